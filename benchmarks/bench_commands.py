@@ -48,10 +48,10 @@ from robotid.commanded.unknowns import LoopSimulator, body_unknowns
 from robotid.commands.job import read_job
 from robotid.exceptions import SettingsError
 from robotid.export.commanded import CommandedDrive, loops_of
-from robotid.identification.evaluation import evaluate_logs
+from robotid.fitting.evaluation import evaluate_logs
+from robotid.fitting.settings import SimulationSettings
+from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import identify
-from robotid.identification.settings import SimulationSettings
-from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.drives import AUTO

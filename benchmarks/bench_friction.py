@@ -21,7 +21,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from robotid.commands.job import read_job
-from robotid.identification.bands import REACH, friction_curve
+from robotid.fitting.bands import REACH, friction_curve
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings

@@ -25,7 +25,7 @@ from helpers import mujoco_plant
 
 from robotid.commanded.fit import fit_loops
 from robotid.commanded.settings import LoopSettings
-from robotid.identification.settings import SimulationSettings
+from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
 
 SECONDS, NOISE, TORQUE, DELAY = 6.0, 3e-4, 0.05, 0.005  # [s], [rad], [N m], [s]

@@ -23,9 +23,9 @@ import numpy as np
 from setting import machine, robot
 
 from robotid.commands.job import read_job
-from robotid.identification.evaluation import pool
+from robotid.fitting.evaluation import pool
+from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
-from robotid.identification.settings import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor

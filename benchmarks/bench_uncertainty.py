@@ -31,7 +31,7 @@ import scipy.signal
 
 from robotid.logs.data import Log
 from robotid.simulation.motions import random_fourier
-from robotid.identification import pipeline
+from robotid.fitting import fit
 from robotid.identification.pipeline import identify
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
@@ -220,7 +220,7 @@ def main():
     if options.encoders:
         print(setting.machine())
         if options.uncorrected:
-            pipeline.find_regressor_noise = lambda *_: None
+            fit.find_regressor_noise = lambda *_: None
         if options.quick:
             print_encoders(["UR5"], options.friction[:1], options.bits, 2)
         else:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from robotid.commanded.settings import LoopSettings
 from robotid.commands.job import Job, LogEntry
-from robotid.identification.settings import ESTIMATORS, ConstraintSettings
+from robotid.fitting.settings import ESTIMATORS, ConstraintSettings
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.transmission import Transmission
 from robotid.robot.drives import AUTO, FAMILIES, TERMS

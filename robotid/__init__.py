@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from robotid.commands.identify import run_job
+    from robotid.commands.identify import run_job, save_result
     from robotid.commands.job import read_job
     from robotid.doctor.diagnosis import check_logs
     from robotid.doctor.urdf import inspect_urdf
@@ -14,10 +14,11 @@ if TYPE_CHECKING:
     from robotid.export.result import load_result
     from robotid.export.sdf import write_sdf
     from robotid.export.urdf import write_urdf
+    from robotid.fitting.settings import EstimatorSettings
     from robotid.identification.payload_fit import identify_payload
-    from robotid.identification.pipeline import Identification, identify
+    from robotid.identification.pipeline import identify
     from robotid.identification.previews import preview
-    from robotid.identification.settings import EstimatorSettings
+    from robotid.identification.result import Identification
     from robotid.logs.data import Log, Trajectory
     from robotid.logs.read import read_log, write_log
     from robotid.logs.settings import LogSource, LogUnits, SignalSettings
@@ -51,6 +52,7 @@ __all__ = [
     "read_log",
     "replay",
     "run_job",
+    "save_result",
     "write_log",
     "write_mjcf",
     "write_ranges",
@@ -60,7 +62,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "commands.identify": ["run_job"],
+    "commands.identify": ["run_job", "save_result"],
     "commands.job": ["read_job"],
     "doctor.diagnosis": ["check_logs"],
     "doctor.urdf": ["inspect_urdf"],
@@ -70,10 +72,11 @@ _HOMES = {
     "export.result": ["load_result"],
     "export.sdf": ["write_sdf"],
     "export.urdf": ["write_urdf"],
+    "fitting.settings": ["EstimatorSettings"],
     "identification.payload_fit": ["identify_payload"],
-    "identification.pipeline": ["Identification", "identify"],
+    "identification.pipeline": ["identify"],
     "identification.previews": ["preview"],
-    "identification.settings": ["EstimatorSettings"],
+    "identification.result": ["Identification"],
     "logs.data": ["Log", "Trajectory"],
     "logs.read": ["read_log", "write_log"],
     "logs.settings": ["LogSource", "LogUnits", "SignalSettings"],

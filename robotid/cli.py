@@ -177,8 +177,8 @@ def _identify(options: argparse.Namespace) -> int:
     with _progress(options) as progress:
         report_stage(progress, "reading logs")  # before what takes the first second: its modules
         from robotid.commands.identify import run_job
-        from robotid.identification.advice import Origin, next_steps
-        from robotid.identification.pipeline import Identification
+        from robotid.identification.result import Identification
+        from robotid.report.advice import Origin, next_steps
         from robotid.workers.plan import WorkPlan
 
         job = job_from_flags(options)
@@ -247,7 +247,7 @@ def _serve(job: "Job", folder: str | None, options: argparse.Namespace) -> None:
 def _doctor(options: argparse.Namespace) -> int:
     from robotid.commands.logs import examine
     from robotid.doctor.diagnosis import findings_to_dict
-    from robotid.identification.verdict import alarming
+    from robotid.judgement.verdict import alarming
 
     with _progress(options) as progress:
         job = job_from_flags(options)

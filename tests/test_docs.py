@@ -18,7 +18,7 @@ from helpers.synthetic import exact_log, truth
 import robotid
 from robotid.cli import main
 from robotid.commands.job import Job, LogEntry, job_from_settings
-from robotid.identification.settings import EstimatorSettings
+from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf

@@ -181,7 +181,7 @@ CALLS_OF_A_RESULT = {
     "joint is None, a NoneType, wanted the name": lambda found, q: found.plot_why(None),
     "recording is 5, a int, wanted": lambda found, q: found.plot_torques("joint_1", recording=5),
     "name is ['wls'], wanted 'estimate' or 'wls'": lambda found, q: found.metrics(["wls"]),
-    "'a\\x00b' cannot name a file": lambda found, q: found.save("a\0b"),
+    "'a\\x00b' cannot name a file": lambda found, q: robotid.save_result(found, "a\0b"),
     "'\\ud800' cannot name a file": lambda found, q: robotid.write_report(found, "\ud800"),
 }
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from robotid.commanded.unknowns import TorqueRows
 from robotid.exceptions import DataError
-from robotid.identification.pipeline import Identification, identify
+from robotid.identification.pipeline import identify
+from robotid.identification.result import Identification
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import unwrap

@@ -20,8 +20,8 @@ from robotid.estimators.estimator import Estimate
 from robotid.estimators.output_error import OutputError
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
-from robotid.identification.pipeline import Identification
-from robotid.identification.settings import SimulationSettings
+from robotid.fitting.settings import SimulationSettings
+from robotid.identification.result import Identification
 from robotid.logs.data import Log
 from robotid.logs.measured_velocity import is_trustworthy
 from robotid.logs.settings import SignalSettings

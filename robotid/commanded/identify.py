@@ -18,9 +18,9 @@ from robotid.commanded.unknowns import with_terms
 from robotid.commanded.zeros import CLEAR, parallel_axes
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, listed
-from robotid.identification.bands import REACH
-from robotid.identification.settings import SimulationSettings
-from robotid.identification.verdict import Verdict, alarming
+from robotid.fitting.bands import REACH
+from robotid.fitting.settings import SimulationSettings
+from robotid.judgement.verdict import Verdict, alarming
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.prediction import predict_instants

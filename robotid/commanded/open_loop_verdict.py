@@ -6,7 +6,7 @@ import numpy as np
 
 from robotid.commanded.errors import OpenLoop
 from robotid.findings import listed
-from robotid.identification.verdict import JointVerdict, Verdict
+from robotid.judgement.verdict import JointVerdict, Verdict
 
 __all__ = ["GOOD", "POOR", "judge_open_loops"]
 

@@ -13,12 +13,12 @@ from robotid.doctor.diagnosis import diagnose
 from robotid.exceptions import SettingsError
 from robotid.export.result import Result, build_commanded
 from robotid.export.urdf import DYNAMICS_TERMS, write_urdf
-from robotid.identification.advice import Origin
-from robotid.identification.settings import SimulationSettings
-from robotid.identification.verdict import check_ignored
+from robotid.fitting.settings import SimulationSettings
+from robotid.judgement.verdict import check_ignored
 from robotid.logs.data import Log
 from robotid.logs.read import Needs
 from robotid.regressor.friction_projection import DriveMoments, project_friction
+from robotid.report.advice import Origin
 from robotid.report.commanded_page import Followed, write_commanded_report
 from robotid.robot.drives import AUTO
 

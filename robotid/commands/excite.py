@@ -21,8 +21,8 @@ from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.excitation.motion_page import write_motion_page
 from robotid.excitation.payload_motion import design_payload
 from robotid.excitation.routes import design_stands, design_sweeps
+from robotid.fitting.survey import hold_log
 from robotid.identification.previews import Preview, Run, preview_logs
-from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
 from robotid.regressor.compiled import is_installed, why_not
 from robotid.robot.model import RobotModel

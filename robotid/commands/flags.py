@@ -414,7 +414,7 @@ def _add_serve(parser: argparse.ArgumentParser, words: str) -> None:
 
 def _add_job(parser: argparse.ArgumentParser, json_: str = "one JSON object") -> None:
     """Add a job file, or the flags that say what it says."""
-    from robotid.identification.settings import ESTIMATORS
+    from robotid.fitting.settings import ESTIMATORS
 
     parser.add_argument("source", metavar="JOB.toml | URDF")
     parser.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")

@@ -13,20 +13,21 @@ from robotid.commanded.identify import Commanded
 from robotid.commands.commanded import run_commanded
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import checkpoint_inputs, examine_logs, locked_as_logged, survey_logs
+from robotid.diagnosis.drive_choice import wanted_families
 from robotid.exceptions import DataError
 from robotid.export.result import build_result
 from robotid.export.urdf import DYNAMICS_TERMS, write_urdf
-from robotid.identification.advice import Origin
-from robotid.identification.bands import fitted_moments
-from robotid.identification.drive_choice import wanted_families
-from robotid.identification.evaluation import Evaluation
-from robotid.identification.findings import locked_findings
-from robotid.identification.pipeline import Identification, conclude
-from robotid.identification.recordings import Recordings
-from robotid.identification.settings import SimulationSettings
-from robotid.identification.verdict import check_ignored
+from robotid.fitting.bands import fitted_moments
+from robotid.fitting.evaluation import Evaluation
+from robotid.fitting.recordings import Recordings
+from robotid.fitting.settings import SimulationSettings
+from robotid.identification.pipeline import conclude
+from robotid.identification.result import Identification
+from robotid.judgement.findings import locked_findings
+from robotid.judgement.verdict import check_ignored
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.friction_projection import project_friction
+from robotid.report.advice import Origin
 from robotid.report.document import write_report
 from robotid.robot.drives import AUTO, DriveTerm
 from robotid.robot.model import RobotModel
@@ -90,7 +91,12 @@ def run_job(
 
 
 def save_result(identification: Identification, folder: str | Path, *, report: bool = True) -> Path:
-    """Write an identification as ``run_job`` does; see ``Identification.save``.
+    """Write what ``robotid identify`` writes: result.json, report, URDF with its sidecar.
+
+    ``robotid.load_result(folder)``, ``robotid validate`` and ``robotid replay`` read it. Every file
+    is made in a folder of its own first and put in place when all are complete. A result that
+    cannot be right has no URDF. Logs in files are named, with their hashes; how their columns were
+    read by hand (gains, units, names) is not known to it.
 
     Args:
         identification: What was found.

@@ -12,7 +12,7 @@ from robotid._settings import Entries, Range, Settings, check_keys, require_kind
 from robotid.commanded.settings import LoopSettings
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
-from robotid.identification.settings import (
+from robotid.fitting.settings import (
     ConsistentSettings,
     EstimatorSettings,
     SimulationSettings,

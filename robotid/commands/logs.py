@@ -16,10 +16,10 @@ from robotid.doctor.locked_joints import STILL, check_locked
 from robotid.exceptions import DataError
 from robotid.export.result import load_result, stated_model, stated_parameters
 from robotid.findings import Finding, by_severity
+from robotid.fitting.recordings import Recordings
+from robotid.fitting.survey import SurveyedLog, survey_log
 from robotid.identification.previews import Run
-from robotid.identification.recordings import Recordings
-from robotid.identification.survey import SurveyedLog, survey_log
-from robotid.identification.verdict import check_ignored
+from robotid.judgement.verdict import check_ignored
 from robotid.logs.read import LogLayout, Needs
 from robotid.logs.table import Table
 from robotid.regressor.base_parameters import structural_mapping

@@ -10,8 +10,8 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import job_of_result, survey_logs
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
+from robotid.fitting.recordings import Recordings
 from robotid.identification.payload_fit import fit_payloads, own_friction
-from robotid.identification.recordings import Recordings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.drives import DriveTerm
 from robotid.robot.model import RobotModel

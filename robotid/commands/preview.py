@@ -10,8 +10,8 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import result_run
 from robotid.exceptions import DataError
 from robotid.export.result import build_preview, load_result
+from robotid.fitting.survey import SurveyedLog, survey_log
 from robotid.identification.previews import preview_logs
-from robotid.identification.survey import SurveyedLog, survey_log
 from robotid.robot.model import RobotModel
 
 __all__ = ["preview_job"]

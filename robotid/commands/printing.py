@@ -11,7 +11,7 @@ from robotid._text import columns, in_digits_of, terminal_width, tinted, wrapped
 from robotid.findings import Finding, grouped, listed
 
 if TYPE_CHECKING:
-    from robotid.identification.advice import Step
+    from robotid.report.advice import Step
 
 __all__ = ["print_content", "print_files", "print_steps", "say"]
 

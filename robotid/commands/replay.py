@@ -18,9 +18,9 @@ from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.export.result import Result, load_result, stated_model
 from robotid.export.shape import FILE, NUMBER, TABLE, TEXT, check_shape
 from robotid.findings import listed
-from robotid.identification.evaluation import predict
-from robotid.identification.pipeline import Identification
-from robotid.identification.survey import hold_log
+from robotid.fitting.evaluation import predict
+from robotid.fitting.survey import hold_log
+from robotid.identification.result import Identification
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table
 from robotid.logs.settings import LogSource

@@ -14,8 +14,8 @@ from robotid.commands.job import Job, job_from_settings
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.result import Result, load_result
 from robotid.findings import listed
-from robotid.identification.advice import Origin
-from robotid.identification.pipeline import Identification
+from robotid.identification.result import Identification
+from robotid.report.advice import Origin
 from robotid.report.commanded_page import Followed, write_commanded_report
 from robotid.report.document import write_report
 from robotid.simulation.loops import LoopedRobot, open_loops

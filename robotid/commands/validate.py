@@ -26,15 +26,15 @@ from robotid.export.result import (
     stated_witness,
 )
 from robotid.findings import Finding, listed
-from robotid.identification.evaluation import (
+from robotid.fitting.evaluation import (
     Evaluation,
     evaluate_logs,
     hidden_joints,
     shares_rows,
 )
-from robotid.identification.metrics import Metrics
-from robotid.identification.survey import SurveyedLog
-from robotid.identification.verdict import Doubt, Verdict, alarming, doubts_of, judge
+from robotid.fitting.metrics import Metrics
+from robotid.fitting.survey import SurveyedLog
+from robotid.judgement.verdict import Doubt, Verdict, alarming, doubts_of, judge
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
 from robotid.simulation.loops import LoopedRobot, open_loops

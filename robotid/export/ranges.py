@@ -18,8 +18,8 @@ from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.export.urdf import link_parameters
 from robotid.export.yaml_text import yaml_text
-from robotid.identification.bands import REACH, fitted_moments
-from robotid.identification.pipeline import Identification
+from robotid.fitting.bands import REACH, fitted_moments
+from robotid.identification.result import Identification
 from robotid.regressor.friction_projection import project_friction
 from robotid.robot.bodies import principal_moments
 from robotid.robot.drives import TERMS

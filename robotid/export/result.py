@@ -27,14 +27,15 @@ from robotid.export.ranges import body_ranges, parameter_ranges
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.urdf import load_identified, terms_from_facts
 from robotid.findings import listed
-from robotid.identification.bands import REACH, FrictionCurve, fitted_moments, usual_friction
-from robotid.identification.drive_choice import DriveChoice
-from robotid.identification.evaluation import Evaluation
-from robotid.identification.parameter_table import parameter_entries, parameter_table
-from robotid.identification.pipeline import SOURCES, Identification
+from robotid.fitting.bands import REACH, FrictionCurve, fitted_moments, usual_friction
+from robotid.fitting.drives import DriveChoice
+from robotid.fitting.evaluation import Evaluation
+from robotid.fitting.parameter_table import parameter_entries, parameter_table
+from robotid.fitting.result import SOURCES
 from robotid.identification.previews import Preview
-from robotid.identification.verdict import Doubt
-from robotid.identification.witness import Witness
+from robotid.identification.result import Identification
+from robotid.judgement.verdict import Doubt
+from robotid.judgement.witness import Witness
 from robotid.logs.data import Log, suggestion
 from robotid.logs.transmission import Transmission
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping

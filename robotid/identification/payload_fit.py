@@ -9,16 +9,16 @@ import numpy as np
 
 from robotid._settings import is_number, require_each, require_kind
 from robotid._typing import Array
+from robotid.diagnosis.drive_choice import wanted_families
 from robotid.estimators import Consistent, Constraints, Estimate
 from robotid.estimators.stretches import quantile
 from robotid.estimators.two_runs import Compared, TwoRuns, payload_runs
 from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.findings import listed
-from robotid.identification.drive_choice import wanted_families
+from robotid.fitting.recordings import Recordings
+from robotid.fitting.settings import ConsistentSettings
+from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import robot_of, with_drives
-from robotid.identification.recordings import Recordings
-from robotid.identification.settings import ConsistentSettings
-from robotid.identification.survey import hold_log
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping

@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotid._typing import Array
-from robotid.identification.bands import REACH, TorqueBand, friction_curve
-from robotid.identification.evaluation import Evaluation
-from robotid.identification.residuals import autocorrelation, friction_split, spectrum
+from robotid.fitting.bands import REACH, TorqueBand, friction_curve
+from robotid.fitting.evaluation import Evaluation
+from robotid.fitting.residuals import autocorrelation, friction_split, spectrum
 from robotid.pages.charts import Chart, Series, broken
 from robotid.regressor.memory import drive_motion_along
 
 if TYPE_CHECKING:
-    from robotid.identification.pipeline import Identification
+    from robotid.identification.result import Identification
 
 __all__ = [
     "friction_chart",

@@ -26,14 +26,14 @@ from robotid.estimators.determination import base_spread, determine
 from robotid.estimators.stretches import FEWEST_STRETCHES, scatter
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
-from robotid.identification.bands import TorqueBand, expected_band
-from robotid.identification.evaluation import evaluate_logs
-from robotid.identification.fitting import Known, consistent_fit
-from robotid.identification.pipeline import Identification
-from robotid.identification.recordings import Recordings
-from robotid.identification.settings import ConsistentSettings, EstimatorSettings
-from robotid.identification.standard_errors import StandardErrors, about_prior, standard_of
-from robotid.identification.survey import SurveyedLog, hold_log
+from robotid.fitting.bands import TorqueBand, expected_band
+from robotid.fitting.estimators import Known, consistent_fit
+from robotid.fitting.evaluation import evaluate_logs
+from robotid.fitting.recordings import Recordings
+from robotid.fitting.settings import ConsistentSettings, EstimatorSettings
+from robotid.fitting.standard_errors import StandardErrors, about_prior, standard_of
+from robotid.fitting.survey import SurveyedLog, hold_log
+from robotid.identification.result import Identification
 from robotid.logs.data import suggestion
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings

@@ -10,8 +10,8 @@ from robotid._text import columns
 from robotid.pages.html import code, number, percent, table, text
 
 if TYPE_CHECKING:
-    from robotid.identification.metrics import Metrics
-    from robotid.identification.pipeline import Identification
+    from robotid.fitting.metrics import Metrics
+    from robotid.identification.result import Identification
 
 __all__ = [
     "cell",

@@ -3,10 +3,10 @@
 import numpy as np
 
 from robotid._typing import Array
-from robotid.identification.bands import REACH
-from robotid.identification.dependence import Dependence
+from robotid.diagnosis.dependence import Dependence
+from robotid.diagnosis.torque_split import JointTorque
+from robotid.fitting.bands import REACH
 from robotid.identification.pictures import unused_spans
-from robotid.identification.torque_split import JointTorque
 from robotid.pages.charts import Chart, Series, broken
 
 __all__ = ["why_charts"]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from html import escape
 
 from robotid.findings import Cause, grouped
-from robotid.identification.pipeline import Identification
+from robotid.identification.result import Identification
 from robotid.pages.html import Cell, code, table
 from robotid.report.summary_screen import joint_errors
 

@@ -15,9 +15,9 @@ from robotid.commanded.errors import DRIFTS
 from robotid.exceptions import DataError
 from robotid.export.ranges import stated_ranges
 from robotid.findings import Finding, grouped, listed
-from robotid.identification.advice import Origin
 from robotid.pages.charts import Chart, Series, chart_html
 from robotid.pages.html import Cell, Section, code, folded, number, page, table, text, with_error
+from robotid.report.advice import Origin
 from robotid.report.causes import causes_html
 from robotid.versions import __version__
 

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from robotid._typing import Array
 from robotid.findings import listed
-from robotid.identification.drive_choice import DriveChoice
-from robotid.identification.information import Information, information
+from robotid.fitting.drives import DriveChoice
+from robotid.fitting.information import Information, information
+from robotid.fitting.residuals import friction_split
 from robotid.identification.pictures import (
     friction_chart,
     parameter_charts,
@@ -17,8 +18,7 @@ from robotid.identification.pictures import (
     shown_evaluation,
     singular_chart,
 )
-from robotid.identification.pipeline import Identification
-from robotid.identification.residuals import friction_split
+from robotid.identification.result import Identification
 from robotid.pages.charts import Chart, chart_html
 from robotid.pages.html import code, figure, number, table, text
 from robotid.robot.parameters import INERTIAL_TERMS

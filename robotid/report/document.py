@@ -8,10 +8,9 @@ from pathlib import Path
 from robotid._files import write_text
 from robotid._settings import require_each, require_kind
 from robotid.findings import listed
-from robotid.identification.advice import Origin
-from robotid.identification.evaluation import Evaluation
-from robotid.identification.metrics import JointMetrics, Metrics
-from robotid.identification.pipeline import Identification
+from robotid.fitting.evaluation import Evaluation
+from robotid.fitting.metrics import JointMetrics, Metrics
+from robotid.identification.result import Identification
 from robotid.identification.summary import verdict_cell
 from robotid.logs.settings import SignalSettings
 from robotid.pages.html import (
@@ -24,6 +23,7 @@ from robotid.pages.html import (
     table,
     text,
 )
+from robotid.report.advice import Origin
 from robotid.report.causes import findings_line, findings_section
 from robotid.report.diagnosis import (
     body_figures,

@@ -3,12 +3,13 @@
 from collections.abc import Mapping
 from html import escape
 
-from robotid.identification.advice import Origin, next_steps
-from robotid.identification.metrics import JointMetrics
-from robotid.identification.pipeline import SOURCES, Identification
+from robotid.fitting.metrics import JointMetrics
+from robotid.fitting.result import SOURCES
+from robotid.identification.result import Identification
 from robotid.identification.summary import joint_reason
-from robotid.identification.verdict import GOOD, POOR, JointVerdict
+from robotid.judgement.verdict import GOOD, POOR, JointVerdict
 from robotid.pages.html import code, percent
+from robotid.report.advice import Origin, next_steps
 
 __all__ = ["DETERMINED", "joint_errors", "summary_screen"]
 

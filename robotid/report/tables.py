@@ -11,9 +11,10 @@ import numpy as np
 from robotid._files import file_sha256
 from robotid.export.urdf import urdf_changes
 from robotid.findings import listed
-from robotid.identification.evaluation import Recording
-from robotid.identification.parameter_table import correlated_parameters
-from robotid.identification.pipeline import SOURCES, Identification
+from robotid.fitting.evaluation import Recording
+from robotid.fitting.parameter_table import correlated_parameters
+from robotid.fitting.result import SOURCES
+from robotid.identification.result import Identification
 from robotid.pages.html import Cell, code, number, percent, table, text, with_error
 from robotid.report.summary_screen import DETERMINED
 from robotid.robot.parameters import pseudo_inertia

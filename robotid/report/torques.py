@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from html import escape
 
-from robotid.identification.bands import TorqueBand
-from robotid.identification.evaluation import Evaluation
+from robotid.fitting.bands import TorqueBand
+from robotid.fitting.evaluation import Evaluation
 from robotid.identification.pictures import torque_charts
-from robotid.identification.pipeline import Identification
+from robotid.identification.result import Identification
 from robotid.identification.summary import verdict_cell
 from robotid.pages.charts import chart_html
 from robotid.pages.html import code, folded, percent

@@ -2,9 +2,9 @@
 
 from html import escape
 
-from robotid.identification.dependence import LEAST
-from robotid.identification.pipeline import Identification
-from robotid.identification.torque_split import JointTorque, joint_torques
+from robotid.diagnosis.dependence import LEAST
+from robotid.diagnosis.torque_split import JointTorque, joint_torques
+from robotid.identification.result import Identification
 from robotid.identification.why_pictures import why_charts
 from robotid.pages.charts import Chart, chart_html
 from robotid.pages.html import Cell, code, folded, number, percent, table, text

@@ -10,7 +10,7 @@ from robotid.commanded.fit import fit_loops
 from robotid.commanded.identify import identify_commands
 from robotid.commanded.settings import LoopSettings
 from robotid.exceptions import DataError, SettingsError
-from robotid.identification.settings import SimulationSettings
+from robotid.fitting.settings import SimulationSettings
 
 KP, KD, DELAY, TORQUE = 80.0, 3.0, 0.0053, 0.05
 LOOP = LoopSettings(kp=KP, kd=KD, delay=DELAY)

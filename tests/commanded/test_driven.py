@@ -9,7 +9,7 @@ from robotid.commanded.errors import DRIFTS, run_open_loop
 from robotid.commanded.identify import identify_commands
 from robotid.commanded.settings import LoopSettings
 from robotid.exceptions import DataError
-from robotid.identification.settings import SimulationSettings
+from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.model import RobotModel

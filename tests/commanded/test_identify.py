@@ -13,7 +13,7 @@ from robotid.commanded.settings import LoopSettings
 from robotid.commanded.term_choice import _Fold, _gains
 from robotid.exceptions import DataError
 from robotid.findings import Finding
-from robotid.identification.settings import SimulationSettings
+from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
 from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Presliding, Viscous
 from robotid.simulation.loops import LoopedRobot, cut_windows

@@ -8,7 +8,7 @@ from robotid.commanded.fit import fit_loops
 from robotid.commanded.identify import identify_commands
 from robotid.commanded.settings import LoopSettings
 from robotid.doctor.command_channels import largest_speeds
-from robotid.identification.settings import SimulationSettings
+from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
 
 RATE, HELD, RAMP, STEPS = 250.0, 200, 20, 10  # [Hz], rows, of a leg that goes from pose to pose

@@ -9,7 +9,7 @@ from robotid.commanded.identify import identify_commands
 from robotid.commanded.settings import LoopSettings
 from robotid.commanded.unknowns import LoopSimulator, body_unknowns
 from robotid.commanded.zeros import CLEAR, find_encoders, parallel_axes
-from robotid.identification.settings import SimulationSettings
+from robotid.fitting.settings import SimulationSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.loops import LoopedRobot

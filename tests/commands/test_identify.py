@@ -14,8 +14,8 @@ from robotid.cli import main
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.exceptions import DataError, SettingsError
+from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
-from robotid.identification.settings import EstimatorSettings
 from robotid.logs.read import write_log
 
 

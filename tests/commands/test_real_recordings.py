@@ -10,7 +10,7 @@ from robotid.commands.identify import run_job
 from robotid.commands.job import read_job
 from robotid.export.result import read_result
 from robotid.export.urdf import load_identified
-from robotid.identification.evaluation import predict
+from robotid.fitting.evaluation import predict
 from robotid.robot.parameters import pseudo_inertia
 
 JOBS = Path(__file__).parents[1] / "jobs"

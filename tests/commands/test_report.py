@@ -18,7 +18,7 @@ from robotid.commands.commanded import log_of_commands
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.export.result import load_result
-from robotid.identification.settings import SimulationSettings
+from robotid.fitting.settings import SimulationSettings
 from robotid.logs.read import write_log
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel

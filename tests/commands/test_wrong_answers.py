@@ -13,8 +13,8 @@ from robotid.cli import main
 from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings, read_job
 from robotid.export.urdf import load_identified, write_urdf
+from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
-from robotid.identification.settings import EstimatorSettings
 from robotid.logs.read import read_log, write_log
 from robotid.regressor.prediction import predict
 from robotid.robot.examples import example_urdf

@@ -15,7 +15,7 @@ from robotid.commands.logs import examine
 from robotid.doctor.diagnosis import check_logs, diagnose, findings_to_dict
 from robotid.exceptions import SettingsError
 from robotid.findings import Finding
-from robotid.identification.verdict import alarming, check_ignored
+from robotid.judgement.verdict import alarming, check_ignored
 from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings

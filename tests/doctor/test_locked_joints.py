@@ -9,7 +9,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import examine
-from robotid.identification.settings import EstimatorSettings
+from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import LogUnits
 from robotid.robot.examples import example_urdf
@@ -104,7 +104,7 @@ def test_a_joint_that_stands_where_it_is_said_to_is_not_named(job):
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_held_joints_are_checked_in_logs_read_in_pieces_too(job, tmp_path, suffix, monkeypatch):
-    monkeypatch.setattr("robotid.identification.survey._WINDOW", 300)
+    monkeypatch.setattr("robotid.fitting.survey._WINDOW", 300)
     short = job(0.5)
     path = tmp_path / f"run.{suffix}"
     write_log(read_log(tmp_path / "run.csv", (*short.model().joints, HELD)), path)

@@ -7,7 +7,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.estimators import OLS, TLS, WLS
 from robotid.estimators.batch import mixed_tls
 from robotid.exceptions import DataError, RankDeficientError
-from robotid.identification.pipeline import EstimatorSettings
+from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.factors import compress
 from robotid.regressor.problem import Problem

@@ -9,7 +9,7 @@ from helpers.synthetic import exact_log, truth
 
 import robotid
 from robotid.exceptions import DataError
-from robotid.identification.settings import EstimatorSettings
+from robotid.fitting.settings import EstimatorSettings
 from robotid.robot.model import RobotModel
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"

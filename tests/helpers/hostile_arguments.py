@@ -143,7 +143,7 @@ CALLS = {
                  lambda c, _: {"joint": "joint_1"}),
     "metrics": (lambda **given: robot().found.metrics(**given), lambda c, _: {"name": "wls"}),
     "save": (
-        lambda **given: robot().found.save(**given),
+        lambda **given: robotid.save_result(robot().found, **given),
         lambda c, f: {"folder": f / "saved", "report": False},
     ),
     "load_result": (robotid.load_result, lambda c, _: {"path": good_result()[0]}),

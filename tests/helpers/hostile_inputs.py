@@ -27,7 +27,7 @@ from helpers.recorders import messages_of, write_bag1, write_bag2, write_mcap
 from helpers.synthetic import exact_log, truth
 from robotid.cli import main
 from robotid.commands.job import Job
-from robotid.identification.settings import ESTIMATORS
+from robotid.fitting.settings import ESTIMATORS
 from robotid.logs.read import write_log
 from robotid.robot.model import RobotModel
 

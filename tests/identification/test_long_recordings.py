@@ -14,8 +14,8 @@ from robotid.commands.job import Job, LogEntry, job_from_settings, read_job
 from robotid.commands.logs import examine, survey_logs
 from robotid.commands.validate import validate_result
 from robotid.exceptions import DataError, SettingsError
-from robotid.identification.evaluation import evaluate_logs
-from robotid.identification.settings import EstimatorSettings
+from robotid.fitting.evaluation import evaluate_logs
+from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import SignalSettings
@@ -167,8 +167,8 @@ def test_a_fitted_recording_is_no_validation_in_pieces_either(
 
 
 def test_only_stretches_of_a_long_log_are_drawn_and_examined(noisy_job, tmp_path, monkeypatch):
-    monkeypatch.setattr("robotid.identification.evaluation._SHOWN", 100)
-    monkeypatch.setattr("robotid.identification.survey._WINDOW", 400)
+    monkeypatch.setattr("robotid.fitting.evaluation._SHOWN", 100)
+    monkeypatch.setattr("robotid.fitting.survey._WINDOW", 400)
     job = replace(noisy_job, rows_in_memory=HELD, validation=(), report=True)
     identification, result = run_job(job, tmp_path)
     (evaluation,) = identification.fitted

@@ -7,8 +7,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import batch
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
-from robotid.identification import pipeline
-from robotid.identification.pipeline import EstimatorSettings
+from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
@@ -156,7 +155,7 @@ def test_the_mass_matrix_is_checked_once_and_again_for_other_parameters(ur5, rng
         asked.append(pi)
         return MassMatrixCheck(1, 1.0, 1.0)
 
-    monkeypatch.setattr(pipeline, "check_mass_matrix", check)
+    monkeypatch.setattr("robotid.fitting.result.check_mass_matrix", check)
     found = identify(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT, estimator="wls")
     assert found.mass_matrix is replace(found, alarms=("x",)).mass_matrix is found.mass_matrix
     assert len(asked) == 1

@@ -9,12 +9,13 @@ import pytest
 from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
 
 from robotid.commands.export import export_result
+from robotid.commands.identify import save_result
 from robotid.exceptions import DataError
 from robotid.export.ranges import parameter_ranges
 from robotid.export.result import load_result
 from robotid.export.urdf import read_sidecar
-from robotid.identification.bands import REACH, friction_curve
-from robotid.identification.settings import EstimatorSettings
+from robotid.fitting.bands import REACH, friction_curve
+from robotid.fitting.settings import EstimatorSettings
 from robotid.regressor.friction_projection import project_friction
 from robotid.regressor.memory import drive_motion_along
 from robotid.robot.drives import LoadFriction
@@ -31,7 +32,7 @@ def found():
 
 @pytest.fixture(scope="module")
 def loaded(found, tmp_path_factory):
-    return load_result(found.save(tmp_path_factory.mktemp("saved"), report=False))
+    return load_result(save_result(found, tmp_path_factory.mktemp("saved"), report=False))
 
 
 def moving_rows(found):

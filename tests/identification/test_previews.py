@@ -11,9 +11,9 @@ from helpers.synthetic import truth
 
 from robotid.estimators.batch import solve_factor
 from robotid.exceptions import DataError, SettingsError
+from robotid.fitting.settings import EstimatorSettings
+from robotid.fitting.survey import hold_log
 from robotid.identification.previews import TorqueNoise, assumed_noise, preview
-from robotid.identification.settings import EstimatorSettings
-from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.factors import compress

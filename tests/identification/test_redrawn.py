@@ -12,7 +12,7 @@ from robotid.estimators import Consistent
 from robotid.estimators.consistent.cone_programme import Programme
 from robotid.estimators.consistent.cones import Cone, nearest, svec, unsvec
 from robotid.exceptions import NotConvergedError, SettingsError
-from robotid.identification.settings import EstimatorSettings
+from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.prior import prior_spread

@@ -43,7 +43,7 @@ def found(logs):
 
 @pytest.fixture(scope="module")
 def saved(found, tmp_path_factory):
-    return found.save(tmp_path_factory.mktemp("saved") / "result")
+    return robotid.save_result(found, tmp_path_factory.mktemp("saved") / "result")
 
 
 def test_the_files_are_those_of_the_command_line_and_hold_what_was_found(saved, found):
@@ -90,7 +90,7 @@ def test_what_a_job_found_is_saved_with_the_job_that_was_run(logs, tmp_path):
         "identification": [{"log": str(logs / "first.csv")}],
     }
     found, result = robotid.run_job(job_from_settings(table, "job.toml", logs), tmp_path / "one")
-    path = found.save(tmp_path / "two", report=False)
+    path = robotid.save_result(found, tmp_path / "two", report=False)
     assert json.loads(path.read_text())["settings"] == result["settings"]
     assert result["settings"]["torque"]["gains"] == {"joint_1": 3.0}
 
@@ -100,7 +100,8 @@ def test_logs_in_memory_have_no_file_to_name(ur5, found, tmp_path):
         replace(e, recording=replace(e.recording, log=replace(e.recording.log, path="")))
         for e in found.fitted
     ]
-    path = replace(found, fitted=tuple(evaluations), validation=()).save(tmp_path, report=False)
+    found = replace(found, fitted=tuple(evaluations), validation=())
+    path = robotid.save_result(found, tmp_path, report=False)
     content = json.loads(path.read_text())
     assert "identification" not in content["settings"] or not content["settings"]["identification"]
     assert [entry["path"] for entry in content["inputs"][1:]] == [""]
@@ -109,8 +110,8 @@ def test_logs_in_memory_have_no_file_to_name(ur5, found, tmp_path):
 def test_a_result_is_written_whole_or_not_at_all(found, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(SettingsError, match="file' is a file, wanted a folder for the results"):
-        found.save(tmp_path / "file")
+        robotid.save_result(found, tmp_path / "file")
     monkeypatch.setattr("robotid.commands.identify.build_result", lambda *a, **k: {"x": np.inf})
     with pytest.raises(ValueError, match="JSON"):
-        found.save(tmp_path / "out", report=False)
+        robotid.save_result(found, tmp_path / "out", report=False)
     assert list((tmp_path / "out").iterdir()) == []

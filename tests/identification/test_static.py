@@ -13,7 +13,8 @@ from robotid.commands.job import read_job
 from robotid.commands.validate import validate_result
 from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.export.result import load_result
-from robotid.identification.pipeline import EstimatorSettings, identify
+from robotid.fitting.settings import EstimatorSettings
+from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings

@@ -19,7 +19,7 @@ from helpers.recorders import (
 
 from robotid.commands.convert import convert
 from robotid.exceptions import DataError, SettingsError
-from robotid.identification.survey import survey_log
+from robotid.fitting.survey import survey_log
 from robotid.logs.data import COLUMNS, Log
 from robotid.logs.formats import write_columns
 from robotid.logs.read import lay_out, read_log, read_logs, write_log

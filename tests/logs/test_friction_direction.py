@@ -9,11 +9,11 @@ from helpers.synthetic import exact_log, truth
 from scipy.signal import butter, sosfiltfilt
 
 from robotid.exceptions import DataError
-from robotid.identification.bands import torque_band
+from robotid.fitting.bands import torque_band
+from robotid.fitting.recordings import Recordings
+from robotid.fitting.settings import EstimatorSettings
+from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude
-from robotid.identification.recordings import Recordings
-from robotid.identification.settings import EstimatorSettings
-from robotid.identification.survey import hold_log
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.friction_direction import acting_directions
 from robotid.logs.settings import SignalSettings

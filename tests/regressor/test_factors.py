@@ -4,7 +4,7 @@ import scipy.linalg
 from helpers.synthetic import exact_log, truth
 
 from robotid.exceptions import DataError
-from robotid.identification.survey import hold_log
+from robotid.fitting.survey import hold_log
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor import lapack

@@ -10,7 +10,7 @@ from helpers.pages import chart, charts, tables
 
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
-from robotid.identification.advice import Origin
+from robotid.report.advice import Origin
 from robotid.report.commanded_page import Followed, _undetermined, write_commanded_report
 
 ERRORS = {"rmse": (2e-3, 4e-3, 8e-3), "command_rmse": (0.02, 0.05, 0.08), "urdf_rmse": (0.01,) * 3}

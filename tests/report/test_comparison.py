@@ -15,9 +15,9 @@ from helpers.synthetic import exact_log, truth
 
 from robotid._files import write_json
 from robotid.cli import main
+from robotid.diagnosis.torque_split import split_torque
 from robotid.exceptions import DataError
 from robotid.export.result import build_result, read_result
-from robotid.identification.torque_split import split_torque
 from robotid.logs.read import write_log
 from robotid.pages.html import code
 from robotid.report.comparison import compare_results, write_comparison

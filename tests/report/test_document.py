@@ -10,7 +10,7 @@ from helpers.pages import chart, tables
 
 from robotid.exceptions import DataError
 from robotid.findings import Finding
-from robotid.identification.information import information
+from robotid.fitting.information import information
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings

@@ -12,9 +12,9 @@ import pytest
 from helpers.figures import torques
 from helpers.pages import chart
 
-from robotid.identification.information import information
+from robotid.fitting.information import information
+from robotid.fitting.residuals import autocorrelation, spectrum
 from robotid.identification.pictures import torque_charts
-from robotid.identification.residuals import autocorrelation, spectrum
 from robotid.robot.parameters import INERTIAL_TERMS
 
 JOINTS = range(6)

@@ -6,9 +6,9 @@ from html import unescape
 
 import pytest
 
-from robotid.identification.advice import Origin, next_steps
-from robotid.identification.verdict import GOOD, POOR
+from robotid.judgement.verdict import GOOD, POOR
 from robotid.report import summary_screen as first
+from robotid.report.advice import Origin, next_steps
 from robotid.report.summary_screen import joint_errors, summary_screen
 
 ORIGIN = Origin(("arm.toml",), "out")

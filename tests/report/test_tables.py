@@ -13,7 +13,7 @@ from helpers.figures import figures
 from helpers.pages import number, percent, tables
 
 from robotid.estimators.determination import Group
-from robotid.identification.information import information
+from robotid.fitting.information import information
 from robotid.identification.summary import verdict_cell
 from robotid.pages import html
 from robotid.report import tables as report_tables

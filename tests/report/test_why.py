@@ -9,7 +9,7 @@ import pytest
 from helpers.browsing import until, visit
 from helpers.pages import charts, number, percent, tables
 
-from robotid.identification.torque_split import joint_torques
+from robotid.diagnosis.torque_split import joint_torques
 from robotid.pages.html import page
 from robotid.report.why import _caption, why_section
 

@@ -5,8 +5,8 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.doctor.urdf import inspect_urdf
 from robotid.exceptions import SettingsError
+from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
-from robotid.identification.settings import EstimatorSettings
 from robotid.logs.settings import SignalSettings
 from robotid.robot.geometry import (
     body_boxes,

@@ -6,8 +6,8 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.estimators.consistent.cones import SOLVERS
 from robotid.export.result import build_result
-from robotid.identification.findings import consistency_findings
-from robotid.identification.settings import EstimatorSettings
+from robotid.fitting.settings import EstimatorSettings
+from robotid.judgement.findings import consistency_findings
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf

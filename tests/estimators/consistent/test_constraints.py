@@ -10,8 +10,8 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.estimators.consistent.constraints import Constraints, slabs
 from robotid.exceptions import DataError, NotConvergedError, SettingsError
-from robotid.identification.fitting import make_constraints
-from robotid.identification.settings import ConstraintSettings, EstimatorSettings
+from robotid.fitting.estimators import make_constraints
+from robotid.fitting.settings import ConstraintSettings, EstimatorSettings
 from robotid.regressor.factors import compress
 from robotid.robot.geometry import body_boxes
 from robotid.robot.parameters import pseudo_inertia

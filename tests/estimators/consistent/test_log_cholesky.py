@@ -18,7 +18,7 @@ from robotid.estimators.consistent.log_cholesky import (
     to_log_cholesky,
 )
 from robotid.exceptions import SettingsError
-from robotid.identification.settings import EstimatorSettings
+from robotid.fitting.settings import EstimatorSettings
 from robotid.regressor.factors import compress
 from robotid.robot.geometry import body_boxes
 from robotid.robot.parameters import inertial_from_pseudo_inertia

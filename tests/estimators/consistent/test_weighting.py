@@ -17,7 +17,7 @@ from robotid.estimators.consistent.weighting import (
     log_evidence,
 )
 from robotid.exceptions import DataError, SettingsError
-from robotid.identification.settings import EstimatorSettings
+from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress, compress_stretches, gather, merge

@@ -1,0 +1,237 @@
+"""Terms of a drive's torque that the model may lack: columns to test what a fit leaves against."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from operator import attrgetter
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.fitting.joint_motion import JointMotion
+from robotid.robot.drives import COUNTERBALANCE, DriveTerm, Harmonic
+
+__all__ = ["CANDIDATES", "Candidate", "couplings", "ripples"]
+
+_HARMONICS = 4  # of a torque that is periodic in the position
+_RIPPLES = np.arange(5, 241)  # times a turn that it may repeat beyond: 200 of a gear of 100 : 1
+_PEAKS = 6  # of them are tried, those at which the residual is most periodic
+_STEEP = 8  # twice the order of the filter, which runs both ways
+_STRIBECK = (0.05, 0.2)  # of the usual speed, over which friction falls from its value at rest
+_PRESLIDING = (0.03, 0.15)  # of the usual speed, over which friction changes its sign
+_WINDUP = (0.02, 0.1)  # of the usual way between two reversals, on which a torque is taken up
+_TURNED = 0.05  # of the usual rigid torque, over which the side of a gear changes
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A term that a drive's torque may have, linear in its parameters.
+
+    Attributes:
+        name: Its name.
+        code: Code of the finding that says it is missing.
+        columns: What its c parameters multiply in N rows, shape (N, c). Scales in it are those of
+            the motion given, unless that names another.
+        meaning: What it is, in words of a finding.
+        advice: What the user can do beside adding it to the model; empty if nothing.
+        families: Friction of a job that has it, see ``FAMILIES``; advised is the first for which
+            the joint turned far enough.
+        terms: Terms of a job's [drives] that are it, if no family is.
+        units: Unit of the parameter of a joint that turns, and of one that slides; None: the size
+            is the torque of the term, root mean square.
+        turns: Whether only a joint that turns has it.
+        coupled: The other joint of a coupling; empty for none.
+        ratio: Its ratio beside 1 of the joint's own.
+        tried: How many such terms it was selected from by the residual.
+        is_imitated: Whether a drive that sticks at its reversals looks like it behind a filter: it
+            is no more than a note then.
+    """
+
+    name: str
+    code: str
+    columns: Callable[[JointMotion], Array]
+    meaning: str
+    advice: str = ""
+    units: tuple[str, str] | None = None
+    turns: bool = False
+    families: tuple[str, ...] = ()
+    terms: tuple[DriveTerm, ...] = ()
+    tried: int = 1
+    coupled: str = ""
+    ratio: float = 0.0
+    is_imitated: bool = False
+
+
+def _usual(m: JointMotion, of: Callable[[JointMotion], Array]) -> float:
+    """Return the root mean square of a signal of the motion that scales, 1 if it is 0 there."""
+    return float(np.sqrt(np.mean(of(m.scale or m) ** 2))) or 1.0
+
+
+def _stribeck(m: JointMotion) -> Array:
+    v = np.abs(m.v)[:, None] / (np.array(_STRIBECK) * _usual(m, attrgetter("v")))
+    falling: Array = m.direction[:, None] * np.exp(-v)
+    return falling
+
+
+def _presliding(m: JointMotion) -> Array:
+    setting_in: Array = np.tanh(m.v[:, None] / (np.array(_PRESLIDING) * _usual(m, attrgetter("v"))))
+    return setting_in
+
+
+def _periodic(m: JointMotion, harmonics: int = _HARMONICS) -> Array:
+    angle = np.outer(m.q, np.arange(1, harmonics + 1))
+    return np.hstack([np.cos(angle), np.sin(angle)])
+
+
+def _ripple(m: JointMotion, count: int) -> Array:
+    """Return cosine and sine of many times the position, as the filter of torques passes them."""
+    passed = _passed(m, np.array([count]))
+    columns: Array = passed * np.column_stack([np.cos(count * m.q), np.sin(count * m.q)])
+    return columns
+
+
+def _passed(m: JointMotion, counts: Array) -> Array:
+    """Return what the filter leaves of torques that repeat so often a turn, shape (N, k)."""
+    hertz = np.abs(np.outer(m.v, counts)) / (2 * np.pi)
+    passed: Array = 1.0 / (1.0 + (hertz / m.passes) ** _STEEP)
+    return passed
+
+
+def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
+    """Return candidates of a torque that repeats many times a turn, from the residual's spectrum.
+
+    Args:
+        m: The joint's motion, N rows.
+        weight: What torques of the rows are multiplied by, 0 where they are not used, shape (N,).
+        r: The residual, likewise multiplied, shape (N,).
+    """
+    X = weight[:, None] * _passed(m, _RIPPLES) * np.exp(1j * np.outer(m.q, _RIPPLES))
+    power = np.sum(np.abs(X) ** 2, axis=0)
+    explained = np.abs(r @ X) ** 2 / np.where(power > 0, power, np.inf)
+    counts = _RIPPLES[np.sort(np.argsort(-explained)[:_PEAKS])]
+    return tuple(
+        Candidate(
+            f"ripple {count}", "position_periodic", partial(_ripple, count=count),
+            f"a torque that repeats {count} times a turn (teeth of a gear, poles of a motor, "
+            "a harmonic drive)",
+            turns=True,
+            terms=(Harmonic(order=float(count)), Harmonic(order=float(count), is_sine=True)),
+            tried=len(_RIPPLES),
+        )
+        for count in counts.tolist()
+    )  # fmt: skip
+
+
+def _windup(m: JointMotion) -> Array:
+    way = m.travelled[:, None] / (np.array(_WINDUP) * _usual(m, attrgetter("travelled")))
+    taken_up = m.direction[:, None] * np.exp(-way)
+    return np.column_stack([taken_up, np.tanh(m.load / (_TURNED * _usual(m, attrgetter("load"))))])
+
+
+def _drift(m: JointMotion) -> Array:
+    drifting: Array = m.time[:, None] * np.column_stack([m.direction, m.v, np.ones_like(m.v)])
+    return drifting
+
+
+def _coupled(m: JointMotion, other: str, ratio: float) -> Array:
+    """Return what a drive that turns with both joints, w = v + ratio v', adds to the first."""
+
+    def turned(motion: JointMotion) -> Array:
+        return motion.v + ratio * motion.others[other].v
+
+    if other not in m.others:  # it is at rest
+        none = np.zeros_like(m.v)
+        return np.column_stack([none, none, np.tanh(m.v / (_STRIBECK[0] * _usual(m, turned)))])
+    beside, w = m.others[other], turned(m)
+    return np.column_stack([beside.a, beside.v, np.tanh(w / (_STRIBECK[0] * _usual(m, turned)))])
+
+
+_FRICTION = "friction that is not viscous and Coulomb"
+#: The candidates of each joint, those of couplings aside.
+CANDIDATES = (
+    Candidate(
+        "coulomb", "friction_shape", lambda m: m.direction[:, None], "Coulomb friction",
+        "Set friction = 'viscous+coulomb' in [model]",
+    ),
+    Candidate(
+        "stribeck", "friction_shape", _stribeck,
+        f"{_FRICTION} but rises towards standstill (Stribeck)",
+        "Raise min_velocity to leave the slow rows out",
+        families=("stribeck",),
+    ),
+    Candidate(
+        "presliding", "friction_shape", _presliding,
+        f"{_FRICTION} but sets in with speed, or a drive that sticks",
+        "Set friction_band, or raise min_velocity to leave the slow rows out",
+        is_imitated=True,
+        families=("tanh",),
+    ),
+    Candidate(
+        "power", "friction_shape", lambda m: (m.direction * np.cbrt(np.abs(m.v)))[:, None],
+        f"{_FRICTION} but bends with speed, as |v|^(1/3) does",
+        families=("power",),
+    ),
+    Candidate(
+        "cubic", "friction_shape", lambda m: m.v[:, None] ** 3,
+        f"{_FRICTION} but bends with speed, as v^3 does",
+        families=("cubic",),
+    ),
+    Candidate(
+        "asymmetric", "friction_shape", lambda m: np.abs(m.v)[:, None],
+        "viscous friction that differs by direction",
+        units=("N m s/rad", "N s/m"),
+        families=("asymmetric",),
+    ),
+    Candidate(
+        "load", "load_friction", lambda m: (m.direction * np.abs(m.load))[:, None],
+        "friction that grows with the load",
+        units=("N m per N m of load", "N per N of load"),
+        families=("load",),
+    ),
+    Candidate(
+        "periodic", "position_periodic", _periodic,
+        "a torque that repeats with the joint's position (cogging, an eccentric gear)",
+        turns=True,
+        families=("harmonics4",),
+    ),
+    Candidate(
+        "linear spring", "spring", lambda m: m.q[:, None], "a spring on the joint",
+        units=("N m/rad", "N/m"),
+        families=("spring",),
+    ),
+    Candidate(
+        "counterbalance", "spring", lambda m: _periodic(m, 2),
+        "a spring or counterbalance that follows the joint's position", turns=True,
+        families=("harmonics2", COUNTERBALANCE, "spring"),
+    ),
+    Candidate(
+        "windup", "backlash", _windup,
+        "a torque that changes after each reversal, or with the side of the gear that is loaded "
+        "(backlash, windup)",
+        "Raise min_velocity to leave the reversals out",
+    ),
+    Candidate(
+        "drift", "drift", _drift,
+        "friction or an offset that drifts with time (a drive that warms up)",
+        "Warm the robot up before recording, or cut the log with start",
+    ),
+)  # fmt: skip
+
+
+def couplings(motion: JointMotion) -> tuple[Candidate, ...]:
+    """Return candidates of a drive that turns with a joint and with the one before or after it.
+
+    Args:
+        motion: The joint's motion.
+    """
+    return tuple(
+        Candidate(
+            f"coupling {ratio:+g} {name}", "coupling",
+            partial(_coupled, other=name, ratio=ratio),
+            f"a drive that turns with {name}, too",
+            coupled=name,
+            ratio=ratio,
+        )
+        for name in motion.others
+        for ratio in (1.0, -1.0)
+    )  # fmt: skip

@@ -1,0 +1,367 @@
+"""What recordings or URDF have otherwise than stated: zeros, scales, the clock, where joints lie.
+
+A robot of other masses could imitate none of these for long: each changes the torque tau(q, v, a)
+that the estimate gives in its own way. To first order, in all joints together,
+
+    tau_measured - tau = W delta + Z x + e,    Z = d tau / d x,
+
+where W delta is what other base parameters may do, and x is refitted without one stretch of the
+recordings after the other (``misfit``). x is the size of what is otherwise, with its own error.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.diagnosis.misfit import Misfit, find_misfits
+from robotid.diagnosis.sample import Sample, along, chance, trials
+from robotid.findings import Finding, listed
+from robotid.fitting.result import Fit
+from robotid.logs.data import Trajectory
+from robotid.regressor.prediction import inverse_dynamics
+from robotid.robot.model import RobotModel
+
+__all__ = ["explain_residual"]
+
+_Applied = Callable[[Array], tuple[RobotModel, Sequence[Trajectory]]]
+
+_STEP = 1e-5  # of a derivative [-, rad or m]
+_STEPS = 5  # of sizes that are sought anew from where they were found
+_MOST = 3  # that are named of a result
+_CHANCE = 3e-4  # that one is named which is not there, each time that one is tried
+_LEAST = 0.1  # share of the squared residual from which one is named
+_ALIKE = 0.02  # of the squared residual, within which two explain alike: the simpler is named
+_CONFIRMED = 0.25  # of that share, that recordings kept apart must show of it
+# A smaller share is named, too, if recordings kept apart show no less of it, by chance hardly ever,
+# and its size is twice what changes a result: noise that hides it does not keep it out of masses
+_FAINT = 0.03
+_FAINT_CHANCE = 1e-5
+_FAINT_SIZE = 2.0
+_SURE = 5.0  # standard errors that its size is from nothing
+
+
+@dataclass(frozen=True, eq=False)
+class _Alteration:
+    """Something that may be otherwise than stated, with sizes x of which 0 is as stated.
+
+    Attributes:
+        code: Code of the finding.
+        where: Joint that it is about; empty for all of them.
+        Z: Torque that a size of 1 adds, shape (N, n, c).
+        least: Smallest size that changes a result.
+        words: Returns the finding's sentence of sizes (c,) and their standard errors (c,).
+        applied: Returns the robot and its motions with sizes (c,), where torques bend with these.
+    """
+
+    code: str
+    where: str
+    Z: Array
+    least: float
+    words: Callable[[Array, Array], str]
+    applied: _Applied | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """An alteration that was found: its finding, and the rows as it leaves them."""
+
+    alteration: _Alteration
+    finding: Finding
+    there: Sample
+
+
+def explain_residual(
+    fit: Fit, sample: Sample | None
+) -> tuple[tuple[Misfit, ...], tuple[Finding, ...]]:
+    """Return what the drives lack, and what recordings or URDF have otherwise than stated.
+
+    A spring imitates a zero that is off, and a zero a spring: what explains more of the residual of
+    all joints together is taken first, and what is found of the others alone is sought beside it.
+
+    Args:
+        fit: What was found.
+        sample: Rows of its recordings; None if they are too few to judge by.
+
+    Returns:
+        Terms that the drives lack, the largest first, and warnings "position_offset",
+        "lost_motion", "angle_scale", "torque_scale", "time_scale", "gravity" and "joint_origin",
+        what explains most of the residual first.
+    """
+    if sample is None:
+        return (), ()
+    misfits = find_misfits(sample)
+    own = list(_alterations(fit.model, fit.standard, sample))
+    found = list(_found(fit, sample, own))
+    if misfits and found:
+        altered = np.concatenate([one.alteration.Z for one in found], axis=2)
+        lacking = _columns(misfits, sample)
+        if _left(sample, altered) < _left(sample, lacking):
+            alone = {(misfit.joint, misfit.term.code) for misfit in misfits}
+            beside = find_misfits(found[0].there.beside(altered))
+            misfits = tuple(m for m in beside if (m.joint, m.term.code) in alone)
+        else:
+            among = {one.alteration for one in found}
+            beside_them = _found(fit, sample.beside(lacking), own)
+            found = [one for one in beside_them if one.alteration in among]
+    return misfits, tuple(one.finding for one in found)
+
+
+def _columns(misfits: Sequence[Misfit], sample: Sample) -> Array:
+    """Return the torque of the parameters of terms that drives lack, shape (N, n, c)."""
+    columns = []
+    for misfit in misfits:
+        j = sample.joints.index(misfit.joint)
+        of_joint = misfit.term.columns(sample.motions[j])  # (N, k)
+        only = np.eye(len(sample.joints))[j]
+        columns.append(only[None, :, None] * of_joint[:, None, :])
+    return np.concatenate(columns, axis=2)
+
+
+def _left(sample: Sample, Z: Array) -> float:
+    """Return the squared residual that columns leave of stretches they were not fitted to."""
+    apart, _ = trials(sample, slice(None), Z)
+    return float(apart.left(list(range(Z.shape[2])))[: sample.fitted].sum())
+
+
+def _refined(applied: _Applied, x: Array, pi: Array, sample: Sample) -> tuple[Array, Array, Sample]:
+    """Return the sizes of an alteration, their standard errors, and the rows as it leaves them.
+
+    Torques are no straight line over a tenth of a radian: sizes are sought anew from where they
+    were found, until they stay.
+
+    Args:
+        applied: Returns the robot and its motions with sizes (c,).
+        x: The sizes to first order, shape (c,).
+        pi: Standard parameters of the estimate, shape (p,).
+        sample: Rows of the recordings.
+    """
+    every, error = list(range(len(x))), np.full(len(x), np.inf)
+    for _ in range(_STEPS):
+        model, at = applied(x)
+        tau = _torques(model, pi, at)
+        sample = along(sample, model, at, tau)
+        beyond = [applied(x + _STEP * axis) for axis in np.eye(len(x))]
+        moved = [_torques(model, pi, at) for model, at in beyond]
+        Z = (np.stack(moved, axis=-1) - tau[..., None]) / _STEP
+        step, covariance = trials(sample, slice(None), Z)[1].estimate(every, sample.fitted)
+        x, error = x + step, np.sqrt(np.diag(covariance))
+        if np.linalg.norm(step) < 0.1 * np.linalg.norm(error):
+            break
+    return x, error, sample
+
+
+def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alteration]:
+    """Yield what may be otherwise, with what it would do to the torques of the sample."""
+    n, size = len(model.joints), model.layout.n_inertial
+    bodies = np.where(np.arange(len(pi)) < size, pi, 0.0)
+    tau = _torques(model, pi, sample.at)
+
+    def moved(scale: Array, shift: Array) -> Array:
+        """Return what positions (1 + e scale) q + e shift would change, over e."""
+        factor = 1.0 + _STEP * scale
+        change = [
+            replace(m, q=factor * m.q + _STEP * shift, v=factor * m.v, a=factor * m.a)
+            for m in sample.at
+        ]
+        return (_torques(model, pi, change) - tau)[..., None] / _STEP
+
+    def offset(joint: int, x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
+        """Return the motions with the position of a joint that was x farther."""
+        return model, [replace(m, q=m.q + x * np.eye(n)[joint]) for m in sample.at]
+
+    for j, joint in enumerate(model.joints):
+        only, none = np.eye(n)[j], np.zeros(n)
+        unit = "m" if joint in model.layout.prismatic else "rad"
+        applied = partial(offset, j)
+        Z = moved(none, only)
+        yield _Alteration("position_offset", joint, Z, 0.01, _zero(joint, unit), applied)
+        lost = 0.5 * Z * sample.motions[j].direction[:, None, None]
+        yield _Alteration("lost_motion", joint, lost, 0.005, _lost_motion(joint, unit))
+        yield _Alteration("angle_scale", joint, moved(only, none), 0.02, _scale(f"q_{joint}"))
+        yield _Alteration("torque_scale", joint, (tau * only)[..., None], 0.05, _gain(joint))
+    for first in range(1, n - 1):  # the drives of a wrist are of one kind
+        names = listed(model.joints[first:])
+        Z = (tau * (np.arange(n) >= first))[..., None]
+        yield _Alteration("torque_scale", ", ".join(model.joints[first:]), Z, 0.05, _gains(names))
+    every = moved(np.ones(n), np.zeros(n))
+    yield _Alteration("angle_scale", "", every, 0.02, _scale("every position"))
+    still = [replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in sample.at]
+    inertial = _torques(model, bodies, sample.at) - _torques(model, bodies, still)
+    yield _Alteration("time_scale", "", inertial[..., None], 0.04, _clock)
+    down = np.array(model.pin_model.gravity.linear)
+    if down.any():
+        across = np.linalg.svd(down[None])[2][1:]  # two directions at right angles to gravity
+
+        def tilted(x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
+            return _pulled(model, _turned(x, across, down)), sample.at
+
+        pulls = [_torques(tilted(_STEP * axis)[0], pi, sample.at) - tau for axis in np.eye(2)]
+        Z = np.stack(pulls, axis=-1) / _STEP
+        yield _Alteration("gravity", "", Z, 0.05, _tilt(across, down), tilted)
+    origins = [_origins(model, pi, sample, joint, tau) for joint in model.joints]
+    for joint, Z in zip(model.joints, origins, strict=True):
+        yield _Alteration("joint_origin", joint, Z, 0.01, _origin(joint))
+    yield _Alteration("joint_origin", "", np.concatenate(origins, axis=2), 0.01, _origin("a joint"))
+
+
+def _origins(model: RobotModel, pi: Array, sample: Sample, joint: str, tau: Array) -> Array:
+    """Return what moving a joint in the frame of the one before would change, shape (N, n, 3)."""
+    moved = [_torques(_displaced(model, joint, axis), pi, sample.at) for axis in np.eye(3)]
+    return (np.stack(moved, axis=-1) - tau[..., None]) / _STEP
+
+
+def _torques(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
+    """Return the torques of motions by standard parameters, shape (N, n)."""
+    return np.concatenate([inverse_dynamics(model, pi, motion) for motion in at])
+
+
+def _displaced(model: RobotModel, joint: str, axis: Array) -> RobotModel:
+    """Return the robot with the origin of a joint moved a little along an axis of its parent."""
+    pin_model = model.pin_model.copy()
+    placement = pin_model.jointPlacements[pin_model.getJointId(joint)]
+    placement.translation = placement.translation + _STEP * axis
+    return replace(model, pin_model=pin_model)
+
+
+def _pulled(model: RobotModel, gravity: Array) -> RobotModel:
+    """Return the robot under another gravity (3,) [m/s^2]."""
+    pin_model = model.pin_model.copy()
+    pin_model.gravity.linear = gravity
+    return replace(model, pin_model=pin_model)
+
+
+def _turned(x: Array, across: Array, down: Array) -> Array:
+    """Return gravity turned towards the two axes across it, by tangents x of angles (2,)."""
+    size = np.linalg.norm(down)
+    turned = down + size * x @ across
+    return np.asarray(turned * size / np.linalg.norm(turned))
+
+
+def _found(fit: Fit, sample: Sample, own: Sequence[_Alteration]) -> Iterator[_Found]:
+    """Yield what explains the residual, one after the other, beside what was found before."""
+    Z = np.concatenate([alteration.Z for alteration in own], axis=2)
+    ends = np.cumsum([alteration.Z.shape[2] for alteration in own]).tolist()
+    place = [list(range(end - a.Z.shape[2], end)) for a, end in zip(own, ends, strict=True)]
+    apart, whole = trials(sample, slice(None), Z)
+    chosen: list[int] = []
+    total = before = apart.left([])
+    untried = dict(zip(own, place, strict=True))
+    for _ in range(_MOST):
+        left = {one: apart.left([*chosen, *which]) for one, which in untried.items()}
+        least = min(float(x[: sample.fitted].sum()) for x in left.values())
+        bound = least + _ALIKE * total[: sample.fitted].sum()
+        alike = [one for one, x in left.items() if x[: sample.fitted].sum() <= bound]
+        best = min(alike, key=lambda one: (*_complexity(one), left[one][: sample.fitted].sum()))
+        gain, after = before - left[best], left[best]
+        share = float(gain[: sample.fitted].sum() / total[: sample.fitted].sum())
+        kept = gain[sample.fitted :].sum() / max(total[sample.fitted :].sum(), 1e-300)
+        is_confirmed = len(gain) == sample.fitted or kept > _CONFIRMED * share
+        by_chance = chance(before, after, sample.fitted)
+        is_faint = share < _LEAST
+        if is_faint:
+            is_shown = len(gain) > sample.fitted and kept > share > _FAINT
+            is_confirmed = is_shown and by_chance < _FAINT_CHANCE
+        if by_chance > _CHANCE or not is_confirmed:
+            return
+        which = untried.pop(best)
+        chosen, before = [*chosen, *which], after
+        sizes, covariance = whole.estimate(chosen, sample.fitted)
+        size, error = (x[-len(which) :] for x in (sizes, np.sqrt(np.diag(covariance))))
+        least = best.least * (_FAINT_SIZE if is_faint else 1.0)
+        if np.linalg.norm(size) < max(least, _SURE * float(np.linalg.norm(error))):
+            return
+        there = sample
+        if best.applied is not None and len(chosen) == len(which):
+            size, error, there = _refined(best.applied, size, fit.standard, sample)
+        others = [one for one in alike if one is not best]
+        yield _Found(best, _finding(best, size, error, share, others), there)
+
+
+def _complexity(one: _Alteration) -> tuple[int, int]:
+    """Return how many sizes an alteration has, and how many joints it names."""
+    return one.Z.shape[2], one.where.count(",")
+
+
+def _finding(
+    found: _Alteration, size: Array, error: Array, share: float, alike: Sequence[_Alteration]
+) -> Finding:
+    others = [f"{one.code} of {one.where}" for one in alike if one.where]
+    also = f"; {listed(others)} would explain as much" if others else ""
+    message = (
+        f"{found.words(size, error)}. This explains {100 * share:.0f} % of the squared residual, "
+        f"which other masses and friction do not{also}"
+    )
+    evidence = {
+        "size": float(size[0] if len(size) == 1 else np.linalg.norm(size)),
+        "std_error": float(np.linalg.norm(error)),
+        "share_pct": 100 * share,
+    }
+    return Finding(found.code, "warning", found.where or "all joints", message, evidence)
+
+
+def _zero(joint: str, unit: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joint}: the zero of its position is off by {-x[0]:.3g} +- {error[0]:.2g} {unit}: "
+        f"correct q_{joint}, or the joint's origin in the URDF"
+    )
+
+
+def _lost_motion(joint: str, unit: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joint}: its position is {abs(x[0]):.2g} +- {error[0]:.1g} {unit} farther in one "
+        "direction of motion than in the other: backlash between the joint and its encoder; remove "
+        "it, or log the position of an encoder on the joint"
+    )
+
+
+def _scale(what: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{what} fits best times {1 + x[0]:.3f} +- {error[0]:.2g}: check the unit, the gear ratio "
+        "and the counts per turn"
+    )
+
+
+def _gain(joint: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joint}: its torque is about {1 + x[0]:.2f} (+- {error[0]:.1g}) times what those of the "
+        f"other joints imply: check its gain and gear ratio (--gain {joint}=...)"
+    )
+
+
+def _gains(joints: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joints}: their torques are {'at least' if x[0] > 0 else 'at most'} {1 + x[0]:.2f} (+- "
+        f"{error[0]:.1g}) times what those of the joints before them imply: check their gains "
+        "and gear ratios (--gain JOINT=...)"
+    )
+
+
+def _clock(x: Array, error: Array) -> str:
+    return (
+        f"inertial torques are {1 + x[0]:.3f} +- {error[0]:.2g} times what gravity implies: the "
+        f"time stamps run {np.sqrt(max(1 + x[0], 0.0)):.3f} times as fast as the clock, or gravity "
+        "is stated wrongly"
+    )
+
+
+def _tilt(across: Array, down: Array) -> Callable[[Array, Array], str]:
+    def words(x: Array, error: Array) -> str:
+        turned = _turned(x, across, down)
+        angle, sure = (np.degrees(np.arctan(np.linalg.norm(size))) for size in (x, error))
+        shown = ", ".join(f"{value:.2f}" for value in turned)
+        return (
+            f"gravity is tilted by about {angle:.2g} +- {sure:.1g} degrees from what is stated: if "
+            f"the base is not level, state gravity = [{shown}] in the job file"
+        )
+
+    return words
+
+
+def _origin(joint: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joint} seems to lie {np.linalg.norm(x):.2g} +- {np.linalg.norm(error):.1g} m from where "
+        "the URDF has it: check that the URDF is of this robot"
+    )

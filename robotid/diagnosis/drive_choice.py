@@ -1,0 +1,601 @@
+"""Which terms the drive of each joint has: the fewest that explain what was held out.
+
+Terms are tried beside viscous and Coulomb friction, joint by joint, on rows spread over the fitted
+logs. The family that explains most of the stretches left out is taken if it does so beyond chance,
+then the next one beside it, until nothing is left to gain. Recordings kept apart have no say in it.
+
+What a family is not linear in, its shape, is sought on a grid; then all shapes of a joint together,
+with the linear parameters refitted each time (Golub, Pereyra 2003, variable projection).
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from scipy.special import stdtr
+
+from robotid._settings import require_kind
+from robotid._typing import Array
+from robotid.diagnosis.sample import Sample, Trial, take_sample, trials
+from robotid.exceptions import SettingsError
+from robotid.findings import listed
+from robotid.fitting.drives import DriveChoice, FoundShape, Tried, with_shapes
+from robotid.fitting.result import Fit
+from robotid.regressor.memory import drive_motion_along
+from robotid.robot.drives import AUTO, FAMILIES, DriveMotion, DriveTerm, Family, Seen
+
+__all__ = ["TENFOLD", "choose_drives", "wanted_families"]
+
+#: Times that terms may make the standard error of another parameter grow, unreported.
+TENFOLD = 10.0
+_OF_MODEL = ("none", "viscous", "coulomb")  # named in ``friction``, and terms of the model
+_GRID = 6  # sizes of a shape that are tried, over its bounds
+_SPAN = 100.0  # from the smallest of them to the largest; a bound beyond is tried, too
+_FAMILIES = 4  # chosen for a joint, at most
+_CHANCE = 0.01  # that a family is chosen that is not there, each time that one is tried
+_DOUBTED = 0.25  # that a family is counted as open, which is likelier by chance than one taken
+_LEAST = 0.05  # of the squared residual that is left, from which a family is worth its parameters
+_SEEN = 0.006  # of the torque: a gain that is smaller may be of how signs pass the filter
+_ALIKE = 0.02  # of the squared residual, within which two families explain alike
+_EDGE = 0.02  # of the logarithm of its range, within which a shape is at its bound
+_SLOWEST = 0.0  # share of the rows that are slower than what counts as seen
+_TURN = 2 * np.pi  # [rad]
+_ROUNDING = 1e-10  # share of a column that is rounding: shapes and their errors know no other
+_STEP = 1e-3  # relative, of a derivative
+_STEPS = 40  # of the search for all shapes of a joint together
+_STILL = 1e-9  # of the squared residual of another stretch: the joint stands still in it
+_FEWEST = 3  # stretches that show chance
+_SHARPEST = 1e-6  # of the squared residual: exact data leave nothing to weigh by
+_NOTHING = 1e-300
+
+
+@dataclass(frozen=True, eq=False)
+class _Drive:
+    """A joint's drive along the sampled rows."""
+
+    j: int
+    slides: bool
+    motions: tuple[DriveMotion, ...]  # of each recording, all its rows
+    taken: tuple[Array, ...]  # rows of each recording in the sample
+    seen: Seen
+    plain: Mapping[str, Array]  # what of x is each of its plain parameters, U^T x, by name
+
+    def columns(self, terms: Sequence[DriveTerm]) -> Array:
+        """Return what terms multiply in the sampled rows, shape (N, c)."""
+        parts = [
+            np.column_stack([term.column(motion)[rows] for term in terms])
+            for motion, rows in zip(self.motions, self.taken, strict=True)
+        ]
+        return np.concatenate(parts)
+
+
+def wanted_families(
+    friction: str | Mapping[str, str], joints: Sequence[str]
+) -> dict[str, tuple[str, ...] | None]:
+    """Return the names of the families each joint is to have; None where they are to be chosen.
+
+    Args:
+        friction: "auto", or names of friction with + between them; or that by joint, "*" for all
+            joints that are not named ("auto" if it is left out). Viscous and Coulomb friction are
+            the model's terms.
+        joints: Names of the joints.
+
+    Raises:
+        SettingsError: If a name or a joint is unknown.
+    """
+    wanted_kind = "auto, names of families joined by +, or a table of these by joint"
+    require_kind(friction, (str, Mapping), "friction", wanted_kind)
+    for joint, names in friction.items() if isinstance(friction, Mapping) else ():
+        require_kind(names, str, f"friction of {joint}", wanted_kind)
+    stated = {"*": friction} if isinstance(friction, str) else {"*": AUTO, **friction}
+    strangers = [joint for joint in stated if joint not in (*joints, "*")]
+    if strangers:
+        raise SettingsError(
+            f"friction is stated for {listed(strangers)}, not among the joints to identify: "
+            f"{listed(joints)}"
+        )
+    wanted: dict[str, tuple[str, ...] | None] = {}
+    for joint in joints:
+        names = stated.get(joint, stated["*"])
+        own = [name for name in names.split("+") if name and name not in _OF_MODEL]
+        unknown = [name for name in own if name not in FAMILIES]
+        if names != AUTO and unknown:
+            raise SettingsError(
+                f"friction of {joint} has {listed(unknown)}, wanted auto, or some of "
+                f"{listed(FAMILIES)}"
+            )
+        wanted[joint] = None if names == AUTO else tuple(own)
+    return wanted
+
+
+def choose_drives(
+    fit: Fit,
+    wanted: Mapping[str, Sequence[str] | None],
+    balanced: Mapping[str, str] | None = None,
+) -> tuple[DriveChoice, ...]:
+    """Return the terms of each joint's drive.
+
+    Args:
+        fit: What was found with viscous and Coulomb friction alone.
+        wanted: Families that joints are to have, by name; None: those that held-out stretches of
+            the fitted logs ask for; see ``wanted_families``.
+        balanced: Family of the counterbalance of joints whose families are to be chosen.
+
+    Returns:
+        A choice per joint; none where a joint hardly moved, or the logs are too short to judge.
+    """
+    sample = take_sample(fit, is_steady=False)
+    if sample is None or fit.model.free_flyer:
+        return ()
+    model = fit.model.with_reference(fit.standard)
+    kept = [e for e in fit.validation if not e.is_refitted]
+    recordings = [e.recording for e in (*fit.fitted, *kept)]
+    motions = [drive_motion_along(model, recording.trajectory) for recording in recordings]
+    used = sample.weight[: sample.rows] > 0
+    choices = []
+    for j, joint in enumerate(sample.joints):
+        names = wanted[joint]
+        if not used[:, j].any() or (names is not None and not names):
+            continue
+        own = tuple(motion.of(j) for motion in motions)
+        seen = _seen(own, sample.taken, used[:, j])
+        plain = {
+            name: sample.U[:, k]
+            for k, name in enumerate(fit.mapping.base_names)
+            if name.startswith(f"{joint}.")
+        }
+        drive = _Drive(j, bool(sample.slides[j]), own, sample.taken, seen, plain)
+        first = [own for own in [(balanced or {}).get(joint)] if own is not None]
+        chosen = _auto(sample, drive, first) if names is None else _fixed(sample, drive, names)
+        choices.append(chosen)
+    return tuple(choices)
+
+
+def _seen(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Array) -> Seen:
+    """Return the ranges of position and of the size of speed in the fitted rows that count."""
+    fitted = [(m.q[rows], m.v[rows]) for m, rows in zip(motions, taken, strict=True)]
+    q, v = (np.concatenate(x)[: len(used)][used] for x in zip(*fitted, strict=True))
+    speed = np.abs(v)
+    return {
+        "q": (float(q.min()), float(q.max())),
+        "v": (float(np.quantile(speed, _SLOWEST)), float(speed.max())),
+    }
+
+
+def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[tuple[Family, list[float]]]:
+    """Yield families with every shape on their grid."""
+    for family in families:
+        turns = (drive.seen["q"][1] - drive.seen["q"][0]) / _TURN
+        bounds = [shape.within(drive.seen) for shape in family.shapes]
+        if family.needs and (drive.slides or turns < family.needs):
+            continue
+        if not all(0.0 < low < high for low, high in bounds):  # it hardly moved
+            continue
+        grids = [_sizes(*pair) for pair in bounds]
+        yield from ((family, [float(x) for x in sizes]) for sizes in product(*grids))
+
+
+def _sizes(low: float, high: float) -> Array:
+    """Return the sizes of a shape that are tried."""
+    own = np.geomspace(low, min(high, _SPAN * low), _GRID)
+    return own if own[-1] >= high else np.append(own, high)
+
+
+@dataclass(frozen=True, eq=False)
+class _Trials:
+    """Candidates of a joint, and what they leave."""
+
+    own: list[tuple[Family, list[float]]]
+    place: list[list[int]]  # columns of each
+    is_positive: Array  # which columns multiply what cannot be negative, bool
+    highest: Array  # what their parameters are at most
+    apart: Trial
+    whole: Trial
+    fitted: int
+
+    @classmethod
+    def of(cls, sample: Sample, drive: _Drive, own: list[tuple[Family, list[float]]]) -> "_Trials":
+        terms = [family.make(drive.seen, *sizes) for family, sizes in own]
+        columns = [drive.columns(those) for those in terms]
+        ends = np.cumsum([x.shape[1] for x in columns]).tolist()
+        place = [list(range(e - x.shape[1], e)) for x, e in zip(columns, ends, strict=True)]
+        Z = np.hstack(columns) if columns else np.empty((len(sample.r), 0))
+        flat = [term for those in terms for term in those]
+        positive = np.array([term.is_nonnegative for term in flat], dtype=bool)
+        largest = max(float(np.abs(motion.tau[:, drive.j]).max()) for motion in sample.at)
+        highest = np.array([min(term.highest, largest / _reach(drive, term)) for term in flat])
+        apart, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
+        return cls(own, place, positive, highest, apart, whole, sample.fitted)
+
+    def left(self, chosen: Sequence[int]) -> Array:
+        """Return the squared residual of each fitted stretch with some candidates."""
+        return self.apart.left(self._columns(chosen))[: self.fitted]
+
+    def is_possible(self, chosen: Sequence[int]) -> bool:
+        """Return whether no parameter of some candidates has a size that physics forbids.
+
+        Friction is of one sign, and below the largest torque of the joint.
+        """
+        columns = self._columns(chosen)
+        theta = self.whole.parameters(columns)
+        is_signed = (theta[self.is_positive[columns]] >= 0).all()
+        return bool(is_signed and (np.abs(theta) <= self.highest[columns]).all())
+
+    def _columns(self, chosen: Sequence[int]) -> list[int]:
+        return [k for i in chosen for k in self.place[i]]
+
+
+def _reach(drive: _Drive, term: DriveTerm) -> float:
+    """Return how large the column of a curve of speed may be; next to 0 of another term.
+
+    Behind a filter directions are small where a drive is slow, and hide how large a curve is there.
+    """
+    if term.guards != "v":
+        return _NOTHING
+    v = np.linspace(*drive.seen["v"], 50)
+    one, none = np.ones_like(v), np.zeros_like(v)
+    return float(np.abs(term.column(DriveMotion(none, v, none, one, none, none))).max()) + _NOTHING
+
+
+def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoice:
+    """Return the fewest families that held-out segments require beside the first ones."""
+    grid = list(_candidates(drive, [f for f in FAMILIES.values() if f.is_automatic]))
+    known = list(_candidates(drive, [FAMILIES[name] for name in first]))
+    start = _weighed_anew(sample, drive, known)
+    every = _Trials.of(start, drive, [*known, *grid])
+    torque = float(start.torque[drive.j])
+    chosen = list(range(len(known)))
+    doubted: list[tuple[Family, list[float]]] = []
+    before = every.left(chosen)
+    names = tuple(family.name for family, _ in known)
+    tried = [Tried(names, _percent(before, torque), 1.0, True)]
+    for _ in range(_FAMILIES):
+        beside = _beside(every, chosen, len(known))
+        left = {
+            i: every.left([*others, i])
+            for i, others in beside.items()
+            if every.is_possible([*others, i])
+        }
+        best = _best(every, left, before, torque)
+        found = None
+        if best is not None:
+            found = _conditioned(sample, drive, every, left, beside, before, best)
+            best = found.number
+        tried += list(_told(every, left, before, torque, beside, best))
+        if found is None or best is None:
+            nearest = min(left, key=lambda i: float(left[i].sum()), default=None)
+            if nearest is not None and _chance(before, left[nearest]) < _DOUBTED:
+                doubted = [every.own[nearest]]
+            break
+        own = found.own
+        known = known if set(chosen) <= set(beside[best]) else []
+        anew = _weighed_anew(sample, drive, own)
+        every, torque = _Trials.of(anew, drive, [*own, *grid]), float(anew.torque[drive.j])
+        chosen = list(range(len(own)))
+        before = every.left(chosen)
+    choice = _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
+    return replace(choice, doubted=_terms(drive, doubted))
+
+
+def _beside(every: _Trials, chosen: Sequence[int], known: int) -> dict[int, list[int]]:
+    """Return what stays of the chosen candidates beside each other one that may join them.
+
+    A joint has one family of each kind; only those it was given before the choice are replaced.
+    """
+    groups = [_group(every.own[k][0]) for k in chosen]
+    return {
+        i: [k for k, group in zip(chosen, groups, strict=True) if group != _group(family)]
+        for i, (family, _) in enumerate(every.own)
+        if i not in chosen and _group(family) not in groups[known:]
+    }
+
+
+def _group(family: Family) -> str:
+    """Return what families of one kind have in common, of which a joint has one."""
+    return family.name.rstrip("0123456789")
+
+
+def _best(every: _Trials, left: Mapping[int, Array], before: Array, torque: float) -> int | None:
+    """Return the simplest of the candidates that explain as much as the best; None without one."""
+    whole = float(before.sum())
+    gains = {i: float((before - after).sum()) for i, after in left.items()}
+    sure = {
+        i: gain
+        for i, gain in gains.items()
+        if gain > _LEAST * whole and gain > _SEEN**2 * torque and _chance(before, left[i]) < _CHANCE
+    }
+    alike = [i for i, gain in sure.items() if gain >= max(sure.values()) - _ALIKE * whole]
+    return min(alike, key=lambda i: (*_simplicity(every, i), -sure[i]), default=None)
+
+
+def _simplicity(every: _Trials, i: int) -> tuple[int, int]:
+    """Return how many columns a candidate has, and where its family is in the order of them."""
+    return len(every.place[i]), list(FAMILIES).index(every.own[i][0].name)
+
+
+@dataclass(frozen=True)
+class _Refined:
+    """A candidate beside those chosen, with shapes between the sizes of the grid."""
+
+    number: int
+    own: list[tuple[Family, list[float]]]  # of those chosen and of itself
+    faults: tuple[bool, bool]  # a shape is at its bound, a standard error grows tenfold
+
+
+def _conditioned(
+    sample: Sample,
+    drive: _Drive,
+    every: _Trials,
+    left: Mapping[int, Array],
+    beside: Mapping[int, Sequence[int]],
+    before: Array,
+    best: int,
+) -> _Refined:
+    """Return the best candidate, or one of another family that is as good and better conditioned.
+
+    As good: it leaves no more of held-out segments than the best, within the standard error of the
+    difference. Better conditioned: no shape is at its bound, or no term makes the standard error of
+    another parameter of the drive grow tenfold, where the best has that.
+    """
+
+    def refined(i: int) -> _Refined:
+        own = _refined(sample, drive, [every.own[k] for k in (*beside[i], i)])
+        grown = _grown(_weighed_anew(sample, drive, own), drive, own)
+        is_grown = max(grown.values(), default=1.0) > TENFOLD
+        return _Refined(i, own, (bool(_at_bound(drive, own).any()), is_grown))
+
+    def left_of(other: _Refined) -> Array:
+        return _Trials.of(sample, drive, other.own).left(range(len(other.own)))
+
+    first = refined(best)
+    if not any(first.faults):
+        return first
+    by_family: dict[str, int] = {}
+    for i in sorted(left, key=lambda i: float(left[i].sum())):
+        by_family.setdefault(every.own[i][0].name, i)
+    by_family.pop(every.own[best][0].name)
+    others = [refined(i) for i in by_family.values() if left[i].sum() < before.sum()]
+    better = [other for other in others if other.faults < first.faults]
+    least, slack = left_of(first), _ALIKE * float(before.sum())
+    alike = [other for other in better if _is_alike(least, left_of(other), slack)]
+    return min((first, *alike), key=lambda x: (x.faults, *_simplicity(every, x.number)))
+
+
+def _is_alike(best: Array, other: Array, slack: float) -> bool:
+    """Return whether segments are left as small, within a slack or the difference's scatter."""
+    more = other - best
+    scatter = np.sqrt(len(more)) * float(np.std(more, ddof=1))
+    return bool(float(more.sum()) <= max(slack, scatter))
+
+
+def _chance(before: Array, after: Array) -> float:
+    """Return how likely stretches gain that much, in the mean of their shares, by chance [-].
+
+    Stretches in which the joint stands still have no say.
+    """
+    moves = before > _STILL * before.max()
+    if moves.sum() < _FEWEST:
+        return 1.0
+    before, after = before[moves], after[moves]
+    gain = (before - after) / np.maximum(np.maximum(before, after), _NOTHING)
+    spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), _NOTHING)
+    return float(stdtr(len(gain) - 1, -gain.mean() / spread))
+
+
+def _told(
+    every: _Trials,
+    left: Mapping[int, Array],
+    before: Array,
+    torque: float,
+    beside: Mapping[int, Sequence[int]],
+    best: int | None,
+) -> Iterator[Tried]:
+    """Yield what each family would leave, at its best shape."""
+    by_family: dict[str, int] = {}
+    for i, after in left.items():
+        name = every.own[i][0].name
+        if i == best or (
+            by_family.get(name, i) != best and after.sum() <= left[by_family.get(name, i)].sum()
+        ):
+            by_family[name] = i
+    for name, i in by_family.items():
+        chance = _chance(before, left[i])
+        names = [every.own[k][0].name for k in beside[i]]
+        yield Tried((*names, name), _percent(left[i], torque), chance, i == best)
+
+
+def _percent(left: Array, torque: float) -> float:
+    return 100.0 * float(np.sqrt(left.sum() / max(torque, _NOTHING)))
+
+
+def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
+    """Return the families asked for, with the shapes that fit best."""
+    families = [FAMILIES[name] for name in names]
+    every = _Trials.of(sample, drive, list(_candidates(drive, families)))
+    groups = [[i for i, (f, _) in enumerate(every.own) if f.name == name] for name in names]
+    missing = [name for name, group in zip(names, groups, strict=True) if not group]
+    if missing:
+        raise SettingsError(
+            f"friction of {sample.joints[drive.j]} has {listed(missing)}, but the joint slides, or "
+            "turned less than half a turn in the fitted logs; leave it out, or record more"
+        )
+    chosen = [group[len(group) // 2] for group in groups]
+    for _ in range(3 if len(names) > 1 else 1):  # one after the other, a few times over
+        for at, group in enumerate(groups):
+            rest = [*chosen[:at], *chosen[at + 1 :]]
+            chosen[at] = min(group, key=lambda i: float(every.left([*rest, i]).sum()))
+    torque = float(sample.torque[drive.j])
+    tried = (
+        Tried((), _percent(every.left([]), torque), 1.0, False),
+        Tried(tuple(names), _percent(every.left(chosen), torque), 1.0, True),
+    )
+    return _found(sample, drive, [every.own[i] for i in chosen], tried)
+
+
+def _found(
+    sample: Sample,
+    drive: _Drive,
+    chosen: Sequence[tuple[Family, list[float]]],
+    tried: tuple[Tried, ...],
+) -> DriveChoice:
+    """Return the choice with its shapes refined."""
+    refined = _refined(sample, drive, chosen)
+    families = [family for family, _ in refined]
+    flat = _flat(refined)
+    shapes = [(family, shape) for family in families for shape in family.shapes]
+    is_at_bound = _at_bound(drive, refined)
+    anew = _weighed_anew(sample, drive, refined)
+    covariance = _shape_covariance(anew, drive, families, flat)
+    return DriveChoice(
+        joint=sample.joints[drive.j],
+        families=tuple(family.name for family in families),
+        terms=_terms(drive, refined),
+        tried=tried,
+        shapes=tuple(
+            FoundShape(
+                name=f"{family.name}.{shape.name}",
+                value=float(value),
+                std_error=float(std_error),
+                unit=shape.units[int(drive.slides)],
+                is_at_bound=bool(is_edge),
+            )
+            for (family, shape), value, std_error, is_edge in zip(
+                shapes, flat, np.sqrt(np.diag(covariance)), is_at_bound, strict=True
+            )
+        ),
+        shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
+        sizes=tuple(tuple(own) for _, own in refined),
+        seen=drive.seen,
+        grown=_grown(anew, drive, refined),
+    )
+
+
+def _flat(chosen: Sequence[tuple[Family, Sequence[float]]]) -> Array:
+    """Return all shapes of families in a row, shape (k,)."""
+    return np.array([size for _, own in chosen for size in own])
+
+
+def _at_bound(drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]) -> Array:
+    """Return which shapes are at the end of the range in which they are sought, shape (k,)."""
+    bounds = _log_bounds(drive, [family for family, _ in chosen])
+    margin = _EDGE * np.ptp(bounds, axis=1)
+    is_near: Array = np.min(np.abs(np.log(_flat(chosen))[:, None] - bounds), axis=1) < margin
+    return is_near
+
+
+def _grown(
+    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> dict[str, float]:
+    """Return how many times larger terms make the standard error of each plain drive parameter.
+
+    With X the columns of terms and shapes, M = 1 - W (W^T W + 1)^-1 W^T and T = (W^T W + 1)^-1 W^T
+    X, the covariance (W^T W + 1)^-1 of the base parameters becomes that plus T (X^T M X)^-1 T^T.
+    """
+    families = [family for family, _ in chosen]
+    if not families:
+        return {}
+    _, trial = _with_slopes(sample, drive, families, _flat(chosen))
+    T, S = trial.T[:, :-1], trial.S[:-1, :-1]
+    _, before = sample.whole
+    grown = {}
+    for name, u in drive.plain.items():
+        more = u @ T @ np.linalg.solve(S, T.T @ u)
+        grown[name] = float(np.sqrt(1.0 + max(more, 0.0) / (u @ before @ u)))
+    return grown
+
+
+def _weighed_anew(
+    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> Sample:
+    """Return the rows with the joint's weighed by what its new terms leave of the residual.
+
+    By that of the fit without them the data of this joint would be far too weak: against those of
+    the others, and against what is known before the data.
+    """
+    if not chosen:
+        return sample
+    Z = drive.columns(_terms(drive, chosen))
+    _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
+    left = [
+        float(whole.left(which)[: sample.fitted].sum()) for which in ([], list(range(Z.shape[1])))
+    ]
+    factor = np.ones(len(sample.joints))
+    factor[drive.j] = np.sqrt(left[0] / max(left[1], _SHARPEST * left[0], _NOTHING))
+    W, r = sample.W * factor[:, None], sample.r * factor
+    by_stretch = [(W[k].reshape(-1, W.shape[2]), r[k].ravel()) for k in sample.stretches]
+    return replace(
+        sample,
+        weight=sample.weight * factor,
+        torque=sample.torque * factor**2,
+        W=W,
+        r=r,
+        A=np.array([W_k.T @ W_k for W_k, _ in by_stretch]),
+        B=np.array([W_k.T @ r_k for W_k, r_k in by_stretch]),
+    )
+
+
+def _terms(
+    drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> tuple[DriveTerm, ...]:
+    """Return the terms of families with their shapes."""
+    return tuple(term for family, own in chosen for term in family.make(drive.seen, *own))
+
+
+def _log_bounds(drive: _Drive, families: Sequence[Family]) -> Array:
+    """Return logarithms of where each shape is sought, shape (k, 2)."""
+    bounds = [shape.within(drive.seen) for family in families for shape in family.shapes]
+    logs: Array = np.log(np.reshape(bounds, (-1, 2)))
+    return logs
+
+
+def _refined(
+    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> list[tuple[Family, list[float]]]:
+    """Return families with the shapes that together leave least of the fitted rows, near theirs."""
+    from scipy.optimize import minimize
+
+    families = [family for family, _ in chosen]
+    start = np.log(_flat(chosen))
+
+    def left(log_sizes: Array) -> float:
+        Z = drive.columns(_terms(drive, with_shapes(families, np.exp(log_sizes))))
+        _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None], _ROUNDING)
+        return float(np.log(whole.left(list(range(Z.shape[1])))[: sample.fitted].sum() + _NOTHING))
+
+    best = start
+    if len(start):
+        sample = _weighed_anew(sample, drive, chosen)
+        bounds, options = _log_bounds(drive, families), {"eps": _STEP, "maxiter": _STEPS}
+        found = minimize(left, start, method="L-BFGS-B", bounds=bounds, options=options)
+        best = found.x if found.fun <= left(start) else start
+    return with_shapes(families, np.exp(best))
+
+
+def _shape_covariance(
+    sample: Sample, drive: _Drive, families: Sequence[Family], flat: Array
+) -> Array:
+    """Return the covariance of shapes: that of the columns d(torque)/d(shape) beside all."""
+    if not len(flat):
+        return np.empty((0, 0))
+    count, beside = _with_slopes(sample, drive, families, flat)
+    _, every = beside.estimate(list(range(count + len(flat))), sample.fitted)
+    covariance: Array = every[count:, count:]
+    return covariance
+
+
+def _with_slopes(
+    sample: Sample, drive: _Drive, families: Sequence[Family], flat: Array
+) -> tuple[int, Trial]:
+    """Return the number c of columns of terms, and a trial of them and of d(torque)/d(shape)."""
+    Z = drive.columns(_terms(drive, with_shapes(families, flat)))
+    _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None], _ROUNDING)
+    theta = whole.parameters(list(range(Z.shape[1])))
+    slopes = np.empty((len(Z), len(flat)))
+    for k, h in enumerate(_STEP * flat):
+        larger = flat + h * (np.arange(len(flat)) == k)
+        moved = drive.columns(_terms(drive, with_shapes(families, larger)))
+        slopes[:, k] = (moved - Z) @ theta / h
+    columns = np.hstack([Z, slopes])[:, None]
+    _, beside = trials(sample, slice(drive.j, drive.j + 1), columns, _ROUNDING)
+    return Z.shape[1], beside

@@ -1,0 +1,229 @@
+"""Standard errors that know what the drive model lacks, and what is open of its shapes.
+
+A term that the drives have and the model lacks moves the other parameters, by -T theta if theta is
+what it would be. That is no noise, and does not shrink with the length of the log: its square adds
+to their covariance; so does that of a term which was nearly chosen. A shape that was found beside
+them has an error of its own, and so do they:
+
+    C += sum_terms (T theta) (T theta)^T + sum_joints T C_s T^T,  T = (W^T W + C_0^-1)^-1 W^T z
+
+A prediction errs by what such a term moves and by its own torque at once, and the two cancel in
+part: W T theta - z theta. Hence each is kept as an ``OpenTerm``, beside what it adds to C.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.diagnosis.misfit import Misfit
+from robotid.diagnosis.sample import Sample, Trial, take_sample, trials
+from robotid.fitting.joint_motion import JointMotion
+from robotid.fitting.open_terms import OpenTerm
+from robotid.fitting.result import Fit
+from robotid.regressor.memory import drive_motion_along
+from robotid.robot.drives import DriveMotion, DriveTerm
+
+if TYPE_CHECKING:
+    from robotid.fitting.drives import DriveChoice
+
+__all__ = ["settled_shapes", "with_model_error"]
+
+_STEP = 1e-3  # relative, of a derivative
+_ROUNDING = 1e-10  # share of a column that is rounding
+_MOVES = 0.2  # standard errors by which a shape moves that is worth another fit
+_PINNED = 1e-6  # of the smallest spread: that of a parameter that is known
+_GROWN = 1.3  # times by which a standard error grows that stands on a misfit
+
+
+def with_model_error(
+    found: Fit, sample: Sample | None, misfits: Sequence[Misfit]
+) -> tuple[Fit, tuple[str, ...]]:
+    """Return a fit whose errors count what its drive model lacks.
+
+    Args:
+        found: What was found.
+        sample: Rows of its recordings; None if they are too few to judge by.
+        misfits: Terms that the model of its drives lacks.
+
+    Returns:
+        The fit, and names of the drive parameters whose errors grew by the misfits.
+    """
+    if sample is None:
+        return found, ()
+    motions = _motions(found) if found.drives else []
+    found = _wider(found, sample, list(_of_shapes(found, sample, motions)))
+    found = _wider(found, sample, list(_of_doubts(found, sample, motions)))
+    wider = _wider(found, sample, [_of_misfit(misfit) for misfit in misfits])
+    before, after = found.standard_error, wider.standard_error
+    drives = np.arange(len(before)) >= found.model.layout.n_inertial
+    grown = np.flatnonzero(drives & np.isfinite(before) & (after > _GROWN * before))
+    return wider, tuple(found.mapping.names[i] for i in grown)
+
+
+@dataclass(frozen=True, eq=False)
+class _Move:
+    """What is open of a drive, in the sample's units."""
+
+    joint: str
+    shift: Array  # of base parameters over their spread, (b,)
+    torque: Callable[[DriveMotion, JointMotion], Array]
+
+
+def _wider(found: Fit, sample: Sample, moved: Sequence[_Move]) -> Fit:
+    """Return a fit with what else is open of its drives."""
+    if not moved:
+        return found
+    X = sample.U.T @ np.column_stack([move.shift for move in moved])  # (b, m), base parameters
+    GX = _gain(found) @ X
+    terms = [
+        OpenTerm(move.joint, moves, move.torque) for move, moves in zip(moved, GX.T, strict=True)
+    ]
+    return replace(
+        found,
+        standard_covariance=found.standard_covariance + GX @ GX.T,
+        base_error=np.sqrt(found.base_error**2 + np.sum(X**2, axis=1)),
+        open_terms=(*found.open_terms, *terms),
+    )
+
+
+def _gain(found: Fit) -> Array:
+    """Return how a change of base parameters spreads over the standard ones, shape (p, b)."""
+    spread = found.prior_std
+    least = _PINNED * float(spread[spread > 0].min())  # what is known exactly hardly moves
+    return found.mapping.gain(np.maximum(spread, least))
+
+
+def _of_shapes(found: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
+    """Yield what is open of shapes.
+
+    Shapes of a joint err together: their covariance is C_s = L L^T, one move for each column of L.
+    """
+    for choice in found.drives:
+        if choice.shapes:
+            T = _shape_trial(found, choice, sample, motions).T[:, :-1]
+            variance, axes = np.linalg.eigh(np.array(choice.shape_covariance))
+            for axis in (axes * np.sqrt(np.maximum(variance, 0.0))).T:
+                bends = partial(_bent, found, choice, axis)
+                yield _Move(choice.joint, -(T @ axis), bends)
+
+
+def _bent(
+    found: Fit,
+    choice: "DriveChoice",
+    axis: Array,
+    motion: DriveMotion,
+    alone: JointMotion,
+) -> Array:
+    """Return what shapes that are larger by an axis (k,) change in a drive's torque, shape (N,)."""
+    slopes = [shape_slope(found, choice, k, motion) for k in range(len(axis))]
+    return np.asarray(np.column_stack(slopes) @ axis)
+
+
+def _of_misfit(misfit: Misfit) -> _Move:
+    """Return what is open by a term that the model lacks."""
+
+    def torque(motion: DriveMotion, alone: JointMotion) -> Array:
+        return misfit.torque(alone)
+
+    return _Move(misfit.joint, misfit.shift, torque)
+
+
+def _shape_trial(
+    found: Fit, choice: "DriveChoice", sample: Sample, motions: Sequence[DriveMotion]
+) -> Trial:
+    """Return a trial of the columns d(torque)/d(shape) of a joint, beside all that was fitted."""
+    j = sample.joints.index(choice.joint)
+    slopes = [
+        np.column_stack(
+            [shape_slope(found, choice, k, motion.of(j)) for k in range(len(choice.shapes))]
+        )[rows]
+        for motion, rows in zip(motions, sample.taken, strict=True)
+    ]
+    _, whole = trials(sample, slice(j, j + 1), np.concatenate(slopes)[:, None], _ROUNDING)
+    return whole
+
+
+def settled_shapes(found: Fit) -> "tuple[DriveChoice, ...] | None":
+    """Return choices with shapes that fit better now that all joints have their terms.
+
+    One step of Gauss and Newton: what a shape should be moved by is the parameter of its column.
+
+    Args:
+        found: What was found with the shapes as they are.
+
+    Returns:
+        The choices; None if no shape moves by more than a part of its standard error.
+    """
+    sample = take_sample(found, is_steady=False)
+    if sample is None or not any(choice.shapes for choice in found.drives):
+        return None
+    motions, drives, farthest = _motions(found), [], 0.0
+    for choice in found.drives:
+        if choice.shapes:
+            whole = _shape_trial(found, choice, sample, motions)
+            step, covariance = whole.estimate(list(range(len(choice.shapes))), sample.fitted)
+            moved = choice.moved(step, covariance)
+            before, after = (np.array([s.value for s in c.shapes]) for c in (choice, moved))
+            errors = np.sqrt(np.diag(covariance))
+            farthest = max(farthest, float((np.abs(after - before) / errors).max()))
+            choice = moved
+        drives.append(choice)
+    return tuple(drives) if farthest > _MOVES else None
+
+
+def _of_doubts(found: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
+    """Yield what is open by terms that were nearly taken."""
+    for choice in found.drives:
+        if not choice.doubted:
+            continue
+        j = sample.joints.index(choice.joint)
+        columns = [
+            np.column_stack([term.column(motion.of(j)) for term in choice.doubted])[rows]
+            for motion, rows in zip(motions, sample.taken, strict=True)
+        ]
+        Z = np.concatenate(columns)
+        _, whole = trials(sample, slice(j, j + 1), Z[:, None])
+        theta = whole.parameters(list(range(len(choice.doubted))))
+
+        torque = partial(_of_terms, choice.doubted, theta)
+        yield _Move(choice.joint, -whole.T[:, :-1] @ theta, torque)
+
+
+def _of_terms(
+    terms: Sequence[DriveTerm], theta: Array, motion: DriveMotion, alone: JointMotion
+) -> Array:
+    """Return the torque of terms of a drive, shape (N,)."""
+    return np.asarray(np.column_stack([term.column(motion) for term in terms]) @ theta)
+
+
+def _motions(found: Fit) -> list[DriveMotion]:
+    """Return how the drives move along each recording, as ``Sample.taken`` counts them."""
+    kept = [e for e in found.validation if not e.is_refitted]
+    recordings = [e.recording for e in (*found.fitted, *kept)]
+    model = found.model.with_reference(found.standard)
+    return [drive_motion_along(model, x.trajectory) for x in recordings]
+
+
+def shape_slope(found: Fit, choice: "DriveChoice", which: int, motion: DriveMotion) -> Array:
+    """Return how the torque of a joint's drive changes with one of its shapes, shape (N,).
+
+    Args:
+        found: The fit.
+        choice: The joint's terms.
+        which: Which of its shapes.
+        motion: How the drive moves, arrays of shape (N,).
+    """
+    layout = found.model.layout
+    theta = dict(zip(layout.names, found.standard, strict=True))
+    size = choice.shapes[which].value * _STEP
+    change = np.zeros_like(motion.v)
+    for term, other in zip(choice.terms, choice.altered(which, _STEP), strict=True):
+        change += theta[f"{choice.joint}.{term.name}"] * (
+            other.column(motion) - term.column(motion)
+        )
+    slope: Array = change / size
+    return slope

@@ -1,0 +1,432 @@
+"""Why a joint is predicted as it is: what its torque consists of, and what its residual follows.
+
+A torque is gravity, inertia, velocity torques, and what each drive adds, sum by sum:
+
+    tau = g(q) + M(q) a + C(q, v) v + friction + motor inertia + offset + ... + residual.
+
+What the residual follows, and whether by chance, ``dependence`` tells.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.diagnosis.dependence import FEWEST, Dependence, even_bins, follow
+from robotid.exceptions import DataError
+from robotid.fitting.evaluation import Evaluation
+from robotid.fitting.result import Fit
+from robotid.regressor.columns import drive_values, friction_directions
+from robotid.regressor.prediction import rigid_parts
+from robotid.regressor.used_rows import independent_share
+from robotid.robot.model import RobotModel
+
+__all__ = ["JointTorque", "Rows", "TorqueSplit", "joint_torques", "split_torque"]
+
+_RIGID = ("gravity", "inertia", "Coriolis")
+_ROWS = 4000  # of all recordings together that are split
+_STRETCHES = 16  # left out in turn
+_SHORTEST = 10  # independent rows in a stretch
+_OUTLIER = 12.0  # usual residuals from which a row is left out
+_QUARTERS = 4  # of a recording, between which its residual may drift; and pieces of each
+_ROUNDING = 1e-10  # of the torque, below which a part is none
+_SLOW = 0.25  # of the usual speed: below it is low speed
+_FORGOTTEN = 0.5  # share that is as quick as noise, from which the rest needs no other reason
+_ADVICE = {
+    "constant": "Zero the torque sensor, and look for a spring or a weight that the model lacks",
+    "position": "Look for a spring, a cable or a gear's ripple that the model lacks",
+    "speed": "Try another friction model",
+    "acceleration": "Look for an inertia that the model lacks, or a torque that comes late",
+    "load": "Look at the scale of the torque, and for friction that grows with the load",
+    "time": "Friction that warms up, a sensor that drifts or a load that was changed does this",
+}
+_CHANGED = (
+    "The fitted recordings do not show this: something has changed since (friction with "
+    "temperature, the zero of a sensor, a load), or they do not move the joint that way"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueSplit:
+    """What predicted torques consist of.
+
+    Attributes:
+        parts: "gravity", "inertia" and "Coriolis" (with centrifugal torques) of the bodies, then
+            what the drives add, by ``DriveTerm.part``; each of shape (N, n_rows) [N m, N].
+        names: Names of the k drive parameters.
+        kinds: Which part each of them counts as.
+        terms: What each of them adds at its drive, shape (k, N) [N m, N].
+        loads: Ratio of each row to the drive of each parameter, shape (n_rows, k) [-].
+    """
+
+    parts: Mapping[str, Array]
+    names: tuple[str, ...]
+    kinds: tuple[str, ...]
+    terms: Array
+    loads: Array
+
+    @cached_property
+    def predicted(self) -> Array:
+        """The torque predicted, the sum of the parts, shape (N, n_rows) [N m, N]."""
+        return np.asarray(sum(self.parts.values()))
+
+    @cached_property
+    def load(self) -> Array:
+        """The torque of the bodies, shape (N, n_rows) [N m, N]."""
+        return np.asarray(sum(self.parts[name] for name in _RIGID if name in self.parts))
+
+    def terms_of(self, row: int) -> dict[str, dict[str, Array]]:
+        """Return what each drive parameter that loads a row adds to it, (N,), by part and name.
+
+        Args:
+            row: Which row.
+        """
+        terms: dict[str, dict[str, Array]] = {}
+        for name, kind, ratio, torque in zip(
+            self.names, self.kinds, self.loads[row], self.terms, strict=True
+        ):
+            if ratio:
+                terms.setdefault(kind, {})[name] = ratio * torque
+        return terms
+
+
+def split_torque(
+    model: RobotModel,
+    pi: Array,
+    q: Array,
+    v: Array,
+    a: Array,
+    direction: Array | None = None,
+    memory: Array | None = None,
+) -> TorqueSplit:
+    """Return what the torques that parameters predict consist of.
+
+    Of a static model, no torque of motion is known, so that gravity stands alone for the bodies.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,).
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+        v: Velocities, shape (N, n_rows) [rad/s, m/s].
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+        direction: As of ``joint_torque_regressor``.
+        memory: As of ``Trajectory.memory``; needed if drives remember anything.
+
+    Raises:
+        DataError: If a shape does not fit the model.
+    """
+    layout, first = model.layout, model.n_rows - len(model.joints)
+    wanted = (len(q), model.n_rows)
+    if v.shape != wanted or a.shape != wanted or len(pi) != len(layout.names):
+        raise DataError(
+            f"v, a and pi have shapes {v.shape}, {a.shape} and {pi.shape}, wanted {wanted}, "
+            f"{wanted} and ({len(layout.names)},)"
+        )
+    parts = dict(zip(_RIGID, rigid_parts(model, pi, q, v, a), strict=True))
+    if model.is_static:
+        parts = {"gravity": parts["gravity"]}
+    signs = friction_directions(layout, v, direction)
+    terms = pi[layout.n_inertial :, None] * drive_values(layout, q, v, a, signs, memory)  # (k, N)
+    loads = np.vstack([np.zeros((first, len(terms))), layout.drive_loads])  # (n_rows, k)
+    kinds = tuple(term.part for _, term in layout.drive_parameters)
+    for kind in dict.fromkeys(kinds):
+        own = [k for k, other in enumerate(kinds) if other == kind]
+        parts[kind] = terms[own].T @ loads[:, own].T  # (N, n_rows)
+    return TorqueSplit(parts, layout.drive_names, kinds, terms, loads)
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows of recordings, one after the other.
+
+    Attributes:
+        recordings: Names of the recordings.
+        t: Time stamps, shape (N,) [s].
+        recording: Which recording each row is of, shape (N,), int.
+        segment: Which uninterrupted stretch of it, shape (N,), int.
+        stretches: Which of the stretches that are left out in turn, shape (N,), int; None if the
+            recordings are too short for six.
+    """
+
+    recordings: tuple[str, ...]
+    t: Array
+    recording: Array
+    segment: Array
+    stretches: Array | None
+
+    @property
+    def time(self) -> Array:
+        """Time of the log; of several recordings, from the start of the first, without breaks."""
+        starts = np.flatnonzero(np.diff(self.recording, prepend=-1))
+        if len(starts) == 1:
+            return self.t
+        lengths = np.array([np.ptp(self.t[self.recording == k]) for k in range(len(starts))])
+        before = np.concatenate([[0.0], np.cumsum(lengths)[:-1]])
+        return np.asarray(self.t - self.t[starts][self.recording] + before[self.recording])
+
+    @cached_property
+    def pieces(self) -> Array:
+        """Which of 16 pieces of its recording each row is in, counted on, shape (N,), int."""
+        count = _QUARTERS**2
+        pieces = np.empty(len(self.t), dtype=int)
+        for k in range(len(self.recordings)):
+            own = self.recording == k
+            pieces[own] = count * k + np.arange(own.sum()) * count // max(own.sum(), 1)
+        return pieces
+
+
+@dataclass(frozen=True, eq=False)
+class JointTorque:
+    """Torque of one row of the equations, split, and what its residual follows.
+
+    Attributes:
+        joint: Name of the row.
+        unit: Unit of its torque.
+        rows: The N samples.
+        used: Which of them are used, shape (N,), bool.
+        tau: Measured torque, shape (N,).
+        parts: What the predicted torque consists of, by name, each of shape (N,).
+        terms: What each drive parameter adds, likewise, by part and name.
+        quantities: What the residual may follow: unit and values, (N,), by name.
+        quick: Share of the squared residual that is forgotten within a period of the filter's
+            cut-off, as filtered noise is, or from sample to sample; None if that is not known.
+        fitted: The same of the fitted recordings; None if it is of them itself.
+    """
+
+    joint: str
+    unit: str
+    rows: Rows
+    used: Array
+    tau: Array
+    parts: Mapping[str, Array]
+    terms: Mapping[str, Mapping[str, Array]]
+    quantities: Mapping[str, tuple[str, Array]]
+    quick: float | None
+    fitted: "JointTorque | None" = None
+
+    @cached_property
+    def residual(self) -> Array:
+        """Measured minus predicted torque, shape (N,)."""
+        return np.asarray(self.tau - sum(self.parts.values()))
+
+    @cached_property
+    def present(self) -> tuple[str, ...]:
+        """Names of the parts that are more than rounding in any row."""
+        least = _ROUNDING * float(np.abs(self.tau).max())
+        return tuple(name for name, x in self.parts.items() if np.abs(x).max() > least)
+
+    @property
+    def power(self) -> Array | None:
+        """Mechanical power tau v, shape (N,) [W]; None where no speed is known."""
+        speed = self.quantities.get("speed")
+        return None if speed is None else self.tau * speed[1]
+
+    @property
+    def rms(self) -> dict[str, float]:
+        """Root mean square of each part, of "residual" and of "measured" over the rows used."""
+        every = {**self.parts, "residual": self.residual, "measured": self.tau}
+        return {name: self.size(x) for name, x in every.items()}
+
+    def size(self, x: Array) -> float:
+        """Return the root mean square of a signal over the rows used; NaN without one.
+
+        Args:
+            x: The signal, shape (N,).
+        """
+        return float(np.sqrt(np.mean(x[self.used] ** 2))) if self.used.any() else float("nan")
+
+    @cached_property
+    def follows(self) -> tuple[Dependence, ...]:
+        """How the residual follows nothing (a constant), each quantity, and time.
+
+        A quantity is asked what it explains beside a constant; time, of what the best other leaves.
+        """
+        r = self.residual
+        if not self.used.any():
+            return ()
+        used = self.used & (np.abs(r) <= _OUTLIER * np.median(np.abs(r[self.used])))
+        everywhere, piece = np.zeros(int(used.sum()), dtype=int), self.rows.pieces[used]
+        stretches = None if self.rows.stretches is None else self.rows.stretches[used]
+        found = [follow("constant", self.unit, r[used], r[used], everywhere, stretches)]
+        for name, (unit, x) in self.quantities.items():
+            if np.ptp(x[used]) > 0:
+                found.append(follow(name, unit, x[used], r[used], even_bins(x[used]), stretches))
+        left = self._less_best(found)[0]
+        quarter = np.unique(piece // _QUARTERS, return_inverse=True)[1]
+        time = follow("time", "s", self.rows.time[used], left[used], quarter, piece)
+        return (*found, time)
+
+    @cached_property
+    def against_time(self) -> tuple[Array, str]:
+        """The residual as time is asked what it explains, shape (N,), and what it is less of.
+
+        The second is the quantity that explains most, whose means are subtracted; "" if none is.
+        """
+        return self._less_best(self.follows[:-1])
+
+    def _less_best(self, found: Sequence[Dependence]) -> tuple[Array, str]:
+        """Return the residual less what the best quantity explains of it, and its name."""
+        best = self._best(found)
+        if best is None or best.name not in self.quantities:
+            return self.residual, ""
+        means = np.interp(self.quantities[best.name][1], best.centres, best.means)
+        return self.residual - means, best.name
+
+    @staticmethod
+    def _best(follows: Sequence[Dependence]) -> Dependence | None:
+        sure = [d for d in follows if d.is_sure]
+        return max(sure, key=lambda d: d.share or 0.0, default=None)
+
+    @property
+    def sentence(self) -> str:
+        """Why the joint is predicted no better, in words."""
+        rms, best = self.rms, self._best(self.follows)
+        if np.isnan(rms["measured"]):
+            return "no row is used: the joint does not move"
+        if rms["measured"] == 0:
+            return "the measured torque is 0 throughout"
+        left = f"the residual is {_percent(rms['residual'] / rms['measured'])} of the torque"
+        if best is not None:
+            advice = _CHANGED if self._has_changed(best.name) else _ADVICE[best.name]
+            return f"{left} and {self._said(best)}. {advice}"
+        if self.quick is None or self.rows.stretches is None:
+            return f"{left}; too little was recorded to tell what it follows"
+        quick = f"{_percent(self.quick)} of its square is as quick as noise"
+        if self.quick >= _FORGOTTEN:
+            return f"{left}, and nothing explains it: {quick}"
+        names = [d.name for d in self.follows if d.name != "constant"]
+        return (
+            f"{left}, and neither a constant nor {', '.join(names)} alone explain it, though only "
+            f"{quick}. Look at the motion of other joints, and at elasticity"
+        )
+
+    def _said(self, best: Dependence) -> str:
+        """Return in words what the residual follows."""
+        share = _percent(best.share or 0.0)
+        if best.name == "constant":
+            return f"{share} of its square is a constant of {best.means[0]:.2g} {self.unit}"
+        usual = self.size(self.quantities[best.name][1]) if best.name == "speed" else 0.0
+        low = " at low speed," if abs(best.where) < _SLOW * usual else ""
+        return (
+            f"follows the {best.name}, which explains {share} of its variance (best seen{low} "
+            f"about {best.where:.2g} {best.unit})"
+        )
+
+    def _has_changed(self, name: str) -> bool:
+        """Whether the residual of the fitted recordings, asked the same, does not follow it."""
+        before = () if self.fitted is None else self.fitted.follows
+        return any(d.name == name and d.share is not None and not d.is_sure for d in before)
+
+
+def joint_torques(found: Fit) -> tuple[JointTorque, ...]:
+    """Return the torque of each row, split, and what its residual follows.
+
+    It is that of the recordings kept apart, or of the fitted ones without any; of at most 4000
+    samples spread over what is at hand of them.
+
+    Args:
+        found: What was found.
+    """
+    kept = [e for e in found.validation if not e.is_refitted]
+    fitted = _torques_of(found, found.fitted)
+    if not kept:
+        return fitted
+    judged = zip(_torques_of(found, kept), fitted, strict=True)
+    return tuple(replace(torque, fitted=of_fit) for torque, of_fit in judged)
+
+
+def _torques_of(found: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTorque, ...]:
+    """Return the torque of each row in some recordings."""
+    model, pi = found.model, found.standard
+    most = _ROWS // len(evaluations)
+    own = [(e, _spread(len(e.recording.trajectory.t), most)) for e in evaluations]
+    motions = [e.recording.trajectory.at(k) for e, k in own]
+    splits = [split_torque(model, pi, m.q, m.v, m.a, m.direction, m.memory) for m in motions]
+    used = np.concatenate([e.recording.mask[k] for e, k in own])
+    q, v, a, tau = (
+        np.concatenate([getattr(m, x) for m in motions]) for x in ("q", "v", "a", "tau")
+    )
+    load = np.concatenate([s.load for s in splits])
+    rows, quick = _rows(own), _quick_shares(evaluations)
+    judged = []
+    for j, joint in enumerate(model.row_names):
+        terms = [split.terms_of(j) for split in splits]  # alike in all
+        angle = "m" if joint in model.layout.prismatic else "rad"
+        quantities = {
+            "position": (angle, q[:, j]),
+            "speed": (f"{angle}/s", v[:, j]),
+            "acceleration": (f"{angle}/s^2", a[:, j]),
+            "load": (model.row_units[j], load[:, j]),
+        }
+        if model.is_static:  # its samples are means of stretches, without speeds
+            quantities = {name: quantities[name] for name in ("position", "load")}
+        judged.append(
+            JointTorque(
+                joint=joint,
+                unit=model.row_units[j],
+                rows=rows,
+                used=used[:, j],
+                tau=tau[:, j],
+                parts={
+                    x: np.concatenate([s.parts[x][:, j] for s in splits]) for x in splits[0].parts
+                },
+                terms={
+                    part: {x: np.concatenate([each[part][x] for each in terms]) for x in own}
+                    for part, own in terms[0].items()
+                },
+                quantities=quantities,
+                quick=quick[j],
+            )
+        )
+    return tuple(judged)
+
+
+def _spread(count: int, most: int) -> Array:
+    """Return which of so many samples are taken, spread over all."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
+def _rows(own: Sequence[tuple[Evaluation, Array]]) -> Rows:
+    """Return samples of recordings, cut into stretches long enough to be left out in turn."""
+    counts = [len(k) for _, k in own]
+    independent = sum(
+        min(len(k), independent_share(e.recording.signals) * len(e.recording.trajectory.t))
+        for e, k in own
+    )
+    many, total = min(_STRETCHES, int(independent / _SHORTEST)), sum(counts)
+    return Rows(
+        recordings=tuple(e.recording.name for e, _ in own),
+        t=np.concatenate([e.recording.trajectory.t[k] for e, k in own]),
+        recording=np.repeat(np.arange(len(own)), counts),
+        segment=np.concatenate([e.recording.trajectory.segment[k] for e, k in own]),
+        stretches=np.arange(total) * many // total if many >= FEWEST else None,
+    )
+
+
+def _quick_shares(evaluations: Sequence[Evaluation]) -> list[float | None]:
+    """Return which share of each row's squared residual is forgotten as filtered noise is.
+
+    It is 1 - r(L) / r(0) with r the autocovariance and L a period of the filter's cut-off.
+    """
+    rows = evaluations[0].recording.mask.shape[1]
+    squares, products = np.zeros(rows), np.zeros(rows)
+    for e in evaluations:
+        motion, signals = e.recording.trajectory, e.recording.signals
+        r = np.where(e.recording.mask, motion.tau - e.torques["estimate"], 0.0)
+        lag = 1
+        if signals.cutoff is not None and motion.rate is not None:
+            lag = max(1, round(motion.rate / signals.cutoff))
+        beside = (motion.segment[lag:] == motion.segment[:-lag])[:, None]
+        both = beside & e.recording.mask[lag:] & e.recording.mask[:-lag]
+        products += np.sum(r[lag:] * r[:-lag], axis=0, where=both)
+        squares += np.sum(0.5 * (r[lag:] ** 2 + r[:-lag] ** 2), axis=0, where=both)
+    return [
+        min(1.0, 1.0 - product / square) if square > 0 else None
+        for product, square in zip(products.tolist(), squares.tolist(), strict=True)
+    ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"

@@ -1,0 +1,3 @@
+"""A robot and its recordings to a fit: what is fitted, its errors, and how well it predicts."""
+
+__all__: list[str] = []

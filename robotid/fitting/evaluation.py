@@ -1,0 +1,373 @@
+"""Predicted torque of recordings, and its metrics: piece by piece, a log in memory at once."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial, reduce
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.fitting.metrics import Metrics, TorqueSums
+from robotid.fitting.survey import PieceTask, SurveyedLog
+from robotid.logs.data import Log, Trajectory
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import turns_note
+from robotid.regressor.prediction import predict
+from robotid.robot.model import RobotModel
+from robotid.workers.plan import WorkPlan
+
+__all__ = [
+    "Evaluation",
+    "Extent",
+    "Recording",
+    "evaluate_logs",
+    "hidden_joints",
+    "pool",
+    "predict",
+    "shares_rows",
+]
+
+_SHOWN = 10_000  # samples at the beginning, in the middle and at the end that are kept for plots
+_SAMPLED = 200  # rows spread over a log that are looked for in others
+_SHARED = 0.02  # share of them that another recording may hold: windows that meet share a row
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How much of a log there is.
+
+    Attributes:
+        samples: Rows of the log.
+        rate: Their median rate [Hz].
+        start: First time stamp [s].
+        end: Last time stamp [s].
+        smooth: Samples of its trajectory.
+        rows_used: Torque rows of these that are used.
+        segments: Uninterrupted stretches of the trajectory.
+    """
+
+    samples: int
+    rate: float
+    start: float
+    end: float
+    smooth: int
+    rows_used: int
+    segments: int
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A log made ready for a model. Of a long log, only some stretches are at hand.
+
+    Attributes:
+        log: The raw log, or its first rows.
+        signals: The settings it was processed with, everything automatic decided.
+        trajectory: The smooth motion, N samples, or stretches of it.
+        mask: Rows used, shape (N, n_rows), bool.
+        extent: How much of the whole log there is.
+    """
+
+    log: Log
+    signals: SignalSettings
+    trajectory: Trajectory
+    mask: Array
+    extent: Extent
+
+    @property
+    def name(self) -> str:
+        """Name of the log's file and the stretch of it, as ``run3.parquet 5-7.4 s``."""
+        file = Path(self.log.path).name or "log"
+        return f"{file} {self.extent.start:.4g}-{self.extent.end:.4g} s"
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether only stretches of the motion are at hand."""
+        return len(self.trajectory.t) < self.extent.smooth
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A recording with the torques predicted for it.
+
+    Attributes:
+        recording: The recording.
+        torques: Predicted torques by name of the parameters, each of shape (N, n_rows) [N m, N];
+            among them the baselines "urdf", "gravity_only" and "urdf_with_drives".
+        sums: What the metrics over the whole log are made of, by name of the parameters, without
+            the baselines.
+        metrics: Metrics over the whole log, likewise.
+        is_refitted: Whether it was kept apart, but holds rows that were fitted.
+    """
+
+    recording: Recording
+    torques: Mapping[str, Array]
+    sums: Mapping[str, TorqueSums]
+    metrics: Mapping[str, Metrics]
+    is_refitted: bool = False
+
+
+def evaluate_logs(
+    fitted: Sequence[SurveyedLog],
+    kept: Sequence[SurveyedLog],
+    parameters: Mapping[str, Array],
+    prior: Array,
+    driven: Array | None = None,
+    *,
+    plan: WorkPlan | None = None,
+) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
+    """Return how well parameters predict logs.
+
+    Args:
+        fitted: Logs that were fitted, surveyed with the model that predicts.
+        kept: Logs kept apart.
+        parameters: Standard parameters by name, each of shape (p,).
+        prior: Those of the URDF, shape (p,): the baselines are its torque, with and without motion.
+        driven: Those of the URDF with drives fitted to the logs, shape (p,): a baseline, if known.
+        plan: Who works on the pieces of logs in files; this process if None.
+
+    Returns:
+        Evaluations of the fitted logs, and of those kept apart; of logs in files, the torques are
+        those of the stretches that are kept for plots.
+
+    Raises:
+        DataError: If no row of a log is used.
+    """
+    work = partial(_score, parameters=parameters, prior=prior, driven=driven)
+    apart = _score_logs(kept, work, plan)
+    sought = [score.sampled for score in apart]
+    own = _score_logs(fitted, partial(work, sought=sought), plan)
+    again = [any(_is_shared(score.found[k]) for score in own) for k in range(len(apart))]
+    return tuple(map(_conclude, fitted, own)), tuple(map(_conclude, kept, apart, again))
+
+
+def shares_rows(one: Log, other: Log) -> bool:
+    """Return whether two logs hold the same recorded rows, whatever their files are called.
+
+    Args:
+        one: A log.
+        other: Another log of the same joints.
+
+    Returns:
+        Whether more than 2 % of 200 rows of positions and torques spread over the first are in
+        the second; windows that meet share their common row, which counts for nothing.
+    """
+    rows, others = (np.hstack([log.q, log.tau]) for log in (one, other))
+    return _is_shared(_rows_in(rows[:: _sampled_every(len(rows))], others))
+
+
+def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Metrics:
+    """Return the metrics over several recordings together.
+
+    Args:
+        model: The robot.
+        evaluations: The recordings, at least one.
+        name: Which parameters predict.
+
+    Raises:
+        DataError: If no row of any recording is used.
+    """
+    together = reduce(TorqueSums.merge, [evaluation.sums[name] for evaluation in evaluations])
+    return together.metrics(model.row_names, model.row_units)
+
+
+def hidden_joints(model: RobotModel, evaluations: Sequence[Evaluation]) -> tuple[str, ...]:
+    """Return joints of a static model whose torque changes less than the estimate leaves of it.
+
+    What friction holds where the robot stands hides the little that gravity does there.
+
+    Args:
+        model: The robot.
+        evaluations: The recordings.
+    """
+    if not model.is_static or not evaluations:
+        return ()
+    left = pool(model, evaluations, "estimate").per_joint
+    torque = np.vstack([e.torques["estimate"] for e in evaluations])
+    used = np.vstack([e.recording.mask for e in evaluations])
+    hidden = tuple(
+        row
+        for j, row in enumerate(model.row_names)
+        if row in left and np.std(torque[used[:, j], j]) <= left[row].rmse
+    )
+    return hidden if len(hidden) < len(left) else ()
+
+
+_Shown = tuple[Trajectory, Array, Mapping[str, Array]]  # motion, rows used, torques
+
+
+@dataclass(frozen=True, eq=False)
+class _Score:
+    """What is known of a log, or of its pieces so far."""
+
+    sums: Mapping[str, TorqueSums]  # what the metrics are made of, by name of the parameters
+    smooth: int  # samples
+    used: int  # torque rows used
+    segments: frozenset[int]  # numbers of the stretches that have samples
+    turned: Array  # (n,), bool: joints whose full turns were taken out
+    shown: tuple[_Shown, ...]  # all samples, or a few stretches
+    sampled: Array  # (m, 2 n), recorded rows spread over the log
+    found: tuple[Array, ...]  # which of the sampled rows of each other log are in this one
+
+    def join(self, other: "_Score") -> "_Score":
+        """Return what is known with the pieces that follow."""
+        return _Score(
+            sums={name: x.merge(other.sums[name]) for name, x in self.sums.items()},
+            smooth=self.smooth + other.smooth,
+            used=self.used + other.used,
+            segments=self.segments | other.segments,
+            turned=self.turned | other.turned,
+            shown=self.shown + other.shown,
+            sampled=np.concatenate([self.sampled, other.sampled]),
+            found=tuple(one | two for one, two in zip(self.found, other.found, strict=True)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Part(PieceTask):
+    """A piece, and what is kept of it: recorded rows spread over it, and a stretch for plots."""
+
+    sampled: slice
+    shown: slice | None
+
+
+def _parts(log: SurveyedLog) -> list[_Part]:
+    last = len(log.pieces) - 1
+    shown = {0: slice(_SHOWN), (last + 1) // 2: slice(_SHOWN), last: slice(-_SHOWN, None)}
+    if log.is_held:
+        shown = {0: slice(None)}
+    every = _sampled_every(log.stop - log.first)
+    return [
+        _Part(piece, slice((log.first - piece.first) % every, None, every), shown.get(k))
+        for k, piece in enumerate(log.pieces)
+    ]
+
+
+def _score_logs(
+    logs: Sequence[SurveyedLog], work: "partial[_Score]", plan: WorkPlan | None
+) -> list[_Score]:
+    """Return what is known of each log; refuse one without samples."""
+    parts = [_parts(log) for log in logs]
+    every = list(chain.from_iterable(parts))
+    found = (work(x, None) for x in every) if plan is None else plan.map(work, every, "evaluating")
+    scores = []
+    for log, own in zip(logs, parts, strict=True):
+        by_piece = [next(found) for _ in own]
+        score = reduce(_Score.join, by_piece)
+        if not score.smooth:
+            raise log.too_short()
+        if not score.shown:  # of none of the chosen pieces is a sample left: draw another one
+            filled = next(k for k, piece in enumerate(by_piece) if piece.smooth)
+            again = work(replace(own[filled], shown=slice(_SHOWN)), None)
+            score = replace(score, shown=again.shown)
+        scores.append(score)
+    return scores
+
+
+def _score(
+    whole: _Part,
+    threads: int | None,
+    *,
+    parameters: Mapping[str, Array],
+    prior: Array,
+    driven: Array | None,
+    sought: Sequence[Array] = (),
+) -> _Score:
+    """Return what is known of a piece, with the torques of a part of it."""
+    header, rows = whole.piece.header, whole.piece.read()
+    model, motion, mask = header.model, rows.trajectory, rows.mask
+    moving = {"urdf": prior} if driven is None else {"urdf": prior, "urdf_with_drives": driven}
+    every = {**parameters, **moving}
+    torques = {name: np.empty((0, model.n_rows)) for name in (*every, "gravity_only")}
+    if len(motion.t):
+        torques = _predict_all(model, motion, every, prior, header.is_compiled)
+    baselines = {name: torques[name] for name in ("gravity_only", *moving)}
+    shown: tuple[_Shown, ...] = ()
+    if whole.shown is not None and len(motion.t):
+        part = slice(*whole.shown.indices(len(motion.t)))
+        kept = {name: torque[part] for name, torque in torques.items()}
+        shown = ((motion.part(part.start, part.stop), mask[part], kept),)
+    recorded = np.hstack([rows.positions, rows.torques])
+    return _Score(
+        sums={x: TorqueSums.of(motion.tau, torques[x], mask, baselines) for x in parameters},
+        smooth=len(motion.t),
+        used=int(mask.sum()),
+        segments=frozenset(np.unique(motion.segment).tolist()),
+        turned=rows.turned,
+        shown=shown,
+        sampled=recorded[whole.sampled],
+        found=tuple(_rows_in(sampled, recorded) for sampled in sought),
+    )
+
+
+def _predict_all(
+    model: RobotModel,
+    trajectory: Trajectory,
+    parameters: Mapping[str, Array],
+    prior: Array,
+    compiled: bool | None,
+) -> dict[str, Array]:
+    """Return the torques that parameters and the URDF's gravity predict, each (N, n_rows)."""
+    torques = predict(model, [*parameters.values()], trajectory, compiled=compiled)
+    inertial = np.where(np.arange(len(prior)) < model.layout.n_inertial, prior, 0.0)
+    still = np.zeros_like(trajectory.v)
+    at_rest = replace(trajectory, v=still, a=still, direction=None)  # no drive has a say in it
+    torques += predict(model, [inertial], at_rest, compiled=compiled)
+    return dict(zip((*parameters, "gravity_only"), torques, strict=True))
+
+
+def _conclude(log: SurveyedLog, score: _Score, is_refitted: bool = False) -> Evaluation:
+    """Return the evaluation of a log."""
+    motions, masks, torques = zip(*score.shown, strict=True)
+    extent = Extent(
+        samples=log.stop - log.first,
+        rate=1.0 / log.step,
+        start=float(log.stamps[log.first]),
+        end=float(log.stamps[log.stop - 1]),
+        smooth=score.smooth,
+        rows_used=score.used,
+        segments=len(score.segments),
+    )
+    head, model, sums = log.head, log.model, score.sums
+    names = [head.joints[j] for j in np.flatnonzero(score.turned)]
+    if names:
+        head = replace(head, notes=(*head.notes, turns_note(names)))
+    recording = Recording(head, log.signals, _joined(motions), np.concatenate(masks), extent)
+    predicted = {name: np.concatenate([t[name] for t in torques]) for name in torques[0]}
+    metrics = {name: s.metrics(model.row_names, model.row_units) for name, s in sums.items()}
+    return Evaluation(recording, predicted, sums, metrics, is_refitted)
+
+
+def _joined(motions: Sequence[Trajectory]) -> Trajectory:
+    """Return motions one after the other; what is shown never joins what is not beside it."""
+    segments, number = [], 0
+    for motion in motions:
+        segments.append(np.unique(motion.segment, return_inverse=True)[1] + number)
+        number = int(segments[-1][-1]) + 1
+    joined: dict[str, Any] = {
+        key: np.concatenate([getattr(motion, key) for motion in motions])
+        for key in ("t", "q", "v", "a", "tau", "direction", "memory")
+        if len(motions) > 1 and getattr(motions[0], key) is not None
+    }
+    return replace(motions[0], **joined, segment=np.concatenate(segments))
+
+
+def _sampled_every(rows: int) -> int:
+    """Return how far apart the rows are that are looked for, of so many."""
+    return max(1, rows // _SAMPLED)
+
+
+def _rows_in(sampled: Array, rows: Array) -> Array:
+    """Return which of the rows (m, 2 n) of positions and torques are among others, shape (m,)."""
+    found = np.isin(sampled[:, 0], rows[:, 0])
+    likely = rows[np.isin(rows[:, 0], sampled[found, 0])]
+    for k in np.flatnonzero(found):
+        found[k] = (likely == sampled[k]).all(axis=1).any()
+    return found
+
+
+def _is_shared(found: Array) -> bool:
+    """Return whether so many rows are in another log that it holds the same recording."""
+    return int(found.sum()) > max(1, _SHARED * len(found))

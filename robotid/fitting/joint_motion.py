@@ -1,0 +1,121 @@
+"""How a joint moves along recordings: what terms of its drive are functions of."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from operator import attrgetter
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.fitting.evaluation import Recording
+from robotid.logs.data import Trajectory
+from robotid.regressor.columns import friction_directions
+from robotid.robot.drives import DriveMotion
+from robotid.robot.model import RobotModel
+
+__all__ = ["JointMotion", "joint_motions", "travelled"]
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotion:
+    """How a joint moves in N rows of the fitted recordings, and what loads it.
+
+    Attributes:
+        q: Positions, shape (N,) [rad or m].
+        v: Speeds, shape (N,) [rad/s or m/s].
+        a: Accelerations, shape (N,) [rad/s^2 or m/s^2].
+        direction: Which way friction acts: the sign of v, as the torque is filtered, shape (N,).
+        load: Torque of the rigid bodies by the estimate, shape (N,) [N m or N].
+        travelled: Way since v last changed its sign, shape (N,) [rad or m].
+        time: Time since the recording began, over the longest recording's, shape (N,).
+        passes: Cut-off of the filter of torques [Hz]; infinite without one.
+        others: The joints before and after it, by name.
+        scale: The motion whose usual speeds, ways and loads scale columns; None: this one.
+    """
+
+    q: Array
+    v: Array
+    a: Array
+    direction: Array
+    load: Array
+    travelled: Array
+    time: Array
+    passes: float = np.inf
+    others: dict[str, "JointMotion"] = field(default_factory=dict)
+    scale: "JointMotion | None" = None
+
+    @classmethod
+    def steady(cls, motion: DriveMotion) -> "JointMotion":
+        """Return the motion of a joint that has moved steadily for long, the others at rest.
+
+        Args:
+            motion: How its drive moves, arrays of shape (N,).
+        """
+        none, far = np.zeros_like(motion.v), np.full_like(motion.v, np.inf)
+        m = motion
+        return cls(m.q, m.v, m.a, m.direction, m.load, travelled=far, time=none)
+
+    def at(self, rows: slice) -> "JointMotion":
+        """Return the motion in some of the rows, without the other joints.
+
+        Args:
+            rows: The rows.
+        """
+        q, v, a, direction, load = (
+            x[rows] for x in (self.q, self.v, self.a, self.direction, self.load)
+        )
+        travelled, time = self.travelled[rows], self.time[rows]
+        return JointMotion(q, v, a, direction, load, travelled, time, self.passes)
+
+
+def joint_motions(
+    recordings: Sequence[Recording], rows: Sequence[Array], load: Array, model: RobotModel
+) -> tuple[JointMotion, ...]:
+    """Return how each joint moves in some rows of recordings, with its neighbours.
+
+    Args:
+        recordings: The recordings.
+        rows: Which rows of each, N in all.
+        load: Torque of the bodies there, shape (N, n) [N m or N].
+        model: The robot.
+    """
+    motions = [recording.trajectory for recording in recordings]
+    passes = max(recording.signals.cutoff or np.inf for recording in recordings)
+    longest = max(float(np.ptp(m.t)) for m in motions)
+
+    def joined(of: Callable[[Trajectory], Array]) -> Array:
+        return np.concatenate([of(m)[k] for m, k in zip(motions, rows, strict=True)])
+
+    q, v, a = (joined(attrgetter(name)) for name in "qva")
+    signs = joined(partial(_directions, model))
+    way = joined(travelled)
+    time = joined(lambda m: (m.t - m.t[0]) / (longest or 1.0))
+    alone = [
+        JointMotion(q[:, j], v[:, j], a[:, j], signs[:, j], load[:, j], way[:, j], time, passes)
+        for j in range(len(model.joints))
+    ]
+    beside = [[k for k in (j - 1, j + 1) if 0 <= k < len(alone)] for j in range(len(alone))]
+    return tuple(
+        replace(motion, others={model.joints[k]: alone[k] for k in near})
+        for motion, near in zip(alone, beside, strict=True)
+    )
+
+
+def _directions(model: RobotModel, motion: Trajectory) -> Array:
+    """Return which way the friction of each joint's own drive acts, shape (N, n)."""
+    signs = friction_directions(model.layout, motion.v, motion.direction)[:, : len(model.joints)]
+    return signs if signs.shape[1] else np.sign(motion.v)
+
+
+def travelled(motion: Trajectory) -> Array:
+    """Return how far each joint went since it last turned round, shape (N, n) [rad or m].
+
+    Args:
+        motion: The motion, N rows.
+    """
+    begins = np.diff(motion.segment, prepend=motion.segment[0] - 1) != 0
+    turns = (np.diff(np.sign(motion.v), axis=0, prepend=0.0) != 0) | begins[:, None]
+    last = np.maximum.accumulate(np.where(turns, np.arange(len(turns))[:, None], 0), axis=0)
+    way: Array = np.abs(motion.q - np.take_along_axis(motion.q, last, axis=0))
+    return way

@@ -1,0 +1,130 @@
+"""The identified parameters as a table for Python: a row per parameter."""
+
+import math
+from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from robotid.fitting.result import Fit
+from robotid.pages.html import code, number, table, text
+
+__all__ = [
+    "HEADERS",
+    "ParameterRows",
+    "correlated_parameters",
+    "parameter_entries",
+    "parameter_table",
+]
+
+_CORRELATED = 0.95  # from which two parameters of a drive are known as their sum alone
+
+#: What a row says: link or drive, parameter, the URDF's value, the identified one, its standard
+#: error, its 95 % interval, what determined it, unit.
+HEADERS = ("part", "parameter", "urdf", "value", "std_error", "low", "high", "source", "unit")
+_NUMBERS = HEADERS[2:7]
+
+
+class ParameterRows(list[dict[str, Any]]):
+    """The rows without pandas: a list of dictionaries, which a notebook shows as a table."""
+
+    def _repr_html_(self) -> str:
+        cells = [
+            [
+                code(row["part"]),
+                code(row["parameter"]),
+                *(number(row[key]) for key in _NUMBERS),
+                text(row["source"]),
+                text(row["unit"]),
+            ]
+            for row in self
+        ]
+        return table("Parameters", HEADERS, cells)
+
+
+def correlated_parameters(found: Fit) -> dict[int, tuple[int, float]]:
+    """Return drive parameters whose errors are strongly correlated with another's of the drive.
+
+    Args:
+        found: The fit.
+
+    Returns:
+        By number of the standard parameter, that of the other one and their correlation, of which
+        the size is above 0.95.
+    """
+    layout, C, at_bound = found.model.layout, found.standard_covariance, found.at_bound
+    pairs = {}
+    for drive in range(len(layout.drives)):
+        own = [
+            k
+            for k, (d, _) in enumerate(layout.drive_parameters, start=layout.n_inertial)
+            if d == drive and C[k, k] > 0 and not at_bound[k]
+        ]
+        error = np.sqrt(np.diag(C)[own])
+        R = C[np.ix_(own, own)] / np.outer(error, error) - np.eye(len(own))
+        for i, row in zip(own, R, strict=True):
+            k = int(np.argmax(np.abs(row)))
+            if abs(row[k]) > _CORRELATED:
+                pairs[i] = own[k], float(row[k])
+    return pairs
+
+
+def parameter_entries(found: Fit) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return the parameters of the bodies and those of the drives, as result.json has them.
+
+    Args:
+        found: The fit.
+    """
+    layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
+    errors, ends = found.standard_error, found.standard_interval
+    pairs = correlated_parameters(found)
+    entries = [
+        {
+            "name": name,
+            "value": float(found.standard[i]),
+            "std_error": _finite(errors[i]),
+            "interval_95": [_finite(end) for end in ends[i]],
+            "unit": layout.units[i],
+            "prior": float(found.prior[i]),
+            "source": sources[i],
+            "at_bound": bool(at_bound[i]),
+            **({"correlated_with": layout.names[pairs[i][0]]} if i in pairs else {}),
+        }
+        for i, name in enumerate(layout.names)
+    ]
+    return entries[: layout.n_inertial], entries[layout.n_inertial :]
+
+
+def parameter_table(
+    bodies: Iterable[Mapping[str, Any]], drives: Iterable[Mapping[str, Any]]
+) -> Any:  # noqa: ANN401
+    """Return the parameters of a result as a table, links first, then drives.
+
+    Args:
+        bodies: Parameters of the bodies, as of ``parameter_entries``.
+        drives: Those of the drives. What the URDF says of them is not used: it has no value.
+
+    Returns:
+        A pandas DataFrame if pandas is installed, else a list of dictionaries; of ``HEADERS``.
+        What has no value, as the standard error of a parameter at its bound, is None; NaN in a
+        DataFrame.
+    """
+    entries = [*bodies, *({**entry, "prior": None} for entry in drives)]
+    rows = ParameterRows()
+    for entry in entries:
+        part, _, parameter = entry["name"].rpartition(".")
+        low, high = entry.get("interval_95", (None, None))  # of results that lack it
+        values = [entry.get("prior"), entry["value"], entry.get("std_error"), low, high]
+        row = (part, parameter, *values, entry.get("source", ""), entry["unit"])
+        rows.append(dict(zip(HEADERS, row, strict=True)))
+    if find_spec("pandas") is None:
+        return rows
+    import pandas
+
+    frame = pandas.DataFrame(rows, columns=list(HEADERS))
+    return frame.astype(dict.fromkeys(_NUMBERS, float))
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

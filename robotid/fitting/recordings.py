@@ -1,0 +1,172 @@
+"""What an identification asks of its logs: their factors, their samples, their predictions."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, islice
+
+from robotid._typing import Array
+from robotid.fitting.survey import ReducedPiece, SurveyedLog
+from robotid.logs.data import Trajectory
+from robotid.regressor.base_parameters import BaseMapping, structural_mapping
+from robotid.regressor.factors import Factors, Reduction, compress_stretches, join_stretches
+from robotid.regressor.problem import Block, Problem, concatenate
+from robotid.regressor.used_rows import base_problem, independent_share
+from robotid.robot.model import RobotModel
+from robotid.workers.checkpoint import Checkpoint
+from robotid.workers.plan import WorkPlan
+
+__all__ = ["Recordings"]
+
+_STRETCHES = 48  # of all logs in memory: enough to see how much their scores scatter
+_CORRELATIONS = 10  # shortest stretch in correlation times of noise behind the filter
+_STRETCHES_IN_FILE = 64  # of each log in a file whose factors are kept apart
+_FACTORS = 2**26  # bytes of them all, if that leaves each log a few
+_FEW = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Recordings:
+    """The logs of an fit, each read in pieces as often as needed; or held in memory.
+
+    Attributes:
+        model: The robot.
+        mapping: Standard to base parameters.
+        fitted: Logs to fit.
+        kept: Logs kept apart.
+        plan: Who works on the pieces of logs in files; this process if None.
+        checkpoint: Where reductions are kept until the run is complete.
+        weights: Weights of the rows of each log to fit, shapes (N, n_rows); 1 if None.
+    """
+
+    model: RobotModel
+    mapping: BaseMapping
+    fitted: Sequence[SurveyedLog]
+    kept: Sequence[SurveyedLog] = ()
+    plan: WorkPlan | None = None
+    checkpoint: Checkpoint | None = None
+    weights: tuple[Array, ...] | None = None
+
+    @property
+    def is_held(self) -> bool:
+        """Whether all logs are in memory."""
+        return all(log.is_held for log in (*self.fitted, *self.kept))
+
+    @property
+    def share(self) -> float:
+        """Share of the fitted rows that count as independent [-]."""
+        return min(independent_share(log.signals) for log in self.fitted)
+
+    @property
+    def pieces(self) -> list[ReducedPiece]:
+        """The pieces of the logs to fit, in order."""
+        return [ReducedPiece(piece, self.mapping) for log in self.fitted for piece in log.pieces]
+
+    def with_model(self, model: RobotModel) -> "Recordings":
+        """Return the same logs of a robot whose drives have other terms or another load.
+
+        Args:
+            model: The robot, with the same bodies, joints and couplings.
+        """
+        is_same = model.layout == self.model.layout
+        return replace(
+            self,
+            model=model,
+            mapping=self.mapping if is_same else structural_mapping(model),
+            fitted=[log.with_model(model) for log in self.fitted],
+            kept=[log.with_model(model) for log in self.kept],
+            checkpoint=None,  # it holds the pieces of the first fit
+        )
+
+    def reduce(self) -> tuple[Reduction, ...]:
+        """Reduce the logs to fit.
+
+        Returns:
+            One reduction per stretch of a log, in order of time. A stretch of a log in memory is
+            longer than the correlation of filtered noise; one in a file is of neighbouring pieces.
+
+        Raises:
+            DataError: If a row cannot be used, or no stretch of a log is long enough.
+        """
+        if self.is_held:
+            for log in (*self.fitted, *self.kept):
+                log.whole  # noqa: B018 refused before any fit
+            return tuple(chain.from_iterable(map(self._stretches, range(len(self.fitted)))))
+        plan = self.plan or WorkPlan()
+        found = iter(plan.reduce(self.pieces, checkpoint=self.checkpoint))
+        reductions = []
+        size = 8 * self.model.n_rows * (len(self.mapping.independent) + 1) ** 2 * len(self.fitted)
+        most = max(_FEW, min(_STRETCHES_IN_FILE, _FACTORS // size))
+        for log in self.fitted:
+            count = len(log.pieces)
+            own = join_stretches(islice(found, count), count, most)
+            if not any(reduction.samples for reduction in own):
+                raise log.too_short()
+            reductions += own
+        return tuple(reductions)
+
+    def problem(self, *, with_mass: bool = False) -> Problem:
+        """Return the rows of the logs to fit, for estimators that read them in order of time.
+
+        Args:
+            with_mass: Whether each sample also carries the regressor of its mass matrix.
+
+        Returns:
+            The base problem; of logs in files in blocks only: each pass reads them anew.
+        """
+        if self.is_held:
+            motions = [log.whole.trajectory for log in self.fitted]
+            return concatenate([self._problem(k, x, with_mass) for k, x in enumerate(motions)])
+
+        def problems() -> Iterator[Problem]:
+            for piece in (piece for log in self.fitted for piece in log.pieces):
+                rows = piece.read()
+                yield base_problem(
+                    self.model, self.mapping, rows.trajectory, rows.mask, with_mass=with_mass
+                )
+
+        def stream() -> Iterator[Block]:
+            return chain.from_iterable(problem.blocks() for problem in problems())
+
+        def mass_stream() -> Iterator[Array]:
+            for problem in problems():
+                yield from problem.mass_stream() if problem.mass_stream is not None else ()
+
+        return Problem(
+            stream,
+            self.mapping.base_names,
+            self.model.n_rows,
+            self.model.support()[:, self.mapping.independent],
+            mass_stream if with_mass else None,
+        )
+
+    def segments(self, k: int, motion: Trajectory, joined: int = 1) -> tuple[Factors, ...]:
+        """Return the factors of each segment of a log in memory, as ``reduce`` cuts it.
+
+        Args:
+            k: Which of the logs to fit.
+            motion: Its smooth motion, or another one of as many samples; the rows used and their
+                weights are those of its own.
+            joined: How many of the segments are one.
+        """
+        return compress_stretches(self._problem(k, motion), joined * self._length(k))
+
+    def _problem(self, k: int, motion: Trajectory, with_mass: bool = False) -> Problem:
+        """Return the rows of a log in memory, weighted, on a motion of as many samples."""
+        mask = self.fitted[k].whole.mask
+        weight = mask if self.weights is None else mask * self.weights[k]
+        return base_problem(self.model, self.mapping, motion, weight, with_mass=with_mass)
+
+    def _length(self, k: int) -> int:
+        """Return the samples of each segment of a log in memory."""
+        samples, count = len(self.fitted[k].whole.trajectory.t), -(-_STRETCHES // len(self.fitted))
+        shortest = round(_CORRELATIONS / independent_share(self.fitted[k].signals))
+        if self.model.is_static:  # means of stretches, behind no filter
+            shortest = 1
+        return max(-(-samples // count), shortest)
+
+    def _stretches(self, k: int) -> Iterator[Reduction]:
+        """Yield what each stretch of a log in memory comes down to."""
+        motion, length = self.fitted[k].whole.trajectory, self._length(k)
+        for i, factors in enumerate(self.segments(k, motion)):
+            part = motion.part(i * length, (i + 1) * length)
+            yield Reduction(factors, part.squares, len(part.t))

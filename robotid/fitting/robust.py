@@ -1,0 +1,208 @@
+"""Fits that a few bad rows do not move: iteratively reweighted least squares; outliers by name."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.estimators import WLS
+from robotid.exceptions import NotConvergedError, SettingsError
+from robotid.fitting.evaluation import Evaluation
+from robotid.fitting.recordings import Recordings
+from robotid.regressor.factors import Reduction, join
+from robotid.regressor.prediction import predict
+from robotid.robot.drives import DriveMotion
+from robotid.robot.model import RobotModel
+
+__all__ = ["LOSSES", "Outlier", "find_outliers", "loss_slope", "loss_weight", "reweigh"]
+
+#: Losses with a bounded influence of each row, and the bound of their quadratic part in standard
+#: deviations, for which they lose 5 % against least squares where noise is normal.
+LOSSES = {"huber": 1.345, "tukey": 4.685}
+_MAD = 1.4826  # standard deviations of normal noise per median absolute deviation
+_TOLERANCE = 1e-3  # change of the parameters in standard errors that ends the iteration
+_MAX_ITERATIONS = 50
+_OUTLIER = 12.0  # standard deviations from which a row is named
+_MATTERS = 0.1  # of the joint's torque, from which a row is named
+_NEAR = 0.5  # [s] rows closer than this are one outlier, smeared by the filter
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A row, or rows close to each other, that the fit does not explain.
+
+    Attributes:
+        log: The file.
+        joint: The joint.
+        t: Time of the worst row [s].
+        torque: Torque there, as filtered [N m or N].
+        predicted: Predicted torque [N m or N].
+        size: Their difference over the joint's usual residual [-].
+        rows: How many rows there are.
+    """
+
+    log: str
+    joint: str
+    t: float
+    torque: float
+    predicted: float
+    size: float
+    rows: int
+
+
+def loss_weight(loss: str, r: Array) -> Array:
+    """Return the weight psi(r) / r of rows in the equivalent least squares, from 0 to 1.
+
+    Args:
+        loss: "huber" or "tukey".
+        r: Residuals in standard deviations, any shape.
+
+    References:
+        Huber (1964), Robust estimation of a location parameter; Beaton, Tukey (1974), The fitting
+        of power series.
+    """
+    size, bound = np.abs(r), LOSSES[loss]
+    if loss == "huber":
+        weight: Array = bound / np.maximum(size, bound)
+        return weight
+    weight = np.maximum(1.0 - (size / bound) ** 2, 0.0) ** 2
+    return weight
+
+
+def loss_slope(loss: str, r: Array) -> Array:
+    """Return psi'(r), at most 1: how much a row still resists a change of the parameters.
+
+    Args:
+        loss: "huber" or "tukey".
+        r: Residuals in standard deviations, any shape.
+    """
+    u = (r / LOSSES[loss]) ** 2
+    slope: Array = np.where(u < 1.0, 1.0 if loss == "huber" else (1.0 - u) * (1.0 - 5.0 * u), 0.0)
+    return slope
+
+
+def reweigh(
+    recordings: Recordings, reductions: tuple[Reduction, ...], loss: str, prior: Array
+) -> tuple[Recordings, tuple[Reduction, ...], float]:
+    """Weigh rows down that fit badly, until the fit does not change any more.
+
+    The scale of each joint's residual is its median absolute deviation, which outliers hardly move.
+    "tukey", which ignores bad rows altogether, starts where "huber" ends, whose minimum is unique.
+
+    Args:
+        recordings: The recordings, in memory.
+        reductions: What they come down to without weights.
+        loss: "huber" or "tukey".
+        prior: Standard parameters of the URDF, shape (p,), kept where the data say nothing.
+
+    Returns:
+        The recordings with their rows' weights, what the weighted rows come down to, and by how
+        much they understate standard errors [-].
+
+    Raises:
+        NotConvergedError: If the weights do not settle.
+        SettingsError: If the recordings are not in memory.
+    """
+    if not recordings.is_held:
+        raise SettingsError(
+            f"robust is {loss!r}: its weights are found in several passes over rows in memory; "
+            "raise rows_in_memory in [reduction], cut the log with start and end, or leave it out"
+        )
+    mapping, weighted = recordings.mapping, recordings
+    wls = WLS(prior=mapping.to_base(prior))
+    for stage in ("huber",) if loss == "huber" else ("huber", "tukey"):
+        before = None
+        for _ in range(_MAX_ITERATIONS):
+            fit = wls.fit(join(reductions).factors)
+            if before is not None:
+                moved = np.abs(fit.theta - before) / np.maximum(fit.std_error, 1e-300)
+                if moved.max() < _TOLERANCE:
+                    break
+            before = fit.theta
+            residuals = _scaled_residuals(recordings, mapping.to_standard(fit.theta, prior))
+            weighted = replace(recordings, weights=tuple(loss_weight(stage, r) for r in residuals))
+            reductions = weighted.reduce()
+        else:
+            raise NotConvergedError(
+                f"the weights of the {stage} loss still change after {_MAX_ITERATIONS} passes; "
+                "look for logs of different robots, or use robust = 'none'",
+                "max_iterations",
+            )
+    used = np.concatenate([log.whole.mask.ravel() for log in recordings.fitted])
+    scaled = np.concatenate([r.ravel() for r in residuals])[used]
+    weight = loss_weight(loss, scaled)
+    slope = max(float(loss_slope(loss, scaled).mean()), 1e-3)
+    return weighted, reductions, float(weight.mean()) / slope
+
+
+def find_outliers(
+    model: RobotModel, evaluations: Sequence[Evaluation], standard: Array
+) -> tuple[Outlier, ...]:
+    """Return the rows that the fit does not explain, the worst first.
+
+    Near a change of direction a row may also be off by the step of Coulomb friction: where a drive
+    sticks, its friction is anywhere between the two bounds.
+
+    Args:
+        model: The robot.
+        evaluations: Recordings with the torque that the estimate predicts.
+        standard: The estimate, shape (p,).
+
+    Returns:
+        Outliers of 12 times the joint's usual residual and 10 % of its torque, and more; rows
+        within half a second of each other are one.
+    """
+    found: list[Outlier] = []
+    step = _friction_step(model, standard)
+    for e in evaluations:
+        motion, mask, prediction = e.recording.trajectory, e.recording.mask, e.torques["estimate"]
+        scales = _scales([motion.tau - prediction], [mask])
+        turning = np.abs(motion.v) <= np.abs(motion.a) / (e.recording.signals.cutoff or np.inf)
+        excess = np.abs(motion.tau - prediction) - np.where(turning, step, 0.0)
+        rms = np.sqrt(np.mean(motion.tau**2, axis=0))
+        sizes = np.where(excess >= _MATTERS * rms, excess / scales, 0.0)
+        for j, joint in enumerate(model.row_names):
+            rows = np.flatnonzero((sizes[:, j] >= _OUTLIER) & mask[:, j])
+            edges = np.flatnonzero(np.diff(motion.t[rows]) > _NEAR) + 1
+            for i, k in pairwise([0, *edges.tolist(), len(rows)] if len(rows) else []):
+                worst = rows[i:k][np.argmax(sizes[rows[i:k], j])]
+                log, at = Path(e.recording.log.path).name or "log", float(motion.t[worst])
+                tau, wanted, size = (float(x[worst, j]) for x in (motion.tau, prediction, sizes))
+                found.append(Outlier(log, joint, at, tau, wanted, size, k - i))
+    return tuple(sorted(found, key=lambda outlier: -outlier.size))
+
+
+def _friction_step(model: RobotModel, standard: Array) -> Array:
+    """Return how much torque a change of direction adds to each row, shape (n_rows,)."""
+    layout, still, step = model.layout, np.zeros(1), np.zeros(model.n_rows)
+    forth, back = (
+        DriveMotion(still, still, still, sign * np.ones(1), still, still) for sign in (1.0, -1.0)
+    )
+    change = [(x.column(forth) - x.column(back)).item() for _, x in layout.drive_parameters]
+    theta = standard[layout.n_inertial :]
+    step[model.n_rows - len(model.joints) :] = np.abs(layout.drive_loads * theta) @ np.abs(change)
+    return step
+
+
+def _scaled_residuals(recordings: Recordings, standard: Array) -> list[Array]:
+    """Return the residuals of each recording in standard deviations of their joint."""
+    rows = [log.whole for log in recordings.fitted]
+    motions = [r.trajectory for r in rows]
+    residuals = [m.tau - predict(recordings.model, [standard], m)[0] for m in motions]
+    scales = _scales(residuals, [r.mask for r in rows])
+    return [residual / scales for residual in residuals]
+
+
+def _scales(residuals: Sequence[Array], masks: Sequence[Array]) -> Array:
+    """Return the scale of each joint's residual, from its median size over the rows used."""
+    scales = []
+    for j in range(residuals[0].shape[1]):
+        used = [r[mask[:, j], j] for r, mask in zip(residuals, masks, strict=True)]
+        together = np.concatenate(used)
+        scales.append(_MAD * float(np.median(np.abs(together))) if len(together) else np.inf)
+    # data without noise leave residuals of rounding size, in which nothing is an outlier
+    torque = max(float(np.abs(r).max()) for r in residuals)
+    return np.maximum(scales, max(1e-9 * torque, 1e-300))

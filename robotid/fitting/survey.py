@@ -1,0 +1,517 @@
+"""Logs of any length: surveyed once, then read in pieces. A log in memory is one piece.
+
+The survey of a file reads the time stamps of all rows and a few windows of the rest, and decides
+everything automatic for the whole log. A piece is a fixed stretch of rows, read with rows around
+it.
+"""
+
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.fitting.velocity_choice import prefers_measured
+from robotid.logs.data import Log, Trajectory
+from robotid.logs.formats import open_table
+from robotid.logs.read import LogLayout
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import decide, unwrap
+from robotid.logs.smoothing import SPLINE, Stretch, filter_reach, process_stretches, too_short
+from robotid.logs.table import Place, RowReader, Table, prefixes
+from robotid.logs.time_stamps import blocks_of, map_stamps, median_step
+from robotid.logs.units import check_reach, check_units
+from robotid.regressor.base_parameters import BaseMapping
+from robotid.regressor.columns import friction_speeds
+from robotid.regressor.factors import Reduction
+from robotid.regressor.memory import remember
+from robotid.regressor.rows import COMPILED, choose_engine
+from robotid.regressor.used_rows import base_problem, row_mask, static_rows
+from robotid.robot.model import RobotModel
+from robotid.workers.pieces import Piece, Workload
+
+__all__ = [
+    "PIECE",
+    "LogPiece",
+    "PieceTask",
+    "ReducedPiece",
+    "Rows",
+    "SurveyedLog",
+    "hold_log",
+    "survey_log",
+]
+
+#: Rows of a piece, if nothing else is said.
+PIECE = 16384
+_WINDOW = 20_000  # rows of each window that is looked at closely
+
+
+@dataclass(frozen=True, eq=False)
+class _Header:
+    """What the pieces of a log have in common; the source is the log itself if it is in memory."""
+
+    model: RobotModel
+    source: LogLayout | Log
+    signals: SignalSettings
+    samples: int
+
+    def read(self, first: int, stop: int, near: Place) -> Log:
+        """Return rows as a log in SI units, full turns left in; all of them in memory."""
+        if isinstance(self.source, Log):
+            return self.source
+        layout = self.source
+        reader = _reader(open_table(Path(layout.path), layout.source), layout.wanted)
+        return _log_of(layout, reader.read(layout.wanted, first, stop, near), first)
+
+    @property
+    def is_compiled(self) -> bool | None:
+        """Whether the compiled path computes rows of a file: chosen for the log, not by piece."""
+        if isinstance(self.source, Log):
+            return None  # by the samples of its one piece
+        return choose_engine(self.model, self.samples, None) == COMPILED
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """What was read of a piece."""
+
+    positions: Array  # (samples, n), as recorded, full turns left in [rad or m]
+    torques: Array  # (samples, n), as recorded [N m or N]
+    trajectory: Trajectory  # its smooth motion, of no samples if none is left
+    mask: Array  # (N, n_rows), bool: rows of the motion that are used
+    turned: Array  # (n,), bool: joints whose full turns were taken out
+
+
+@dataclass(frozen=True, eq=False)
+class LogPiece:
+    """A stretch of rows of a log, with what is needed to read it and to smooth it as the whole."""
+
+    header: _Header  # what the pieces of the log have in common
+    first: int  # its first row
+    stop: int  # the row after its last one
+    span: tuple[int, int]  # first row that is read with it, and the row after the last one
+    near: Place  # where in the file the span starts, or a little before
+    stretches: tuple[Stretch, ...]  # the uninterrupted ones that it has rows of
+
+    @property
+    def name(self) -> str:
+        """What messages call it, as ``run3.parquet rows 0-16384``."""
+        return f"{Path(self.header.source.path).name} rows {self.first}-{self.stop}"
+
+    @property
+    def samples(self) -> int:
+        """Number of its rows."""
+        return self.stop - self.first
+
+    def read(self) -> Rows:
+        """Return its rows and its smooth motion; those of a log in memory are kept.
+
+        Raises:
+            DataError: If a row cannot be used.
+        """
+        return self._kept if isinstance(self.header.source, Log) else self._read()
+
+    def take(self, rows: Rows) -> None:
+        """Keep rows that were smoothed before, of a robot with the same friction speeds.
+
+        Args:
+            rows: The rows.
+        """
+        model, mask = self.header.model, rows.mask
+        motion = remember(model, replace(rows.trajectory, memory=None))
+        if not model.is_static:  # whose stands were chosen with their speeds
+            mask = row_mask(model, motion, self.header.signals.min_velocity)
+        vars(self)["_kept"] = replace(rows, trajectory=motion, mask=mask)
+
+    @cached_property
+    def _kept(self) -> Rows:
+        return self._read()
+
+    def _read(self) -> Rows:
+        header = self.header
+        raw = header.read(*self.span, self.near)
+        log = _unwrap(header.model, raw)
+        rows = slice(self.first - self.span[0], self.stop - self.span[0])
+        if header.model.is_static:
+            trajectory, mask = static_rows(header.model, log, header.signals)
+        else:
+            trajectory = process_stretches(
+                log,
+                self.stretches,
+                header.signals,
+                first=self.span[0],
+                own=slice(self.first, self.stop),
+                speeds=friction_speeds(header.model.layout),
+            )
+            mask = row_mask(header.model, trajectory, header.signals.min_velocity)
+        trajectory = remember(header.model, trajectory)
+        return Rows(raw.q[rows], raw.tau[rows], trajectory, mask, (log.q != raw.q).any(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class PieceTask(Workload):
+    """Something to do with a piece of a log."""
+
+    piece: LogPiece
+
+    @property
+    def name(self) -> str:
+        return self.piece.name
+
+    @property
+    def samples(self) -> int:
+        return self.piece.samples
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedPiece(PieceTask, Piece):
+    """A piece to be reduced to factors of base parameters."""
+
+    mapping: BaseMapping
+
+    def reduce(self, *, threads: int | None = None) -> Reduction:
+        header, rows = self.piece.header, self.piece.read()
+        motion, compiled = rows.trajectory, header.is_compiled
+        problem = base_problem(header.model, self.mapping, motion, rows.mask, compiled=compiled)
+        return Reduction.of(problem, motion, threads=threads)
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyedLog:
+    """A log ready to be read in pieces.
+
+    Attributes:
+        model: The robot.
+        source: The log if it is in memory, else which columns of its file make it up.
+        asked: How it becomes a trajectory, as the user gave it.
+        stamps: Time stamps of all rows of the file, shape (N,) [s].
+        first: Its first row in the file, of the window.
+        stop: The row after its last one.
+        windows: Stretches of rows that were looked at closely: all, or first, middle and last ones.
+        held: Positions in them of locked joints that the file has, by name [rad or m].
+        length: Rows per piece.
+        places: Where rows of the file start.
+    """
+
+    model: RobotModel
+    source: LogLayout | Log
+    asked: SignalSettings
+    stamps: Array
+    first: int
+    stop: int
+    windows: tuple[Log, ...]
+    held: Mapping[str, Array] = field(default_factory=dict)
+    length: int = PIECE
+    places: Sequence[Place] = (Place(),)
+
+    @property
+    def path(self) -> str:
+        """The file; "" if it was made in memory."""
+        return self.source.path
+
+    @property
+    def is_held(self) -> bool:
+        """Whether it is in memory."""
+        return isinstance(self.source, Log)
+
+    @property
+    def head(self) -> Log:
+        """The first rows, with the notes on the log."""
+        log = self.windows[0]
+        if len(self.windows) == 1:
+            return log
+        looks = ", ".join(f"{first}-{stop}" for first, stop in _close_looks(self.first, self.stop))
+        note = f"too long to be in memory at once; the doctor looked at rows {looks} only"
+        return replace(log, notes=(*log.notes, note))
+
+    @property
+    def looks(self) -> tuple[Log, ...]:
+        """The windows as logs of their own, named by their rows if they are not all rows."""
+        if len(self.windows) == 1:
+            return self.windows
+        ranges = _close_looks(self.first, self.stop)
+        return tuple(
+            replace(log, path=f"{log.path} rows {first}-{stop}", notes=())
+            for log, (first, stop) in zip(self.windows, ranges, strict=True)
+        )
+
+    @cached_property
+    def step(self) -> float:
+        """Median time step [s]."""
+        return median_step(self.stamps[self.first : self.stop])
+
+    @cached_property
+    def signals(self) -> SignalSettings:
+        """How it becomes a trajectory, everything automatic decided for the whole log.
+
+        Raises:
+            DataError: If measured velocity or acceleration is asked for and the log has none.
+            SettingsError: If a setting does not fit the log.
+        """
+
+        def is_trusted() -> bool:
+            return prefers_measured(
+                self.model, [_unwrap(self.model, log) for log in self.windows], self.asked
+            )
+
+        v, a = self.windows[0].v, self.windows[0].a
+        return decide(
+            self.asked,
+            self.step,
+            self.path or "log",
+            has_velocity=v is not None,
+            has_acceleration=a is not None,
+            is_trusted=is_trusted,
+        )
+
+    @cached_property
+    def stretches(self) -> tuple[Stretch, ...]:
+        """Its uninterrupted stretches."""
+        edges = [self.first]
+        for row, t in blocks_of(self.stamps[self.first : self.stop]):
+            breaks = np.flatnonzero(np.diff(t) > (self.signals.max_gap or np.inf)) + 1
+            edges += (self.first + row + breaks).tolist()
+        return tuple(
+            Stretch(i, j, float(self.stamps[i]), float(self.stamps[j - 1]), number)
+            for number, (i, j) in enumerate(pairwise([*edges, self.stop]))
+        )
+
+    def with_model(self, model: RobotModel) -> "SurveyedLog":
+        """Return the log of a robot whose drives have other terms or another load.
+
+        Args:
+            model: The robot, with the same bodies, joints and couplings.
+        """
+        other = replace(self, model=model, asked=self.signals)
+        if self.is_held and np.array_equal(
+            friction_speeds(model.layout), friction_speeds(self.model.layout)
+        ):
+            for piece, own in zip(other.pieces, self.pieces, strict=True):
+                piece.take(own.read())
+        return other
+
+    @property
+    def whole(self) -> Rows:
+        """All rows of a log in memory, and their smooth motion.
+
+        Raises:
+            DataError: If no stretch is long enough, or an angle jumps.
+        """
+        (piece,) = self.pieces
+        rows = piece.read()
+        if not len(rows.trajectory.t):
+            raise self.too_short()
+        return rows
+
+    def too_short(self) -> DataError:
+        """Return the error of a log without a stretch that is long enough."""
+        if self.model.is_static:
+            return DataError(
+                f"{self.path or 'log'}: no stretch of a quarter of a second is slow enough for "
+                "dynamics = 'static'; record poses that are held for a second or longer, or slow "
+                "motion at one speed, or set dynamics = 'full'",
+                code="too_short",
+            )
+        return too_short(self.path or "log", len(self.stretches), self.signals)
+
+    @cached_property
+    def pieces(self) -> tuple[LogPiece, ...]:
+        """Its pieces, in order, each with the rows that are read around it."""
+        stamps, stretches, window = self.stamps, self.stretches, (self.first, self.stop)
+        header = _Header(self.model, self.source, self.signals, self.stop - self.first)
+        reach = filter_reach(self.signals)
+        begins, found = [stretch.first for stretch in stretches], list[LogPiece]()
+        for first in range(*window, self.length):
+            stop = min(first + self.length, window[1])
+            mine = stretches[bisect_right(begins, first) - 1 : bisect_right(begins, stop - 1)]
+            before = int(np.searchsorted(stamps, stamps[first] - reach)) - SPLINE
+            after = int(np.searchsorted(stamps, stamps[stop - 1] + reach)) + SPLINE
+            span = max(before, mine[0].first), min(after, mine[-1].stop)
+            if span[1] - span[0] < 2:  # a lonely row, with another one: a log has two
+                low = max(span[0] - 1, window[0])
+                span = low, low + 2
+            near = _near(self.places, span[0])
+            found.append(LogPiece(header, first, stop, span, near, tuple(mine)))
+        return tuple(found)
+
+
+def hold_log(
+    model: RobotModel, log: Log, signals: SignalSettings, held: Mapping[str, Array] | None = None
+) -> SurveyedLog:
+    """Return a log in memory, ready to be read as one piece; its faults are told as it is read.
+
+    Args:
+        model: The robot.
+        log: The log, of the model's joints in its order.
+        signals: How it becomes a trajectory.
+        held: Positions of locked joints, if it has them, by name [rad or m].
+    """
+    count = len(log.t)
+    if model.is_static:  # means of stretches take the place of filters
+        signals = replace(
+            signals, cutoff=None, rate=None, velocity="differentiated",
+            acceleration="differentiated",
+        )  # fmt: skip
+    return SurveyedLog(model, log, signals, log.t, 0, count, (log,), held or {}, count)
+
+
+def survey_log(
+    layout: LogLayout,
+    table: Table,
+    model: RobotModel,
+    signals: SignalSettings,
+    window: tuple[float | None, float | None] = (None, None),
+    *,
+    length: int | None = PIECE,
+) -> SurveyedLog:
+    """Return a log in a file, ready to be read.
+
+    Every time stamp is checked. Units, and how late the measured velocity is, are judged in the
+    windows; what each piece reads is checked as it is read.
+
+    Args:
+        layout: Which columns of the file make up the log.
+        table: The file, opened.
+        model: The robot.
+        signals: How the log becomes a trajectory.
+        window: First and last time stamp kept, on the log's own clock [s]; None for the ends.
+        length: Rows per piece; None: the log is read at once and kept in memory. A file that is
+            only read whole is one piece.
+
+    Raises:
+        DataError: If time does not increase, the window holds fewer than two rows, or units are
+            suspect.
+    """
+    held = _held_columns(layout, table, model)
+    wanted = list(dict.fromkeys([*layout.wanted, *held.values()]))
+    if length is None:
+        columns = table.read(wanted)
+        log = layout.to_log(columns)
+        check_units(log, layout.units, layout.prismatic)
+        kept = log if window == (None, None) else log.window(*window)
+        inside = slice(*np.searchsorted(log.t, [kept.t[0], np.nextafter(kept.t[-1], np.inf)]))
+        positions = _positions(held, [columns], layout, model, inside)
+        return hold_log(model, kept, signals, positions)
+    reader, places, where = _reader(table, wanted), list[Place](), Path(layout.path).name
+    stamps = map_stamps(_stamps(reader, layout, places), where)
+    first, stop = _window(stamps, where, *window)
+    ranges = _close_looks(first, stop)
+    found = [reader.read(wanted, i, j, _near(places, i)) for i, j in ranges]
+    windows = tuple(_log_of(layout, x, i) for x, (i, _) in zip(found, ranges, strict=True))
+    for log in windows:
+        check_units(log, layout.units, layout.prismatic)
+    positions = _positions(held, found, layout, model)
+    if table.rows is None:
+        length = max(stop - first, 1)
+    return SurveyedLog(
+        model, layout, signals, stamps, first, stop, windows, positions, length, places
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _WholeTable(RowReader):
+    """Rows of a file that is only read whole."""
+
+    table: Table
+    wanted: Sequence[str]
+
+    def count(self) -> int:
+        return len(next(iter(self._columns.values())))
+
+    def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
+        yield self._columns[name], Place()
+
+    def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
+        return {name: self._columns[name][first:stop] for name in wanted}
+
+    @cached_property
+    def _columns(self) -> dict[str, Array]:
+        return self.table.read(self.wanted)
+
+
+def _reader(table: Table, wanted: Sequence[str]) -> RowReader:
+    return _WholeTable(table, wanted) if table.rows is None else table.rows
+
+
+def _log_of(layout: LogLayout, columns: Mapping[str, Array], first: int) -> Log:
+    """Return rows of a file as a log in SI units, full turns left in."""
+    log = layout.to_log(columns, first)
+    check_reach(log, layout.units, layout.prismatic)
+    return log
+
+
+def _unwrap(model: RobotModel, log: Log) -> Log:
+    """Return the log without full turns."""
+    return unwrap(log, np.array([joint.turns_freely for joint in model.limits]))
+
+
+def _stamps(rows: RowReader, layout: LogLayout, places: list[Place]) -> Iterator[Array]:
+    """Yield the time stamps in seconds, and note where the rows of each block are."""
+    for values, place in rows.scan(layout.columns["time"][0]):
+        places.append(place)
+        yield layout.stamps(values)
+
+
+def _near(places: Sequence[Place], row: int) -> Place:
+    return places[max(bisect_right(places, row, key=lambda place: place.row) - 1, 0)]
+
+
+def _window(stamps: Array, where: str, start: float | None, end: float | None) -> tuple[int, int]:
+    """Return the rows from start to end; see ``Log.window``."""
+    count = len(stamps)
+    if count < 2:
+        raise DataError(f"{where} has {count} rows, wanted at least 2")
+    first = 0 if start is None else int(np.searchsorted(stamps, start))
+    stop = count if end is None else int(np.searchsorted(stamps, end, side="right"))
+    if stop - first < 2:
+        low, high = stamps[0], stamps[-1]
+        raise DataError(
+            f"{where}: {max(stop - first, 0)} rows lie between "
+            f"{low if start is None else start:g} s and {high if end is None else end:g} s; "
+            f"the log spans {low:g} s to {high:g} s. Choose start and end inside it"
+        )
+    return first, stop
+
+
+def _close_looks(first: int, stop: int) -> list[tuple[int, int]]:
+    """Return the first, middle and last rows; all, if they are few."""
+    if stop - first <= 3 * _WINDOW:
+        return [(first, stop)]
+    middle = (first + stop - _WINDOW) // 2
+    return [(row, row + _WINDOW) for row in (first, middle, stop - _WINDOW)]
+
+
+def _held_columns(layout: LogLayout, table: Table, model: RobotModel) -> dict[str, str]:
+    """Return the columns of locked joints' positions that a file has and no one reads otherwise."""
+    found = {}
+    for joint in model.locked:
+        named = layout.source.joints.get(joint, joint)
+        names = [prefix + named for prefix in prefixes()["q"] if prefix + named in table.names]
+        if names:
+            found[joint] = names[0]
+    return found
+
+
+def _positions(
+    held: Mapping[str, str],
+    windows: Sequence[Mapping[str, Array]],
+    layout: LogLayout,
+    model: RobotModel,
+    inside: slice = slice(None),
+) -> dict[str, Array]:
+    """Return the positions of locked joints that were read, in rad or m."""
+    turning = {joint.name for joint in model.tree.movable if joint.type != "prismatic"}
+    positions = {}
+    for joint, column in held.items():
+        q = np.concatenate([columns[column] for columns in windows])[inside]
+        q = q[np.isfinite(q)]
+        if joint in turning and layout.units.angle == "deg":
+            q = np.deg2rad(q)
+        if len(q):
+            positions[joint] = q
+    return positions

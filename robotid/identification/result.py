@@ -1,0 +1,200 @@
+"""An identification: a fit, and what is concluded of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from robotid._settings import Settings, require_kind
+from robotid.diagnosis.misfit import Misfit
+from robotid.diagnosis.torque_split import joint_torques
+from robotid.exceptions import DataError
+from robotid.findings import Finding, listed
+from robotid.fitting.evaluation import Evaluation, hidden_joints
+from robotid.fitting.parameter_table import parameter_entries, parameter_table
+from robotid.fitting.result import Fit
+from robotid.identification.pictures import friction_chart, shown_evaluation, torque_charts
+from robotid.identification.summary import (
+    identification_html,
+    identification_line,
+    identification_text,
+)
+from robotid.identification.why_pictures import why_charts
+from robotid.judgement.verdict import Doubt, Verdict, judge
+from robotid.judgement.witness import Witness, call_witness
+from robotid.logs.data import suggestion
+from robotid.logs.settings import SignalSettings
+from robotid.pages.plots import Plot
+from robotid.robot.drives import AUTO
+
+__all__ = ["Asked", "Identification"]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What an identification was asked for, beside robot, logs and estimator.
+
+    Attributes:
+        signals: How logs become trajectories.
+        friction: As of ``identify``.
+        ignore: As of ``identify``.
+        job: The job that was run; None if there was none.
+    """
+
+    signals: SignalSettings = field(default_factory=SignalSettings)
+    friction: str | Mapping[str, str] = AUTO
+    ignore: tuple[str, ...] = ()
+    job: Settings | None = None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification(Fit):
+    """Everything that an identification found.
+
+    Attributes:
+        findings: What the user should know of the robot, of the logs and of the fit.
+        alarms: Faults of the recordings that make the result wrong, as the doctor found them.
+        doubts: Why it may be wrong however well it predicts, as the doctor and the fit found.
+        report: File of the report, if one was written with the result.
+        misfits: Terms that the model of its drives still lacks.
+        on_misfit: Names of drive parameters whose errors grew by these.
+        asked: Signals, friction and findings to ignore, as they were asked for.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    alarms: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
+    report: str = ""
+    misfits: tuple[Misfit, ...] = ()
+    on_misfit: tuple[str, ...] = ()
+    asked: Asked = field(default_factory=Asked)
+
+    def __repr__(self) -> str:
+        return identification_line(self)
+
+    def _repr_html_(self) -> str:
+        return identification_html(self)
+
+    def summary(self) -> str:
+        """Return verdict, reasons and errors by joint as text."""
+        return identification_text(self)
+
+    __str__ = summary
+
+    def table(self) -> Any:  # noqa: ANN401
+        """Return the standard parameters as a table: a row for each, links first, then drives.
+
+        Returns:
+            A pandas DataFrame if pandas is installed, else a list of dictionaries. Columns:
+            "part" (link or drive), "parameter", "urdf", "value", "std_error", "low" and "high"
+            (95 % interval), "source" (as of ``sources``), "unit". A URDF has no value of drives
+            that is used, and a parameter at its bound no standard error: None, or NaN in a
+            DataFrame.
+        """
+        return parameter_table(*parameter_entries(self))
+
+    def plot_torques(self, *joints: str, recording: Evaluation | None = None) -> Plot:
+        """Return charts of measured and identified torque over time, and of the residual.
+
+        Args:
+            joints: The joints; all if none is named.
+            recording: One of ``fitted`` or ``validation``; None: the first that was kept apart,
+                or the first fitted without any.
+
+        Returns:
+            Charts that a notebook shows, and that ``.write("torques.html")`` keeps.
+
+        Raises:
+            DataError: If there is no such joint.
+        """
+        require_kind(
+            recording, (Evaluation, type(None)), "recording", "one of fitted or validation, or none"
+        )
+        shown = shown_evaluation(self) if recording is None else recording
+        band, rows = (
+            self.band(shown),
+            [self._row(joint) for joint in joints or self.model.row_names],
+        )
+        charts = []
+        for row in rows:
+            torque, residual = torque_charts(self, shown, row, band=band)
+            name = self.model.row_names[row]
+            charts += [(torque, f"{name}: torque"), (residual, f"{name}: residual")]
+        return Plot(f"Torques of {shown.recording.name}", tuple(charts))
+
+    def plot_friction(self, *joints: str) -> Plot:
+        """Return charts of friction against speed, measured and identified, with its band.
+
+        Args:
+            joints: The joints; all if none is named.
+
+        Returns:
+            Charts that a notebook shows, and that ``.write("friction.html")`` keeps.
+
+        Raises:
+            DataError: If there is no such joint, or none that moved.
+        """
+        names = [self.model.row_names[self._row(joint)] for joint in joints or self.model.joints]
+        charts = [(friction_chart(self, name), f"{name}: friction and offset") for name in names]
+        shown = tuple((chart, caption) for chart, caption in charts if chart is not None)
+        if not shown:
+            raise DataError(f"{listed(names)}: no rows used, so there is no friction to show")
+        return Plot(f"Friction of {listed(names)} against speed", shown)
+
+    def plot_why(self, joint: str) -> Plot:
+        """Return charts of what a joint's torque consists of, and of what its residual follows.
+
+        Args:
+            joint: The joint.
+
+        Returns:
+            Charts that a notebook shows, and that ``.write("why.html")`` keeps.
+
+        Raises:
+            DataError: If there is no such joint.
+        """
+        torque = joint_torques(self)[self._row(joint)]
+        charts = why_charts(torque)
+        about = {name: f"residual against {name}" for name in charts}
+        about |= {"split": torque.sentence, "power": "mechanical power"}
+        shown = tuple((chart, f"{joint}: {about[name]}") for name, chart in charts.items())
+        return Plot(f"Why {joint} is predicted as it is", shown)
+
+    def _row(self, joint: str) -> int:
+        """Return the number of a joint's torque row."""
+        require_kind(joint, str, "joint", "the name of a joint")
+        names = self.model.row_names
+        if joint not in names:
+            raise DataError(
+                f"joint {joint!r} is not among those identified: {listed(names)}"
+                f"{suggestion(joint, names)}"
+            )
+        return names.index(joint)
+
+    @property
+    def has_urdf(self) -> bool:
+        """Whether a URDF may be written of it: it is possible, and no fault makes it wrong."""
+        return self.is_consistent and not self.alarms
+
+    @cached_property
+    def witness(self) -> Witness:
+        """Gravity and masses against the URDF's: what speaks for the scale but the sensors."""
+        return call_witness(self)
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """How far to trust the result."""
+        return judge(
+            self.metrics(),
+            self.predictions,
+            undetermined=self.determination.undetermined,
+            is_poorly_excited=self.is_poorly_excited,
+            is_consistent=self.is_consistent,
+            joints=self.model.joints,
+            alarms=self.alarms,
+            doubts=self.doubts,
+            refitted=[e.recording.name for e in self.refitted],
+            witness=self.witness,
+            is_static=self.model.is_static,
+            hidden=hidden_joints(self.model, self.fitted),
+        )

@@ -1,0 +1,214 @@
+"""What speaks for the scale of a result but the torque sensors: the URDF's gravity and masses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.findings import listed
+from robotid.fitting.result import Fit
+from robotid.regressor.prediction import predict
+from robotid.regressor.torque import joint_torque_regressor
+
+__all__ = ["Witness", "call_witness"]
+
+_POSES = 300  # at which gravity is compared
+_LOADED = 0.02  # share of the largest gravity torque that a joint must hold to be compared
+_KNOWN = 0.1  # standard error of a ratio that says something
+_AGREES = 0.05  # farther from 1 than this, gravity and total mass bear no witness
+_HELD_BACK = 1.5  # a residual over that of weighted least squares beyond this is the prior's doing
+_ANOTHER = 0.35  # ... and farther than this, they speak against it
+_OFF = 0.1  # a factor of all torques at least so far from 1 is told from one of single masses,
+_CLEARLY = 4.0  # if it is so many times what it leaves unexplained of gravity
+_BETTER = 0.5  # and leaves less than this share of what a payload leaves
+
+
+@dataclass(frozen=True)
+class Witness:
+    """The identified gravity and masses against the URDF's.
+
+    Attributes:
+        gravity: By joint that bears a load, identified over URDF's gravity torque [-].
+        gravity_error: Their standard errors.
+        scale: The same of all joints together beside a payload; None if gravity loads none.
+        factor: The same without a payload.
+        unexplained: Share of the identified gravity that one factor leaves, and that a payload
+            leaves [-].
+        masses: Total mass of the URDF, as identified, and of that payload [kg].
+        is_stated: Whether a mass is stated, which is a witness by itself.
+        friction: Share of each joint's torque that viscous and Coulomb friction make up [-].
+        follows: Whether the result follows the data as weighted least squares does: one that its
+            prior holds back agrees with the URDF whatever the sensors say.
+    """
+
+    gravity: Mapping[str, float] = field(default_factory=dict)
+    gravity_error: Mapping[str, float] = field(default_factory=dict)
+    scale: float | None = None
+    factor: float = 1.0
+    unexplained: tuple[float, float] = (0.0, 0.0)
+    masses: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    is_stated: bool = False
+    friction: Mapping[str, float] = field(default_factory=dict)
+    follows: bool = True
+
+    @property
+    def agrees(self) -> bool:
+        """Whether gravity and total mass confirm the scale, or a mass is stated."""
+        is_near = self.scale is not None and self._off <= _AGREES
+        return self.is_stated or (is_near and self.follows)
+
+    @property
+    def is_against(self) -> bool:
+        """Whether they are so far off that the scale is in doubt."""
+        return not self.is_stated and (self._off > _ANOTHER or self.has_one_factor)
+
+    @property
+    def has_one_factor(self) -> bool:
+        """Whether one factor of all gravity explains it, as of the scale, not of single masses."""
+        left, beside = self.unexplained
+        return abs(self.factor - 1.0) > max(_OFF, _CLEARLY * left) and left < _BETTER * beside
+
+    @property
+    def figures(self) -> str:
+        """Gravity and total mass in words."""
+        before, after, _ = self.masses
+        mass = f"total mass {after:.4g} kg against the URDF's {before:.4g} kg"
+        if self.scale is None:
+            return f"gravity loads no joint, {mass}"
+        return f"gravity torque {self.factor:.2f} x the URDF's, {mass}"
+
+    @property
+    def message(self) -> str:
+        """What was confirmed, or what could not be checked and what to do."""
+        if self.is_stated:
+            return f"the scale rests on the mass that was stated: {self.figures}"
+        if self.agrees:
+            rests = "the scale of the torques rests on the URDF's gravity and total mass, which"
+            if self._off_whole <= _AGREES:
+                return f"{rests} agree within 5 %: {self.figures}"
+            before, after, payload = self.masses
+            return (
+                f"{rests} agree within 5 % only beside a load of {payload:+.3g} kg on the last "
+                f"link that the URDF does not have: without it gravity torque {self.scale:.2f} x "
+                f"the URDF's, total mass {after - payload:.4g} kg against the URDF's "
+                f"{before:.4g} kg; with it {self.figures}. If no such load was mounted, check the "
+                "gains of the torques"
+            )
+        hint = ""
+        if self.has_one_factor:
+            hint = (
+                f" All joints alike are off by {self.factor:.2f}: check the gains of the torques."
+            )
+        elif odd := [f"{j} {x:.2f}" for j, x in self.gravity.items() if abs(x - 1.0) > _ANOTHER]:
+            hint = f" Gravity over the URDF's by joint: {listed(odd)}."
+        return (
+            "the scale of torques, angles and time could not be checked, it rests on the sensors "
+            f"alone: {self.figures}.{hint} Weigh the robot and state total_mass"
+        )
+
+    @property
+    def _off(self) -> float:
+        """How far gravity and total mass are off, a payload left out if it explains them [-]."""
+        before, after, payload = self.masses
+        if not before > 0:
+            return np.inf
+        with_load = max(abs((after - payload) / before - 1.0), abs((self.scale or 1.0) - 1.0))
+        return min(with_load, self._off_whole)
+
+    @property
+    def _off_whole(self) -> float:
+        """How far gravity and total mass are off as they are [-]."""
+        before, after, _ = self.masses
+        if not before > 0:
+            return np.inf
+        return max(abs(after / before - 1.0), abs(self.factor - 1.0))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures as result.json has them."""
+        lists = {"unexplained": list(self.unexplained), "masses": list(self.masses)}
+        return asdict(self) | lists | {"agrees": self.agrees, "message": self.message}
+
+
+def call_witness(found: Fit) -> Witness:
+    """Return gravity and masses of a result against the URDF's.
+
+    With g_u and g the gravity torques of the URDF and of the result over the fitted poses, a
+    joint's ratio is g_u . g / g_u . g_u, linear in the base parameters: its standard error is that
+    of the covariance of the result.
+
+    Args:
+        found: What was identified.
+    """
+    model, size = found.model, found.model.layout.n_inertial
+    bounds = found.estimator.bounds
+    is_stated = bounds.total is not None or any(np.ptp(m) == 0 for m in bounds.masses.values())
+    before, after = (float(pi[:size:10].sum()) for pi in (found.prior, found.standard))
+    rubbing = _friction(found)
+    errors = [found.metrics(name).per_joint for name in ("estimate", "wls")]
+    follows = all(errors[0][j].rmse <= _HELD_BACK * free.rmse for j, free in errors[1].items())
+    plain = Witness(
+        masses=(before, after, 0.0), is_stated=is_stated, friction=rubbing, follows=follows
+    )
+    q = np.vstack([e.recording.trajectory.q for e in found.fitted])
+    if model.free_flyer:
+        return plain
+    q = q[:: -(-len(q) // _POSES)]
+    still = np.zeros_like(q)
+    G = joint_torque_regressor(model, q, still, still).reshape(len(q), model.n_rows, -1)
+    last = G[:, :, size - 10 : size - 6]  # m, mcx, mcy, mcz of the last body
+    G = G[:, :, found.mapping.independent]
+    at_rest = np.arange(len(found.prior)) < size
+    of_urdf, of_result = (
+        G @ found.mapping.to_base(np.where(at_rest, pi, 0.0))
+        for pi in (found.prior, found.standard)
+    )  # (N, n)
+    load = np.sum(of_urdf**2, axis=0)
+    if not load.any():
+        return plain
+    K = found.mapping.K * at_rest
+    covariance = K @ found.standard_covariance @ K.T
+    gravity, error = {}, {}
+    for j in np.flatnonzero(load > _LOADED**2 * load.max()).tolist():
+        w = of_urdf[:, j] @ G[:, j] / load[j]  # (b,), ratio = w beta
+        spread = float(np.sqrt(max(w @ covariance @ w, 0.0)))
+        if spread < _KNOWN:
+            gravity[model.row_names[j]] = float(of_urdf[:, j] @ of_result[:, j] / load[j])
+            error[model.row_names[j]] = spread
+    factor = float(np.sum(of_urdf * of_result) / load.sum())
+    scale, payload, left = _beside_payload(of_urdf, of_result, last)
+    rest = float(np.linalg.norm(of_result - factor * of_urdf) / np.linalg.norm(of_result))
+    return replace(
+        plain, gravity=gravity, gravity_error=error, scale=scale, factor=factor,
+        unexplained=(rest, left), masses=(before, after, payload),
+    )  # fmt: skip
+
+
+def _friction(found: Fit) -> dict[str, float]:
+    """Return which share of each joint's torque its friction makes up, root mean squares."""
+    layout = found.model.layout
+    is_friction = [name.endswith((".viscous", ".coulomb")) for name in layout.names]
+    pi = np.where(is_friction, found.standard, 0.0)
+    motions = [e.recording.trajectory for e in found.fitted]
+    torque = np.vstack([predict(found.model, [pi], motion)[0] for motion in motions])
+    measured = np.vstack([motion.tau for motion in motions])
+    share = np.linalg.norm(torque, axis=0) / np.maximum(np.linalg.norm(measured, axis=0), 1e-300)
+    return dict(zip(found.model.row_names, share.tolist(), strict=True))
+
+
+def _beside_payload(of_urdf: Array, of_result: Array, last: Array) -> tuple[float, float, float]:
+    """Return scale, mass of a payload and what a payload alone leaves of the gravity torque.
+
+    Args:
+        of_urdf: Gravity torque of the URDF, shape (N, n).
+        of_result: The same as identified.
+        last: Gravity torque of m, mcx, mcy and mcz of the last body, shape (N, n, 4).
+    """
+    P, u, g = last.reshape(-1, 4), of_urdf.reshape(-1), of_result.reshape(-1)
+    alone = np.linalg.lstsq(P, g - u)[0]
+    left = float(np.linalg.norm(g - u - P @ alone) / np.linalg.norm(g))
+    both = np.linalg.lstsq(np.column_stack([u, P]), g)[0]
+    return float(both[0]), max(float(both[1]), 0.0), left

@@ -1,0 +1,466 @@
+"""What to do next about a result: a few steps, each with what to type."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, TypeAlias
+
+from robotid.diagnosis.misfit_findings import setting_of, with_entries
+from robotid.findings import Cause, grouped, listed, toml_key
+from robotid.judgement.verdict import GOOD, is_beaten
+from robotid.robot.drives import COUNTERBALANCE, DriveTerm, spring_family
+
+if TYPE_CHECKING:
+    from robotid.identification.result import Identification
+
+__all__ = ["Origin", "Step", "next_steps"]
+
+_MOST = 3  # steps
+_NAMED = 4  # joints that a step names
+_NEW = "NEW.csv"
+_PLAIN = "viscous+coulomb"
+_APPENDED = ("--validate",)  # flags that add to what was stated before
+
+
+@dataclass(frozen=True)
+class Step:
+    """One thing to do.
+
+    Attributes:
+        words: What, and why.
+        blocks: What to type, or to write into the job file; each is copied by itself.
+    """
+
+    words: str
+    blocks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a result came from and where it is, for commands.
+
+    Attributes:
+        source: What follows ``robotid identify``: a job file, or URDF, logs and flags; nothing if
+            no command made it.
+        folder: Folder of the results; "" if they are in none.
+    """
+
+    source: tuple[str, ...] = ()
+    folder: str = ""
+
+    @property
+    def job(self) -> str:
+        """The job file; "" if there is none."""
+        return self.source[0] if self.source and self.source[0].endswith(".toml") else ""
+
+    def again(self, *flags: str) -> str:
+        """Return the command that identifies again.
+
+        Args:
+            flags: Flags to put behind it.
+        """
+        out = ["--out", self.folder] if self.folder else []
+        return shlex.join(["robotid", "identify", *_without(self.source, flags), *flags, *out])
+
+    def stating(self, table: str, line: str, *flags: str) -> tuple[str, ...]:
+        """Return what to do to identify again with another setting.
+
+        Args:
+            table: Table of the job file that it stands in.
+            line: Its line there.
+            flags: The same as flags of the command line, if there are any.
+        """
+        if flags and self.source and not self.job:
+            return (self.again(*flags),)
+        return (f"{table}\n{line}", *([self.again()] if self.job else []))
+
+    def using(self, command: str, *words: str) -> tuple[str, ...]:
+        """Return a command that reads the results, none if they are in no folder.
+
+        Args:
+            command: Name of the command.
+            words: What follows it.
+        """
+        return (shlex.join(["robotid", command, *words]),) if self.folder else ()
+
+
+def _without(source: Sequence[str], flags: Sequence[str]) -> list[str]:
+    """Return the words of a command without what other flags state anew."""
+    anew = {_key(*pair) for pair in pairwise(flags) if pair[0] not in _APPENDED}
+    words, kept = [*source, ""], []
+    skip = False
+    for word, following in pairwise(words):
+        flag, sign, value = word.partition("=")
+        is_apart = word.startswith("--") and not sign
+        if not skip and _key(flag, value if sign else following) not in anew:
+            kept.append(word)
+            continue
+        skip = is_apart and not skip
+    return kept
+
+
+def _key(flag: str, value: str) -> tuple[str, str]:
+    """Return what two flags have in common that state the same: of J=VALUE the joint, too."""
+    name, sign, _ = value.partition("=")
+    return flag, name if sign else ""
+
+
+def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
+    """Return what to do next, the most urgent first: three steps at most.
+
+    What makes the result wrong comes first, then what leaves it in doubt, then how to use it.
+
+    Args:
+        found: The result.
+        origin: Where it came from.
+    """
+    asked: dict[int, list[Cause]] = {}
+    causes = (*grouped(found.findings, found.model.joints), *_of_verdict(found))
+    named = {
+        j for c in causes if c.severity != "note" and c.code in _NAMED_CAUSES for j in c.joints
+    }
+    for cause in causes:
+        if cause.code in _UNNAMED and named.intersection(cause.joints):
+            # what is wrong with these has a step of its own
+            cause = replace(cause, joints=tuple(j for j in cause.joints if j not in named))
+            if not cause.joints:
+                continue
+        number = _step_for(cause)
+        if cause.severity != "note" and number is not None:
+            asked.setdefault(number, []).append(cause)
+    urgent = sorted(asked, key=lambda k: (all(c.severity != "error" for c in asked[k]), k))
+    steps = [_STEPS[number][0](found, origin, asked[number]) for number in urgent]
+    return _once([*steps, *_uses(found, origin, steps)][:_MOST])
+
+
+def _once(steps: Sequence[Step]) -> tuple[Step, ...]:
+    """Return the steps, what several ask to be typed in the last of them only."""
+    kept: list[Step] = []
+    for k, step in enumerate(steps):
+        later = {block for other in steps[k + 1 :] for block in other.blocks}
+        blocks = tuple(block for block in step.blocks if block not in later)
+        kept.append(replace(step, blocks=blocks))
+    return tuple(kept)
+
+
+_Maker: TypeAlias = "Callable[[Identification, Origin, Sequence[Cause]], Step]"
+
+
+def _of_verdict(found: Identification) -> list[Cause]:
+    """Return what a verdict blames beside findings."""
+    causes, kept = [], found.predictions
+    measured = [(j, m) for metrics in kept.values() for j, m in metrics.per_joint.items()]
+    beaten = {joint for joint, m in measured if is_beaten(m)}
+    missed = {j for j, m in measured if m.relative_error_pct and m.relative_error_pct > GOOD}
+    for code, joints in (("beaten", beaten), ("missed", missed)):
+        if joints:
+            named = tuple(joint for joint in found.model.joints if joint in joints)
+            causes.append(Cause(code, "warning", named, (), ()))
+    if not kept:
+        causes.append(Cause("unseen", "warning", (), (), ()))
+    if not found.is_consistent:
+        causes.append(Cause("impossible", "warning", (), (), ()))
+    if not found.witness.agrees:
+        severity = "warning" if found.witness.is_against else "note"
+        causes.append(Cause("unweighed", severity, (), (), ()))
+    return causes
+
+
+def _step_for(cause: Cause) -> int | None:
+    """Return the number of the step that a cause asks for; None if it asks for none."""
+    last = 0 if cause.severity == "error" else None  # the doctor explains any other error
+    return next((k for k, (_, codes) in enumerate(_STEPS) if cause.code in codes), last)
+
+
+def _named(causes: Sequence[Cause], wanted: Sequence[str] = ()) -> str:
+    """Return the joints that causes are about, as a sentence holds them."""
+    return listed(dict.fromkeys(j for cause in causes for j in cause.joints) or wanted, _NAMED)
+
+
+def _weigh(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    before, after, _ = found.witness.masses
+    check = ""
+    if any(cause.code in ("total_mass", "urdf_mismatch") for cause in causes):
+        check = "Check the sign, the order and the unit of the torques and the URDF's masses. "
+    words = (
+        f"{check}Weigh the links that move and state their mass, which tells the scale: "
+        f"{after:.4g} kg as identified, {before:.4g} kg in the URDF."
+    )
+    return Step(words, origin.stating("[estimator.constraints]", "total_mass = KG"))
+
+
+def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    joints = list(dict.fromkeys(j for cause in causes for j in cause.joints))
+    words = (
+        f"State the gain of {listed(joints or ['the joints'], _NAMED)} in N m per A (N per A if it "
+        "slides), if the column is a current: the torque fits the URDF in another scale only."
+    )
+    line = "\n".join(f"{toml_key(joint)} = GAIN" for joint in joints or ["JOINT"])
+    flags = [x for joint in joints or ["JOINT"] for x in ("--gain", f"{joint}=GAIN")]
+    return Step(words, origin.stating("[torque.gains]", line, *flags))
+
+
+def _delay(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    delays = [finding.evidence["delay"] for cause in causes for finding in cause.findings]
+    delay = f"{sum(delays) / len(delays):.4f}"
+    words = (
+        f"If the drives filter their torque, state that it is {delay} s late; friction that the "
+        "model lacks can look like this, too."
+    )
+    line = f"torque_delay = {delay}"
+    return Step(words, origin.stating("[signals]", line, "--torque-delay", delay))
+
+
+def _locks(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    joints = list(found.model.locked)
+    places = {
+        finding.where.rpartition(": ")[2]: f"{finding.evidence['median']:.4g}"
+        for cause in causes
+        for finding in cause.findings
+        if "median" in finding.evidence
+    }
+    asked = places or dict.fromkeys(joints if len(joints) <= _NAMED else ["*"], "POSITION")
+    words = f"State where the locked joints {listed(places or joints, _NAMED)} truly stood."
+    flags = [x for joint, place in asked.items() for x in ("--lock", f"{joint}={place}")]
+    line = "\n".join(f"{toml_key(joint)} = {place}" for joint, place in asked.items())
+    return Step(words, origin.stating("[locked]", line, *flags))
+
+
+def _keep(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    words = (
+        "Record another motion and keep it apart: how well an unseen motion is predicted is not "
+        "known."
+    )
+    line = f'log = "{_NEW}"'
+    return Step(words, origin.stating("[[validation]]", line, "--validate", _NEW))
+
+
+def _pin(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    joints = {joint for cause in causes for joint in cause.joints}
+    links = [joint.child for joint in found.model.tree.movable if joint.name in joints]
+    words = (
+        f"Leave the links of {_named(causes)} at the URDF: with fitted drives it predicts these "
+        "joints better than the identified bodies."
+    )
+    line = f"pinned = {json.dumps(links, ensure_ascii=False)}"
+    return Step(words, origin.stating("[estimator.constraints]", line))
+
+
+def _terms(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    """Return what adds the terms to the model that drives lack."""
+    codes = {cause.code for cause in causes}
+    entries: dict[str, list[str | DriveTerm]] = {}
+    for joint, turned in _balanced(causes):
+        entries[joint] = [spring_family(turned, COUNTERBALANCE)]
+    couplings: dict[frozenset[str], str] = {}
+    for misfit in found.misfits:
+        term = misfit.term
+        if term.code in codes and term.coupled:
+            couplings.setdefault(frozenset((misfit.joint, term.coupled)), setting_of(misfit, found))
+        elif term.code in codes and misfit.entries:
+            own = entries.setdefault(misfit.joint, [])
+            own += [entry for entry in misfit.entries if entry not in own]
+    lines = [with_entries(found, joint, own) for joint, own in entries.items()]
+    blocks = [*couplings.values(), *(["\n".join(["[drives]", *lines])] if lines else [])]
+    what = listed(dict.fromkeys(_CAUSES[cause.code] for cause in causes))
+    words = f"Add to the model of {_named(causes)} what its drive lacks: {what}."
+    if not blocks and any(m.term.name == "coulomb" and m.term.code in codes for m in found.misfits):
+        return Step(
+            words, origin.stating("[model]", f'friction = "{_PLAIN}"', "--friction", _PLAIN)
+        )
+    if not blocks:
+        words = (
+            f"Leave out the rows in which {_named(causes)} shows what no term of the model is "
+            f"like, or record other motion: {what}."
+        )
+    return Step(words, (*blocks, *((origin.again(),) if origin.job and blocks else ())))
+
+
+def _balanced(causes: Sequence[Cause]) -> list[tuple[str, float]]:
+    """Return the joints with a counterbalance, and how far they turned [rad]."""
+    found = [finding for cause in causes for finding in cause.findings]
+    return [
+        (finding.where.rpartition(": ")[2], finding.evidence["turned"])
+        for finding in found
+        if finding.code == "counterbalance" and "turned" in finding.evidence
+    ]
+
+
+def _payload(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    logs = [x for x in found.validation if not x.is_refitted] or list(found.fitted)
+    log = str(logs[0].recording.log.path)
+    words = (
+        "Validate with the load of the fitted logs: this log has another one. The load itself is "
+        "what robotid payload finds."
+    )
+    words_of = (str(found.model.tree.path), log, "--reference", f"{origin.folder}/result.json")
+    return Step(words, origin.using("payload", *words_of))
+
+
+def _unclipped(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    words = (
+        f"Record a slower motion, or one with less load: the torque of {_named(causes)} reaches "
+        "its limit, and what lies beyond is not in the log."
+    )
+    return Step(words, _another_log(origin))
+
+
+def _zeros(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    sizes = [f for cause in causes for f in cause.findings if "size" in f.evidence]
+    by = "".join(f"; of {f.where} by {-f.evidence['size']:.3g}" for f in sizes)
+    words = (
+        f"Correct the zero of the position of {_named(causes)}, in the log or by the joint's "
+        f"origin in the URDF{by}."
+    )
+    return Step(words, (shlex.join(["robotid", "inspect", str(found.model.tree.path)]),))
+
+
+def _as_found(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    """Return what the findings say themselves, which name a cause and its remedy."""
+    return Step(" ".join(f"{m[0].upper()}{m[1:]}." for cause in causes for m in cause.messages[:1]))
+
+
+def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    words = (
+        f"Identify with the consistent estimator: what {found.estimator.name} found is physically "
+        "not possible, so no URDF could be written."
+    )
+    flags = ("--estimator", "consistent")
+    return Step(words, origin.stating("[estimator]", 'name = "consistent"', *flags))
+
+
+def _watch(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    words = (
+        f"Look at what the torque of {_named(causes, found.model.joints)} does that the model does "
+        "not explain, under Why and in motion: a channel that holds something else, a spring, a "
+        "gear that is not round."
+    )
+    return Step(words, _replay(found, origin))
+
+
+def _richer(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    count = len(found.determination.undetermined)
+    words = (
+        f"Record a richer motion, with more speed and wider poses, and fit it as well: the data "
+        f"leave {count} base parameters open."
+    )
+    return Step(words, _another_log(origin))
+
+
+def _another_log(origin: Origin) -> tuple[str, ...]:
+    """Return what identifies again with one more log."""
+    if not origin.job and origin.source:
+        urdf, *others = origin.source
+        return (Origin((urdf, _NEW, *others), origin.folder).again(),)
+    logs = (origin.again(),) if origin.job else ()
+    return (f'[[identification]]\nlog = "{_NEW}"', *logs)
+
+
+def _inspect(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    words = "Correct the URDF: what its inspection names stands in the way of the prior."
+    return Step(words, (shlex.join(["robotid", "inspect", str(found.model.tree.path)]),))
+
+
+def _doctor(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    said = causes[0].messages[0]
+    words = f"{said[0].upper()}{said[1:]}."
+    return Step(
+        words, (shlex.join(["robotid", "doctor", *origin.source]),) if origin.source else ()
+    )
+
+
+def _uses(found: Identification, origin: Origin, asked: Sequence[Step]) -> list[Step]:
+    """Return what may be done with a result, but for what is asked for already."""
+    result = f"{origin.folder}/result.json"
+    target = ["--format", "mjcf", "--out", f"{found.model.name or 'robot'}.xml"]
+    steps = [
+        Step("Play a recording and see where the prediction misses.", _replay(found, origin)),
+        Step(
+            "Measure the prediction on another motion, one with the speeds of your use.",
+            origin.using("validate", result, _NEW),
+        ),
+    ]
+    if found.has_urdf:
+        words = "Use it: the identified URDF is written; this makes a model for MuJoCo of it."
+        steps.insert(0, Step(words, origin.using("export", result, *target)))
+    if not found.witness.agrees:
+        steps.insert(0, _weigh(found, origin, ()))
+    typed = {block for step in asked for block in step.blocks}
+    return [step for step in steps if step.blocks and typed.isdisjoint(step.blocks)]
+
+
+def _replay(found: Identification, origin: Origin) -> tuple[str, ...]:
+    log = str((found.validation or found.fitted)[0].recording.log.path)
+    return origin.using("replay", str(found.model.tree.path), log, origin.folder)
+
+
+#: Terms that drives may have and the model lacks, by the code of the finding, in words.
+_CAUSES = {
+    "backlash": "backlash or windup",
+    "counterbalance": "a counterbalance",
+    "coupling": "a coupling with another joint",
+    "friction_shape": "friction of another shape",
+    "load_friction": "friction that grows with the load",
+    "position_periodic": "a torque that repeats with the position",
+    "spring": "a spring",
+}
+#: What names a cause but has nothing to type: its message says what to do.
+_AS_FOUND = (
+    "angle_scale",
+    "bound_binds",
+    "com_outside",
+    "constant_torque",
+    "density",
+    "drift",
+    "gravity",
+    "gravity_compensated",
+    "gyration",
+    "held_torque",
+    "joint_axis",
+    "joint_order",
+    "joint_origin",
+    "joint_torque_delay",
+    "lost_motion",
+    "mass_matrix",
+    "payload",
+    "position_order",
+    "position_sign",
+    "solvers_differ",
+    "time_scale",
+    "torque_order",
+    "torque_sign",
+    "unmounted_part",
+    "unsigned_torque",
+)
+#: Codes that name what is wrong with a joint, and those that only say that something is.
+_NAMED_CAUSES = (*_CAUSES, *_AS_FOUND, "clipped", "payload_change", "position_offset")
+_UNNAMED = ("missed", "unexplained_torque", "constraint_costs")
+#: The steps, the most telling first, each with the codes of what asks for it.
+_STEPS: Sequence[tuple[_Maker, tuple[str, ...]]] = (
+    (_doctor, ()),
+    (_weigh, ("total_mass", "urdf_mismatch", "unweighed")),
+    (_gains, ("current_for_torque", "torque_scale")),
+    (_delay, ("torque_delay",)),
+    (_locks, ("locked_at_zero", "locked_position")),
+    (_zeros, ("position_offset",)),
+    (_payload, ("payload_change",)),
+    (_unclipped, ("clipped",)),
+    (_terms, tuple(_CAUSES)),
+    (_as_found, _AS_FOUND),
+    (_keep, ("unseen", "repeated_motion", "validation_was_fitted")),
+    (_possible, ("impossible",)),
+    (_watch, (*_UNNAMED, "outliers", "spikes")),
+    (_pin, ("beaten",)),
+    (_richer, ("undetermined", "excitation", "faint_parameters", "no_motion")),
+    (
+        _inspect,
+        (
+            "copied_inertial", "default_inertial", "missing_inertial", "negative_mass",
+            "not_positive_definite", "zero_mass",
+        ),
+    ),
+)  # fmt: skip

@@ -1,0 +1,202 @@
+"""Zeros, scales, a clock and joints that are stated wrongly are named with their size."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.fitting import identify
+from helpers.misfits import EFFECTS, log_with
+from helpers.paths import ROOT
+
+from robotid.diagnosis.discrepancies import explain_residual
+from robotid.diagnosis.misfit import find_misfits
+from robotid.diagnosis.sample import along, take_sample, trials
+from robotid.fitting.settings import EstimatorSettings
+from robotid.logs.data import Log
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+sys.path.append(str(ROOT / "benchmarks"))
+from verdict_cases import ROBOTS, build, measured, move
+
+
+@pytest.fixture(scope="module")
+def model():
+    return RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
+
+
+def fitted(model, logs):
+    """Return what is found of a log and one kept apart, at a weight of the prior that is stated."""
+    settings = EstimatorSettings(prior_weight=1.0)
+    return identify(model, logs[:1], validation=logs[1:], estimator=settings)
+
+
+def found(model, change, robot="ur5_robot.urdf", turn=None):
+    """Return the findings on logs of a robot near its URDF that a change spoilt alike."""
+    arm, logs = build(replace(ROBOTS["ur5"], urdf=str(robot)), (3,), turn=turn), []
+    for part in (0, 1):
+        run = move(arm.model, np.random.default_rng([3, part]), 100.0, 25.0)
+        run = replace(run, tau=arm.rigid(run) + arm.drives(run))
+        run = measured(run, "usual", np.random.default_rng([4, part]))
+        log = Log(run.t, run.q, run.tau, model.joints, run.v, path=f"run{part}.csv")
+        logs.append(change(log))
+    identification = fitted(model, logs)
+    _, findings = explain_residual(identification, take_sample(identification))
+    doubted = {doubt.code for doubt in identification.doubts}
+    assert {finding.code for finding in findings} <= doubted
+    return findings
+
+
+def times(log, **factors):
+    """Return the log with channels multiplied."""
+    return replace(log, **{name: factor * getattr(log, name) for name, factor in factors.items()})
+
+
+def on(model, joint, value, elsewhere):
+    return np.where(np.array(model.joints) == joint, value, elsewhere)
+
+
+def test_nothing_is_said_of_a_robot_that_only_weighs_differently(model):
+    assert found(model, lambda log: log) == ()
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_nothing_is_said_of_drives_that_do_more_than_their_model(model, effect):
+    logs = [log_with(model, 3, effect, part=part) for part in (0, 1)]
+    found = fitted(model, logs)
+    _, discrepancies = explain_residual(found, take_sample(found))
+    assert discrepancies == ()
+
+
+# sizes are of first order: those of large faults are off by a quarter
+@pytest.mark.parametrize(
+    ("change", "code", "where", "size", "words"),
+    [
+        (lambda log, one: replace(log, q=log.q + one("elbow_joint", 0.1, 0.0)),
+         "position_offset", "elbow_joint", -0.1, "zero of its position is off by 0."),
+        (lambda log, one: replace(log, q=log.q + one("elbow_joint", 0.02, 0.0) * np.sign(log.v)),
+         "lost_motion", "elbow_joint", -0.04, "position is 0.04"),
+        (lambda log, one: replace(log, q=1.1 * log.q, v=None),
+         "angle_scale", "all joints", 1 / 1.1 - 1, "every position fits best times 0.9"),
+        (lambda log, one: replace(log, q=log.q * one("elbow_joint", 1.2, 1.0), v=None),
+         "angle_scale", "elbow_joint", 1 / 1.2 - 1, "q_elbow_joint fits best times 0.8"),
+        (lambda log, one: replace(log, tau=log.tau * one("elbow_joint", 1.3, 1.0)),
+         "torque_scale", "elbow_joint", 0.3, "about 1."),
+        (lambda log, one: replace(times(log, t=1.1), v=None),
+         "time_scale", "all joints", 1.1**2 - 1, "time stamps run 1."),
+        # of joints at the end of the chain half of the 0.5: the other half is in the masses
+        (lambda log, one: times(log, tau=np.where(np.arange(6) < 3, 1.0, 1.5)),
+         "torque_scale", "wrist_1_joint, wrist_2_joint, wrist_3_joint", 0.25, "are at least 1."),
+    ],
+)  # fmt: skip
+def test_what_is_stated_wrongly_is_named_with_its_size(model, change, code, where, size, words):
+    first = found(model, lambda log: change(log, lambda *args: on(model, *args)))[0]
+    assert (first.code, first.where, first.severity) == (code, where, "warning")
+    assert first.evidence["size"] == pytest.approx(size, rel=0.25)
+    assert words in first.message
+
+
+@pytest.mark.parametrize(
+    ("joint", "offset"), [("shoulder_lift_joint", 0.15), ("elbow_joint", -0.2)]
+)
+def test_a_large_offset_of_a_zero_has_its_size_and_makes_no_other_finding(model, joint, offset):
+    moved = offset * on(model, joint, 1.0, 0.0)
+    (finding,) = found(model, lambda log: replace(log, q=log.q + moved))
+    assert (finding.code, finding.where) == ("position_offset", joint)
+    # to first order it would be 0.08 of 0.15 rad
+    assert finding.evidence["size"] == pytest.approx(-offset, rel=0.06)
+    assert 0 < finding.evidence["std_error"] < 0.05 * abs(offset)
+
+
+def both(truth, model, seed, joint, offset, **effect):
+    """Return what is found of logs with the effect on a joint, whose position is off besides."""
+    moved = offset * np.eye(len(model.joints))[joint]
+    logs = [log_with(truth, seed, joint=joint, part=part, **effect) for part in (0, 1)]
+    found = fitted(model, [replace(log, q=log.q + moved) for log in logs])
+    misfits, discrepancies = explain_residual(found, take_sample(found))
+    assert discrepancies == tuple(f for f in found.findings if f in discrepancies)
+    return find_misfits(take_sample(found)), misfits, discrepancies
+
+
+def named(findings):
+    return [(finding.code, finding.where) for finding in findings]
+
+
+def test_a_zero_that_is_off_makes_no_spring_of_another_joint():
+    joints = [f"panda_joint{i}" for i in range(1, 8)]
+    panda = RobotModel.from_urdf(example_urdf("panda.urdf"), joints=joints)
+    alone, misfits, others = both(panda, panda, 2, 1, 0.15, rate=50.0)
+    assert [(m.joint, m.term.code, m.matters) for m in alone] == [("panda_joint3", "spring", True)]
+    assert misfits == ()
+    assert named(others) == [("position_offset", "panda_joint2")]
+
+
+@pytest.mark.parametrize(("offset", "size"), [(0.1, 1.0), (0.03, 3.0)])  # what explains more
+def test_a_spring_is_named_beside_a_zero_that_is_off(model, offset, size):
+    alone, (spring,), others = both(model, model, 3, 2, offset, effect="spring", size=size)
+    assert (spring.joint, spring.term.name) == ("elbow_joint", "linear spring")
+    assert spring.size == pytest.approx(alone[0].size, rel=0.01)
+    assert named(others) == [("position_offset", "elbow_joint")]
+    assert others[0].evidence["size"] == pytest.approx(-offset, rel=0.04)
+
+
+def test_columns_beside_the_base_parameters_are_refitted_with_them(model, rng):
+    found = fitted(model, [log_with(model, 3, "spring", part=part) for part in (0, 1)])
+    sample = take_sample(found)
+    Z = rng.standard_normal((*sample.r.shape, 2)) + sample.r[..., None]
+    together, _ = trials(sample, slice(None), Z)[1].estimate([0, 1], sample.fitted)
+    beside = sample.beside(Z[..., :1])
+    alone, _ = trials(beside, slice(None), Z[..., 1:])[1].estimate([0], sample.fitted)
+    assert alone[0] == pytest.approx(together[1], rel=2e-3)
+    tau = np.concatenate([m.tau for m in sample.at])
+    there = along(beside, found.model, sample.at, tau)
+    np.testing.assert_allclose(there.W, beside.W, atol=1e-9 * np.abs(beside.W).max())
+    assert not there.r.any()
+
+
+def test_a_base_that_is_not_level_makes_no_counterbalance(model):
+    turn = pin.exp3(np.array([np.radians(6), 0.0, 0.0]))
+    gravity = turn @ np.array([0.0, 0.0, -9.81])
+    truth = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), gravity=gravity)
+    alone, misfits, others = both(truth, model, 3, 1, 0.1)
+    assert [(m.joint, m.term.code) for m in alone] == [("shoulder_pan_joint", "position_periodic")]
+    assert misfits == ()
+    assert named(others) == [("gravity", "all joints"), ("position_offset", "shoulder_lift_joint")]
+
+
+def test_a_joint_that_lies_elsewhere_is_named(model, tmp_path):
+    text = example_urdf("ur5_robot.urdf").read_text()
+    start = text.index('<joint name="elbow_joint"')
+    origin = text.index("<origin", start)
+    end = text.index("/>", origin)
+    path = tmp_path / "longer.urdf"
+    was = text[origin:end]
+    xyz = was.split('xyz="')[1].split('"')[0].split()
+    longer = was.replace(" ".join(xyz), " ".join([*xyz[:2], str(float(xyz[2]) + 0.05)]))
+    path.write_text(text[:origin] + longer + text[end:])
+    first = found(model, lambda log: log, robot=path)[0]
+    assert (first.code, first.where) == ("joint_origin", "elbow_joint")
+    assert first.evidence["size"] == pytest.approx(0.05, rel=0.25)
+
+
+def test_a_base_that_is_not_level_is_named(model):
+    turn = pin.exp3(np.array([0.15, 0.0, 0.0]))
+    first = found(model, lambda log: log, turn=turn)[0]
+    assert (first.code, first.where) == ("gravity", "all joints")
+    assert first.evidence["size"] == pytest.approx(np.tan(0.15), rel=0.03)
+    stated = [float(x) for x in first.message.split("gravity = [")[1].split("]")[0].split(",")]
+    np.testing.assert_allclose(stated, turn @ [0.0, 0.0, -9.81], atol=0.15)
+
+
+def test_a_small_share_of_the_residual_is_named_if_recordings_kept_apart_show_it(model):
+    def change(log):
+        rng = np.random.default_rng(int(log.name[3]))
+        noise = 0.1 * log.tau.std(axis=0) * rng.standard_normal(log.tau.shape)
+        return replace(log, tau=log.tau + noise, t=1.1 * log.t, v=None)
+
+    (first, *_) = found(model, change)
+    assert (first.code, first.where) == ("time_scale", "all joints")
+    assert 3 < first.evidence["share_pct"] < 10
+    assert first.evidence["size"] == pytest.approx(0.21, rel=0.25)

@@ -1,0 +1,394 @@
+"""Terms that a drive's model lacks are named on their joint, with their share; others are not."""
+
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.misfits import EFFECTS, log_with
+from helpers.paths import ROOT
+
+from robotid.commands.identify import run_job
+from robotid.commands.job import job_from_settings, read_job
+from robotid.commands.logs import survey_logs
+from robotid.diagnosis import misfit
+from robotid.diagnosis import sample as sample_module
+from robotid.diagnosis.candidates import CANDIDATES
+from robotid.diagnosis.misfit import find_misfits
+from robotid.diagnosis.misfit_findings import (
+    counterbalanced,
+    misfit_findings,
+    setting_of,
+    settled,
+    with_entries,
+)
+from robotid.diagnosis.sample import take_sample, trials
+from robotid.doctor.diagnosis import check_logs
+from robotid.findings import Finding
+from robotid.fitting.recordings import Recordings
+from robotid.fitting.settings import EstimatorSettings
+from robotid.identification.pipeline import conclude, identify
+from robotid.judgement.findings import fit_findings
+from robotid.judgement.verdict import doubts_of
+from robotid.logs.read import write_log
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.drives import Harmonic
+from robotid.robot.model import RobotModel
+
+PAN, LIFT, ELBOW = "shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"
+
+
+def fitted(model, logs, **settings):
+    """Return what is found of a log and one kept apart, by the fit of plain friction alone."""
+    plain = {"doctor": False, "friction": "viscous+coulomb", **settings}
+    return identify(model, logs[:1], validation=logs[1:], **plain)
+
+
+def identified(model, seed, effect=None, joint=0, **options):
+    return fitted(model, [log_with(model, seed, effect, joint, part=k, **options) for k in (0, 1)])
+
+
+def misfits(found):
+    return find_misfits(take_sample(found))
+
+
+def findings_of(found):
+    return misfit_findings(found, found.misfits, found.on_misfit)
+
+
+@pytest.fixture(scope="module")
+def clean(ur5):
+    """The robot of seed 1 whose drives have nothing beside their model."""
+    return identified(ur5, 1)
+
+
+def rmse(found, joint):
+    return found.metrics().per_joint[joint].rmse
+
+
+@pytest.mark.parametrize(
+    ("effect", "joint"),
+    [("stribeck", 2), ("saturating", 0), ("load", 1), ("periodic", 3), ("ripple", 2),
+     ("harmonic drive", 1), ("spring", 2),
+     ("counterbalance", 4), ("windup", 1), ("drift", 5)],
+)  # fmt: skip
+def test_a_missing_term_is_named_first_on_its_joint_with_its_share(ur5, clean, effect, joint):
+    found = identified(ur5, 1, effect, joint)
+    name = ur5.joints[joint]
+    # what is left without the effect is the noise: the rest is its share
+    share = 1.0 - (rmse(clean, name) / rmse(found, name)) ** 2
+    first, *others = misfits(found)
+    assert (first.joint, first.term.code) == (name, EFFECTS[effect].code)
+    assert first.share == pytest.approx(share, abs=0.15)
+    assert first.confirmed > 0.4 * share
+    assert all(other.joint == name and other.share < 0.1 * first.share for other in others)
+
+
+def test_nothing_is_named_where_nothing_is_missing(clean):
+    assert misfits(clean) == ()
+
+
+@pytest.mark.parametrize(
+    ("effect", "joint", "size", "unit"),
+    [("load", 1, 0.1, "N m per N m of load"), ("spring", 2, None, "N m/rad")],
+)
+def test_the_size_holds_the_truth(ur5, effect, joint, size, unit):
+    (found,) = misfits(identified(ur5, 2, effect, joint))
+    if size is None:  # 0.3 of the usual torque per radian
+        t, q, v, load = np.zeros((4, 1))
+        log, clean = (log_with(ur5, 2, e, joint, noise=0.0) for e in (effect, None))
+        usual = np.sqrt(np.mean(clean.tau[:, joint] ** 2))
+        size = float(EFFECTS[effect].torque(t, q + 1.2, v, load, usual)[0])
+        slope = np.polyfit(log.q[:, joint], (log.tau - clean.tau)[:, joint], 1)[0]
+        assert slope == pytest.approx(size, rel=1e-3)
+    assert found.unit == unit
+    # the load is that of an estimate without the term, which is some per cent off
+    assert abs(found.size - size) < 3.0 * found.std_error + 0.02 * size
+    assert found.std_error < 0.03 * size
+
+
+def test_the_size_of_several_columns_is_their_torque(ur5):
+    """A torque that no base parameter explains is seen as it was added, root mean square."""
+    log, clean = (log_with(ur5, 1, effect, 2, noise=0.0) for effect in ("periodic", None))
+    added = np.sqrt(np.mean((log.tau - clean.tau)[:, 2] ** 2))
+    (found,) = misfits(identified(ur5, 1, "periodic", 2))
+    # gravity explains a part of a slow harmonic
+    assert 0.6 * added < found.size < 1.05 * added
+    assert (found.unit, found.std_error < 0.05 * added) == ("N m rms", True)
+
+
+def test_coulomb_friction_that_was_left_out_is_asked_for(ur5):
+    model = RobotModel.from_urdf(ur5.tree.path, terms=("armature", "viscous", "offset"))
+    logs = [log_with(ur5, 1, part=k) for k in (0, 1)]
+    found = findings_of(fitted(model, logs))
+    assert {finding.where for finding in found if finding.severity == "warning"} == set(ur5.joints)
+    for finding in found:
+        assert (finding.code, finding.evidence["share_pct"] > 50) == ("friction_shape", True)
+        assert "Set friction = 'viscous+coulomb' in [model]" in finding.message
+
+
+def test_a_ripple_is_named_with_its_periods_a_turn_and_the_terms_that_predict_it(ur5, tmp_path):
+    paths = [tmp_path / name for name in ("fit.csv", "kept.csv")]
+    for k, path in enumerate(paths):
+        write_log(log_with(ur5, 2, "harmonic drive", 1, part=k), path)
+    table = {
+        "urdf": ur5.tree.path,
+        "identification": [{"log": str(paths[0])}],
+        "validation": [{"log": str(paths[1])}],
+        "output": {"report": False},
+    }
+
+    def run(drives):
+        job = job_from_settings(table | tomllib.loads(drives), "job", tmp_path)
+        found, _ = run_job(job, tmp_path / "out")
+        (metrics,) = found.predictions.values()
+        return found, metrics.per_joint[LIFT].relative_error_pct
+
+    found, error = run("")
+    named, *_ = found.misfits
+    assert (named.joint, named.term.name) == (LIFT, "ripple 40")
+    pasted = setting_of(named, found)
+    assert pasted == (
+        f'[drives]\n{LIFT} = [{{ term = "Harmonic", order = 40.0, is_sine = false }}, '
+        '{ term = "Harmonic", order = 40.0, is_sine = true }]'
+    )
+    better, less = run(pasted)
+    assert error > 10.0
+    assert less < 4.0  # the torque's noise is 2 %
+    assert better.misfits == ()
+
+
+def test_a_setting_keeps_what_the_drive_has_already(ur5):
+    friction = {ELBOW: "load+harmonics1", "*": "none"}
+    found = fitted(ur5, [log_with(ur5, 1, "load", 2, duration=12.0)], friction=friction)
+    stated = Harmonic(order=9.0)
+    own = {**found.model.layout.own, ELBOW: (*found.model.layout.own[ELBOW], stated)}
+    found = replace(found, model=found.model.with_terms(own))
+    line = with_entries(found, ELBOW, ["harmonics2", "stribeck"])
+    assert tomllib.loads(line)[ELBOW] == [
+        {"term": "Harmonic", "order": 9.0, "is_sine": False}, "load", "harmonics2", "stribeck",
+    ]  # fmt: skip
+    assert with_entries(found, LIFT, ["load"]) == f'{LIFT} = ["load"]'
+
+
+def test_a_family_is_advised_only_where_the_joint_turned_far_enough_for_it(ur5):
+    sample = take_sample(identified(ur5, 1, "spring", 2, duration=12.0))
+    (candidate,) = (c for c in CANDIDATES if c.name == "counterbalance")
+
+    def advised(turned, term=candidate):
+        q = np.linspace(0.0, turned, sample.rows)
+        rows = np.append(q, np.full(len(sample.motions[2].q) - sample.rows, 99.0))  # of others
+        motions = (*sample.motions[:2], replace(sample.motions[2], q=rows), *sample.motions[3:])
+        return misfit._entries(replace(sample, motions=motions), 2, term)
+
+    assert [advised(x) for x in (3.5, 3.4, 0.7, 0.6)] == [
+        ("harmonics2",), ("harmonics1",), ("harmonics1",), ("spring",)
+    ]  # fmt: skip
+    (periodic,) = (c for c in CANDIDATES if c.name == "periodic")
+    assert (advised(3.5, periodic), advised(3.0, periodic)) == (("harmonics4",), ())
+
+
+@pytest.mark.parametrize("memory", [0, 30, 100])
+def test_noise_of_any_colour_is_no_term(ur5, memory):
+    assert misfits(identified(ur5, 5, noise=0.03, memory=memory)) == ()
+
+
+def test_a_counterbalance_is_named_taken_into_the_model_and_no_error(ur5):
+    """40 N m at the lift: gravity of the URDF's is held by the other joints."""
+    logs = [log_with(ur5, 3, "balancing", 1, part=k) for k in (0, 1)]
+    said = [f for f in check_logs(ur5, logs[:1], validation=logs[1:]) if f.severity != "note"]
+    assert {(f.code, f.severity) for f in said} == {("counterbalance", "warning")}
+    assert said[0].where == f"run0.csv: {LIFT}"
+    assert f'Add it to the model: {LIFT} = ["harmonics1"] in [drives]' in said[0].message
+    found = identify(ur5, logs[:1], validation=logs[1:])
+    (choice,) = (c for c in found.drives if c.families)
+    assert (choice.joint, choice.families) == (LIFT, ("harmonics1",))
+    known = [f for f in found.findings if f.code == "counterbalance"]
+    assert {f.severity for f in known} == {"note"}
+    assert "The model has it: cos1, sin1 of shoulder_lift_joint" in known[0].message
+    assert found.verdict.status == "good"
+    for name, size in (("cos1", 40.0 * np.cos(0.1)), ("sin1", -40.0 * np.sin(0.1))):
+        k = found.model.layout.names.index(f"{LIFT}.{name}")
+        assert abs(found.standard[k] - size) < 2.6 * found.standard_error[k], name
+        assert found.standard_error[k] < 8.0
+    stated = identify(ur5, logs[:1], validation=logs[1:], friction={LIFT: "load", "*": "none"})
+    (warned, _) = [f for f in stated.findings if f.code == "counterbalance"]
+    assert warned.severity == "warning"
+    assert stated.verdict.joints[LIFT].status == "usable"
+
+
+def test_a_counterbalance_of_a_validation_log_alone_has_no_part_in_the_model():
+    on_joint = [
+        Finding("counterbalance", "warning", f"{log}: {joint}", "", {"turned": turned})
+        for log, joint, turned in (("a.csv", LIFT, 2.0), ("b.csv", ELBOW, 2.0), ("a.csv", PAN, 0.3))
+    ]
+    other = Finding("spring", "warning", f"a.csv: {ELBOW}", "", {"turned": 2.0})
+    found = counterbalanced([*on_joint, other], ["a.csv"])
+    assert found == {LIFT: "harmonics1", PAN: "spring"}
+
+
+def test_a_coupling_is_named_on_both_joints_with_the_setting_to_copy(ur5):
+    pair = {joint: 1.0 for joint in ur5.joints[4:6]}
+    one, other = findings_of(identified(ur5, 4, coupling=tuple(pair.items())))
+    assert [(f.code, f.severity, f.where) for f in (one, other)] == [
+        ("coupling", "warning", joint) for joint in pair
+    ]
+    assert 'Add [[coupling]] to the job with name = "wrist_2_joint_wrist_3_joint"' in one.message
+    assert "ratios = { wrist_2_joint = 1.0, wrist_3_joint = 1.0 }" in one.message
+    assert one.evidence["share_pct"] > 90
+
+
+def test_columns_join_the_regressor_and_base_parameters_are_refitted(ur5):
+    sample = take_sample(identified(ur5, 1, "load", 1, duration=12.0))
+    j, b = 2, sample.W.shape[-1]
+    Z = np.column_stack([sample.motions[j].q, sample.motions[j].v ** 3])
+    apart, whole = trials(sample, slice(j, j + 1), Z[:, None])
+    for trial, left_out in ((whole, None), (apart, 3)):
+        rows = np.arange(len(sample.r)) < sample.rows
+        if left_out is not None:
+            rows[sample.stretches[left_out]] = False
+        columns = np.zeros((*sample.r.shape, 2))
+        columns[:, j] = sample.weight[:, [j]] * Z
+        X = np.concatenate([sample.W, columns], axis=2)
+        # the prior of base parameters, and the ridge of the columns
+        size = np.sqrt(sample_module._RIDGE * np.sum(columns[rows] ** 2, axis=(0, 1)))
+        prior = np.diag(np.concatenate([np.ones(b), size]))
+        stacked = np.vstack([X[rows].reshape(-1, b + 2), prior])
+        r = np.append(sample.r[rows].ravel(), np.zeros(b + 2))
+        theta = np.linalg.lstsq(stacked, r, rcond=None)[0]
+        found = trial.parameters([0, 1])
+        found = found if left_out is None else found[left_out]
+        np.testing.assert_allclose(found, theta[b:], rtol=1e-6)
+        k = sample.stretches[left_out or 0]
+        squares = np.sum((sample.r[k, j] - X[k, j] @ theta) ** 2)
+        assert trial.left([0, 1])[left_out or 0] == pytest.approx(squares, rel=1e-6)
+
+
+def test_a_misfit_reaches_the_verdict_unless_the_torque_is_explained_well(ur5):
+    large, small, note = (
+        Finding("friction_shape", severity, LIFT, "", {"share_pct": 90, "error_pct": error})
+        for severity, error in (("warning", 5.1), ("warning", 4.9), ("note", 20.0))
+    )
+    (doubt,) = doubts_of([large, small, note], ur5.joints)
+    assert (doubt.code, doubt.joint) == ("friction_shape", LIFT)
+    assert doubt.message == (
+        "friction of another shape than viscous and Coulomb would explain 90 % of the squared "
+        "residual (5.1 % of the torque): the model of its drive lacks it"
+    )
+
+
+def test_a_hook_of_stribeck_makes_its_joint_usable(ur5, tmp_path):
+    paths = [tmp_path / name for name in ("fit.csv", "kept.csv")]
+    for k, path in enumerate(paths):
+        write_log(log_with(ur5, 1, "stribeck", 2, part=k), path)
+    table = {
+        "urdf": ur5.tree.path,
+        "model": {"friction": "viscous+coulomb"},
+        "identification": [{"log": str(paths[0])}],
+        "validation": [{"log": str(paths[1])}],
+        "output": {"report": False},
+    }
+    found, result = run_job(job_from_settings(table, "job", tmp_path), tmp_path / "out")
+    (named,) = [f for f in result["warnings"] if f["code"] == "friction_shape"]
+    assert named["where"] == ELBOW
+    assert f"state {ELBOW} = [" in named["message"].lower()
+    assert "in [drives] to add it to the model" in named["message"]
+    assert f"{ELBOW}.coulomb" in named["message"].partition("stand on this misfit")[0]
+    assert set(found.on_misfit) <= {name for name in found.mapping.names if ELBOW in name}
+    by_joint = found.verdict.joints
+    assert by_joint[ELBOW].status == "usable"
+    assert by_joint[ELBOW].reasons[-1].endswith("(friction_shape)")
+    assert by_joint[LIFT].status == "good"
+
+
+def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(ur5):
+    guesses = [
+        Finding("urdf_mismatch", "warning", "run.csv", ""),
+        Finding("unexplained_torque", "warning", f"run.csv: {LIFT}", ""),
+        Finding("unexplained_torque", "warning", f"run.csv: {PAN}", ""),
+        Finding("clipped", "warning", f"run.csv: {LIFT}", ""),
+    ]
+
+    def said(code, share):
+        term = Finding(code, "note", LIFT, "It is.", {"share_pct": share, "error_pct": 1.0})
+        *kept, term = settled(guesses, [term])
+        return [guesses.index(f) for f in kept], term
+
+    kept, term = said("spring", 90.0)
+    assert kept == [2, 3]
+    assert (term.severity, term.evidence["replaces"]) == ("warning", 2.0)
+    assert "It explains urdf_mismatch, unexplained_torque, and" in term.message
+    assert [doubt.joint for doubt in doubts_of([term], ur5.joints)] == [LIFT]
+    assert said("position_offset", 90.0)[0] == [2, 3]
+    assert said("load_friction", 90.0)[0] == [0, 2, 3]
+    assert said("spring", 40.0) == ([0, 1, 2, 3], Finding(
+        "spring", "note", LIFT, "It is.", {"share_pct": 40.0, "error_pct": 1.0}
+    ))  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("effect", "seed", "size", "guess"),
+    [("counterbalance", 5, 3.0, "current_for_torque"), ("periodic", 1, 2.0, "counterbalance")],
+)
+def test_a_joint_that_follows_its_position_is_no_other_robot(ur5, effect, seed, size, guess):
+    logs = [log_with(ur5, seed, effect, 1, part=k, size=size) for k in (0, 1)]
+    guesses = check_logs(ur5, logs[:1], validation=logs[1:])
+    assert guess in {finding.code for finding in guesses}
+    found = fitted(ur5, logs)
+    said = {
+        f.code for f in settled(guesses, fit_findings(found, found.misfits)) if f.severity != "note"
+    }
+    assert EFFECTS[effect].code in said
+    assert not said & {"counterbalance", "urdf_mismatch", "current_for_torque"}
+    assert "unexplained_torque" not in said
+
+
+def test_logs_in_files_are_judged_by_the_stretches_at_hand(ur5, tmp_path):
+    for k, name in enumerate(("fit.csv", "kept.csv")):
+        write_log(log_with(ur5, 1, "load", 1, part=k), tmp_path / name)
+    table = {
+        "urdf": ur5.tree.path,
+        "reduction": {"rows_in_memory": 1024},
+        "identification": [{"log": "fit.csv"}],
+        "validation": [{"log": "kept.csv"}],
+    }
+    job = job_from_settings(table, "job", tmp_path)
+    surveyed = survey_logs(job, ur5, job.identification, job.validation)
+    recordings = Recordings(ur5, structural_mapping(ur5), *surveyed)
+    assert not recordings.is_held
+    (found,) = misfits(conclude(recordings, EstimatorSettings("wls"), friction="none"))
+    assert (found.joint, found.term.code) == (LIFT, "load_friction")
+    assert found.size == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_log_too_short_to_judge_by_is_not_judged(ur5):
+    log = log_with(ur5, 1, "spring", 2, duration=8.0)
+    signals = SignalSettings(cutoff=2.0)
+    assert misfits(fitted(ur5, [log], signals=signals)) == ()
+    assert len(misfits(fitted(ur5, [log]))) == 1
+
+
+def test_real_drives_have_the_terms_that_others_measured_on_them(recordings, monkeypatch):
+    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
+    said = {}
+    for name in ("ur10e", "tx40", "panda_inria"):
+        job = read_job(ROOT / "tests" / "jobs" / f"{name}.toml")
+        for couplings in (job.couplings, ())[: 2 if name == "tx40" else 1]:
+            model = replace(job, couplings=couplings).model()
+            fit, kept = (
+                [job.read(entry, model) for entry in some]
+                for some in (job.identification, job.validation)
+            )
+            found = identify(
+                model, fit, validation=kept, signals=job.signals, doctor=False, friction="none"
+            )
+            key = name if couplings == job.couplings else f"{name} uncoupled"
+            said[key] = {(m.joint, m.term.code): m for m in misfits(found) if m.matters}
+    load = {joint: said["ur10e"][joint, "load_friction"] for joint in (LIFT, ELBOW)}
+    for term in load.values():  # mu of six fits of two robots: 0.064 to 0.081
+        assert 0.06 < term.size < 0.085
+        assert min(term.share, term.confirmed) > 0.6
+    assert set(said["tx40"]) == {("joint_2", "friction_shape"), ("joint_3", "load_friction")}
+    assert {("joint_5", "coupling"), ("joint_6", "coupling")} < set(said["tx40 uncoupled"])
+    assert said["panda_inria"] == {}

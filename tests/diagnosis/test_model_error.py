@@ -1,0 +1,183 @@
+"""Errors of drive parameters count what the model of the drives lacks, and what its shapes may be.
+
+The truth of a parameter is that of the robot that made the log: Coulomb friction is what it is
+without load, whether the model that is fitted knows of load friction or not.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
+
+from robotid.diagnosis.drive_choice import choose_drives
+from robotid.diagnosis.misfit import find_misfits
+from robotid.diagnosis.model_error import with_model_error
+from robotid.diagnosis.sample import take_sample
+from robotid.fitting.bands import expected_band, friction_curve
+from robotid.fitting.open_terms import open_torques
+from robotid.regressor.torque import trajectory_regressor
+from robotid.robot.drives import LoadFriction, Stribeck
+
+REACH = 1.5
+PLAIN = "viscous+coulomb"
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return arm()
+
+
+@pytest.fixture(scope="module")
+def loaded(plain):
+    """A robot whose elbow has load friction, its parameters by name, and its log."""
+    true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": 0.1})
+    names = dict(zip(true.layout.names, pi, strict=True))
+    return names, driven_log(true, pi, 3, reach=REACH)
+
+
+@pytest.fixture(scope="module")
+def hooked(plain):
+    true, pi = driven(plain, {ELBOW: [Stribeck(speed=0.1)]}, {f"{ELBOW}.stribeck": 3.0})
+    names = dict(zip(true.layout.names, pi, strict=True))
+    return names, driven_log(true, pi, 3, reach=REACH)
+
+
+def at(found, name):
+    return list(found.model.layout.names).index(name)
+
+
+def test_coulomb_friction_that_stands_on_a_misfit_covers_the_truth(plain, loaded):
+    true, log = loaded
+    found = found_in(plain, [log], friction=PLAIN, estimator="wls")
+    (misfit,) = found.misfits
+    assert (misfit.joint, misfit.term.code) == (ELBOW, "load_friction")
+    assert misfit.size == pytest.approx(0.1, abs=0.015)
+    coulomb = f"{ELBOW}.coulomb"
+    assert coulomb in found.on_misfit
+    k, b = at(found, coulomb), found.mapping.base_names.index(coulomb)
+    noise_alone = found.wls.std_error[b]
+    miss = abs(found.standard[k] - true[coulomb])
+    assert miss > 5.0 * noise_alone  # it took a part of the load's
+    assert found.standard_error[k] > 5.0 * noise_alone
+    assert miss < 1.96 * found.standard_error[k]
+    assert found.base_interval[b, 0] < true[coulomb] < found.base_interval[b, 1]
+    (said,) = [f for f in found.findings if f.code == "load_friction"]
+    assert f"{coulomb} stand" in said.message or f"{coulomb}, " in said.message
+
+
+def test_what_a_misfit_moves_is_what_a_fit_with_the_term_finds(plain, loaded):
+    """The oracle: the same log fitted with the term."""
+    _, log = loaded
+    found = found_in(plain, [log], friction=PLAIN, estimator="wls")
+    better = found_in(plain, [log], friction={ELBOW: "load", "*": "none"}, estimator="wls")
+    (misfit,) = found.misfits
+    sample = take_sample(found)
+    shift = sample.U.T @ misfit.shift  # base parameters
+    for name in (f"{ELBOW}.coulomb", f"{ELBOW}.viscous", f"{LIFT}.coulomb"):
+        b = found.mapping.base_names.index(name)
+        moved = better.standard[at(better, name)] - found.standard[at(found, name)]
+        assert shift[b] == pytest.approx(moved, abs=3.0 * better.standard_error[at(better, name)])
+        before = found.wls.std_error[b]
+        assert found.base_error[b] == pytest.approx(np.hypot(before, shift[b]), rel=1e-6)
+        is_wide = found.base_error[b] > 1.3 * before
+        assert (name in found.on_misfit) == is_wide
+
+
+@pytest.mark.parametrize(("robot", "family"), [("loaded", "load"), ("hooked", "stribeck")])
+def test_a_prediction_errs_by_what_a_missing_term_moves_and_by_its_torque(
+    plain, robot, family, request
+):
+    """The oracle: how much the prediction changes once the term is in the model."""
+    (_, log), joint = request.getfixturevalue(robot), plain.joints.index(ELBOW)
+    slower = replace(log, t=1.4 * log.t, v=None, a=None)  # at other speeds, other loads
+    found, better = (
+        found_in(plain, [log], validation=[slower], friction=friction, estimator="wls")
+        for friction in (PLAIN, {ELBOW: family, "*": "none"})
+    )
+    (term,) = (term for term in found.open_terms if term.joint == ELBOW)
+    pure = found.standard_covariance - sum(np.outer(x.moves, x.moves) for x in found.open_terms)
+    assert np.linalg.eigvalsh(pure).min() > -1e-9 * np.linalg.eigvalsh(pure).max()
+    for one, other in zip(
+        (*found.fitted, *found.validation), (*better.fitted, *better.validation), strict=True
+    ):
+        band = expected_band(found, one)
+        changed = (other.torques["estimate"] - one.torques["estimate"])[band.samples, joint]
+        W = trajectory_regressor(found.model, one.recording.trajectory.at(band.samples))
+        W = W.reshape(len(band.samples), -1, W.shape[1])[:, joint]
+        (torque,) = (
+            z
+            for x, z in zip(found.open_terms, open_torques(found, one, band.samples), strict=True)
+            if x is term
+        )
+        errs = W @ term.moves + torque[:, joint]
+        assert np.sqrt(np.mean((errs - changed) ** 2)) < 0.2 * np.sqrt(np.mean(changed**2))
+        assert not torque[:, :joint].any()
+        others = [x for x in found.open_terms if x is not term]
+        wanted = np.einsum("ij,jk,ik->i", W, pure, W) + errs**2
+        wanted += sum((W @ x.moves) ** 2 for x in others)
+        np.testing.assert_allclose(band.parameters[:, joint] ** 2, wanted, rtol=1e-6)
+    v = np.array([-1.0, -0.3, 0.3, 1.0])
+    curves = [friction_curve(x, ELBOW, v, load=20.0) for x in (found, better)]
+    changed = curves[1].torque - curves[0].torque
+    np.testing.assert_allclose(curves[0].std, np.abs(changed), atol=0.3 * np.abs(changed).max())
+
+
+def test_without_rows_to_judge_by_errors_stay_as_they_are(plain, loaded):
+    found = found_in(plain, [loaded[1]], friction=PLAIN, estimator="wls")
+    assert with_model_error(found, None, ()) == (found, ())
+    assert found.mapping.names  # and with rows and no misfit they do, too
+    same, on_misfit = with_model_error(found, take_sample(found), ())
+    np.testing.assert_array_equal(same.base_error, found.base_error)
+    assert on_misfit == ()
+
+
+def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked):
+    """The oracle: fits with the shape stated, larger and smaller by its standard error."""
+    true, log = hooked
+    found = found_in(plain, [log], friction={ELBOW: "stribeck", "*": "none"}, estimator="wls")
+    (choice,) = found.drives
+    (shape,) = choice.shapes
+    sure = {}
+    for size in (shape.value - shape.std_error, shape.value, shape.value + shape.std_error):
+        (term,) = choice.terms
+        own = Stribeck(speed=size, seen=term.seen)
+        model = plain.with_terms({ELBOW: [own]})
+        sure[size] = found_in(model, [log], friction="none", estimator="wls")
+    low, middle, high = sure.values()
+    for term in ("stribeck", "coulomb", "viscous"):
+        k = at(found, f"{ELBOW}.{term}")
+        moved = 0.5 * (high.standard[k] - low.standard[k])
+        wanted = np.hypot(middle.standard_error[k], moved)
+        assert found.standard_error[k] == pytest.approx(wanted, rel=0.05), term
+        by_one_error = found.open_terms[0].moves[k]  # of either sign
+        assert abs(by_one_error) == pytest.approx(abs(moved), rel=0.1), term
+        assert abs(found.standard[k] - true[f"{ELBOW}.{term}"]) < 2.6 * found.standard_error[k]
+    k = at(found, f"{ELBOW}.stribeck")
+    assert found.standard_error[k] > 1.1 * middle.standard_error[k]
+    # the curve itself bends with the shape: at a speed it moves less or more than its parameters
+    v = np.array([0.05, 0.1, 0.3, 1.0])
+    curves = [friction_curve(x, ELBOW, v).torque for x in (low, high)]
+    bent = 0.5 * (curves[1] - curves[0])
+    wanted = np.hypot(friction_curve(middle, ELBOW, v).std, bent)
+    np.testing.assert_allclose(friction_curve(found, ELBOW, v).std, wanted, rtol=0.05)
+
+
+def test_shapes_that_err_together_have_one_covariance(plain, hooked):
+    """A hook's speed and excess make up for each other: alone each looks far too sure."""
+    found = found_in(plain, [hooked[1]], friction={ELBOW: "lugre", "*": "none"}, estimator="wls")
+    (choice,) = found.drives
+    C = np.array(choice.shape_covariance)
+    np.testing.assert_allclose(np.sqrt(np.diag(C)), [s.std_error for s in choice.shapes])
+    np.testing.assert_allclose(C, C.T)
+    assert np.linalg.eigvalsh(C / np.sqrt(np.outer(np.diag(C), np.diag(C)))).min() > -1e-9
+    speed, excess = 1, 2
+    assert abs(C[speed, excess]) > 0.5 * np.sqrt(C[speed, speed] * C[excess, excess])
+
+
+def test_a_clean_robot_has_the_errors_of_its_noise(plain):
+    true, pi = driven(plain, {}, {})
+    found = found_in(plain, [driven_log(true, pi, 3, reach=REACH)], friction=PLAIN, estimator="wls")
+    assert find_misfits(take_sample(found)) == found.misfits == ()
+    np.testing.assert_allclose(found.base_error, found.wls.std_error)
+    assert choose_drives(found, dict.fromkeys(found.model.joints, ())) == ()

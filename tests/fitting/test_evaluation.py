@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.fitting.evaluation import evaluate_logs, pool, predict, shares_rows
+from robotid.fitting.survey import hold_log
+from robotid.logs.data import Log, Trajectory
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.used_rows import row_mask
+from robotid.robot.parameters import Coupling
+
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+
+
+def evaluated(model, log, parameters, prior):
+    """Return the evaluation of one log in memory."""
+    ((found,), ()) = evaluate_logs([hold_log(model, log, EXACT)], (), parameters, prior)
+    return found
+
+
+def test_baselines_are_the_urdf_with_and_without_motion(ur5, rng):
+    pi, prior = truth(ur5), ur5.standard_parameters()
+    found = evaluated(ur5, exact_log(ur5, pi, rng), {"truth": pi}, prior)
+    recording = found.recording
+    assert set(found.torques) == {"truth", "urdf", "gravity_only"}
+    np.testing.assert_allclose(found.torques["truth"], recording.trajectory.tau, atol=1e-10)
+    (urdf,) = predict(ur5, [prior], recording.trajectory)
+    np.testing.assert_allclose(found.torques["urdf"], urdf, rtol=1e-12, atol=1e-12)
+    assert (
+        np.abs(found.torques["gravity_only"][:, 0]).max() < 1e-9
+    )  # a vertical axis carries no weight
+    measured = found.metrics["truth"].per_joint["elbow_joint"]
+    assert measured.relative_error_pct < 1e-9
+    assert measured.baselines["gravity_only"] > 10
+
+
+def test_gravity_knows_no_offset(ur5, rng):
+    pi = truth(ur5)
+    found = evaluated(ur5, exact_log(ur5, pi, rng), {"truth": pi}, pi)
+    assert np.abs(found.torques["gravity_only"][:, 0]).max() < 1e-9
+
+
+def test_pooled_metrics_are_those_of_all_rows(ur5, rng):
+    pi = truth(ur5)
+    logs = [exact_log(ur5, pi, rng, noise=np.full(6, s), samples=200) for s in (0.1, 0.3)]
+    found = [evaluated(ur5, log, {"x": pi}, pi) for log in logs]
+    squares = [f.metrics["x"].pooled_rmse ** 2 for f in found]
+    np.testing.assert_allclose(pool(ur5, found, "x").pooled_rmse, np.sqrt(np.mean(squares)))
+
+
+def test_rows_of_slow_joints_and_slow_coupled_drives_are_left_out(ur5, rng):
+    from robotid.robot.model import RobotModel
+
+    coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", 1.0)))
+    coupled = RobotModel.from_urdf(ur5.tree.path, couplings=(coupling,))
+    trajectory = hold_log(ur5, exact_log(ur5, truth(ur5), rng), EXACT).whole.trajectory
+    v = trajectory.v
+    mask = row_mask(ur5, trajectory, 0.1)
+    np.testing.assert_array_equal(mask, np.abs(v) >= 0.1)
+    slow = np.abs(v[:, 4] + v[:, 5]) < 0.1
+    both = row_mask(coupled, trajectory, 0.1)
+    assert not both[slow][:, 4:].any()
+    np.testing.assert_array_equal(both[:, :4], mask[:, :4])
+    frictionless = RobotModel.from_urdf(ur5.tree.path, terms=("viscous",))
+    assert row_mask(frictionless, trajectory, 0.1).all()
+
+
+def test_a_slow_slider_is_slow_by_its_own_stroke():
+    from helpers.corruptions import robot
+
+    tiago = robot("tiago")  # its torso lifts 0.35 m: 0.02 rad/s is 1.1 mm/s of it
+    v = np.zeros((4, len(tiago.joints)))
+    v[:, 0] = [0.0010, 0.0012, 0.019, 0.021]
+    v[:, 1] = [0.019, 0.021, 0.019, 0.021]
+    q, rows = np.zeros_like(v), np.arange(4)
+    motion = Trajectory(rows / 1.0, q, v, q, q, tiago.joints, None, rows * 0)
+    mask = row_mask(tiago, motion, 0.02)
+    assert mask[:, 0].tolist() == [False, True, True, True]
+    assert mask[:, 1].tolist() == [False, True, False, True]
+
+
+def test_rows_recorded_twice_are_found_whatever_the_clock_says(ur5, rng):
+    log, other = (exact_log(ur5, truth(ur5), rng) for _ in range(2))
+    later = Log(t=log.t + 5.0, q=log.q, tau=log.tau, joints=log.joints)
+    part = later.window(8.0, 9.0)
+    assert shares_rows(part, log)
+    assert not shares_rows(other, log)
+    before, after = log.window(end=6.0), log.window(start=6.0)
+    assert before.t[-1] == after.t[0]  # both hold the row where they meet
+    assert not shares_rows(after, before)
+    jittered = Log(t=log.t, q=log.q, tau=log.tau * (1 + 1e-12), joints=log.joints)
+    assert not shares_rows(jittered, log)
+
+
+def test_a_recording_is_named_by_its_file_and_stretch(ur5, rng):
+    pi = truth(ur5)
+    found = evaluated(ur5, exact_log(ur5, pi, rng), {"x": pi}, pi)
+    assert found.recording.name == "log 0-11.98 s"
+
+
+@pytest.mark.parametrize(
+    ("rows", "same", "shared"), [(200, 4, False), (200, 5, True), (10, 1, False), (10, 2, True)]
+)
+def test_more_than_two_percent_and_more_than_one_row_make_a_shared_log(rng, rows, same, shared):
+    def log(q):
+        return Log(t=np.arange(rows) / 100.0, q=q, v=None, tau=q + 1.0, joints=("a", "b"))
+
+    q, other = rng.standard_normal((2, rows, 2))
+    other[:same] = q[:same]
+    assert shares_rows(log(q), log(other)) is shared

@@ -1,0 +1,77 @@
+"""The table of parameters: every parameter once, with what result.json says of it."""
+
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+
+from robotid.export.result import Result, build_result
+from robotid.fitting import parameter_table
+
+
+@pytest.fixture
+def written(identified, tmp_path):
+    content = json.loads(json.dumps(build_result(identified, {"estimator": {"name": "x"}})))
+    return Result(tmp_path / "result.json", content)
+
+
+@pytest.mark.parametrize("of", ["found", "loaded"])
+def test_a_data_frame_has_a_row_for_each_parameter(identified, written, of):
+    frame = (identified if of == "found" else written).table()
+    assert list(frame.columns) == list(parameter_table.HEADERS)
+    assert tuple(frame["part"] + "." + frame["parameter"]) == identified.model.layout.names
+    np.testing.assert_array_equal(frame["value"], identified.standard)
+    size = identified.model.layout.n_inertial
+    np.testing.assert_array_equal(frame["urdf"][:size], identified.prior[:size])
+    assert frame["urdf"][size:].isna().all()
+    errors = identified.standard_error
+    np.testing.assert_array_equal(frame["std_error"], np.where(np.isfinite(errors), errors, np.nan))
+    assert tuple(frame["source"]) == identified.sources
+    assert tuple(frame["unit"]) == identified.model.layout.units
+    assert frame["value"].dtype == frame["std_error"].dtype == frame["high"].dtype == float
+    low, high = identified.standard_interval.T
+    known = np.isfinite(errors)
+    np.testing.assert_array_equal(frame["low"], np.where(known, low, np.nan))
+    np.testing.assert_array_equal(frame["high"], np.where(known, high, np.nan))
+
+
+def test_the_interval_of_a_parameter_that_is_a_base_parameter_is_that_of_it(identified):
+    mapping, own = identified.mapping, identified.standard_interval
+    checked = 0
+    for b, row in enumerate(mapping.K):
+        (columns,) = np.nonzero(row)
+        if len(columns) == 1 and np.isfinite(own[columns[0], 0]):
+            assert row[columns[0]] == 1.0
+            half = np.diff(identified.base_interval[b])
+            assert np.diff(own[columns[0]]) == pytest.approx(half, rel=1e-6)
+            checked += 1
+    assert checked > 12
+    errors = identified.standard_error
+    known = np.isfinite(errors) & (errors > 0)
+    reach = np.diff(own[known], axis=1)[:, 0] / (2.0 * errors[known])
+    assert (reach >= 1.95).all()
+
+
+def test_without_pandas_it_is_a_list_that_a_notebook_shows(identified, monkeypatch):
+    monkeypatch.setattr(parameter_table, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    rows = identified.table()
+    k = identified.model.layout.names.index("forearm_link.m")
+    assert rows[k] == {
+        "part": "forearm_link",
+        "parameter": "m",
+        "urdf": identified.prior[k],
+        "value": identified.standard[k],
+        "std_error": identified.standard_error[k],
+        "low": identified.standard_interval[k, 0],
+        "high": identified.standard_interval[k, 1],
+        "source": identified.sources[k],
+        "unit": "kg",
+    }
+    assert all(row["std_error"] is None or math.isfinite(row["std_error"]) for row in rows)
+    assert rows[-1]["urdf"] is None
+    html = rows._repr_html_()
+    assert html.count("<tr>") == len(rows) + 1
+    assert f"{identified.standard[k]:.4g}" in html

@@ -1,0 +1,203 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.signal
+import scipy.stats
+from helpers.fitting import identify
+from helpers.synthetic import exact_log, truth
+
+from robotid.estimators import OLS, WLS
+from robotid.estimators.stretches import quantile, scatter
+from robotid.exceptions import DataError
+from robotid.fitting.standard_errors import measured_errors, with_wls_errors
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.factors import compress, merge
+from robotid.regressor.problem import Problem
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+N, JOINTS, STRETCHES = 2400, 2, 40
+SIGMA = np.array([2.0, 0.1])
+TRUTH = np.array([1.0, -2.0, 0.5, 3.0])
+
+
+@pytest.fixture(scope="module")
+def W():
+    rng = np.random.default_rng(0)
+    slow = scipy.signal.lfilter([1.0], [1.0, -0.95], rng.standard_normal((N, JOINTS, 3)), axis=0)
+    return np.concatenate([slow, np.ones((N, JOINTS, 1))], axis=2)
+
+
+def noise(rng, colour):
+    white = rng.standard_normal((N, JOINTS))
+    coloured = scipy.signal.lfilter([np.sqrt(1 - colour**2)], [1.0, -colour], white, axis=0)
+    return SIGMA * coloured
+
+
+def stretches(W, tau):
+    def problem(W, tau):
+        k = len(tau) * JOINTS
+        return Problem(
+            lambda: iter([(W.reshape(k, -1), tau.reshape(k), np.ones(k))]),
+            tuple("abcd"),
+            JOINTS,
+            np.ones((JOINTS, 4), dtype=bool),
+        )
+
+    parts = zip(np.split(W, STRETCHES), np.split(tau, STRETCHES), strict=True)
+    return [compress(problem(*part)) for part in parts]
+
+
+def estimate(W, tau):
+    parts = stretches(W, tau)
+    whole = merge(parts)
+    rough = WLS().fit(whole)
+    return measured_errors(rough, parts, whole, 1.0, np.eye(4), rough.sigma)
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.9])
+def test_standard_errors_are_the_scatter_of_many_recordings(W, colour):
+    rng = np.random.default_rng(1)
+    errors, reported, held = [], [], []
+    for _ in range(150):
+        found, basis = estimate(W, W @ TRUTH + noise(rng, colour))
+        errors.append(found.theta - TRUTH)
+        reported.append(found.std_error)
+        held.append(np.abs(errors[-1]) <= basis.reach * found.std_error)
+    scattered = np.sqrt(np.mean(np.square(errors), axis=0))
+    ratio = np.sqrt(np.mean(np.square(reported), axis=0)) / scattered
+    # 150 runs know their own scatter to 6 %
+    assert ((ratio > 0.82) & (ratio < 1.25)).all(), ratio
+    assert 0.92 < np.mean(held) < 0.98
+
+
+@pytest.mark.parametrize(("samples", "basis"), [(1600, "16 stretches"), (800, "filter's band")])
+def test_behind_the_filter_errors_are_the_scatter_and_those_of_independent_rows_are_not(
+    samples, basis
+):
+    model = RobotModel.from_urdf(example_urdf("double_pendulum_simple.urdf"))
+    rng, filtered = np.random.default_rng(1), SignalSettings(cutoff=5.0)  # of logs at 100 Hz
+    clean = exact_log(model, truth(model), np.random.default_rng(0), samples=samples, rate=100.0)
+    level = np.array([0.1, 0.005]) * np.sqrt(np.mean(clean.tau**2, axis=0))
+    found, stated, naive = [], [], []
+    for _ in range(30):
+        log = replace(clean, tau=clean.tau + level * rng.standard_normal(clean.tau.shape))
+        result = identify(model, [log], signals=filtered, estimator="ols")
+        assert basis in result.errors.method
+        pair = (result.estimate, result.wls)
+        found.append([estimate.theta for estimate in pair])
+        stated.append([estimate.std_error for estimate in pair])
+        naive.append([kind.fit(result.factors).std_error for kind in (OLS(), WLS())])
+    scattered = np.std(found, axis=0, ddof=1)  # (2, 13)
+    ratio = np.sqrt(np.mean(np.square(stated), axis=0)) / scattered
+    # 30 runs know a standard deviation to 13 %
+    assert ((ratio > 0.67) & (ratio < 1.5)).all(), ratio
+    assert ((np.median(ratio, axis=1) > 0.8) & (np.median(ratio, axis=1) < 1.2)).all()
+    # one row in ten is independent, 2 cutoff / rate: errors of as many as there are rows are short
+    blind = np.sqrt(np.mean(np.square(naive), axis=0)) / scattered
+    assert np.median(blind) == pytest.approx(0.3, abs=0.06)
+    assert blind.max() < 0.5
+
+
+def test_independent_rows_need_no_inflation_and_coloured_ones_do(W):
+    rng = np.random.default_rng(2)
+    _, white = estimate(W, W @ TRUTH + noise(rng, 0.0))
+    _, coloured = estimate(W, W @ TRUTH + noise(rng, 0.9))
+    assert 0.7 < white.inflation < 1.4
+    assert coloured.inflation > 5  # (1 + 0.9) / (1 - 0.9) = 19 for rows that never change
+
+
+def test_one_parameter_is_the_closed_form_of_cr2(rng):
+    x, e = rng.standard_normal((20, 10)), rng.standard_normal((20, 10))
+    y = 0.7 * x + e
+    theta = (x * y).sum() / (x**2).sum()
+    bread = 1 / (x**2).sum()
+
+    def problem(x, y):
+        blocks = [(x[:, None], y, np.ones(len(x)))]
+        return Problem(lambda: iter(blocks), ("a",), 1, np.ones((1, 1), dtype=bool))
+
+    parts = [compress(problem(*part)) for part in zip(x, y, strict=True)]
+    found = scatter(parts, np.array([theta]), np.ones(1), np.array([[bread]]))
+    # with one column, (I - H_ss)^-1/2 acts along x_s alone, with leverage h_s
+    h = (x**2).sum(axis=1) * bread
+    scores = (x * (y - theta * x)).sum(axis=1) / np.sqrt(1 - h)
+    assert found.covariance[0, 0] == pytest.approx(bread**2 * (scores**2).sum(), rel=1e-9)
+    a = np.sqrt((x**2).sum(axis=1) / (1 - h)) * bread
+    back = np.sqrt((x**2).sum(axis=1)) * a
+    gram = np.diag(a**2) - np.outer(back, back) * bread
+    freedom = np.trace(gram) ** 2 / (gram**2).sum()
+    assert found.freedom()[0] == pytest.approx(freedom, rel=1e-9)
+
+
+def test_a_direction_of_one_stretch_alone_gets_the_scatter_of_the_others(W):
+    alone = W.copy()
+    alone[:, :, 1] = 0.0
+    alone[60:120, :, 1] = W[60:120, :, 1]  # the second of 40 stretches
+    rng = np.random.default_rng(3)
+    ratio = []
+    for _ in range(40):
+        found, _ = estimate(alone, alone @ TRUTH + noise(rng, 0.0))
+        ratio.append(((found.theta - TRUTH)[1] / found.std_error[1]) ** 2)
+    assert 0.5 < np.mean(ratio) < 2.0
+
+
+def test_few_stretches_keep_the_band_of_the_filter(W):
+    parts = stretches(W, W @ TRUTH + noise(np.random.default_rng(0), 0.0))[:11]
+    whole = merge(parts)
+    rough = WLS(independent_share=0.2).fit(whole)
+    found, basis = measured_errors(rough, parts, whole, 0.2, np.eye(4), rough.sigma)
+    np.testing.assert_array_equal(found.covariance, rough.covariance)
+    assert basis.inflation == pytest.approx(5.0)
+    assert "only 11 stretches" in basis.method
+    with pytest.raises(DataError, match="11 stretches"):
+        scatter(parts, rough.theta, rough.sigma, rough.covariance)
+
+
+def test_quantiles_are_students():
+    np.testing.assert_allclose(
+        quantile(np.array([5.0, 30.0, np.inf])), scipy.stats.t.ppf(0.975, [5.0, 30.0, 1e12]), 1e-9
+    )
+
+
+def test_a_filter_that_forgets_keeps_its_own_covariance_grown_by_the_inflation(W):
+    parts = stretches(W, W @ TRUTH + noise(np.random.default_rng(4), 0.9))
+    whole = merge(parts)
+    share = 0.25  # the covariance of the fit takes a quarter of the rows to be independent
+    own = WLS(independent_share=share).fit(whole)
+    found, errors = measured_errors(own, parts, whole, share, np.eye(4), own.sigma, is_filter=True)
+    _, plain = measured_errors(own, parts, whole, share, np.eye(4), own.sigma)
+    assert errors.inflation == pytest.approx(plain.inflation, rel=1e-6)
+    assert errors.inflation > 5
+    np.testing.assert_allclose(found.covariance, own.covariance * share * errors.inflation)
+
+
+def test_a_gradient_method_ends_beside_the_minimum_and_says_so(W):
+    parts = stretches(W, W @ TRUTH + noise(np.random.default_rng(5), 0.0))
+    wls = WLS().fit(merge(parts))
+    away = np.array([0.1, 0.0, -0.2, 0.3])
+    rough = replace(wls, theta=wls.theta + away, covariance=np.zeros((4, 4)))
+    found = with_wls_errors(rough, wls)
+    np.testing.assert_allclose(found.covariance, wls.covariance + np.outer(away, away))
+    np.testing.assert_array_equal(found.theta, rough.theta)
+    assert "plus the distance to it" in found.message
+
+
+def test_the_prior_makes_the_sandwich_of_its_formula(W):
+    # B (K^T M K + L) B with B = (K^T H K + L)^-1, computed from the rows themselves
+    rng, share = np.random.default_rng(6), 0.25
+    tau = W @ TRUTH + noise(rng, 0.0)
+    parts = stretches(W, tau)
+    whole, K = merge(parts), np.hstack([np.eye(4), rng.standard_normal((4, 2))])
+    wls = WLS().fit(whole)
+    L = np.diag(np.arange(1.0, 7.0))
+    rows = W.reshape(-1, 4) / np.tile(wls.sigma, N)[:, None]
+    B = np.linalg.inv(share * K.T @ rows.T @ rows @ K + L)
+    theta = np.linalg.lstsq(K, wls.theta, rcond=None)[0]
+    estimate = replace(wls, theta=theta, covariance=B, names=tuple("abcdef"))
+    found, _ = measured_errors(estimate, parts, whole, share, K, wls.sigma)
+    meat = scatter(parts, K @ theta, wls.sigma, share * K @ B @ K.T).meat
+    np.testing.assert_allclose(
+        found.covariance, B @ (share**2 * K.T @ meat @ K + L) @ B, rtol=1e-6, atol=1e-12
+    )

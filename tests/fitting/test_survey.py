@@ -1,0 +1,232 @@
+"""A log read in pieces gives what the same log in memory gives."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from helpers.synthetic import truth
+
+from robotid.estimators import WLS
+from robotid.exceptions import DataError
+from robotid.fitting import survey
+from robotid.fitting.recordings import Recordings
+from robotid.fitting.survey import ReducedPiece, hold_log, survey_log
+from robotid.logs.data import Log
+from robotid.logs.formats import open_table, write_columns
+from robotid.logs.read import lay_out, read_log, write_log
+from robotid.logs.settings import LogUnits, SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.factors import join
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.simulation.motions import random_fourier
+
+LENGTH = 500  # rows per piece
+
+
+@pytest.fixture(scope="module")
+def recording(ur5):
+    """Return a noisy log of a UR5 with jitter and gaps, one of them where a piece ends."""
+    rng = np.random.default_rng(0)
+    step = 0.01 * (1 + 0.1 * rng.uniform(-1, 1, 1999))
+    step[[2 * LENGTH - 1, 1234]] = [0.5, 0.7]
+    t = np.concatenate([[0.0], np.cumsum(step)])
+    q, v, a = random_fourier(ur5, rng, period=7.0).evaluate(t)
+    tau = (joint_torque_regressor(ur5, q, v, a) @ truth(ur5)).reshape(v.shape)
+    noisy = {"q": q + 1e-5 * rng.standard_normal(q.shape), "v": v, "a": a}
+    return Log(t=t, tau=tau + 0.1 * rng.standard_normal(q.shape), joints=ur5.joints, **noisy)
+
+
+def long_log(model, path, signals, *, start=None, end=None, length=LENGTH, **reading):
+    layout, table = lay_out(path, model.joints, **reading)
+    return survey_log(layout, table, model, signals, (start, end), length=length)
+
+
+def pieces_of(log):
+    """Return the pieces of a log, ready to be reduced."""
+    mapping = structural_mapping(log.model)
+    return [ReducedPiece(piece, mapping) for piece in log.pieces]
+
+
+def assert_alike(model, path, signals, *, start=None, end=None, **reading):
+    """Check pieces against the log in memory; return both."""
+    mapping = structural_mapping(model)
+    found = long_log(model, path, signals, start=start, end=end, **reading)
+    whole = hold_log(model, read_log(path, model.joints, start=start, end=end, **reading), signals)
+    wanted = join(Recordings(model, mapping, [whole]).reduce())
+    joined = join([piece.reduce() for piece in pieces_of(found)])
+    assert found.signals == whole.signals
+    assert joined.samples == wanted.samples
+    np.testing.assert_array_equal(joined.factors.rows, wanted.factors.rows)
+    np.testing.assert_allclose(joined.squares, wanted.squares, rtol=1e-9)
+    one, other = WLS().fit(joined.factors), WLS().fit(wanted.factors)
+    size = np.abs(other.theta).max()
+    np.testing.assert_allclose(one.theta, other.theta, rtol=1e-9, atol=1e-10 * size)
+    np.testing.assert_allclose(one.std_error, other.std_error, rtol=1e-8)
+    if signals.cutoff is None:
+        assert whole.whole.trajectory.direction is None
+    else:
+        directions = [piece.read().trajectory.direction for piece in found.pieces]
+        wanted = whole.whole.trajectory.direction
+        np.testing.assert_allclose(np.concatenate(directions), wanted, rtol=0, atol=1e-10)
+    return found, whole
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet", "npz"])
+@pytest.mark.parametrize(
+    "given",
+    [
+        {},
+        {"velocity": "differentiated", "cutoff": 12.0, "order": 2},
+        {"cutoff": None, "min_velocity": 0.0},
+        {"cutoff": None, "rate": 70.0},
+        {"rate": 50.0, "trim": 0.6, "torque_delay": 0.02},
+    ],
+    ids=str,
+)
+def test_pieces_reduce_to_what_the_whole_log_reduces_to(ur5, recording, suffix, given, tmp_path):
+    path = tmp_path / f"run.{suffix}"
+    write_log(recording, path)
+    found, _ = assert_alike(ur5, path, SignalSettings(**given))
+    assert len(found.pieces) == (4 if suffix != "npz" else 1)
+    assert [p.name for p in found.pieces][:1] in (
+        ["run.csv rows 0-500"],
+        ["run.parquet rows 0-500"],
+        ["run.npz rows 0-2000"],
+    )
+    assert sum(piece.samples for piece in found.pieces) == len(recording.t)
+    assert found.stamps[[found.first, found.stop - 1]].tolist() == [recording.t[0], recording.t[-1]]
+    assert found.step == np.median(np.diff(recording.t))
+
+
+def test_a_window_of_a_file_is_cut_as_in_memory(ur5, recording, tmp_path):
+    path = tmp_path / "run.csv"
+    write_log(recording, path)
+    found, whole = assert_alike(ur5, path, SignalSettings(), start=3.3, end=12.01)
+    np.testing.assert_array_equal(found.stamps[found.first : found.stop], whole.stamps)
+    with pytest.raises(DataError) as in_memory:
+        read_log(path, ur5.joints, start=50.0, end=60.0)
+    with pytest.raises(DataError) as in_pieces:
+        long_log(ur5, path, SignalSettings(), start=50.0, end=60.0)
+    assert str(in_pieces.value) == str(in_memory.value)
+
+
+def test_units_and_gains_are_read_as_in_memory(ur5, recording, tmp_path):
+    columns = {"time": 1e3 * recording.t}
+    for j, joint in enumerate(ur5.joints):
+        columns[f"q_{joint}"] = np.rad2deg(recording.q[:, j])
+        columns[f"dq_{joint}"] = np.rad2deg(recording.v[:, j])
+        columns[f"current_{joint}"] = recording.tau[:, j] / (j + 2.0)
+    path = tmp_path / "run.parquet"
+    write_columns(columns, path)
+    gains = {joint: j + 2.0 for j, joint in enumerate(ur5.joints)}
+    assert_alike(ur5, path, SignalSettings(), gains=gains, units=LogUnits("ms", "deg"))
+    with pytest.raises(DataError, match="milliseconds"):
+        long_log(ur5, path, SignalSettings(), gains=gains, units=LogUnits(None, "deg"))
+    with pytest.raises(DataError, match=r"q_.* looks like degrees"):
+        long_log(ur5, path, SignalSettings(), gains=gains, units=LogUnits("ms"))
+
+
+def test_full_turns_are_taken_out_of_each_piece(tmp_path):
+    """A turn more or less of a joint without limits changes neither motion nor torque."""
+    kinova = RobotModel.from_urdf(example_urdf("kinova.urdf"))
+    free = np.array([joint.turns_freely for joint in kinova.limits])
+    assert free.any()
+    rng = np.random.default_rng(1)
+    t = 0.01 * np.arange(1500)
+    q, v, a = random_fourier(kinova, rng, period=8.0).evaluate(t)
+    turn = np.sin(0.5 * t)[:, None] * 6.0 * free  # [rad] beyond a half turn to both sides
+    q, v, a = q + turn, v + 3.0 * np.cos(0.5 * t)[:, None] * free, a - 0.25 * turn
+    tau = (joint_torque_regressor(kinova, q, v, a) @ truth(kinova)).reshape(v.shape)
+    wrapped = np.where(free, (q + np.pi) % (2 * np.pi) - np.pi, q)
+    tau += 0.1 * rng.standard_normal(tau.shape)
+    path = tmp_path / "run.parquet"
+    write_log(Log(t=t, q=wrapped, tau=tau, joints=kinova.joints), path)
+    found, _ = assert_alike(kinova, path, SignalSettings())
+    turned = [piece.read().turned for piece in found.pieces]
+    assert np.any(turned, axis=0).tolist() == free.tolist()
+
+
+def test_parquet_is_read_across_its_row_groups(ur5, recording, tmp_path):
+    path = tmp_path / "run.parquet"
+    write_log(recording, path)
+    table = pq.read_table(path)
+    pq.write_table(table, path, row_group_size=170)
+    rows = open_table(path, lay_out(path, ur5.joints)[0].source).rows
+    assert rows.count() == 2000
+    for first, stop in ((0, 2000), (169, 341), (170, 340), (1999, 2000)):
+        part = rows.read(["time", "q_elbow_joint"], first, stop, None)
+        np.testing.assert_array_equal(part["time"], recording.t[first:stop])
+        np.testing.assert_array_equal(part["q_elbow_joint"], recording.q[first:stop, 2])
+    with_null = table.set_column(0, "time", pa.array([None, *recording.t[1:].tolist()]))
+    pq.write_table(with_null, path)
+    with pytest.raises(DataError, match=r"run.parquet: time is NaN at row 0"):
+        long_log(ur5, path, SignalSettings())
+
+
+def test_blank_lines_of_a_csv_are_no_rows(ur5, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "robotid.logs.csv_files._BLOCK", 170
+    )  # lines, so that pieces start within one
+    path = tmp_path / "run.csv"
+    write_log(recording, path)
+    lines = path.read_text().splitlines()
+    lines[700:700] = ["", "  "]
+    path.write_text("\ufeff" + "\r\n".join(lines) + "\r\n\r\n", encoding="utf-8")
+    assert_alike(ur5, path, SignalSettings())
+    lines[1500] = lines[1500].replace(",", ",,", 1)
+    path.write_text("\n".join(lines))
+    with pytest.raises(DataError, match=r"line 1501 has 26 cells, the header has 25"):
+        long_log(ur5, path, SignalSettings())
+
+
+def spoilt(recording, tmp_path, name, row, value):
+    table = {"time": recording.t.copy()}
+    for j, joint in enumerate(recording.joints):
+        table[f"q_{joint}"] = recording.q[:, j].copy()
+        table[f"tau_{joint}"] = recording.tau[:, j].copy()
+    table[name][row] = value
+    path = tmp_path / "run.parquet"
+    write_columns(table, path)
+    return path
+
+
+def test_a_hole_in_the_last_piece_is_named_by_its_row_in_the_file(
+    ur5, recording, tmp_path, monkeypatch
+):
+    path = spoilt(recording, tmp_path, "tau_elbow_joint", 1801, np.nan)
+    layout, table = lay_out(path, ur5.joints)
+    short = replace(layout, notes=())
+    monkeypatch.setattr(survey, "_WINDOW", 100)
+    window = (2.0, None)
+    log = survey_log(short, table, ur5, SignalSettings(cutoff=None), window, length=LENGTH)
+    pieces = pieces_of(log)
+    pieces[-2].reduce()
+    with pytest.raises(DataError, match=r"tau_elbow_joint is NaN at row 1801 \(t = ") as found:
+        pieces[-1].reduce()
+    assert found.value.code == "not_finite"
+
+
+@pytest.mark.parametrize("row", [LENGTH, 2 * LENGTH, LENGTH + 1])
+def test_time_must_increase_where_pieces_meet_too(ur5, recording, tmp_path, row):
+    path = spoilt(recording, tmp_path, "time", row, recording.t[row - 1])
+    with pytest.raises(DataError) as in_memory:
+        read_log(path, ur5.joints)
+    with pytest.raises(DataError) as in_pieces:
+        long_log(ur5, path, SignalSettings())
+    assert str(in_pieces.value) == str(in_memory.value)
+    assert f"t[{row}]" in str(in_pieces.value)
+
+
+def test_pieces_travel_as_they_are(ur5, recording, tmp_path):
+    path = tmp_path / "run.parquet"
+    write_log(recording, path)
+    pieces = pieces_of(long_log(ur5, path, SignalSettings()))
+    for piece, again in zip(pieces, pickle.loads(pickle.dumps(pieces)), strict=True):
+        np.testing.assert_array_equal(again.reduce().factors.R, piece.reduce().factors.R)
+    # the model and the mapping go along once
+    assert len(pickle.dumps(pieces)) < len(pickle.dumps(pieces[:1])) + 1000 * len(pieces)

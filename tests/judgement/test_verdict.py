@@ -1,0 +1,411 @@
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.commands.identify import run_job
+from robotid.commands.job import job_from_settings
+from robotid.commands.validate import validate_result
+from robotid.findings import Finding
+from robotid.fitting.metrics import JointMetrics, Metrics
+from robotid.judgement.verdict import Doubt, doubts_of, is_outvoted, judge, refuted
+from robotid.judgement.witness import Witness
+from robotid.logs.read import write_log
+from robotid.robot.examples import example_urdf
+
+NOISE = np.array([2.0, 2.0, 1.0, 0.3, 0.3, 0.1])
+JOINTS = ("a", "b", "c")
+
+
+def finding(code, where, severity="warning", **evidence):
+    return Finding(code, severity, where, "what was found", evidence)
+
+
+def joint(error, *, urdf=100.0, constant=True, **others):
+    r2 = 0.9 if constant else -0.44  # the mean torque misses 1 / 1.2 of it
+    return JointMetrics(1.0, "N m", error, r2, 100, {"urdf": urdf} | others, constant)
+
+
+def verdict(validation, fitted=None, undetermined=(), is_consistent=True):
+    fit = Metrics(fitted or {"a": joint(3.0)}, 1.0)
+    logs = {"val.csv": Metrics(validation, 1.0)} if validation is not None else {}
+    return judge(fit, logs, undetermined=undetermined, is_consistent=is_consistent)
+
+
+def test_good_needs_every_joint_good_on_kept_recordings():
+    found = verdict({"a": joint(4.0)})
+    assert found.status == "good"
+    assert "within 4.0 % on recordings that were not fitted" in found.reasons[0]
+
+
+def test_not_evaluated_is_never_a_pass():
+    found = verdict(None)
+    assert found.status == "usable"
+    assert "was not evaluated: no validation log given" in found.reasons[0]
+    found = verdict({"a": joint(4.0)}, fitted={"a": joint(3.0), "b": joint(3.0)})
+    assert found.status == "usable"
+    assert found.reasons == ("the joints b do not move in any validation log: not evaluated",)
+
+
+def test_worse_than_a_constant_is_said_first():
+    found = verdict({"a": joint(20.0), "b": joint(40.0, constant=False)})
+    assert found.status == "poor"
+    assert found.reasons[0] == (
+        "b: worse than a constant torque on val.csv: 40.0 % of it is missed, by its mean 33.3 %"
+    )
+
+
+def test_alarms_come_before_everything_and_constants_before_the_rest():
+    joints = {"a": joint(60.0), "b": joint(40.0, constant=False)}
+    logs = {"val.csv": Metrics(joints, 1.0)}
+    found = judge(
+        Metrics({}, 1.0), logs, undetermined=(), is_consistent=True, alarms=["torque of c swapped"]
+    )
+    assert found.status == "poor"
+    assert found.reasons[0] == "torque of c swapped"
+    assert found.reasons[1].startswith("b: worse than a constant")
+    assert found.reasons[2].startswith("a: predicted to 60.0 % only")
+
+
+def test_worse_than_the_urdf_is_poor():
+    found = verdict({"a": joint(8.0, urdf=6.0)})
+    assert found.status == "poor"
+    assert found.reasons == ("a: 8.0 % on val.csv, worse than the URDF's 6.0 %",)
+
+
+def test_large_errors_and_open_parameters_make_it_usable_at_best():
+    assert verdict({"a": joint(20.0)}).status == "usable"
+    assert verdict({"a": joint(60.0)}).status == "poor"
+    assert verdict({"a": joint(9.0)}).status == "usable"  # three times the error of the fit
+    assert verdict({"a": joint(4.0)}, undetermined=["x.m"]).status == "usable"
+    assert verdict({"a": joint(4.0)}, is_consistent=False).status == "usable"
+
+
+def test_each_joint_has_a_verdict_of_its_own():
+    joints = {"a": joint(4.0), "b": joint(20.0), "c": joint(40.0, constant=False)}
+    found = verdict(joints, fitted={name: joint(3.0) for name in "abcd"}).joints
+    assert {name: v.status for name, v in found.items()} == {
+        "a": "good", "b": "usable", "c": "poor", "d": "not evaluated",
+    }  # fmt: skip
+    assert found["a"].reasons[0].startswith("predicted within 4.0 %")
+    assert found["c"].reasons[0].startswith("c: worse than a constant torque on val.csv: 40.0 %")
+    assert found["d"].reasons == ("it does not move in any kept recording",)
+
+
+def test_the_worst_of_several_recordings_decides_on_a_joint():
+    logs = {
+        "one.csv": Metrics({"a": joint(4.0)}, 1.0),
+        "two.csv": Metrics({"a": joint(60.0)}, 1.0),
+    }
+    found = judge(Metrics({"a": joint(3.0)}, 1.0), logs, undetermined=(), is_consistent=True)
+    assert found.joints["a"].status == "poor"
+    assert found.to_dict()["per_joint"]["a"]["reasons"] == [
+        "a: predicted to 60.0 % only on two.csv"
+    ]
+
+
+def test_without_a_kept_recording_no_joint_is_evaluated():
+    alone = verdict(None).joints["a"]
+    assert (alone.status, alone.reasons) == ("not evaluated", ("no recording was kept apart",))
+
+
+def test_a_joint_that_moves_nowhere_is_not_evaluated():
+    found = judge(
+        Metrics({"a": joint(3.0)}, 1.0),
+        {"val.csv": Metrics({"a": joint(4.0)}, 1.0)},
+        undetermined=(),
+        is_consistent=True,
+        joints=("a", "b"),
+    )
+    assert found.status == "usable"
+    assert found.reasons == ("the joints b move in no recording: not evaluated",)
+    assert found.joints["b"].status == "not evaluated"
+    assert found.joints["b"].reasons == ("it does not move in any recording",)
+
+
+def test_a_result_that_is_validated_later_knows_only_what_was_kept():
+    kept = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
+    found = judge(Metrics({}, 0.0), kept, undetermined=(), is_consistent=True, joints=("a", "b"))
+    assert found.reasons == ("the joints b do not move in any validation log: not evaluated",)
+
+
+def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
+    fit = {name: joint(3.0) for name in "abc"}
+    logs = {"val.csv": Metrics({"a": joint(4.0), "b": joint(4.0), "c": joint(60.0)}, 1.0)}
+    doubts = [Doubt("clipped", name, "it is clipped") for name in "bc"]
+    found = judge(Metrics(fit, 1.0), logs, undetermined=(), is_consistent=True, doubts=doubts)
+    assert {name: v.status for name, v in found.joints.items()} == {
+        "a": "good", "b": "usable", "c": "poor",
+    }  # fmt: skip
+    assert found.joints["b"].reasons == ("b: it is clipped (clipped)",)
+    assert "b, c: it is clipped (clipped)" in found.reasons
+    assert found.status == "poor"
+    whole = [Doubt("urdf_mismatch", "", "run.csv: masses do not fit")]
+    logs = {"val.csv": Metrics({name: joint(4.0) for name in "abc"}, 1.0)}
+    found = judge(Metrics(fit, 1.0), logs, undetermined=(), is_consistent=True, doubts=whole)
+    assert found.status == "usable"
+    assert found.reasons == ("run.csv: masses do not fit (urdf_mismatch)",)
+    assert {v.status for v in found.joints.values()} == {"usable"}
+    assert found.to_dict()["doubts"] == [
+        {"code": "urdf_mismatch", "joint": "", "message": "run.csv: masses do not fit"}
+    ]
+
+
+def test_kept_recordings_that_were_fitted_are_named():
+    found = judge(
+        Metrics({"a": joint(3.0)}, 1.0), {}, undetermined=(), is_consistent=True, refitted=["x.csv"]
+    )
+    assert found.status == "usable"
+    (reason,) = found.reasons
+    assert reason.endswith("was not evaluated: x.csv hold rows that were fitted")
+
+
+def test_a_torque_of_zero_is_no_prediction():
+    found = verdict({"a": joint(None, constant=False)})
+    assert found.status == "poor"
+    assert found.reasons == ("a: the torque on val.csv is 0 throughout: nothing was predicted",)
+
+
+@pytest.mark.parametrize(
+    ("error", "fitted", "status"),
+    [
+        (14.9, 14.0, "good"),
+        (15.1, 14.0, "usable"),
+        (49.9, 40.0, "usable"),
+        (50.1, 40.0, "poor"),
+        (7.9, 4.0, "good"),  # twice the fitted error is allowed
+        (8.1, 4.0, "usable"),
+        (4.9, 0.1, "good"),  # small errors are, however much smaller the fitted one
+        (5.1, 0.1, "usable"),
+    ],
+)
+def test_each_threshold_lies_where_it_is_stated(error, fitted, status):
+    found = verdict({"a": joint(error)}, fitted={"a": joint(fitted)})
+    assert found.status == status
+    assert found.joints["a"].status == status
+
+
+def test_an_alarm_alone_makes_a_good_prediction_poor():
+    kept = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
+    found = judge(
+        Metrics({"a": joint(3.0)}, 1.0), kept, undetermined=(), is_consistent=True, alarms=["late"]
+    )
+    assert found.status == "poor"
+    assert found.reasons == ("late",)
+    assert found.to_dict()["alarms"] == ["late"]
+
+
+def test_an_error_equal_to_the_urdfs_is_not_worse_than_it():
+    assert verdict({"a": joint(4.0, urdf=4.0)}).status == "good"
+    assert verdict({"a": joint(4.1, urdf=4.0)}).status == "poor"
+
+
+@pytest.mark.parametrize(
+    ("where", "joints"),
+    [("run.csv: b", ["b"]), ("b", ["b"]), ("run.csv: a, c", ["a", "c"]), ("run.csv", [""])],
+)
+def test_a_doubt_is_about_the_joints_that_the_finding_names(where, joints):
+    found = doubts_of([finding("unexplained_torque", where)], JOINTS)
+    assert [doubt.joint for doubt in found] == joints
+    assert found[0].message.startswith("run.csv: much" if joints == [""] else "much of the torque")
+
+
+def test_notes_errors_and_harmless_warnings_raise_no_doubt():
+    harmless = [
+        finding("clipped", "run.csv: a", "note"),
+        finding("torque_sign", "run.csv: a", "error"),  # leads the verdict as it is
+        finding("velocity_delay", "run.csv"),
+        finding("payload", "run.csv: link"),
+        finding("constraint_costs", "a", error_pct=1.9, wls_error_pct=1.0),
+        finding("constraint_costs", "b", error_pct=0.9, wls_error_pct=1e-3),
+    ]
+    assert doubts_of(harmless, JOINTS) == ()
+
+
+def test_what_several_logs_show_is_said_once():
+    found = doubts_of([finding("clipped", f"{log}: a") for log in ("one", "two")], JOINTS)
+    assert found == (Doubt("clipped", "a", "the torque is clipped at a limit"),)
+
+
+def test_figures_are_stated():
+    (late,) = doubts_of([finding("torque_delay", "run.csv", delay=0.0562)], JOINTS)
+    assert late.message == "run.csv: the torque is +0.056 s (+ late, - early) against the position"
+    (costs,) = doubts_of([finding("constraint_costs", "a", error_pct=4.0, wls_error_pct=1)], JOINTS)
+    assert costs.message.startswith("4.0 % of the torque is missed where it was fitted, 1.0 %")
+
+
+def test_a_repeated_motion_matters_if_no_other_motion_was_kept_apart():
+    repeated = [finding("repeated_motion", "one.csv")]
+    assert doubts_of(repeated, JOINTS, ["one.csv", "two.csv"]) == ()
+    assert doubts_of(repeated, JOINTS) == ()
+    (doubt,) = doubts_of(repeated, JOINTS, ["one.csv"])
+    assert "no prediction was tested" in doubt.message
+
+
+def test_a_robust_loss_excuses_jumps_of_the_torque_and_what_they_cause():
+    jump = finding("spikes", "run.csv: tau_a", "error")
+    assert is_outvoted(jump)
+    assert not is_outvoted(finding("spikes", "run.csv: q_a", "error"))
+    found = [jump, finding("unexplained_torque", "run.csv: a")]
+    assert doubts_of(found, JOINTS, is_robust=True) == ()
+    assert [doubt.joint for doubt in doubts_of(found, JOINTS)] == ["a"]
+    other = [jump, finding("unexplained_torque", "run.csv: b")]
+    assert [doubt.joint for doubt in doubts_of(other, JOINTS, is_robust=True)] == ["b"]
+
+
+@pytest.fixture
+def run(ur5, tmp_path):
+    """Run a job on two logs of the same arm, the fitted one as a test spoils it."""
+
+    def runner(spoil=None, ignore=(), **settings):
+        names = ("run.csv", "kept.csv")
+        for name, rng in zip(names, np.random.default_rng(0).spawn(2), strict=True):
+            log = exact_log(ur5, truth(ur5), rng, samples=800, rate=100.0, noise=0.1 * NOISE)
+            if spoil is not None:
+                log = spoil(log, name)
+            write_log(log, tmp_path / name)
+        table = {
+            "urdf": str(example_urdf("ur5_robot.urdf")),
+            "identification": [{"log": "run.csv"}],
+            "validation": [{"log": "kept.csv"}],
+            "estimator": {"prior_weight": 1.0, "draws": 0, **settings},
+            "doctor": {"ignore": list(ignore)},
+            "output": {"report": False},
+        }
+        out = tmp_path / "out"
+        found, result = run_job(job_from_settings(table, "job.toml", tmp_path), out)
+        again = validate_result(out / "result.json", [tmp_path / "kept.csv"])
+        return found, result, again["verdict"]
+
+    return runner
+
+
+def test_a_stated_bound_that_binds_makes_it_usable(run):
+    far = {"com": {"forearm_link": [[1, 1, 1], [1.2, 1.2, 1.2]]}}
+    _, result, again = run(constraints=far)
+    assert result["verdict"]["status"] == again["status"] == "usable"
+    bound = "centre_of_mass forearm_link: the data, or the masses that it leaves, speak against"
+    assert bound in str(result["verdict"])
+    (finding,) = [f for f in result["warnings"] if f["code"] == "bound_binds"]
+    assert "the data push against them at shoulder_lift_joint," in finding["message"]
+
+
+def test_a_stated_bound_that_only_the_urdf_minds_is_a_note(run):
+    found, result, _ = run(constraints={"total_mass": [10.0, 17.0]})
+    (finding,) = [f for f in result["warnings"] if f["code"] == "bound_binds"]
+    assert found.doubts == ()
+    assert "the torque is explained as well as without" in finding["message"]
+    assert found.verdict.status == "good"
+
+
+def test_a_mass_that_is_stated_does_not_come_from_the_data(run):
+    _, result, _ = run(constraints={"mass": {"forearm_link": 2.0}})
+    (mass,) = [p for p in result["standard_parameters"] if p["name"] == "forearm_link.m"]
+    assert (mass["value"], mass["source"]) == (pytest.approx(2.0), "prior")
+
+
+def test_a_wrong_total_mass_makes_the_joints_usable_that_it_costs(run):
+    _, result, again = run(constraints={"total_mass": 5.0})
+    assert result["verdict"]["status"] == again["status"] == "usable"
+    lift = result["verdict"]["per_joint"]["shoulder_lift_joint"]
+    assert lift["status"] == "usable"
+    costs = [f["message"] for f in result["warnings"] if f["code"] == "constraint_costs"]
+    assert costs
+    assert all("what [estimator] asks for ({'total_mass': 5.0})" in text for text in costs)
+    assert "physics and data disagree" in lift["reasons"][-1]
+    assert again["per_joint"]["shoulder_lift_joint"]["status"] == "usable"
+    found, *_ = run(constraints={"total_mass": 5.0}, ignore=["constraint_costs"])
+    assert "constraint_costs" not in {doubt.code for doubt in found.doubts}
+
+
+def test_spikes_in_torques_do_not_condemn_a_robust_fit(run):
+    def spoil(log, name):
+        tau = log.tau.copy()
+        if name == "run.csv":
+            tau[[200, 400, 600], 2] += 1000.0
+        return type(log)(**{**vars(log), "tau": tau})
+
+    plain, result, _ = run(spoil)
+    assert "jumps by up to" in result["verdict"]["reasons"][0]
+    assert plain.alarms
+    robust, result, again = run(spoil, robust="tukey")
+    verdict = result["verdict"]
+    assert verdict["status"] == again["status"] == "good", verdict["reasons"]
+    assert verdict["doubts"] == []
+    assert not robust.alarms
+
+
+def test_what_noise_hides_of_a_rich_motion_is_said_and_does_not_condemn():
+    logs = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
+    found = judge(
+        Metrics({"a": joint(3.0)}, 1.0),
+        logs,
+        undetermined=("x.Ixy",),
+        is_consistent=True,
+        is_poorly_excited=False,
+    )
+    assert found.status == "good"
+    assert "1 base parameters are lost in the noise" in found.reasons[-1]
+
+
+def test_the_urdf_with_fitted_drives_is_to_be_beaten():
+    found = verdict({"a": joint(8.0, urdf_with_drives=7.0)}, fitted={"a": joint(7.0)})
+    assert found.status == found.joints["a"].status == "usable"
+    assert found.joints["a"].reasons == (
+        "a: 8.0 % on val.csv, 7.0 % by the URDF with fitted drives: leave its link at the URDF",
+    )
+    assert "predicts a better than the identified bodies" in found.reasons[1]
+    tie = verdict({"a": joint(8.0, urdf_with_drives=7.8)}, fitted={"a": joint(7.0)})
+    assert tie.status == "good"
+
+
+def refuted_code(code, error, gravity=None, where="run.csv", more=()):
+    witness = Witness(gravity=gravity or {}, gravity_error=gravity or {})
+    kept = {"val.csv": Metrics({"a": joint(error), "b": joint(1.0)}, 1.0)}
+    return refuted([finding(code, where), *more], kept, witness)[0].severity
+
+
+def test_a_prediction_of_unseen_motion_refutes_hypotheses_on_masses_and_units():
+    assert refuted_code("urdf_mismatch", 1.0) == "note"
+    assert refuted_code("urdf_mismatch", 5.1) == "warning"
+    assert refuted_code("clipped", 1.0) == "warning"
+    assert refuted_code("current_for_torque", 1.0, {"a": 1.3}) == "note"
+    assert refuted_code("current_for_torque", 1.0, {"a": 0.1}) == "warning"  # 1 % of what unit?
+    assert refuted_code("unexplained_torque", 9.0, where="run.csv: b") == "note"
+    assert refuted_code("unexplained_torque", 9.0, where="run.csv: a") == "warning"
+    assert refuted_code("gravity", 1.0) == "note"
+    assert refuted_code("gravity", 1.0, where="all joints") == "warning"  # by what was left
+    no_gravity = finding("gravity_compensated", "run.csv", "error")
+    kept = {"val.csv": Metrics({"a": joint(1.0)}, 1.0)}
+    for factor, severity in ((1.3, "note"), (0.2, "error")):
+        witness = Witness(scale=factor, factor=factor)
+        assert refuted([no_gravity], kept, witness)[0].severity == severity
+    seen = [finding("repeated_motion", "val.csv")]
+    assert refuted_code("urdf_mismatch", 1.0, more=seen) == "warning"
+
+
+@pytest.mark.parametrize(
+    ("witness", "status", "said"),
+    [
+        (Witness(scale=0.97, factor=0.97, masses=(10.0, 10.2, 0.0)), "good", "agree within"),
+        (Witness(scale=0.8, factor=0.8, masses=(10.0, 9.0, 0.0)), "good", "could not be checked"),
+        (Witness(scale=0.6, factor=0.6, masses=(10.0, 9.0, 0.0)), "usable", "rests on the sensors"),
+        (
+            Witness(scale=0.8, factor=0.8, unexplained=(0.01, 0.1), masses=(10.0, 9.0, 0.0)),
+            "usable",
+            "All joints alike are off by 0.80",
+        ),
+        (Witness(scale=1.0, factor=1.0, masses=(10.0, 15.0, 0.0)), "usable", "15 kg against"),
+        (Witness(scale=1.0, factor=1.4, masses=(10.0, 15.0, 5.0)), "good", "agree within"),
+        (Witness(scale=0.6, factor=0.6, masses=(10.0, 9.0, 0.0), is_stated=True), "good", "stated"),
+    ],
+)
+def test_good_needs_a_witness_or_says_that_there_is_none(witness, status, said):
+    found = judge(
+        Metrics({"a": joint(3.0)}, 1.0),
+        {"val.csv": Metrics({"a": joint(4.0)}, 1.0)},
+        undetermined=(),
+        is_consistent=True,
+        witness=witness,
+    )
+    assert found.status == status
+    assert said in found.reasons[-1]

@@ -1,0 +1,149 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.fitting.settings import EstimatorSettings
+from robotid.identification.pipeline import identify
+from robotid.judgement.witness import Witness
+from robotid.logs.settings import SignalSettings
+
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+NOISE = 0.05 * np.array([4, 4, 2, 1, 1, 0.5])
+
+
+def near_urdf(model, scale=1.0):
+    pi, size = model.standard_parameters(), model.layout.n_inertial
+    pi[size:] = truth(model)[size:]
+    return scale * pi
+
+
+def found_of(model, pi, estimator="consistent"):
+    logs = [exact_log(model, pi, r, noise=NOISE) for r in np.random.default_rng(0).spawn(2)]
+    return identify(
+        model, logs[:1], validation=logs[1:], signals=EXACT, doctor=False, estimator=estimator
+    )
+
+
+def test_a_robot_like_its_urdf_is_good_and_its_urdf_bears_witness(ur5):
+    found = found_of(ur5, near_urdf(ur5))
+    assert found.witness.factor == pytest.approx(1.0, abs=0.01)
+    for joint, ratio in found.witness.gravity.items():
+        assert ratio == pytest.approx(1.0, abs=5 * found.witness.gravity_error[joint] + 1e-3)
+    assert found.witness.agrees
+    assert found.verdict.status == "good"
+    assert "agree within 5 %" in found.verdict.reasons[-1]
+
+
+def test_torques_of_another_gain_are_told_from_other_masses_and_never_good(ur5):
+    found = found_of(ur5, near_urdf(ur5, 0.8))
+    assert found.witness.factor == pytest.approx(0.8, abs=0.01)
+    assert found.witness.has_one_factor
+    assert found.verdict.status == "usable"
+    (reason,) = [r for r in found.verdict.reasons if "could not be checked" in r]
+    assert "All joints alike are off by 0.80" in reason
+    stated = EstimatorSettings("consistent", constraints={"total_mass": [10.0, 20.0]})
+    found = found_of(ur5, near_urdf(ur5, 0.8), stated)
+    assert found.verdict.status == "good"
+    assert "rests on the mass that was stated" in found.verdict.reasons[-1]
+
+
+def test_a_load_in_the_hand_is_no_other_scale(ur5):
+    found = found_of(ur5, truth(ur5))  # links 10 to 30 % off, and 1.2 kg in the hand
+    assert found.witness.factor > 1.2
+    assert found.witness.masses[2] == pytest.approx(1.2, abs=0.4)
+    assert not found.witness.has_one_factor
+    assert found.verdict.status == "good", found.verdict.reasons
+    assert "could not be checked" in found.verdict.reasons[-1]
+
+
+def test_a_load_that_is_left_out_is_said_with_its_mass_and_both_figures():
+    loaded = Witness(scale=1.01, factor=1.37, masses=(20.0, 24.9, 4.7), unexplained=(0.2, 0.01))
+    assert loaded.agrees
+    message = loaded.message
+    assert "only beside a load of +4.7 kg on the last link" in message
+    assert "without it gravity torque 1.01 x the URDF's, total mass 20.2 kg" in message
+    assert "with it gravity torque 1.37 x the URDF's, total mass 24.9 kg" in message
+    alike = replace(loaded, factor=1.04, masses=(20.0, 20.9, 0.5))
+    assert "agree within 5 %: gravity torque 1.04 x" in alike.message
+
+
+def test_without_gravity_nothing_bears_witness(ur5):
+    model = ur5.from_urdf(ur5.tree.path, gravity=(0.0, 0.0, 0.0))
+    found = found_of(model, near_urdf(model))
+    assert found.witness.scale is None
+    assert not found.witness.agrees
+    assert "gravity loads no joint" in found.verdict.reasons[-1]
+
+
+def test_friction_stands_beside_it_as_a_share_of_the_torque(ur5):
+    found = found_of(ur5, near_urdf(ur5))
+    layout, (e,) = ur5.layout, found.fitted
+    viscous, coulomb = (
+        found.standard[layout.names.index(f"wrist_3_joint.{term}")]
+        for term in ("viscous", "coulomb")
+    )
+    v, tau = e.recording.trajectory.v[:, 5], e.recording.trajectory.tau[:, 5]
+    share = np.linalg.norm(viscous * v + coulomb * np.sign(v)) / np.linalg.norm(tau)
+    assert found.witness.friction["wrist_3_joint"] == pytest.approx(share, rel=1e-9)
+    json.dumps(found.witness.to_dict(), allow_nan=False)
+
+
+def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is_its_own(ur5):
+    from robotid.judgement.findings import fit_findings
+
+    found = found_of(ur5, near_urdf(ur5))
+    shapes = {f.code for f in fit_findings(found) if f.severity == "warning"}
+    assert not shapes & {"com_outside", "gyration", "density"}
+    i = ur5.layout.names.index("forearm_link.mcx")
+
+    def is_forearm(finding):
+        return (finding.code, finding.where) == ("com_outside", "link forearm_link")
+
+    far = found.standard.copy()
+    far[i] += 1.0 * far[i - 1]  # the centre of mass a metre aside
+    (finding,) = [f for f in fit_findings(replace(found, standard=far)) if is_forearm(f)]
+    assert (finding.severity, finding.where) == ("warning", "link forearm_link")
+    assert finding.message.startswith("as identified, link 'forearm_link'")
+    of_urdf = fit_findings(replace(found, standard=far, prior=far))
+    (finding,) = [f for f in of_urdf if is_forearm(f)]
+    assert finding.severity == "note"
+    assert "so it is in the URDF already" in finding.message
+
+
+def test_a_needle_denser_than_any_material_is_named_unless_the_urdf_has_it(ur5):
+    from robotid.judgement.findings import fit_findings
+
+    found = found_of(ur5, near_urdf(ur5))
+
+    def dense(found):
+        return [f for f in fit_findings(found) if f.code == "dense_body"]
+
+    assert dense(found) == []
+    needle = found.standard.copy()
+    second = slice(10, 20)  # 7.6 kg about the URDF's frame, semi-axes of 6, 6 and 225 mm
+    x, y, z = 7.6 * np.array([0.006, 0.006, 0.225]) ** 2 / 5.0
+    needle[second] = [7.6, 0.0, 0.0, 0.0, y + z, 0.0, z + x, 0.0, 0.0, x + y]
+    (finding,) = dense(replace(found, standard=needle))
+    assert finding.where == f"link {ur5.layout.bodies[1]}"
+    density = 7.6 / (4.0 / 3.0 * np.pi * 0.006 * 0.006 * 0.225)
+    assert finding.evidence == {"mass": 7.6, "density": pytest.approx(density)}
+    assert "7.6 kg" in finding.message
+    assert "at least 2.24e+05 kg/m^3, wanted at most 12000" in finding.message
+    assert dense(replace(found, standard=needle, prior=needle)) == []
+
+
+def test_a_result_that_its_prior_holds_back_bears_no_witness(ur5, rng):
+    pi = truth(ur5)
+    size = ur5.layout.n_inertial
+    pi[:size] = 3.0 * ur5.standard_parameters()[:size]  # the sensors say three times the URDF
+    log = exact_log(ur5, pi, rng, samples=1000, noise=0.5)
+    kept = EstimatorSettings(prior_weight=1e9)
+    held = identify(ur5, [log], estimator=kept, doctor=False)
+    assert held.witness.factor == pytest.approx(1.0, abs=0.05)  # it stays at the URDF
+    assert not held.witness.follows
+    assert not held.witness.agrees
+    free = identify(ur5, [log], doctor=False)
+    assert free.witness.follows

@@ -1,0 +1,303 @@
+"""What to do next: the cause of trouble first, in words and commands that the program takes."""
+
+import shlex
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robotid.cli import _parser
+from robotid.commands.job import job_from_settings
+from robotid.diagnosis.candidates import CANDIDATES, couplings, ripples
+from robotid.diagnosis.misfit import Misfit
+from robotid.diagnosis.misfit_findings import misfit_findings, setting_of
+from robotid.findings import Finding
+from robotid.fitting.joint_motion import JointMotion
+from robotid.judgement.verdict import DOUBTFUL
+from robotid.report.advice import Origin, next_steps
+from robotid.robot.examples import example_urdf
+
+JOB = Origin(("my job.toml",), "out")
+FLAGS = Origin(("arm.urdf", "first.csv", "--cutoff", "8"), "out")
+
+
+def told(identified, *findings, **others):
+    return replace(identified, findings=findings, **others)
+
+
+def warning(code, where="elbow_joint", severity="warning", **evidence):
+    return Finding(code, severity, where, f"{code} is so; do something", evidence)
+
+
+def words(steps):
+    return [step.words.split()[0] for step in steps]
+
+
+def test_every_command_is_one_that_the_program_takes(identified):
+    codes = ["current_for_torque", "torque_delay", "unexplained_torque", "undetermined"]
+    codes += ["zero_mass", "repeated_motion", "spikes", *NAMED, "locked_position"]
+    typed = 0
+    for origin in (JOB, FLAGS):
+        for found in (
+            told(identified),
+            *(told(identified, warning(code, delay=0.01)) for code in codes),
+        ):
+            for step in next_steps(found, origin):
+                for block in step.blocks:
+                    if not block.startswith("robotid"):
+                        read(block)
+                    else:
+                        _parser(shlex.split(block)[1:]).parse_args(shlex.split(block)[1:])
+                        typed += 1
+    assert typed > 30
+
+
+#: Codes that name what is wrong with a joint, and the first words of their steps.
+NAMED = {
+    "backlash": "Leave out the rows",
+    "clipped": "Record a slower motion",
+    "counterbalance": "Add to the model of elbow_joint",
+    "coupling": "Add to the model of elbow_joint",
+    "drift": "Drift is so; do something",
+    "friction_shape": "Add to the model of elbow_joint",
+    "load_friction": "Add to the model of elbow_joint",
+    "payload_change": "Validate with the load",
+    "position_offset": "Correct the zero",
+    "position_periodic": "Add to the model of elbow_joint",
+    "spring": "Add to the model of elbow_joint",
+}
+
+
+def read(block):
+    """Return the job of a block, as it stands in a file with a robot and a log."""
+    for blank in ("GAIN", "POSITION", "KG"):
+        block = block.replace(f"= {blank}", "= 1.5")
+    table = tomllib.loads(block)
+    table.setdefault("identification", [{"log": "a.csv"}])
+    return job_from_settings(
+        {"urdf": str(example_urdf("ur5_robot.urdf")), **table}, "job", Path.cwd()
+    )
+
+
+def lacking(joint, term, entries=()):
+    none = np.zeros(1)
+    still = JointMotion(*[none] * 7)
+    size = (1.0, 0.1, "N m rms", 0.1)
+    return Misfit(joint, term, 0.9, 1e-9, 0.9, *size, none, none, still, entries)
+
+
+def motion_of(joint, other, rng):
+    x = rng.standard_normal((7, 40))
+    alone = JointMotion(*x)
+    return replace(alone, others={other: alone})
+
+
+def candidates(joint, other, rng):
+    motion = motion_of(joint, other, rng)
+    found = ripples(motion, np.ones(40), rng.standard_normal(40))
+    return (*CANDIDATES, *couplings(motion), *found)
+
+
+@pytest.mark.parametrize("joint", ["elbow_joint", 'odd "j".1'])
+def test_every_setting_that_is_advised_for_a_term_is_read(identified, joint, rng):
+    """Each term that a drive may lack, with each family that it may be given."""
+    other, seen = "b c", set()
+    for term in candidates(joint, other, rng):
+        for entries in ((name,) for name in term.families) if term.families else (term.terms,):
+            found = told(identified, misfits=(lacking(joint, term, entries),))
+            setting = setting_of(found.misfits[0], found)
+            (finding,) = misfit_findings(found, found.misfits, found.on_misfit)
+            if not setting:
+                assert term.name in ("coulomb", "windup", "drift")
+                assert finding.message.endswith(term.advice)
+                continue
+            job = read(setting)
+            assert all(line in finding.message for line in setting.split("\n"))
+            if term.coupled:
+                (made,) = job.couplings
+                assert dict(made.ratios) == {joint: 1.0, other: term.ratio}
+            else:
+                assert job.drives == {joint: entries}
+            seen.add(term.name.split()[0])
+    assert seen == {
+        "stribeck", "presliding", "power", "cubic", "asymmetric", "load", "periodic", "linear",
+        "counterbalance", "ripple", "coupling",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("code", NAMED)
+def test_a_named_cause_has_its_step_and_no_guess_beside_it(identified, code, rng):
+    """A joint that is also badly predicted is not said to have a spring or a round gear."""
+    joint = "elbow_joint"
+    own = [c for c in candidates(joint, "wrist_1_joint", rng) if c.code == code]
+    entries = {c.name: c.families[:1] or c.terms for c in own}
+    lacks = [lacking(joint, c, entries[c.name]) for c in own[:2]]
+    evidence = {"turned": 2.0} if code == "counterbalance" else {}
+    found = told(
+        identified, warning("unexplained_torque"), warning(code, **evidence), misfits=tuple(lacks)
+    )
+    steps = next_steps(found, JOB)
+    assert not any(_guesses(step, joint) for step in steps)
+    assert sum(step.words.startswith(NAMED[code]) for step in steps) == 1
+    blocks = [block for step in steps for block in step.blocks]
+    if code in ("counterbalance", "friction_shape", "spring"):
+        (drives,) = [block for block in blocks if block.startswith("[drives]")]
+        wanted = {
+            "counterbalance": ("harmonics1",),
+            "friction_shape": ("stribeck",),
+            "spring": ("spring", "harmonics2"),
+        }
+        assert read(drives).drives == {joint: wanted[code]}
+    if code == "coupling":
+        (made,) = read(blocks[0]).couplings
+        assert set(dict(made.ratios)) == {joint, "wrist_1_joint"}
+    alone = told(identified, warning("unexplained_torque"))
+    assert any(_guesses(step, joint) for step in next_steps(alone, JOB))
+
+
+def _guesses(step, joint):
+    return "gear that is not round" in step.words and joint in step.words
+
+
+def test_a_flag_that_was_given_is_stated_anew_and_not_twice():
+    origin = Origin(
+        ("arm.urdf", "a.csv", "--lock", "j6=0", "--lock=j7=1", "--torque-delay", "0.01",
+         "--validate", "b.csv"), "out",
+    )  # fmt: skip
+    again = origin.again("--lock", "j6=0.1824", "--torque-delay", "0.02", "--validate", "NEW.csv")
+    assert again == (
+        "robotid identify arm.urdf a.csv --lock=j7=1 --validate b.csv --lock j6=0.1824 "
+        "--torque-delay 0.02 --validate NEW.csv --out out"
+    )
+    assert "j7=1" not in origin.again("--lock", "j7=2").replace("j7=2", "")
+
+
+def test_a_locked_joint_is_stated_where_the_log_has_it(identified):
+    there = warning("locked_position", "a.csv: j6", median=0.18241, stated=0.0)
+    (step, *_) = next_steps(told(identified, there), FLAGS)
+    assert step.blocks == (
+        "robotid identify arm.urdf first.csv --cutoff 8 --lock j6=0.1824 --out out",
+    )
+
+
+def test_many_locked_joints_are_placed_together(identified):
+    locked = {f"hand_{i}": 0.0 for i in range(40)}
+    hand = replace(identified, model=replace(identified.model, locked=locked))
+    (step, *_) = next_steps(told(hand, warning("locked_at_zero", ", ".join(locked))), FLAGS)
+    assert "hand_0, hand_1" in step.words
+    assert step.blocks == (
+        "robotid identify arm.urdf first.csv --cutoff 8 --lock '*=POSITION' --out out",
+    )
+    (step, *_) = next_steps(told(hand, warning("locked_at_zero", ", ".join(locked))), JOB)
+    assert step.blocks[0] == '[locked]\n"*" = POSITION'
+
+
+def test_a_result_without_trouble_is_measured_used_and_played(identified):
+    calm = told(identified, validation=identified.validation)
+    result = "out/result.json"
+    blocks = [block for step in next_steps(calm, JOB) for block in step.blocks]
+    assert len(next_steps(calm, JOB)) <= 3
+    assert f"robotid export {result} --format mjcf --out ur5.xml" in blocks
+
+
+def test_an_error_comes_before_a_warning_and_three_steps_are_enough(identified):
+    codes = ("undetermined", "current_for_torque", "torque_delay", "unexplained_torque")
+    found = told(
+        identified,
+        *(warning(code, delay=0.01) for code in codes),
+        warning("not_known", severity="error"),
+    )
+    steps = next_steps(found, JOB)
+    assert next(step.words for step in steps) == "Not_known is so; do something."
+    assert steps[0].blocks == ("robotid doctor 'my job.toml'",)
+    assert words(steps)[1:] == ["State", "If"]
+    grave = told(
+        identified, warning("torque_delay", delay=0.01), warning("spikes", severity="error")
+    )
+    assert words(next_steps(grave, JOB))[:2] == ["Look", "If"]
+
+
+@pytest.mark.parametrize(
+    ("code", "evidence", "table", "flags"),
+    [
+        (
+            "current_for_torque",
+            {},
+            "[torque.gains]\nelbow_joint = GAIN",
+            "--gain elbow_joint=GAIN",
+        ),
+        (
+            "torque_delay",
+            {"delay": 0.0051},
+            "[signals]\ntorque_delay = 0.0051",
+            "--torque-delay 0.0051",
+        ),
+    ],
+)
+def test_a_setting_is_a_line_of_the_job_file_or_a_flag(identified, code, evidence, table, flags):
+    found = told(identified, warning(code, **evidence))
+    assert next_steps(found, FLAGS)[0].blocks == (
+        f"robotid identify arm.urdf first.csv --cutoff 8 {flags} --out out",
+    )
+    assert next_steps(found, JOB)[0].blocks == (
+        table,
+        "robotid identify 'my job.toml' --out out",
+    )
+
+
+@pytest.mark.parametrize("code", sorted({*DOUBTFUL, "payload"} - {"total_mass"}))
+def test_whatever_leaves_a_result_in_doubt_has_a_step(identified, code):
+    """Findings whose remedy is no setting are said again in their own words."""
+    calm = {step.words for step in next_steps(told(identified), JOB)}
+    found = told(identified, warning(code, delay=0.01, size=0.1, mass=1.0))
+    own = [step for step in next_steps(found, JOB) if step.words not in calm]
+    assert own, code
+    if code in ("joint_torque_delay", "joint_axis", "torque_sign"):
+        assert own[0].words == f"{code.capitalize()} is so; do something."
+
+
+def test_what_two_steps_ask_to_be_typed_is_typed_last(identified):
+    found = told(identified, warning("current_for_torque"), warning("torque_delay", delay=0.01))
+    first, second, *_ = next_steps(found, JOB)
+    assert first.blocks == ("[torque.gains]\nelbow_joint = GAIN",)
+    assert second.blocks[-1] == "robotid identify 'my job.toml' --out out"
+
+
+def test_without_a_recording_apart_one_is_asked_for(identified):
+    step = next_steps(told(identified, validation=()), FLAGS)[0]
+    assert step.words.startswith("Record another motion and keep it apart")
+    assert step.blocks[0].endswith("--validate NEW.csv --out out")
+
+
+def test_links_that_the_urdf_describes_better_are_pinned(identified):
+    (kept,) = identified.validation
+    measured = kept.metrics["estimate"].per_joint
+    joint = {
+        name: replace(m, baselines={**m.baselines, "urdf_with_drives": 0.1})
+        if name == "elbow_joint"
+        else replace(m, baselines={**m.baselines, "urdf_with_drives": 99.0})
+        for name, m in measured.items()
+    }
+    metrics = {**kept.metrics, "estimate": replace(kept.metrics["estimate"], per_joint=joint)}
+    steps = next_steps(told(identified, validation=(replace(kept, metrics=metrics),)), JOB)
+    (step,) = [step for step in steps if step.words.startswith("Leave the links of")]
+    assert step.blocks[0] == '[estimator.constraints]\npinned = ["forearm_link"]'
+
+
+def test_nothing_is_typed_where_nothing_is_known_of_commands(identified):
+    found = told(identified, warning("torque_delay", delay=0.005))
+    for step in next_steps(found, Origin()):
+        assert not any(block.startswith("robotid identify") for block in step.blocks)
+    assert Origin().using("replay", "x") == ()
+
+
+def test_the_source_of_a_command_line_is_what_is_identified():
+    from robotid.commands.flags import source_words
+
+    line = "identify --verbose arm.urdf a.csv --out here --gain j=2 --json --validate b.csv"
+    wanted = ("arm.urdf", "a.csv", "--gain", "j=2", "--validate", "b.csv")
+    assert source_words(line.split()) == wanted
+    assert source_words(["identify", "job.toml", "--out=x", "--resume"]) == ("job.toml",)
+    assert (Origin(wanted).job, JOB.job) == ("", "my job.toml")
