@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from robotid._typing import Array
+from robotid.logs.filters import local_polynomial
 from robotid.simulation.loops import Column, Loops, RollOut, Window
 
 __all__ = ["DriveTorques", "drive_torques", "find_gains", "measured_motion"]
@@ -105,7 +105,7 @@ def measured_motion(window: Window) -> RollOut:
     q, t = (x[window.counted] for x in (window.log.q, window.log.t))
     dt = float(np.median(np.diff(t)))
     wide = min(2 * max(2, round(_SMOOTH / dt)) + 1, len(t) - 1 + len(t) % 2)
-    v: Array = savgol_filter(q, wide, min(2, wide - 1), deriv=1, delta=dt, axis=0)
+    v = local_polynomial(q, wide, min(2, wide - 1), derivative=1, step=dt)
     return RollOut(window, q, v)
 
 

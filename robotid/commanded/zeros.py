@@ -14,6 +14,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.logs.data import Log
+from robotid.logs.filters import zero_phase
 from robotid.regressor.compiled import flatten
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
@@ -29,6 +30,7 @@ _TRIALS = np.array([(s, z) for s in (1.0, -1.0) for z in np.deg2rad(np.arange(-1
 _SAMPLES = 400  # of all logs together
 _SWEEPS = 4  # over the joints, until none moves any more
 _SLOW, _FAST = 0.4, 4.0  # [Hz] of the motion that is looked at, and of its friction's sense
+_PAD = 9  # rows by which both ends are continued
 _PERIODS = 30  # of the slowest motion that all logs together should have
 _RANGE = 0.4  # [rad] of slow motion that shows how a torque turns; over less it is a straight line
 _SAME = 1.0 - 1e-6  # cosine of axes that are parallel
@@ -152,15 +154,14 @@ def _descend(
 
 def _smooth(log: Log, count: int, cutoff: float) -> tuple[Array, ...]:
     """Return the slow motion at some samples of a log: the arrays of ``_Motion``."""
-    import scipy.signal  # takes most of a second
-
     dt = float(np.median(np.diff(log.t)))
-    fast, slow = (
-        scipy.signal.butter(2, min(f, 0.2 / dt), fs=1.0 / dt, output="sos") for f in (_FAST, cutoff)
-    )
-    v = np.gradient(scipy.signal.sosfiltfilt(fast, log.q, axis=0), dt, axis=0)
+
+    def low_pass(x: Array, below: float) -> Array:
+        return zero_phase(x, 2, min(below, 0.2 / dt), 1.0 / dt, _PAD)
+
+    v = np.gradient(low_pass(log.q, _FAST), dt, axis=0)
     smooth = [
-        scipy.signal.sosfiltfilt(slow, x, axis=0)
+        low_pass(x, cutoff)
         for x in (log.q, v, np.gradient(v, dt, axis=0), log.q_ref - log.q, np.tanh(v / _STILL))
     ]
     rows = np.linspace(0, len(log.t) - 1, count).astype(int)

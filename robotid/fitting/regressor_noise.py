@@ -38,6 +38,7 @@ from robotid.findings import Finding, listed
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import SurveyedLog, hold_log
 from robotid.logs.data import Trajectory
+from robotid.logs.filters import local_polynomial
 from robotid.logs.measured_velocity import quantum
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.factors import Factors, Reduction
@@ -202,10 +203,8 @@ def smoothed(q: Array, steps: Array, width: int) -> Array:
         steps: Steps of the encoders, shape (n,) [rad or m]; 0: none.
         width: Rows in which the motion is taken to be a cubic, odd.
     """
-    from scipy.signal import savgol_filter
-
     rows = (len(q) - 1) // 2 * 2 + 1
-    smooth = savgol_filter(q, min(width, rows), min(3, rows - 1), axis=0)
+    smooth = local_polynomial(q, min(width, rows), min(3, rows - 1))
     change: Array = np.clip(smooth - q, -steps, steps)
     return change
 

@@ -11,6 +11,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.logs.data import Log, Trajectory
+from robotid.logs.filters import butterworth_poles, zero_phase
 from robotid.logs.friction_direction import acting_directions
 from robotid.logs.settings import SignalSettings
 
@@ -101,10 +102,8 @@ def filter_reach(settings: SignalSettings) -> float:
     late = max(abs(settings.torque_delay), abs(settings.velocity_delay))
     if settings.cutoff is None or settings.rate is None:
         return late
-    from scipy.signal import butter
-
     order, cutoff, rate = settings.order, settings.cutoff, settings.rate
-    poles = butter(order, cutoff, fs=rate, output="zpk")[1]
+    poles = butterworth_poles(order, cutoff, rate)
     digital = 1 / (-np.log(np.abs(poles).max()) * rate)
     analog = 1 / (2 * np.pi * cutoff * np.sin(np.pi / (2 * order)))  # on a finer grid
     return late + 2.0 * _FORGOTTEN * float(max(digital, analog)) + _LONGEST / cutoff
@@ -120,12 +119,8 @@ def low_pass(values: Array, rate: float, settings: SignalSettings) -> Array:
     """
     if settings.cutoff is None or len(values) < 2:
         return values
-    from scipy.signal import butter, sosfiltfilt
-
-    sos = butter(settings.order, settings.cutoff, fs=rate, output="sos")
     pad = min(len(values) - 1, int(2 * rate / settings.cutoff))  # two periods
-    filtered: Array = sosfiltfilt(sos, values.T, axis=-1, padlen=pad).T
-    return filtered
+    return zero_phase(values, settings.order, settings.cutoff, rate, pad)
 
 
 def too_short(where: str, stretches: int, settings: SignalSettings) -> DataError:

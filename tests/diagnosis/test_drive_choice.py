@@ -29,7 +29,6 @@ from robotid.fitting.bands import friction_curve
 from robotid.fitting.parameter_table import parameter_entries
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
-from robotid.identification import pipeline
 from robotid.identification.pipeline import conclude, identify
 from robotid.logs.read import write_log
 from robotid.logs.signals import process
