@@ -4,13 +4,11 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from robotid._files import check_folder, folder_beside, write_json
 from robotid._settings import require_kind
 from robotid._typing import report_stage
-from robotid.commanded.identify import Commanded
-from robotid.commands.commanded import run_commanded
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import checkpoint_inputs, examine_logs, locked_as_logged, survey_logs
 from robotid.diagnosis.drive_choice import wanted_families
@@ -35,6 +33,9 @@ from robotid.robot.tree import read_tree
 from robotid.workers.checkpoint import Checkpoint, released_on_error
 from robotid.workers.plan import WorkPlan
 
+if TYPE_CHECKING:
+    from robotid.commanded.identify import Commanded
+
 __all__ = ["identify_job", "run_job", "save_result"]
 
 _log = logging.getLogger(__name__)
@@ -47,7 +48,7 @@ def run_job(
     plan: WorkPlan | None = None,
     source: Sequence[str] = (),
     beside: Mapping[str, str] | None = None,
-) -> tuple[Identification | Commanded, dict[str, Any]]:
+) -> "tuple[Identification | Commanded, dict[str, Any]]":
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
     A job may want no report, and an impossible result has no URDF. Every file is made in a folder
@@ -75,6 +76,8 @@ def run_job(
     require_kind(folder, (str, Path), "folder", "the path of a folder")
     chosen = plan or WorkPlan(job.workers or 1)
     if isinstance(job.estimator, SimulationSettings):
+        from robotid.commands.commanded import run_commanded  # compiles roll-outs
+
         return run_commanded(job, folder, progress=chosen.progress)
     report_stage(chosen.progress, "reading logs")
     model, target = job.model(), Path(folder)

@@ -34,8 +34,7 @@ from robotid.robot.bodies import (
 from robotid.robot.drives import TERMS, term_from_dict
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, pseudo_inertia
-from robotid.robot.tree import MOMENTS, Inertial, read_tree
-from robotid.robot.urdf_text import read_with_yourdfpy
+from robotid.robot.tree import MOMENTS, Inertial
 from robotid.versions import __version__
 
 __all__ = [
@@ -107,7 +106,6 @@ def write_urdf(
     original, places = source.read_bytes(), link_places(model)
     content = _content(original, model, pi, written, dynamics=dynamics)
     sidecar = goal.with_name(f"{goal.stem}.drive.json")
-    readers = ["robotid", "yourdfpy"] if _suits_yourdfpy(source) else ["robotid"]
     facts = {
         "schema_version": _SCHEMA_VERSION,
         "robotid": __version__,
@@ -117,15 +115,12 @@ def write_urdf(
         "source": {"urdf": source.name, "sha256": _digest(original)},
         **_facts(model, pi, places),
         **_projected_facts(dynamics),
-        "read_back_with": readers,
     }
     with folder_beside(goal.parent) as partial:
         (partial / goal.name).write_bytes(content)
         text = json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False)
         (partial / sidecar.name).write_text(text + "\n", encoding="utf-8")
         _check_torque(model, pi, partial / goal.name, partial / sidecar.name)
-        if "yourdfpy" in readers:
-            _check_masses(partial / goal.name)
     return sidecar
 
 
@@ -447,15 +442,6 @@ def _dynamics_edits(document: Document, model: RobotModel, pi: Array) -> list[Ed
     return edits
 
 
-def _suits_yourdfpy(source: Path) -> bool:
-    """Whether yourdfpy reads the original; if not, that is no fault of what is written."""
-    try:
-        read_with_yourdfpy(source)
-    except ModelError:
-        return False
-    return True
-
-
 def _check_torque(model: RobotModel, pi: Array, urdf: Path, sidecar: Path) -> None:
     """Raise if the files, read back, do not give the torque of pi in every row."""
     loaded, read_back = load_identified(urdf, sidecar)
@@ -473,16 +459,3 @@ def _check_torque(model: RobotModel, pi: Array, urdf: Path, sidecar: Path) -> No
             f"at {[model.row_names[i] for i in off]}; has {model.tree.path} changed since the "
             "model was read?"
         )
-
-
-def _check_masses(urdf: Path) -> None:
-    """Raise if yourdfpy finds another mass in any link than this package does."""
-    inertials = read_tree(urdf).inertials
-    for link in read_with_yourdfpy(urdf).links:
-        found = link.inertial.mass if link.inertial is not None else None
-        wanted = inertials[link.name].mass if link.name in inertials else None
-        if found != wanted:
-            raise ModelError(
-                f"{urdf.name} was not written: yourdfpy reads the mass of link {link.name!r} as "
-                f"{found}, robotid as {wanted}"
-            )

@@ -10,6 +10,7 @@ from robotid.logs.data import Trajectory
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors, Reduction, compress_stretches, join_stretches
 from robotid.regressor.problem import Block, Problem, concatenate
+from robotid.regressor.rows import keep_inertial_rows
 from robotid.regressor.used_rows import base_problem, independent_share
 from robotid.robot.model import RobotModel
 from robotid.workers.checkpoint import Checkpoint
@@ -88,8 +89,8 @@ class Recordings:
             DataError: If a row cannot be used, or no stretch of a log is long enough.
         """
         if self.is_held:
-            for log in (*self.fitted, *self.kept):
-                log.whole  # noqa: B018 refused before any fit
+            for log in (*self.fitted, *self.kept):  # refused before any fit
+                keep_inertial_rows(self.model, log.whole.trajectory)
             return tuple(chain.from_iterable(map(self._stretches, range(len(self.fitted)))))
         plan = self.plan or WorkPlan()
         found = iter(plan.reduce(self.pieces, checkpoint=self.checkpoint))

@@ -123,7 +123,7 @@ class LogPiece:
             rows: The rows.
         """
         model, mask = self.header.model, rows.mask
-        motion = remember(model, replace(rows.trajectory, memory=None))
+        motion = remember(model, rows.trajectory.with_memory(None))
         if not model.is_static:  # whose stands were chosen with their speeds
             mask = row_mask(model, motion, self.header.signals.min_velocity)
         vars(self)["_kept"] = replace(rows, trajectory=motion, mask=mask)

@@ -7,6 +7,7 @@ import difflib
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -207,6 +208,21 @@ class Trajectory:
     def __repr__(self) -> str:
         stretches = len(np.unique(self.segment))
         return f"<Trajectory: {_extent(self, self.rate)}, in {stretches} stretches>"
+
+    @cached_property
+    def derived(self) -> dict[str, Any]:
+        """What was computed of this motion and is kept with it, by name."""
+        return {}
+
+    def with_memory(self, memory: Array | None) -> "Trajectory":
+        """Return the same motion with other memory, and what was computed of it.
+
+        Args:
+            memory: What drives remember, as of ``memory``.
+        """
+        same = replace(self, memory=memory)
+        vars(same)["derived"] = self.derived
+        return same
 
     @property
     def squares(self) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
+from robotid.logs.data import Trajectory
 from robotid.regressor.columns import RowPlan
 
 if TYPE_CHECKING:
@@ -91,19 +92,16 @@ class CompiledWriter:
         states = self._work[-bodies * (12 + 6 * depth) * lanes.LANES :]
         _prepare(states.reshape(bodies, 12 + 6 * depth, lanes.LANES), model, tree)
 
-    def load(
-        self, q: Array, v: Array, a: Array, tau: Array, values: Array, weights: Array | None
-    ) -> None:
+    def load(self, motion: Trajectory, part: slice, values: Array, weights: Array | None) -> None:
         """Take the samples of the next blocks, and what drive parameters multiply in them.
 
         Args:
-            q: Joint coordinates, as of ``Trajectory``; so are v, a and tau.
-            v: Velocities.
-            a: Accelerations.
-            tau: Torques.
+            motion: The trajectory.
+            part: Which of its samples.
             values: As of ``drive_values``, shape (k, N).
             weights: Weight of each row; None: all 1.
         """
+        q, v, a, tau = motion.q[part], motion.v[part], motion.a[part], motion.tau[part]
         self._base = np.zeros((12, 0))
         if self._model.free_flyer:
             self._base = _base_state(self._model, q, v, a)

@@ -1,7 +1,5 @@
 """What drives remember along a trajectory: the load of their gears, its change, their reversals."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from robotid._typing import Array
@@ -32,7 +30,7 @@ def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:
     if not model.layout.remembering:
         return trajectory
     motion = drive_motion_along(model, trajectory)
-    return replace(trajectory, memory=remembered(model.layout, motion))
+    return trajectory.with_memory(remembered(model.layout, motion))
 
 
 def drive_motion_along(model: RobotModel, trajectory: Trajectory) -> DriveMotion:
@@ -49,7 +47,7 @@ def drive_motion_along(model: RobotModel, trajectory: Trajectory) -> DriveMotion
         Arrays of shape (d, N).
     """
     layout, pi = model.layout, model.carried_by
-    m = replace(trajectory, memory=None)  # that of another reference, if it has one
+    m = trajectory.with_memory(None)  # that of another reference, if it has one
     first = model.n_rows - len(model.joints)
     signs = friction_directions(layout, m.v, m.direction)
     begins = np.diff(m.segment, prepend=m.segment[:1] - 1) != 0
@@ -59,7 +57,7 @@ def drive_motion_along(model: RobotModel, trajectory: Trajectory) -> DriveMotion
     load = predict(plain, [bodies], m)[0][:, first:]
     motion = drive_motion(layout, m.q, m.v, m.a, signs, load, None, begins)
     if layout.remembering:
-        m = replace(m, memory=remembered(layout, motion))
+        m = m.with_memory(remembered(layout, motion))
     drives = trajectory_values(layout, m).T @ (layout.drive_loads * pi[layout.n_inertial :]).T
     rate = _rate(load + drives, m)
     return drive_motion(layout, m.q, m.v, m.a, signs, load, rate, begins)

@@ -12,7 +12,7 @@ from robotid.findings import listed
 from robotid.logs.data import Trajectory, real_numbers
 from robotid.regressor.columns import friction_directions, trajectory_values
 from robotid.regressor.compiled import work_per_sample
-from robotid.regressor.rows import BLOCK, COMPILED, TrajectoryRows, trajectory_rows
+from robotid.regressor.rows import BLOCK, COMPILED, InertialRows, TrajectoryRows, trajectory_rows
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
 
@@ -47,6 +47,8 @@ def predict(
         Luh, Walker, Paul (1980), On-Line Computational Scheme for Mechanical Manipulators.
     """
     source = trajectory_rows(model, trajectory, None, compiled)
+    if source.inertial is not None:
+        return _from_kept(source, source.inertial, np.column_stack(list(parameters)))
     few = len(parameters) * (_START + model.pin_model.nv) <= work_per_sample(model)
     if source.engine != COMPILED and few and all(_has_centres(model, pi) for pi in parameters):
         return [inverse_dynamics(model, pi, trajectory) for pi in parameters]
@@ -156,6 +158,17 @@ def _from_rows(source: TrajectoryRows, stacked: Array) -> list[Array]:
         for j, rows in enumerate(block):
             torques[:, part, j] = (rows[:, :-1] @ own[j]).T
         start = part.stop
+    return list(torques)
+
+
+def _from_kept(source: TrajectoryRows, inertial: InertialRows, stacked: Array) -> list[Array]:
+    """Return the rows times the columns of (p, k), the inertial ones computed before."""
+    layout, n = source.model.layout, len(source.model.joints)
+    torques, theta = inertial.torque(stacked), stacked[layout.n_inertial :]
+    if theta.any():
+        values = trajectory_values(layout, source.trajectory)  # (drive parameters, N)
+        for torque, own in zip(torques, theta.T, strict=True):
+            torque[:, source.model.n_rows - n :] += values.T @ (layout.drive_loads * own).T
     return list(torques)
 
 

@@ -26,7 +26,16 @@ from robotid.regressor.compiled import (
 from robotid.regressor.problem import RowSource
 from robotid.robot.model import RobotModel
 
-__all__ = ["BLOCK", "COMPILED", "TrajectoryRows", "choose_engine", "trajectory_rows"]
+__all__ = [
+    "BLOCK",
+    "COMPILED",
+    "InertialRows",
+    "TrajectoryRows",
+    "choose_engine",
+    "keep_inertial_rows",
+    "kept_rows",
+    "trajectory_rows",
+]
 
 BLOCK = 512  # samples per block: fits in the cache with 100 columns
 COMPILED = "compiled by Numba"
@@ -34,6 +43,7 @@ COMPILED = "compiled by Numba"
 _LANES = 64  # the compiled path works on whole groups of so many samples
 _BLOCK_SIZE = 2**18  # numbers per block, 2 MiB, if that leaves it a group of samples
 _LOADED = 8  # blocks that a writer takes at once
+_KEPT = 2**25  # bytes of inertial columns that are kept with a trajectory
 
 _log = logging.getLogger(__name__)
 
@@ -68,6 +78,82 @@ def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str
 
 
 @dataclass(frozen=True, eq=False)
+class InertialRows:
+    """Inertial columns of a trajectory's regressor, which neither drives nor their terms change.
+
+    Attributes:
+        pin_model: The robot that they are of.
+        columns: Which of the inertial parameters each row has, n_rows arrays of shape (c_j,).
+        values: Row after row the columns of each, shape (sum of c_j, N).
+    """
+
+    pin_model: pin.Model
+    columns: tuple[Array, ...]
+    values: Array
+
+    @cached_property
+    def first(self) -> Array:
+        """Place at which each row begins, and the end, shape (n_rows + 1,), int."""
+        return np.concatenate([[0], np.cumsum([len(own) for own in self.columns])])
+
+    def part(self, start: int, stop: int) -> "InertialRows":
+        """Return those of some samples.
+
+        Args:
+            start: First sample.
+            stop: Sample after the last one.
+        """
+        return replace(self, values=self.values[:, start:stop])
+
+    def torque(self, stacked: Array) -> Array:
+        """Return the torques of bodies, shape (k, N, n_rows) [N m, N].
+
+        Args:
+            stacked: Standard parameters, shape (p, k).
+        """
+        rows = zip(self.columns, pairwise(self.first), strict=True)
+        return np.stack([stacked[own].T @ self.values[i:j] for own, (i, j) in rows], axis=-1)
+
+
+def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
+    """Compute the inertial columns of a trajectory once and keep them with it.
+
+    Not if they are many, or compiled code computes them in less time than they are read in.
+
+    Args:
+        model: The robot.
+        trajectory: N samples, which stay in memory.
+    """
+    size, samples = model.layout.n_inertial, len(trajectory.t)
+    columns = tuple(np.flatnonzero(row[:size]) for row in model.support())
+    number = samples * sum(map(len, columns))
+    is_kept = kept_rows(model, trajectory) is not None
+    if is_kept or 8 * number > _KEPT or choose_engine(model, samples, None) == COMPILED:
+        return
+    plan = plan_rows(model.layout, columns)
+    out = np.empty((plan.first[-1], samples))
+    writer, m = _PinocchioWriter(model, plan, out[:, :BLOCK]), trajectory
+    values = np.empty((sum(map(len, columns)), samples))
+    place = np.concatenate(plan.places)
+    for start in range(0, samples, BLOCK):
+        k = slice(start, min(start + BLOCK, samples))
+        writer.write_inertial(m.q[k], m.v[k], m.a[k])
+        values[:, k] = out[place, : k.stop - k.start]
+    trajectory.derived["inertial rows"] = InertialRows(model.pin_model, columns, values)
+
+
+def kept_rows(model: RobotModel, trajectory: Trajectory) -> InertialRows | None:
+    """Return the inertial columns that are kept with a trajectory, if they are of that robot.
+
+    Args:
+        model: The robot.
+        trajectory: The trajectory.
+    """
+    rows: InertialRows | None = trajectory.derived.get("inertial rows")
+    return rows if rows is not None and rows.pin_model is model.pin_model else None
+
+
+@dataclass(frozen=True, eq=False)
 class TrajectoryRows(RowSource):
     """Rows of a robot's trajectory; see ``RowSource``.
 
@@ -78,6 +164,7 @@ class TrajectoryRows(RowSource):
         support: Shape (n_rows, p), bool: False where row j is zero for every motion.
         kept: Which of the p columns these are, shape (c,).
         engine: What computes the regressor.
+        inertial: Its inertial columns if they were computed before.
     """
 
     model: RobotModel
@@ -86,6 +173,7 @@ class TrajectoryRows(RowSource):
     support: Array
     kept: Array
     engine: str
+    inertial: InertialRows | None = None
 
     @property
     def samples(self) -> int:
@@ -106,7 +194,8 @@ class TrajectoryRows(RowSource):
 
     def part(self, start: int, stop: int) -> "TrajectoryRows":
         motion = self.trajectory.part(start, stop)
-        return replace(self, trajectory=motion, weights=self.weights[start:stop])
+        inertial = None if self.inertial is None else self.inertial.part(start, stop)
+        return replace(self, trajectory=motion, weights=self.weights[start:stop], inertial=inertial)
 
     def select(self, columns: Array) -> "TrajectoryRows":
         return replace(self, kept=self.kept[columns])
@@ -119,16 +208,14 @@ class TrajectoryRows(RowSource):
         writer = (
             CompiledWriter(self.model, self._tree, plan, out)
             if self.engine == COMPILED
-            else _PinocchioWriter(self.model, plan, out)
+            else _PinocchioWriter(self.model, plan, out, self.inertial)
         )
         for first in range(start, stop, _LOADED * length):
             last = min(first + _LOADED * length, stop)
             part = slice(first, last)
             weights = self.weights[part] if self._is_weighted else None
             values = trajectory_values(self.model.layout, motion, part)
-            writer.load(
-                motion.q[part], motion.v[part], motion.a[part], motion.tau[part], values, weights
-            )
+            writer.load(motion, part, values, weights)
             for k in range(0, last - first, length):
                 end = min(k + length, last - first)
                 writer.write(k, end)
@@ -172,15 +259,24 @@ def trajectory_rows(
     if weights.shape != shape:
         raise DataError(f"weight has shape {weights.shape}, wanted {shape}")
     kept, engine = np.arange(len(model.layout.names)), choose_engine(model, shape[0], compiled)
-    return TrajectoryRows(model, trajectory, weights, model.support(), kept, engine)
+    inertial = kept_rows(model, trajectory)
+    return TrajectoryRows(model, trajectory, weights, model.support(), kept, engine, inertial)
 
 
 class _PinocchioWriter:
-    """Writes the inertial columns with Pinocchio's own function, sample by sample."""
+    """Writes the inertial columns with Pinocchio's own function, sample by sample, or kept ones."""
 
-    def __init__(self, model: RobotModel, plan: RowPlan, out: Array) -> None:
+    def __init__(
+        self, model: RobotModel, plan: RowPlan, out: Array, inertial: InertialRows | None = None
+    ) -> None:
         G, nv = model.velocity_map, model.pin_model.nv
         self._model, self._plan, self._out = model, plan, out
+        self._kept: Array | None = None
+        if inertial is not None:
+            own = zip(inertial.first, inertial.columns, plan.inertial, strict=False)
+            self._kept = inertial.values
+            self._from = np.concatenate([i + np.searchsorted(x, wanted) for i, x, wanted in own])
+            self._to = _as_slice(np.concatenate(plan.places))
         self._data = model.pin_model.createData()
         size = 10 * (model.pin_model.njoints - 1)
         self._map = None if np.array_equal(G, np.eye(nv)) else G
@@ -195,28 +291,30 @@ class _PinocchioWriter:
         self._wanted = np.concatenate(wanted)
         self._raw = np.empty((out.shape[1], end))
 
-    def load(
-        self, q: Array, v: Array, a: Array, tau: Array, values: Array, weights: Array | None
-    ) -> None:
+    def load(self, motion: Trajectory, part: slice, values: Array, weights: Array | None) -> None:
         """Take the samples of the next blocks, and what drive parameters multiply in them."""
-        self._q, self._v, self._a, self._tau, self._weights = q, v, a, tau, weights
-        self._values = values
+        self._motion, self._first, self._weights, self._values = motion, part.start, weights, values
 
     def write(self, start: int, stop: int) -> None:
         """Write the rows of samples start to stop of those loaded."""
-        part = slice(start, stop)
-        self._write_inertial(self._q[part], self._v[part], self._a[part])
+        part, m = slice(start, stop), self._motion
+        own = slice(self._first + start, self._first + stop)
+        if self._kept is None:
+            self.write_inertial(m.q[own], m.v[own], m.a[own])
+        else:
+            self._out[self._to, : stop - start] = self._kept[self._from, own]
         out = self._out[:, : stop - start]
         for place, k, ratio in chain.from_iterable(self._plan.drives):
             np.multiply(ratio, self._values[k, part], out=out[place])
-        out[list(self._plan.torques)] = self._tau[part].T
+        out[list(self._plan.torques)] = m.tau[own].T
         if self._weights is not None:
             for root, (i, j) in zip(
                 np.sqrt(self._weights[part]).T, pairwise(self._plan.first), strict=True
             ):
                 out[i:j] *= root
 
-    def _write_inertial(self, q: Array, v: Array, a: Array) -> None:
+    def write_inertial(self, q: Array, v: Array, a: Array) -> None:
+        """Write the inertial columns of some samples at the beginning of the block."""
         regressor, model, data = pin.computeJointTorqueRegressor, self._model.pin_model, self._data
         wanted = self._wanted
         if self._map is not None:
