@@ -11,7 +11,8 @@ from robotid.commanded.identify import Commanded, identify_commands, with_gravit
 from robotid.commands.job import Job, LogEntry
 from robotid.doctor.diagnosis import diagnose
 from robotid.exceptions import SettingsError
-from robotid.export.result import Result, build_commanded
+from robotid.export.commanded_entries import build_commanded
+from robotid.export.result import Result
 from robotid.export.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.fitting.settings import SimulationSettings
 from robotid.judgement.verdict import check_ignored

@@ -13,7 +13,7 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import checkpoint_inputs, examine_logs, locked_as_logged, survey_logs
 from robotid.diagnosis.drive_choice import wanted_families
 from robotid.exceptions import DataError
-from robotid.export.result import build_result
+from robotid.export.entries import build_result
 from robotid.export.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.fitting.bands import fitted_moments
 from robotid.fitting.evaluation import Evaluation

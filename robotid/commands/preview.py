@@ -9,7 +9,8 @@ from robotid._files import file_sha256
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import result_run
 from robotid.exceptions import DataError
-from robotid.export.result import build_preview, load_result
+from robotid.export.entries import build_preview
+from robotid.export.result import load_result
 from robotid.fitting.survey import SurveyedLog, survey_log
 from robotid.identification.previews import preview_logs
 from robotid.robot.model import RobotModel

@@ -15,11 +15,11 @@ from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import survey_logs
 from robotid.doctor.diagnosis import diagnose
 from robotid.export.commanded import loops_of
+from robotid.export.commanded_entries import open_loop_entry
+from robotid.export.entries import recording_metrics
 from robotid.export.result import (
     Result,
     load_result,
-    open_loop_entry,
-    recording_metrics,
     stated_model,
     stated_parameters,
     stated_urdf_with_drives,

@@ -9,7 +9,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.doctor.motions import check_excitation
 from robotid.estimators.determination import base_spread, determine
 from robotid.exceptions import RankDeficientError
-from robotid.export.result import build_result
+from robotid.export.entries import build_result
 from robotid.findings import listed
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log

@@ -7,8 +7,8 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from robotid.export.entries import build_result
 from robotid.export.ranges import parameter_ranges, ranges_text, write_ranges
-from robotid.export.result import build_result
 from robotid.export.yaml_text import yaml_text
 from robotid.robot.parameters import pseudo_inertia
 

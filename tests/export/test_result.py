@@ -11,7 +11,8 @@ from helpers.figures import figures
 
 from robotid import __version__
 from robotid.exceptions import DataError, ModelError
-from robotid.export.result import build_result, read_result, recording_metrics, stated_parameters
+from robotid.export.entries import build_result, recording_metrics
+from robotid.export.result import read_result, stated_parameters
 from robotid.findings import Finding
 from robotid.robot.parameters import INERTIAL_TERMS
 

@@ -5,7 +5,7 @@ import pytest
 from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
-from robotid.export.result import build_result
+from robotid.export.entries import build_result
 from robotid.fitting.bands import TorqueBand, expected_band, torque_band
 from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.settings import SignalSettings

@@ -7,7 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from robotid.export.result import Result, build_result
+from robotid.export.entries import build_result
+from robotid.export.result import Result
 from robotid.fitting import parameter_table
 
 

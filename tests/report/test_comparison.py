@@ -17,7 +17,8 @@ from robotid._files import write_json
 from robotid.cli import main
 from robotid.diagnosis.torque_split import split_torque
 from robotid.exceptions import DataError
-from robotid.export.result import build_result, read_result
+from robotid.export.entries import build_result
+from robotid.export.result import read_result
 from robotid.logs.read import write_log
 from robotid.pages.html import code
 from robotid.report.comparison import compare_results, write_comparison

@@ -5,7 +5,7 @@ from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators.consistent.cones import SOLVERS
-from robotid.export.result import build_result
+from robotid.export.entries import build_result
 from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement.findings import consistency_findings
 from robotid.logs.settings import SignalSettings

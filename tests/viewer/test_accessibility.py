@@ -11,7 +11,7 @@ from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid._files import write_json
-from robotid.export.result import build_result
+from robotid.export.entries import build_result
 from robotid.findings import Finding
 from robotid.identification.pipeline import identify
 from robotid.report.comparison import write_comparison

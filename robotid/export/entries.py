@@ -1,0 +1,327 @@
+"""What result.json holds of an identification from torques, and of a preview."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from robotid._files import file_sha256
+from robotid.export.ranges import parameter_ranges
+from robotid.fitting.bands import REACH, fitted_moments, usual_friction
+from robotid.fitting.drives import DriveChoice
+from robotid.fitting.evaluation import Evaluation
+from robotid.fitting.parameter_table import parameter_entries
+from robotid.fitting.result import SOURCES
+from robotid.identification.previews import Preview
+from robotid.identification.result import Identification
+from robotid.logs.transmission import Transmission
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.friction_projection import (
+    DriveMoments,
+)
+from robotid.robot.drives import TERMS
+from robotid.robot.parameters import pseudo_inertia
+from robotid.versions import __version__, versions
+
+__all__ = [
+    "SCHEMA_VERSION",
+    "build_preview",
+    "build_result",
+    "finite",
+    "plain_moments",
+    "recording_metrics",
+    "source_entry",
+]
+
+SCHEMA_VERSION = 1
+
+_EXTENT = ("samples", "rate", "start", "end", "rows_used", "segments")
+
+
+def build_result(
+    identification: Identification,
+    settings: Mapping[str, Any],
+    outputs: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """Return the content of result.json, plain values only and all of them finite.
+
+    Args:
+        identification: What was found.
+        settings: The job, in the shape of its file.
+        outputs: Files written beside it, by kind.
+    """
+    model, size = identification.model, identification.model.layout.n_inertial
+    bodies, drives = parameter_entries(identification)
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "robotid": __version__,
+        "versions": versions(),
+        "robot": model.name,
+        "joints": list(model.joints),
+        "settings": dict(settings),
+        "inputs": _inputs(identification),
+        "outputs": dict(outputs or {}),
+        "structure": _structure(identification),
+        "base_parameters": _base_parameters(identification),
+        "uncertainty": {
+            "method": identification.errors.method,
+            "stretches": identification.errors.stretches,
+            "inflation": identification.errors.inflation,
+        },
+        "standard_parameters": bodies,
+        "drive_parameters": [
+            entry | {"with_urdf": float(value)}
+            for entry, value in zip(drives, identification.urdf_with_drives[size:], strict=True)
+        ],
+        "motors": _motors(identification, settings),
+        "own_terms": model.options["own_terms"],
+        "drive_moments": plain_moments(fitted_moments(identification)),
+        "friction": {
+            drive.joint: _friction(identification, drive) for drive in identification.drives
+        },
+        "consistency": _consistency(identification),
+        **({"ranges": parameter_ranges(identification)} if identification.has_urdf else {}),
+        "identification": identification.metrics().to_dict(),
+        "validation": [
+            recording_metrics(e, "estimate") | {"band": _band(identification, e)}
+            for e in identification.validation
+        ],
+        "warnings": [
+            {"code": f.code, "severity": f.severity, "message": f.message, "where": f.where}
+            for f in identification.findings
+        ],
+        "wls": {
+            "base_values": identification.wls.theta.tolist(),
+            "base_std_errors": [finite(error) for error in identification.wls.std_error],
+            "identification": identification.metrics("wls").to_dict(),
+            "validation": [recording_metrics(e, "wls") for e in identification.validation],
+        },
+        "witness": identification.witness.to_dict(),
+        "verdict": identification.verdict.to_dict(),
+    }
+
+
+def build_preview(preview: Preview) -> dict[str, Any]:
+    """Return what a preview tells, plain values only and all of them finite.
+
+    Args:
+        preview: The preview.
+    """
+    found, noise = preview.expected, preview.noise
+    bodies, drives = parameter_entries(found)
+    kept = ("name", "expression", "std_error", "unit")
+    base = [
+        {key: entry[key] for key in kept} | {"plausible": float(spread)}
+        for entry, spread in zip(_base_parameters(found), preview.plausible, strict=True)
+    ]
+    if preview.before is not None and preview.gain is not None:
+        for entry, before, gain in zip(base, preview.before, preview.gain, strict=True):
+            entry |= {"std_error_before": finite(before), "gain": finite(gain)}
+    units = dict(zip(found.model.row_names, found.model.row_units, strict=True))
+    return {
+        "robot": found.model.name,
+        "joints": list(found.model.joints),
+        "estimator": found.estimator.name,
+        "motions": [
+            {"role": "motion", **source_entry(e.recording.log.path), **_extent(e)}
+            for e in found.fitted
+        ],
+        "noise": {
+            joint: {"std": float(std), "unit": units[joint], "correlation": float(time), "is": of}
+            for joint, std, time, of in zip(
+                found.model.joints, noise.std, noise.correlation, noise.origins, strict=True
+            )
+        },
+        "structure": _structure(found),
+        "undetermined": list(found.determination.undetermined),
+        "words": preview.words,
+        "base_parameters": base,
+        "standard_parameters": [_without_value(entry) for entry in bodies],
+        "drive_parameters": [_without_value(entry) for entry in drives],
+        "torque": _expected_torque(preview),
+    }
+
+
+def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
+    """Return the metrics of one recording as result.json has them.
+
+    Args:
+        evaluation: The recording.
+        name: Which parameters predict.
+    """
+    recording = evaluation.recording
+    return {"log": recording.log.path, "name": recording.name, **evaluation.metrics[name].to_dict()}
+
+
+def plain_moments(moments: Mapping[str, DriveMoments]) -> dict[str, Any]:
+    """Return the moments of drives as plain values, by name.
+
+    Args:
+        moments: The moments.
+    """
+    return {name: of_drive.to_dict() for name, of_drive in moments.items()}
+
+
+def _friction(found: Identification, drive: DriveChoice) -> dict[str, Any]:
+    """Return what friction a joint has, and what was tried."""
+    own = [term for term in found.model.layout.terms if TERMS[term].is_friction]
+    told = drive.to_dict()
+    return {
+        "terms": [*own, *drive.families],
+        **told,
+        **_curve(found, drive.joint),
+        "on_misfit": [name for name in found.on_misfit if name.startswith(f"{drive.joint}.")],
+        "tried": [{"terms": [*own, *tried["families"]], **tried} for tried in told["tried"]],
+    }
+
+
+def _curve(found: Identification, joint: str) -> dict[str, Any]:
+    """Return the friction of a joint against its speed; nothing of one that was never seen move."""
+    row = found.model.row_names.index(joint)
+    seen = [e.recording.trajectory.v[e.recording.mask[:, row], row] for e in found.fitted]
+    if not np.any(np.concatenate(seen)):
+        return {}
+    return {"curve": usual_friction(found, joint).to_dict()}
+
+
+def _structure(found: Identification) -> dict[str, Any]:
+    """Return how many parameters there are, and which the data determine."""
+    return {
+        "standard": found.model.layout.n_inertial,
+        "base_inertial": len(structural_mapping(found.model, inertial_only=True).K),
+        "base": len(found.base),
+        "rank": found.determination.rank,
+        "condition": finite(found.wls.condition),
+        "undetermined": list(found.determination.undetermined),
+        "poorly_excited": found.is_poorly_excited,
+        "not_told_apart": found.determination.to_list(),
+    }
+
+
+def _without_value(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a parameter's entry without what only data tell."""
+    return {key: x for key, x in entry.items() if key not in ("value", "at_bound")}
+
+
+def _expected_torque(preview: Preview) -> dict[str, dict[str, Any]]:
+    """Return size and 95 % band of each joint's torque on the motions, root mean squares."""
+    found, bands = preview.expected, preview.bands
+    torque = np.vstack([e.recording.trajectory.tau for e in found.fitted])
+    of_parameters = REACH * np.sqrt(np.mean(np.vstack([b.parameters for b in bands]) ** 2, axis=0))
+    half = REACH * np.sqrt(np.mean(np.vstack([b.total for b in bands]) ** 2, axis=0))
+    rms = np.sqrt(np.mean(torque**2, axis=0))
+    model = found.model
+    return {
+        row: {
+            "rms": float(rms[j]),
+            "half_width": float(half[j]),
+            "of_parameters": float(of_parameters[j]),
+            "unit": model.row_units[j],
+        }
+        for j, row in enumerate(model.row_names)
+    }
+
+
+def _inputs(identification: Identification) -> list[dict[str, Any]]:
+    inputs = [{"role": "urdf", **source_entry(identification.model.tree.path)}]
+    for role, evaluations in (
+        ("identification", identification.fitted),
+        ("validation", identification.validation),
+    ):
+        for evaluation in evaluations:
+            recording = evaluation.recording
+            signals = {"signals": dataclasses.asdict(recording.signals)}
+            source = source_entry(recording.log.path)
+            inputs.append({"role": role, **source, **_extent(evaluation), **signals})
+    return inputs
+
+
+def _extent(evaluation: Evaluation) -> dict[str, Any]:
+    return {key: getattr(evaluation.recording.extent, key) for key in _EXTENT}
+
+
+def source_entry(path: str) -> dict[str, Any]:
+    """Return the path of an input and the hash of its file, None if it has none.
+
+    Args:
+        path: The file; "" for what was in memory.
+    """
+    return {"path": str(path), "sha256": file_sha256(path) if path else None}
+
+
+def _base_parameters(found: Identification) -> list[dict[str, Any]]:
+    mapping, units = found.mapping, found.model.layout.units
+    return [
+        {
+            "name": name,
+            "expression": mapping.expressions[k],
+            "value": float(found.base[k]),
+            "std_error": finite(found.base_error[k]),
+            "interval_95": [finite(end) for end in found.base_interval[k]],
+            "unit": units[i],
+        }
+        for k, (name, i) in enumerate(zip(mapping.base_names, mapping.independent, strict=True))
+    ]
+
+
+def _motors(found: Identification, settings: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Return gear ratio and inertia at the motor, armature / ratio^2, of drives behind gears."""
+    model, gears = found.model, dict[str, float]()
+    for table in settings.get("transmission", ()):
+        gears |= Transmission.from_dict(table).stated(model.tree.reductions).gears
+    drives = [
+        (model.layout.drives[d].name, value)
+        for (d, term), value in zip(
+            model.layout.drive_parameters, found.standard[model.layout.n_inertial :], strict=True
+        )
+        if term.is_inertia
+    ]
+    return {
+        name: {"gear": gears[name], "inertia": float(value) / gears[name] ** 2}
+        for name, value in drives
+        if name in gears
+    }
+
+
+def _consistency(found: Identification) -> dict[str, Any]:
+    layout = found.model.layout
+    J = pseudo_inertia(found.standard[: layout.n_inertial])
+    smallest = np.linalg.eigvalsh(J)[:, 0]
+    return {
+        "is_consistent": found.is_consistent,
+        "links": [
+            {"name": body, "mass": float(J[i, 3, 3]), "min_eigenvalue": float(smallest[i])}
+            for i, body in enumerate(layout.bodies)
+        ],
+        "total_mass": float(J[:, 3, 3].sum()),
+        "mass_matrix": dataclasses.asdict(found.mass_matrix),
+        "fit": dict(found.estimate.details),
+        "sources": {kind: found.sources.count(kind) for kind in SOURCES},
+    }
+
+
+def _band(identification: Identification, evaluation: Evaluation) -> dict[str, Any]:
+    """Return the 95 % band of the predicted torque: its half width, and what lies in it."""
+    recording, band = evaluation.recording, identification.band(evaluation)
+    held = band.held(recording.trajectory.tau, evaluation.torques["estimate"], recording.mask)
+    return {
+        row: {
+            "half_width": float(REACH * np.sqrt(np.mean(total**2))),
+            "of_parameters": float(REACH * np.sqrt(np.mean(parameters**2))),
+            "held_pct": finite(100 * share),
+        }
+        for row, total, parameters, share in zip(
+            identification.model.row_names, band.total.T, band.parameters.T, held, strict=True
+        )
+    }
+
+
+def finite(value: float) -> float | None:
+    """Return a number as JSON has it: None if it is not finite.
+
+    Args:
+        value: The number.
+    """
+    return float(value) if math.isfinite(value) else None
