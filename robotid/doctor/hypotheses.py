@@ -5,7 +5,7 @@ by the URDF, of the inertia and the frictions of its drive, and of a constant. M
 by any factor; signs, columns, gravity and positions may not.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -68,27 +68,32 @@ def compensated(probe: Probe) -> tuple[Probe, Array]:
     return whole, np.minimum(share, 1.0)
 
 
-def unexplained(probe: Probe, gravity: Array | None = None) -> Array:
+def unexplained(probe: Probe) -> Array:
     """Return which share of each torque column no physics of each joint explains.
 
     Args:
         probe: The motion.
-        gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
 
     Returns:
         Shares of variance, shape (n, n, 2): torque column i, physics of joint k, with the column's
         sign as it is and reversed. 0 for a constant column.
     """
     n = len(probe.model.joints)
-    loads = probe.loads(gravity)
+    own = {k: [(i, sign) for i in range(n) for sign in (1.0, -1.0)] for k in range(n)}
+    return np.stack(
+        [_shares(probe, k, columns).reshape(n, 2) for k, columns in own.items()], axis=1
+    )
+
+
+def _shares(probe: Probe, k: int, columns: Sequence[tuple[int, float]]) -> Array:
+    """Return which share of torque columns, of a sign each, the physics of a joint leaves."""
     size = _variation(probe)
-    share = np.zeros((n, n, 2))
-    for k in range(n):
-        R, T = _compressed(np.hstack([loads[:, k], probe.drive(k)]), probe.tau)
-        for i in np.flatnonzero(size > 0):
-            for s, sign in enumerate((1.0, -1.0)):
-                share[i, k, s] = _nonnegative_misfit(R, sign * T[:, i]) / size[i]
-    return np.minimum(share, 1.0)
+    R, T = _compressed(np.hstack([probe.loads()[:, k], probe.drive(k)]), probe.tau)
+    left = [
+        _nonnegative_misfit(R, sign * T[:, i]) / size[i] if size[i] > 0 else 0.0
+        for i, sign in columns
+    ]
+    return np.minimum(left, 1.0)
 
 
 def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanation]]:
@@ -171,8 +176,10 @@ def _gravity(probe: Probe) -> Explanation:
     size = float(np.linalg.norm(probe.gravity)) or _EARTH
     n = len(probe.model.joints)
 
+    share_in = _shares_by_gravity(probe)
+
     def explained(g: Array) -> Explanation:
-        share = own_share(probe, g)
+        share = share_in(g)
         return Explanation("gravity", share, tuple(range(n)), tuple(g.tolist()))
 
     axes = [sign * size * axis for axis in np.eye(3) for sign in (1, -1)]
@@ -194,6 +201,30 @@ def _gravity(probe: Probe) -> Explanation:
     return tilted(found.x)
 
 
+def _shares_by_gravity(probe: Probe) -> Callable[[Array], Array]:
+    """Return a function of gravity (3,): the share that own physics leaves of each torque, (n,).
+
+    Loads are linear in gravity, so that one triangle of each joint serves for all of them.
+    """
+    size, links, pulls = _variation(probe), probe.loads(), probe.parts.pulls
+    triangles = {}
+    for j in np.flatnonzero(size > 0).tolist():
+        X = [links[:, j], *pulls[:, :, j], probe.drive(j), probe.tau[:, [j]]]
+        triangles[j] = np.asarray(np.linalg.qr(np.hstack(X), mode="r"))
+    bodies = links.shape[2]
+
+    def shares(g: Array) -> Array:
+        share, more = np.zeros(len(size)), g - probe.gravity
+        for j, R in triangles.items():
+            parts = R[:, : 4 * bodies].reshape(-1, 4, bodies)
+            loads = parts[:, 0] + np.tensordot(more, parts[:, 1:], axes=(0, 1))
+            A, b = _compressed(np.hstack([loads, R[:, 4 * bodies : -1]]), R[:, -1:])
+            share[j] = min(_nonnegative_misfit(A, b[:, 0]) / size[j], 1.0)
+        return share
+
+    return shares
+
+
 def _positions(probe: Probe) -> Iterator[Explanation]:
     """Yield readings in which a position column means something else."""
     every = max(1, len(probe.rows) // 200)
@@ -202,9 +233,11 @@ def _positions(probe: Probe) -> Iterator[Explanation]:
     for pair in combinations(range(n), 2):
         order = [pair[1] if j == pair[0] else pair[0] if j == pair[1] else j for j in range(n)]
         state = small.q[:, order], small.v[:, order], small.a[:, order]
-        share = unexplained(small.with_motion(state))
-        yield Explanation("position_order", np.diagonal(share[:, :, 0]), pair)
-        yield Explanation("joint_order", share[np.arange(n), order, 0], pair)
+        moved = small.with_motion(state)
+        # of joint k its own torque, and that of the joint whose position it has
+        share = np.array([_shares(moved, k, [(k, 1.0), (order[k], 1.0)]) for k in range(n)])
+        yield Explanation("position_order", share[:, 0], pair)
+        yield Explanation("joint_order", share[order, 1], pair)
     turning = [j for j in range(n) if probe.model.joints[j] not in probe.model.layout.prismatic]
     for j in turning:
         share = own_share(small.with_motion(_moved(small, j, -1.0, 0.0)))

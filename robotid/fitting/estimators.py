@@ -57,7 +57,7 @@ class Known:
     spread: Array  # (p,), how far they may plausibly be wrong
     share: float  # share of the rows that count as independent [-]
     sigma: Array  # (n,), noise level of each joint [N m or N]
-    stretches: tuple[Factors, ...] = ()  # of the fitted logs, to choose a weight with
+    held_out: tuple[Factors, ...] = ()  # segments to judge weight and extents by
 
 
 def make_estimator(
@@ -140,7 +140,7 @@ def consistent_fit(
         solver=settings.solver,
         check=settings.check,
     )
-    folds = gather(prior.stretches, _FOLDS)
+    folds = gather(prior.held_out, _FOLDS)
     how = "" if not isinstance(weight, str) else "cv" if weight == "auto" else weight
     if how == "cv" and len(folds) < 2:
         how = ""

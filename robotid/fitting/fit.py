@@ -41,7 +41,7 @@ _SETTLED = 1e-3  # of the torque, by which they may still move it
 
 
 def rough_choice(choice: EstimatorSettings) -> EstimatorSettings:
-    """Return the estimator without what takes long and moves an estimate little.
+    """Return the estimator without what takes long and moves a fit's residual little.
 
     Args:
         choice: The estimator asked for.
@@ -60,8 +60,8 @@ def fit_recordings(
     Args:
         recordings: The recordings.
         choice: Which estimator.
-        is_last: Whether the bias by the steps of the positions is taken off, which fits in between
-            keep.
+        is_last: Whether the bias by the steps of the positions is taken off, and bounds that the
+            data contradict are judged by held-out segments; not for fits in between.
 
     Raises:
         DataError: If a row of a log cannot be used.
@@ -70,7 +70,7 @@ def fit_recordings(
     """
     recordings = _under_own_load(recordings, choice)
     model, mapping = recordings.model, recordings.mapping
-    ground = _ground(recordings, choice)
+    ground = _ground(recordings, choice, is_last=is_last)
     if is_last:
         ground = _without_regressor_noise(ground, choice)
     prior, spread = ground.before.pi, ground.before.spread
@@ -122,7 +122,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
         return recordings
     choice = rough_choice(choice)
     for step in range(_MOST_LOADS):
-        ground = _ground(recordings, choice)
+        ground = _ground(recordings, choice, is_last=False)
         before = ground.before
         standard, _ = standard_of(ground.rough, mapping, before.pi, before.spread)
         moved = standard - recordings.model.carried_by
@@ -157,7 +157,8 @@ class _Ground:
 
     recordings: Recordings  # their rows weighted if a robust loss was asked for
     whole: Reduction  # what all fitted rows come down to, base parameters
-    before: Known  # without them, and how they are cut into stretches
+    before: Known  # without them
+    segments: tuple[Factors, ...]  # what the segments of the logs come down to
     rough: Estimate  # weighted least squares on them
     determination: Determination  # which base parameters they determine
     grown: float  # by how much a robust loss widens the covariance [-]
@@ -169,7 +170,7 @@ class _Ground:
         return self.whole.factors
 
 
-def _ground(recordings: Recordings, choice: EstimatorSettings) -> _Ground:
+def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool) -> _Ground:
     """Reduce the rows, with a robust loss reweighted, to what every estimator stands on."""
     model, mapping = recordings.model, recordings.mapping
     prior = model.standard_parameters()
@@ -178,15 +179,15 @@ def _ground(recordings: Recordings, choice: EstimatorSettings) -> _Ground:
         recordings, reductions, understated = reweigh(recordings, reductions, choice.loss, prior)
         grown = understated**2
     reduction = join(reductions)
-    stretches = tuple(part.factors for part in reductions if part.factors.rows.any())
+    segments = tuple(part.factors for part in reductions if part.factors.rows.any())
     factors, share = reduction.factors, recordings.share
     spread = prior_spread(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
-    before = Known(prior, spread, share, rough.sigma, stretches)
+    before = Known(prior, spread, share, rough.sigma, segments if is_last else (factors,))
     known = model.layout.owned_by(choice.bounds.pinned)
     rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
     determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
-    return _Ground(recordings, reduction, before, rough, determination, grown)
+    return _Ground(recordings, reduction, before, segments, rough, determination, grown)
 
 
 def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Ground:
@@ -206,11 +207,12 @@ def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Gro
     if isinstance(choice, RecursiveSettings):
         noise = noise.uncorrected(ground.factors.information(1.0 / sigma**2))
         return replace(ground, noise=noise)
-    stretches = tuple(part.without(noise.shift) for part in ground.before.stretches)
+    segments = tuple(part.without(noise.shift) for part in ground.segments)
     return replace(
         ground,
         whole=replace(ground.whole, factors=ground.factors.without(noise.shift)),
-        before=replace(ground.before, stretches=stretches),
+        before=replace(ground.before, held_out=segments),
+        segments=segments,
         rough=replace(ground.rough, theta=theta - noise.shift),
         noise=noise,
     )
@@ -225,10 +227,10 @@ def _measured(
         estimate, fit, weighing = _run(choice, ground)
     except RankDeficientError as error:
         raise ground.determination.refusal(error) from error
-    stretches, share, K = ground.before.stretches, ground.before.share, mapping.K
+    segments, share, K = ground.segments, ground.before.share, mapping.K
     more = None if ground.noise is None else ground.noise.meat
     of_wls = more if weighing != "alike" else None  # which is of other weights
-    wls, errors = measured_errors(rough, stretches, factors, share, K, rough.sigma, more=of_wls)
+    wls, errors = measured_errors(rough, segments, factors, share, K, rough.sigma, more=of_wls)
     if weighing == "by step" and fit is None:
         estimate = with_wls_errors(estimate, wls)
     else:
@@ -240,7 +242,7 @@ def _measured(
             redraws, pull = Redraws(fit, choice.draws, np.random.default_rng(0)), fit.pull
         is_filter = weighing == "by age"
         estimate, errors = measured_errors(
-            estimate, stretches, factors, share, K, sigma,
+            estimate, segments, factors, share, K, sigma,
             is_filter=is_filter, pull=pull, redraws=redraws, more=more,
         )  # fmt: skip
     if ground.grown != 1.0:

@@ -222,18 +222,17 @@ def with_drives(
     Raises:
         DataError, RankDeficientError, NotConvergedError: As of ``identify``.
     """
-    report = progress or ignore_progress
+    report, rough = progress or ignore_progress, rough_choice(choice)
     report("fits", 0, 1, "fits")
     fit = fit_recordings(recordings, choice)
     drives = choose_drives(fit, wanted, balanced)
     if not any(drive.terms for drive in drives):
         return replace(fit, drives=drives)
-    rough = rough_choice(choice)
     most = _MOST_SHAPES if any(drive.shapes for drive in drives) else 0
     for done in range(most):
         report("fits", 1 + done, 2 + most, "fits")
-        found = fit_recordings(_with_own(recordings, fit, drives), rough, is_last=False)
-        moved = settled_shapes(replace(found, drives=drives))
+        fit = fit_recordings(_with_own(recordings, fit, drives), rough, is_last=False)
+        moved = settled_shapes(replace(fit, drives=drives))
         if moved is None:
             break
         drives = moved

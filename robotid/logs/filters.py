@@ -44,36 +44,37 @@ def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Ar
         rate: Rows per second.
         pad: Rows by which both ends are continued, below N.
     """
-    flat = x.reshape(len(x), -1)
-    before, after = 2 * flat[0] - flat[pad:0:-1], 2 * flat[-1] - flat[-2 : -pad - 2 : -1]
-    y = np.concatenate([before, flat, after])
-    sections = [_Section(pole) for pole in butterworth_poles(order, cutoff, rate)]
+    rows = x.reshape(len(x), -1).T  # (k, N): each signal in one piece of memory
+    first, last = rows[:, :1], rows[:, -1:]
+    before, after = 2 * first - rows[:, pad:0:-1], 2 * last - rows[:, -2 : -pad - 2 : -1]
+    y = np.concatenate([before, rows, after], axis=1)
+    sections = [_Section(pole, y.shape[1]) for pole in butterworth_poles(order, cutoff, rate)]
     for _ in range(2):
-        start = y[0]
-        y = y - start
+        start = y[:, :1].copy()
+        y -= start
         for section in sections:
-            y = section.filtered(y)
-        y = (y + start)[::-1]
-    return np.asarray(y[pad : len(y) - pad].reshape(x.shape))
+            section.filter(y)
+        y = np.ascontiguousarray((y + start)[:, ::-1])
+    return np.asarray(y[:, pad : y.shape[1] - pad].T.reshape(x.shape))
 
 
 class _Section:
     """One pole, or a pair of conjugate ones, with zeros at half the rate: y + a y' = g (x + x')."""
 
-    def __init__(self, pole: complex) -> None:
+    def __init__(self, pole: complex, samples: int) -> None:
         is_real = abs(pole.imag) < 1e-12 * abs(pole)
-        self.a = np.array([1.0, -pole.real] if is_real else [1.0, -2 * pole.real, abs(pole) ** 2])
-        self.b = np.array([1.0, 1.0] if is_real else [1.0, 2.0, 1.0])
-        self.b *= self.a.sum() / self.b.sum()  # what is constant passes
+        a = np.array([1.0, -pole.real] if is_real else [1.0, -2 * pole.real, abs(pole) ** 2])
+        self.gain = a.sum() / (2.0 if is_real else 4.0)  # what is constant passes
+        self.band = np.tile(a, (samples, 1)).T  # of the triangle whose solution is the recursion
 
-    def filtered(self, x: Array) -> Array:
-        """Return the output of the section that was at rest, shape (N, k)."""
-        right = self.b[0] * x
-        for k, b in enumerate(self.b[1:], start=1):
-            right[k:] += b * x[:-k]
-        band = np.tile(self.a, (len(x), 1)).T  # of the triangle whose solution is the recursion
-        columns = [dtbsv(len(self.a) - 1, band, column, lower=1, diag=1) for column in right.T]
-        return np.reshape(columns, x.shape[::-1]).T
+    def filter(self, x: Array) -> None:
+        """Filter signals in place, shape (k, N), of a section that was at rest."""
+        order = len(self.band) - 1
+        for row in x:
+            for _ in range(order):
+                row[1:] += row[:-1].copy()
+            row *= self.gain
+            row[:] = dtbsv(order, self.band, row, lower=1, diag=1, overwrite_x=1)
 
 
 def local_polynomial(
