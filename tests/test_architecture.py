@@ -47,7 +47,7 @@ INSIDE_FUNCTIONS = {
     "h5py": {"logs"},
     "distributed": {"workers"},
     "loky": {"workers"},
-    "rich": {"commands"},
+    "rich": {"cli"},
     "coal": {"excitation"},
     "matplotlib": {"paper"},
     "clarabel": {"estimators"},

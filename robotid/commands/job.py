@@ -202,7 +202,7 @@ class Job(Settings):
     )
     report: bool = setting(
         True,
-        "whether report.html is written, which takes most of the time of a short log",
+        "whether report.html is written",
         at="output.report",
     )
     identification: tuple[LogEntry, ...] = setting((), "logs to fit")

@@ -18,9 +18,8 @@ from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid._typing import STAGES
-from robotid.cli import main
-from robotid.commands.console import terminal_progress
-from robotid.commands.printing import print_content
+from robotid.cli import doctor, main
+from robotid.cli.console import terminal_progress
 from robotid.identification.pipeline import identify
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
@@ -223,21 +222,21 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
         finding("arm_1", "noise", 1, "note"),
     ]
     content = {"findings": findings, "joints": joints}
-    print_content("doctor", content)
+    doctor.show(content, is_verbose=False)
     assert capsys.readouterr().out.splitlines() == [
         "warning: stepped: run.csv: 20 % of arm_6, arm_7's torque is odd",
         "warning: odd: run.csv: 37 to 68 % of arm_6, arm_7's torque is odd",
         "4 findings, 2 causes; worst: arm_7; 1 note hidden (--verbose)",
     ]
     findings.append(finding("arm_1", "reversed", 1, "error"))  # graver than any two warnings
-    print_content("doctor", content, is_verbose=True)
+    doctor.show(content, is_verbose=True)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "error: reversed: run.csv: 1 % of arm_1's torque is odd"
     assert lines[-2:] == [
         "note: noise: run.csv: 1 % of arm_1's torque is odd",
         "6 findings, 4 causes; worst: arm_1",
     ]
-    print_content("doctor", {"findings": [], "joints": joints})
+    doctor.show({"findings": [], "joints": joints}, is_verbose=False)
     assert capsys.readouterr().out == "nothing was found\n"
 
 

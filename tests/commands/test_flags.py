@@ -4,14 +4,17 @@ import argparse
 
 import pytest
 
-from robotid.commands.flags import add_flags, job_from_flags
+from robotid.cli import doctor, identify, preview, track
+from robotid.cli.flags import job_from_flags
 from robotid.exceptions import SettingsError
+from robotid.fitting.settings import ESTIMATORS
 from robotid.logs.settings import SignalSettings
+from robotid.robot.drives import FAMILIES
 
 
 def job(command, *words):
     parser = argparse.ArgumentParser()
-    add_flags(parser, command)
+    command.add_flags(parser)
     return job_from_flags(parser.parse_args(["robot.urdf", "run.csv", *words]))
 
 
@@ -25,39 +28,62 @@ def test_every_setting_of_the_signals_has_a_flag():
     stated = {name: type(getattr(SignalSettings(), name))(word) for name, word in words.items()
               if name not in ("rate", "max_gap")}  # fmt: skip
     assert set(words) == set(SignalSettings.paths())
-    for command in ("identify", "doctor"):
+    for command in (identify, doctor):
         found = job(command, *flags).signals
         assert found == SignalSettings(rate=200.0, max_gap=0.3, **stated)
 
 
 def test_a_flag_that_a_command_has_no_use_for_is_not_there(capsys):
     with pytest.raises(SystemExit):
-        job("track", "--trim", "0.5")
+        job(track, "--trim", "0.5")
     assert "--trim" in capsys.readouterr().err
-    assert job("track", "--min-velocity", "0.1").signals.min_velocity == 0.1
+    assert job(track, "--min-velocity", "0.1").signals.min_velocity == 0.1
 
 
 def test_gains_are_stated_for_all_joints_or_by_joint():
     fit = ("--estimator", "simulation")
-    found = job("identify", *fit, "--kp", "pan=18", "--kp", "lift=25", "--kd", "0.5").controller
+    found = job(identify, *fit, "--kp", "pan=18", "--kp", "lift=25", "--kd", "0.5").controller
     assert (found.kp, found.kd) == ({"pan": 18.0, "lift": 25.0}, 0.5)
-    assert job("identify", *fit, "--kp", "18").controller.kp == 18.0
+    assert job(identify, *fit, "--kp", "18").controller.kp == 18.0
     for words in (("--kp", "stiff"), ("--kd", "pan=soft"), ("--kp", "18", "--kp", "19")):
         with pytest.raises(SettingsError, match=rf"{words[0]} '.*': wanted (NUMBER or )?JOINT="):
-            job("identify", *fit, *words)
+            job(identify, *fit, *words)
 
 
-@pytest.mark.parametrize(("command", "wanted"), [("identify", "URDF LOG"), ("preview", "URDF MOT")])
+@pytest.mark.parametrize(("command", "wanted"), [(identify, "URDF LOG"), (preview, "URDF MOT")])
 def test_a_command_without_a_log_names_what_it_wants(command, wanted):
     parser = argparse.ArgumentParser()
-    add_flags(parser, command)
+    command.add_flags(parser)
     with pytest.raises(SettingsError, match=f"no .* was given; wanted {wanted}"):
         job_from_flags(parser.parse_args(["robot.urdf"]))
 
 
 def test_a_flag_of_zero_is_a_flag_beside_a_job_file(tmp_path):
     parser = argparse.ArgumentParser()
-    add_flags(parser, "identify")
+    identify.add_flags(parser)
     options = parser.parse_args([str(tmp_path / "job.toml"), "--min-velocity", "0"])
     with pytest.raises(SettingsError, match="leave out"):
         job_from_flags(options)
+
+
+@pytest.mark.parametrize(
+    ("command", "without"),
+    [(track, ("--dynamics", "--no-report", "--ignore")), (doctor, ("--dynamics", "--no-report"))],
+)
+def test_help_shows_the_flags_that_do_something(command, without):
+    parser = argparse.ArgumentParser()
+    command.add_flags(parser)
+    shown = " ".join(parser.format_help().split())
+    assert not [flag for flag in without if flag in shown]
+    assert "auto (default: chosen by the logs), none, viscous, viscous+coulomb" in shown
+    assert all(family in shown for family in FAMILIES)
+
+
+def test_help_names_each_estimator_once():
+    parser = argparse.ArgumentParser()
+    identify.add_flags(parser)
+    words = parser.format_help().replace("\n", " ")
+    names = words.split("which estimator: ")[1].split("--")[0].replace("(default)", "").split(",")
+    names = [name.strip() for name in names]
+    assert sorted(names) == sorted(ESTIMATORS)
+    assert parser.parse_args(["robot.urdf", "--no-report", "--dynamics"]).no_report is False

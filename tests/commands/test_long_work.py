@@ -17,8 +17,8 @@ from helpers.piecework import local_cluster
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
+from robotid.cli.console import terminal_progress
 from robotid.commands import identify as workflow
-from robotid.commands.console import terminal_progress
 from robotid.exceptions import SettingsError
 from robotid.logs.read import write_log
 from robotid.robot.model import RobotModel

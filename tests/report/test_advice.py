@@ -294,7 +294,7 @@ def test_nothing_is_typed_where_nothing_is_known_of_commands(identified):
 
 
 def test_the_source_of_a_command_line_is_what_is_identified():
-    from robotid.commands.flags import source_words
+    from robotid.cli.flags import source_words
 
     line = "identify --verbose arm.urdf a.csv --out here --gain j=2 --json --validate b.csv"
     wanted = ("arm.urdf", "a.csv", "--gain", "j=2", "--validate", "b.csv")

@@ -1,0 +1,92 @@
+"""The command line: flags to arguments, results to text; nothing is computed here."""
+
+import argparse
+import io
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+from robotid.cli.console import (
+    Terminated,
+    open_closed_streams,
+    print_error,
+    shown_log,
+    terminations_raised,
+    unheard_in_silence,
+)
+from robotid.exceptions import RobotIdError, SettingsError
+from robotid.versions import __version__
+
+__all__ = ["COMMANDS", "main"]
+
+#: The commands in the order of the help; each is a module: SUMMARY, add_flags and run.
+COMMANDS = (
+    "demo", "paper", "inspect", "identify", "track", "excite", "preview", "replay", "doctor",
+    "validate", "payload", "report", "compare", "export", "simulate", "convert",
+)  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: The words after ``robotid``; those of the process if None.
+
+    Returns:
+        Exit code: 0 done, 1 the data or the model do not allow it or the doctor found an error
+        that is not ignored, 2 wrong usage, 129 SIGHUP, 130 Ctrl-C, 143 SIGTERM.
+    """
+    code = 0
+    open_closed_streams()
+    if isinstance(sys.stdout, io.TextIOWrapper):  # whose encoding may lack what a name has
+        sys.stdout.reconfigure(errors="backslashreplace")
+    try:
+        with unheard_in_silence():
+            code = _run(sys.argv[1:] if arguments is None else arguments)
+    except OSError as error:  # the standard output cannot be written to
+        print_error(error)
+        return 1
+    return code
+
+
+def _run(words: Sequence[str]) -> int:
+    """Run a command line, tell what stops it, and return its exit code."""
+    options = _parser(words).parse_args(words, argparse.Namespace(words=words))
+    try:
+        with terminations_raised(), shown_log(is_verbose=getattr(options, "verbose", False)):
+            code: int | None = options.run(options)
+    except BrokenPipeError:
+        raise
+    except SettingsError as error:
+        print_error(error)
+        return 2
+    except (RobotIdError, OSError) as error:
+        print_error(error)
+        return 1
+    except MemoryError as error:
+        remedy = "not enough memory; lower rates, shorten logs, or lock joints"
+        print_error(error, f"{remedy} ({error})" if str(error) else remedy)
+        return 1
+    except KeyboardInterrupt as error:
+        print_error(error, "interrupted")
+        return 128 + error.number if isinstance(error, Terminated) else 130
+    return code or 0
+
+
+def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    """Return the parser of a command line, with the flags of its own command alone."""
+    parser = argparse.ArgumentParser(
+        prog="robotid",
+        description="Identify a robot's inertial and drive parameters from its URDF and motion "
+        "logs.",
+    )
+    parser.add_argument("--version", action="version", version=f"robotid {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    chosen = next((word for word in words if not word.startswith("-")), None)
+    for name in COMMANDS:
+        module = import_module(f"robotid.cli.{name}")
+        command = commands.add_parser(name, help=module.SUMMARY)
+        command.set_defaults(run=module.run)
+        if name == chosen:
+            module.add_flags(command)
+    return parser

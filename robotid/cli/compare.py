@@ -1,0 +1,94 @@
+"""robotid compare: several results side by side."""
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from robotid._text import columns, in_digits_of, tinted
+from robotid.cli.flags import add_json
+from robotid.cli.printing import say, window_name
+from robotid.cli.running import show_found
+from robotid.findings import listed
+
+__all__ = ["SUMMARY", "add_flags", "run"]
+
+SUMMARY = "several results side by side"
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command.
+
+    Args:
+        parser: Its parser.
+    """
+    add = parser.add_argument
+    add("results", nargs="+", metavar="RESULT.json")
+    add("--out", metavar="FILE.html", help="page to write")
+    add_json(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the command.
+
+    Args:
+        options: Its flags.
+    """
+    from robotid.report.comparison import compare_results, write_comparison
+
+    if options.out:
+        content = write_comparison(options.results, options.out)
+    else:
+        content = compare_results(options.results)
+    show_found(content, options, _show)
+    if options.out and not options.json:
+        print(f"\nwritten to {options.out}")
+
+
+def _show(content: dict[str, Any]) -> None:
+    from robotid.identification.summary import cell
+
+    results = content["results"]
+    labels = [result["label"] for result in results]
+    for result in results:
+        verdict = result["verdict"]["status"]
+        said = f"{result['label']}  {verdict:7} {result['estimator']:10} "
+        print(tinted(f"{said}{result['path']}", verdict, verdict, sys.stdout))
+    for remark in content["remarks"]:
+        say(f"- {remark}", "  ")
+    alike = "" if content["fitted_alike"] else "; other recordings, not comparable"
+    tables = [
+        (f"not fitted: {window_name(entry['name'], entry)}, error %", entry["per_joint"])
+        for entry in content["validation"]
+    ]
+    tables.append((f"fitted recordings of each, error %{alike}", content["fitted"]))
+    for title, per_joint in tables:
+        rows = [[e["joint"], *map(cell, e["relative_error_pct"])] for e in per_joint]
+        say(f"\n{title}", "  ")
+        print("\n".join(columns(["joint", *labels], rows)))
+    _print_base_parameters(content, labels)
+    for key in ("settings", "versions"):
+        for row in content[key]:
+            say(f"{key}: {row['name']}: {' | '.join(v or '-' for v in row['values'])}", "  ")
+    for row in content["inputs"]:
+        if not all(row["in"]):
+            read = listed(label for label, has in zip(labels, row["in"], strict=True) if has)
+            name = row["path"] if row["start"] is None else window_name(row["path"], row)
+            say(f"only {read} read {name} ({row['role']})", "  ")
+
+
+def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) -> None:
+    say(
+        "\nbase parameters to the second digit of their standard errors; last columns: difference "
+        f"to {labels[0]} over the combined standard error, the largest first"
+    )
+    rows = []
+    for entry in content["base_parameters"]:
+        pairs = zip(entry["values"], entry["std_errors"], strict=True)
+        values = ["-" if x is None else in_digits_of(x, error)[0] for x, error in pairs]
+        differences = [
+            "-" if x is None else f"{round(x, 1) + 0.0:.1f}" for x in entry["differences"]
+        ]
+        rows.append([entry["name"], *values, entry["unit"], *differences])
+    heads = ["", *labels, "", *[f"{label}-{labels[0]}" for label in labels[1:]]]
+    print("\n".join(columns(heads, rows, left=(0, len(labels) + 1))))

@@ -1,0 +1,59 @@
+"""robotid convert: write a log as CSV, Parquet, NPZ, HDF5 or MAT, with standard column names."""
+
+import argparse
+from typing import Any
+
+from robotid.cli.flags import SOURCE, add_json, add_settings, stated_by
+from robotid.cli.printing import say
+from robotid.cli.running import show_found
+
+__all__ = ["SUMMARY", "add_flags", "run"]
+
+SUMMARY = "write a log as CSV, Parquet, NPZ, HDF5 or MAT, with standard column names"
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command.
+
+    Args:
+        parser: Its parser.
+    """
+    add = parser.add_argument
+    add("log", metavar="IN", help="a log of any format, or a bag's folder")
+    add("out", metavar="OUT", help="file to write; its suffix says the format")
+    add("--joints", metavar="A,B,...", help="joints to write; default: all")
+    add_settings(parser, SOURCE)
+    add_json(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the command.
+
+    Args:
+        options: Its flags.
+    """
+    from dataclasses import asdict
+
+    from robotid.commands.convert import convert
+    from robotid.logs.settings import LogSource
+
+    joints = options.joints.split(",") if options.joints else None
+    source = LogSource(**source_settings(options))
+    done = convert(options.log, options.out, joints=joints, source=source)
+    show_found(asdict(done), options, _show)
+
+
+def source_settings(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the settings of a ``LogSource`` that were given, by name.
+
+    Args:
+        options: The flags of the command "convert".
+    """
+    return dict(stated_by(options, SOURCE).get("log", {}))
+
+
+def _show(done: dict[str, Any]) -> None:
+    print(f"{done['path']}: {done['samples']} samples of {len(done['joints'])} joints")
+    say(f"  columns {', '.join(done['columns'])}", "  ")
+    if done["ignored"]:
+        say(f"  not of a joint, left out: {', '.join(done['ignored'])}", "  ")

@@ -1,0 +1,70 @@
+"""robotid doctor: what is wrong with logs: JOB.toml, or URDF LOG ...."""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from robotid.cli.flags import add_job, job_from_flags
+from robotid.cli.printing import as_finding, print_causes
+from robotid.cli.running import progress_of, show_found
+from robotid.findings import Finding, grouped
+
+__all__ = ["SUMMARY", "add_flags", "run", "show"]
+
+SUMMARY = "what is wrong with logs: JOB.toml, or URDF LOG ..."
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command.
+
+    Args:
+        parser: Its parser.
+    """
+    add_job(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command.
+
+    Args:
+        options: Its flags.
+    """
+    from robotid.commands.logs import examine
+    from robotid.doctor.diagnosis import findings_to_dict
+    from robotid.judgement.verdict import alarming
+
+    with progress_of(options) as progress:
+        job = job_from_flags(options)
+        model = job.model()
+        findings = examine(job, model, progress=progress)
+    content = findings_to_dict(findings) | {"joints": list(model.joints)}
+    show_found(content, options, partial(show, is_verbose=options.verbose))
+    return 1 if alarming(findings, job.ignore) else 0
+
+
+def show(content: dict[str, Any], *, is_verbose: bool) -> None:
+    """Print what the doctor found.
+
+    Args:
+        content: Findings and joints, as ``--json`` prints them.
+        is_verbose: Whether to print notes, too.
+    """
+    findings, joints = content["findings"], content["joints"]
+    print_causes(findings, joints, is_verbose=is_verbose, worst=_worst_of(findings, joints))
+
+
+def _worst_of(findings: Sequence[Mapping[str, Any]], joints: Sequence[str]) -> str:
+    """Return the joint that most errors are about, then warnings, then the gravest by figure."""
+    ranks = dict.fromkeys(joints, (0, 0, 0.0))
+    for finding in findings:
+        (cause,) = grouped([Finding(**as_finding(finding))], joints)
+        for joint in cause.joints:
+            errors, warnings, share = ranks[joint]
+            ranks[joint] = (
+                errors + (cause.severity == "error"),
+                warnings + (cause.severity == "warning"),
+                max(share, finding["evidence"].get("share", 0.0)),
+            )
+    worst = max(ranks, key=lambda joint: ranks[joint], default="")
+    return worst if any(ranks.get(worst, ())[:2]) else ""

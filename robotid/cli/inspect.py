@@ -1,0 +1,68 @@
+"""robotid inspect: joints, parameters and faults of a URDF."""
+
+import argparse
+from functools import partial
+from typing import Any
+
+from robotid.cli.flags import add_json, add_verbose
+from robotid.cli.printing import print_causes, say
+from robotid.cli.running import show_found
+from robotid.findings import listed
+
+__all__ = ["SUMMARY", "add_flags", "run"]
+
+SUMMARY = "joints, parameters and faults of a URDF"
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command.
+
+    Args:
+        parser: Its parser.
+    """
+    add = parser.add_argument
+    add("urdf", metavar="URDF")
+    add("--free-flyer", action="store_true", help="the base floats")
+    add("--base", action="store_true", help="print the base parameters, too")
+    add_json(parser)
+    add_verbose(parser, "print notes, too")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the command.
+
+    Args:
+        options: Its flags.
+    """
+    from robotid.doctor.urdf import inspect_urdf
+    from robotid.exceptions import ModelError
+
+    content = inspect_urdf(options.urdf, free_flyer=options.free_flyer).to_dict()
+    if not (content["robot"] or options.json):
+        raise ModelError(content["findings"][0]["message"])
+    show_found(content, options, partial(_show, is_verbose=options.verbose, with_base=options.base))
+    if content["structure"] is None:
+        raise ModelError(f"no model can be built from {options.urdf}; see the findings")
+
+
+def _show(content: dict[str, Any], *, is_verbose: bool, with_base: bool) -> None:
+    structure, joints = content["structure"], content["joints"]
+    findings = [
+        {**finding, "where": finding.get("link") or finding.get("joint") or ""}
+        for finding in content["findings"]
+    ]
+    if content["robot"]:
+        say(f"{content['robot']}: {len(joints)} joints: {listed(joints)}", "  ")
+    if structure:
+        say(
+            f"{structure['standard']} standard inertial parameters, {structure['base_inertial']} "
+            f"base; with drives {structure['base']}"
+        )
+    names = list(dict.fromkeys([*joints, *(finding["where"] for finding in findings)]))
+    print_causes(findings, [name for name in names if name], is_verbose=is_verbose)
+    if with_base:
+        print("\nbase parameters, inertial")
+        for group in content["base_groups"]:
+            say(f"  {group}", "    ")
+    elif structure:
+        say("the base parameters: --base")

@@ -1,0 +1,56 @@
+"""robotid paper: the paper's simulation: figures, tables, numbers."""
+
+import argparse
+from typing import Any
+
+from robotid.cli.flags import add_json, add_out, add_progress
+from robotid.cli.running import progress_of, show_found
+
+__all__ = ["SUMMARY", "add_flags", "run"]
+
+SUMMARY = "the paper's simulation: figures, tables, numbers"
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command.
+
+    Args:
+        parser: Its parser.
+    """
+    add = parser.add_argument
+    add_out(parser, "robotid-paper")
+    add_json(parser, "paper.json")
+    add("--quick", action="store_true", help="few iterations and motions: a try-out")
+    add_progress(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the command.
+
+    Args:
+        options: Its flags.
+    """
+    from robotid.paper.run import run_paper
+    from robotid.paper.study import PaperSettings
+
+    few = PaperSettings(iterations=5, longest=5, runs=5, patience=5)
+    with progress_of(options) as progress:
+        result = run_paper(options.out, settings=few if options.quick else None, progress=progress)
+    show_found(result, options, _show)
+    if not options.json:
+        files = "paper.html, paper.json, replay.html, figures as PNG and SVG"
+        print(f"\nwritten to {options.out}: {files}")
+
+
+def _show(result: dict[str, Any]) -> None:
+    cases = {"disturbed": "disturbed", "noisy": "noisy", "on_program": "on program"}
+    print("relative error of the parameters; the last three cases at the end")
+    print("  model       start   after 1   at end   " + "  ".join(cases.values()) + "   NA")
+    for name, model in result["models"].items():
+        errors = model["relative_error"]
+        ends = [result[case][name]["relative_error"][-1] for case in cases]
+        cells = [errors[0], errors[1], errors[-1], *ends]
+        print(f"  {name:10}" + "".join(f"{cell:9.2g}" for cell in cells) + f"   {model['NA']}")
+    print("\nrandom motions that converged to 1e-3")
+    for name, found in result["trajectories"].items():
+        print(f"  {name:10} {found['converged']} of {found['runs']}")

@@ -1,0 +1,123 @@
+"""robotid payload: what hangs on a link: a log with it against one without."""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from robotid._text import columns, in_digits_of
+from robotid.cli.flags import LOG, add_json, add_settings, job_from_flags, refuse_log_flags
+from robotid.cli.printing import say
+from robotid.cli.running import progress_of, show_found
+from robotid.findings import listed
+
+__all__ = ["SUMMARY", "add_flags", "run"]
+
+SUMMARY = "what hangs on a link: a log with it against one without"
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command.
+
+    Args:
+        parser: Its parser.
+    """
+    add = parser.add_argument
+    add("source", metavar="URDF")
+    add("logs", nargs="+", metavar="LOG", help="logs with the payload")
+    words = "log without the payload, or a result.json or its folder; may be given again"
+    again: dict[str, Any] = {"action": "append", "default": []}
+    add("--reference", required=True, metavar="LOG | RESULT", help=words, action="append")
+    words = "link that it hangs on; default: the last moving one; may be given again"
+    add("--link", metavar="NAME", help=words, **again)
+    words = "its mass, if it is known; of several: LINK=KG"
+    add("--mass", metavar="KG", help=words, **again)
+    words = "find the gains of logged currents that no --gain states, from a known mass"
+    add("--gains", action="store_true", help=words)
+    add_json(parser)
+    add_settings(parser.add_argument_group("the logs, unless a RESULT says it"), LOG)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the command.
+
+    Args:
+        options: Its flags.
+    """
+    from robotid.commands.payload import is_result, measure_payload
+
+    if any(map(is_result, options.reference)):
+        refuse_log_flags(options, "a RESULT says how its logs are read")
+    with progress_of(options) as progress:
+        found = measure_payload(
+            job_from_flags(options),
+            options.reference,
+            links=options.link,
+            masses=options.mass,
+            find_gains=options.gains,
+            progress=progress,
+        )
+    show_found(found, options, _show)
+
+
+def _show(content: dict[str, Any]) -> None:
+    from robotid.identification.summary import cell
+
+    for found in content["payloads"]:
+        _print_one_payload(found)
+    errors = [f"{joint} {cell(x)} %" for joint, x in content["relative_error_pct"].items()]
+    say(f"torque left unexplained: {listed(errors)}", "  ")
+    if "gains" in content:
+        print("\n[torque.gains]")
+        for joint, gain in content["gains"].items():
+            low, high = gain["interval"]
+            value, _ = in_digits_of(gain["gain"], gain["std_error"])
+            print(f"{joint} = {value}  # 95 % interval {low:.4g} to {high:.4g}")
+
+
+def _print_one_payload(found: Mapping[str, Any]) -> None:
+    link, (low, high) = found["link"], found["mass_interval"]
+    mass, error = in_digits_of(found["mass"], found["mass_std_error"])
+    print(f"payload on {link}")
+    if error == "-":
+        print(f"  mass {found['mass']:g} kg, stated")
+    else:
+        low, high = (in_digits_of(end, found["mass_std_error"])[0] for end in (low, high))
+        say(
+            f"  mass {mass} kg (95 % interval {low} to {high}, in the scale of the torques: gains "
+            "that are too large make it too large)",
+            "  ",
+        )
+    if found["com"] is not None:
+        print(f"  centre of mass in the frame of {link} [m]")
+        rows = [
+            [axis, *_with_error(x, error)]
+            for axis, x, error in zip("xyz", found["com"], found["com_std_error"], strict=True)
+        ]
+        _print_values(rows)
+    if found["inertia"] is not None:
+        for where, key in (
+            ("its centre of mass", "inertia"),
+            (f"the origin of {link}", "inertia_at_link"),
+        ):
+            say(f"  inertia about {where}, axes of {link} [kg m^2]", "  ")
+            errors = found["inertia_std_error"] if key == "inertia" else None
+            rows = [
+                [f"I{'xyz'[i]}{'xyz'[j]}", *_with_error(found[key][i][j], errors and errors[i][j])]
+                for i in range(3)
+                for j in range(i, 3)
+            ]
+            _print_values(rows)
+    for name, reason in found["reasons"].items():
+        what = "centre of mass" if name == "com" else name
+        say(f"  {what}: not determined; {reason}", "  ")
+
+
+def _with_error(value: float, error: float | None) -> list[str]:
+    """Return a value in the digits of its error, and that error, as cells."""
+    shown, half = in_digits_of(value, error)
+    return [shown, "" if half == "-" else f"+- {half}"]
+
+
+def _print_values(rows: Sequence[Sequence[str]]) -> None:
+    for line in columns([""] * len(rows[0]), rows, left=(0, 2))[1:]:
+        print(f"  {line}")

@@ -1,0 +1,149 @@
+"""robotid preview: what a motion will tell, before it is recorded."""
+
+import argparse
+import re
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+from robotid._text import columns
+from robotid.cli.flags import (
+    FLAGS,
+    MOTION,
+    add_json,
+    add_settings,
+    job_from_flags,
+    pairs,
+    refuse_log_flags,
+)
+from robotid.cli.printing import recordings_of, say
+from robotid.cli.running import show_found
+from robotid.findings import listed
+
+__all__ = ["SUMMARY", "add_flags", "run"]
+
+SUMMARY = "what a motion will tell, before it is recorded"
+_TERM = re.compile(r" [+-] ")  # what stands before each further term of an expression
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command.
+
+    Args:
+        parser: Its parser.
+    """
+    add = parser.add_argument
+    add("source", metavar="JOB.toml | URDF")
+    add("logs", nargs="*", metavar="MOTION", help="motions or logs; only positions are read")
+    words = "a result.json or its folder: what its logs have said, and their noise"
+    add("--given", metavar="RESULT", help=words)
+    words = "standard deviation of a joint's torque [N m or N]; may be given again; default: that "
+    words += "of RESULT, or 1 %% of the joint's largest torque"
+    add("--noise", metavar="JOINT=N_M", action="append", default=[], help=words)
+    words = "time over which that is correlated [s]; 0: from sample to sample; default: 0.1"
+    add("--correlation", metavar="S", type=float, help=words)
+    add_json(parser)
+    words = "print standard parameters and whole expressions, too; say on stderr what is chosen"
+    parser.add_argument("--verbose", action="store_true", help=words)
+    flags = parser.add_argument_group("instead of a job file or a RESULT, with URDF MOTION")
+    flags.add_argument("--estimator", **FLAGS["--estimator"][1], help="as of identify")
+    add_settings(flags, MOTION)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the command.
+
+    Args:
+        options: Its flags.
+    """
+    from robotid.commands.preview import preview_job
+
+    if options.given:
+        refuse_log_flags(options, "a RESULT says how its logs are read")
+    stated = {"noise": stated_noise(options), "correlation": options.correlation}
+    show_found(
+        preview_job(job_from_flags(options), options.given, **stated),
+        options,
+        partial(_show, is_verbose=options.verbose),
+    )
+
+
+def stated_noise(options: argparse.Namespace) -> dict[str, float]:
+    """Return the noise that was stated, by joint [N m or N].
+
+    Args:
+        options: The flags of the command "preview".
+
+    Raises:
+        SettingsError: If a word is not JOINT=NUMBER.
+    """
+    return pairs(options.noise, "--noise")
+
+
+def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
+    motions = recordings_of(content["motions"], "motion")
+    count = f"{content['structure']['base']} base parameters, by {content['estimator']}"
+    say(f"{content['robot']}: {', '.join(motions)}; {count}", "  ")
+    say("\nbase parameters: standard errors to be expected, and the share of the plausible spread")
+    keys = {"std_error_before": "before", "gain": "gain", "achieved_std_error": "achieved",
+            "ratio": "ratio"}  # fmt: skip
+    keys = {key: head for key, head in keys.items() if key in content["base_parameters"][0]}
+    rows = []
+    for entry in content["base_parameters"]:
+        error, more = entry["std_error"], len(_TERM.findall(entry["expression"]))
+        short = f"{entry['name']} + {more} more" if more else entry["name"]
+        left = "open" if error is None else f"{100 * min(error / entry['plausible'], 1):.0f} %"
+        name = entry["expression"] if is_verbose else short
+        rows.append([name, _two_digits(error), entry["unit"], left,
+                     *(_two_digits(entry[key]) for key in keys)])  # fmt: skip
+    print("\n".join(columns(["", "+-", "", "left", *keys.values()], rows, left=(0, 2))))
+    parameters = [*content["standard_parameters"], *content["drive_parameters"]]
+    sources = [entry["source"] for entry in parameters]
+    counts = [f"{sources.count(source)} {source}" for source in dict.fromkeys(sources)]
+    say(f"\nstandard parameters, given the URDF: by {listed(counts)}", "  ")
+    if is_verbose:
+        rows = [
+            [e["name"], f"{e['prior']:.4g}", _two_digits(e["std_error"]), e["unit"], e["source"]]
+            for e in parameters
+        ]
+        print("\n".join(columns(["", "prior", "+-", "", "by"], rows, left=(0, 3, 4))))
+    else:
+        say("each of them, and what is in each base parameter: --verbose")
+    _print_expected_torque(content)
+    say(f"\n{content['words']}", "  ")
+    if "achieved" in content:
+        achieved = content["achieved"]
+        say(
+            f"\nthese logs were identified: {achieved['count']} standard errors became "
+            "{:.2f} to {:.2f} times what was expected, eight of ten; median {:.2f}".format(
+                *achieved["range_80"], achieved["median"]
+            )
+        )
+
+
+def _print_expected_torque(content: Mapping[str, Any]) -> None:
+    """Print each joint's torque with its band, and the noise that all rests on."""
+    say(
+        "\ntorque of the motion, 95 % band of a measurement about its prediction, and the part of "
+        "that which is due to the parameters"
+    )
+    rows, noises = [], content["noise"].values()
+    found = ["achieved"] if all("achieved" in noise for noise in noises) else []
+    for (joint, torque), noise in zip(content["torque"].items(), noises, strict=True):
+        cells = [f"{torque[key]:.3g}" for key in ("rms", "half_width", "of_parameters")]
+        achieved = [_two_digits(noise[key]) for key in found]
+        rows.append([joint, *cells, _two_digits(noise["std"]), *achieved, torque["unit"],
+                     f"{noise['correlation']:.2g} s", noise["is"]])  # fmt: skip
+    heads = ["joint", "torque", "band", "part", "noise", *found, "", "over", ""]
+    print("\n".join(columns(heads, rows, left=(0, len(heads) - 3, len(heads) - 1))))
+    if any(noise["is"] == "assumed" for noise in noises):
+        say(
+            "assumed noise is 1 % of the URDF's effort limit, or of the bodies' largest torque "
+            "where there is none. Standard errors are in proportion to it: state it with --noise "
+            "JOINT=N_M, or take it from a run before with --given RESULT",
+            "  ",
+        )
+
+
+def _two_digits(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2g}"

@@ -1,0 +1,60 @@
+"""robotid replay: play a log in the browser: robot, torques, what was identified."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from robotid._files import check_file
+from robotid.cli.flags import (
+    ONLINE,
+    add_robot_and_log,
+    add_serve,
+    add_settings,
+    job_from_flags,
+    refuse_log_flags,
+)
+from robotid.cli.running import serve
+
+__all__ = ["SUMMARY", "add_flags", "run"]
+
+SUMMARY = "play a log in the browser: robot, torques, what was identified"
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command.
+
+    Args:
+        parser: Its parser.
+    """
+    add = parser.add_argument
+    add_robot_and_log(parser)
+    results = "result.json, track.json or their folder"
+    add("results", nargs="*", metavar="RESULT", help=results)
+    add("--html", metavar="FILE", help="page to write; default: replay.html")
+    add("--ghost", metavar="LOG", help="second motion, shown as a ghost")
+    add_serve(parser, "track the log again, in true time, and show it as it goes")
+    group = parser.add_argument_group("the log, unless a RESULT says it")
+    add_settings(group, ONLINE)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the command.
+
+    Args:
+        options: Its flags.
+    """
+    from robotid.commands.replay import read_findings, replay_files, stated_job
+
+    findings = read_findings(options.results)
+    if findings.settings is None:
+        job = job_from_flags(options)
+    else:
+        refuse_log_flags(options, "a RESULT says how its logs are read")
+        job = stated_job(findings, options.source, options.logs[0])
+    if options.html or options.serve is None:
+        check_file(Path(options.html or "replay.html"))
+        page = replay_files(job, findings, ghost=options.ghost)
+        target = page.write(options.html or "replay.html")
+        print(f"written: {target}, {target.stat().st_size / 1e6:.1f} MB", file=sys.stderr)
+    if options.serve is not None:
+        serve(job, None, options, lambda found: None)

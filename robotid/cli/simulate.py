@@ -1,0 +1,132 @@
+"""robotid simulate: a log of a motion by a robot whose truth is known."""
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from robotid._settings import table_in
+from robotid.cli.console import terminal_progress
+from robotid.cli.flags import ROBOT, add_json, add_settings, stated_by
+from robotid.cli.printing import print_files, say
+from robotid.cli.running import show_found
+from robotid.exceptions import SettingsError
+
+if TYPE_CHECKING:
+    from robotid.commands.job import Job
+    from robotid.simulation.settings import Simulation
+
+
+__all__ = ["SUMMARY", "add_flags", "run"]
+
+SUMMARY = "a log of a motion by a robot whose truth is known"
+#: Key of the file of a plant that each flag of "simulate" states.
+_SIMULATION: Mapping[str, tuple[str, dict[str, Any]]] = {
+    "--seed": ("seed", {"metavar": "N", "type": int}),
+    "--rate": ("rate", {"metavar": "HZ", "type": float}),
+    "--duration": ("duration", {"metavar": "S", "type": float}),
+    "--perturb": ("truth.inertials", {"metavar": "SIZE", "type": float}),
+    "--controller": ("controller.kind", {"metavar": "KIND"}),
+    "--torque-noise": ("sensors.noise.tau", {"metavar": "SHARE", "type": float}),
+    "--limits": ("actuator.effort", {"metavar": "TIMES", "type": float}),
+    "--payload": ("payload.mass", {"metavar": "KG", "type": float}),
+}
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command.
+
+    Args:
+        parser: Its parser.
+    """
+    add = parser.add_argument
+    add("source", metavar="URDF")
+    add("motion", metavar="MOTION", help="table of time and q_<joint>, as a log or a design")
+    add("--out", required=True, metavar="LOG", help="log to write; its truth goes beside it")
+    add("--urdf", metavar="FILE", help="URDF of the true robot to write, too")
+    words = "TOML file of the true robot, its controller, actuators, sensors and payload"
+    add("--plant", metavar="FILE", help=words)
+    add("--cutoff", type=float, metavar="HZ", help="smooth MOTION, a recorded one, to this")
+    add_json(parser)
+    group = parser.add_argument_group("instead of, or over, the same in --plant")
+    for flag, (key, about) in _SIMULATION.items():
+        group.add_argument(flag, **about, help=_simulation_words(key))
+    add_settings(parser.add_argument_group("the robot"), ROBOT)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the command.
+
+    Args:
+        options: Its flags.
+    """
+    from robotid.commands.simulate import SimulatedFiles, simulate_log
+
+    job, settings = simulation_from_flags(options)
+    urdf = Path(options.urdf) if options.urdf else None
+    files = SimulatedFiles(Path(options.motion), Path(options.out), urdf, options.cutoff)
+    with terminal_progress(quiet=options.json) as progress:
+        content = simulate_log(job, files, settings, progress=progress)
+    show_found(content, options, _show)
+    if not options.json:
+        print_files("", content["outputs"])
+
+
+def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation]":
+    """Return the robot and the settings of a simulation.
+
+    Args:
+        options: The flags of the command "simulate".
+
+    Raises:
+        SettingsError: If the file of the plant cannot be used, or a flag is not usable.
+    """
+    from robotid.commands.job import job_from_settings
+    from robotid.simulation.settings import read_simulation
+
+    given: dict[str, Any] = {}
+    for flag, (path, _) in _SIMULATION.items():
+        value = getattr(options, flag[2:].replace("-", "_"))
+        if value is not None:
+            *tables, key = path.split(".")
+            table_in(given, tables)[key] = value
+    settings, drives = read_simulation(options.plant, given)
+    for joint, entries in drives.items():
+        if named := [entry for entry in entries if isinstance(entry, str)]:
+            raise SettingsError(
+                f"{options.plant}: drives.{joint} has {named[0]!r}; a plant states its terms with "
+                "their shapes, as { term = 'Stribeck', speed = 0.1 }"
+            )
+    if options.plant:  # so that what is wrong with its drives is told of it
+        job_from_settings({"urdf": options.source, "drives": drives}, options.plant, Path())
+    table = {"urdf": options.source, "drives": drives, **stated_by(options, ROBOT)}
+    return job_from_settings(table, "command line", Path()), settings
+
+
+def _simulation_words(key: str) -> str:
+    from robotid.simulation.settings import Simulation
+
+    return Simulation.paths()[key].words.replace("%", "%%")
+
+
+def _show(content: dict[str, Any]) -> None:
+    print(
+        f"{content['robot']}: {content['samples']} samples over {content['duration']:g} s, seed "
+        f"{content['settings']['seed']}"
+    )
+    noise = content["settings"].get("sensors", {}).get("noise", {})
+    if not any(noise.get(kind) for kind in ("tau", "torque")):
+        say(
+            "no noise was added to the torques: errors of parameters from this log are smaller "
+            "than those of a recorded one, and than those of a preview, which takes noise into "
+            "account; state it with --torque-noise 0.02, a share of the torque"
+        )
+    head = "error of the position"
+    width = max(len(head), *(len(joint) for joint in content["joints"]))
+    print(f"\n{head:{width}}  rms, largest")
+    for joint in content["following"]:
+        line = f"{joint['joint']:{width}}  {joint['rms']:.2g}, {joint['largest']:.2g}"
+        line += f" {joint['unit']}"
+        if joint["at_limit"] > 0:
+            line += f"; at its effort limit for {100 * joint['at_limit']:.2g} % of the time"
+        print(line)

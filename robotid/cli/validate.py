@@ -1,0 +1,49 @@
+"""robotid validate: measure a result's prediction on other logs."""
+
+import argparse
+from typing import Any
+
+from robotid._text import terminal_width
+from robotid.cli.flags import add_json
+from robotid.cli.printing import print_open_loop, print_verdict, say
+from robotid.cli.running import show_found
+
+__all__ = ["SUMMARY", "add_flags", "run"]
+
+SUMMARY = "measure a result's prediction on other logs"
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command.
+
+    Args:
+        parser: Its parser.
+    """
+    add = parser.add_argument
+    add("result", metavar="RESULT.json")
+    add("logs", nargs="+", metavar="LOG")
+    add_json(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the command.
+
+    Args:
+        options: Its flags.
+    """
+    from robotid.commands.validate import validate_result
+
+    show_found(validate_result(options.result, options.logs), options, _show)
+
+
+def _show(found: dict[str, Any]) -> None:
+    from robotid.identification.summary import error_lines
+
+    say(f"predicted with {found['predicted_with']}")
+    for recording in found["validation"]:
+        if "horizons" in recording:
+            print_open_loop(recording)
+            continue
+        say(f"\n{recording['name']}", "  ")
+        print("\n".join(error_lines(recording, width=terminal_width())))
+    print_verdict(found["verdict"])
