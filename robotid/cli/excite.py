@@ -1,7 +1,7 @@
 """robotid excite: design the motion to record, within the robot's limits."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from robotid.cli.console import terminal_progress
@@ -12,7 +12,8 @@ from robotid.exceptions import SettingsError
 from robotid.findings import listed
 
 if TYPE_CHECKING:
-    from robotid.commands.excite import MotionSettings
+    from robotid.excitation.clearance import Box
+    from robotid.excitation.settings import MotionSettings
     from robotid.simulation.settings import Payload
 
 
@@ -34,40 +35,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("--given", metavar="RESULT", help="a result.json or its folder: what its logs have told")
     words = "page to write about the motion: its limits over time, what it will tell"
     add("--report", metavar="PAGE.html", help=words)
-    words = "sweeps show friction, stands gravity, payload what hangs on a link; default: fourier"
-    add("--kind", choices=("fourier", "bspline", "sweeps", "stands", "payload"), help=words)
-    words = "of the kind payload: link that it hangs on; default: the last moving one"
-    add("--link", metavar="NAME", help=words)
-    add("--mass", metavar="KG", type=float, help="its mass: limits are kept with it, too")
-    words = "its centre of mass in the frame of the link [m]; default: 0,0,0"
-    add("--com", metavar="X,Y,Z", help=words)
-    words = "joints that move for it, by comma; default: the fewest before the link that suffice"
-    add("--moving", metavar="JOINTS", help=words)
-    add("--duration", metavar="S", type=float, help="default: 10")
-    add("--harmonics", metavar="N", type=int, help="of the series; default: 5")
-    words = (
-        "of the information: D (volume), A (mean), E (weakest), condition, or widest (the quarter "
-        "that RESULT knows the least); default: widest with --given, else D"
-    )
-    add("--criterion", choices=("D", "A", "E", "condition", "widest"), help=words)
-    add("--share", metavar="X", type=float, help="of the URDF's limits; default: 0.9")
-    for name, unit in (
-        ("acceleration", "rad/s^2 or m/s^2"), ("jerk", "rad/s^3 or m/s^3"), ("power", "W"),
-    ):  # fmt: skip
-        words = f"largest {name} of a joint [{unit}]; may be given again"
-        add(f"--max-{name}", metavar="JOINT=X", action="append", default=[], help=words)
-    words = "distance kept from collisions [m], or none to leave them unlooked at; default: 0.02"
-    add("--clearance", metavar="M", help=words)
-    add("--floor", metavar="M", type=float, help="height of the floor in the root link's frame [m]")
-    words = "a box beside the robot, NAME=x0,y0,z0,x1,y1,z1 [m]; may be given again"
-    add("--box", metavar="BOX", action="append", default=[], help=words)
-    words = "standard deviation of a joint's torque [N m or N]; may be given again"
-    add("--noise", metavar="JOINT=N_M", action="append", default=[], help=words)
-    add("--seed", metavar="N", type=int, help="of the random starts; default: 0")
-    add("--starts", metavar="N", type=int, help="that are followed to the end; default: 3")
-    add("--seconds", metavar="S", type=float, help="after which the best so far is taken")
-    words = "rows per second that are written; default: 100"
-    add("--points", metavar="HZ", type=float, help=words)
+    for flag, (at, about) in _FLAGS.items():
+        add(flag, **about, help=_words(at, is_again=about.get("action") == "append"))
     add_json(parser)
     add_progress(parser)
     flags = parser.add_argument_group("the robot, instead of a job file")
@@ -104,20 +73,52 @@ def motion_settings(options: argparse.Namespace) -> "MotionSettings":
     Raises:
         SettingsError: If a flag is not usable.
     """
-    from robotid.commands.excite import MotionSettings, stated_boxes
+    from robotid.excitation.settings import MotionSettings
 
-    plain = ("kind", "duration", "harmonics", "criterion", "share", "floor", "seed", "starts",
-             "seconds", "points")  # fmt: skip
-    stated = {name: getattr(options, name) for name in plain}
-    stated = {name: value for name, value in stated.items() if value is not None}
-    stated["noise"] = pairs(options.noise, "--noise")
-    for name in ("acceleration", "jerk", "power"):
-        stated[name] = pairs(getattr(options, f"max_{name}"), f"--max-{name}")
-    if options.clearance is not None:
-        stated["clearance"] = _clearance(options.clearance)
-    if options.moving is not None:
-        stated["moving"] = options.moving.split(",")
-    return MotionSettings(**stated, boxes=stated_boxes(options.box), payload=_load(options))
+    stated: dict[str, Any] = {}
+    for flag, (at, _) in _FLAGS.items():
+        value = getattr(options, flag[2:].replace("-", "_"))
+        if value not in (None, []) and at not in _OF_PAYLOAD:
+            stated[at] = _READ[at](value, flag) if at in _READ else value
+    return MotionSettings(**stated, payload=_load(options))
+
+
+def _words(at: str, *, is_again: bool) -> str:
+    """Return the help of a flag, by the setting that it states."""
+    from robotid.excitation.settings import MotionSettings
+    from robotid.simulation.settings import Payload
+
+    settings = Payload if at in _OF_PAYLOAD else MotionSettings
+    (found, key) = next((f, key) for f, key, path in settings.entries() if path == [at])
+    words, default = key.text, found.default
+    if isinstance(default, int | float) and default not in (0.0, float("inf")):
+        words += f"; default: {default:g}"
+    return (words + ("; may be given again" if is_again else "")).replace("%", "%%")
+
+
+def _boxes(words: Sequence[str], flag: str) -> tuple["Box", ...]:
+    """Return boxes that are stated as NAME=x0,y0,z0,x1,y1,z1, two corners [m].
+
+    Raises:
+        SettingsError: If a word is another one.
+    """
+    from robotid.excitation.clearance import Box
+    from robotid.excitation.settings import FARTHEST
+
+    boxes = []
+    for word in words:
+        name, _, numbers = word.partition("=")
+        try:
+            x = [float(number) for number in numbers.split(",")]
+        except ValueError:
+            x = []
+        if len(x) != 6 or not all(abs(number) <= FARTHEST for number in x):
+            raise SettingsError(
+                f"{flag} {word!r}: wanted NAME=x0,y0,z0,x1,y1,z1, the lower and the upper corner "
+                f"[m], within {FARTHEST:g} m"
+            )
+        boxes.append(Box(name, (x[0], x[1], x[2]), (x[3], x[4], x[5])))
+    return tuple(boxes)
 
 
 def _load(options: argparse.Namespace) -> "Payload":
@@ -141,13 +142,47 @@ def _load(options: argparse.Namespace) -> "Payload":
     return Payload(**{key: value for key, value in load.items() if value is not None})
 
 
-def _clearance(word: str) -> float | None:
+def _clearance(word: str, flag: str) -> float | None:
     if word == "none":
         return None
     try:
         return float(word)
     except ValueError as error:
-        raise SettingsError(f"--clearance {word!r}: wanted metres, or none") from error
+        raise SettingsError(f"{flag} {word!r}: wanted metres, or none") from error
+
+
+_OF_PAYLOAD = ("link", "mass", "com")
+_AGAIN: dict[str, Any] = {"action": "append", "default": []}
+#: Field of ``MotionSettings``, or of its payload, that each flag states.
+_FLAGS: Mapping[str, tuple[str, dict[str, Any]]] = {
+    "--kind": ("kind", {"choices": ("fourier", "bspline", "sweeps", "stands", "payload")}),
+    "--link": ("link", {"metavar": "NAME"}),
+    "--mass": ("mass", {"metavar": "KG", "type": float}),
+    "--com": ("com", {"metavar": "X,Y,Z"}),
+    "--moving": ("moving", {"metavar": "JOINTS"}),
+    "--duration": ("duration", {"metavar": "S", "type": float}),
+    "--harmonics": ("harmonics", {"metavar": "N", "type": int}),
+    "--criterion": ("criterion", {"choices": ("D", "A", "E", "condition", "widest")}),
+    "--share": ("share", {"metavar": "X", "type": float}),
+    "--max-acceleration": ("acceleration", {"metavar": "JOINT=X", **_AGAIN}),
+    "--max-jerk": ("jerk", {"metavar": "JOINT=X", **_AGAIN}),
+    "--max-power": ("power", {"metavar": "JOINT=X", **_AGAIN}),
+    "--clearance": ("clearance", {"metavar": "M"}),
+    "--floor": ("floor", {"metavar": "M", "type": float}),
+    "--box": ("boxes", {"metavar": "NAME=x0,y0,z0,x1,y1,z1", **_AGAIN}),
+    "--noise": ("noise", {"metavar": "JOINT=N_M", **_AGAIN}),
+    "--seed": ("seed", {"metavar": "N", "type": int}),
+    "--starts": ("starts", {"metavar": "N", "type": int}),
+    "--seconds": ("seconds", {"metavar": "S", "type": float}),
+    "--points": ("points", {"metavar": "HZ", "type": float}),
+}
+#: How the words of a flag become the value of its field, where they are not it themselves.
+_READ: Mapping[str, Callable[[Any, str], Any]] = {
+    "moving": lambda word, _: word.split(","),
+    "boxes": _boxes,
+    "clearance": _clearance,
+    **dict.fromkeys(("acceleration", "jerk", "power", "noise"), pairs),
+}
 
 
 def _show(content: dict[str, Any]) -> None:

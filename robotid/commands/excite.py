@@ -1,8 +1,8 @@
 """A motion to record: designed for a robot within its limits, and written."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from robotid.commands.job import Job
 from robotid.commands.logs import result_run
 from robotid.exceptions import SettingsError
 from robotid.excitation.basis import Basis, BSplineBasis, FourierBasis
-from robotid.excitation.clearance import Box, Clearance
+from robotid.excitation.clearance import Clearance
 from robotid.excitation.course import Course
 from robotid.excitation.design import Design, Designer
 from robotid.excitation.files import check_motion_file, write_motion
@@ -21,138 +21,19 @@ from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.excitation.motion_page import write_motion_page
 from robotid.excitation.payload_motion import design_payload
 from robotid.excitation.routes import design_stands, design_sweeps
+from robotid.excitation.settings import ROUTES, MotionSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.previews import Preview, Run, preview_logs
 from robotid.logs.data import Log
 from robotid.regressor.compiled import is_installed, why_not
 from robotid.robot.model import RobotModel
-from robotid.simulation.settings import Payload
 
 if TYPE_CHECKING:
     from robotid._typing import ProgressCallback
 
-__all__ = ["MotionSettings", "design_motion", "stated_boxes"]
+__all__ = ["design_motion"]
 
-_ROUTES = ("sweeps", "stands")
 _START = 2.0  # [s] of design from which compiled code pays
-_RANGES = {
-    "duration": (0.1, 3600.0, " s"),
-    "harmonics": (2, 100, ""),
-    "share": (1e-3, 1.0, " of the limits"),
-    "starts": (1, 1000, ""),
-    "seconds": (1e-3, np.inf, " s"),
-    "points": (0.1, 1e5, " rows per second"),
-}
-_SIZES = 1e-9, 1e12  # of limits and noise, in any unit
-_FARTHEST = 1e3  # [m] of what stands around a robot
-_KINDS = ("fourier", "bspline", "payload", *_ROUTES)
-
-
-@dataclass(frozen=True)
-class MotionSettings:
-    """What motion is wanted.
-
-    Attributes:
-        kind: "fourier" or "bspline"; "sweeps", slow ones of joint after joint, which show friction;
-            "stands", which show gravity; "payload", one of few joints for what hangs on a link.
-        duration: Its length [s]; that of sweeps and stands is what they take.
-        harmonics: Harmonics of a Fourier series; pieces of B-splines are twice as many.
-        criterion: "D", "A", "E", "condition" or "widest", as of ``criterion``; if None, "widest"
-            after logs that were identified, else "D".
-        share: How much of the URDF's limits is used, more than 0 and at most 1.
-        acceleration: Largest accelerations by joint [rad/s^2 or m/s^2].
-        jerk: Largest jerks by joint [rad/s^3 or m/s^3].
-        power: Largest mechanical powers by joint [W].
-        clearance: Distance that is kept from collisions [m]; None: they are not looked at.
-        floor: Height of the floor in the frame of the root link [m]; None: there is none.
-        boxes: What stands around the robot.
-        noise: Standard deviation of the torque's noise by joint [N m or N].
-        seed: Of the random starts.
-        starts: How many are followed to the end.
-        seconds: Time after which the best motion so far is taken [s].
-        points: Rows per second that are written [Hz].
-        payload: What hangs on which link, as far as it is known, of the kind "payload".
-        moving: Joints that move then; the fewest that suffice if there are none.
-    """
-
-    kind: str = "fourier"
-    duration: float = 10.0
-    harmonics: int = 5
-    criterion: str | None = None
-    share: float = 0.9
-    acceleration: Mapping[str, float] = field(default_factory=dict)
-    jerk: Mapping[str, float] = field(default_factory=dict)
-    power: Mapping[str, float] = field(default_factory=dict)
-    clearance: float | None = 0.02
-    floor: float | None = None
-    boxes: Sequence[Box] = ()
-    noise: Mapping[str, float] = field(default_factory=dict)
-    seed: int = 0
-    starts: int = 3
-    seconds: float = np.inf
-    points: float = 100.0
-    payload: Payload = field(default_factory=Payload)
-    moving: Sequence[str] = ()
-
-    def __post_init__(self) -> None:
-        if self.kind not in _KINDS:
-            raise SettingsError(f"kind is {self.kind!r}, wanted one of {', '.join(_KINDS)}")
-        for name, (least, most, unit) in _RANGES.items():
-            value = getattr(self, name)
-            if not least <= value <= most:
-                wanted = f"{least:g} to {most:g}" if most < np.inf else f"{least:g} or more"
-                raise SettingsError(f"{name} is {value:g}, wanted {wanted}{unit}")
-        for name in ("acceleration", "jerk", "power", "noise"):
-            for joint, value in getattr(self, name).items():
-                if not _SIZES[0] <= value <= _SIZES[1]:
-                    raise SettingsError(
-                        f"{name} of {joint!r} is {value:g}, wanted {_SIZES[0]:g} to {_SIZES[1]:g}"
-                    )
-        if not 0 <= self.seed < 2**63:
-            raise SettingsError(f"seed is {self.seed}, wanted 0 or a positive whole number")
-        for name, value in {"clearance": self.clearance, "floor": self.floor}.items():
-            if value is not None and not abs(value) <= _FARTHEST:
-                raise SettingsError(f"{name} is {value:g} m, wanted at most {_FARTHEST:g} m")
-        if self.kind != "payload" and (self.moving or self.payload != Payload()):
-            raise SettingsError(
-                f"a payload or joints that move are stated, but kind is {self.kind!r}; wanted "
-                "payload"
-            )
-
-    def basis(self) -> Basis:
-        """Return the functions that the motion is a sum of.
-
-        Raises:
-            SettingsError: If there are too few.
-        """
-        if self.kind == "bspline":
-            return BSplineBasis(self.duration, 2 * self.harmonics)
-        return FourierBasis(self.duration, self.harmonics)
-
-
-def stated_boxes(words: Sequence[str]) -> tuple[Box, ...]:
-    """Return boxes that are stated as NAME=x0,y0,z0,x1,y1,z1, two corners [m].
-
-    Args:
-        words: What follows --box.
-
-    Raises:
-        SettingsError: If a word is another one.
-    """
-    boxes = []
-    for word in words:
-        name, _, numbers = word.partition("=")
-        try:
-            x = [float(number) for number in numbers.split(",")]
-        except ValueError:
-            x = []
-        if len(x) != 6 or not (np.abs(x) <= _FARTHEST).all():
-            raise SettingsError(
-                f"--box {word!r}: wanted NAME=x0,y0,z0,x1,y1,z1, the lower and the upper corner "
-                f"[m], within {_FARTHEST:g} m"
-            )
-        boxes.append(Box(name, (x[0], x[1], x[2]), (x[3], x[4], x[5])))
-    return tuple(boxes)
 
 
 def design_motion(
@@ -205,7 +86,7 @@ def design_motion(
         design = _designed(designer, settings, told)
     design = replace(design, seconds=time.monotonic() - begun)
     course = Course.of_design(designer, design)
-    if settings.kind in _ROUTES:
+    if settings.kind in ROUTES:
         _check_jerk(course, model.joints)
     expected: Preview | list[str] | None = None
     if report is not None:  # before anything is written: a motion may be too short for it
@@ -222,6 +103,13 @@ def design_motion(
         write_motion_page(report, model, content, course, expected)
         content["report"] = str(report)
     return content
+
+
+def _basis(settings: MotionSettings) -> Basis:
+    """Return the functions that the motion is a sum of."""
+    if settings.kind == "bspline":
+        return BSplineBasis(settings.duration, 2 * settings.harmonics)
+    return FourierBasis(settings.duration, settings.harmonics)
 
 
 def _designer(job: Job, settings: MotionSettings, given: str | None) -> tuple[Designer, Run | None]:
@@ -251,7 +139,7 @@ def _designer(job: Job, settings: MotionSettings, given: str | None) -> tuple[De
             is_fast=is_fast,
         )  # fmt: skip
     designer = Designer.of_model(
-        model, settings.basis(), limits, name=name, clearance=clearance, noise=settings.noise,
+        model, _basis(settings), limits, name=name, clearance=clearance, noise=settings.noise,
         run=run, is_fast=is_fast,
     )  # fmt: skip
     return designer, run
@@ -271,7 +159,7 @@ def _designed(
 
 def _pays(model: RobotModel, settings: MotionSettings) -> bool:
     """Return whether compiled code can be used and pays its start of about half a second."""
-    is_long = settings.kind not in _ROUTES and settings.seconds > _START
+    is_long = settings.kind not in ROUTES and settings.seconds > _START
     return is_long and is_installed() and why_not(model) is None
 
 
@@ -316,7 +204,7 @@ def _content(
     limits, clearance = course.limits, course.clearance
     jerk = LIMITS.index("jerk")
     most = design.used.copy()
-    if settings.kind in _ROUTES:
+    if settings.kind in ROUTES:
         most[jerk] = course.largest[jerk]
     for name, used, sizes in zip(LIMITS, most, limits.sizes, strict=True):
         if np.isfinite(sizes).any():

@@ -1,3 +1,4 @@
+import argparse
 import json
 import re
 from dataclasses import replace
@@ -5,12 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotid.cli import main
+from robotid.cli import excite, main
+from robotid.excitation.clearance import Box
 from robotid.excitation.design import Designer
+from robotid.excitation.settings import MotionSettings
 from robotid.logs.formats import open_table
 from robotid.logs.settings import LogSource
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+from robotid.simulation.settings import Payload
 
 WRIST = ["wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
 WORDS = [
@@ -69,16 +73,16 @@ def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
     [
         (["--clearance", "near"], "--clearance 'near': wanted metres, or none"),
         (["--box", "post=1,2,3"], "--box 'post=1,2,3': wanted NAME=x0,y0,z0,x1,y1,z1"),
-        (["--duration", "-1"], "duration is -1, wanted 0.1 to 3600 s"),
+        (["--duration", "-1"], "duration is -1.0, wanted 0.1 to 3600 s"),
         (["--max-jerk", "elbow=3"], "jerk is stated of 'elbow', which is no joint that moves"),
         (["--noise", "wrist_1_joint=-1"], "noise of 'wrist_1_joint' is -1, wanted 1e-09 to 1e+12"),
         (["--harmonics", "1"], "harmonics is 1, wanted 2 to 100"),
         (["--harmonics", "100000"], "harmonics is 100000, wanted 2 to 100"),
-        (["--duration", "1e9"], "duration is 1e+09, wanted 0.1 to 3600 s"),
-        (["--points", "1e9"], "points is 1e+09, wanted 0.1 to 100000 rows per second"),
-        (["--seconds", "0"], "seconds is 0, wanted 0.001 or more s"),
+        (["--duration", "1e9"], "duration is 1000000000.0, wanted 0.1 to 3600 s"),
+        (["--points", "1e9"], "points is 1000000000.0, wanted 0.1 to 100000 rows per second"),
+        (["--seconds", "0"], "seconds is 0.0, wanted 0.001 or more s"),
         (["--seed", "-1"], "seed is -1, wanted 0 or a positive whole number"),
-        (["--floor", "1e300"], "floor is 1e+300 m, wanted at most 1000 m"),
+        (["--floor", "1e300"], "floor is 1e+300, wanted at most 1000 m"),
         (
             ["--max-jerk", "wrist_1_joint=1e300"],
             "jerk of 'wrist_1_joint' is 1e+300, wanted",
@@ -278,3 +282,35 @@ def test_a_format_that_motions_are_not_written_in_is_refused_before_the_design(t
     said = " ".join(capsys.readouterr().err.split())
     assert "motion.txt: motions are written as .csv, .parquet, " in said
     assert ".yaml or .script files, not '.txt'" in said
+
+
+def test_every_flag_states_its_setting():
+    """Each with a value that is not the default, two where it may be given again."""
+    words = {
+        "kind": "bspline", "duration": "4", "harmonics": "3", "criterion": "E", "share": "0.5",
+        "clearance": "0.1", "floor": "-0.2", "seed": "7", "starts": "2", "seconds": "9",
+        "points": "50",
+    }  # fmt: skip
+    line = [word for name, value in words.items() for word in (f"--{name}", value)]
+    for flag in ("--max-acceleration", "--max-jerk", "--max-power", "--noise"):
+        line += [flag, "one=3", flag, "two=0.5"]
+    line += ["--box", "post=0,1,2,3,4,5", "--box", "wall=-1,0,0,0,1,1"]
+    found = stated_by_flags(*line)
+    each = {"one": 3.0, "two": 0.5}
+    assert found == MotionSettings(
+        kind="bspline", duration=4.0, harmonics=3, criterion="E", share=0.5, clearance=0.1,
+        floor=-0.2, seed=7, starts=2, seconds=9.0, points=50.0,
+        acceleration=each, jerk=each, power=each, noise=each,
+        boxes=(Box("post", (0, 1, 2), (3, 4, 5)), Box("wall", (-1, 0, 0), (0, 1, 1))),
+    )  # fmt: skip
+    load = ["--link", "wrist_3_link", "--mass", "2", "--com", "0.1,0,-0.2", "--moving", "one,two"]
+    found = stated_by_flags("--kind", "payload", "--clearance", "none", *load)
+    payload = Payload(link="wrist_3_link", mass=2.0, com=(0.1, 0.0, -0.2))
+    assert (found.payload, found.moving, found.clearance) == (payload, ["one", "two"], None)
+    assert stated_by_flags() == MotionSettings()
+
+
+def stated_by_flags(*words):
+    parser = argparse.ArgumentParser()
+    excite.add_flags(parser)
+    return excite.motion_settings(parser.parse_args(["arm.urdf", "--out", "m.csv", *words]))
