@@ -97,7 +97,7 @@ def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation
                 f"{options.plant}: drives.{joint} has {named[0]!r}; a plant states its terms with "
                 "their shapes, as { term = 'Stribeck', speed = 0.1 }"
             )
-    if options.plant:  # so that what is wrong with its drives is told of it
+    if options.plant:  # whose name errors about its drives have
         job_from_settings({"urdf": options.source, "drives": drives}, options.plant, Path())
     table = {"urdf": options.source, "drives": drives, **stated_by(options, ROBOT)}
     return job_from_settings(table, "command line", Path()), settings

@@ -85,9 +85,7 @@ def run_job(
     found, checkpoint = identify_job(job, model, chosen, target)
     report_stage(chosen.progress, "writing")
     with released_on_error(checkpoint):
-        asked = found.asked.job
-        done = asked if isinstance(asked, Job) else job
-        saved = _write(found, done, target, source=source, beside=beside)
+        saved = _write(found, _job_of(found), target, source=source, beside=beside)
     if checkpoint is not None:
         checkpoint.remove()
     return saved
@@ -117,9 +115,7 @@ def save_result(identification: Identification, folder: str | Path, *, report: b
     require_kind(report, bool, "report", "True or False")
     target = Path(folder)
     check_folder(target, ["result.json", *_names(identification.model)])
-    asked = identification.asked
-    job = asked.job if isinstance(asked.job, Job) else _job_of(identification)
-    _write(identification, replace(job, report=report), target)
+    _write(identification, replace(_job_of(identification), report=report), target)
     return target / "result.json"
 
 
@@ -163,11 +159,13 @@ def _write(
 
 
 def _job_of(identification: Identification) -> Job:
-    """Return the job that an identification made in Python comes from, as far as it is known.
+    """Return the job that an identification comes from, made in Python as far as it is known.
 
     Logs in memory have no file, and gains, units and names of columns are not in a ``Log``.
     """
     model, asked = identification.model, identification.asked
+    if isinstance(asked.job, Job):
+        return asked.job
     chosen = {drive.joint: drive for drive in identification.drives}
     wanted = wanted_families(asked.friction, model.joints)
     is_auto = all(names is None for names in wanted.values())
@@ -236,10 +234,8 @@ def identify_job(
     if not fitted:
         raise DataError("no log was given; at least one is needed to identify anything")
     report_stage(plan.progress, "checking logs")
-    job, placed = locked_as_logged(job, model, (*fitted, *kept))
-    if placed:
-        model = job.model()
-        fitted, kept = (tuple(replace(x, model=model) for x in logs) for logs in (fitted, kept))
+    there = locked_as_logged(job, model, fitted, kept)
+    job, model, fitted, kept = there.job, there.model, there.fitted, there.kept
     locked = locked_findings(model, job.placed(model))
     found = [*locked, *examine_logs(job, model, fitted, kept)]
     recordings = Recordings(model, structural_mapping(model), fitted, kept)
@@ -266,4 +262,4 @@ def identify_job(
             progress=plan.progress,
         )
     asked = replace(concluded.asked, job=job)
-    return replace(concluded, asked=asked, findings=(*placed, *concluded.findings)), checkpoint
+    return replace(concluded, asked=asked, findings=(*there.notes, *concluded.findings)), checkpoint

@@ -1,7 +1,7 @@
 """The logs of a job: each opened once, examined, and told from others by what made them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from robotid.robot.model import RobotModel
 from robotid.versions import code_versions
 
 __all__ = [
+    "LockedLogs",
     "checkpoint_inputs",
     "examine",
     "examine_logs",
@@ -114,16 +115,33 @@ def examine(
     groups = job.identification, job.validation
     fitted, kept = survey_logs(job, model, *groups, refuse=refuse, needs="any")
     report_stage(progress, "checking logs", STAGES[:2])
-    job, found = locked_as_logged(job, model, (*fitted, *kept))
-    if found:
-        model = job.model()
-        fitted, kept = (tuple(replace(x, model=model) for x in logs) for logs in (fitted, kept))
-    return by_severity([*refused, *found, *examine_logs(job, model, fitted, kept)])
+    there = locked_as_logged(job, model, fitted, kept)
+    found = examine_logs(there.job, there.model, there.fitted, there.kept)
+    return by_severity([*refused, *there.notes, *found])
+
+
+@dataclass(frozen=True, eq=False)
+class LockedLogs:
+    """A job whose joints are locked where its logs have them.
+
+    Attributes:
+        job: The job.
+        model: Its robot.
+        fitted: Its logs to fit.
+        kept: Its logs kept apart.
+        notes: The joints that were locked so and their positions, if there are any.
+    """
+
+    job: Job
+    model: RobotModel
+    fitted: tuple[SurveyedLog, ...]
+    kept: tuple[SurveyedLog, ...]
+    notes: tuple[Finding, ...] = ()
 
 
 def locked_as_logged(
-    job: Job, model: RobotModel, logs: Sequence[SurveyedLog]
-) -> tuple[Job, list[Finding]]:
+    job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], kept: Sequence[SurveyedLog]
+) -> LockedLogs:
     """Return the job with joints locked where the logs have them, unless it says where.
 
     A joint that moves, or stands elsewhere in another log, is left to ``check_locked``.
@@ -131,25 +149,26 @@ def locked_as_logged(
     Args:
         job: The job.
         model: Its robot.
-        logs: Its logs.
-
-    Returns:
-        The job, and a note of the joints and their positions; none if there are none.
+        fitted: Its logs to fit.
+        kept: Its logs kept apart.
     """
-    there = {}
+    there, logs = {}, (*fitted, *kept)
     for joint in [joint for joint in model.locked if joint not in job.placed(model)]:
         found = [log.held[joint] for log in logs if joint in log.held]
         if found and np.ptp(np.concatenate(found)) <= STILL:
             there[joint] = float(np.median(np.concatenate(found)))
     if not there:
-        return job, []
+        return LockedLogs(job, model, tuple(fitted), tuple(kept))
     shown = ", ".join(f"{joint} = {position:.4g}" for joint, position in there.items())
     message = (
         f"locked where the logs have them: {shown}. State other positions with locked = {{ joint "
         "= position }"
     )
     note = Finding("locked_as_logged", "note", ", ".join(there), message, there)
-    return replace(job, locked={**job.locked, **there}), [note]
+    job = replace(job, locked={**job.locked, **there})
+    model = job.model()
+    first, second = (tuple(replace(x, model=model) for x in logs) for logs in (fitted, kept))
+    return LockedLogs(job, model, first, second, notes=(note,))
 
 
 def examine_logs(

@@ -22,6 +22,7 @@ from robotid.robot.model import RobotModel
 __all__ = ["check_torque_delay"]
 
 _LONGEST = 0.1  # [s] delays are sought up to this
+_ROUNDING = 1e-10  # of the longest column
 _GRID = np.linspace(-_LONGEST, _LONGEST, 81)
 _NEAR = 0.01  # [s] about the delay, where the misfit is a parabola
 _FINEST = 0.001  # [s] by which friction that no curve describes imitates a delay
@@ -361,7 +362,8 @@ def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, int
     if size.min() <= 0:
         return None
     length = np.linalg.norm(X, axis=0)
-    U, s, _ = np.linalg.svd(X / np.where(length > 0, length, 1.0), full_matrices=False)
+    seen = length > _ROUNDING * length.max()  # other columns are 0 but for rounding
+    U, s, _ = np.linalg.svd(X[:, seen] / length[seen], full_matrices=False)
     Q = U[:, s > 1e-5 * s[0]]
     rest = (late - (late @ Q) @ Q.T) ** 2 / size[:, None]
     blocks = np.array_split(rest, _BLOCKS, axis=1)

@@ -39,7 +39,7 @@ def test_a_short_clean_log_has_no_late_torque_but_a_delayed_one_has(name, seed, 
         assert spoilt.severity == "warning"
         # what was found of the clean log is the bias of the method
         assert spoilt.evidence["delay"] - clean.evidence["delay"] == pytest.approx(delay, abs=2e-3)
-        assert spoilt.evidence["gain"] > 0.24  # which rounding moves by 0.003
+        assert spoilt.evidence["gain"] > 0.25
 
 
 def test_a_stated_delay_is_no_longer_found(ur5):

@@ -3,7 +3,6 @@
 As those of ``hostile_inputs``, whose ``KINDS`` these are beside.
 """
 
-import copy
 import json
 import shutil
 import tempfile
@@ -20,6 +19,7 @@ from helpers.hostile_inputs import (
     MARKUP,
     URDF,
     columns,
+    edited,
     good_log,
     good_result,
     obey,
@@ -46,28 +46,6 @@ def edits(found, new=replacements, most=2):
     """Return a strategy of what is done with values at some of the places of a JSON value."""
     actions = st.sampled_from(["put", "put", "drop", "add"])
     return st.lists(st.tuples(st.sampled_from(found), actions, new), max_size=most)
-
-
-def edited(content, given):
-    """Return a JSON value with values at some places replaced, removed or added."""
-    for path, action, value in given:
-        value = copy.deepcopy(value)
-        if not path:
-            content = value
-            continue
-        try:
-            inside = content
-            for key in path[:-1]:
-                inside = inside[key]
-            if action == "drop":
-                del inside[path[-1]]
-            elif action == "add" and isinstance(inside, list):
-                inside.append(value)
-            else:
-                inside[path[-1]] = value
-        except (KeyError, IndexError, TypeError):  # an earlier edit took that place away
-            continue
-    return content
 
 
 def flagged(pairs):

@@ -611,31 +611,37 @@ replacements = values | st.sampled_from(
 )
 
 
-@st.composite
-def results(draw):
-    """The text of a result.json with values of any shape."""
-    content = json.loads(good_result()[1])
-    for _ in range(draw(st.integers(1, 3))):
-        path = draw(st.sampled_from(draw(st.sampled_from(result_places()))))
-        new, action = (
-            copy.deepcopy(draw(replacements)),
-            draw(st.sampled_from(["replace", "replace", "drop", "add"])),
-        )
+def edited(content, given):
+    """Return a JSON value with values at some places put, dropped or added: path, action, value."""
+    for path, action, value in given:
+        value = copy.deepcopy(value)
+        if not path:
+            content = value
+            continue
         try:
             inside = content
             for key in path[:-1]:
                 inside = inside[key]
-            if not path:
-                content = new
-            elif action == "drop":
+            if action == "drop":
                 del inside[path[-1]]
             elif action == "add" and isinstance(inside, list):
-                inside.append(new)
+                inside.append(value)
             else:
-                inside[path[-1]] = new
+                inside[path[-1]] = value
         except (KeyError, IndexError, TypeError):  # an earlier edit took that place away
             continue
-    text = json.dumps(content)
+    return content
+
+
+@st.composite
+def results(draw):
+    """The text of a result.json with values of any shape."""
+    actions, places = st.sampled_from(["put", "put", "drop", "add"]), result_places()
+    given = [
+        (draw(st.sampled_from(draw(st.sampled_from(places)))), draw(actions), draw(replacements))
+        for _ in range(draw(st.integers(1, 3)))
+    ]
+    text = json.dumps(edited(json.loads(good_result()[1]), given))
     if draw(st.integers(0, 9)) == 0:
         at = draw(st.integers(0, len(text)))
         text = (
