@@ -8,6 +8,7 @@ import scipy.linalg
 
 from robotid._typing import Array
 from robotid.estimators.estimator import BatchEstimator, Estimate, Weighing
+from robotid.estimators.stretches import sandwich
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
 from robotid.regressor.factors import Factors
 
@@ -53,7 +54,7 @@ class OLS(BatchEstimator):
         solution = solve_factor(factors, np.ones(len(factors.rows)), self.prior)
         sigma = _noise(factors, solution.theta, factors.leverages(solution.covariance))
         bread, meat = solution.covariance, factors.information(sigma**2)  # bread: (W^T W)^+
-        covariance = bread @ meat @ bread / self.independent_share
+        covariance = sandwich(bread, meat) / self.independent_share
         return solution.estimate(factors.names, covariance, sigma, 1, "solved by QR")
 
 

@@ -16,7 +16,7 @@ import scipy.linalg
 
 from robotid._typing import Array, ProgressCallback, ignore_progress
 from robotid.estimators.estimator import Estimate
-from robotid.estimators.stretches import FEWEST_STRETCHES, scatter
+from robotid.estimators.stretches import FEWEST_STRETCHES, at_least, sandwich, scatter
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, triangle_of
 
@@ -381,7 +381,7 @@ class OutputError:
         is_low = theta <= simulator.lowest
         return Estimate(
             theta=theta,
-            covariance=_at_least(bread @ (meat + np.diag(known)) @ bread.T, independent),
+            covariance=at_least(sandwich(bread, meat + np.diag(known)), independent),
             names=simulator.names,
             sigma=weights.sigma / np.sqrt(self.inflation),
             rank=len(theta) - len(undetermined),
@@ -397,14 +397,6 @@ class OutputError:
             },
             **{**how, "converged": how["converged"] and left < 1.0},
         )
-
-
-def _at_least(covariance: Array, variance: Array) -> Array:
-    """Return a covariance with variances of at least some size, correlations as they are."""
-    own = np.sqrt(np.diag(covariance))
-    wider = np.maximum(own, np.sqrt(variance)) / own
-    grown: Array = covariance * np.outer(wider, wider)
-    return grown
 
 
 def _summed(

@@ -14,7 +14,7 @@ from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.regressor.factors import Factors
 
-__all__ = ["FEWEST_STRETCHES", "Scatter", "quantile", "scatter"]
+__all__ = ["FEWEST_STRETCHES", "Scatter", "at_least", "quantile", "sandwich", "scatter"]
 
 #: Fewer stretches do not show how much their scores scatter.
 FEWEST_STRETCHES = 12
@@ -36,8 +36,7 @@ class Scatter:
     @property
     def covariance(self) -> Array:
         """Covariance of the parameters, shape (c, c)."""
-        sandwich: Array = self.bread @ self.meat @ self.bread
-        return sandwich
+        return sandwich(self.bread, self.meat)
 
     def freedom(self) -> Array:
         """Return the degrees of freedom of each parameter's variance, shape (c,), at least 1.
@@ -104,6 +103,30 @@ def scatter(stretches: Sequence[Factors], theta: Array, sigma: Array, bread: Arr
         alone += missing.T @ missing
     inflation = along_squares / expected
     return Scatter(meat + inflation * alone, bread, inflation, turned, adjusted)
+
+
+def sandwich(bread: Array, meat: Array) -> Array:
+    """Return the covariance bread meat bread^T of parameters whose score has a covariance.
+
+    Args:
+        bread: Derivative of the parameters by the score, shape (c, c).
+        meat: Covariance of the score, shape (c, c).
+    """
+    covariance: Array = bread @ meat @ bread.T
+    return covariance
+
+
+def at_least(covariance: Array, variance: Array) -> Array:
+    """Return a covariance with variances of at least some size, correlations as they are.
+
+    Args:
+        covariance: Covariance, shape (c, c).
+        variance: The least variances, shape (c,).
+    """
+    own = np.sqrt(np.diag(covariance))
+    wider = np.maximum(own, np.sqrt(variance)) / own
+    grown: Array = covariance * np.outer(wider, wider)
+    return grown
 
 
 def quantile(freedom: Array) -> Array:

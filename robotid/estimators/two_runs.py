@@ -18,7 +18,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.estimators.stretches import FEWEST_STRETCHES, scatter
+from robotid.estimators.stretches import FEWEST_STRETCHES, at_least, sandwich, scatter
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, Reduction, merge, triangle_of
 from robotid.robot.parameters import ParameterLayout
@@ -278,11 +278,9 @@ class TwoRuns:
         joints = [_of_joint(run, j) for run in whole for j in range(len(gain))]
         if by_joint and len(joints) >= FEWEST_STRETCHES:
             other, few = self._scattered(joints, gain, solution, bread)
-            grown = np.sqrt(np.maximum(np.diag(other) / np.diag(covariance), 1.0))
-            covariance = covariance * np.outer(grown, grown)
-            freedom = np.where(grown > 1.0, few, freedom)
-        short = np.sqrt(np.maximum(np.diag(bread) / np.diag(covariance), 1.0))
-        return covariance * np.outer(short, short), freedom
+            freedom = np.where(np.diag(other) > np.diag(covariance), few, freedom)
+            covariance = at_least(covariance, np.diag(other))
+        return at_least(covariance, np.diag(bread)), freedom
 
     def _scattered(
         self, parts: Sequence[Factors], gain: Array, solution: Array, bread: Array
@@ -292,7 +290,7 @@ class TwoRuns:
         found = scatter(parts, solution, np.abs(gain) * self._noise, apart)
         meat = self.share**2 * found.meat
         meat[:size, :size] += self.precision
-        return bread @ meat @ bread, replace(found, bread=apart).freedom()
+        return sandwich(bread, meat), replace(found, bread=apart).freedom()
 
 
 def _of_joint(factors: Factors, joint: int) -> Factors:

@@ -15,7 +15,7 @@ from robotid.excitation.limits import LIMITS
 from robotid.findings import listed
 from robotid.identification.previews import Preview
 from robotid.pages.charts import Chart, Series, chart_html
-from robotid.pages.html import Section, code, number, page, percent, table, text
+from robotid.pages.html import Section, code, facts_html, number, page, percent, table, text
 from robotid.robot.model import RobotModel
 from robotid.versions import __version__
 
@@ -97,10 +97,9 @@ def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
         ),
         "designed in": how,
     }
-    items = "".join(f"<div><dt>{k}</dt><dd>{escape(v)}</dd></div>" for k, v in facts.items())
+    said = facts_html({name: escape(value) for name, value in facts.items()})
     return (
-        f"<h1>{escape(model.name)}: a motion to record</h1>\n"
-        f'<dl class="facts">{items}</dl>\n'
+        f"<h1>{escape(model.name)}: a motion to record</h1>\n{said}"
         "<p>Torques rest on the URDF's masses and on assumed friction. Play the motion slowly "
         f'first.</p>\n<p class="note">Written by robotid {__version__}.</p>\n'
     )

@@ -4,7 +4,7 @@ import base64
 import hashlib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from html import escape
@@ -16,18 +16,22 @@ __all__ = [
     "Section",
     "asset",
     "code",
+    "facts_html",
     "figure",
     "folded",
     "number",
     "page",
     "percent",
     "scaffold",
+    "steps_html",
     "table",
     "text",
+    "verdict_html",
     "with_error",
 ]
 
 _ASSETS = Path(__file__).parent / "assets"
+_FIRST = 3  # reasons of a verdict that are seen at once
 #: What in a page asks for which script.
 _SCRIPTS = {"page.js": '<details|<table class="data"', "tables.js": '<table class="data"'}
 
@@ -188,6 +192,61 @@ def folded(key: str, summary: str, html: str, *, is_open: bool = False) -> str:
     """
     opened = " open" if is_open else ""
     return f'<details id="{key}"{opened}><summary>{summary}</summary>\n{html}</details>\n'
+
+
+def verdict_html(robot: str, status: str, reasons: Sequence[str]) -> str:
+    """Return the heading of a result: its robot and its verdict, with the first reasons in sight.
+
+    Args:
+        robot: Name of the robot, not escaped yet.
+        status: The verdict in a word or two.
+        reasons: Its reasons, not escaped yet, the gravest first.
+    """
+    items = [f"<li>{escape(reason)}</li>" for reason in reasons]
+    more = "".join(items[_FIRST:])
+    if more:
+        count = len(items) - _FIRST
+        title = f"{count} more reason{'s' if count > 1 else ''}"
+        more = f"<details><summary>{title}</summary><ul>{more}</ul></details>"
+    return (
+        f'<div class="verdict {status.replace(" ", "-")}"><h1>{escape(robot)} '
+        f"<span>Verdict: <strong>{status}</strong></span></h1>"
+        f"<ul>{''.join(items[:_FIRST])}</ul>{more}</div>\n"
+    )
+
+
+def facts_html(facts: Mapping[str, str], files: Mapping[str, str] | None = None) -> str:
+    """Return the HTML of figures beside their names.
+
+    Args:
+        facts: What is said by its name, both HTML.
+        files: Files to link to, by what they are; they come last.
+    """
+    links = ", ".join(
+        f'<a href="{escape(path)}">{escape("URDF" if kind == "urdf" else kind)}</a>'
+        for kind, path in (files or {}).items()
+    )
+    said = {**facts, "Files": links} if links else facts
+    cells = "".join(f"<div><dt>{name}</dt><dd>{html}</dd></div>" for name, html in said.items())
+    return f'<dl class="facts">{cells}</dl>\n'
+
+
+def steps_html(steps: Iterable[tuple[str, Sequence[str]]]) -> str:
+    """Return the HTML of what to do next; nothing if there is nothing.
+
+    Args:
+        steps: What is done, in words, and the commands or lines to copy, none of it escaped yet.
+    """
+    items = "".join(
+        f"<li><p>{escape(words)}</p>"
+        + "".join(
+            f'<div class="copy"><pre class="command">{escape(block)}</pre></div>'
+            for block in blocks
+        )
+        + "</li>\n"
+        for words, blocks in steps
+    )
+    return f'<h2 id="next">Do next</h2>\n<ol class="next">{items}</ol>\n' if items else ""
 
 
 def page(title: str, header: str, sections: Mapping[str, Section | tuple[str, str]]) -> str:

@@ -16,7 +16,20 @@ from robotid.exceptions import DataError
 from robotid.export.ranges import stated_ranges
 from robotid.findings import Finding, grouped, listed
 from robotid.pages.charts import Chart, Series, chart_html
-from robotid.pages.html import Cell, Section, code, folded, number, page, table, text, with_error
+from robotid.pages.html import (
+    Cell,
+    Section,
+    code,
+    facts_html,
+    folded,
+    number,
+    page,
+    steps_html,
+    table,
+    text,
+    verdict_html,
+    with_error,
+)
 from robotid.report.advice import Origin
 from robotid.report.causes import causes_html
 from robotid.versions import __version__
@@ -37,7 +50,6 @@ _ROWS = 24_000  # of all charts together: about half a MB
 _LONGEST = 3000  # rows of one chart
 _OPEN = 3  # joints whose charts are open at first
 _NAMED = 7  # joints whose errors over the horizon are drawn
-_FIRST = 3  # reasons of the verdict that are seen at once
 _SMALL = 1e-3  # of rad and m, which errors are shown in
 #: Parameters of a drive that stand before all others.
 _FIRST_TERMS = ("kp", "kd", "delay", "limit", "zero")
@@ -115,7 +127,9 @@ def write_commanded_report(
         "findings": Section("Findings", _findings(content)),
         "appendix": Section("Appendix", _appendix(content)),
     }
-    header = _verdict(content) + _facts(content, files or {}) + _first_charts(content)
+    verdict = content["verdict"]
+    header = verdict_html(content["robot"], verdict["status"], verdict["reasons"])
+    header += _facts(content, files or {}) + _first_charts(content)
     header += _next(content, origin or Origin())
     source = "roll-outs of its torques" if _is_driven(content) else "commands"
     title = f"{content['robot']}: drives from {source}"
@@ -157,21 +171,6 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return math.exp(float(np.mean(np.log(np.array(values, dtype=float)))))
 
 
-def _verdict(content: Mapping[str, Any]) -> str:
-    verdict = content["verdict"]
-    items = [f"<li>{escape(reason)}</li>" for reason in verdict["reasons"]]
-    more = "".join(items[_FIRST:])
-    if more:
-        title = f"{len(items) - _FIRST} more reason{'s' if len(items) > _FIRST + 1 else ''}"
-        more = f"<details><summary>{title}</summary><ul>{more}</ul></details>"
-    status = verdict["status"]
-    return (
-        f'<div class="verdict {status.replace(" ", "-")}"><h1>{escape(content["robot"])} '
-        f"<span>Verdict: <strong>{status}</strong></span></h1>"
-        f"<ul>{''.join(items[:_FIRST])}</ul>{more}</div>\n"
-    )
-
-
 def _facts(content: Mapping[str, Any], files: Mapping[str, str]) -> str:
     role, entry = _entries(content)[0]
     joints = entry["per_joint"].values()
@@ -194,13 +193,7 @@ def _facts(content: Mapping[str, Any], files: Mapping[str, str]) -> str:
     found = sum(entry.get("std_error") is not None for entry in content["drive_parameters"])
     stated = len(content["drive_parameters"]) - found
     facts["Drive parameters"] = f"{found} found, {stated} stated or held"
-    if files:
-        facts["Files"] = ", ".join(
-            f'<a href="{escape(path)}">{escape("URDF" if kind == "urdf" else kind)}</a>'
-            for kind, path in files.items()
-        )
-    cells = "".join(f"<div><dt>{name}</dt><dd>{html}</dd></div>" for name, html in facts.items())
-    return f'<dl class="facts">{cells}</dl>\n'
+    return facts_html(facts, files)
 
 
 def _first_charts(content: Mapping[str, Any]) -> str:
@@ -248,21 +241,12 @@ def _next(content: Mapping[str, Any], origin: Origin) -> str:
         uses = {
             "See measured and predicted torque.": ("replay", urdf, log, result),
             "Simulate it in MuJoCo.": (
-                "export",
-                result,
-                "--format",
-                "mjcf",
-                "--out",
-                f"{robot}.xml",
+                "export", result, "--format", "mjcf", "--out", f"{robot}.xml",
             ),
-        }
-    steps = "".join(
-        f'<li><p>{escape(words)}</p><div class="copy"><pre class="command">{escape(block)}</pre>'
-        "</div></li>\n"
-        for words, command in uses.items()
-        for block in origin.using(*command)
+        }  # fmt: skip
+    return steps_html(
+        (words, origin.using(*command)) for words, command in uses.items() if origin.folder
     )
-    return f'<h2 id="next">Do next</h2>\n<ol class="next">{steps}</ol>\n' if steps else ""
 
 
 def _findings(content: Mapping[str, Any]) -> str:

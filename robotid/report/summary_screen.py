@@ -8,7 +8,7 @@ from robotid.fitting.result import SOURCES
 from robotid.identification.result import Identification
 from robotid.identification.summary import joint_reason
 from robotid.judgement.verdict import GOOD, POOR, JointVerdict
-from robotid.pages.html import code, percent
+from robotid.pages.html import code, facts_html, percent, steps_html, verdict_html
 from robotid.report.advice import Origin, next_steps
 
 __all__ = ["DETERMINED", "joint_errors", "summary_screen"]
@@ -20,7 +20,6 @@ DETERMINED = {
     "prior": "prior",
     "bound": "at its bound",
 }
-_FIRST = 3  # reasons of the verdict that are seen at once
 _ROWS = 10  # joints whose errors are seen at once
 _WIDEST = 150.0  # [%] at the end of the scale; what is beyond stands there
 _TICKS = (1.0, 5.0, GOOD, POOR, 100.0, _WIDEST)  # [%] of the scale
@@ -41,9 +40,11 @@ def summary_screen(found: Identification, origin: Origin, files: Mapping[str, st
         origin: Where it came from, for commands.
         files: Files beside the report, by what they are.
     """
+    verdict = found.verdict
+    steps = [(step.words, step.blocks) for step in next_steps(found, origin)]
     return (
-        f"{_verdict(found)}{_facts(found, files)}"
-        f'<div class="halves">\n<div>{_bars(found)}</div>\n<div>{_next(found, origin)}</div>\n'
+        f"{verdict_html(found.model.name, verdict.status, verdict.reasons)}{_facts(found, files)}"
+        f'<div class="halves">\n<div>{_bars(found)}</div>\n<div>{steps_html(steps)}</div>\n'
         "</div>\n"
     )
 
@@ -74,21 +75,6 @@ def _size(measured: JointMetrics) -> float:
     return float("inf") if value is None else value
 
 
-def _verdict(found: Identification) -> str:
-    verdict = found.verdict
-    items = [f"<li>{escape(reason)}</li>" for reason in verdict.reasons]
-    more = "".join(items[_FIRST:])
-    if more:
-        count = len(items) - _FIRST
-        title = f"{count} more reason{'s' if count > 1 else ''}"
-        more = f"<details><summary>{title}</summary><ul>{more}</ul></details>"
-    return (
-        f'<div class="verdict {verdict.status}"><h1>{escape(found.model.name)} '
-        f"<span>Verdict: <strong>{verdict.status}</strong></span></h1>"
-        f"<ul>{''.join(items[:_FIRST])}</ul>{more}</div>\n"
-    )
-
-
 def _facts(found: Identification, files: Mapping[str, str]) -> str:
     before, after, _ = found.witness.masses
     change = f" ({100 * (after / before - 1):+.0f} %)".replace("-", "−") if before > 0 else ""
@@ -106,13 +92,7 @@ def _facts(found: Identification, files: Mapping[str, str]) -> str:
         ),
         f"{total} parameters, determined by": f'<span class="shares">{shares}</span>{words}',
     }
-    if files:
-        facts["Files"] = ", ".join(
-            f'<a href="{escape(path)}">{escape("URDF" if kind == "urdf" else kind)}</a>'
-            for kind, path in files.items()
-        )
-    cells = "".join(f"<div><dt>{name}</dt><dd>{html}</dd></div>" for name, html in facts.items())
-    return f'<dl class="facts">{cells}</dl>\n'
+    return facts_html(facts, files)
 
 
 def _bars(found: Identification) -> str:
@@ -202,16 +182,3 @@ def _legend() -> str:
         f'<p class="legend">{keys}</p>\n<div class="scale" aria-hidden="true"><div>{scale}</div>'
         "</div>\n"
     )
-
-
-def _next(found: Identification, origin: Origin) -> str:
-    steps = "".join(
-        f"<li><p>{escape(step.words)}</p>"
-        + "".join(
-            f'<div class="copy"><pre class="command">{escape(block)}</pre></div>'
-            for block in step.blocks
-        )
-        + "</li>\n"
-        for step in next_steps(found, origin)
-    )
-    return f'<h2 id="next">Do next</h2>\n<ol class="next">{steps}</ol>\n'

@@ -1,0 +1,36 @@
+"""Blocks that several pages share: the verdict, figures beside their names, commands to copy."""
+
+from robotid.pages.html import facts_html, steps_html, verdict_html
+
+
+def test_a_verdict_shows_three_reasons_and_folds_all_others():
+    html = verdict_html("<arm>", "not evaluated", ["a & b", "c", "d", "e", "f"])
+    assert html == (
+        '<div class="verdict not-evaluated"><h1>&lt;arm&gt; '
+        "<span>Verdict: <strong>not evaluated</strong></span></h1>"
+        "<ul><li>a &amp; b</li><li>c</li><li>d</li></ul>"
+        "<details><summary>2 more reasons</summary><ul><li>e</li><li>f</li></ul></details></div>\n"
+    )
+    assert "<summary>1 more reason</summary>" in verdict_html("arm", "poor", "abcd")
+    assert "<details>" not in verdict_html("arm", "good", "abc")
+
+
+def test_facts_end_with_links_to_the_files():
+    html = facts_html({"Mass": "<b>2 kg</b>"}, {"urdf": "a b.urdf", "result": 'r".json'})
+    assert html == (
+        '<dl class="facts"><div><dt>Mass</dt><dd><b>2 kg</b></dd></div>'
+        '<div><dt>Files</dt><dd><a href="a b.urdf">URDF</a>, '
+        '<a href="r&quot;.json">result</a></dd></div></dl>\n'
+    )
+    assert "Files" not in facts_html({"Mass": "2 kg"})
+
+
+def test_a_step_has_each_of_its_blocks_to_copy():
+    html = steps_html([("Try <it>.", ("one", "a & b")), ("Read.", ())])
+    assert html == (
+        '<h2 id="next">Do next</h2>\n<ol class="next"><li><p>Try &lt;it&gt;.</p>'
+        '<div class="copy"><pre class="command">one</pre></div>'
+        '<div class="copy"><pre class="command">a &amp; b</pre></div></li>\n'
+        "<li><p>Read.</p></li>\n</ol>\n"
+    )
+    assert steps_html([]) == ""
