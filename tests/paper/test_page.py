@@ -19,7 +19,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def content(folder):
-    return run_paper(folder, settings=PaperSettings(iterations=24, longest=4, runs=6, patience=9))
+    return run_paper(folder, settings=PaperSettings(iterations=20, longest=3, runs=4, patience=5))
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +140,7 @@ def test_the_verdict_is_that_of_the_last_iteration(html, content):
     box = html.split('<div class="verdict ')[1].split("</div>")[0]
     last = [content["models"][name]["relative_error"][-1] for name in MODELS]
     assert box.startswith("good" if max(last) <= 1e-4 else "poor")
-    assert "After <strong>24 iterations</strong>" in box
+    assert "After <strong>20 iterations</strong>" in box
     for name, error in zip(MODELS, last, strict=True):
         on = content["on_program"][name]["relative_error"][-1]
         assert (
