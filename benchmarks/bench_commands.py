@@ -54,8 +54,8 @@ from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
-from robotid.robot.drives import AUTO
 from robotid.robot.examples import example_urdf
+from robotid.robot.families import AUTO
 from robotid.robot.model import RobotModel
 from robotid.simulation.loops import LoopedRobot, Window, open_loops
 

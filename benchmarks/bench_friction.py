@@ -28,7 +28,8 @@ from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.memory import remember
 from robotid.regressor.prediction import predict
-from robotid.robot.drives import AUTO, DriveMotion, LoadFriction, Stribeck
+from robotid.robot.drives import DriveMotion, LoadFriction, Stribeck
+from robotid.robot.families import AUTO
 from robotid.simulation.closed_loop import another_robot
 from robotid.simulation.motions import random_fourier
 

@@ -12,7 +12,8 @@ from robotid.commands.job import Job, LogEntry
 from robotid.fitting.settings import ESTIMATORS, ConstraintSettings
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.transmission import Transmission
-from robotid.robot.drives import AUTO, FAMILIES, TERMS
+from robotid.robot.drives import TERMS
+from robotid.robot.families import AUTO, FAMILIES
 from robotid.simulation.settings import Simulation
 
 PAGE = Path(__file__).with_name("job_file.md")

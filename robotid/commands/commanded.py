@@ -16,12 +16,12 @@ from robotid.export.result import Result
 from robotid.export.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.fitting.settings import SimulationSettings
 from robotid.judgement.verdict import check_ignored
+from robotid.logs.columns import Needs
 from robotid.logs.data import Log
-from robotid.logs.read import Needs
 from robotid.regressor.friction_projection import DriveMoments, project_friction
 from robotid.report.advice import Origin
 from robotid.report.commanded_page import Followed, write_commanded_report
-from robotid.robot.drives import AUTO
+from robotid.robot.families import AUTO
 
 __all__ = ["log_of_commands", "run_commanded"]
 

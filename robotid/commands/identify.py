@@ -27,7 +27,8 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.friction_projection import project_friction
 from robotid.report.advice import Origin
 from robotid.report.document import write_report
-from robotid.robot.drives import AUTO, DriveTerm
+from robotid.robot.drives import DriveTerm
+from robotid.robot.families import AUTO
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import read_tree
 from robotid.workers.checkpoint import Checkpoint, released_on_error

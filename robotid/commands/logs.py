@@ -20,7 +20,8 @@ from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import SurveyedLog, survey_log
 from robotid.identification.previews import Run
 from robotid.judgement.verdict import check_ignored
-from robotid.logs.read import LogLayout, Needs
+from robotid.logs.columns import Needs
+from robotid.logs.read import LogLayout
 from robotid.logs.table import Table
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel

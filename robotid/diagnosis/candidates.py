@@ -9,7 +9,8 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.fitting.joint_motion import JointMotion
-from robotid.robot.drives import COUNTERBALANCE, DriveTerm, Harmonic
+from robotid.robot.drives import DriveTerm, Harmonic
+from robotid.robot.families import COUNTERBALANCE
 
 __all__ = ["CANDIDATES", "Candidate", "couplings", "ripples"]
 

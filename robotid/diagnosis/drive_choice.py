@@ -23,7 +23,8 @@ from robotid.findings import listed
 from robotid.fitting.drives import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.fitting.result import Fit
 from robotid.regressor.memory import drive_motion_along
-from robotid.robot.drives import AUTO, FAMILIES, DriveMotion, DriveTerm, Family, Seen
+from robotid.robot.drives import DriveMotion, DriveTerm
+from robotid.robot.families import AUTO, FAMILIES, Family, Seen
 
 __all__ = ["TENFOLD", "choose_drives", "wanted_families"]
 

@@ -10,7 +10,8 @@ from robotid._typing import Array
 from robotid.diagnosis.candidates import CANDIDATES, Candidate, couplings, ripples
 from robotid.diagnosis.sample import Sample, Trial, chance, trials
 from robotid.fitting.joint_motion import JointMotion
-from robotid.robot.drives import DriveTerm, has_turned
+from robotid.robot.drives import DriveTerm
+from robotid.robot.families import has_turned
 
 if TYPE_CHECKING:
     pass

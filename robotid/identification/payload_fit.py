@@ -24,7 +24,8 @@ from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
 from robotid.robot.bodies import link_transfer
-from robotid.robot.drives import AUTO, DriveTerm
+from robotid.robot.drives import DriveTerm
+from robotid.robot.families import AUTO
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import (
     ParameterLayout,

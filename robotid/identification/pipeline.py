@@ -36,7 +36,7 @@ from robotid.judgement.verdict import alarming, check_ignored, doubts_of, refute
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.robot.drives import AUTO
+from robotid.robot.families import AUTO
 from robotid.robot.model import RobotModel
 
 __all__ = ["conclude", "identify", "robot_of", "with_drives"]

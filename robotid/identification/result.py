@@ -25,7 +25,7 @@ from robotid.judgement.witness import Witness, call_witness
 from robotid.logs.data import suggestion
 from robotid.logs.settings import SignalSettings
 from robotid.pages.plots import Plot
-from robotid.robot.drives import AUTO
+from robotid.robot.families import AUTO
 
 __all__ = ["Asked", "Identification"]
 

@@ -5,7 +5,8 @@ import pytest
 from robotid.commands.job import Job, job_from_settings, read_job
 from robotid.exceptions import SettingsError
 from robotid.logs.settings import LogSource
-from robotid.robot.drives import AUTO, DRIVE_TERMS
+from robotid.robot.drives import DRIVE_TERMS
+from robotid.robot.families import AUTO
 from robotid.robot.model import GRAVITY
 from robotid.robot.parameters import Coupling
 

@@ -35,7 +35,8 @@ from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.memory import drive_motion_along, remember
 from robotid.regressor.prediction import predict
-from robotid.robot.drives import AUTO, FAMILIES, DriveMotion, Harmonic, LoadFriction, Stribeck, Tanh
+from robotid.robot.drives import DriveMotion, Harmonic, LoadFriction, Stribeck, Tanh
+from robotid.robot.families import AUTO, FAMILIES
 
 SEED, REACH = 3, 1.5  # of the motion: the elbow turns more than half a turn
 SURE = 2.6  # standard errors, of a few hundred figures that are looked at

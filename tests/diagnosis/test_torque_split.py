@@ -26,15 +26,7 @@ from robotid.logs.signals import process
 from robotid.regressor.memory import remember
 from robotid.regressor.prediction import predict
 from robotid.regressor.torque import joint_torque_regressor
-from robotid.robot.drives import (
-    Harmonic,
-    Hat,
-    Lag,
-    LoadFriction,
-    Presliding,
-    Spring,
-    Stribeck,
-)
+from robotid.robot.drives import Harmonic, Hat, Lag, LoadFriction, Presliding, Spring, Stribeck
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling

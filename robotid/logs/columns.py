@@ -1,0 +1,401 @@
+"""Which columns of a table are what: positions, speeds, torques and commands of the joints."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from robotid._settings import is_number
+from robotid.exceptions import DataError, SettingsError
+from robotid.findings import listed
+from robotid.logs.data import (
+    repeated,
+    suggestion,
+)
+from robotid.logs.settings import LogSource
+from robotid.logs.table import prefixes, quantity_of
+from robotid.logs.transmission import Transmission
+
+__all__ = ["NOUNS", "TORQUES", "Finder", "Needs", "without_torque"]
+
+#: What a log is read for beside its positions, as of ``lay_out``.
+Needs: TypeAlias = Literal["torque", "motion", "commands", "any"]
+
+#: What the columns of each kind are called.
+NOUNS = {
+    "q": "position",
+    "dq": "velocity",
+    "ddq": "acceleration",
+    "tau": "torque or current",
+    "qref": "commanded position",
+    "dqref": "commanded velocity",
+    "tauref": "commanded torque",
+}
+#: Kinds of columns that hold torques.
+TORQUES = ("tau", "tauref")
+_SIZES = ("loadsize_", "load_size_")  # of loads without their sign, as bus servos give them
+
+
+def without_torque(is_commanded: bool) -> str:
+    """Return what a log without any torque can do.
+
+    Args:
+        is_commanded: Whether it has commands.
+    """
+    begin = "Its commands are" if is_commanded else "Commanded positions, qref_<joint>, would be"
+    return (
+        f'{begin} enough for [estimator] name = "simulation" with a [controller] table; all other '
+        "estimators need tau_<joint> or current_<joint>"
+    )
+
+
+@dataclass(frozen=True)
+class Finder:
+    """Finds the columns of the wanted joints among the names in a file.
+
+    Attributes:
+        where: What the file is called.
+        names: Names of its columns.
+        columns: Names that stand for others, as the user stated them.
+        joints: The wanted joints.
+        gains: Gains of currents by joint.
+        source: How the file is read.
+        gears: Transmissions between motors and joints.
+        needs: What is read beside the positions.
+        notes: What was noticed.
+        seen: Columns that are read, or named in a note of their own.
+    """
+
+    where: str
+    names: list[str]
+    columns: Mapping[str, str]
+    joints: tuple[str, ...]
+    gains: Mapping[str, float]
+    source: LogSource
+    gears: tuple[Transmission, ...]
+    needs: Needs = "torque"
+    notes: list[str] = field(default_factory=list)
+    seen: set[str] = field(default_factory=set)  # read, or named in a note of their own
+
+    def find_all(self) -> dict[str, list[str]]:
+        """Return the names of the columns to read: of time, q, what is needed, what is complete."""
+        self._check_arguments()
+        found = {
+            "time": [self._find("time", ["time", "t"]) or self._missing("time", "")],
+            "q": [column or self._missing(*at) for at, column in self._each("q")],
+        }
+        optional, wanted = ["dq", "ddq"], self._wanted()
+        if "commands" in wanted:
+            found["qref"] = self._find_commands()
+            optional += ["dqref", "tauref"]
+        if "torque" in wanted or ("commands" in wanted and self._is_torque_whole()):
+            found["tau"] = [
+                self._find_torque(self.joints[j], is_motor)
+                for j, is_motor in enumerate(self.of_motors("tau"))
+            ]
+        found |= {kind: names for kind in optional if (names := self._find_optional(kind))}
+        self._note_sizes()
+        extra = [name for name in self.names if name not in self.seen]
+        if extra:
+            self.notes.append(f"columns ignored: {listed(extra)}")
+        if twice := repeated([name for names in found.values() for name in names]):
+            raise SettingsError(
+                f"{self.where}: {listed(twice)} are read twice; correct columns={{...}}"
+            )
+        return found
+
+    def factors(self, torques: Sequence[str]) -> tuple[float, ...]:
+        """Return what makes each of n columns a torque: a current's gain, or 1.
+
+        Args:
+            torques: Names of the columns.
+        """
+        currents = {
+            self._find_of(kind, name): name
+            for kind, names in (("current", self.joints), ("currentm", self.motors.values()))
+            for name in names
+        }
+        return tuple(float(self.gains[currents[n]]) if n in currents else 1.0 for n in torques)
+
+    @property
+    def motors(self) -> dict[str, str]:
+        """The motor in the place of each joint that has one, by joint."""
+        return {
+            joint: motor
+            for gear in self.gears
+            for joint, motor in zip(gear.joints, gear.names, strict=True)
+        }
+
+    def of_motors(self, kind: str) -> tuple[bool, ...]:
+        """Return of which joints a quantity is read at the motor in their place.
+
+        Args:
+            kind: "q", "dq", "ddq" or "tau".
+
+        Raises:
+            DataError: If joints of one transmission have it at the motors and at the joints.
+        """
+        kinds = ("tau", "current") if kind == "tau" else (kind,)
+        turned = set[str]()
+        for gear in self.gears:
+            at_motors, at_joints = (
+                [found for name in names for k in kinds if (found := self._find_of(k + m, name))]
+                for m, names in (("m", gear.names), ("", gear.joints))
+            )
+            if at_motors and at_joints:
+                raise DataError(
+                    f"{self.where} has {at_motors[0]!r} of a motor and {at_joints[0]!r} of a joint "
+                    f"that it drives, two {NOUNS[kind].partition(' ')[0]} columns of one "
+                    "transmission; remove one side, or the [[transmission]] that reads the motors"
+                )
+            turned.update(gear.joints if at_motors else ())
+        return tuple(joint in turned for joint in self.joints)
+
+    def _each(self, kind: str) -> list[tuple[tuple[str, str], str | None]]:
+        """Return the column of one quantity of each joint, or of the motor in its place.
+
+        Each behind its kind, "q" or "qm", and the name of joint or motor.
+        """
+        places = [
+            (f"{kind}m", self.motors[joint]) if is_motor else (kind, joint)
+            for joint, is_motor in zip(self.joints, self.of_motors(kind), strict=True)
+        ]
+        return [(at, self._find_of(*at)) for at in places]
+
+    def _check_arguments(self) -> None:
+        """Refuse names twice in the file, and gains and columns of what is not read."""
+        if twice := repeated([name for name in self.names if name]):
+            raise DataError(
+                f"{self.where} has more than one column {listed(twice)}; rename or remove one"
+            )
+        for joint, gain in self.gains.items():
+            self._require_read(joint, "a gain is given for")
+            if not (is_number(gain) and np.isfinite(gain)) or gain == 0:
+                raise SettingsError(f"gain of {joint!r} is {gain}, wanted a number other than 0")
+        for joint in self.source.joints:
+            self._require_read(joint, "log.joints renames")
+        names = dict.fromkeys([*self.joints, *self.motors.values()])
+        known = ["time", *(f"{kind}_{name}" for kind in prefixes() for name in names)]
+        for standard, name in self.columns.items():
+            if standard not in known:
+                raise SettingsError(
+                    f"columns: {standard!r} is not the standard name of a column that is read, "
+                    f"as 'time' or 'tau_{self.joints[0]}'{suggestion(standard, known)}"
+                )
+            if name not in self.names:
+                raise DataError(
+                    f"{self.where} has no column {name!r}, which columns gives for {standard!r}; "
+                    f"columns found: {listed(self.names)}{suggestion(name, self.names)}"
+                )
+
+    def _require_read(self, joint: str, what: str) -> None:
+        if joint not in (*self.joints, *self.motors.values()):
+            raise SettingsError(
+                f"{self.where}: {what} {joint!r}, which is not among the joints read: "
+                f"{listed(self.joints)}{suggestion(str(joint), self.joints)}"
+            )
+
+    def _find(self, standard: str, aliases: Sequence[str]) -> str | None:
+        """Return the column of one quantity, or None."""
+        found = [a for a in aliases if a in self.names and a not in self.columns.values()]
+        if standard in self.columns:
+            found = [self.columns[standard]]
+        if len(found) > 1:
+            raise DataError(
+                f"{self.where} has {found[0]!r} and {found[1]!r}, two names of the same quantity; "
+                f"remove one, or pass columns={{{standard!r}: ...}}"
+            )
+        self.seen.update(found)
+        return found[0] if found else None
+
+    def _find_of(self, kind: str, joint: str) -> str | None:
+        """Return the column of one quantity of one joint, or None."""
+        named, starts = self._named(joint), prefixes(self.source.effort)[kind]
+        return self._find(f"{kind}_{joint}", [prefix + named for prefix in starts])
+
+    def _named(self, joint: str) -> str:
+        """Return the name of a joint in the file."""
+        return self.source.joints.get(joint, joint)
+
+    def _find_torque(self, joint: str, is_motor: bool) -> str:
+        """Return the column of a joint's or its motor's torque, or current if that has a gain."""
+        m, joint = ("m", self.motors[joint]) if is_motor else ("", joint)
+        tau, current = self._find_of(f"tau{m}", joint), self._find_of(f"current{m}", joint)
+        has_gain = joint in self.gains
+        if tau and current:
+            used, unused = (current, tau) if has_gain else (tau, current)
+            self.notes.append(
+                f"{unused} ignored: {used} is read ({'a' if has_gain else 'no'} gain)"
+            )
+            return used
+        if tau and has_gain:
+            self.notes.append(f"the gain of {joint!r} is not used: {tau} is a torque")
+        if current and not has_gain:
+            raise self._no_gain(joint, current)
+        return tau or current or self._missing(f"tau{m}", joint)
+
+    def _wanted(self) -> set[str]:
+        """Return which of torque and commands must be there, of every joint."""
+        if self.needs != "any":
+            return {self.needs}
+        has_torque = any(self.has_torque(joint) for joint in self.joints)
+        told = [self._has("qref", joint) for joint in self.joints]
+        wanted = {"commands"} if all(told) or (any(told) and not has_torque) else set[str]()
+        return wanted | ({"torque"} if has_torque or not wanted else set())
+
+    def _is_torque_whole(self) -> bool:
+        """Return whether every joint has a torque, or a current with its gain; note it if few."""
+        without = []
+        for joint, is_motor in zip(self.joints, self.of_motors("tau"), strict=True):
+            m, name = ("m", self.motors[joint]) if is_motor else ("", joint)
+            has_gain = name in self.gains
+            if not (self._has(f"tau{m}", name) or (has_gain and self._has(f"current{m}", name))):
+                without.append(joint)
+        if without and any(self.has_torque(joint) for joint in self.joints):
+            self.notes.append(
+                f"torques ignored: {listed(without)} have none, nor a current with a gain"
+            )
+        return not without
+
+    def _find_commands(self) -> list[str]:
+        """Return the columns of the commanded position of every joint."""
+        found = self._each("qref")
+        without = [joint for (_, joint), column in found if column is None]
+        if not without:
+            return [column for _, column in found if column]
+        known = [name for name in self.names if (quantity_of(name) or ("",))[0] == "qref"]
+        if len(without) == len(found):
+            raise DataError(
+                f"{self.where} has no commanded position, as 'qref_{self.joints[0]}', of any joint "
+                f"read; columns of commanded positions found: {listed(known)}. Record what the "
+                "controller was told, rename the columns, or pass columns={'qref_<joint>': ...}"
+                + "".join(f"; {note}" for note in self.notes),
+                code="missing_column",
+            )
+        raise DataError(
+            f"{self.where} has commanded positions, but none of {listed(without)}: no column "
+            f"'qref_{self._named(without[0])}'; found: {listed(known)}. Record or rename what is "
+            "missing, pass columns={'qref_<joint>': ...}, or lock joints that stood still",
+            code="missing_column",
+        )
+
+    def _note_sizes(self) -> None:
+        """Note loads without their sign, which nothing reads."""
+        sizes = [name for name in self.names if name.startswith(_SIZES) and name not in self.seen]
+        self.seen.update(sizes)
+        if sizes:
+            self.notes.append(
+                f"{listed(sizes)} ignored: the size of a load without its sign is no torque; it "
+                "does not tell a drive that pushes from one that brakes"
+            )
+
+    def _no_gain(self, joint: str, current: str) -> DataError:
+        """Return the error of a current without a gain, with all that the others lack, too."""
+        without = [joint]
+        if joint in self.joints:
+            logged = [other for other in self.joints if self._has("current", other)]
+            without = [x for x in logged if not self._has("tau", x) and x not in self.gains]
+        has = f"joint {joint!r} has the current {current!r}"
+        if len(without) > 1:
+            has = f"joints {listed(without)} have currents"
+        more = ", ..." if len(without) > 1 else ""
+        flags = " ".join(f"--gain {name}=..." for name in without)
+        absent = [x for x in self.joints if not (self._has("tau", x) or self._has("current", x))]
+        also = ""
+        if absent and joint in self.joints:
+            locks = " ".join(f"--lock {name}=0" for name in absent)
+            also = (
+                f". There is no torque of {listed(absent)} either; if they stood still, lock them "
+                f"where they stood, as with {locks}"
+            )
+        return DataError(
+            f"{self.where}: {has} but no gain; give it in N m/A: "
+            f"gains={{{without[0]!r}: ...{more}}} (job file table [torque], key gains; CLI "
+            f"{flags}){also}",
+            code="missing_gain",
+        )
+
+    def _find_optional(self, kind: str) -> list[str]:
+        """Return the columns of a quantity that every joint has; none if some joint lacks it."""
+        found = self._each(kind)
+        names = [name for _, name in found if name]
+        without = [joint for (_, joint), name in found if not name]
+        if names and without:
+            self.notes.append(f"{listed(names)} ignored: {listed(without)} have no {NOUNS[kind]}")
+        return [] if without else names
+
+    def _missing(self, kind: str, joint: str) -> str:
+        """Refuse a file without a column, naming those of its kind and the nearest."""
+        standard = f"{kind}_{joint}" if joint else kind
+        noun = f"{NOUNS[kind.removesuffix('m')]} columns" if joint else "columns"
+        kinds, named = (kind, "current") if kind == "tau" else (kind,), self._named(joint)
+        others = {self._named(other) for other in self.joints}
+        found, ends = [], {}  # columns; and by the joint that they name, if it is not another's
+        for name in self.names:
+            quantity, end = quantity_of(name, self.source.effort) or ("", name)
+            if quantity in kinds or not joint:
+                found.append(name)
+                if end not in others:
+                    ends[end] = name
+        nearest = difflib.get_close_matches(named or kind, ends, n=1)
+        near = repr(ends[nearest[0]]) if nearest else "..."
+        hint = f"Did you mean {near}? " if nearest else ""
+        sought = f"{kind}_{named}" if joint else kind
+        stood = ""
+        if joint in self.joints and kind in NOUNS:
+            stood = f"; if {joint!r} stood still, leave it out of joints and lock it"
+            stood += self._how_to_lock()
+        if at_motors := [name for name in self.names if name.startswith(f"{kind}m_")]:
+            stood = (
+                f". Columns of motors, as {at_motors[0]}, need the gears: [[transmission]] with "
+                "joints and matrix"
+            )
+        if kind == "tau" and not any(self.has_torque(other) for other in self.joints):
+            is_commanded = all(self._has("qref", other) for other in self.joints)
+            stood = f". {without_torque(is_commanded)}"
+        raise DataError(
+            f"{self.where} has no column {sought!r}; {noun} found: {listed(found)}. {hint}"
+            f"Rename it, or pass columns={{{standard!r}: {near}}}{stood}",
+            code="missing_column",
+        )
+
+    def _how_to_lock(self) -> str:
+        """Return the flags that leave out the joints whose columns are missing, "" if all are."""
+        logged = [joint for joint in self.joints if self._is_logged(joint)]
+        absent = [joint for joint in self.joints if joint not in logged]
+        if not logged:
+            return ""
+        locks = " ".join(f"--lock {joint}=0" for joint in absent)
+        held = ", ".join(f"{joint!r}: 0" for joint in absent)
+        return (
+            f" where it stood, as with --joints {','.join(logged)} {locks}; in Python "
+            f"RobotModel.from_urdf(..., locked={{{held}}})"
+        )
+
+    def _is_logged(self, joint: str) -> bool:
+        """Return whether the file has what is needed of a joint."""
+        wanted = self._wanted()
+        return (
+            self._has("q", joint)
+            and ("torque" not in wanted or self.has_torque(joint))
+            and ("commands" not in wanted or self._has("qref", joint))
+        )
+
+    def has_torque(self, joint: str) -> bool:
+        """Return whether the file has a torque or a current of a joint.
+
+        Args:
+            joint: The joint.
+        """
+        return self._has("tau", joint) or self._has("current", joint)
+
+    def _has(self, kind: str, joint: str) -> bool:
+        """Return whether the file has a quantity of a joint, or of the motor in its place."""
+        names = (prefix + self._named(joint) for prefix in prefixes(self.source.effort)[kind])
+        return (
+            f"{kind}_{joint}" in self.columns
+            or any(name in self.names for name in names)
+            or (joint in self.motors and self._has(f"{kind}m", self.motors[joint]))
+        )
