@@ -1,6 +1,6 @@
 """From logs of commands and positions to drives, loops and bodies: the stages of the fit."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +10,15 @@ from robotid.commanded.drive_torques import find_gains, measured_motion
 from robotid.commanded.driven import identified_rows, torque_rows
 from robotid.commanded.errors import DRIFTS
 from robotid.commanded.gain_check import GainScale, gain_scale
+from robotid.commanded.initial_values import (
+    drive_unknowns,
+    first_loops,
+    is_stated,
+    likeness,
+    usual_sizes,
+    usual_sizes_of_torques,
+    zero_unknowns,
+)
 from robotid.commanded.second_order import SecondOrder, fit_second_order
 from robotid.commanded.settings import LoopSettings, groups_of
 from robotid.commanded.term_choice import Tried, candidates, choose
@@ -25,11 +34,9 @@ from robotid.identification.result import Identification
 from robotid.logs.data import Log
 from robotid.logs.measured_velocity import is_trustworthy
 from robotid.logs.settings import SignalSettings
-from robotid.robot.drives import DriveTerm, Viscous
-from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
 from robotid.simulation.loops import LoopedRobot, Loops, Window, cut_windows, open_loops
-from robotid.simulation.settings import PerJoint, by_joint
+from robotid.simulation.settings import by_joint
 
 __all__ = ["STAGES", "Fitted", "fit_loops", "stated_loops"]
 
@@ -41,14 +48,6 @@ STAGES = (
 
 
 _NAMES = {"output": "output error", "input": "input error", "direct": "direct input error"}
-_WIDE = 10.0  # spreads of drives are so many times their usual size: they bind nothing
-_SHARE = 0.5  # of the loop's inertia by which gains are unknown, that bodies have to begin with
-_SLOWEST = 0.1  # [s] spread of a delay
-_TURN = 0.3  # [rad or m] spread of an encoder's zero about where it was found
-_LIGHTEST = 0.3  # of the largest such inertia: small joints have a motor behind a gear, too
-_POSES = 50  # that the bodies' inertia is looked at in
-_LEAST = 0.05  # of a usual size, that an inertia begins with, or a gain keeps
-_LIMITED = 0.8  # of the largest torque that was asked for, that a limit begins with
 _WHITE = 2.0  # whitening ends at so many times the rate at which a loop follows
 _FEW = 12  # windows that are fitted first, of many
 _STARTS = 3  # fits with better starts of the windows
@@ -165,7 +164,7 @@ def fit_loops(
     scale = None
     if begun.linear is None:
         simulator, estimate = refine_steps(simulator, estimator, estimate)
-        if _is_stated(loop.kp, model).all() and simulator.error == "output":
+        if is_stated(loop.kp, model).all() and simulator.error == "output":
             scale = gain_scale(simulator, estimator, estimate)
     chosen = (begun.encoders, tuple(tried), begun.linear, scale)
     return Fitted(simulator, estimate, begun.plain, *chosen)
@@ -204,7 +203,7 @@ def _begun_by_commands(
     windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
     stated = replace(stated_loops(model, loop), zero=encoders.zero)
     weighs = settings.torques and all(log.has_torque for log in logs)
-    has_gain, behind = _is_stated(loop.kp, model), None
+    has_gain, behind = is_stated(loop.kp, model), None
     if weighs and loop.rate is None:
         is_open = _open_gains(loop, model)
         moved = [measured_motion(window) for window in _few(windows)]
@@ -214,17 +213,17 @@ def _begun_by_commands(
         has_gain, stated = has_gain | (told.kp != stated.kp), told
     report_stage(progress, "trying plain loops", STAGES)
     plain = fit_second_order(robot, windows, stated, finds_delay=loop.delay is None)
-    groups = groups_of(loop, model.joints, _likeness(model))
+    groups = groups_of(loop, model.joints, likeness(model))
     top = _largest_speeds(model, loop, logs)
-    usual = _usual(robot, plain, windows, has_gain, top)
+    usual = usual_sizes(robot, plain, windows, has_gain, top)
     finds_limit = (top > 0.0) | (loop.limit == "find")
-    base = _begin(model, stated, plain, usual, finds_limit)
+    base = first_loops(model, stated, plain, usual, finds_limit)
     # positions alone tell the sum of kd and viscous friction
     tells_kd = weighs or all(log.v_ref is not None for log in logs)
-    unknowns = _unknowns(
+    unknowns = drive_unknowns(
         model, loop, groups, base, usual, tells_kd=tells_kd, finds_limit=finds_limit
     )
-    unknowns += _zeros(model, encoders) if loop.zeros == "find" else []
+    unknowns += zero_unknowns(model, encoders) if loop.zeros == "find" else []
     unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
     most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 3)  # positions, speeds, torques
@@ -259,10 +258,10 @@ def _begun_by_torque(
     robot = LoopedRobot(model, step=settings.step)
     length, lead = settings.window or DRIFTS, settings.lead or 0.0
     windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
-    usual = _usual_of_torques(model, found.standard, base.armature, windows)
+    usual = usual_sizes_of_torques(model, found.standard, base.armature, windows)
     groups = groups_of(loop, model.joints, range(len(model.joints)))
     none = np.zeros(len(groups), dtype=bool)
-    unknowns = _unknowns(model, loop, groups, base, usual, tells_kd=False, finds_limit=none)
+    unknowns = drive_unknowns(model, loop, groups, base, usual, tells_kd=False, finds_limit=none)
     unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
     simulator = LoopSimulator(robot, windows, base, tuple(unknowns), velocities=settings.velocities)
     report_stage(progress, "fitting loops", STAGES)
@@ -369,7 +368,7 @@ def _check_settings(
     if settings.error != "direct":
         return
     unknown = [
-        key for key in ("kp", "kd", "delay") if not _is_stated(getattr(loop, key), model).all()
+        key for key in ("kp", "kd", "delay") if not is_stated(getattr(loop, key), model).all()
     ]
     finds_limit = loop.limit == "find" or bool(_largest_speeds(model, loop, logs).any())
     unknown += ["limit"] * finds_limit + ["zeros"] * (loop.zeros == "find")
@@ -387,7 +386,7 @@ def _largest_speeds(model: RobotModel, loop: LoopSettings, logs: Sequence[Log]) 
     for log in logs:
         found = largest_speeds(log)
         speed = np.maximum(speed, [found.get(joint, 0.0) for joint in model.joints])
-    is_open = ~_is_stated(None if loop.limit == "find" else loop.limit, model)
+    is_open = ~is_stated(None if loop.limit == "find" else loop.limit, model)
     return np.where(is_open, speed, 0.0)
 
 
@@ -418,183 +417,6 @@ def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
     )
 
 
-def _zeros(model: RobotModel, encoders: Encoders) -> list[Unknown]:
-    """Return the zeros of encoders that are not the URDF's, near where they were found."""
-    return [
-        Unknown(f"{model.joints[j]}.zero", "zero", (int(j),), float(encoders.zero[j]), _TURN)
-        for j in np.flatnonzero(encoders.gain > 0)
-    ]
-
-
-def _likeness(model: RobotModel) -> list[tuple[object, ...]]:
-    """Return what makes joints alike: their limits, and mass and moments of their bodies."""
-    bodies = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)
-    sizes = np.column_stack([bodies[:, 0], bodies[:, [4, 6, 9]]])
-    found: list[tuple[object, ...]] = []
-    for body, joint in zip(sizes, model.limits, strict=True):
-        digits = tuple(f"{x:.2g}" for x in body)
-        found.append((joint.type, f"{joint.effort:.3g}", f"{joint.velocity:.3g}", digits))
-    return found
-
-
-@dataclass(frozen=True, eq=False)
-class _Usual:
-    """Usual sizes, joint by joint, shape (n,): where unknowns begin, and how far they may be."""
-
-    inertia: Array  # [kg m^2 or kg] of the whole loop
-    bodies: Array  # of the URDF's bodies in it
-    torque: Array  # [N m or N]
-    largest: Array  # that the loop asked for, somewhat less [N m or N]
-    speed: Array  # [rad/s or m/s]
-    scale: Array  # torques over those of the plain model
-
-
-def _usual(
-    robot: LoopedRobot, plain: SecondOrder, windows: Sequence[Window], has_gain: Array, top: Array
-) -> _Usual:
-    """Return usual sizes; where a gain is unknown, the bodies' inertia measures all torques.
-
-    A joint at its largest speed, ``top`` if more than 0, gives what friction takes there.
-    """
-    model = robot.model
-    q = np.concatenate([w.log.q[w.counted] for w in windows])
-    bodies = _inertia(model, model.standard_parameters(), windows)
-    measure = np.maximum(bodies, _LIGHTEST * bodies.max()) / _SHARE
-    scale = np.where(has_gain, 1.0, measure / plain.inertia)
-    inertia = np.maximum(plain.inertia * scale, bodies)  # friction may hide it from a plain loop
-    error = np.concatenate([w.log.q_ref[w.counted] for w in windows]) - q  # type: ignore[index]
-    asked = _LIMITED * plain.loops.kp * np.abs(error).max(axis=0)
-    taken = plain.friction("viscous") * top + plain.friction("coulomb")
-    largest = scale * np.where(top > 0.0, np.minimum(taken, asked), asked)
-    return _Usual(inertia, bodies, plain.torque * scale, largest, _speed(windows), scale)
-
-
-def _usual_of_torques(
-    model: RobotModel, pi: Array, armature: Array, windows: Sequence[Window]
-) -> _Usual:
-    """Return usual sizes where torques are logged and no loop is closed."""
-    tau = np.concatenate([w.log.tau[w.counted] for w in windows])
-    torque = np.maximum(np.sqrt(np.mean(tau**2, axis=0)), 1e-6)
-    inertia, one = _inertia(model, pi, windows), np.ones(len(armature))
-    return _Usual(inertia, inertia - armature, torque, np.inf * one, _speed(windows), one)
-
-
-def _inertia(model: RobotModel, pi: Array, windows: Sequence[Window]) -> Array:
-    """Return the usual inertia that each joint moves, shape (n,)."""
-    q = np.concatenate([w.log.q[w.counted] for w in windows])
-    M = joint_mass_matrices(model, pi, q[:: max(1, len(q) // _POSES)])
-    usual: Array = np.median(np.diagonal(M, axis1=1, axis2=2), axis=0)
-    return usual
-
-
-def _speed(windows: Sequence[Window]) -> Array:
-    """Return the usual speed of each joint, shape (n,)."""
-    steps = np.concatenate([np.diff(w.log.q[w.counted], axis=0) for w in windows])
-    dt = float(np.median(np.diff(windows[0].log.t)))
-    speed: Array = np.maximum(np.sqrt(np.mean(steps**2, axis=0)) / dt, 1e-6)
-    return speed
-
-
-def _begin(
-    model: RobotModel, stated: Loops, plain: SecondOrder, usual: _Usual, finds_limit: Array
-) -> Loops:
-    """Return the loops that the fit begins with."""
-    friction = {name: plain.friction(name) * usual.scale for name in ("viscous", "coulomb")}
-    none = np.zeros(len(usual.scale))
-    terms = tuple(
-        tuple(
-            term
-            for d, term in model.layout.drive_parameters
-            if model.layout.drives[d].name == joint and not term.is_inertia
-        )
-        for joint in model.joints
-    )
-    values = [friction.get(t.name, none)[j] for j, own in enumerate(terms) for t in own]
-    return replace(
-        stated,
-        kp=stated.kp * usual.scale,
-        armature=np.maximum(usual.inertia - usual.bodies, _LEAST * usual.inertia),
-        delay=plain.loops.delay,
-        limit=np.where(finds_limit, usual.largest, stated.limit),
-        terms=terms,
-        values=np.array(values),
-    )
-
-
-def _unknowns(
-    model: RobotModel,
-    loop: LoopSettings,
-    groups: Sequence[str],
-    base: Loops,
-    usual: _Usual,
-    *,
-    tells_kd: bool,
-    finds_limit: Array,
-) -> list[Unknown]:
-    """Return what is unknown of drives and loops, beginning with what the loops have."""
-    members: dict[str, list[int]] = {}
-    for j, group in enumerate(groups):
-        members.setdefault(group, []).append(j)
-    is_closed = np.full(len(groups), loop.kind != "torque")
-    # a limit is a setting of each drive, a delay mostly the bus's and the controller's
-    sharing: dict[str, dict[str, list[int]]] = {
-        "limit": {joint: [j] for j, joint in enumerate(model.joints)}
-    }
-    if loop.delays == "one":
-        sharing["delay"] = {"robot": [*range(len(groups))]}
-    open_ = {
-        "armature": np.full(len(groups), "armature" in model.layout.terms),
-        "kp": ~_is_stated(loop.kp, model) & is_closed,
-        "kd": ~_is_stated(loop.kd, model) & tells_kd,
-        "limit": finds_limit,
-        "delay": ~_is_stated(loop.delay, model) & is_closed,
-    }
-    spread = {
-        "armature": usual.inertia,
-        "kp": base.kp / _WIDE,
-        "kd": usual.torque / usual.speed,
-        "limit": usual.torque,
-        "delay": np.full(len(groups), _SLOWEST / _WIDE),
-    }
-    found = []
-    for what, is_open in open_.items():
-        for name, joints in sharing.get(what, members).items():
-            own = tuple(j for j in joints if is_open[j])
-            if own:
-                begin = float(np.median(getattr(base, what)[list(own)]))
-                wide = _WIDE * float(np.median(spread[what][list(own)]))
-                lowest = _LEAST * begin if what in ("kp", "limit") else 0.0
-                found.append(Unknown(f"{name}.{what}", what, own, begin, wide, lowest))
-    for group, joints in members.items():
-        for term in {t: None for j in joints for t in base.terms[j]}:
-            having = [j for j in joints if term in base.terms[j]]
-            # what wears and what leans differ from drive to drive, grease and motor do not
-            for owners in [having] if isinstance(term, Viscous) else [[j] for j in having]:
-                name = group if len(owners) > 1 else model.joints[owners[0]]
-                found.append(_term(name, term, owners, base, usual))
-    return found
-
-
-def _term(
-    owner: str, term: DriveTerm, joints: Sequence[int], base: Loops, usual: _Usual
-) -> Unknown:
-    """Return the unknown of a term of one joint, or of several that share it."""
-    begin = float(np.median([base.values[base.place(j, term)] for j in joints]))
-    size = usual.torque / (usual.speed if isinstance(term, Viscous) else 1.0)
-    wide = _WIDE * float(np.median(size[list(joints)]))
-    lowest = 0.0 if term.is_nonnegative else -np.inf
-    return Unknown(f"{owner}.{term.name}", "term", tuple(joints), begin, wide, lowest, term=term)
-
-
-def _is_stated(value: PerJoint | str | None, model: RobotModel) -> Array:
-    """Return for which joints a number is stated, shape (n,), bool."""
-    named = [
-        value is not None and (not isinstance(value, Mapping) or joint in value)
-        for joint in model.joints
-    ]
-    return np.array(named)
-
-
 def _few(windows: Sequence[Window]) -> tuple[Window, ...]:
     """Return some of many windows."""
     return tuple(windows[:: max(1, len(windows) // _FEW)])
@@ -602,7 +424,7 @@ def _few(windows: Sequence[Window]) -> tuple[Window, ...]:
 
 def _open_gains(loop: LoopSettings, model: RobotModel) -> Array:
     """Return for which joints gains of position and of speed are to be found, (2, n), bool."""
-    return ~np.stack([_is_stated(gain, model) for gain in (loop.kp, loop.kd)])
+    return ~np.stack([is_stated(gain, model) for gain in (loop.kp, loop.kd)])
 
 
 def _with(
