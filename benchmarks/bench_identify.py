@@ -53,7 +53,7 @@ def run(checkout, job):
         done = subprocess.run(
             [sys.executable, *words],
             cwd=checkout,  # where -m looks first
-            env={**os.environ, "PYTHONPATH": str(checkout)},
+            env={**os.environ, "PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": ""},
             capture_output=True,
             text=True,
         )

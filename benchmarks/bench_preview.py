@@ -28,7 +28,8 @@ import scipy.signal
 
 from robotid.commands.job import read_job
 from robotid.identification.pipeline import identify
-from robotid.identification.previews import TorqueNoise, preview
+from robotid.identification.assumptions import TorqueNoise
+from robotid.identification.previews import preview
 from robotid.logs.data import Log
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia

@@ -11,7 +11,6 @@ from robotid._settings import require_kind
 from robotid._typing import report_stage
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import checkpoint_inputs, examine_logs, locked_as_logged, survey_logs
-from robotid.diagnosis.drive_choice import wanted_families
 from robotid.exceptions import DataError
 from robotid.export.entries import build_result
 from robotid.export.urdf import DYNAMICS_TERMS, write_urdf
@@ -28,7 +27,7 @@ from robotid.regressor.friction_projection import project_friction
 from robotid.report.advice import Origin
 from robotid.report.document import write_report
 from robotid.robot.drives import DriveTerm
-from robotid.robot.families import AUTO
+from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import read_tree
 from robotid.workers.checkpoint import Checkpoint, released_on_error

@@ -15,7 +15,6 @@ from itertools import product
 import numpy as np
 from scipy.special import stdtr
 
-from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.diagnosis.sample import Sample, Trial, take_sample, trials
 from robotid.exceptions import SettingsError
@@ -24,13 +23,12 @@ from robotid.fitting.drives import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.fitting.result import Fit
 from robotid.regressor.memory import drive_motion_along
 from robotid.robot.drives import DriveMotion, DriveTerm
-from robotid.robot.families import AUTO, FAMILIES, Family, Seen
+from robotid.robot.families import FAMILIES, Family, Seen
 
-__all__ = ["TENFOLD", "choose_drives", "wanted_families"]
+__all__ = ["TENFOLD", "choose_drives"]
 
 #: Times that terms may make the standard error of another parameter grow, unreported.
 TENFOLD = 10.0
-_OF_MODEL = ("none", "viscous", "coulomb")  # named in ``friction``, and terms of the model
 _GRID = 6  # sizes of a shape that are tried, over its bounds
 _SPAN = 100.0  # from the smallest of them to the largest; a bound beyond is tried, too
 _FAMILIES = 4  # chosen for a joint, at most
@@ -69,45 +67,6 @@ class _Drive:
             for motion, rows in zip(self.motions, self.taken, strict=True)
         ]
         return np.concatenate(parts)
-
-
-def wanted_families(
-    friction: str | Mapping[str, str], joints: Sequence[str]
-) -> dict[str, tuple[str, ...] | None]:
-    """Return the names of the families each joint is to have; None where they are to be chosen.
-
-    Args:
-        friction: "auto", or names of friction with + between them; or that by joint, "*" for all
-            joints that are not named ("auto" if it is left out). Viscous and Coulomb friction are
-            the model's terms.
-        joints: Names of the joints.
-
-    Raises:
-        SettingsError: If a name or a joint is unknown.
-    """
-    wanted_kind = "auto, names of families joined by +, or a table of these by joint"
-    require_kind(friction, (str, Mapping), "friction", wanted_kind)
-    for joint, names in friction.items() if isinstance(friction, Mapping) else ():
-        require_kind(names, str, f"friction of {joint}", wanted_kind)
-    stated = {"*": friction} if isinstance(friction, str) else {"*": AUTO, **friction}
-    strangers = [joint for joint in stated if joint not in (*joints, "*")]
-    if strangers:
-        raise SettingsError(
-            f"friction is stated for {listed(strangers)}, not among the joints to identify: "
-            f"{listed(joints)}"
-        )
-    wanted: dict[str, tuple[str, ...] | None] = {}
-    for joint in joints:
-        names = stated.get(joint, stated["*"])
-        own = [name for name in names.split("+") if name and name not in _OF_MODEL]
-        unknown = [name for name in own if name not in FAMILIES]
-        if names != AUTO and unknown:
-            raise SettingsError(
-                f"friction of {joint} has {listed(unknown)}, wanted auto, or some of "
-                f"{listed(FAMILIES)}"
-            )
-        wanted[joint] = None if names == AUTO else tuple(own)
-    return wanted
 
 
 def choose_drives(

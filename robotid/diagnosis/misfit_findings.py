@@ -8,8 +8,8 @@ from robotid.diagnosis.candidates import Candidate
 from robotid.diagnosis.misfit import Misfit
 from robotid.findings import Finding, listed, toml_key
 from robotid.fitting.result import Fit
-from robotid.robot.drives import DriveTerm, drive_line
-from robotid.robot.families import COUNTERBALANCE, spring_family
+from robotid.robot.drives import DriveTerm
+from robotid.robot.families import COUNTERBALANCE, drive_line, spring_family
 
 __all__ = [
     "counterbalanced",

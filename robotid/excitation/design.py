@@ -21,13 +21,13 @@ from robotid.excitation.clearance import Clearance, Contact
 from robotid.excitation.information import Aim, MotionInformation, MotionRows, criterion
 from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.findings import listed
-from robotid.identification.previews import (
+from robotid.identification.assumptions import (
     CORRELATION,
-    Run,
     assumed_noise,
     assumed_parameters,
     largest_torques,
 )
+from robotid.identification.previews import Run
 from robotid.regressor.adjoint import Poses
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.prediction import predict_instants

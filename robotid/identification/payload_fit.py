@@ -9,7 +9,6 @@ import numpy as np
 
 from robotid._settings import is_number, require_each, require_kind
 from robotid._typing import Array
-from robotid.diagnosis.drive_choice import wanted_families
 from robotid.estimators import Consistent, Constraints, Estimate
 from robotid.estimators.stretches import quantile
 from robotid.estimators.two_runs import Compared, TwoRuns, payload_runs
@@ -25,7 +24,7 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
 from robotid.robot.bodies import link_transfer
 from robotid.robot.drives import DriveTerm
-from robotid.robot.families import AUTO
+from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import (
     ParameterLayout,

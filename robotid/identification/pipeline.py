@@ -10,7 +10,7 @@ import numpy as np
 from robotid._settings import require_flag, require_kind
 from robotid._typing import ProgressCallback, ignore_progress, report_stage
 from robotid.diagnosis.discrepancies import explain_residual
-from robotid.diagnosis.drive_choice import choose_drives, wanted_families
+from robotid.diagnosis.drive_choice import choose_drives
 from robotid.diagnosis.misfit_findings import counterbalanced, settled, with_known_springs
 from robotid.diagnosis.model_error import settled_shapes, with_model_error
 from robotid.diagnosis.sample import take_sample
@@ -36,7 +36,7 @@ from robotid.judgement.verdict import alarming, check_ignored, doubts_of, refute
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.robot.families import AUTO
+from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 
 __all__ = ["conclude", "identify", "robot_of", "with_drives"]

@@ -17,14 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from robotid._settings import is_number, require_kind
+from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.doctor.motions import excitation_finding
 from robotid.estimators import Estimate
 from robotid.estimators.batch import solve_factor
 from robotid.estimators.determination import base_spread, determine
 from robotid.estimators.stretches import FEWEST_STRETCHES, scatter
-from robotid.exceptions import DataError, SettingsError
+from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.fitting.bands import TorqueBand, expected_band
 from robotid.fitting.estimators import Known, consistent_fit
@@ -33,8 +33,14 @@ from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import ConsistentSettings, EstimatorSettings
 from robotid.fitting.standard_errors import StandardErrors, about_prior, standard_of
 from robotid.fitting.survey import SurveyedLog, hold_log
+from robotid.identification.assumptions import (
+    FAINTEST,
+    TorqueNoise,
+    assumed_noise,
+    assumed_parameters,
+    largest_torques,
+)
 from robotid.identification.result import Identification
-from robotid.logs.data import suggestion
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
@@ -45,53 +51,14 @@ from robotid.regressor.used_rows import base_problem, independent_share
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
-__all__ = [
-    "CORRELATION",
-    "Preview",
-    "Run",
-    "TorqueNoise",
-    "assumed_noise",
-    "assumed_parameters",
-    "largest_torques",
-    "preview",
-    "preview_logs",
-]
+__all__ = ["Preview", "Run", "preview", "preview_logs"]
 
-#: Correlation time of noise of which nothing else is known [s].
-CORRELATION = 0.1
-_NOISE = 0.01  # the same of its standard deviation, as a share of the largest torque
-_FRICTION = 0.05  # assumed Coulomb friction, and viscous at full speed, likewise
-_FAINTEST = 1e-3  # of the largest torque of all joints, that of one that carries nothing
 #: The same of a consistent fit's prior where "auto" weighs it, and what is plausible beside that:
 #: the heaviest weight that held-out stretches do not reject, of robots as far from their URDF.
 _WEIGHT = (10.0, 1.0)
 _EXACT = 1e-9  # share of the largest residual that every joint has at least
 _LEAST_FREE = 0.1  # share of a joint's rows that are left to tell its noise, at least
 _IMPULSE = 40.0  # periods of the filter after which nothing is left of an impulse
-
-
-@dataclass(frozen=True, eq=False)
-class TorqueNoise:
-    """How far the torque of each joint lies off the model.
-
-    Attributes:
-        std: Standard deviation of each joint, shape (n,) [N m or N].
-        correlation: Time over which it is correlated, shape (n,) [s]; 0 for white noise.
-        origins: Where it comes from: "stated", "assumed" or "found" in a run before, of each.
-    """
-
-    std: Array
-    correlation: Array
-    origins: tuple[str, ...]
-
-    def density(self, step: float) -> Array:
-        """Return the density of each joint's noise at low frequency, shape (n,) [(N m)^2 s].
-
-        Args:
-            step: Time between independent samples, if it is white [s].
-        """
-        density: Array = self.std**2 * np.maximum(self.correlation, step)
-        return density
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +130,7 @@ class Run:
                 alone = np.where(np.arange(len(sigma)) == j, sigma, np.inf)
                 own = np.diag(bread @ factors.information(alone**-2.0) @ bread)
                 share = own / np.diag(bread)  # of each parameter's variance, by this joint
-                told = share > _FAINTEST
+                told = share > FAINTEST
                 scattered = np.diag(scatter(self.stretches, beta, alone, bread).covariance)
                 ratio = np.log(scattered[told] / own[told])
                 inflation[j] = np.exp(np.average(ratio, weights=share[told]))
@@ -348,48 +315,6 @@ def preview_logs(
     return Preview(expected, noise, before)
 
 
-def assumed_noise(
-    model: RobotModel,
-    size: Array,
-    stated: Mapping[str, float],
-    correlation: float | None = None,
-    found: TorqueNoise | None = None,
-) -> TorqueNoise:
-    """Return the noise of each joint: stated, or that of a run before, or assumed.
-
-    What is assumed is 1 % of the joint's largest torque.
-
-    Args:
-        model: The robot.
-        size: Largest torque of each joint, shape (n,) [N m or N].
-        stated: Standard deviation by joint [N m or N], of those that it is known of.
-        correlation: As of ``preview_logs``.
-        found: That of a run before, if there is one.
-
-    Raises:
-        SettingsError: If a joint is unknown, or a number is not positive.
-    """
-    for joint, value in stated.items():
-        if joint not in model.joints:
-            raise SettingsError(
-                f"noise is stated of {joint!r}, which is not among the joints "
-                f"{listed(model.joints)}{suggestion(str(joint), model.joints)}"
-            )
-        if not (is_number(value) and value > 0):
-            raise SettingsError(f"noise of {joint!r} is {value!r}, wanted a positive number")
-    if correlation is not None and not 0 <= correlation < np.inf:
-        raise SettingsError(f"correlation is {correlation:g} s, wanted 0 (white noise) or more")
-    is_stated = np.isin(model.joints, list(stated))
-    values = np.array([stated.get(joint, np.nan) for joint in model.joints])
-    std = _NOISE * size if found is None else found.std
-    time = np.full(len(size), CORRELATION) if found is None else found.correlation
-    if correlation is not None:
-        time = np.where(is_stated | (found is None), correlation, time)
-    other = "assumed" if found is None else "found"
-    origins = tuple("stated" if known else other for known in is_stated)
-    return TorqueNoise(np.where(is_stated, values, std), time, origins)
-
-
 @dataclass(frozen=True, eq=False)
 class _Information:
     """What recordings say, or will."""
@@ -484,37 +409,6 @@ def _seen(model: RobotModel, motions: Sequence[SurveyedLog]) -> tuple[Array, Arr
     moved = [np.abs(predict(model, [bodies], log.whole.trajectory)[0]) for log in motions]
     peak = np.max([torque.max(axis=0) for torque in moved], axis=0)
     return peak, np.max([np.abs(log.whole.trajectory.v).max(axis=0) for log in motions], axis=0)
-
-
-def largest_torques(model: RobotModel, peak: Array) -> Array:
-    """Return the largest torque of each joint, shape (n,): the URDF's limit, or one that was seen.
-
-    Args:
-        model: The robot.
-        peak: What stands for the limit where the URDF states none, shape (n,) [N m or N].
-    """
-    peak = np.maximum(peak, _FAINTEST * max(float(peak.max()), 1e-300))
-    limit = np.array([joint.effort for joint in model.limits])
-    return np.where(np.isfinite(limit) & (limit > 0), limit, peak)
-
-
-def assumed_parameters(model: RobotModel, size: Array, fastest: Array) -> Array:
-    """Return the URDF's bodies with friction of a usual size, shape (p,).
-
-    Args:
-        model: The robot.
-        size: Largest torque of each joint, shape (n,) [N m or N].
-        fastest: What stands for the largest speed where the URDF states none, shape (n,)
-            [rad/s or m/s].
-    """
-    pi = model.standard_parameters()
-    for j, limits in enumerate(model.limits):
-        speed = limits.velocity if 0 < limits.velocity < np.inf else max(float(fastest[j]), 1e-3)
-        for term, value in (("coulomb", 1.0), ("viscous", 1.0 / speed)):
-            name = f"{model.joints[j]}.{term}"
-            if name in model.layout.names:
-                pi[model.layout.names.index(name)] = _FRICTION * size[j] * value
-    return pi
 
 
 def _expect(log: SurveyedLog, pi: Array) -> None:

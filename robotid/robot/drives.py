@@ -8,7 +8,6 @@ The columns of many terms are guarded: beyond the speeds or positions that the f
 stay as they were at the end of that range, for no data say how they go on.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
@@ -19,7 +18,7 @@ import numpy as np
 from robotid._settings import is_number
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
-from robotid.findings import listed, toml_key
+from robotid.findings import listed
 
 __all__ = [
     "DRIVE_TERMS",
@@ -29,7 +28,6 @@ __all__ = [
     "DriveTerm",
     "Lag",
     "LoadFriction",
-    "drive_line",
     "term_from_dict",
 ]
 
@@ -557,23 +555,6 @@ _CLASSES: dict[str, type[DriveTerm]] = {
         Presliding, LuGre, Spring, Hat, Counterbalance, Lag,
     )
 }  # fmt: skip
-
-
-def drive_line(joint: str, *entries: str | DriveTerm) -> str:
-    """Return the line of a job's [drives] that gives a joint families or terms.
-
-    Args:
-        joint: The joint.
-        entries: Names of families, or terms.
-    """
-    return f"{toml_key(joint)} = [{', '.join(map(_toml_entry, entries))}]"
-
-
-def _toml_entry(entry: str | DriveTerm) -> str:
-    if isinstance(entry, str):
-        return json.dumps(entry)
-    table = {key: value for key, value in entry.to_dict().items() if key != "seen"}
-    return "{ " + ", ".join(f"{key} = {json.dumps(x)}" for key, x in table.items()) + " }"
 
 
 def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:

@@ -1,12 +1,16 @@
 """Families of drive terms, which the friction of joints is chosen from, and their shapes."""
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from robotid._settings import require_kind
 from robotid._typing import Array
+from robotid.exceptions import SettingsError
+from robotid.findings import listed, toml_key
 from robotid.robot.drives import (
     Asymmetric,
     Cubic,
@@ -32,14 +36,17 @@ __all__ = [
     "Family",
     "Seen",
     "Shape",
+    "drive_line",
     "has_turned",
     "spring_family",
+    "wanted_families",
 ]
 
 #: What ``friction`` says to have the families of each joint chosen.
 AUTO = "auto"
 #: Family of a counterbalance that opposes gravity.
 COUNTERBALANCE = "harmonics1"
+_OF_MODEL = ("none", "viscous", "coulomb")  # named in ``friction``, and terms of the model
 
 #: Ranges of position "q" and of the size of speed "v" that a fit has seen.
 Seen = Mapping[str, tuple[float, float]]
@@ -206,3 +213,59 @@ def has_turned(family: str, turned: float) -> bool:
         turned: Range of the joint's positions [rad]; 0 of a prismatic joint.
     """
     return _SPARE * FAMILIES[family].needs * 2 * np.pi <= turned
+
+
+def drive_line(joint: str, *entries: str | DriveTerm) -> str:
+    """Return the line of a job's [drives] that gives a joint families or terms.
+
+    Args:
+        joint: The joint.
+        entries: Names of families, or terms.
+    """
+    return f"{toml_key(joint)} = [{', '.join(map(_toml_entry, entries))}]"
+
+
+def _toml_entry(entry: str | DriveTerm) -> str:
+    if isinstance(entry, str):
+        return json.dumps(entry)
+    table = {key: value for key, value in entry.to_dict().items() if key != "seen"}
+    return "{ " + ", ".join(f"{key} = {json.dumps(x)}" for key, x in table.items()) + " }"
+
+
+def wanted_families(
+    friction: str | Mapping[str, str], joints: Sequence[str]
+) -> dict[str, tuple[str, ...] | None]:
+    """Return the names of the families each joint is to have; None where they are to be chosen.
+
+    Args:
+        friction: "auto", or names of friction with + between them; or that by joint, "*" for all
+            joints that are not named ("auto" if it is left out). Viscous and Coulomb friction are
+            the model's terms.
+        joints: Names of the joints.
+
+    Raises:
+        SettingsError: If a name or a joint is unknown.
+    """
+    wanted_kind = "auto, names of families joined by +, or a table of these by joint"
+    require_kind(friction, (str, Mapping), "friction", wanted_kind)
+    for joint, names in friction.items() if isinstance(friction, Mapping) else ():
+        require_kind(names, str, f"friction of {joint}", wanted_kind)
+    stated = {"*": friction} if isinstance(friction, str) else {"*": AUTO, **friction}
+    strangers = [joint for joint in stated if joint not in (*joints, "*")]
+    if strangers:
+        raise SettingsError(
+            f"friction is stated for {listed(strangers)}, not among the joints to identify: "
+            f"{listed(joints)}"
+        )
+    wanted: dict[str, tuple[str, ...] | None] = {}
+    for joint in joints:
+        names = stated.get(joint, stated["*"])
+        own = [name for name in names.split("+") if name and name not in _OF_MODEL]
+        unknown = [name for name in own if name not in FAMILIES]
+        if names != AUTO and unknown:
+            raise SettingsError(
+                f"friction of {joint} has {listed(unknown)}, wanted auto, or some of "
+                f"{listed(FAMILIES)}"
+            )
+        wanted[joint] = None if names == AUTO else tuple(own)
+    return wanted

@@ -21,7 +21,7 @@ from helpers.driven import (
 from robotid.commands.job import job_from_settings
 from robotid.commands.logs import survey_logs
 from robotid.diagnosis import drive_choice
-from robotid.diagnosis.drive_choice import _chance, choose_drives, wanted_families
+from robotid.diagnosis.drive_choice import _chance, choose_drives
 from robotid.diagnosis.sample import take_sample
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.export.urdf import load_identified, write_urdf
@@ -36,7 +36,7 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.memory import drive_motion_along, remember
 from robotid.regressor.prediction import predict
 from robotid.robot.drives import DriveMotion, Harmonic, LoadFriction, Stribeck, Tanh
-from robotid.robot.families import AUTO, FAMILIES
+from robotid.robot.families import AUTO, FAMILIES, wanted_families
 
 SEED, REACH = 3, 1.5  # of the motion: the elbow turns more than half a turn
 SURE = 2.6  # standard errors, of a few hundred figures that are looked at

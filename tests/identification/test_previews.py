@@ -13,7 +13,8 @@ from robotid.estimators.batch import solve_factor
 from robotid.exceptions import DataError, SettingsError
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
-from robotid.identification.previews import TorqueNoise, assumed_noise, preview
+from robotid.identification.assumptions import TorqueNoise, assumed_noise
+from robotid.identification.previews import preview
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.factors import compress

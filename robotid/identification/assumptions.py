@@ -1,0 +1,126 @@
+"""What is assumed where nothing was recorded: noise of torques, drives of a usual size."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from robotid._settings import is_number
+from robotid._typing import Array
+from robotid.exceptions import SettingsError
+from robotid.findings import listed
+from robotid.logs.data import suggestion
+from robotid.robot.model import RobotModel
+
+__all__ = [
+    "CORRELATION",
+    "FAINTEST",
+    "TorqueNoise",
+    "assumed_noise",
+    "assumed_parameters",
+    "largest_torques",
+]
+
+#: Correlation time of noise of which nothing else is known [s].
+CORRELATION = 0.1
+_NOISE = 0.01  # its standard deviation, as a share of the largest torque
+_FRICTION = 0.05  # assumed Coulomb friction, and viscous at full speed, likewise
+#: Of the largest torque of all joints, that of one that carries nothing.
+FAINTEST = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueNoise:
+    """How far the torque of each joint lies off the model.
+
+    Attributes:
+        std: Standard deviation of each joint, shape (n,) [N m or N].
+        correlation: Time over which it is correlated, shape (n,) [s]; 0 for white noise.
+        origins: Where it comes from: "stated", "assumed" or "found" in a run before, of each.
+    """
+
+    std: Array
+    correlation: Array
+    origins: tuple[str, ...]
+
+    def density(self, step: float) -> Array:
+        """Return the density of each joint's noise at low frequency, shape (n,) [(N m)^2 s].
+
+        Args:
+            step: Time between independent samples, if it is white [s].
+        """
+        density: Array = self.std**2 * np.maximum(self.correlation, step)
+        return density
+
+
+def assumed_noise(
+    model: RobotModel,
+    size: Array,
+    stated: Mapping[str, float],
+    correlation: float | None = None,
+    found: TorqueNoise | None = None,
+) -> TorqueNoise:
+    """Return the noise of each joint: stated, or that of a run before, or assumed.
+
+    What is assumed is 1 % of the joint's largest torque.
+
+    Args:
+        model: The robot.
+        size: Largest torque of each joint, shape (n,) [N m or N].
+        stated: Standard deviation by joint [N m or N], of those that it is known of.
+        correlation: As of ``preview_logs``.
+        found: That of a run before, if there is one.
+
+    Raises:
+        SettingsError: If a joint is unknown, or a number is not positive.
+    """
+    for joint, value in stated.items():
+        if joint not in model.joints:
+            raise SettingsError(
+                f"noise is stated of {joint!r}, which is not among the joints "
+                f"{listed(model.joints)}{suggestion(str(joint), model.joints)}"
+            )
+        if not (is_number(value) and value > 0):
+            raise SettingsError(f"noise of {joint!r} is {value!r}, wanted a positive number")
+    if correlation is not None and not 0 <= correlation < np.inf:
+        raise SettingsError(f"correlation is {correlation:g} s, wanted 0 (white noise) or more")
+    is_stated = np.isin(model.joints, list(stated))
+    values = np.array([stated.get(joint, np.nan) for joint in model.joints])
+    std = _NOISE * size if found is None else found.std
+    time = np.full(len(size), CORRELATION) if found is None else found.correlation
+    if correlation is not None:
+        time = np.where(is_stated | (found is None), correlation, time)
+    other = "assumed" if found is None else "found"
+    origins = tuple("stated" if known else other for known in is_stated)
+    return TorqueNoise(np.where(is_stated, values, std), time, origins)
+
+
+def largest_torques(model: RobotModel, peak: Array) -> Array:
+    """Return the largest torque of each joint, shape (n,): the URDF's limit, or one that was seen.
+
+    Args:
+        model: The robot.
+        peak: What stands for the limit where the URDF states none, shape (n,) [N m or N].
+    """
+    peak = np.maximum(peak, FAINTEST * max(float(peak.max()), 1e-300))
+    limit = np.array([joint.effort for joint in model.limits])
+    return np.where(np.isfinite(limit) & (limit > 0), limit, peak)
+
+
+def assumed_parameters(model: RobotModel, size: Array, fastest: Array) -> Array:
+    """Return the URDF's bodies with friction of a usual size, shape (p,).
+
+    Args:
+        model: The robot.
+        size: Largest torque of each joint, shape (n,) [N m or N].
+        fastest: What stands for the largest speed where the URDF states none, shape (n,)
+            [rad/s or m/s].
+    """
+    pi = model.standard_parameters()
+    for j, limits in enumerate(model.limits):
+        speed = limits.velocity if 0 < limits.velocity < np.inf else max(float(fastest[j]), 1e-3)
+        for term, value in (("coulomb", 1.0), ("viscous", 1.0 / speed)):
+            name = f"{model.joints[j]}.{term}"
+            if name in model.layout.names:
+                pi[model.layout.names.index(name)] = _FRICTION * size[j] * value
+    return pi
