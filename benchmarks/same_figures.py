@@ -64,7 +64,7 @@ def commands(tree, data):
     ):
         yield f"export {form}", ["export", "OUT/../ur10e", "--format", form, "--out", f"OUT/{file}"]
     if go2.is_file():
-        yield "go2", ["identify", "OUT/../go2.job", "--out", "OUT"]
+        yield "go2", ["identify", "OUT/../go2.toml", "--out", "OUT"]
 
 
 GO2 = """urdf = "{urdf}"
@@ -88,7 +88,7 @@ def run(tree, folder, names):
     data = Path(os.environ["ROBOTID_DATA"])
     folder.mkdir()
     log = data / "commands/go2/chirp.parquet"
-    (folder / "go2.job").write_text(GO2.format(urdf=example_urdf("go2.urdf"), log=log))
+    (folder / "go2.toml").write_text(GO2.format(urdf=example_urdf("go2.urdf"), log=log))
     for name, words in commands(tree, data):
         if names and name not in names:
             continue
