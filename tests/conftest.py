@@ -3,6 +3,8 @@ from pathlib import Path
 
 # one thread of BLAS per process, before numpy loads it: the workers of pytest-xdist share the cores
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# programs that tests start compile the package once, not each of them
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import numpy as np
 import pytest
