@@ -21,7 +21,7 @@ from robotid.diagnosis.sample import Sample, along, chance, trials
 from robotid.findings import Finding, listed
 from robotid.fitting.result import Fit
 from robotid.logs.data import Trajectory
-from robotid.regressor.prediction import inverse_dynamics
+from robotid.regressor.prediction import body_slopes, drive_torque, inverse_dynamics
 from robotid.robot.model import RobotModel
 
 __all__ = ["explain_residual"]
@@ -155,9 +155,11 @@ def _refined(applied: _Applied, x: Array, pi: Array, sample: Sample) -> tuple[Ar
 
 def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alteration]:
     """Yield what may be otherwise, with what it would do to the torques of the sample."""
-    n, size = len(model.joints), model.layout.n_inertial
-    bodies = np.where(np.arange(len(pi)) < size, pi, 0.0)
-    tau = _torques(model, pi, sample.at)
+    n = len(model.joints)
+    tau, of_drives = _torques(model, pi, sample.at), _drives(model, pi, sample.at)
+    of_motions = [body_slopes(model, pi, motion).arrays for motion in sample.at]
+    *by_motion, by_gravity, by_origin = map(np.concatenate, zip(*of_motions, strict=True))
+    q, v, a = (np.concatenate([getattr(m, key) for m in sample.at]) for key in "qva")
 
     def moved(scale: Array, shift: Array) -> Array:
         """Return what positions (1 + e scale) q + e shift would change, over e."""
@@ -166,7 +168,9 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
             replace(m, q=factor * m.q + _STEP * shift, v=factor * m.v, a=factor * m.a)
             for m in sample.at
         ]
-        return (_torques(model, pi, change) - tau)[..., None] / _STEP
+        Z = (_drives(model, pi, change) - of_drives) / _STEP
+        states = zip(by_motion, (scale * q + shift, scale * v, scale * a), strict=True)
+        return (Z + sum(np.einsum("kij,kj->ki", D, x) for D, x in states))[..., None]
 
     def offset(joint: int, x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
         """Return the motions with the position of a joint that was x farther."""
@@ -188,8 +192,9 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
         yield _Alteration("torque_scale", ", ".join(model.joints[first:]), Z, 0.05, _gains(names))
     every = moved(np.ones(n), np.zeros(n))
     yield _Alteration("angle_scale", "", every, 0.02, _scale("every position"))
+    bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
     still = [replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in sample.at]
-    inertial = _torques(model, bodies, sample.at) - _torques(model, bodies, still)
+    inertial = tau - of_drives - _torques(model, bodies, still)
     yield _Alteration("time_scale", "", inertial[..., None], 0.04, _clock)
     down = np.array(model.pin_model.gravity.linear)
     if down.any():
@@ -198,19 +203,12 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
         def tilted(x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
             return _pulled(model, _turned(x, across, down)), sample.at
 
-        pulls = [_torques(tilted(_STEP * axis)[0], pi, sample.at) - tau for axis in np.eye(2)]
-        Z = np.stack(pulls, axis=-1) / _STEP
+        Z = by_gravity @ (np.linalg.norm(down) * across).T
         yield _Alteration("gravity", "", Z, 0.05, _tilt(across, down), tilted)
-    origins = [_origins(model, pi, sample, joint, tau) for joint in model.joints]
-    for joint, Z in zip(model.joints, origins, strict=True):
-        yield _Alteration("joint_origin", joint, Z, 0.01, _origin(joint))
-    yield _Alteration("joint_origin", "", np.concatenate(origins, axis=2), 0.01, _origin("a joint"))
-
-
-def _origins(model: RobotModel, pi: Array, sample: Sample, joint: str, tau: Array) -> Array:
-    """Return what moving a joint in the frame of the one before would change, shape (N, n, 3)."""
-    moved = [_torques(_displaced(model, joint, axis), pi, sample.at) for axis in np.eye(3)]
-    return (np.stack(moved, axis=-1) - tau[..., None]) / _STEP
+    for j, joint in enumerate(model.joints):
+        yield _Alteration("joint_origin", joint, by_origin[:, :, j], 0.01, _origin(joint))
+    anywhere = by_origin.reshape(len(tau), n, -1)
+    yield _Alteration("joint_origin", "", anywhere, 0.01, _origin("a joint"))
 
 
 def _torques(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
@@ -218,12 +216,9 @@ def _torques(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
     return np.concatenate([inverse_dynamics(model, pi, motion) for motion in at])
 
 
-def _displaced(model: RobotModel, joint: str, axis: Array) -> RobotModel:
-    """Return the robot with the origin of a joint moved a little along an axis of its parent."""
-    pin_model = model.pin_model.copy()
-    placement = pin_model.jointPlacements[pin_model.getJointId(joint)]
-    placement.translation = placement.translation + _STEP * axis
-    return replace(model, pin_model=pin_model)
+def _drives(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
+    """Return the torques of drives in motions, shape (N, n)."""
+    return np.concatenate([drive_torque(model, pi, motion) for motion in at])
 
 
 def _pulled(model: RobotModel, gravity: Array) -> RobotModel:

@@ -15,8 +15,16 @@ from robotid.regressor.compiled import work_per_sample
 from robotid.regressor.rows import BLOCK, COMPILED, InertialRows, TrajectoryRows, trajectory_rows
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
+from robotid.robot.torque_slopes import TorqueSlopes, torque_slopes
 
-__all__ = ["inverse_dynamics", "predict", "predict_instants", "rigid_parts"]
+__all__ = [
+    "body_slopes",
+    "drive_torque",
+    "inverse_dynamics",
+    "predict",
+    "predict_instants",
+    "rigid_parts",
+]
 
 _START = 5  # work of one call of inverse dynamics beside its joints, as of work_per_sample
 
@@ -196,15 +204,39 @@ def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Ar
     Returns:
         Torques, shape (N, n_rows) [N m, N].
     """
-    m, layout, theta = trajectory, model.layout, pi[model.layout.n_inertial :]
-    added = _making_possible(model, pi)
+    m, added = trajectory, _making_possible(model, pi)
     torque = _newton_euler(model, pi + added, m.q, m.v, m.a)
     if added.any():
         torque -= _newton_euler(model, added, m.q, m.v, m.a)
-    if theta.any():
-        values = trajectory_values(layout, m)
-        torque[:, model.n_rows - len(model.joints) :] += values.T @ (layout.drive_loads * theta).T
+    if pi[model.layout.n_inertial :].any():
+        torque[:, model.n_rows - len(model.joints) :] += drive_torque(model, pi, m)
     return torque
+
+
+def drive_torque(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
+    """Return the torque of the drives' terms alone, shape (N, n) [N m, N].
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,).
+        trajectory: N samples of q, v, a and, if the torque was filtered, direction.
+    """
+    layout, theta = model.layout, pi[model.layout.n_inertial :]
+    torque: Array = trajectory_values(layout, trajectory).T @ (layout.drive_loads * theta).T
+    return torque
+
+
+def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueSlopes:
+    """Return how the torque of the bodies changes with the motion, gravity and origins of joints.
+
+    Args:
+        model: The robot, with a fixed base.
+        pi: Standard parameters, shape (p,), possible ones or not.
+        trajectory: N samples of q, v and a.
+    """
+    state, added = (trajectory.q, trajectory.v, trajectory.a), _making_possible(model, pi)
+    slopes = torque_slopes(model, pi + added, *state)
+    return slopes - torque_slopes(model, added, *state) if added.any() else slopes
 
 
 def _making_possible(model: RobotModel, pi: Array) -> Array:
