@@ -168,9 +168,10 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
             replace(m, q=factor * m.q + _STEP * shift, v=factor * m.v, a=factor * m.a)
             for m in sample.at
         ]
-        Z = (_drives(model, pi, change) - of_drives) / _STEP
-        states = zip(by_motion, (scale * q + shift, scale * v, scale * a), strict=True)
-        return (Z + sum(np.einsum("kij,kj->ki", D, x) for D, x in states))[..., None]
+        Z: Array = (_drives(model, pi, change) - of_drives)[..., None] / _STEP
+        for D, x in zip(by_motion, (scale * q + shift, scale * v, scale * a), strict=True):
+            Z += D @ x[..., None]
+        return Z
 
     def offset(joint: int, x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
         """Return the motions with the position of a joint that was x farther."""

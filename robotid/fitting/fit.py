@@ -158,7 +158,7 @@ class _Ground:
     recordings: Recordings  # their rows weighted if a robust loss was asked for
     whole: Reduction  # what all fitted rows come down to, base parameters
     before: Known  # without them
-    segments: tuple[Factors, ...]  # what the segments of the logs come down to
+    segments: tuple[Factors, ...]  # those of segments of the logs; none of a fit in between
     rough: Estimate  # weighted least squares on them
     determination: Determination  # which base parameters they determine
     grown: float  # by how much a robust loss widens the covariance [-]
@@ -173,21 +173,21 @@ class _Ground:
 def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool) -> _Ground:
     """Reduce the rows, with a robust loss reweighted, to what every estimator stands on."""
     model, mapping = recordings.model, recordings.mapping
-    prior = model.standard_parameters()
-    reductions, grown = recordings.reduce(), 1.0
+    prior, understated = model.standard_parameters(), 1.0
     if choice.is_robust:
-        recordings, reductions, understated = reweigh(recordings, reductions, choice.loss, prior)
-        grown = understated**2
+        recordings, understated = reweigh(recordings, choice.loss, prior)
+    reductions = recordings.reduce(is_cut=is_last)
     reduction = join(reductions)
-    segments = tuple(part.factors for part in reductions if part.factors.rows.any())
+    parts = reductions if is_last else ()
+    segments = tuple(part.factors for part in parts if part.factors.rows.any())
     factors, share = reduction.factors, recordings.share
     spread = prior_spread(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
-    before = Known(prior, spread, share, rough.sigma, segments if is_last else (factors,))
+    before = Known(prior, spread, share, rough.sigma, segments or (factors,))
     known = model.layout.owned_by(choice.bounds.pinned)
     rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
     determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
-    return _Ground(recordings, reduction, before, segments, rough, determination, grown)
+    return _Ground(recordings, reduction, before, segments, rough, determination, understated**2)
 
 
 def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Ground:

@@ -78,8 +78,11 @@ class Recordings:
             checkpoint=None,  # it holds the pieces of the first fit
         )
 
-    def reduce(self) -> tuple[Reduction, ...]:
+    def reduce(self, *, is_cut: bool = True) -> tuple[Reduction, ...]:
         """Reduce the logs to fit.
+
+        Args:
+            is_cut: Whether logs in memory are cut into stretches, which a fit's errors stand on.
 
         Returns:
             One reduction per stretch of a log, in order of time. A stretch of a log in memory is
@@ -91,7 +94,8 @@ class Recordings:
         if self.is_held:
             for log in (*self.fitted, *self.kept):  # refused before any fit
                 keep_inertial_rows(self.model, log.whole.trajectory)
-            return tuple(chain.from_iterable(map(self._stretches, range(len(self.fitted)))))
+            reduced = self._stretches if is_cut else self._whole
+            return tuple(chain.from_iterable(map(reduced, range(len(self.fitted)))))
         plan = self.plan or WorkPlan()
         found = iter(plan.reduce(self.pieces, checkpoint=self.checkpoint))
         reductions = []
@@ -171,3 +175,8 @@ class Recordings:
         for i, factors in enumerate(self.segments(k, motion)):
             part = motion.part(i * length, (i + 1) * length)
             yield Reduction(factors, part.squares, len(part.t))
+
+    def _whole(self, k: int) -> Iterator[Reduction]:
+        """Yield what a log in memory comes down to."""
+        motion = self.fitted[k].whole.trajectory
+        yield Reduction.of(self._problem(k, motion), motion)

@@ -12,7 +12,7 @@ from robotid.estimators import WLS
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.recordings import Recordings
-from robotid.regressor.factors import Reduction, join
+from robotid.regressor.factors import join
 from robotid.regressor.prediction import predict
 from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
@@ -84,9 +84,7 @@ def loss_slope(loss: str, r: Array) -> Array:
     return slope
 
 
-def reweigh(
-    recordings: Recordings, reductions: tuple[Reduction, ...], loss: str, prior: Array
-) -> tuple[Recordings, tuple[Reduction, ...], float]:
+def reweigh(recordings: Recordings, loss: str, prior: Array) -> tuple[Recordings, float]:
     """Weigh rows down that fit badly, until the fit does not change any more.
 
     The scale of each joint's residual is its median absolute deviation, which outliers hardly move.
@@ -94,13 +92,12 @@ def reweigh(
 
     Args:
         recordings: The recordings, in memory.
-        reductions: What they come down to without weights.
         loss: "huber" or "tukey".
         prior: Standard parameters of the URDF, shape (p,), kept where the data say nothing.
 
     Returns:
-        The recordings with their rows' weights, what the weighted rows come down to, and by how
-        much they understate standard errors [-].
+        The recordings with their rows' weights, and by how much the weighted rows understate
+        standard errors [-].
 
     Raises:
         NotConvergedError: If the weights do not settle.
@@ -116,7 +113,7 @@ def reweigh(
     for stage in ("huber",) if loss == "huber" else ("huber", "tukey"):
         before = None
         for _ in range(_MAX_ITERATIONS):
-            fit = wls.fit(join(reductions).factors)
+            fit = wls.fit(join(weighted.reduce(is_cut=False)).factors)
             if before is not None:
                 moved = np.abs(fit.theta - before) / np.maximum(fit.std_error, 1e-300)
                 if moved.max() < _TOLERANCE:
@@ -124,7 +121,6 @@ def reweigh(
             before = fit.theta
             residuals = _scaled_residuals(recordings, mapping.to_standard(fit.theta, prior))
             weighted = replace(recordings, weights=tuple(loss_weight(stage, r) for r in residuals))
-            reductions = weighted.reduce()
         else:
             raise NotConvergedError(
                 f"the weights of the {stage} loss still change after {_MAX_ITERATIONS} passes; "
@@ -135,7 +131,7 @@ def reweigh(
     scaled = np.concatenate([r.ravel() for r in residuals])[used]
     weight = loss_weight(loss, scaled)
     slope = max(float(loss_slope(loss, scaled).mean()), 1e-3)
-    return weighted, reductions, float(weight.mean()) / slope
+    return weighted, float(weight.mean()) / slope
 
 
 def find_outliers(

@@ -33,12 +33,14 @@ class Triangle:
     def __init__(self, columns: int) -> None:
         """Begin with no rows of so many columns."""
         self.R = np.zeros((columns, columns), order="F")
+        self._is_empty = True
         self._panel = min(_PANEL if columns < _WIDE else _WIDE_PANEL, columns)
         self._scratch = np.empty(2 * self._panel * columns)
         # m, n, l, nb, lda, ldb, ldt, info
         self._sizes = np.array(
             [0, columns, 0, self._panel, columns, 0, self._panel, 0], dtype=np.intc
         )
+        self._begin = self.R.ctypes.data
         self._addresses = self._list_addresses()
 
     def fold(self, rows: Array) -> None:
@@ -60,6 +62,12 @@ class Triangle:
             other: Upper triangular factor, shape (m, m).
             places: Which of the c columns it has, shape (m,), ascending.
         """
+        if len(places) == len(self.R):
+            if self._is_empty:
+                self.R[:], self._is_empty = other, False
+            else:
+                self._fold(other.copy(order="F"), 0, len(other))
+            return
         first = int(places[0])
         rows = np.zeros((len(places), len(self.R) - first), order="F")
         rows[:, places - first] = other
@@ -69,6 +77,7 @@ class Triangle:
         """Fold rows that begin at a column, the last ones of them upper trapezoidal."""
         if len(rows) == 0:
             return
+        self._is_empty = False
         call, width = _dtpqrt(), rows.shape[1]
         panel = min(self._panel, width)
         if call is None:
@@ -78,7 +87,7 @@ class Triangle:
         ldb = max(len(rows), rows.strides[1] // rows.itemsize)
         self._sizes[:4] = len(rows), width, triangular, panel
         self._sizes[5] = ldb
-        self._addresses[4] = self.R.ctypes.data + first * (len(self.R) + 1) * self.R.itemsize
+        self._addresses[4] = self._begin + first * (len(self.R) + 1) * self.R.itemsize
         self._addresses[6] = rows.ctypes.data
         call(*self._addresses)
 
@@ -89,7 +98,7 @@ class Triangle:
             sizes, sizes + self._sizes.nbytes, self._sizes.itemsize
         )
         T, work = scratch, scratch + self._scratch.nbytes // 2
-        return [m, n, pentagon, nb, self.R.ctypes.data, lda, 0, ldb, T, ldt, work, info]
+        return [m, n, pentagon, nb, self._begin, lda, 0, ldb, T, ldt, work, info]
 
 
 @cache

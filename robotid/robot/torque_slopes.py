@@ -72,19 +72,19 @@ def torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) ->
         configurations[:, to : to + size] = known[:, here : here + size]
     rates, changes = np.zeros((2, len(v), sliding.nv))
     rates[:, own], changes[:, own] = v @ G.T, a @ G.T
-    D = np.empty((3, len(q), len(own), sliding.nv))
+    slopes = np.empty((3, len(q), len(own), sliding.nv))
     derive, data = pin.computeRNEADerivatives, sliding.createData()
     states = zip(configurations, rates, changes, strict=True)
-    for D_q, D_v, D_a, state in zip(*D, states, strict=True):
+    for D_q, D_v, D_a, state in zip(*slopes, states, strict=True):
         by_q, by_v, by_a = derive(sliding, data, *state)
         D_q[:], D_v[:], D_a[:] = by_q[own], by_v[own], by_a[own]
-    D = G.T @ D  # tau = G^T tau_pinocchio
-    by_motion = D[..., own] @ G
+    D: Array = G.T @ slopes  # tau = G^T tau_pinocchio
+    by_q, by_v, by_a = D[..., own] @ G
     leaders = np.array([plain.getJointId(name) - 1 for name in model.joints])
     axes = before[leaders][:, None] + np.arange(3)
     roots = before[[plain.parents[i] == 0 for i in range(1, plain.njoints)]]
     falling = sum(D[2][..., root : root + 3] for root in roots)  # as the base is accelerated
-    return TorqueSlopes(*by_motion, by_gravity=-falling, by_origin=D[0][..., axes])
+    return TorqueSlopes(by_q, by_v, by_a, -falling, D[0][..., axes])
 
 
 def _with_sliding_origins(model: pin.Model) -> tuple[pin.Model, list[int]]:

@@ -8,7 +8,16 @@ import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, NotConvergedError
-from robotid.robot.drives import Bristles, DriveMotion, DriveTerm, Lag, LoadFriction
+from robotid.robot.drives import (
+    Bristles,
+    Coulomb,
+    DriveMotion,
+    DriveTerm,
+    Lag,
+    LoadFriction,
+    Offset,
+    Viscous,
+)
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
@@ -16,6 +25,7 @@ __all__ = ["Friction", "RobotPlant", "rk4"]
 
 _ITERATIONS = 200  # of the load and its friction, which shrink by the size of the parameter
 _SETTLED = 1e-12  # relative change of the load that ends them
+_SIMPLE = (Coulomb, Viscous, Offset)
 _SIGN_SPEED = 2e-4  # [rad/s or m/s] speed over which the plant's Coulomb friction changes sign
 
 
@@ -79,7 +89,7 @@ class RobotPlant:
         self.armature = drive_inertia(model.layout, pi)  # (n, n)
         self.ratios = model.layout.drive_ratios  # (d, n)
         self._share = self.ratios / np.sum(self.ratios**2, axis=1, keepdims=True).clip(min=1e-300)
-        self._groups = _grouped(model, pi)
+        self._simple, self._groups = _grouped(model, pi)
         self.n_states = sum(g.states.stop - g.states.start for g in self._groups)
         self.is_loaded = any(isinstance(g.term, LoadFriction) for g in self._groups)
         G, A = model.velocity_map, self.armature
@@ -138,7 +148,8 @@ class RobotPlant:
             z: What presliding has taken up, shape (n_states,) [-]; None: drives that have slid.
         """
         angle, w = self.ratios @ q, self.ratios @ v
-        along, rest, loaded = np.zeros((3, len(w)))
+        coulomb, viscous, offset = self._simple
+        along, rest, loaded = coulomb.copy(), viscous * w + offset, np.zeros(len(w))
         for group in self._groups:
             term = group.term
             if z is not None and isinstance(term, Bristles):
@@ -262,12 +273,18 @@ class RobotPlant:
         return x
 
 
-def _grouped(model: RobotModel, pi: Array) -> tuple[_Group, ...]:
-    """Return the terms of the drives that are neither inertia nor of what is measured."""
-    theta = pi[model.layout.n_inertial :]
+def _grouped(model: RobotModel, pi: Array) -> tuple[Array, tuple[_Group, ...]]:
+    """Return the terms of the drives that are neither inertia nor of what is measured.
+
+    First Coulomb, viscous friction and offset of each drive, shape (3, d), whose columns need no
+    motion but the speed itself; then the others.
+    """
+    theta, simple = pi[model.layout.n_inertial :], np.zeros((3, len(model.layout.drives)))
     terms: dict[DriveTerm, list[int]] = {}
-    for k, (_, term) in enumerate(model.layout.drive_parameters):
-        if theta[k] != 0.0 and not term.is_inertia and not isinstance(term, Lag):
+    for k, (d, term) in enumerate(model.layout.drive_parameters):
+        if type(term) in _SIMPLE:
+            simple[_SIMPLE.index(type(term)), d] += theta[k]
+        elif theta[k] != 0.0 and not term.is_inertia and not isinstance(term, Lag):
             terms.setdefault(term, []).append(k)
     groups, states = [], 0
     for term, numbers in terms.items():
@@ -285,7 +302,7 @@ def _grouped(model: RobotModel, pi: Array) -> tuple[_Group, ...]:
             )
         )
         states += more
-    return tuple(groups)
+    return simple, tuple(groups)
 
 
 def rk4(
