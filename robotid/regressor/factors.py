@@ -95,7 +95,7 @@ class Factors:
         c = len(self.names)
         folded, everything = [Triangle(len(own) + 1) for own in self.columns], Triangle(c + 1)
         for total, own, level in zip(folded, self.triangles, sigma, strict=True):
-            total.R[:] = own / level
+            total.fold_triangle(own / level, np.arange(len(own)))
         for j, k in self._carriers:
             columns = np.append(self.columns[j], c)
             if k is None:

@@ -27,7 +27,7 @@ class Triangle:
     It is changed in place, against the house's habit: it is the innermost loop.
 
     Attributes:
-        R: Upper triangular factor of all rows so far, shape (c, c), column-major.
+        R: Upper triangular factor of all rows so far, shape (c, c), column-major; to be read only.
     """
 
     def __init__(self, columns: int) -> None:

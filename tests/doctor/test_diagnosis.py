@@ -53,7 +53,8 @@ def spoil(name, table, folder):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_clean_log_gives_no_more_than_notes(name):
     model = robot(name)
-    findings = diagnose(model, [clean_log(model, 1, rate=50.0)], [], SIGNALS)
+    log = clean_log(model, 1, rate=50.0, controller="feedforward")
+    findings = diagnose(model, [log], [], SIGNALS)
     assert loud(findings) == set()
     assert {"rate", "noise", "excitation"} <= {f.code for f in findings}
 

@@ -9,6 +9,7 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.closed_loop import Noise, another_robot, simulate
 from robotid.simulation.motions import random_fourier
+from robotid.simulation.settings import Controller, Simulation
 
 NOISE = Noise(q=2e-5, v=2e-4, tau=0.02)
 ROBOTS = {
@@ -23,12 +24,20 @@ def robot(name, **options):
     return RobotModel.from_urdf(example_urdf(file), joints=joints, **options)
 
 
-def clean_log(model, seed, *, pi=None, rate=100.0, duration=20.0, path="run.csv"):
-    """Simulate a robot like the model, but with other masses, a tool, friction and noise."""
+def clean_log(
+    model, seed, *, pi=None, rate=100.0, duration=20.0, path="run.csv", controller="perfect"
+):
+    """Return the log of a robot like the model, but with other masses, a tool, friction and noise.
+
+    It follows its motion exactly, unless a controller is named that has to make it do so.
+    """
     rng = np.random.default_rng(seed)
     truth = another_robot(model, rng) if pi is None else pi
     motion = random_fourier(model, rng, period=duration / 2)
-    log = simulate(model, truth, motion, rate=rate, duration=duration, rng=rng, noise=NOISE)
+    settings = Simulation(controller=Controller(controller))
+    log = simulate(
+        model, truth, motion, rate=rate, duration=duration, rng=rng, noise=NOISE, settings=settings
+    )
     return replace(log, path=path)
 
 
