@@ -14,7 +14,7 @@ _CREASE = np.radians(30.0)  # faces that meet at a sharper angle than this show 
 _WELD = 1e-6  # corners this near are one, over the size of the largest surface
 # whether rims stay, and how fast the bound on the error grows, until few enough are left
 _ATTEMPTS = ((True, 3.0), (False, 3.0), (False, 7.0))
-_APART = 3.0  # distance between solids that are simplified together, over their size
+_APART = 3.0  # distance between patches that are simplified together, over their size
 
 
 def thin(solids: Sequence[Sequence[Surface]], most: int) -> list[list[Surface]]:
@@ -45,14 +45,16 @@ def thin(solids: Sequence[Sequence[Surface]], most: int) -> list[list[Surface]]:
     if not len(F):  # all triangles are flat
         return [[] for _ in solids]
     F = _oriented(V, F)
-    of_vertex = np.rint(np.bincount(which, of_vertex) / np.bincount(which))
-    apart = np.array([_APART * size, 0.0, 0.0])  # of solids that lie in the same place
-    V, F, patch = _simplified((V + of_vertex[:, None] * apart) / size, F, patch, most)
+    V, F, patch = _simplified(V / size, F, patch, most)
+    of_vertex = np.zeros(len(V), dtype=int)
+    of_vertex[F] = solid[patch][:, None]
+    which, V = _cells(size * V, of_vertex, _WELD * size)
+    F, patch = _proper(which[F], patch)
     is_open = np.unique(solid[patch[_open_faces(F)]])
-    left = []
-    for k, p in enumerate(patches):
-        own = Surface(size * V - solid[k] * apart, F[patch == k], p.rgba, solid[k] not in is_open)
-        left.append(_creased(own))
+    left = [
+        _creased(Surface(V, F[patch == k], p.rgba, solid[k] not in is_open))
+        for k, p in enumerate(patches)
+    ]
     return [[s for s, k in zip(left, solid, strict=True) if k == i] for i in range(len(solids))]
 
 
@@ -123,16 +125,20 @@ def _oriented(V: Array, F: Array) -> Array:
 
 
 def _simplified(V: Array, F: Array, patch: Array, most: int) -> tuple[Array, Array, Array]:
-    """Return corners, at most so many triangles, and the patch of the nearest one before.
+    """Return corners, at most so many triangles, and their patches; no two share a corner.
 
-    Rims stay where they are, unless too many triangles would be left. The library's bound on the
-    error grows from round to round, and is that of corners in units of the largest surface.
+    Rims of patches stay where they are, so that neighbours still meet, unless too many triangles
+    would be left. The library's bound on the error is of corners that are about 1 in size.
     """
     import fast_simplification
     from scipy.spatial import cKDTree
 
     if len(F) <= most:
         return V, F, patch
+    own, F = np.unique(F + len(V) * patch[:, None], return_inverse=True)  # corners of patches
+    number, corner = np.divmod(own, len(V))
+    apart = np.array([_APART, 0.0, 0.0])
+    V = V[corner] + number[:, None] * apart  # the library knows nothing of patches
     for keeps_rims, step in _ATTEMPTS:
         places, faces = fast_simplification.simplify(
             V, F.astype(np.int32), target_count=most, preserve_border=keeps_rims, agg=step
@@ -140,7 +146,10 @@ def _simplified(V: Array, F: Array, patch: Array, most: int) -> tuple[Array, Arr
         if len(faces) <= most:
             break
     nearest = cKDTree(V[F].mean(axis=1)).query(places[faces].mean(axis=1))[1]
-    return places, faces.astype(np.int64), patch[nearest]
+    patch = patch[nearest]
+    number = np.zeros(len(places), dtype=int)
+    number[faces] = patch[:, None]
+    return places - number[:, None] * apart, faces.astype(np.int64), patch
 
 
 def _creased(surface: Surface) -> Surface:
