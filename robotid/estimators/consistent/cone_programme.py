@@ -1,5 +1,6 @@
 """The convex programme of a consistent fit: data and prior over the cone, at any weight."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -71,19 +72,42 @@ class Programme:
         Raises:
             NotConvergedError: If it is not solved.
         """
+        starts = None if start is None else [start]
+        return self.minimise_each(rows[None], weight, is_exact=is_exact, starts=starts)[0]
+
+    def minimise_each(
+        self,
+        rows: Array,
+        weight: float,
+        *,
+        is_exact: bool = True,
+        starts: Sequence[ConeSolution] | None = None,
+    ) -> list[ConeSolution]:
+        """Return the minimum of each data set, as of ``minimise``, in one pass.
+
+        Args:
+            rows: Information on the base parameters, shape (f, k, b + 1).
+            weight: Weight of the penalty [-].
+            is_exact: Whether to solve beyond 1e-3 standard deviations.
+            starts: Minima of nearly the same rows, or at another weight.
+
+        Raises:
+            NotConvergedError: If one is not solved.
+        """
         if not isinstance(self.penalty, Entropic):
-            return self.expanded(rows, weight, self.penalty.centre, is_exact=is_exact)
+            centre = self.penalty.centre
+            return [self.expanded(own, weight, centre, is_exact=is_exact) for own in rows]
         tolerance = _EXACT if is_exact else _ROUGH
-        if start is not None:
-            start = replace(start, x=start.x / self.scale)
-        A, d = rows[:, :-1] @ self.K * self.scale, rows[:, -1]
+        if starts is not None:
+            starts = [replace(start, x=start.x / self.scale) for start in starts]
+        A, d = rows[:, :, :-1] @ (self.K * self.scale), rows[:, :, -1]
         try:
-            solution = self._entropic.minimise(A, d, weight, tolerance, start)
+            solutions = self._entropic.minimise(A, d, weight, tolerance, starts)
         except NotConvergedError:
             # the cone solver knows whether the bounds leave room for possible bodies
-            self.expanded(rows, weight, self.penalty.centre, within=self.cone)
+            self.expanded(rows[0], weight, self.penalty.centre, within=self.cone)
             raise
-        return replace(solution, x=solution.x * self.scale)
+        return [replace(solution, x=solution.x * self.scale) for solution in solutions]
 
     @cached_property
     def _entropic(self) -> EntropicProblem:
