@@ -285,9 +285,11 @@ def _score(
     baselines = {x: torques[x] for x in ("gravity_only", *moving) if x in torques}
     shown: tuple[_Shown, ...] = ()
     if whole.shown is not None and len(motion.t):
-        part = slice(*whole.shown.indices(len(motion.t)))
-        kept = {name: torque[part] for name, torque in torques.items()}
-        shown = ((motion.part(part.start, part.stop), mask[part], kept),)
+        start, stop, _ = whole.shown.indices(len(motion.t))
+        kept = {name: torque[start:stop] for name, torque in torques.items()}
+        # all of it as it is, with what was computed of it
+        seen = motion if stop - start == len(motion.t) else motion.part(start, stop)
+        shown = ((seen, mask[start:stop], kept),)
     recorded = np.hstack([rows.positions, rows.torques])
     return _Score(
         sums={x: TorqueSums.of(motion.tau, torques[x], mask, baselines) for x in parameters},
@@ -345,6 +347,8 @@ def _conclude(log: SurveyedLog, score: _Score, is_refitted: bool = False) -> Eva
 
 def _joined(motions: Sequence[Trajectory]) -> Trajectory:
     """Return motions one after the other; what is shown never joins what is not beside it."""
+    if len(motions) == 1:
+        return motions[0]
     segments, number = [], 0
     for motion in motions:
         segments.append(np.unique(motion.segment, return_inverse=True)[1] + number)
@@ -352,7 +356,7 @@ def _joined(motions: Sequence[Trajectory]) -> Trajectory:
     joined: dict[str, Any] = {
         key: np.concatenate([getattr(motion, key) for motion in motions])
         for key in ("t", "q", "v", "a", "tau", "direction", "memory")
-        if len(motions) > 1 and getattr(motions[0], key) is not None
+        if getattr(motions[0], key) is not None
     }
     return replace(motions[0], **joined, segment=np.concatenate(segments))
 
