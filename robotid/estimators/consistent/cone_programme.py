@@ -18,6 +18,7 @@ __all__ = ["Programme"]
 
 _EXACT = 1e-12  # decrease of the objective by another step at which a fit is exact, relative
 _ROUGH = 1e-6  # ... and at which it will do for a prediction
+_TOGETHER = 2**17  # numbers of data sets that are fitted in one pass: more leave a cache
 _NOISE_STEPS, _NOISE_SETTLED = 50, 1e-4  # a noise level need not be known better
 _FLOOR = 1e-6  # smallest noise level, as a share of the torque: noise-free data have none
 _LEAST_FREEDOM = 0.1  # share of the rows that are left to tell the noise
@@ -101,8 +102,12 @@ class Programme:
         if starts is not None:
             starts = [replace(start, x=start.x / self.scale) for start in starts]
         A, d = rows[:, :, :-1] @ (self.K * self.scale), rows[:, :, -1]
+        solutions: list[ConeSolution] = []
+        most = max(1, _TOGETHER // A[0].size)
         try:
-            solutions = self._entropic.minimise(A, d, weight, tolerance, starts)
+            for k in (slice(first, first + most) for first in range(0, len(A), most)):
+                near = None if starts is None else starts[k]
+                solutions += self._entropic.minimise(A[k], d[k], weight, tolerance, near)
         except NotConvergedError:
             # the cone solver knows whether the bounds leave room for possible bodies
             self.expanded(rows[0], weight, self.penalty.centre, within=self.cone)
