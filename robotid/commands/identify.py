@@ -140,11 +140,11 @@ def _write(
         outputs = {}
         written = {"urdf": name, "sidecar": sidecar} if identification.has_urdf else {}
         if job.report:
+            identification = replace(identification, report=str(target / report))
             links = {"result": "result.json", **written, **(beside or {})}
             origin = Origin(tuple(source), str(target))
             write_report(identification, partial / report, files=links, origin=origin)
             outputs["report"] = report
-            identification = replace(identification, report=str(target / report))
         if written:
             model, pi = identification.model, identification.standard
             moments = fitted_moments(identification) if job.dynamics else {}

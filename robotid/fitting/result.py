@@ -38,7 +38,7 @@ from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-__all__ = ["SOURCES", "Fit"]
+__all__ = ["SOURCES", "Fit", "Solution"]
 
 #: What may have determined a standard parameter.
 SOURCES = ("data", "mixed", "prior", "bound")
@@ -50,51 +50,62 @@ _STAYED = 0.3  # spreads that such a parameter may have moved
 _AT_BOUND = 1e-6  # of its spread: a drive term that small is at its bound of 0
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A robot's parameters as fitted to recordings, before anything is concluded of them.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Solution:
+    """A robot's parameters as fitted to recordings, before their errors are known.
 
     Attributes:
         model: The robot as the URDF describes it.
         mapping: Standard to base parameters.
+        prior_std: How far parameters may plausibly be wrong before the data, shape (p,).
+        standard: Standard parameters, shape (p,).
+        fitted: The recordings that were fitted.
+        validation: Those that were kept apart.
+        drives: What friction its joints have beside viscous and Coulomb's, and what was tried.
+    """
+
+    model: RobotModel
+    mapping: BaseMapping
+    prior_std: Array
+    standard: Array
+    fitted: tuple[Evaluation, ...]
+    validation: tuple[Evaluation, ...]
+    drives: tuple[DriveChoice, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fit(Solution):
+    """A robot's parameters as fitted to recordings, before anything is concluded of them.
+
+    Its recordings have predictions "estimate" and "wls".
+
+    Attributes:
         estimator: The estimator's settings.
         estimate: What the estimator returned: base parameters, or standard ones ("consistent").
         wls: Weighted least squares on the same factors, base parameters.
         prior: Standard parameters of the URDF, shape (p,).
         urdf_with_drives: The same with the drive terms that then fit best, shape (p,).
-        prior_std: How far they may plausibly be wrong, shape (p,).
-        standard: Standard parameters, shape (p,).
         standard_covariance: Their covariance given the prior, shape (p, p).
         base: Base parameters, shape (b,).
         base_error: Their standard errors, shape (b,); inf where the data say nothing.
-        fitted: The recordings that were fitted, with predictions "estimate" and "wls".
-        validation: The same of the recordings that were kept apart.
         errors: What the standard errors rest on.
         factors: What the fitted rows come down to, base parameters.
         determination: Which base parameters the fitted rows determine.
-        drives: What friction its joints have beside viscous and Coulomb's, and what was tried.
         open_terms: What is open of its drives, which ``standard_covariance`` counts.
         regressor_noise: What the steps of the positions do to least squares; None: next to nothing.
     """
 
-    model: RobotModel
-    mapping: BaseMapping
     estimator: EstimatorSettings
     estimate: Estimate
     wls: Estimate
     prior: Array
     urdf_with_drives: Array
-    prior_std: Array
-    standard: Array
     standard_covariance: Array
     base: Array
     base_error: Array
-    fitted: tuple[Evaluation, ...]
-    validation: tuple[Evaluation, ...]
     errors: StandardErrors
     factors: Factors
     determination: Determination
-    drives: tuple[DriveChoice, ...] = ()
     open_terms: tuple[OpenTerm, ...] = ()
     regressor_noise: RegressorNoise | None = None
     _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
