@@ -8,16 +8,16 @@ from typing import Any
 from robotid._files import check_file, file_sha256
 from robotid._typing import ProgressCallback, report_stage
 from robotid.commanded.errors import run_open_loop
-from robotid.commands.commanded import log_of_commands
 from robotid.commands.identify import identify_job
 from robotid.commands.job import Job, job_from_settings
+from robotid.commands.logs import log_of_commands
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.result import Result, load_result
 from robotid.findings import listed
 from robotid.identification.result import Identification
 from robotid.report.advice import Origin
-from robotid.report.commanded_page import Followed, write_commanded_report
 from robotid.report.document import write_report
+from robotid.report.loop_page import Followed, write_loop_report
 from robotid.simulation.loops import LoopedRobot, open_loops
 from robotid.versions import versions
 from robotid.workers.plan import WorkPlan
@@ -72,9 +72,7 @@ def rewrite_report(
     }
     origin = Origin((), str(folder))
     if found is None:
-        write_commanded_report(
-            content, followed_logs(loaded, job), goal, files=files, origin=origin
-        )
+        write_loop_report(content, followed_logs(loaded, job), goal, files=files, origin=origin)
     else:
         write_report(found, goal, files=files, origin=origin)
     return {"result": str(loaded.path), "report": str(goal)}

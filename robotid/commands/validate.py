@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 
 from robotid._files import file_sha256
-from robotid.commanded.errors import run_open_loop
-from robotid.commanded.open_loop_verdict import judge_open_loops
-from robotid.commands.commanded import log_of_commands
+from robotid.commanded.errors import position_metrics, run_open_loop
 from robotid.commands.job import Job, LogEntry, job_from_settings
-from robotid.commands.logs import survey_logs
+from robotid.commands.logs import log_of_commands, survey_logs
 from robotid.doctor.diagnosis import diagnose
 from robotid.export.commanded import loops_of
-from robotid.export.commanded_entries import open_loop_entry
 from robotid.export.entries import recording_metrics
+from robotid.export.loops import open_loop_entry
 from robotid.export.result import (
     Result,
     load_result,
@@ -34,6 +32,7 @@ from robotid.fitting.evaluation import (
 )
 from robotid.fitting.metrics import Metrics
 from robotid.fitting.survey import SurveyedLog
+from robotid.judgement.positions import judge_positions
 from robotid.judgement.verdict import Doubt, Verdict, alarming, doubts_of, judge
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
@@ -98,8 +97,11 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
     hashes = {i["sha256"] for i in loaded.content["inputs"] if i["role"] == "identification"}
     is_kept = not any(file_sha256(entry.path) in hashes for entry in entries)
     alarms = alarming(diagnose(model, (), logs, job.signals), job.ignore)
-    verdict = judge_open_loops(
-        model.joints, runs, is_kept=is_kept, alarms=[finding.message for finding in alarms]
+    verdict = judge_positions(
+        position_metrics(model, runs, moving=True),
+        model.joints,
+        is_kept=is_kept,
+        alarms=[finding.message for finding in alarms],
     )
     return {
         "result": str(loaded.path),

@@ -9,7 +9,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
-from robotid.logs.data import Log, Trajectory
+from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 from robotid.simulation.loops import LoopedRobot, Loops, cut_windows, open_loops
@@ -19,11 +19,9 @@ __all__ = [
     "commanded_drives",
     "follow_commands",
     "limit_of",
-    "logged_motion",
     "loops_of",
 ]
 
-_GAP = 3.0  # median steps: across a longer one no speed is computed
 #: Parameters of a joint's controller, 0 where a result has none.
 _OF_CONTROLLER = ("kd", "delay", "zero")
 _OF_DRIVE = ("armature", "viscous", "coulomb", "offset")
@@ -169,21 +167,3 @@ def limit_of(drive: CommandedDrive, joint: Joint) -> float:
         joint: Its joint as the URDF describes it.
     """
     return min(drive.effort_limit, joint.effort if joint.effort > 0 else np.inf)
-
-
-def logged_motion(log: Log) -> Trajectory:
-    """Return the motion of a log of commands: positions, and their differences over time.
-
-    Args:
-        log: The log, of N samples; accelerations and torques of its motion are 0.
-    """
-    still = np.zeros_like(log.q)
-    dt = np.diff(log.t)
-    gaps = dt > _GAP * np.median(dt)
-    segment = np.append(0, np.cumsum(gaps))
-    v = still.copy()
-    for k in range(segment[-1] + 1):
-        rows = np.flatnonzero(segment == k)
-        if len(rows) > 1:
-            v[rows] = np.gradient(log.q[rows], log.t[rows], axis=0)
-    return Trajectory(log.t, log.q, v, still, still, log.joints, None, segment)

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from robotid._files import write_text
 from robotid._settings import require_each, require_kind
+from robotid.commanded.result import LoopIdentification
+from robotid.export.entries import build_result
 from robotid.findings import listed
 from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.metrics import JointMetrics, Metrics
@@ -31,6 +33,7 @@ from robotid.report.diagnosis import (
     information_section,
     residual_section,
 )
+from robotid.report.loop_page import followed_logs, write_loop_report
 from robotid.report.summary_screen import summary_screen
 from robotid.report.tables import tables
 from robotid.report.torques import torques_section
@@ -41,7 +44,7 @@ __all__ = ["write_report"]
 
 
 def write_report(
-    identification: Identification,
+    identification: Identification | LoopIdentification,
     target: str | Path,
     *,
     files: Mapping[str, str] | None = None,
@@ -64,12 +67,16 @@ def write_report(
     Raises:
         DataError: If the folder of the target does not exist.
     """
-    require_kind(identification, Identification, "identification", "a robotid.Identification")
+    kinds = (Identification, LoopIdentification)
+    require_kind(identification, kinds, "identification", "a robotid.Identification")
     require_kind(target, (str, Path), "target", "the path of a page to write")
     require_kind(files, (Mapping, type(None)), "files", "a table of file names")
     for what, name in (files or {}).items():
         require_each([what, name], str, "an entry of files", "text, and the name of a file")
     require_kind(origin, (Origin, type(None)), "origin", "an Origin")
+    if isinstance(identification, LoopIdentification):
+        content, logs = build_result(identification, {}), followed_logs(identification)
+        return write_loop_report(content, logs, target, files=files, origin=origin)
     found, made = identification, tables(identification)
     header = summary_screen(found, origin or Origin(), files or {}) + _made(found)
     joints = len(found.verdict.joints)

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from html import escape
 
+from robotid.fitting.identified import SOURCES
 from robotid.fitting.metrics import JointMetrics
-from robotid.fitting.result import SOURCES
 from robotid.identification.result import Identification
 from robotid.identification.summary import joint_reason
 from robotid.judgement.verdict import GOOD, POOR, JointVerdict

@@ -12,8 +12,8 @@ from robotid._files import file_sha256
 from robotid.export.urdf import urdf_changes
 from robotid.findings import listed
 from robotid.fitting.evaluation import Recording
+from robotid.fitting.identified import SOURCES
 from robotid.fitting.parameter_table import correlated_parameters
-from robotid.fitting.result import SOURCES
 from robotid.identification.result import Identification
 from robotid.pages.html import Cell, code, number, percent, table, text, with_error
 from robotid.report.summary_screen import DETERMINED

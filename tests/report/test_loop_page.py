@@ -11,7 +11,7 @@ from helpers.pages import chart, charts, tables
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.report.advice import Origin
-from robotid.report.commanded_page import Followed, _undetermined, write_commanded_report
+from robotid.report.loop_page import Followed, _undetermined, write_loop_report
 
 ERRORS = {"rmse": (2e-3, 4e-3, 8e-3), "command_rmse": (0.02, 0.05, 0.08), "urdf_rmse": (0.01,) * 3}
 REASON = "the calf is <i>off</i>"
@@ -64,7 +64,7 @@ def content(tmp_path_factory):
 @pytest.fixture(scope="module")
 def page(content, followed, tmp_path_factory):
     target = tmp_path_factory.mktemp("pages") / "report.html"
-    page = write_commanded_report(
+    page = write_loop_report(
         content, [followed], target, files={"URDF": "a.urdf"}, origin=Origin((), "out")
     )
     return page.read_text()
@@ -148,8 +148,8 @@ def test_findings_and_commands_are_shown(page):
 def test_logs_that_do_not_fit_are_refused(content, followed, tmp_path):
     other = Followed("b.csv", True, followed.t, *[x[:, :2] for x in 3 * [followed.q]])
     with pytest.raises(DataError, match=r"b.csv has 2 joints, the result 3"):
-        write_commanded_report(content, [other], tmp_path / "a.html")
+        write_loop_report(content, [other], tmp_path / "a.html")
     with pytest.raises(DataError, match=r"c.csv: q_sim has shape \(399, 3\), wanted \(400, n\)"):
         Followed("c.csv", True, followed.t, followed.q_ref, followed.q, followed.q_sim[1:])
-    write_commanded_report(content, [], tmp_path / "a.html")
+    write_loop_report(content, [], tmp_path / "a.html")
     assert "No log is at hand" in (tmp_path / "a.html").read_text()

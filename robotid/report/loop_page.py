@@ -12,6 +12,7 @@ import numpy as np
 from robotid._files import write_text
 from robotid._typing import Array
 from robotid.commanded.errors import DRIFTS
+from robotid.commanded.result import LoopIdentification
 from robotid.exceptions import DataError
 from robotid.export.ranges import stated_ranges
 from robotid.findings import Finding, grouped, listed
@@ -34,7 +35,7 @@ from robotid.report.advice import Origin
 from robotid.report.causes import causes_html
 from robotid.versions import __version__
 
-__all__ = ["Followed", "write_commanded_report"]
+__all__ = ["Followed", "followed_logs", "write_loop_report"]
 
 #: What predicts a position beside the identified robot: key of its error, name, tone.
 _OTHERS = {
@@ -89,7 +90,23 @@ class Followed:
                 )
 
 
-def write_commanded_report(
+def followed_logs(found: LoopIdentification) -> list[Followed]:
+    """Return the logs beside the positions simulated for them, those kept apart first.
+
+    Args:
+        found: What was identified.
+    """
+    return [
+        Followed(
+            f"{run.log.name}, {run.log.t[0]:.4g} to {run.log.t[-1]:.4g} s", is_kept, run.log.t,
+            None if run.is_driven else run.log.q_ref, run.log.q, run.q,
+        )
+        for is_kept, runs in ((True, found.validation), (False, found.fitted))
+        for run in runs
+    ]  # fmt: skip
+
+
+def write_loop_report(
     content: Mapping[str, Any],
     followed: Sequence[Followed],
     target: str | Path,
