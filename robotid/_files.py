@@ -315,9 +315,10 @@ def _sha256(path: Path, *_state: int) -> str:
 
 
 def source_entry(path: str) -> dict[str, Any]:
-    """Return the path of an input and the hash of its file, None if it has none.
+    """Return the path of an input and the hash of its file, None of what is in no file.
 
     Args:
         path: The file; "" for what was in memory.
     """
-    return {"path": str(path), "sha256": file_sha256(path) if path else None}
+    is_file = bool(path) and Path(path).exists()
+    return {"path": str(path), "sha256": file_sha256(path) if is_file else None}

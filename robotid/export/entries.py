@@ -8,7 +8,7 @@ import numpy as np
 
 from robotid._files import finite, source_entry
 from robotid.commanded.result import LoopIdentification
-from robotid.export.loops import loop_entries
+from robotid.export.loops import loop_entries, loop_inputs
 from robotid.export.ranges import parameter_ranges
 from robotid.fitting.bands import REACH, usual_friction
 from robotid.fitting.drives import DriveChoice
@@ -27,6 +27,7 @@ __all__ = [
     "SCHEMA_VERSION",
     "build_preview",
     "build_result",
+    "input_entries",
     "recording_metrics",
 ]
 
@@ -61,7 +62,7 @@ def build_result(
         "robot": model.name,
         "joints": list(model.joints),
         "settings": dict(settings),
-        "inputs": [{"role": "urdf", **source_entry(model.tree.path)}, *own.pop("inputs")],
+        "inputs": input_entries(found),
         "outputs": dict(outputs or {}),
         "structure": _structure(found) | own.pop("structure"),
         "base_parameters": _base_parameters(found),
@@ -85,7 +86,6 @@ def build_result(
 def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return what result.json has of an identification from torques, and of no other."""
     return {
-        "inputs": _inputs(found),
         "structure": _determined(found),
         "uncertainty": {
             "method": found.errors.method,
@@ -230,11 +230,18 @@ def _expected_torque(preview: Preview) -> dict[str, dict[str, Any]]:
     }
 
 
-def _inputs(identification: Identification) -> list[dict[str, Any]]:
-    inputs = []
+def input_entries(found: Identification | LoopIdentification) -> list[dict[str, Any]]:
+    """Return the files that were read, as result.json has them, the URDF first.
+
+    Args:
+        found: What was identified.
+    """
+    inputs = [{"role": "urdf", **source_entry(found.model.tree.path)}]
+    if isinstance(found, LoopIdentification):
+        return [*inputs, *loop_inputs(found)]
     for role, evaluations in (
-        ("identification", identification.fitted),
-        ("validation", identification.validation),
+        ("identification", found.fitted),
+        ("validation", found.validation),
     ):
         for evaluation in evaluations:
             recording = evaluation.recording

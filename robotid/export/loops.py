@@ -11,7 +11,7 @@ from robotid.commanded.errors import OpenLoop, position_metrics, position_units
 from robotid.commanded.result import LoopIdentification
 from robotid.robot.model import RobotModel
 
-__all__ = ["loop_entries", "open_loop_entry"]
+__all__ = ["loop_entries", "loop_inputs", "open_loop_entry"]
 
 
 def loop_entries(found: LoopIdentification) -> dict[str, Any]:
@@ -27,7 +27,6 @@ def loop_entries(found: LoopIdentification) -> dict[str, Any]:
         name for name, i, error in bodies if i < model.layout.n_inertial and math.isinf(error)
     ]
     return {
-        "inputs": [_input(run, role) for role, own in runs.items() for run in own],
         "structure": {
             "rank": estimate.rank,
             "condition": finite(estimate.condition),
@@ -58,13 +57,21 @@ def loop_entries(found: LoopIdentification) -> dict[str, Any]:
     }
 
 
-def _input(run: OpenLoop, role: str) -> dict[str, Any]:
-    log, dt = run.log, float(np.median(np.diff(run.log.t)))
-    return {
-        "role": role, **source_entry(log.path), "samples": len(log.t), "rate": 1.0 / dt,
-        "start": float(log.t[0]), "end": float(log.t[-1]), "rows_used": len(log.t), "segments": 1,
-        "signals": {},
-    }  # fmt: skip
+def loop_inputs(found: LoopIdentification) -> list[dict[str, Any]]:
+    """Return the logs that were read, as result.json has them.
+
+    Args:
+        found: What was identified.
+    """
+    every = {"identification": found.fitted, "validation": found.validation}
+    return [
+        {
+            "role": role, **source_entry(log.path), "samples": len(log.t),
+            "rate": 1.0 / float(np.median(np.diff(log.t))), "start": float(log.t[0]),
+            "end": float(log.t[-1]), "rows_used": len(log.t), "segments": 1, "signals": {},
+        }
+        for role, runs in every.items() for log in (run.log for run in runs)
+    ]  # fmt: skip
 
 
 def _loop_parameters(found: LoopIdentification) -> list[dict[str, Any]]:

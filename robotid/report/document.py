@@ -34,7 +34,7 @@ from robotid.report.diagnosis import (
     residual_section,
 )
 from robotid.report.loop_page import followed_logs, write_loop_report
-from robotid.report.summary_screen import summary_screen
+from robotid.report.summary_screen import joint_errors, summary_screen
 from robotid.report.tables import tables
 from robotid.report.torques import torques_section
 from robotid.report.why import why_section
@@ -80,10 +80,16 @@ def write_report(
     found, made = identification, tables(identification)
     header = summary_screen(found, origin or Origin(), files or {}) + _made(found)
     joints = len(found.verdict.joints)
+    worst = list(joint_errors(found))
     counts = [found.sources.count(source) for source in ("data", "mixed")]
     sections = {
         "errors": Section("Errors", _errors(found), f"{joints} joints, by recording", False),
-        "findings": Section("Findings", findings_section(found), findings_line(found), False),
+        "findings": Section(
+            "Findings",
+            findings_section(found.findings, found.model.joints, worst),
+            findings_line(found.findings, found.model.joints, next(iter(worst), "")),
+            False,
+        ),
         "torques": Section("Torques", torques_section(found)),
         "why": Section("Why each joint", why_section(found), "what its torque is made of", False),
         "parameters": Section(

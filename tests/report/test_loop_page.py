@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.commanded_results import by_position, written_result
 from helpers.mujoco_plant import LEG, plant
-from helpers.pages import chart, charts, tables
+from helpers.pages import bars, chart, charts, tables
 
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
@@ -48,7 +48,11 @@ def content(tmp_path_factory):
         position={LEG[2]: by_position(0.05, 0.3, -2.5, -1.0)},
         simulation=simulation,
         structure={"base": 0, "undetermined": ["FL_calf.Ixx"]},
-        verdict={"status": "usable", "reasons": [REASON]},
+        verdict={
+            "status": "usable",
+            "reasons": [REASON],
+            "per_joint": {LEG[2]: {"status": "usable", "reasons": [f"{LEG[2]}: it is soft"]}},
+        },
         warnings=[
             {
                 "code": "saturation",
@@ -58,7 +62,15 @@ def content(tmp_path_factory):
             }
         ],
     )
-    return load_result(folder).content
+    per_joint = {
+        joint: {
+            "relative_error_pct": 2.0 * (j + 1), "rmse": ERRORS["rmse"][j], "unit": "rad",
+            "command_relative_error_pct": 40.0, "urdf_relative_error_pct": 10.0,
+        }
+        for j, joint in enumerate(LEG)
+    }  # fmt: skip
+    kept = {"log": "logs/kept.csv", "per_joint": per_joint}
+    return {**load_result(folder).content, "validation": [kept]}
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +97,14 @@ def test_errors_are_those_of_the_result_in_mrad(page):
 
 
 def test_charts_show_commanded_measured_and_simulated_and_the_worst_joint_first(page, followed):
-    bars = chart(page, "open-loop position error of each joint")
-    assert bars["x_names"] == [*LEG[::-1]]
-    np.testing.assert_allclose(bars["series"][0]["y"], [8.0, 4.0, 2.0], rtol=1e-4)
+    found = bars(page)
+    assert list(found) == [*LEG[::-1]]
+    for width, (joint, (end, marks)) in zip((6.0, 4.0, 2.0), found.items(), strict=True):
+        assert 1.5 * end**2 / 100 == pytest.approx(width, rel=2e-3), joint
+        assert [1.5 * x**2 / 100 for x in marks] == pytest.approx([10.0, 40.0], rel=2e-3)
+    assert '<strong>usable</strong><span class="why">it is soft</span>' in page
+    assert ">5 good<" in page
+    assert ">30 usable<" in page
     horizon = chart(page, "position error over the horizon")
     np.testing.assert_allclose(horizon["x"], [0.1, 0.5, 4.0], rtol=1e-6)
     mean = horizon["series"][-1]
@@ -124,6 +141,10 @@ def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content
     said = page[page.index("The logs leave these open") :]
     assert "FL_calf.Ixx" in said
     assert "kp of every joint, kd of every joint, masses of the URDF" in said
+    files = tables(page)["Files read"]
+    assert files.column("role") == ["URDF", "fitted"]
+    assert files.column("SHA-256") == ["not read from a file"] * 2
+    assert tables(page)["Versions that ran"].rows[0] == ["robotid", "0"]
 
 
 def test_proportional_commands_leave_no_claim_that_all_is_determined():
