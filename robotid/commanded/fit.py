@@ -127,7 +127,7 @@ def fit_loops(
         unknowns=tuple(simulator.unknowns[k] for k in drives),
     )
     theta = simulator.prior.copy()
-    theta[drives] = replace(estimator, rounds=1).fit(few, few.prior).theta
+    theta[drives] = replace(estimator, rounds=1).fit(few).theta
     simulator = replace(simulator, error=settings.error)
     for left in reversed(range(_STARTS)):
         simulator = simulator.begun_better(theta)
