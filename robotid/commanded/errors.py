@@ -67,6 +67,8 @@ def run_open_loop(
     loops: Loops,
     log: Log,
     others: Mapping[str, Loops] | None = None,
+    *,
+    horizons: Sequence[float] = HORIZONS,
 ) -> OpenLoop:
     """Return how far open loops run from a log.
 
@@ -75,6 +77,7 @@ def run_open_loop(
         loops: Its loops as they were identified; without gains, the logged torque drives it.
         log: The log, with commands, in the URDF's sense of the joints.
         others: Plainer models, by name of the baseline: "urdf", "second_order", "rows".
+        horizons: How long open loops run, beside the whole log, before they are put back [s].
 
     Raises:
         NotConvergedError: If the identified robot cannot be rolled out.
@@ -101,7 +104,7 @@ def run_open_loop(
         baselines=baselines,
         horizons={
             h: error
-            for h in HORIZONS
+            for h in horizons
             if h < log.t[-1] - log.t[0] and (error := _error(robot, loops, log, h)) is not None
         },
         spread=_size(np.concatenate(moved)) if is_driven else np.std(log.q, axis=0),

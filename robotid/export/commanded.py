@@ -9,15 +9,13 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
-from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
-from robotid.simulation.loops import LoopedRobot, Loops, cut_windows, open_loops
+from robotid.simulation.loops import Loops, open_loops
 
 __all__ = [
     "CommandedDrive",
     "commanded_drives",
-    "follow_commands",
     "limit_of",
     "loops_of",
 ]
@@ -124,39 +122,6 @@ def loops_of(
     )
     found = open_loops(model, pi)
     return replace(found, kp=kp, kd=kd, delay=delay, zero=zero, limit=limit, rate=rate)
-
-
-def follow_commands(
-    model: RobotModel,
-    pi: Array,
-    drives: Sequence[CommandedDrive],
-    log: Log,
-    rate: float | None = None,
-) -> Array:
-    """Return the positions that a robot takes on the commands of a log, in open loop.
-
-    It starts as the log does, and again after each gap.
-
-    Args:
-        model: The identified robot.
-        pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        drives: Its drives.
-        log: The log, of its joints in its order, with commands.
-        rate: Ticks per second of a controller with a clock [Hz]; None: it has none.
-
-    Returns:
-        Positions that encoders would read, shape (N, n) [rad or m]; NaN of a sample between gaps.
-
-    Raises:
-        MissingDependencyError: If Numba is not installed.
-        NotConvergedError: If a step has no solution.
-        SettingsError: If a term of the drives cannot be rolled out.
-    """
-    robot, q = LoopedRobot(model), np.full_like(log.q, np.nan)
-    loops = loops_of(model, pi, drives, rate)
-    for out in robot.roll_out(loops, cut_windows(log, np.inf, 0.0)):
-        q[out.window.counted] = out.q
-    return q
 
 
 def limit_of(drive: CommandedDrive, joint: Joint) -> float:

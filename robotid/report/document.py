@@ -33,7 +33,7 @@ from robotid.report.diagnosis import (
     information_section,
     residual_section,
 )
-from robotid.report.loop_page import followed_logs, write_loop_report
+from robotid.report.loop_page import write_loop_report
 from robotid.report.summary_screen import joint_errors, summary_screen
 from robotid.report.tables import tables
 from robotid.report.torques import torques_section
@@ -75,8 +75,9 @@ def write_report(
         require_each([what, name], str, "an entry of files", "text, and the name of a file")
     require_kind(origin, (Origin, type(None)), "origin", "an Origin")
     if isinstance(identification, LoopIdentification):
-        content, logs = build_result(identification, {}), followed_logs(identification)
-        return write_loop_report(content, logs, target, files=files, origin=origin)
+        content = build_result(identification, {})
+        runs = identification.fitted, identification.validation
+        return write_loop_report(content, *runs, target, files=files, origin=origin)
     found, made = identification, tables(identification)
     header = summary_screen(found, origin or Origin(), files or {}) + _made(found)
     joints = len(found.verdict.joints)

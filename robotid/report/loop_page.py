@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -10,9 +9,7 @@ from typing import Any
 import numpy as np
 
 from robotid._files import write_text
-from robotid._typing import Array
-from robotid.commanded.errors import DRIFTS
-from robotid.commanded.result import LoopIdentification
+from robotid.commanded.errors import DRIFTS, OpenLoop
 from robotid.exceptions import DataError
 from robotid.export.ranges import stated_ranges
 from robotid.findings import Finding, listed
@@ -37,7 +34,7 @@ from robotid.report.summary_screen import first_screen
 from robotid.report.tables import input_table, version_table
 from robotid.versions import __version__
 
-__all__ = ["Followed", "followed_logs", "write_loop_report"]
+__all__ = ["write_loop_report"]
 
 #: What predicts a position beside the identified robot, by name of the baseline.
 _MARKS = {
@@ -61,58 +58,10 @@ _FIRST_TERMS = ("kp", "kd", "delay", "limit", "zero")
 _ROLES = {"validation": "kept apart", "identification": "fitted"}
 
 
-@dataclass(frozen=True, eq=False)
-class Followed:
-    """A log of commands beside what the identified robot does on the same commands.
-
-    Attributes:
-        name: Its file and window, for captions.
-        is_kept: Whether it was kept apart from the fit.
-        t: Times, shape (N,) [s].
-        q_ref: Commanded positions, shape (N, n) [rad or m]; None where the logged torque drives
-            the robot.
-        q: Measured ones, likewise.
-        q_sim: Simulated ones, likewise: an open loop from the first sample on, or from where it
-            was put back to what was measured.
-    """
-
-    name: str
-    is_kept: bool
-    t: Array
-    q_ref: Array | None
-    q: Array
-    q_sim: Array
-
-    def __post_init__(self) -> None:
-        for key in ("q_ref", "q", "q_sim"):
-            if key == "q_ref" and self.q_ref is None:
-                continue
-            shape = getattr(self, key).shape
-            if shape != self.q.shape or len(shape) != 2 or shape[0] != len(self.t):
-                raise DataError(
-                    f"{self.name}: {key} has shape {shape}, wanted ({len(self.t)}, n) as q has"
-                )
-
-
-def followed_logs(found: LoopIdentification) -> list[Followed]:
-    """Return the logs beside the positions simulated for them, those kept apart first.
-
-    Args:
-        found: What was identified.
-    """
-    return [
-        Followed(
-            f"{run.log.name}, {run.log.t[0]:.4g} to {run.log.t[-1]:.4g} s", is_kept, run.log.t,
-            None if run.is_driven else run.log.q_ref, run.log.q, run.q,
-        )
-        for is_kept, runs in ((True, found.validation), (False, found.fitted))
-        for run in runs
-    ]  # fmt: skip
-
-
 def write_loop_report(
     content: Mapping[str, Any],
-    followed: Sequence[Followed],
+    fitted: Sequence[OpenLoop],
+    kept: Sequence[OpenLoop],
     target: str | Path,
     *,
     files: Mapping[str, str] | None = None,
@@ -124,7 +73,8 @@ def write_loop_report(
 
     Args:
         content: Content of the result.json.
-        followed: The logs to show.
+        fitted: The fitted logs, with the positions simulated for them.
+        kept: The same of logs kept apart.
         target: The file to write.
         files: Files beside it to link to, by what they are, as "URDF".
         origin: Where the results are, for the commands that it shows; none if not said.
@@ -136,9 +86,9 @@ def write_loop_report(
         DataError: If a log has other joints than the result, or the target has no folder.
     """
     joints = content["joints"]
-    for log in followed:
-        if log.q.shape[1] != len(joints):
-            raise DataError(f"{log.name} has {log.q.shape[1]} joints, the result {len(joints)}")
+    for run in (*kept, *fitted):
+        if run.q.shape[1] != len(joints):
+            raise DataError(f"{run.log.name} has {run.q.shape[1]} joints, the result {len(joints)}")
     bars = _bars(content)
     worst = [bar.joint for bar in bars]
     findings = [
@@ -151,7 +101,7 @@ def write_loop_report(
     sections = {
         "errors": Section("Errors", _errors(content), f"{len(joints)} joints, by recording", False),
         "findings": Section("Findings", findings_section(findings, joints, worst), line, False),
-        "positions": Section("Positions", _positions(content, followed, worst)),
+        "positions": Section("Positions", _positions(content, fitted, kept, worst)),
         "drives": Section("Drives", _drives(content), f"{known} of {len(drives)} found", False),
         "appendix": Section("Appendix", _appendix(content)),
     }
@@ -327,13 +277,17 @@ def _error_table(role: str, entry: Mapping[str, Any]) -> str:
 
 
 def _positions(
-    content: Mapping[str, Any], followed: Sequence[Followed], worst: Sequence[str]
+    content: Mapping[str, Any],
+    fitted: Sequence[OpenLoop],
+    kept: Sequence[OpenLoop],
+    worst: Sequence[str],
 ) -> str:
     """Return charts of each joint in every log, the worst joints open."""
     joints = content["joints"]
-    if not followed:
+    runs = [*((run, "kept apart") for run in kept), *((run, "fitted") for run in fitted)]
+    if not runs:
         return "<p>No log is at hand to be shown.</p>\n"
-    points = min(_LONGEST, max(200, _ROWS // (2 * len(joints) * len(followed))))
+    points = min(_LONGEST, max(200, _ROWS // (2 * len(joints) * len(runs))))
     units = {name: each["unit"] for _, entry in _entries(content)
              for name, each in entry["per_joint"].items()}  # fmt: skip
     words = (
@@ -348,26 +302,27 @@ def _positions(
     for joint in [*worst, *(name for name in joints if name not in worst)]:
         j = joints.index(joint)
         charts = "".join(
-            _charts(log, j, joint, units.get(joint, "rad"), link=f"log {k}", points=points)
-            for k, log in enumerate(followed)
+            _charts(run, kind, j, joint, units.get(joint, "rad"), link=f"log {k}", points=points)
+            for k, (run, kind) in enumerate(runs)
         )
         summary, is_open = f"<strong>{code(joint).html}</strong>", joint in worst[:_OPEN]
         parts.append(folded(f"position-{j}", summary, charts, is_open=is_open))
     return "".join(parts)
 
 
-def _charts(log: Followed, j: int, joint: str, unit: str, *, link: str, points: int) -> str:
+def _charts(
+    run: OpenLoop, kind: str, j: int, joint: str, unit: str, *, link: str, points: int
+) -> str:
     """Return positions of a joint in a log, and how far they are from what was measured."""
-    q, q_sim = log.q[:, j], log.q_sim[:, j]
+    log, q, q_sim = run.log, run.log.q[:, j], run.q[:, j]
     positions = [Series("measured", q, "text"), Series("simulated", q_sim, "predicted")]
     left = [Series("measured − simulated", (q - q_sim) / _SMALL, "residual")]
-    if log.q_ref is not None:
+    if log.q_ref is not None and not run.is_driven:
         q_ref = log.q_ref[:, j]
         positions.insert(0, Series("commanded", q_ref, "tone-5"))
         far = (q - q_ref) / _SMALL
         left.insert(0, Series("measured − commanded", far, "tone-5", is_hidden=True))
     rmse = float(np.sqrt(np.nanmean((q - q_sim) ** 2))) / _SMALL
-    kind = "kept apart" if log.is_kept else "fitted"
     above = Chart(
         f"position of {joint}", log.t, tuple(positions), "time [s]", f"position [{unit}]", link=link
     )
@@ -375,7 +330,8 @@ def _charts(log: Followed, j: int, joint: str, unit: str, *, link: str, points: 
         f"position error of {joint}", log.t, tuple(left), "time [s]", f"error [m{unit}]",
         link=link, height=110,
     )  # fmt: skip
-    caption = f"{escape(log.name)}, {kind}: RMSE {rmse:.3g} m{unit}"
+    window = f"{escape(log.name)}, {log.t[0]:.4g} to {log.t[-1]:.4g} s"
+    caption = f"{window}, {kind}: RMSE {rmse:.3g} m{unit}"
     return chart_html(above, caption, points=points) + chart_html(below, "", points=points)
 
 
