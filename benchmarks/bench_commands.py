@@ -39,12 +39,12 @@ import mujoco
 from helpers import mujoco_plant
 from mujoco import rollout
 
-from robotid.commanded.driven import driven_log
-from robotid.commanded.errors import run_open_loop
-from robotid.commanded.fit import stated_loops
-from robotid.commanded.identify import identify_commands
-from robotid.commanded.settings import LoopSettings
-from robotid.commanded.unknowns import LoopSimulator, body_unknowns
+from robotid.closed_loop.driven import driven_log
+from robotid.closed_loop.evaluation import run_open_loop
+from robotid.closed_loop.fit import stated_loops
+from robotid.closed_loop.identify import identify_loops
+from robotid.closed_loop.settings import LoopSettings
+from robotid.closed_loop.unknowns import LoopSimulator, body_unknowns
 from robotid.commands.job import read_job
 from robotid.exceptions import SettingsError
 from robotid.export.commanded import CommandedDrive, loops_of
@@ -165,7 +165,7 @@ def by_job(text):
             [job.read(entry, model, needs="commands") for entry in entries]
             for entries in (job.identification, job.validation)
         )
-        found = identify_commands(
+        found = identify_loops(
             model, logs, kept, job.controller, job.estimator, chooses=AUTO in job.terms
         )
         return found, clocks() - begun
@@ -394,9 +394,7 @@ def arm_rows(name, model, logs, kept, signals, truth=None):
     for way, (torques, chooses) in ways.items():
         begun = time.process_time()
         settings = SimulationSettings(torques=torques)
-        found = identify_commands(
-            model, logs, kept, loop, settings, signals=signals, chooses=chooses
-        )
+        found = identify_loops(model, logs, kept, loop, settings, signals=signals, chooses=chooses)
         spent = time.process_time() - begun
         if not rows:
             missed = missed_torque(model, linear.standard, kept, signals)
@@ -565,7 +563,7 @@ def driven_errors(name, runs, seconds):
         plant = mujoco_plant.plant(name, rng, delay=0.0)
         log = mujoco_plant.torque_log(plant, rng, duration=seconds, noise=5e-5, relative=0.05)
         for way, changes in ways.items():
-            found = identify_commands(
+            found = identify_loops(
                 plant.model, [log], [], LoopSettings(kind="torque"),
                 SimulationSettings(bodies=0.0, **changes), signals=SignalSettings(cutoff=10.0),
                 chooses=False,
@@ -631,7 +629,7 @@ def one_run(name, rng, seconds, *, finds_all=False, torque=False):
     gains = {} if finds_all else gains
     # every joint has a drive of its own
     loop = LoopSettings(**gains, groups={first: [first]}, delays="group")
-    found = identify_commands(plant.model, [log], [], loop, settings, chooses=False)
+    found = identify_loops(plant.model, [log], [], loop, settings, chooses=False)
     estimate = found.fit.estimate
     found = zip(estimate.names, estimate.theta, estimate.std_error, estimate.reach, strict=True)
     for key, theta, *said in found:
@@ -656,7 +654,7 @@ def held_run(name, rng, seconds, *, bits):
     first = plant.model.joints[0]
     loop = LoopSettings(**gains, groups={first: [first]})
     settings = SimulationSettings(bodies=0.0)
-    found = identify_commands(plant.model, [log], [], loop, settings, chooses=False)
+    found = identify_loops(plant.model, [log], [], loop, settings, chooses=False)
     estimate, truth = found.fit.estimate, plant.truth
     truth["robot.delay"] = plant.drives[0].delay
     found = zip(estimate.names, estimate.theta, estimate.std_error, estimate.reach, strict=True)

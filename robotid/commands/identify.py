@@ -9,9 +9,9 @@ from typing import Any
 from robotid._files import check_folder, folder_beside, write_json
 from robotid._settings import require_kind
 from robotid._typing import STAGES, ProgressCallback, ignore_progress, report_stage
-from robotid.commanded.fit import STAGES as LOOP_STAGES
-from robotid.commanded.identify import identify_commands
-from robotid.commanded.result import LoopIdentification
+from robotid.closed_loop.fit import STAGES as LOOP_STAGES
+from robotid.closed_loop.identify import identify_loops
+from robotid.closed_loop.result import LoopIdentification
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import (
     checkpoint_inputs,
@@ -289,7 +289,7 @@ def _identify_loops(
         [job.read(entry, model, needs=needed_of(job)) for entry in entries]
         for entries in (job.identification, job.validation)
     )
-    found = identify_commands(
+    found = identify_loops(
         model, logs, kept, job.controller, job.estimator, signals=job.signals,
         chooses=AUTO in job.terms, examined=diagnose(model, logs, kept, job.signals),
         ignore=job.ignore, progress=progress or ignore_progress,

@@ -10,8 +10,8 @@ import numpy as np
 
 from robotid._files import file_sha256
 from robotid._typing import STAGES, ProgressCallback, report_stage
-from robotid.commanded.driven import driven_log
-from robotid.commanded.identify import with_gravity
+from robotid.closed_loop.driven import driven_log
+from robotid.closed_loop.identify import with_gravity
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.locked_joints import STILL, check_locked

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from robotid._files import file_sha256
-from robotid.commanded.errors import position_metrics
+from robotid.closed_loop.evaluation import position_metrics
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import log_of_commands, survey_logs
 from robotid.doctor.diagnosis import diagnose

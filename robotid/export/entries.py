@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from robotid._files import finite, source_entry
-from robotid.commanded.result import LoopIdentification
+from robotid.closed_loop.result import LoopIdentification
 from robotid.export.loops import loop_entries, loop_inputs
 from robotid.export.ranges import parameter_ranges
 from robotid.fitting.bands import REACH, usual_friction

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from robotid._files import finite, source_entry
-from robotid.commanded.errors import OpenLoop, position_metrics, position_units
-from robotid.commanded.result import LoopIdentification
+from robotid.closed_loop.evaluation import OpenLoop, position_metrics, position_units
+from robotid.closed_loop.result import LoopIdentification
 from robotid.robot.model import RobotModel
 
 __all__ = ["loop_entries", "loop_inputs", "open_loop_entry"]

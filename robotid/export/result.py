@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from robotid._files import check_path, read_json
 from robotid._settings import Range, require_kind
 from robotid._typing import Array
-from robotid.commanded.errors import HORIZONS, OpenLoop, run_open_loop
+from robotid.closed_loop.evaluation import HORIZONS, OpenLoop, run_open_loop
 from robotid.exceptions import DataError, ModelError
 from robotid.export.commanded import (
     CommandedDrive,

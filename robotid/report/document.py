@@ -7,7 +7,7 @@ from pathlib import Path
 
 from robotid._files import write_text
 from robotid._settings import require_each, require_kind
-from robotid.commanded.result import LoopIdentification
+from robotid.closed_loop.result import LoopIdentification
 from robotid.export.entries import build_result
 from robotid.findings import listed
 from robotid.fitting.evaluation import Evaluation

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from robotid._files import write_text
-from robotid.commanded.errors import DRIFTS, OpenLoop
+from robotid.closed_loop.evaluation import DRIFTS, OpenLoop
 from robotid.exceptions import DataError
 from robotid.export.ranges import stated_ranges
 from robotid.findings import Finding, listed

@@ -13,7 +13,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid._files import file_sha256
 from robotid.cli import main
-from robotid.commanded.settings import LoopSettings
+from robotid.closed_loop.settings import LoopSettings
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import log_of_commands

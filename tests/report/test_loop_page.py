@@ -9,7 +9,7 @@ from helpers.commanded_results import by_position, written_result
 from helpers.mujoco_plant import LEG, plant
 from helpers.pages import bars, chart, charts, tables
 
-from robotid.commanded.errors import OpenLoop
+from robotid.closed_loop.evaluation import OpenLoop
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.logs.data import Log

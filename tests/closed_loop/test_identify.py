@@ -5,12 +5,12 @@ import pytest
 from helpers.mujoco_plant import held, multisine, plant, recorded
 from helpers.single_joint import slider
 
-from robotid.commanded.errors import position_metrics
-from robotid.commanded.fit import stated_loops
-from robotid.commanded.identify import identify_commands
-from robotid.commanded.second_order import SecondOrder
-from robotid.commanded.settings import LoopSettings
-from robotid.commanded.term_choice import _Fold, _gains
+from robotid.closed_loop.evaluation import position_metrics
+from robotid.closed_loop.fit import stated_loops
+from robotid.closed_loop.identify import identify_loops
+from robotid.closed_loop.second_order import SecondOrder
+from robotid.closed_loop.settings import LoopSettings
+from robotid.closed_loop.term_choice import _Fold, _gains
 from robotid.exceptions import DataError
 from robotid.findings import Finding
 from robotid.fitting.settings import SimulationSettings
@@ -40,7 +40,7 @@ def leg():
 @pytest.fixture(scope="module")
 def found(leg):
     robot, log, kept = leg
-    return identify_commands(robot.model, [log], [kept], stated(robot), SETTINGS, chooses=False)
+    return identify_loops(robot.model, [log], [kept], stated(robot), SETTINGS, chooses=False)
 
 
 def test_the_drives_of_a_leg_are_recovered_within_their_errors(leg, found):
@@ -64,7 +64,7 @@ def test_drives_behind_a_slow_clock_are_recovered_once_it_is_stated(rng):
     worst = {}
     for rate in (100.0, None):
         loop = stated(robot, rate=rate)
-        found = identify_commands(
+        found = identify_loops(
             robot.model, [log], [], loop, replace(SETTINGS, step=2e-3), chooses=False
         )
         values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
@@ -83,7 +83,7 @@ def test_the_drives_of_an_arm_are_recovered():
     rng = np.random.default_rng(1)
     robot = plant("planar", rng)
     log, truth = recorded(robot, rng, duration=8.0)
-    found = identify_commands(robot.model, [log], [], stated(robot), SETTINGS, chooses=False)
+    found = identify_loops(robot.model, [log], [], stated(robot), SETTINGS, chooses=False)
     values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
     for name, value in values.items():
         wide = {"delay": 3e-4, "offset": 0.05}.get(name.rpartition(".")[2], 0.04 * truth[name])
@@ -129,14 +129,14 @@ def test_a_short_log_has_short_horizons_only(leg, found):
     short = Log(
         log.t[:n], log.q[:n], log.tau[:n], log.joints, q_ref=log.q_ref[:n], has_torque=False
     )
-    again = identify_commands(robot.model, [log], [short], stated(robot), SETTINGS, chooses=False)
+    again = identify_loops(robot.model, [log], [short], stated(robot), SETTINGS, chooses=False)
     assert list(again.validation[0].horizons) == [0.1, 0.5]
     np.testing.assert_allclose(again.fit.estimate.theta, found.fit.estimate.theta)
 
 
 def test_without_a_kept_log_nothing_is_judged(leg):
     robot, log, _ = leg
-    found = identify_commands(robot.model, [log], [], stated(robot), SETTINGS, chooses=False)
+    found = identify_loops(robot.model, [log], [], stated(robot), SETTINGS, chooses=False)
     assert found.verdict.status == "not evaluated"
     assert found.verdict.reasons[0].startswith("no log was kept apart")
 
@@ -144,7 +144,7 @@ def test_without_a_kept_log_nothing_is_judged(leg):
 def test_a_robot_that_moves_otherwise_in_the_kept_log_is_poor(leg):
     robot, log, kept = leg
     other = replace(kept, q=kept.q[::-1].copy())
-    found = identify_commands(robot.model, [log], [other], stated(robot), SETTINGS, chooses=False)
+    found = identify_loops(robot.model, [log], [other], stated(robot), SETTINGS, chooses=False)
     assert found.verdict.status == "poor"
     assert "the open loop misses" in found.verdict.reasons[0]
 
@@ -169,7 +169,7 @@ def test_a_joint_that_is_told_to_stand_is_not_evaluated(leg, found):
 
 def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(leg):
     robot, log, kept = leg
-    found = identify_commands(robot.model, [log], [kept], LoopSettings(), SETTINGS, chooses=False)
+    found = identify_loops(robot.model, [log], [kept], LoopSettings(), SETTINGS, chooses=False)
     assert not found.has_gains
     [scale] = [f for f in found.findings if f.code == "scale"]
     assert scale.severity == "warning"
@@ -182,7 +182,7 @@ def test_of_many_scales_that_suit_the_positions_the_urdfs_is_taken():
     robot = plant("planar", rng)
     log, truth = recorded(robot, rng, duration=6.0, rate=250.0, step=2e-4)
     settings, loop = replace(SETTINGS, bodies=0.1, step=2e-3), LoopSettings(delays="group")
-    fitted = identify_commands(robot.model, [log], [], loop, settings, chooses=False).fit
+    fitted = identify_loops(robot.model, [log], [], loop, settings, chooses=False).fit
     gains = [unknown.what == "kp" for unknown in fitted.simulator.unknowns]
     exact = np.array([truth[name] for name in np.array(fitted.estimate.names)[gains]])
     np.testing.assert_allclose(fitted.estimate.theta[gains], exact, rtol=0.02)
@@ -202,7 +202,7 @@ def test_steps_that_are_too_long_are_halved():
     log, truth = recorded(robot, rng, duration=4.0, rate=250.0, noise=1e-4, step=1e-4)
     settings = SimulationSettings(window=1.0, lead=0.3, bodies=0.0)
     loop = stated(robot)
-    fitted = identify_commands(robot.model, [log], [], loop, settings, chooses=False).fit
+    fitted = identify_loops(robot.model, [log], [], loop, settings, chooses=False).fit
     estimate = fitted.estimate
     assert fitted.simulator.fine is not None
     assert fitted.simulator.fine.step == pytest.approx(estimate.details["step"])
@@ -214,7 +214,7 @@ def test_steps_that_are_too_long_are_halved():
 def test_a_stated_delay_that_is_wrong_is_no_good_result(leg):
     robot, log, kept = leg
     wrong = stated(robot, delay=0.03)
-    found = identify_commands(robot.model, [log], [kept], wrong, SETTINGS, chooses=False)
+    found = identify_loops(robot.model, [log], [kept], wrong, SETTINGS, chooses=False)
     [bound] = [f for f in found.findings if f.code == "at_bound"]
     assert bound.severity == "warning"
     assert "armature" in bound.message
@@ -238,7 +238,7 @@ def test_stated_gains_that_the_bodies_contradict_are_named(leg, found):
     assert abs(scale.common) < 4.0 * scale.common_error < 0.05
     gains = {k: {d.joint: 1.25 * getattr(d, k) for d in robot.drives} for k in ("kp", "kd")}
     wrong = stated(robot, **gains)
-    other = identify_commands(robot.model, [log], [kept], wrong, SETTINGS, chooses=False)
+    other = identify_loops(robot.model, [log], [kept], wrong, SETTINGS, chooses=False)
     [named] = [f for f in other.findings if f.code == "gains_contradicted"]
     assert named.severity == "warning"
     assert named.where == "controller"
@@ -253,7 +253,7 @@ def test_a_slow_command_does_not_contradict_the_delay_that_was_found(leg, found)
     robot, log, _ = leg
     evidence = {"frequency": 2.0, "shortest": 0.0, "longest": 0.09}
     slow = Finding("slow_command", "warning", "log", "any delay explains it", evidence)
-    again = identify_commands(
+    again = identify_loops(
         robot.model, [log], [], stated(robot), SETTINGS, chooses=False, examined=[slow]
     )
     [settled] = [f for f in again.findings if f.code == "slow_command"]
@@ -269,7 +269,7 @@ def test_joints_of_a_group_share_their_drive(leg):
     robot, log, kept = leg
     hip, thigh, calf = robot.model.joints
     loop = stated(robot, groups={"upper": [hip, thigh]})
-    found = identify_commands(robot.model, [log], [kept], loop, SETTINGS, chooses=False)
+    found = identify_loops(robot.model, [log], [kept], loop, SETTINGS, chooses=False)
     names = found.fit.estimate.names
     assert "upper.armature" in names
     assert "upper.viscous" in names
@@ -299,7 +299,7 @@ def test_friction_by_position_is_found_where_it_is_and_nowhere_else(leg):
     told = Log(t, q_ref, np.zeros_like(q_ref), model.joints, q_ref=q_ref, has_torque=False)
     [out] = LoopedRobot(model, step=5e-4).roll_out(loops, cut_windows(told, np.inf, 0.0))
     log = replace(told, q=out.q + 3e-4 * rng.standard_normal(out.q.shape))
-    found = identify_commands(model, [log], [], stated(robot), SETTINGS)
+    found = identify_loops(model, [log], [], stated(robot), SETTINGS)
     chosen = {(t.joint, t.terms) for t in found.fit.tried if t.is_chosen}
     assert {joint for joint, _ in chosen} == {model.joints[2]}
     values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
@@ -329,7 +329,7 @@ def test_friction_with_a_stated_way_is_recovered(tmp_path, rng):
     told = Log(t, q_ref, 0 * q_ref, ("j",), q_ref=q_ref, has_torque=False)
     [out] = LoopedRobot(model, step=5e-4).roll_out(loops, cut_windows(told, np.inf, 0.0))
     log = replace(told, q=out.q + 1e-4 * rng.standard_normal(out.q.shape))
-    found = identify_commands(model, [log], [], loop, SETTINGS, chooses=False)
+    found = identify_loops(model, [log], [], loop, SETTINGS, chooses=False)
     values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
     for name, value in (("armature", 0.5), ("viscous", 5.0), ("presliding", 8.0)):
         assert values[f"j.{name}"] == pytest.approx(value, rel=0.05)
@@ -340,9 +340,9 @@ def test_a_log_without_commands_is_refused(leg):
     robot, log, _ = leg
     bare = replace(log, q_ref=None)
     with pytest.raises(DataError, match=r"has no commands, which the estimator 'simulation'"):
-        identify_commands(robot.model, [bare], [], stated(robot), SETTINGS)
+        identify_loops(robot.model, [bare], [], stated(robot), SETTINGS)
     with pytest.raises(DataError, match="no log was given"):
-        identify_commands(robot.model, [], [], stated(robot), SETTINGS)
+        identify_loops(robot.model, [], [], stated(robot), SETTINGS)
 
 
 def test_terms_that_no_other_window_judges_gain_nothing():

@@ -1,4 +1,4 @@
-"""identify_commands(): from a model and logs of commands to drives, loops, bodies and trust."""
+"""identify_loops(): from a model and logs of commands to drives, loops, bodies and trust."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from robotid._typing import ProgressCallback, ignore_progress, report_stage
-from robotid.commanded.driven import driven_log
-from robotid.commanded.errors import run_open_loop
-from robotid.commanded.findings import loop_findings
-from robotid.commanded.fit import STAGES, Fitted, fit_loops, stated_loops
-from robotid.commanded.result import LoopIdentification, identified_loops
-from robotid.commanded.settings import LoopSettings
+from robotid.closed_loop.driven import driven_log
+from robotid.closed_loop.evaluation import run_open_loop
+from robotid.closed_loop.findings import loop_findings
+from robotid.closed_loop.fit import STAGES, Fitted, fit_loops, stated_loops
+from robotid.closed_loop.result import LoopIdentification, identified_loops
+from robotid.closed_loop.settings import LoopSettings
 from robotid.exceptions import DataError
 from robotid.findings import Finding
 from robotid.fitting.settings import SimulationSettings
@@ -23,10 +23,10 @@ from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 from robotid.simulation.loops import Loops, open_loops
 
-__all__ = ["identify_commands", "with_gravity"]
+__all__ = ["identify_loops", "with_gravity"]
 
 
-def identify_commands(
+def identify_loops(
     model: RobotModel,
     logs: Sequence[Log],
     kept: Sequence[Log],

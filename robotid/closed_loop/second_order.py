@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 
 from robotid._typing import Array
-from robotid.commanded.unknowns import LoopSimulator, Unknown
+from robotid.closed_loop.unknowns import LoopSimulator, Unknown
 from robotid.estimators.output_error import OutputError
 from robotid.exceptions import NotConvergedError
 from robotid.robot.drives import TERMS

@@ -4,9 +4,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from robotid.commanded.result import STATED_SCALE, LoopIdentification
-from robotid.commanded.term_choice import Tried
-from robotid.commanded.zeros import CLEAR, parallel_axes
+from robotid.closed_loop.result import STATED_SCALE, LoopIdentification
+from robotid.closed_loop.term_choice import Tried
+from robotid.closed_loop.zeros import CLEAR, parallel_axes
 from robotid.findings import Finding, by_severity, listed
 
 __all__ = ["loop_findings"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.single_joint import slider
 
-from robotid.commanded.errors import OpenLoop, position_metrics
+from robotid.closed_loop.evaluation import OpenLoop, position_metrics
 from robotid.logs.data import Log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, torque_log
 
-from robotid.commanded.driven import driven_log, torque_rows
-from robotid.commanded.errors import DRIFTS, run_open_loop
-from robotid.commanded.identify import identify_commands
-from robotid.commanded.settings import LoopSettings
+from robotid.closed_loop.driven import driven_log, torque_rows
+from robotid.closed_loop.evaluation import DRIFTS, run_open_loop
+from robotid.closed_loop.identify import identify_loops
+from robotid.closed_loop.settings import LoopSettings
 from robotid.exceptions import DataError
 from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
@@ -39,7 +39,7 @@ def arm():
 def found_by(arm, **settings):
     robot, log, kept = arm
     chosen = SimulationSettings(bodies=0.0, step=4e-3, **settings)
-    return identify_commands(
+    return identify_loops(
         robot.model, [log], [kept], DRIVEN, chosen, signals=SIGNALS, chooses=False
     )
 
@@ -150,4 +150,4 @@ def test_a_log_without_torque_drives_nothing(arm):
     robot, log, _ = arm
     bare = Log(log.t, log.q, np.zeros_like(log.q), log.joints, has_torque=False)
     with pytest.raises(DataError, match=r"has no torque, which drives the robot"):
-        identify_commands(robot.model, [bare], [], DRIVEN, SimulationSettings())
+        identify_loops(robot.model, [bare], [], DRIVEN, SimulationSettings())

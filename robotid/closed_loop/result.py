@@ -6,10 +6,10 @@ from functools import cached_property
 import numpy as np
 
 from robotid._typing import Array
-from robotid.commanded.errors import OpenLoop, position_metrics
-from robotid.commanded.fit import Fitted
-from robotid.commanded.settings import LoopSettings
-from robotid.commanded.unknowns import with_terms
+from robotid.closed_loop.evaluation import OpenLoop, position_metrics
+from robotid.closed_loop.fit import Fitted
+from robotid.closed_loop.settings import LoopSettings
+from robotid.closed_loop.unknowns import with_terms
 from robotid.estimators.estimator import Estimate
 from robotid.findings import Finding
 from robotid.fitting.bands import REACH
