@@ -7,7 +7,7 @@ import math
 from dataclasses import MISSING
 from pathlib import Path
 
-from robotid.commanded.settings import LoopSettings
+from robotid.closed_loop.settings import LoopSettings
 from robotid.commands.job import Job, LogEntry
 from robotid.fitting.settings import ESTIMATORS, ConstraintSettings
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings

@@ -27,7 +27,7 @@ LINES = [
     "diagnosis",
     "judgement",
     "identification",
-    "commanded",
+    "closed_loop",
     "online export viewer excitation",
     "report",
     "commands paper",
