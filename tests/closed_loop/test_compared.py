@@ -29,7 +29,7 @@ def leg():
     rng = np.random.default_rng(3)
     robot = plant("leg", rng, kp=KP, kd=KD, delay=DELAY)
     quiet = {"torque": TORQUE, "speed": 0.002, "noise": 4e-4, "step": 1e-4, "highest": 1.5}
-    return robot, recorded(robot, rng, duration=4.0, **quiet)[0]
+    return robot, recorded(robot, rng, duration=2.5, **quiet)[0]
 
 
 def fitted(leg, loop=LOOP, **changes):
@@ -59,7 +59,7 @@ def test_the_drives_are_recovered_whatever_is_compared(leg, methods, error):
 
 def test_gains_and_delay_are_found_from_torques_of_roll_outs(leg):
     robot, rng = leg[0], np.random.default_rng(4)
-    fast, _ = recorded(robot, rng, duration=3.0, torque=TORQUE, step=1e-4, highest=6.0)
+    fast, _ = recorded(robot, rng, duration=2.0, torque=TORQUE, step=1e-4, highest=6.0)
     found = fitted((robot, fast), LoopSettings(), error="input")
     assert found.simulator.knows_torques
     estimate, gains = found.estimate, {"kp": KP, "kd": KD, "delay": DELAY}
@@ -130,10 +130,12 @@ def test_settings_that_contradict_each_other_are_refused():
 
 def test_a_loop_that_is_soft_for_the_direct_method_is_named():
     rng = np.random.default_rng(5)
-    robot = plant("leg", rng, kp=8.0, kd=0.4, delay=0.0)
-    log, _ = recorded(robot, rng, duration=1.5, torque=0.05)
-    loop = LoopSettings(kp=8.0, kd=0.4, delay=0.0)
-    found = identify_loops(robot.model, [log], [], loop, settings(error="direct"), chooses=False)
+    robot = plant("planar", rng, kp=100.0, kd=20.0, delay=0.0)
+    log, _ = recorded(robot, rng, duration=1.0, rate=250.0, torque=0.05)
+    loop = LoopSettings(kp=100.0, kd=20.0, delay=0.0)
+    found = identify_loops(
+        robot.model, [log], [], loop, settings(error="direct", step=4e-3), chooses=False
+    )
     [soft] = [f for f in found.findings if f.code == "soft_loop"]
     assert soft.severity == "warning"
     assert soft.message.endswith("Set error = 'input'")
@@ -144,12 +146,14 @@ def test_torques_that_are_not_of_the_loop_are_named():
     """Of two joints: swapped, and of the motor before a gear of 1:50 where the gain is stated."""
     rng = np.random.default_rng(8)
     robot = plant("planar", rng)
-    log, _ = recorded(robot, rng, duration=2.2, torque=0.5)
+    log, _ = recorded(robot, rng, duration=2.2, rate=250.0, torque=0.5, noise=1e-3)
     gains = LoopSettings(kp={"joint_1": 600.0, "joint_2": 250.0})
 
     def missed(tau, loop):
         own = replace(log, tau=tau)
-        found = identify_loops(robot.model, [own], [], loop, settings(torques=True), chooses=False)
+        found = identify_loops(
+            robot.model, [own], [], loop, settings(torques=True, step=4e-3), chooses=False
+        )
         return {f.where: f for f in found.findings if f.code == "torque_missed"}
 
     assert not missed(log.tau, LoopSettings())

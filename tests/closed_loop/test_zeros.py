@@ -15,7 +15,7 @@ from robotid.robot.model import RobotModel
 from robotid.simulation.loops import LoopedRobot
 
 AWAY = 0.5  # [rad] of the thigh's zero from the URDF's
-SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=2e-3)
+SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=4e-3)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def test_torques_tell_the_gains_that_positions_leave_open():
     lighter = [np.log(0.7) / 2 if u.name.endswith("mass") else 0.0 for u in unknowns]
     # by the URDF's masses positions take the scale, which the torques then have to move
     robot = replace(robot, bodies=simulator.loops(np.array(lighter)).bodies.reshape(-1))
-    log, truth = recorded(robot, rng, duration=6.0, rate=250.0, torque=0.5, step=1e-4)
+    log, truth = recorded(robot, rng, duration=3.4, rate=250.0, noise=1e-4, torque=0.5, step=1e-4)
     settings, loop = replace(SETTINGS, bodies=0.1), LoopSettings(delays="group")
     open_, told = (
         identify_loops(robot.model, [each], [], loop, settings, chooses=False)

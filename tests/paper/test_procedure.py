@@ -49,11 +49,10 @@ def gentle_ur5(ur5):
 
 
 def test_the_true_parameters_track_the_program():
-    # the torque is held for T / 1000, so that the error falls with it; eta itself is exactly 0
-    history = run(P4, settings=short(1, updates=1000))
-    assert history.tracking.max() < 1e-3
-    finer = run(P4, settings=short(1, updates=4000))
-    assert finer.tracking.max() < history.tracking.max() / 3
+    # the torque is held for T / 200, and the error falls with this; eta itself is exactly 0
+    history, finer = (run(P4, settings=short(1, updates=n)).tracking.max() for n in (200, 600))
+    assert history < 1e-3
+    assert history / finer == pytest.approx(3.0, rel=0.03)
 
 
 def test_at_the_true_parameters_prx_is_zero_and_the_procedure_stops_at_once():
@@ -98,9 +97,9 @@ def test_a_ur5_under_gravity_tracks_with_its_true_base_parameters(gentle_ur5):
 @pytest.mark.parametrize(
     ("form", "P", "iterations", "left"),
     [
-        ("printed", planar_2r.PAPER_PARAMETERS, 100, 2e-6),
-        ("corrected_five", planar_2r.PAPER_PARAMETERS, 40, 5e-3),
-        ("corrected", P4, 40, 3e-3),
+        ("printed", planar_2r.PAPER_PARAMETERS, 40, 2.86e-3),
+        ("corrected_five", planar_2r.PAPER_PARAMETERS, 20, 4.04e-2),
+        ("corrected", P4, 20, 3.57e-2),
     ],
 )
 def test_the_recursion_finds_the_papers_parameters(form, P, iterations, left):
@@ -111,7 +110,7 @@ def test_the_recursion_finds_the_papers_parameters(form, P, iterations, left):
     assert error[0] == 0.5
     assert 0.34 < error[1] < 0.40  # the reading has 0.39, 0.15 and, after 100, 1e-5
     assert 0.10 < error[10] < 0.16
-    assert error[-1] < left
+    assert error[-1] == pytest.approx(left, rel=0.02)
     assert (np.diff(error) < 0).all()
 
 

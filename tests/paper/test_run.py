@@ -1,4 +1,4 @@
-"""The paper's simulation: what it writes, what it says of itself, the errata and the energy."""
+"""What a run of the paper's simulation writes: files, paper.json and, cell by cell, its page."""
 
 import json
 import math
@@ -7,34 +7,28 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
+from helpers.pages import number, tables
 from matplotlib.figure import Figure
 
 from robotid.cli import main
-from robotid.exceptions import SettingsError
 from robotid.paper import run as paper
-from robotid.paper.equations import torque
-from robotid.paper.errata import energy_drift, errata
-from robotid.paper.planar_2r import PAPER_PARAMETERS
+from robotid.paper.errata import energy_drift
 from robotid.paper.run import run_paper
-from robotid.paper.study import (
-    DURATION,
-    MODELS,
-    PROGRAM,
-    PaperSettings,
-    paper_arm,
-    random_runs,
-    study_model,
-)
+from robotid.paper.study import CASES, MODELS, PaperSettings
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import INERTIAL_TERMS
 
 FIGURES = ["figure_3a", "figure_3b", "figure_4a", "figure_4b", "figure_5", "convergence"]
 FIGURES += ["disturbance", "trajectories", "energy"]
-FEW = PaperSettings(iterations=3, longest=4, runs=4, patience=2)
+FEW = PaperSettings(iterations=19, longest=1, runs=4, patience=2)
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper") / "out"
-    return folder, run_paper(folder, settings=FEW)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper, "energy_drift", lambda: energy_drift(duration=1.0))
+        return folder, run_paper(folder, settings=FEW)
 
 
 def test_the_json_has_the_schema_of_the_design(written):
@@ -45,12 +39,12 @@ def test_the_json_has_the_schema_of_the_design(written):
     for name, model in found["models"].items():
         c = 4 if name == "physical" else 5
         assert len(model["P_true"]) == c
-        assert np.shape(model["P_hat"]) == (4, c)
-        assert len(model["relative_error"]) == 4
-        assert len(model["prx_norm"]) == 3
+        assert np.shape(model["P_hat"]) == (20, c)
+        assert len(model["relative_error"]) == 20
+        assert len(model["prx_norm"]) == 19
         assert model["relative_error"][0] == 0.5
         np.testing.assert_allclose(np.array(model["P_hat"][0]) * 2, model["P_true"])
-        assert model["NA"] is None  # PRX is not zero after three iterations
+        assert model["NA"] is None  # PRX is not zero after so few iterations
     for erratum in found["errata"]:
         assert erratum["where"]
         assert erratum["max_torque_difference"] > 1.0
@@ -60,7 +54,7 @@ def test_the_json_has_the_schema_of_the_design(written):
         assert runs["converged"] == len(runs["iterations"])
         assert all(failure["reason"] for failure in runs["failures"])
         for case in ("on_program", "disturbed", "noisy", "noisy_dead_zone"):
-            assert len(found[case][name]["relative_error"]) == 4
+            assert len(found[case][name]["relative_error"]) == 20
             assert found[case][name]["converged"] is False
             assert found[case][name]["reason"]
 
@@ -131,88 +125,148 @@ def test_the_command_prints_what_was_reached(tmp_path, capsys, monkeypatch, writ
     assert asked["settings"] is None
 
 
-# --- the parts --------------------------------------------------------------------------------
+# --- the page ---------------------------------------------------------------------------------
 
 
-def test_the_physical_arm_has_four_parameters_and_the_others_the_papers_five():
-    for name in ("printed", "corrected"):
-        np.testing.assert_array_equal(paper_arm(name)[1], PAPER_PARAMETERS)
-    np.testing.assert_allclose(paper_arm("physical")[1], [22, 5, 3, 0.1], rtol=1e-14)
-    with pytest.raises(SettingsError, match=r"^model is 'other', wanted one of printed, corrected"):
-        paper_arm("other")
+@pytest.fixture(scope="module")
+def folder(written):
+    return written[0]
 
 
-def test_one_shot_needs_one_run_and_disturbance_shows():
-    study = study_model("physical", PaperSettings(iterations=2, longest=1))
-    assert study.one_shot_error < 1e-12
-    assert study.errors("disturbed")[1] != study.errors()[1]
-    assert study.errors("noisy")[1] != study.errors()[1]
-    assert study.errors("on_program")[1] > study.errors()[1]
+@pytest.fixture(scope="module")
+def content(written):
+    return written[1]
 
 
-def test_the_errata_make_the_torques_differ_as_worked_out_by_hand():
-    found = {e.where: e for e in errata(np.random.default_rng(0))}
-    assert len(found) == 5
-    # h = 3 s2 + 0.1 c2 <= 3.002: C122 and C112 together miss 2 h v2 (v1 + v2) <= 3.002 * 400
-    assert 1000 < found["(26)"].max_torque_difference < 3.002 * 400
-    # column 4 is off by s2 (v1^2 + v2^2) <= 200, times p3 = 3
-    assert 500 < found["G, column 4"].max_torque_difference < 600
-    # p4 of (27) is 2 instead of 3, times s2 v^2 <= 100
-    assert 95 < found["(27), p4"].max_torque_difference < 100
-    # D a = u - C with u = (D q_* + C) / 2: G P^ - u = D (a - q_*) / 2 = -(D q_* + C) / 4
-    t = np.linspace(0, DURATION, 401)
-    program = torque(*paper_arm("physical")[:1], *PROGRAM.evaluate(t), paper_arm("physical")[1])
-    unseen = found["(23) with Ψ of (22), residual at P̂ = P / 2"]
-    wanted = np.abs(program).max() / 4
-    np.testing.assert_allclose(unseen.max_torque_difference_on_program, wanted, rtol=1e-12)
-    for erratum in found.values():
-        assert 1.0 < erratum.max_torque_difference_on_program < erratum.max_torque_difference
+@pytest.fixture(scope="module")
+def html(folder):
+    return (folder / "paper.html").read_text(encoding="utf-8")
 
 
-def test_only_the_physical_arm_keeps_its_energy():
-    drift = energy_drift(duration=4.0, dt=4e-3)
-    assert np.abs(drift.gained["physical"]).max() < 1e-9  # error of the integration
-    assert np.abs(drift.gained["printed"]).max() > 0.2
-    assert np.abs(drift.gained["corrected"]).max() > 0.1  # p3 != p4
+@pytest.fixture(scope="module")
+def shown(html):
+    return tables(html)
 
 
-def test_random_runs_tell_every_failure(rng):
-    dynamics, P = paper_arm("physical")
-    runs = random_runs(dynamics, P, 8, 12, rng)
-    content = runs.to_dict()
-    assert 0 < content["converged"] < 8
-    for failure in content["failures"]:
-        assert runs.errors[:, failure["run"]].min() >= 1e-3
-        assert re.match(r"slow: an error of .* is left after 12 iterations", failure["reason"])
-    for number, r in zip(runs.iterations, np.flatnonzero(runs.has_converged), strict=True):
-        assert runs.errors[number, r] < 1e-3 <= runs.errors[number - 1, r]
+def test_errors_over_the_iterations(shown, content):
+    table = shown["Relative error |P̂ − P| / |P|"]
+    wanted = []
+    for name in MODELS:
+        model = content["models"][name]
+        errors = [model["relative_error"][k] for k in (0, 1, 10, -1)]
+        errors.append(content["on_program"][name]["relative_error"][-1])
+        cells = [number(error, ".2g") for error in errors]
+        wanted.append(
+            [name, *cells, number(model["NA"], "d"), number(content["one_shot"][name], ".2g")]
+        )
+    assert table.rows == wanted
+    assert table.column("at the end") != table.column("started on program")
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"lost": 3}, "the robot ran away from its program in iteration 3"),
-        (
-            {"skipped": 7},
-            "slow: an error of 0.4 is left after 1 iterations and falls by 20 % in ten; 7 updates "
-            "were left out, as D(q, P^) was not positive definite",
-        ),
-        ({"errors": [0.5, 0.6]}, "the error grew, from 0.5 to 0.6"),
-        ({"errors": [0.5, 0.5]}, "stalled: the motion excites too little; an error of 0.5 is left"),
-    ],
-)
-def test_each_kind_of_failure_has_its_reason(change, reason, rng):
-    from dataclasses import replace
-
-    dynamics, P = paper_arm("physical")
-    runs = random_runs(dynamics, P, 1, 1, rng)
-    errors = np.array(change.pop("errors", [0.5, 0.4]))[:, None]
-    history = replace(runs.history, **{key: np.array([x]) for key, x in change.items()})
-    found = replace(runs, errors=errors, history=history).failures
-    assert [failure["reason"] for failure in found] == [reason]
+def test_parameters_at_the_end(shown, content):
+    for name in MODELS:
+        model = content["models"][name]
+        last = model["P_hat"][-1]
+        assert shown[f"{name}: parameters at the end [kg m²]"].rows == [
+            [p, number(true), number(found, ".7g"), number(found - true, ".1e")]
+            for p, true, found in zip(model["names"], model["P_true"], last, strict=True)
+        ]
 
 
-@pytest.mark.parametrize("name", ["iterations", "longest", "runs", "patience"])
-def test_settings_below_one_are_named(name):
-    with pytest.raises(SettingsError, match=f"^{name} is 0, wanted 1 or more$"):
-        PaperSettings(**{name: 0})
+def test_the_inertial_vector_is_in_the_papers_order(shown, content, folder):
+    vector = content["inertial_vector"]
+    order = ["Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "m"]  # (9)
+    assert vector["names"] == [f"{body}.{term}" for body in ("link_1", "link_2") for term in order]
+    arm = RobotModel.from_urdf(folder / "planar_2r.urdf")
+    urdf = [body.toDynamicParameters() for body in list(arm.pin_model.inertias)[1:]]
+    back = [10 * i + order.index(term) for i in (0, 1) for term in INERTIAL_TERMS]
+    true, found = (np.array(vector[key])[back] for key in ("true", "identified"))
+    np.testing.assert_allclose(true, np.concatenate(urdf), atol=1e-14)
+    assert shown["Inertial vector (9)-(10), SI units"].rows == [
+        [name, number(a), number(b, ".7g")]
+        for name, a, b in zip(vector["names"], vector["true"], vector["identified"], strict=True)
+    ]
+
+    def four_sums(pi):
+        """(27), from inertia about the joints: P of the physical arm, whose links are 1 m long."""
+        (m2, x2, y2, *_), Izz1, Izz2 = pi[10:], pi[9], pi[19]
+        return [Izz1 + m2, Izz2, x2, y2]
+
+    np.testing.assert_allclose(four_sums(true), content["models"]["physical"]["P_true"])
+    last = content["models"]["physical"]["P_hat"][-1]
+    np.testing.assert_allclose(four_sums(found), last, rtol=1e-9)
+    # what no torque shows stays at the first guess, half of the truth
+    np.testing.assert_allclose(found[[4, 6, 14, 16]], true[[4, 6, 14, 16]] / 2)
+
+
+def test_disturbed_cases(shown, content):
+    table = shown["Relative error at the end"]
+    wanted = []
+    for case in ("disturbed", "noisy", "noisy_dead_zone"):
+        for name, entry in content[case].items():
+            errors = entry["relative_error"][-1], entry["last_tenth"], entry["averaged"]
+            said = "yes" if entry["converged"] else "no"
+            wanted.append([name, CASES[case].title, *[number(x, ".2g") for x in errors], said])
+    assert table.rows == wanted
+    assert table.column("at the end") != table.column("mean of last tenth")
+
+
+def test_random_motions(shown, content):
+    rows = shown["Iterations to a relative error of 10⁻³"].rows
+    parts = [(content[key], start) for key, start in (
+        ("trajectories", "up to 0.05 rad beside the program"),
+        ("trajectories_on_program", "on the program"),
+    )]  # fmt: skip
+    wanted = []
+    for part, start in parts:
+        for name, found in part.items():
+            taken = found["iterations"] or [float("nan")]
+            spread = [number(float(np.percentile(taken, p)), ".0f") for p in (0, 50, 90, 100)]
+            counts = [str(found["runs"]), str(found["converged"])]
+            wanted.append([name, start, *counts, *spread, str(found["most_iterations"])])
+    assert rows == wanted
+
+
+def test_runs_that_failed_are_counted_by_reason(shown, content):
+    for key, tail in (("trajectories", ""), ("trajectories_on_program", ", start on the program")):
+        rows = shown[f"Runs that did not converge{tail}; each one is in paper.json"].rows
+        for name, found in content[key].items():
+            counted = [row for row in rows if row[0] == name]
+            assert sum(int(row[2]) for row in counted) == len(found["failures"])
+            errors = [f["relative_error"] for f in found["failures"]]
+            if len(counted) == 1:
+                median, most = float(np.median(errors)), max(errors)
+                assert counted[0][3:] == [number(median, ".2g"), number(most, ".2g")]
+
+
+def test_errata_energy_and_settings(shown, content):
+    assert shown["Errata"].rows == [
+        [e["where"], e["printed"], e["corrected"], number(e["max_torque_difference"], ".1f"),
+         number(e["max_torque_difference_on_program"], ".1f")]
+        for e in content["errata"]
+    ]  # fmt: skip
+    drift = content["energy_drift"]["max_relative"]
+    assert shown["Largest change of energy"].rows == [
+        [name, number(100 * value, ".3g")] for name, value in drift.items()
+    ]
+    assert dict(shown["Settings"].rows) == {k: str(v) for k, v in content["settings"].items()}
+
+
+def test_the_verdict_is_that_of_the_last_iteration(html, content):
+    box = html.split('<div class="verdict ')[1].split("</div>")[0]
+    last = [content["models"][name]["relative_error"][-1] for name in MODELS]
+    assert box.startswith("good" if max(last) <= 1e-4 else "poor")
+    assert "After <strong>19 iterations</strong>" in box
+    for name, error in zip(MODELS, last, strict=True):
+        on = content["on_program"][name]["relative_error"][-1]
+        assert (
+            f"<li>{name}: relative error {number(error, '.2g')}, or {number(on, '.2g')} where"
+            in box
+        )
+
+
+def test_the_summary_says_what_the_start_beside_the_program_does(html, content):
+    last = {name: content["models"][name]["relative_error"][-1] for name in MODELS}
+    gains = [content["on_program"][n]["relative_error"][-1] / last[n] for n in MODELS]
+    assert f"leave an error {min(gains):.2g} to {max(gains):.2g} times as large" in html
+    assert "starts, 1 degree beside its program" in html

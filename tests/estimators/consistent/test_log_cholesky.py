@@ -21,6 +21,7 @@ from robotid.exceptions import SettingsError
 from robotid.fitting.settings import EstimatorSettings
 from robotid.regressor.factors import compress
 from robotid.robot.geometry import body_boxes
+from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia
 
 
@@ -29,10 +30,10 @@ def make_case(ur5, rng, noise):
     return consistent(case), compress(case.problem)
 
 
-@pytest.fixture
-def case(ur5, rng):
+@pytest.fixture(scope="module")
+def case(ur5):
     """A fit at whose optimum constraints bind, and its factors."""
-    return make_case(ur5, rng, 10 * NOISE)
+    return make_case(ur5, np.random.default_rng(0), 10 * NOISE)
 
 
 def test_it_is_pinocchios_parameterisation(rng):
@@ -94,10 +95,10 @@ def test_it_agrees_with_the_cone_programme_where_no_constraint_binds(ur5, rng, m
 
 def test_at_active_constraints_the_gap_is_stated_and_small(case):
     fit, factors = case
-    cone, smooth = fit.fit(factors), LogCholesky(fit, starts=2).fit(factors)
+    cone, smooth = fit.fit(factors), LogCholesky(fit, starts=1).fit(factors)
     assert cone.details["active"]
     gaps = smooth.details["gaps"]
-    assert len(gaps) == 3
+    assert len(gaps) == 2
     assert abs(gaps[0]) < 1e-6
     assert min(gaps) > -1e-6  # nothing lies below the optimum of a convex programme
     rows = fit.rows(factors, cone.sigma)
@@ -122,10 +123,11 @@ def test_it_knows_no_further_constraints(case):
 
 
 def test_identify_takes_it_by_name(ur5, rng):
-    log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
-    settings = EstimatorSettings("log_cholesky", starts=1, seed=2)
-    found = identify(ur5, [log], signals=EXACT, estimator=settings)
-    other = identify(ur5, [log], signals=EXACT)
+    forearm = RobotModel.from_urdf(ur5.tree.path, joints=ur5.joints[2:5])
+    log = exact_log(forearm, truth(forearm), rng, noise=NOISE[2:5])
+    settings = EstimatorSettings("log_cholesky", starts=2, seed=2)
+    found = identify(forearm, [log], signals=EXACT, estimator=settings)
+    other = identify(forearm, [log], signals=EXACT)
     assert found.is_consistent
-    assert len(found.estimate.details["gaps"]) == 2
+    assert len(found.estimate.details["gaps"]) == 3
     np.testing.assert_allclose(found.base, other.base, atol=1e-5 * np.abs(other.base).max())

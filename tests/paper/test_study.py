@@ -1,0 +1,102 @@
+"""The parts of the paper's simulation: its models, errata, energy and random motions."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robotid.exceptions import SettingsError
+from robotid.paper.equations import torque
+from robotid.paper.errata import energy_drift, errata
+from robotid.paper.planar_2r import PAPER_PARAMETERS
+from robotid.paper.study import (
+    DURATION,
+    PROGRAM,
+    PaperSettings,
+    paper_arm,
+    random_runs,
+    study_model,
+)
+
+
+def test_the_physical_arm_has_four_parameters_and_the_others_the_papers_five():
+    for name in ("printed", "corrected"):
+        np.testing.assert_array_equal(paper_arm(name)[1], PAPER_PARAMETERS)
+    np.testing.assert_allclose(paper_arm("physical")[1], [22, 5, 3, 0.1], rtol=1e-14)
+    with pytest.raises(SettingsError, match=r"^model is 'other', wanted one of printed, corrected"):
+        paper_arm("other")
+
+
+def test_one_shot_needs_one_run_and_disturbance_shows():
+    study = study_model("physical", PaperSettings(iterations=2, longest=1))
+    assert study.one_shot_error < 1e-12
+    assert study.errors("disturbed")[1] != study.errors()[1]
+    assert study.errors("noisy")[1] != study.errors()[1]
+    assert study.errors("on_program")[1] > study.errors()[1]
+
+
+def test_the_errata_make_the_torques_differ_as_worked_out_by_hand():
+    found = {e.where: e for e in errata(np.random.default_rng(0))}
+    assert len(found) == 5
+    # h = 3 s2 + 0.1 c2 <= 3.002: C122 and C112 together miss 2 h v2 (v1 + v2) <= 3.002 * 400
+    assert 1000 < found["(26)"].max_torque_difference < 3.002 * 400
+    # column 4 is off by s2 (v1^2 + v2^2) <= 200, times p3 = 3
+    assert 500 < found["G, column 4"].max_torque_difference < 600
+    # p4 of (27) is 2 instead of 3, times s2 v^2 <= 100
+    assert 95 < found["(27), p4"].max_torque_difference < 100
+    # D a = u - C with u = (D q_* + C) / 2: G P^ - u = D (a - q_*) / 2 = -(D q_* + C) / 4
+    t = np.linspace(0, DURATION, 401)
+    program = torque(*paper_arm("physical")[:1], *PROGRAM.evaluate(t), paper_arm("physical")[1])
+    unseen = found["(23) with Ψ of (22), residual at P̂ = P / 2"]
+    wanted = np.abs(program).max() / 4
+    np.testing.assert_allclose(unseen.max_torque_difference_on_program, wanted, rtol=1e-12)
+    for erratum in found.values():
+        assert 1.0 < erratum.max_torque_difference_on_program < erratum.max_torque_difference
+
+
+def test_only_the_physical_arm_keeps_its_energy():
+    drift = energy_drift(duration=4.0, dt=4e-3)
+    assert np.abs(drift.gained["physical"]).max() < 1e-9  # error of the integration
+    assert np.abs(drift.gained["printed"]).max() > 0.2
+    assert np.abs(drift.gained["corrected"]).max() > 0.1  # p3 != p4
+
+
+def test_random_runs_tell_every_failure(rng):
+    dynamics, P = paper_arm("physical")
+    runs = random_runs(dynamics, P, 8, 12, rng)
+    content = runs.to_dict()
+    assert 0 < content["converged"] < 8
+    for failure in content["failures"]:
+        assert runs.errors[:, failure["run"]].min() >= 1e-3
+        assert re.match(r"slow: an error of .* is left after 12 iterations", failure["reason"])
+    for number, r in zip(runs.iterations, np.flatnonzero(runs.has_converged), strict=True):
+        assert runs.errors[number, r] < 1e-3 <= runs.errors[number - 1, r]
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"lost": 3}, "the robot ran away from its program in iteration 3"),
+        (
+            {"skipped": 7},
+            "slow: an error of 0.4 is left after 1 iterations and falls by 20 % in ten; 7 updates "
+            "were left out, as D(q, P^) was not positive definite",
+        ),
+        ({"errors": [0.5, 0.6]}, "the error grew, from 0.5 to 0.6"),
+        ({"errors": [0.5, 0.5]}, "stalled: the motion excites too little; an error of 0.5 is left"),
+    ],
+)
+def test_each_kind_of_failure_has_its_reason(change, reason, rng):
+    dynamics, P = paper_arm("physical")
+    runs = random_runs(dynamics, P, 1, 1, rng)
+    errors = np.array(change.pop("errors", [0.5, 0.4]))[:, None]
+    history = replace(runs.history, **{key: np.array([x]) for key, x in change.items()})
+    found = replace(runs, errors=errors, history=history).failures
+    assert [failure["reason"] for failure in found] == [reason]
+
+
+@pytest.mark.parametrize("name", ["iterations", "longest", "runs", "patience"])
+def test_settings_below_one_are_named(name):
+    with pytest.raises(SettingsError, match=f"^{name} is 0, wanted 1 or more$"):
+        PaperSettings(**{name: 0})
