@@ -169,7 +169,6 @@ def identify_commands(
 
     Raises:
         DataError: If there is no log, or one has no commands.
-        MissingDependencyError: If Numba is not installed.
         NotConvergedError: If it cannot be rolled out.
         SettingsError: If a setting does not fit the robot.
     """

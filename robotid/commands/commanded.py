@@ -41,7 +41,6 @@ def run_commanded(
 
     Raises:
         DataError: If a log cannot be used.
-        MissingDependencyError: If Numba is not installed.
         NotConvergedError: If the loops cannot be rolled out.
         SettingsError: If a setting does not fit.
     """

@@ -92,7 +92,6 @@ def followed_logs(result: Result, job: Job) -> list[Followed]:
 
     Raises:
         DataError: If a log cannot be read, or has no commands.
-        MissingDependencyError: If Numba is not installed.
     """
     found = []
     for is_kept, entries in ((True, job.validation), (False, job.identification)):

@@ -150,7 +150,6 @@ def follow_commands(
         Positions that encoders would read, shape (N, n) [rad or m]; NaN of a sample between gaps.
 
     Raises:
-        MissingDependencyError: If Numba is not installed.
         NotConvergedError: If a step has no solution.
         SettingsError: If a term of the drives cannot be rolled out.
     """
