@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
-from robotid.exceptions import DataError, MissingDependencyError
+from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import RowPlan, plan_rows, trajectory_values
@@ -19,7 +19,7 @@ from robotid.regressor.compiled import (
     CompiledWriter,
     Tree,
     flatten,
-    is_installed,
+    keeps_code,
     why_not,
     work_per_sample,
 )
@@ -54,24 +54,19 @@ def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str
     Args:
         model: The robot.
         samples: Number of samples.
-        compiled: Whether to compile; None: if installed and worth it.
+        compiled: Whether to compile; None: if it is worth it.
 
     Returns:
         ``COMPILED``, or "Pinocchio" with the reason where the compiled path was to be used.
-
-    Raises:
-        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
     """
-    if compiled and not is_installed():
-        raise MissingDependencyError("the compiled regressor", "numba", "fast")
     enough = -(-LONG_ENOUGH // work_per_sample(model))
     engine = "Pinocchio"
-    if compiled is not False and not is_installed():
-        engine += " (robotid[fast] is not installed)"
-    elif compiled is None and samples < enough:
+    if compiled is None and samples < enough:
         engine += f" (fewer than {enough} samples do not pay the start of the compiled path)"
     elif compiled is not False:
         reason = why_not(model)
+        if reason is None and compiled is None and not keeps_code():
+            reason = "no folder to keep compiled code in; name one as NUMBA_CACHE_DIR"
         engine = COMPILED if reason is None else f"{engine} ({reason})"
     _log.info("%s: regressor of %d samples: %s", model.name, samples, engine)
     return engine
@@ -247,7 +242,6 @@ def trajectory_rows(
 
     Raises:
         DataError: If joints or shapes do not fit the model.
-        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
     """
     if trajectory.joints != model.joints:
         raise DataError(

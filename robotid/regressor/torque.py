@@ -235,12 +235,11 @@ def build_problem(
         trajectory: N samples of q, v, a, tau.
         weight: Weight of each row, shape (N, n_rows), 0 to leave it out; all 1 if None.
         with_mass: Whether each sample also carries the regressor of its mass matrix.
-        compiled: Whether to use the compiled path where it supports the robot; None: where it is
-            installed and the trajectory is long enough to pay its start.
+        compiled: Whether to use the compiled path where it supports the robot; None: where the
+            trajectory is long enough to pay its start.
 
     Raises:
         DataError: If joints or shapes do not fit the model.
-        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
     """
     source = trajectory_rows(model, trajectory, weight, compiled)
     shape, weights = source.weights.shape, source.weights

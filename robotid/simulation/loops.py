@@ -12,15 +12,15 @@ from functools import cached_property
 from itertools import pairwise
 from os import cpu_count
 from types import ModuleType
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from robotid._typing import Array
-from robotid.exceptions import MissingDependencyError, NotConvergedError, SettingsError
+from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.findings import listed
 from robotid.logs.data import Log
-from robotid.regressor.compiled import Tree, flatten, is_installed, why_not
+from robotid.regressor.compiled import Tree, flatten, why_not
 from robotid.robot.drives import (
     Asymmetric,
     Coulomb,
@@ -38,6 +38,9 @@ from robotid.robot.drives import (
 )
 from robotid.robot.mass_matrix import rigid_mass_matrices
 from robotid.robot.model import RobotModel
+
+if TYPE_CHECKING:
+    from robotid.simulation.loop_lanes import Course
 
 __all__ = ["Column", "LoopedRobot", "Loops", "RollOut", "Window", "cut_windows", "open_loops"]
 
@@ -225,9 +228,7 @@ class _Part:
 
     joints: Array  # rows of its joints in the model, (k,)
     bodies: Array  # their bodies in the layout, (k,)
-    parents: Array
-    constants: Array
-    is_below: Array
+    tree: Tree
 
 
 class LoopedRobot:
@@ -242,12 +243,9 @@ class LoopedRobot:
             corrects: Whether each step is solved once more, at its middle; it has no derivatives.
 
         Raises:
-            MissingDependencyError: If Numba is not installed.
             SettingsError: If the robot floats, a drive turns with several joints, or a joint is of
                 a kind that is not compiled.
         """
-        if not is_installed():
-            raise MissingDependencyError("rolling out closed loops", "numba", "fast")
         if model.free_flyer or model.layout.couplings or model.mimic == "coupled":
             raise SettingsError(
                 f"{model.name}: a floating base, drives that turn with several joints and coupled "
@@ -258,7 +256,6 @@ class LoopedRobot:
             raise SettingsError(f"{model.name} cannot be rolled out: {why}")
         self.model, self.step, self.corrects = model, step, corrects
         self._parts = _parts(flatten(model))
-        self._gravity = np.array(model.pin_model.gravity.linear)
 
     @property
     def kinds(self) -> dict[str, int]:
@@ -369,21 +366,21 @@ class LoopedRobot:
         drives = np.column_stack(
             [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)]
         )
-        command, steps, ticks, every, start = self._commands(part, windows, loops)
-        samples = len(steps) // every + 1
+        course = self._course(part, windows, loops)
+        samples = len(course.steps) // course.every + 1
         q, v = np.zeros((2, samples, n, lanes.LANES))
         S = np.zeros((samples, outputs * n, len(columns), lanes.LANES))
-        q[0], v[0] = start
+        q[0], v[0] = course.start
         failed = lanes.roll_out(
-            part.parents, part.constants, loops.zero[own], loops.bodies[part.bodies],
-            part.is_below, self._gravity, drives, codes, shapes, loops.values[places],
-            first, columns, along, command, steps, ticks, every, start, q, v, S,
-            np.zeros(lanes.work_size(n, len(columns), int(remembers.sum()))), self.corrects,
+            part.tree, loops.zero[own], loops.bodies[part.bodies], drives,
+            lanes.Terms(codes, shapes, loops.values[places], first),
+            lanes.Columns(columns, along), course, lanes.Motion(q, v, S),
+            lanes.work_of(n, len(columns), int(remembers.sum())), self.corrects,
         )  # fmt: skip
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
             raise NotConvergedError(
                 self._why_not(own, loops, windows[0].start[0]),
-                f"step {failed % len(steps) + 1} of {len(steps)}",
+                f"step {failed % len(course.steps) + 1} of {len(course.steps)}",
             )
         return columns_of, q, v, S
 
@@ -410,10 +407,8 @@ class LoopedRobot:
             "the rate at which the drives close their loops in [controller], or leave it out"
         )
 
-    def _commands(
-        self, part: _Part, windows: Sequence[Window], loops: Loops
-    ) -> tuple[Array, Array, Array, int, Array]:
-        """Return commands and lengths by step and lane, ticks, steps a sample, and the start."""
+    def _course(self, part: _Part, windows: Sequence[Window], loops: Loops) -> "Course":
+        """Return what the joints of a part are told in a block of windows."""
         lanes = _lanes()
         samples = max(window.stop - window.begin for window in windows)
         grids = [_Grid.of(window, samples, loops.rate) for window in windows]
@@ -443,7 +438,8 @@ class LoopedRobot:
                     lanes.average_command(log.t, x, told, loops.delay[j], mean, change)
                     command[:, i, k, lane] = mean[of_step]
                     command[:, i, by_delay, lane] = change[of_step]
-        return command, steps, ticks, every, start
+        course: Course = lanes.Course(command, steps, ticks, every, start)
+        return course
 
 
 @dataclass(frozen=True, eq=False)
@@ -494,21 +490,13 @@ class _Grid:
 
 def _parts(tree: Tree) -> list[_Part]:
     """Return the parts of a robot that the world alone joins."""
-    parents, rows = tree.parents[1:] - 1, tree.leaders[1:]
     root: list[int] = []
-    for i, parent in enumerate(parents):
+    for i, parent in enumerate(tree.parents):
         root.append(i if parent < 0 else root[parent])
     parts = []
     for r in sorted(set(root)):
-        bodies = [i for i, own in enumerate(root) if own == r]
-        place = {body: k for k, body in enumerate(bodies)}
-        above = np.array([place.get(int(parents[i]), -1) for i in bodies], dtype=np.int64)
-        is_below = np.eye(len(bodies), dtype=bool)
-        for k, parent in enumerate(above):
-            if parent >= 0:
-                is_below[k] |= is_below[parent]
-        constants = np.ascontiguousarray(tree.joints[1:][bodies])
-        parts.append(_Part(rows[bodies], np.array(bodies), above, constants, is_below))
+        bodies = np.flatnonzero(np.array(root) == r)
+        parts.append(_Part(tree.leaders[bodies], bodies, tree.part(bodies)))
     return parts
 
 

@@ -10,7 +10,7 @@ from helpers.single_joint import slider
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from robotid.exceptions import MissingDependencyError, NotConvergedError, SettingsError
+from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.logs.data import Log
 from robotid.robot.drives import (
     Asymmetric,
@@ -489,12 +489,6 @@ def test_lanes_know_nothing_of_each_other(legs):
         assert len(out.q) == window.stop - window.first
         for mine, other in zip(alone.slopes, out.slopes, strict=True):
             np.testing.assert_allclose(mine[2], other[2], atol=1e-12)
-
-
-def test_without_numba_the_extra_is_named(planar, monkeypatch):
-    monkeypatch.setattr("robotid.simulation.loops.is_installed", lambda: False)
-    with pytest.raises(MissingDependencyError, match=r"closed loops needs numba.*robotid\[fast\]"):
-        LoopedRobot(planar)
 
 
 @pytest.mark.parametrize(
