@@ -1,6 +1,9 @@
-"""What a term of a drive's torque is: its motion in, its column out. ``drives`` has the terms."""
+"""What a term of a drive's torque is, and a family of terms that come together.
 
-from collections.abc import Mapping
+``drives`` has the terms and the families.
+"""
+
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from itertools import chain, pairwise
@@ -13,9 +16,10 @@ from robotid._typing import Array
 from robotid.exceptions import SettingsError
 from robotid.robot.drive_laws import CONSTANT, DIRECTED, LINEAR, LOADED, PLAIN, law
 
-__all__ = ["DriveMotion", "DriveTerm", "MemorylessTerm"]
+__all__ = ["ANYWHERE", "DriveMotion", "DriveTerm", "Family", "MemorylessTerm", "Seen", "Shape"]
 
-_ANYWHERE = (-np.inf, np.inf)
+#: A range without ends.
+ANYWHERE = (-np.inf, np.inf)
 _NONE = (0.0,) * 4
 _ENDS = (-1e9, 1e9)  # numbers of a term's shape
 
@@ -81,7 +85,7 @@ class DriveTerm:
         rising: Names of numbers that increase in this order.
     """
 
-    seen: tuple[float, float] = _ANYWHERE
+    seen: tuple[float, float] = ANYWHERE
 
     label: ClassVar[str] = ""
     units: ClassVar[tuple[str, str]] = ("N m", "N")
@@ -130,7 +134,7 @@ class DriveTerm:
     def to_dict(self) -> dict[str, Any]:
         """Return the term as plain values, which ``term_from_dict`` reads."""
         shape = {key: value for key, value in asdict(self).items() if key != "seen"}
-        guard = {} if self.seen == _ANYWHERE else {"seen": list(self.seen)}
+        guard = {} if self.seen == ANYWHERE else {"seen": list(self.seen)}
         return {"term": type(self).__name__, **shape, **guard}
 
 
@@ -178,7 +182,7 @@ class MemorylessTerm(DriveTerm):
         """Four numbers of a(v), four of b(q), the largest size of v, the range of q."""
         shapes = ((*shape, *_NONE)[:4] for shape in (self.speed_shape, self.position_shape))
         fastest = self.seen[1] if self.guards == "v" else np.inf
-        seen = self.seen if self.guards == "q" else _ANYWHERE
+        seen = self.seen if self.guards == "q" else ANYWHERE
         return tuple(map(float, (*chain(*shapes), fastest, *seen)))
 
     def amplitude(self, q: Array, v: Array) -> Array:
@@ -208,3 +212,83 @@ class MemorylessTerm(DriveTerm):
         if self.follows_direction:
             column = motion.direction * column
         return np.abs(motion.load) * column if self.bears_load else column
+
+
+#: Ranges of position "q" and of the size of speed "v" that a fit has seen.
+Seen = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A shape parameter that terms are not linear in.
+
+    Attributes:
+        name: Field of the terms that holds it.
+        units: Its unit for a drive that turns, and for one that slides.
+        bounds: Where it is sought, in units of what it is measured by.
+        of: What it is measured by: "v", the largest speed seen, "q", the range seen; "": itself.
+    """
+
+    name: str
+    units: tuple[str, str]
+    bounds: tuple[float, float]
+    of: str = ""
+
+    def within(self, seen: Seen) -> tuple[float, float]:
+        """Return the bounds in the shape's own unit.
+
+        Args:
+            seen: Ranges of position "q" and of the size of speed "v" that the fit has seen.
+        """
+        low, high = self.bounds
+        if not self.of:
+            return low, high
+        first, last = seen[self.of]
+        scale = last if self.of == "v" else last - first
+        return low * scale, high * scale
+
+
+@dataclass(frozen=True)
+class Family:
+    """Terms that come together, with the shape that they share.
+
+    Attributes:
+        name: Its name in a job's ``friction``.
+        meaning: What it is, in words of a finding.
+        make: Returns the terms of the ranges seen and of a shape.
+        shapes: Its shape parameters.
+        needs: What the motion must have seen of the position, in full turns; 0: anything.
+        is_automatic: Whether ``friction = "auto"`` tries it.
+        code: Code of the finding that a model lacks it; empty: what a fit leaves is not tested for
+            it.
+        tested: Shapes at which it is tested for, speeds over their root mean square.
+        instead: Families advised where the joint turned less than this one needs.
+        advice: What the user can do beside adding it to the model; empty if nothing.
+        has_size: Whether its parameter is its size in a finding; else its torque, root mean square.
+        is_imitated: Whether a drive that sticks at its reversals looks like it behind a filter: it
+            is no more than a note then.
+    """
+
+    name: str
+    meaning: str
+    make: Callable[..., tuple[DriveTerm, ...]]
+    shapes: tuple[Shape, ...] = ()
+    needs: float = 0.0
+    is_automatic: bool = False
+    code: str = ""
+    tested: tuple[tuple[float, ...], ...] = ((),)
+    instead: tuple[str, ...] = ()
+    advice: str = ""
+    has_size: bool = False
+    is_imitated: bool = False
+
+    def tested_terms(self, speed: float) -> tuple[DriveTerm, ...]:
+        """Return the terms that what a fit leaves is tested against, of no range in particular.
+
+        Args:
+            speed: Root mean square of the speed [rad/s or m/s].
+        """
+        units = [speed if shape.of == "v" else 1.0 for shape in self.shapes]
+        sizes = [[x * unit for x, unit in zip(own, units, strict=True)] for own in self.tested]
+        anywhere = {"q": ANYWHERE, "v": ANYWHERE}
+        return tuple(term for own in sizes for term in self.make(anywhere, *own))

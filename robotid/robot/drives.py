@@ -9,43 +9,38 @@ The columns of many terms are guarded: beyond the speeds or positions that the f
 stay as they were at the end of that range, for no data say how they go on.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 
-from robotid._settings import is_number
 from robotid._typing import Array
-from robotid.exceptions import SettingsError
-from robotid.findings import listed
-from robotid.robot.drive_laws import (
-    COSINE,
-    CUBIC,
-    FADING,
-    HAT,
-    LEVER,
-    LINEAR,
-    POLYNOMIAL,
-    POWER,
-    RISE,
-    SINE,
-    SIZE,
-    TANH,
-    bristles,
+from robotid.robot import drive_laws as laws
+from robotid.robot.drive_term import (
+    DriveMotion,
+    DriveTerm,
+    Family,
+    MemorylessTerm,
+    Seen,
+    Shape,
 )
-from robotid.robot.drive_term import DriveMotion, DriveTerm, MemorylessTerm
 
 __all__ = [
+    "COUNTERBALANCE",
     "DRIVE_TERMS",
+    "FAMILIES",
     "TERMS",
+    "TERM_CLASSES",
     "Bristles",
     "DriveMotion",
     "DriveTerm",
+    "Family",
     "Lag",
     "LoadFriction",
     "MemorylessTerm",
-    "term_from_dict",
+    "Seen",
 ]
 
 _POSITIVE = (1e-9, 1e9)  # numbers of a term's shape that it is divided by
@@ -78,7 +73,7 @@ class Viscous(MemorylessTerm):
     """Viscous friction, tau = Fv w."""
 
     label = "viscous"
-    speed_law = LINEAR
+    speed_law = laws.LINEAR
     units = ("N m s/rad", "N s/m")
     is_nonnegative = True
     usual = (0.5, 4.0)
@@ -112,7 +107,7 @@ class Asymmetric(MemorylessTerm):
     """Viscous friction that differs by direction, tau = x |w|; of Coulomb's, see ``Offset``."""
 
     label = "asymmetric"
-    speed_law = SIZE
+    speed_law = laws.SIZE
     units = ("N m s/rad", "N s/m")
 
 
@@ -140,7 +135,7 @@ class Cubic(MemorylessTerm):
     """Friction that bends with speed, tau = x w^3."""
 
     label = "cubic"
-    speed_law = CUBIC
+    speed_law = laws.CUBIC
     units = ("N m s^3/rad^3", "N s^3/m^3")
     guards = "v"
 
@@ -159,7 +154,7 @@ class Stribeck(MemorylessTerm):
     speed: float = 0.1
 
     label = "stribeck"
-    speed_law = FADING
+    speed_law = laws.FADING
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"speed": _POSITIVE}
     follows_direction = True
     guards = "v"
@@ -177,7 +172,7 @@ class Tanh(MemorylessTerm):
     speed: float = 0.1
 
     label = "tanh"
-    speed_law = TANH
+    speed_law = laws.TANH
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"speed": _POSITIVE}
     is_nonnegative = True
     guards = "v"
@@ -195,7 +190,7 @@ class Power(MemorylessTerm):
     exponent: float = 1.0 / 3.0
 
     label = "power"
-    speed_law = POWER
+    speed_law = laws.POWER
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"exponent": (0.0, 10.0)}
     units = ("N m (s/rad)^p", "N (s/m)^p")
     follows_direction = True
@@ -215,7 +210,7 @@ class Ramp(MemorylessTerm):
     low: float = 0.0
     high: float = 1.0
 
-    speed_law = RISE
+    speed_law = laws.RISE
     rising: ClassVar[tuple[str, ...]] = ("low", "high")
     is_nonnegative = True
     follows_direction = True
@@ -251,7 +246,7 @@ class Harmonic(MemorylessTerm):
     @property
     def position_law(self) -> int:  # type: ignore[override]
         """Sine or cosine."""
-        return SINE if self.is_sine else COSINE
+        return laws.SINE if self.is_sine else laws.COSINE
 
     @property
     def position_shape(self) -> tuple[float, ...]:
@@ -266,7 +261,7 @@ class PositionCoulomb(MemorylessTerm):
     order: int = 1
     centre: float = 0.0
 
-    position_law = POLYNOMIAL
+    position_law = laws.POLYNOMIAL
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"order": (0, 10)}
     follows_direction = True
     is_shared = False
@@ -304,7 +299,7 @@ class Bristles(DriveTerm):
         Args:
             v: Speeds [rad/s or m/s].
         """
-        return bristles(self.numbers, np.zeros_like(v), v)[0]
+        return laws.bristles(self.numbers, np.zeros_like(v), v)[0]
 
     def column(self, motion: DriveMotion) -> Array:
         """Return z along stretches, from sliding where they begin.
@@ -318,7 +313,7 @@ class Bristles(DriveTerm):
         if motion.begins is None:
             return motion.direction * self.level(motion.v)
         way = np.diff(motion.q, prepend=motion.q[:1])
-        level, _, kept = bristles(self.numbers, way, motion.v)
+        level, _, kept = laws.bristles(self.numbers, way, motion.v)
         ends, start = np.sign(way) * level, motion.direction * level
         z, state = np.empty(len(way)), 0.0
         steps = zip(*(x.tolist() for x in (ends, kept, start, motion.begins)), strict=True)
@@ -369,7 +364,7 @@ class Spring(MemorylessTerm):
     """A linear spring, tau = k q; the torque at q = 0 is the offset's."""
 
     label = "spring"
-    position_law = POLYNOMIAL
+    position_law = laws.POLYNOMIAL
     units = ("N m/rad", "N/m")
     is_shared = False
     is_friction = True
@@ -391,7 +386,7 @@ class Hat(MemorylessTerm):
     before: float = -1.0
     after: float = 1.0
 
-    position_law = HAT
+    position_law = laws.HAT
     rising: ClassVar[tuple[str, ...]] = ("before", "at", "after")
     is_shared = False
     guards = "q"
@@ -421,7 +416,7 @@ class Counterbalance(MemorylessTerm):
     rest: float = 0.0
 
     label = "counterbalance"
-    position_law = LEVER
+    position_law = laws.LEVER
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"arm": _POSITIVE, "base": _POSITIVE}
     units = ("N/m", "N/m")
     is_nonnegative = True
@@ -464,7 +459,8 @@ TERMS: dict[str, DriveTerm] = {
 DRIVE_TERMS = tuple(TERMS)
 
 
-_CLASSES: dict[str, type[DriveTerm]] = {
+#: The terms that have a shape of their own, or are in no model unless stated, by class.
+TERM_CLASSES: dict[str, type[DriveTerm]] = {
     kind.__name__: kind
     for kind in (
         Asymmetric, LoadFriction, Cubic, Stribeck, Tanh, Power, Ramp, Harmonic, PositionCoulomb,
@@ -473,40 +469,101 @@ _CLASSES: dict[str, type[DriveTerm]] = {
 }  # fmt: skip
 
 
-def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:
-    """Return a term of its plain values, as ``DriveTerm.to_dict`` gives them.
+#: Family of a counterbalance that opposes gravity.
+COUNTERBALANCE = "harmonics1"
+_SPEED = Shape("speed", ("rad/s", "m/s"), (0.005, 0.5), "v")
+_RISE = Shape("speed", ("rad/s", "m/s"), (0.005, 1.0), "v")
+_WAY = Shape("displacement", ("rad", "m"), (0.0005, 0.015), "q")
+_KNOTS = 4  # of a piecewise-linear curve of friction
+_TABLE = 8  # entries of a tabulated spring
 
-    Args:
-        table: Its class under "term", and the fields that are not left as they are.
 
-    Raises:
-        SettingsError: If there is no such term, or a field of it is unknown or no number.
-    """
-    if not isinstance(table, Mapping):
-        raise SettingsError(
-            f"a drive term is {table!r}, wanted a table, as {{ term = 'Stribeck', speed = 0.1 }}"
+def _curve(seen: Seen) -> tuple[DriveTerm, ...]:
+    """Return the rises of a monotone curve over the speeds seen, closer together at low speed."""
+    knots = seen["v"][1] * np.linspace(0.0, 1.0, _KNOTS + 1) ** 2
+    return tuple(
+        Ramp(number=k, low=a, high=b) for k, (a, b) in enumerate(pairwise(knots.tolist()), start=1)
+    )
+
+
+def _table(seen: Seen) -> tuple[DriveTerm, ...]:
+    """Return the entries of a tabulated spring but the middle one, which is the offset's."""
+    knots = np.linspace(*seen["q"], _TABLE + 1).tolist()
+    step = knots[1] - knots[0]
+    return tuple(
+        Hat(seen=seen["q"], number=k, at=x, before=x - step, after=x + step)
+        for k, x in enumerate(knots, start=1)
+        if k != _TABLE // 2 + 1
+    )
+
+
+def _harmonics(highest: int) -> Callable[[Seen], tuple[DriveTerm, ...]]:
+    def make(seen: Seen) -> tuple[DriveTerm, ...]:
+        return tuple(
+            Harmonic(seen=seen["q"], order=float(k), is_sine=is_sine)
+            for k in range(1, highest + 1)
+            for is_sine in (False, True)
         )
-    kind = _CLASSES.get(str(table.get("term")))
-    if kind is None:
-        raise SettingsError(f"term is {table.get('term')!r}, wanted one of {listed(_CLASSES)}")
-    known = {field.name: field.default for field in fields(kind)}
-    values: dict[str, Any] = {}
-    for key, value in table.items():
-        if key == "term":
-            continue
-        if key not in known:
-            raise SettingsError(f"{kind.__name__} has no {key!r}; it has {listed(known)}")
-        values[key] = _read_field(kind, key, value, known[key])
-    return kind(**values)
+
+    return make
 
 
-def _read_field(kind: type[DriveTerm], key: str, value: object, default: object) -> object:
-    if key == "seen":
-        if isinstance(value, Sequence) and len(value) == 2 and all(map(is_number, value)):
-            return (float(value[0]), float(value[1]))
-        raise SettingsError(f"{kind.__name__}: seen is {value!r}, wanted [lowest, highest]")
-    is_flag = isinstance(default, bool)
-    if is_flag is not isinstance(value, bool) or not (is_flag or is_number(value)):
-        wanted = "true or false" if is_flag else "a finite number"
-        raise SettingsError(f"{kind.__name__}: {key} is {value!r}, wanted {wanted}")
-    return type(default)(value)  # type: ignore[call-arg]
+def _once_a_turn() -> tuple[DriveTerm, ...]:
+    """Return cosine and sine of the position: gravity has a part of them, beyond the range, too."""
+    return (Harmonic(), Harmonic(is_sine=True))
+
+
+def _by_position(seen: Seen) -> tuple[DriveTerm, ...]:
+    centre = 0.5 * (seen["q"][0] + seen["q"][1])
+    return tuple(PositionCoulomb(seen=seen["q"], order=k, centre=centre) for k in (1, 2))
+
+
+_OTHER = "friction that is not viscous and Coulomb"
+_SLOW = "raise min_velocity to leave the slow rows out"
+#: What a job's ``friction`` may name beside viscous and Coulomb friction, by name.
+FAMILIES: dict[str, Family] = {
+    family.name: family
+    for family in (
+        Family("load", "friction that grows with the load", lambda seen: (LoadFriction(),),
+               is_automatic=True, code="load_friction", has_size=True),
+        Family("stribeck", f"{_OTHER} but rises towards standstill (Stribeck)",
+               lambda seen, speed: (Stribeck(seen=seen["v"], speed=speed),), (_SPEED,),
+               is_automatic=True, code="friction_shape", tested=((0.05,), (0.2,)),
+               advice=f"{_SLOW[0].upper()}{_SLOW[1:]}"),
+        Family("tanh", f"{_OTHER} but sets in with speed, or a drive that sticks",
+               lambda seen, speed: (Tanh(seen=seen["v"], speed=speed),), (_RISE,),
+               is_automatic=True, code="friction_shape", tested=((0.03,), (0.15,)),
+               advice=f"Set friction_band, or {_SLOW}", is_imitated=True),
+        Family("presliding", "friction that is taken up after each reversal",
+               lambda seen, way: (Presliding(displacement=way),), (_WAY,), is_automatic=True),
+        Family("lag", "a torque that comes late (a delay, an elastic gear)",
+               lambda seen: (Lag(),), is_automatic=True),
+        Family(COUNTERBALANCE, "a torque that repeats once a turn, as a counterbalance's",
+               lambda seen: _once_a_turn(), needs=0.1),
+        Family("harmonics2", "a spring or counterbalance that follows the joint's position",
+               _harmonics(2), needs=0.5, is_automatic=True, code="spring",
+               instead=(COUNTERBALANCE, "spring")),
+        Family("harmonics4",
+               "a torque that repeats with the joint's position (cogging, an eccentric gear)",
+               _harmonics(4), needs=0.5, is_automatic=True, code="position_periodic"),
+        Family("asymmetric", "viscous friction that differs by direction",
+               lambda seen: (Asymmetric(),), is_automatic=True, code="friction_shape",
+               has_size=True),
+        Family("power", f"{_OTHER} but bends with speed, as |v|^(1/3) does",
+               lambda seen, exponent: (Power(seen=seen["v"], exponent=exponent),),
+               (Shape("exponent", ("-", "-"), (0.1, 0.9)),), code="friction_shape",
+               tested=((1.0 / 3.0,),)),
+        Family("cubic", f"{_OTHER} but bends with speed, as v^3 does",
+               lambda seen: (Cubic(seen=seen["v"]),), code="friction_shape"),
+        Family("curve", "friction by a monotone curve over speed", _curve),
+        Family("lugre", "presliding with a hook at low speed",
+               lambda seen, way, speed, excess: (
+                   LuGre(displacement=way, speed=speed, excess=excess),
+               ),
+               (_WAY, _SPEED, Shape("excess", ("-", "-"), (0.01, 3.0)))),
+        Family("position", "Coulomb friction that depends on the position", _by_position),
+        Family("spring", "a spring on the joint", lambda seen: (Spring(seen=seen["q"]),),
+               code="spring", has_size=True),
+        Family("spring_table", "a spring of any curve", _table),
+    )
+}  # fmt: skip
