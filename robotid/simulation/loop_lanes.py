@@ -40,18 +40,17 @@ from robotid.regressor.tree_lanes import (
     mass_matrix,
     place,
 )
-from robotid.simulation.law_lanes import BRISTLES, LOAD, loop_torque, taken_up, term
+from robotid.robot.drive_laws import BRISTLES, LOADED
+from robotid.simulation.law_lanes import loop_torque, slid, taken_up, term, turned
 
 __all__ = [
     "ARMATURE",
-    "BRISTLES",
     "INERTIAL",
     "KD",
     "KP",
     "LANES",
     "LATE",
     "LIMIT",
-    "LOAD",
     "SPEED",
     "START",
     "TERM",
@@ -77,17 +76,17 @@ class Terms(NamedTuple):
     """Friction and offset of the joints: T terms, joint by joint.
 
     Attributes:
-        codes: Kind of each, shape (T,), int.
-        shapes: What shapes it, two numbers and the range of positions seen, shape (T, 4); way,
-            speed and excess of a term that is taken up, and its number among those.
+        codes: Law of speed, law of position and kind of each, shape (T, 3), int.
+        shapes: Numbers of its laws, or those of bristles and its number among them, shape (T, 11).
         values: Its parameter, shape (T,).
-        first: Where the terms of a joint begin, shape (n + 1,), int.
+        spans: Where the terms of a joint begin, where those do that are bristles or are in the
+            drives' numbers, and where they end, shape (n, 3), int.
     """
 
     codes: Array
     shapes: Array
     values: Array
-    first: Array
+    spans: Array
 
 
 class Columns(NamedTuple):
@@ -159,7 +158,7 @@ def _balance(work, n, at, drives, terms, step, command):
     load multiplies the bodies' torque tau: so H stays symmetric.
     """
     q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip = at
-    codes, shapes, values, first = terms
+    codes, shapes, values, spans = terms
     if memory >= 0:
         _hold_on(work, n, at, terms, step)
     for i in range(n):
@@ -172,17 +171,21 @@ def _balance(work, n, at, drives, terms, step, command):
                 put(work, load + i, lane, get(work, load + i, lane) + m * moved)
                 put(work, H + i * n + j, lane, m)
         armature, kp, kd = drives[i, 0], drives[i, 1], drives[i, 2]
+        offset, viscous, coulomb = drives[i, 4], drives[i, 5], drives[i, 6]
         for lane in range(LANES):
             span, tau = THETA * step[lane], get(work, load + i, lane)
             speed, angle = get(work, u + i, lane), get(work, middle + i, lane)
-            f, f_u = get(work, grip + i, lane), get(work, grip + n + i, lane)
+            s, s_u = turned(speed)
+            f = get(work, grip + i, lane) + offset + viscous * speed + coulomb * s
+            f_u = get(work, grip + n + i, lane) + viscous + coulomb * s_u
             f_q, e, e_u = 0.0, 1.0, 0.0
-            for k in range(first[i], first[i + 1]):
-                y, y_u, y_q = term(codes[k], shapes[k], angle, speed)
-                if codes[k] == LOAD:
+            for k in range(spans[i, 0], spans[i, 1]):
+                y, y_u, y_q = term(codes, shapes, k, angle, speed, s, s_u)
+                if codes[k, 2] == LOADED:
                     side = math.copysign(values[k], tau)
                     e += side * y
                     e_u += side * y_u
+                    f_q += side * y_q * tau
                 else:
                     f += values[k] * y
                     f_u += values[k] * y_u
@@ -207,12 +210,12 @@ def _balance(work, n, at, drives, terms, step, command):
 def _hold_on(work, n, at, terms, step):
     """Write the friction of memories for the speeds u, and its derivative."""
     u, memory, grip = at[2], at[13], at[14]
-    codes, shapes, values, first = terms
+    codes, shapes, values, spans = terms
     for i in range(n):
         for lane in range(LANES):
             speed, f, f_u = get(work, u + i, lane), 0.0, 0.0
-            for k in range(first[i], first[i + 1]):
-                if codes[k] == BRISTLES:
+            for k in range(spans[i, 0], spans[i, 2]):
+                if codes[k, 2] == BRISTLES:
                     before = get(work, memory + 5 * int(shapes[k, 3]), lane)
                     z, z_u, _ = taken_up(shapes[k], before, speed, THETA * step[lane])
                     f += values[k] * z
@@ -278,7 +281,7 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, tree)
     """Advance the sensitivities S of q and v, shape (2n, P), over a step that is solved."""
     q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip = at
     T_q, T_v, S, own, change, by_hold, by_memory = sweeps
-    codes, shapes, values, first = terms
+    codes, shapes, values, spans = terms
     kinds, directions = columns
     P = len(kinds)
     _combine(work, n, at, sweeps, drives, step)
@@ -303,11 +306,12 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, tree)
                 span, speed, x = THETA * step[lane], get(work, u + j, lane), 0.0
                 if kind == ARMATURE:
                     x = (speed - get(work, v + j, lane)) / span
-                elif kind == TERM and codes[index] == BRISTLES:
+                elif kind == TERM and codes[index, 2] == BRISTLES:
                     x = get(work, memory + 5 * int(shapes[index, 3]) + 1, lane)
                 elif kind == TERM:
-                    x, _, _ = term(codes[index], shapes[index], get(work, middle + j, lane), speed)
-                    x *= abs(get(work, load + j, lane)) if codes[index] == LOAD else 1.0
+                    angle, (s, s_u) = get(work, middle + j, lane), turned(speed)
+                    x, _, _ = term(codes, shapes, index, angle, speed, s, s_u)
+                    x *= abs(get(work, load + j, lane)) if codes[index, 2] == LOADED else 1.0
                 elif held < 0:
                     reach = command[j, 0, lane] - get(work, q + j, lane) - span * speed
                     slip = command[j, 2, lane] - speed
@@ -334,10 +338,10 @@ def _remember(work, n, at, terms, step):
     These are of what acts by z before, of z after by the speed u, and by z before.
     """
     u, memory = at[2], at[13]
-    codes, shapes, values, first = terms
+    codes, shapes, values, spans = terms
     for i in range(n):
-        for k in range(first[i], first[i + 1]):
-            if codes[k] == BRISTLES:
+        for k in range(spans[i, 0], spans[i, 2]):
+            if codes[k, 2] == BRISTLES:
                 z = memory + 5 * int(shapes[k, 3])
                 for lane in range(LANES):
                     speed, before = get(work, u + i, lane), get(work, z, lane)
@@ -355,20 +359,15 @@ def _slide(work, n, at, by_memory, columns, terms):
     It is that of long sliding, but for joints that take longer than ``_SLID`` to go their way.
     """
     v, memory = at[1], at[13]
-    codes, shapes, values, first = terms
+    codes, shapes, values, spans = terms
     for i in range(n):
-        for k in range(first[i], first[i + 1]):
-            if codes[k] != BRISTLES:
+        for k in range(spans[i, 0], spans[i, 2]):
+            if codes[k, 2] != BRISTLES:
                 continue
             slot, P = int(shapes[k, 3]), len(columns)
             for lane in range(LANES):
-                speed = get(work, v + i, lane)
-                extra = shapes[k, 2] * math.exp(-((speed / shapes[k, 1]) ** 2))
-                slow = shapes[k, 0] / _SLID
-                root = math.sqrt(speed * speed + slow * slow)
-                put(work, memory + 5 * slot, lane, speed / root * (1.0 + extra))
-                by_speed = slow * slow / root**3 * (1.0 + extra)
-                by_speed -= 2.0 * speed * speed / (root * shapes[k, 1] ** 2) * extra
+                z, by_speed = slid(shapes[k], get(work, v + i, lane), _SLID)
+                put(work, memory + 5 * slot, lane, z)
                 for p in range(P):
                     if columns[p, 0] == SPEED and columns[p, 1] == i:
                         put(work, by_memory + slot * P + p, lane, by_speed)
@@ -379,10 +378,10 @@ def _recall(work, n, at, sweeps, terms, p, P, is_after):
     """Add to one column what memories make of their past; after the step, advance theirs."""
     loss, memory = at[11], at[13]
     own, change, by_memory = sweeps[3], sweeps[4], sweeps[6]
-    codes, shapes, values, first = terms
+    codes, shapes, values, spans = terms
     for i in range(n):
-        for k in range(first[i], first[i + 1]):
-            if codes[k] != BRISTLES:
+        for k in range(spans[i, 0], spans[i, 2]):
+            if codes[k, 2] != BRISTLES:
                 continue
             slot = int(shapes[k, 3])
             z, Z = memory + 5 * slot, by_memory + slot * P + p
@@ -508,7 +507,8 @@ def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, cor
         tree: The n joints, in the order of their bodies.
         zeros: Angle of the URDF where an encoder reads 0, shape (n,) [rad or m].
         bodies: Ten inertial parameters of each joint's body, shape (n, 10).
-        drives: Armature, kp, kd and largest torque of each joint, shape (n, 4).
+        drives: Armature, kp, kd and largest torque of each joint, and the sums of its parameters of
+            1, the speed and its direction, shape (n, 7).
         terms: ``Terms`` of the drives.
         columns: ``Columns`` of sensitivities.
         course: ``Course`` of what is told.
@@ -526,7 +526,7 @@ def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, cor
     load, loss, M = change + n, change + 2 * n, change + 3 * n
     H, T_q, T_v, S = M + n * n, M + 2 * n * n, M + 3 * n * n, M + 4 * n * n
     by_hold, held = S + 2 * n * P, S + 3 * n * P if len(ticks) else -1
-    memories = (codes == BRISTLES).sum()
+    memories = (codes[:, 2] == BRISTLES).sum()
     grip = S + (3 * P + 1) * n
     memory, by_memory = grip + 2 * n if memories else -1, grip + 2 * n + 5 * memories
     at = (q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip)

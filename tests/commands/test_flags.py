@@ -9,7 +9,7 @@ from robotid.cli.flags import job_from_flags
 from robotid.exceptions import SettingsError
 from robotid.fitting.settings import ESTIMATORS
 from robotid.logs.settings import SignalSettings
-from robotid.robot.families import FAMILIES
+from robotid.robot.drives import FAMILIES
 
 
 def job(command, *words):

@@ -136,7 +136,7 @@ def test_a_zero_that_is_off_makes_no_spring_of_another_joint():
 @pytest.mark.parametrize(("offset", "size"), [(0.1, 1.0), (0.03, 3.0)])  # what explains more
 def test_a_spring_is_named_beside_a_zero_that_is_off(model, offset, size):
     alone, (spring,), others = both(model, model, 3, 2, offset, effect="spring", size=size)
-    assert (spring.joint, spring.term.name) == ("elbow_joint", "linear spring")
+    assert (spring.joint, spring.term.name) == ("elbow_joint", "spring")
     assert spring.size == pytest.approx(alone[0].size, rel=0.01)
     assert named(others) == [("position_offset", "elbow_joint")]
     assert others[0].evidence["size"] == pytest.approx(-offset, rel=0.04)

@@ -91,7 +91,7 @@ def test_nothing_is_named_where_nothing_is_missing(clean):
 
 @pytest.mark.parametrize(
     ("effect", "joint", "size", "unit"),
-    [("load", 1, 0.1, "N m per N m of load"), ("spring", 2, None, "N m/rad")],
+    [("load", 1, 0.1, "N m per N m"), ("spring", 2, None, "N m/rad")],
 )
 def test_the_size_holds_the_truth(ur5, effect, joint, size, unit):
     (found,) = misfits(identified(ur5, 2, effect, joint))
@@ -174,7 +174,7 @@ def test_a_setting_keeps_what_the_drive_has_already(ur5):
 
 def test_a_family_is_advised_only_where_the_joint_turned_far_enough_for_it(ur5):
     sample = take_sample(identified(ur5, 1, "spring", 2, duration=12.0))
-    (candidate,) = (c for c in CANDIDATES if c.name == "counterbalance")
+    (candidate,) = (c for c in CANDIDATES if c.name == "harmonics2")
 
     def advised(turned, term=candidate):
         q = np.linspace(0.0, turned, sample.rows)
@@ -185,7 +185,7 @@ def test_a_family_is_advised_only_where_the_joint_turned_far_enough_for_it(ur5):
     assert [advised(x) for x in (3.5, 3.4, 0.7, 0.6)] == [
         ("harmonics2",), ("harmonics1",), ("harmonics1",), ("spring",)
     ]  # fmt: skip
-    (periodic,) = (c for c in CANDIDATES if c.name == "periodic")
+    (periodic,) = (c for c in CANDIDATES if c.name == "harmonics4")
     assert (advised(3.5, periodic), advised(3.0, periodic)) == (("harmonics4",), ())
 
 

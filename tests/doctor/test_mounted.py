@@ -9,7 +9,7 @@ from helpers.corruptions import NOISE, clean_log, robot
 from robotid.doctor.diagnosis import diagnose
 from robotid.logs.settings import SignalSettings
 from robotid.robot.bodies import link_places
-from robotid.robot.families import FAMILIES
+from robotid.robot.drives import FAMILIES
 from robotid.simulation.closed_loop import another_robot, simulate
 from robotid.simulation.motions import random_fourier
 

@@ -17,8 +17,8 @@ from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.drives import FAMILIES
 from robotid.robot.examples import example_urdf
-from robotid.robot.families import FAMILIES
 
 #: Friction is chosen where the test is about that.
 with_known_friction = partial(identify_payload, friction="viscous+coulomb")
