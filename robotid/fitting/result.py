@@ -176,7 +176,6 @@ class Fit(Identified):
 
     @property
     def base_reach(self) -> Array:
-        """How many standard errors the 95 % interval of each base parameter reaches, (b,)."""
         return self.errors.reach
 
     @property

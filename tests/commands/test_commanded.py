@@ -102,10 +102,13 @@ def test_what_was_found_is_printed_with_its_values(folder, result, job, capsys, 
     printed = capsys.readouterr().out
     for role, words in (("identification", "fitted"), ("validation", "not fitted")):
         assert f"{words}: chirp.parquet" in printed
-        own = result["simulation"][role][0]["per_joint"][LEG[2]]
+        part = result[role] if role == "identification" else result[role][0]
+        own = part["per_joint"][LEG[2]]
         row = [line for line in printed.splitlines() if line.split()[:1] == [LEG[2]]]
-        wanted = [f"{1e3 * own[key]:.2f}" for key in ("rmse", "second_order_rmse", "command_rmse")]
+        keys = [f"{key}relative_error_pct" for key in ("", "second_order_", "command_")]
+        wanted = [f"{own['rmse']:#.3g}", "rad", *(f"{own[key]:.1f}" for key in keys)]
         assert any(all(word in line.split() for word in wanted) for line in row)
+    assert f"{result['simulation']['fit']['parameters']} unknowns" in printed
     [armature] = [e for e in result["drive_parameters"] if e["name"] == f"{LEG[0]}.armature"]
     assert f"{armature['value']:.4g}" in printed
     assert result["verdict"]["status"] in printed
