@@ -39,7 +39,7 @@ def loop_entries(found: LoopIdentification) -> dict[str, Any]:
         "ranges": {"undetermined": [*unfitted, *found.undetermined]},
         "loop_parameters": _loop_parameters(found),
         "validation": [
-            {"log": run.log.path, "name": run.log.name, **position_metrics(model, (run,)).to_dict()}
+            {"log": run.log.path, "name": run.name, **position_metrics(model, (run,)).to_dict()}
             for run in found.validation
         ],
         "simulation": {
