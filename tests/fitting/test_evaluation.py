@@ -34,7 +34,7 @@ def test_baselines_are_the_urdf_with_and_without_motion(ur5, rng):
     assert measured.baselines["gravity_only"] > 10
 
 
-def test_without_parameters_nothing_is_predicted_but_the_recordings_are_told(ur5, rng):
+def test_without_parameters_there_are_recordings_but_no_predictions(ur5, rng):
     own, other = (hold_log(ur5, exact_log(ur5, truth(ur5), rng), EXACT) for _ in range(2))
     (fitted,), kept = evaluate_logs([own], [other, own], {}, None)
     assert [e.is_refitted for e in kept] == [False, True]
