@@ -134,7 +134,7 @@ def take_sample(fit: Solution, *, is_steady: bool = True) -> Sample | None:
         return None
     parts = list(zip([*fit.fitted, *kept], rows, strict=True))
     motion = [e.recording.trajectory.at(k) for e, k in parts]
-    Y = np.concatenate([_regressor(model, m) for m in motion])  # (N, n, p)
+    Y = np.concatenate([_regressor(model, e.recording.trajectory, k) for e, k in parts])
     tau = np.concatenate([m.tau for m in motion])
     r = tau - Y @ fit.standard
     used = np.concatenate([e.recording.mask[k] for e, k in parts])
@@ -223,9 +223,10 @@ def _stretches(fitted: int, kept: int, independent: float) -> tuple[slice, ...]:
     return tuple(slice(*pair) for pair in pairwise(edges))
 
 
-def _regressor(model: RobotModel, motion: Trajectory) -> Array:
-    """Return the regressor of the standard parameters, shape (N, n, p)."""
-    return trajectory_regressor(model, motion).reshape(len(motion.t), model.n_rows, -1)
+def _regressor(model: RobotModel, motion: Trajectory, samples: Array | None = None) -> Array:
+    """Return the regressor of the standard parameters at some samples, shape (N, n, p)."""
+    Y = trajectory_regressor(model, motion, samples)
+    return Y.reshape(-1, model.n_rows, Y.shape[1])
 
 
 def _usual_size(r: Array, used: Array) -> Array:

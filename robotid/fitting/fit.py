@@ -199,14 +199,14 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
     if not model.layout.remembering:
         return recordings
     choice = rough_choice(choice)
+    own = replace(recordings, kept=())  # nothing is predicted meanwhile
     for step in range(_MOST_LOADS):
-        ground = _ground(recordings, choice, is_last=False)
+        ground = _ground(own, choice, is_last=False)
         before = ground.before
         standard, _ = standard_of(ground.rough, mapping, before.pi, before.spread)
-        moved = standard - recordings.model.carried_by
+        moved = standard - own.model.carried_by
         if step >= _DAMPED:  # friction that takes a large share of the load may overshoot
             standard = standard - 0.5 * moved
-        recordings = recordings.with_model(model.with_reference(standard))
         loads = [_size_of(ground, x) for x in (moved, standard)]
         if (loads[0] <= _SETTLED * loads[1]).all():
             estimator = make_estimator(choice, model, mapping, before)
@@ -214,6 +214,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
                 estimate = estimator.fit(ground.factors)
                 standard, _ = standard_of(estimate, mapping, before.pi, before.spread)
             return recordings.with_model(model.with_reference(standard))
+        own = own.with_model(model.with_reference(standard))
     raise NotConvergedError(
         f"the load of the gears still changes after {_MOST_LOADS} fits; use friction = "
         "'viscous+coulomb', or record motion that determines more",

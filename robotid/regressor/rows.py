@@ -100,6 +100,17 @@ class InertialRows:
         """
         return replace(self, values=self.values[:, start:stop])
 
+    def write(self, samples: Array | slice, Y: Array) -> None:
+        """Write those of N samples into regressors, shape (N, n_rows, p).
+
+        Args:
+            samples: Which samples.
+            Y: The regressors, 0 where nothing is written.
+        """
+        rows = zip(self.columns, pairwise(self.first), strict=True)
+        for j, (own, (first, stop)) in enumerate(rows):
+            Y[:, j, own] = self.values[first:stop, samples].T
+
     def torque(self, stacked: Array) -> Array:
         """Return the torques of bodies, shape (k, N, n_rows) [N m, N].
 

@@ -10,7 +10,7 @@ from robotid.regressor import rows
 from robotid.regressor.memory import remember
 from robotid.regressor.prediction import predict
 from robotid.regressor.rows import keep_inertial_rows, kept_rows
-from robotid.regressor.torque import build_problem
+from robotid.regressor.torque import build_problem, trajectory_regressor
 from robotid.robot.drives import LoadFriction
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -43,6 +43,13 @@ def test_rows_and_predictions_are_those_without_what_is_kept(name, rng, monkeypa
     vectors[1][model.layout.n_inertial :] = 0.0
     for wanted, found in zip(*(predict(model, vectors, m) for m in (fresh, kept)), strict=True):
         np.testing.assert_allclose(found, wanted, atol=1e-9 * np.abs(wanted).max())
+    whole, every = (trajectory_regressor(model, m) for m in (fresh, kept))
+    np.testing.assert_allclose(every, whole, atol=1e-12 * np.abs(whole).max())
+    some = np.array([650, 3, 128])  # of samples that are taken out
+    wanted = whole.reshape(SAMPLES, model.n_rows, -1)[some].reshape(-1, whole.shape[1])
+    for m in (fresh, kept):
+        found = trajectory_regressor(model, m, some)
+        np.testing.assert_allclose(found, wanted, atol=1e-12 * np.abs(whole).max())
 
 
 def test_what_is_kept_is_of_one_robot_and_goes_with_its_motion_alone(ur5, rng, monkeypatch):
