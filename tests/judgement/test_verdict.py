@@ -267,6 +267,7 @@ def run(ur5, tmp_path):
             "urdf": str(example_urdf("ur5_robot.urdf")),
             "identification": [{"log": "run.csv"}],
             "validation": [{"log": "kept.csv"}],
+            "model": {"friction": "viscous+coulomb"},
             "estimator": {"prior_weight": 1.0, "draws": 0, **settings},
             "doctor": {"ignore": list(ignore)},
             "output": {"report": False},

@@ -3,10 +3,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.fitting.settings import EstimatorSettings
-from robotid.identification.pipeline import identify
+from robotid.judgement.findings import fit_findings
 from robotid.judgement.witness import Witness
 from robotid.logs.settings import SignalSettings
 
@@ -20,15 +21,20 @@ def near_urdf(model, scale=1.0):
     return scale * pi
 
 
-def found_of(model, pi, estimator="consistent"):
+def found_of(model, pi, **constraints):
     logs = [exact_log(model, pi, r, noise=NOISE) for r in np.random.default_rng(0).spawn(2)]
-    return identify(
-        model, logs[:1], validation=logs[1:], signals=EXACT, doctor=False, estimator=estimator
-    )
+    settings = EstimatorSettings(draws=0, constraints=constraints)
+    return identify(model, logs[:1], validation=logs[1:], signals=EXACT, estimator=settings)
 
 
-def test_a_robot_like_its_urdf_is_good_and_its_urdf_bears_witness(ur5):
-    found = found_of(ur5, near_urdf(ur5))
+@pytest.fixture(scope="module")
+def alike(ur5):
+    """A robot whose bodies are those of its URDF."""
+    return found_of(ur5, near_urdf(ur5))
+
+
+def test_a_robot_like_its_urdf_is_good_and_its_urdf_bears_witness(alike):
+    found = alike
     assert found.witness.factor == pytest.approx(1.0, abs=0.01)
     for joint, ratio in found.witness.gravity.items():
         assert ratio == pytest.approx(1.0, abs=5 * found.witness.gravity_error[joint] + 1e-3)
@@ -44,8 +50,7 @@ def test_torques_of_another_gain_are_told_from_other_masses_and_never_good(ur5):
     assert found.verdict.status == "usable"
     (reason,) = [r for r in found.verdict.reasons if "could not be checked" in r]
     assert "All joints alike are off by 0.80" in reason
-    stated = EstimatorSettings("consistent", constraints={"total_mass": [10.0, 20.0]})
-    found = found_of(ur5, near_urdf(ur5, 0.8), stated)
+    found = found_of(ur5, near_urdf(ur5, 0.8), total_mass=[10.0, 20.0])
     assert found.verdict.status == "good"
     assert "rests on the mass that was stated" in found.verdict.reasons[-1]
 
@@ -78,8 +83,8 @@ def test_without_gravity_nothing_bears_witness(ur5):
     assert "gravity loads no joint" in found.verdict.reasons[-1]
 
 
-def test_friction_stands_beside_it_as_a_share_of_the_torque(ur5):
-    found = found_of(ur5, near_urdf(ur5))
+def test_friction_stands_beside_it_as_a_share_of_the_torque(ur5, alike):
+    found = alike
     layout, (e,) = ur5.layout, found.fitted
     viscous, coulomb = (
         found.standard[layout.names.index(f"wrist_3_joint.{term}")]
@@ -91,10 +96,10 @@ def test_friction_stands_beside_it_as_a_share_of_the_torque(ur5):
     json.dumps(found.witness.to_dict(), allow_nan=False)
 
 
-def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is_its_own(ur5):
-    from robotid.judgement.findings import fit_findings
-
-    found = found_of(ur5, near_urdf(ur5))
+def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is_its_own(
+    ur5, alike
+):
+    found = alike
     shapes = {f.code for f in fit_findings(found) if f.severity == "warning"}
     assert not shapes & {"com_outside", "gyration", "density"}
     i = ur5.layout.names.index("forearm_link.mcx")
@@ -113,10 +118,8 @@ def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is
     assert "so it is in the URDF already" in finding.message
 
 
-def test_a_needle_denser_than_any_material_is_named_unless_the_urdf_has_it(ur5):
-    from robotid.judgement.findings import fit_findings
-
-    found = found_of(ur5, near_urdf(ur5))
+def test_a_needle_denser_than_any_material_is_named_unless_the_urdf_has_it(ur5, alike):
+    found = alike
 
     def dense(found):
         return [f for f in fit_findings(found) if f.code == "dense_body"]
@@ -140,10 +143,10 @@ def test_a_result_that_its_prior_holds_back_bears_no_witness(ur5, rng):
     size = ur5.layout.n_inertial
     pi[:size] = 3.0 * ur5.standard_parameters()[:size]  # the sensors say three times the URDF
     log = exact_log(ur5, pi, rng, samples=1000, noise=0.5)
-    kept = EstimatorSettings(prior_weight=1e9)
-    held = identify(ur5, [log], estimator=kept, doctor=False)
+    kept = EstimatorSettings(prior_weight=1e9, draws=0)
+    held = identify(ur5, [log], estimator=kept)
     assert held.witness.factor == pytest.approx(1.0, abs=0.05)  # it stays at the URDF
     assert not held.witness.follows
     assert not held.witness.agrees
-    free = identify(ur5, [log], doctor=False)
+    free = identify(ur5, [log], estimator=EstimatorSettings(draws=0))
     assert free.witness.follows
