@@ -2,13 +2,15 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
-from helpers.fitting import identify
+from helpers.driven import arm
+from helpers.fitting import fit, identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement.findings import fit_findings
-from robotid.judgement.witness import Witness
+from robotid.judgement.witness import Witness, call_witness
 from robotid.logs.settings import SignalSettings
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
@@ -150,3 +152,51 @@ def test_a_result_that_its_prior_holds_back_bears_no_witness(ur5, rng):
     assert not held.witness.agrees
     free = identify(ur5, [log], estimator=EstimatorSettings(draws=0))
     assert free.witness.follows
+
+
+def test_its_figures_are_those_of_pinocchios_gravity_over_the_poses_of_all_logs():
+    model, rng = arm(), np.random.default_rng(3)
+    size, pi = model.layout.n_inertial, truth(model)
+    pi[:size].reshape(-1, 10)[-1] *= 1.3
+    logs = [exact_log(model, pi, rng, samples=n, noise=0.5) for n in (170, 130)]
+    found = fit(model, logs, signals=EXACT, estimator=EstimatorSettings(draws=0))
+    witness = call_witness(found)
+
+    def gravity(values):
+        bodies = model.with_parameters(values).pin_model
+        data = bodies.createData()
+        poses = model.configurations(np.vstack([log.q for log in logs]))
+        return np.array([pin.computeGeneralizedGravity(bodies, data, q) for q in poses])
+
+    def columns(of):
+        """Return the gravity torque of each of some parameters, by differences; it is linear."""
+        step = 1e-3 * np.eye(len(pi))[of]
+        return np.stack([(gravity(found.prior + d) - u) / 1e-3 for d in step], axis=-1)
+
+    u, g = gravity(found.prior), gravity(found.standard)
+    ratio = np.sum(u * g, axis=0) / np.sum(u * u, axis=0)
+    assert witness.factor == pytest.approx(np.sum(u * g) / np.sum(u * u), rel=1e-6)
+    rest = np.linalg.norm(g - witness.factor * u) / np.linalg.norm(g)
+    weights = np.einsum("nj,njk->jk", u, columns(slice(0, size))) / np.sum(u * u, axis=0)[:, None]
+    C = found.standard_covariance[:size, :size]
+    error = np.sqrt(np.einsum("jk,kl,jl->j", weights, C, weights))
+    known = {j: (x, e) for j, x, e in zip(model.joints, ratio, error, strict=True) if e < 0.1}
+    assert 0 < len(known) < 3
+    assert witness.gravity == {j: pytest.approx(x, rel=1e-6) for j, (x, _) in known.items()}
+    assert witness.gravity_error == {j: pytest.approx(e, rel=1e-4) for j, (_, e) in known.items()}
+    P = columns(slice(size - 10, size - 6)).reshape(-1, 4)
+    both = np.linalg.lstsq(np.column_stack([u.ravel(), P]), g.ravel())[0]
+    assert witness.scale == pytest.approx(both[0], rel=1e-6)
+    payload = np.linalg.lstsq(P, (g - u).ravel())[0]
+    left = np.linalg.norm((g - u).ravel() - P @ payload) / np.linalg.norm(g)
+    assert witness.unexplained == pytest.approx((rest, left), rel=1e-4)
+    masses = (found.prior[:size:10].sum(), found.standard[:size:10].sum(), max(both[1], 0.0))
+    assert witness.masses == pytest.approx(masses, rel=1e-5)
+    # friction of both logs
+    k = [
+        [model.layout.names.index(f"{j}.{t}") for j in model.joints] for t in ("viscous", "coulomb")
+    ]
+    v, tau = (np.vstack([getattr(log, x) for log in logs]) for x in ("v", "tau"))
+    torque = found.standard[k[0]] * v + found.standard[k[1]] * np.sign(v)
+    share = np.linalg.norm(torque, axis=0) / np.linalg.norm(tau, axis=0)
+    np.testing.assert_allclose(list(witness.friction.values()), share, rtol=1e-9)
