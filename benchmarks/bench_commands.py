@@ -39,12 +39,12 @@ import mujoco
 from helpers import mujoco_plant
 from mujoco import rollout
 
-from robotid.commanded.driven import driven_log
-from robotid.commanded.errors import run_open_loop
-from robotid.commanded.fit import stated_loops
-from robotid.commanded.identify import identify_commands
-from robotid.commanded.settings import LoopSettings
-from robotid.commanded.unknowns import LoopSimulator, body_unknowns
+from robotid.closed_loop.driven import driven_log
+from robotid.closed_loop.evaluation import run_open_loop
+from robotid.closed_loop.fit import stated_loops
+from robotid.closed_loop.identify import identify_loops
+from robotid.closed_loop.settings import LoopSettings
+from robotid.closed_loop.unknowns import LoopSimulator, body_unknowns
 from robotid.commands.job import read_job
 from robotid.exceptions import SettingsError
 from robotid.export.commanded import CommandedDrive, loops_of
@@ -165,7 +165,7 @@ def by_job(text):
             [job.read(entry, model, needs="commands") for entry in entries]
             for entries in (job.identification, job.validation)
         )
-        found = identify_commands(
+        found = identify_loops(
             model, logs, kept, job.controller, job.estimator, chooses=AUTO in job.terms
         )
         return found, clocks() - begun
@@ -191,7 +191,7 @@ def go2(sysid_steps):
         f'[[identification]]\nlog = "{log}"\nend = {GO2_SPLIT}\n'
         f'[[validation]]\nlog = "{log}"\nstart = {begin}\n'
     )
-    ours = 1e3 * found.kept[0].rmse
+    ours = 1e3 * found.validation[0].rmse
     beside = [(GO2_PUBLISHED, np.array(GO2_SYSID))]
     if sysid_steps:
         theirs, count, steps, their_time = sysid_fit(found, sysid_steps)
@@ -199,7 +199,7 @@ def go2(sysid_steps):
     joints = found.model.joints
     print(f"| open loop on the rest of the chirp, error in mrad | {' | '.join(joints)} | ratio |")
     print("|---" * (len(joints) + 2) + "|")
-    count_of_ours = len(found.fitted.estimate.theta)
+    count_of_ours = len(found.fit.estimate.theta)
     table = [(f"robotid, {count_of_ours} parameters", ours), *beside]
     for who, errors in table:
         ratio = "" if errors is ours else f"{geometric_mean(ours / errors):.3f}"
@@ -209,7 +209,7 @@ def go2(sysid_steps):
         f"{who} {t[0]:.0f} s of the wall, {t[1]:.0f} s of processor" for who, t in times.items()
     ]
     print(f"\nRatio: geometric mean of robotid's error over theirs. {'; '.join(said)}.")
-    print(f"{found.fitted.estimate.message}.\n", flush=True)
+    print(f"{found.fit.estimate.message}.\n", flush=True)
     return {
         "errors_mrad": {who: list(errors) for who, errors in table},
         "ratios": {who: geometric_mean(ours / errors) for who, errors in beside},
@@ -221,7 +221,7 @@ def sysid_fit(found, most):
     """Return the errors of mujoco.sysid on the kept log, parameters, steps and times."""
     from mujoco import sysid
 
-    log, kept = found.errors[0].log, found.kept[0].log
+    log, kept = found.fitted[0].log, found.validation[0].log
     model, begun = found.model, clocks()
     spec = sysid_spec(model)
     params = sysid.ParameterDict()
@@ -341,7 +341,7 @@ def so101():
     print(f"| kept motion, error in mrad | {' | '.join(found.model.joints)} | ratio |")
     print("|---" * (len(found.model.joints) + 2) + "|")
     ratios, rows = [], {}
-    for (name, plain), run in zip(SO101_PLAIN.items(), found.kept, strict=True):
+    for (name, plain), run in zip(SO101_PLAIN.items(), found.validation, strict=True):
         errors = 1e3 * run.rmse
         ratios.append(errors / np.array(plain))
         rows[name] = list(errors)
@@ -352,7 +352,7 @@ def so101():
     whole = geometric_mean(ratios)
     print(f"| ratio | {' | '.join(f'{x:.2f}' for x in by_joint)} | {whole:.3f} |")
     print(f"\n{took[0]:.0f} s of the wall, {took[1]:.0f} s of processor; "
-          f"{found.fitted.estimate.message}.\n", flush=True)  # fmt: skip
+          f"{found.fit.estimate.message}.\n", flush=True)  # fmt: skip
     return {"errors_mrad": rows, "ratio": whole, "by_joint": by_joint, "seconds": list(took)}
 
 
@@ -394,16 +394,13 @@ def arm_rows(name, model, logs, kept, signals, truth=None):
     for way, (torques, chooses) in ways.items():
         begun = time.process_time()
         settings = SimulationSettings(torques=torques)
-        found = identify_commands(
-            model, logs, kept, loop, settings, signals=signals, chooses=chooses
-        )
+        found = identify_loops(model, logs, kept, loop, settings, signals=signals, chooses=chooses)
         spent = time.process_time() - begun
         if not rows:
-            rows["torque rows alone"] = (
-                missed_torque(model, linear.standard, kept, signals), found.kept[0].rows, took
-            )  # fmt: skip
+            missed = missed_torque(model, linear.standard, kept, signals)
+            rows["torque rows alone"] = (missed, found.validation[0].baselines["rows"], took)
         missed = missed_torque(found.model, found.standard, kept, signals)
-        rows[way] = (missed, found.kept[0].rmse, spent)
+        rows[way] = (missed, found.validation[0].rmse, spent)
     if truth is not None:
         position = driven_error(model, truth, kept[0], signals)
         rows["the truth"] = (missed_torque(model, truth, kept, signals), position, 0.0)
@@ -566,12 +563,12 @@ def driven_errors(name, runs, seconds):
         plant = mujoco_plant.plant(name, rng, delay=0.0)
         log = mujoco_plant.torque_log(plant, rng, duration=seconds, noise=5e-5, relative=0.05)
         for way, changes in ways.items():
-            found = identify_commands(
+            found = identify_loops(
                 plant.model, [log], [], LoopSettings(kind="torque"),
                 SimulationSettings(bodies=0.0, **changes), signals=SignalSettings(cutoff=10.0),
                 chooses=False,
             )  # fmt: skip
-            estimate, linear = found.fitted.estimate, found.fitted.linear
+            estimate, linear = found.fit.estimate, found.fit.linear
             kinds = [(key, key.rpartition(".")[2]) for key in estimate.names]
             for (key, kind), theta, *said in zip(
                 kinds, estimate.theta, estimate.std_error, estimate.reach, strict=True
@@ -632,8 +629,8 @@ def one_run(name, rng, seconds, *, finds_all=False, torque=False):
     gains = {} if finds_all else gains
     # every joint has a drive of its own
     loop = LoopSettings(**gains, groups={first: [first]}, delays="group")
-    found = identify_commands(plant.model, [log], [], loop, settings, chooses=False)
-    estimate = found.fitted.estimate
+    found = identify_loops(plant.model, [log], [], loop, settings, chooses=False)
+    estimate = found.fit.estimate
     found = zip(estimate.names, estimate.theta, estimate.std_error, estimate.reach, strict=True)
     for key, theta, *said in found:
         joint, _, kind = key.rpartition(".")
@@ -657,8 +654,8 @@ def held_run(name, rng, seconds, *, bits):
     first = plant.model.joints[0]
     loop = LoopSettings(**gains, groups={first: [first]})
     settings = SimulationSettings(bodies=0.0)
-    found = identify_commands(plant.model, [log], [], loop, settings, chooses=False)
-    estimate, truth = found.fitted.estimate, plant.truth
+    found = identify_loops(plant.model, [log], [], loop, settings, chooses=False)
+    estimate, truth = found.fit.estimate, plant.truth
     truth["robot.delay"] = plant.drives[0].delay
     found = zip(estimate.names, estimate.theta, estimate.std_error, estimate.reach, strict=True)
     for key, theta, *said in found:

@@ -18,7 +18,7 @@ from unittest import mock
 import numpy as np
 from bench_excitation import CASES, DURATION, designer
 
-from robotid.excitation.design import _Multipliers
+from robotid.excitation.multipliers import Multipliers
 from robotid.excitation.information import criterion
 from robotid.excitation.limits import LIMITS
 from robotid.logs.data import Trajectory
@@ -48,7 +48,7 @@ def gradient_row(name, way, task, repeats):
     """Return the times of value, value with gradient, and Pinocchio's regressors."""
     finer = round(500 / (task._functions.shape[1] - 1))
     whole = replace(task, clearance=None, finer=finer)
-    C, multipliers = task.random(np.random.default_rng(3)), _Multipliers(0.1)
+    C, multipliers = task.random(np.random.default_rng(3)), Multipliers(0.1)
     model, t = task.information.model, np.linspace(0.0, DURATION, whole._functions.shape[1])
     q, v, a, jerk = whole._functions @ C
     segment = np.zeros(len(t), dtype=int)
@@ -84,7 +84,7 @@ def main():
         for way in ("plain", "compiled"):
             begun = time.process_time()
             tasks[name, way] = task = designer(name, way == "compiled")
-            task._lagrangian(task.random(np.random.default_rng(0)), _Multipliers(0.1))
+            task._lagrangian(task.random(np.random.default_rng(0)), Multipliers(0.1))
             built[name, way] = time.process_time() - begun
     start = built[cases[0], "compiled"] - built[cases[0], "plain"]
     print(

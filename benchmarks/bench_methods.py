@@ -23,8 +23,8 @@ import mujoco
 from bench_commands import FINE, RATE, REACH, STIFF
 from helpers import mujoco_plant
 
-from robotid.commanded.fit import fit_loops
-from robotid.commanded.settings import LoopSettings
+from robotid.closed_loop.fit import fit_loops
+from robotid.closed_loop.settings import LoopSettings
 from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
 

@@ -7,7 +7,7 @@ import math
 from dataclasses import MISSING
 from pathlib import Path
 
-from robotid.commanded.settings import LoopSettings
+from robotid.closed_loop.settings import LoopSettings
 from robotid.commands.job import Job, LogEntry
 from robotid.fitting.settings import ESTIMATORS, ConstraintSettings
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
@@ -24,7 +24,9 @@ START = """# Job file
 A job file is TOML: `robotid identify job.toml`. Only `urdf` and one `[[identification]]` are needed; every other key has
 the default below. A misspelt key is an error that names the nearest right one. Paths are relative to the job file, and
 `$NAME` in them is filled in from the environment. This page is written by `python docs/make_job_file.py` from the settings
-in the code; `result.json` holds the same keys under `settings`.
+in the code; `result.json` holds the same keys under `settings`. `robotid schema > job.schema.json` writes them as a JSON
+schema: with `#:schema job.schema.json` in its first line, editors that know TOML complete and check a job file. Shells complete commands and flags after
+`eval "$(register-python-argcomplete robotid)"`.
 
 <!-- example -->
 ```toml

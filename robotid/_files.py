@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 import shutil
 import tempfile
@@ -18,9 +19,11 @@ __all__ = [
     "check_folder",
     "check_path",
     "file_sha256",
+    "finite",
     "folder_beside",
     "missing_file",
     "read_json",
+    "source_entry",
     "write_json",
     "write_text",
     "written_whole",
@@ -229,6 +232,15 @@ def write_json(content: Mapping[str, Any], target: str | Path) -> None:
     write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", target)
 
 
+def finite(value: float) -> float | None:
+    """Return a number as JSON has it: None if it is not finite.
+
+    Args:
+        value: The number.
+    """
+    return float(value) if math.isfinite(value) else None
+
+
 def missing_file(path: Path, what: str) -> str:
     """Return what is wrong with a path that is no file.
 
@@ -300,3 +312,13 @@ def _sha256(path: Path, *_state: int) -> str:
     """Return the SHA-256 of a file, which is read once as long as its state is the same."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def source_entry(path: str) -> dict[str, Any]:
+    """Return the path of an input and the hash of its file, None of what is in no file.
+
+    Args:
+        path: The file; "" for what was in memory.
+    """
+    is_file = bool(path) and Path(path).exists()
+    return {"path": str(path), "sha256": file_sha256(path) if is_file else None}

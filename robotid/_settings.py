@@ -17,6 +17,7 @@ from robotid.findings import listed
 __all__ = [
     "NOT_NEGATIVE",
     "POSITIVE",
+    "REQUIRED",
     "Entries",
     "Key",
     "Range",
@@ -115,6 +116,8 @@ def require_flag(value: object, name: str) -> None:
         require_kind(value, bool, name, "True or False")
 
 
+#: Keys that a table in a list of tables must have, if it may have them.
+REQUIRED = ("log", "name", "ratios", "joints", "matrix")
 POSITIVE = Range("a positive number", lambda x: x > 0)
 NOT_NEGATIVE = Range("0 or a positive number", lambda x: x >= 0)
 
@@ -279,7 +282,7 @@ def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str
         )
     for item in value:
         check_keys(item, schema, where, f"{name}.")
-        for required in ("log", "name", "ratios", "joints", "matrix"):
+        for required in REQUIRED:
             if required in schema and required not in item:
                 raise SettingsError(f"{where}: a [[{name}]] has no key {required!r}")
 

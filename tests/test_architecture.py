@@ -7,6 +7,7 @@ import json
 import pkgutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -27,7 +28,7 @@ LINES = [
     "diagnosis",
     "judgement",
     "identification",
-    "commanded",
+    "closed_loop",
     "online export viewer excitation",
     "report",
     "commands paper",
@@ -65,9 +66,18 @@ def room(path):
     return inside[0] if len(inside) > 1 else path.stem
 
 
+@cache
+def parsed(path):
+    return ast.parse(path.read_text())
+
+
+@cache
 def imports(path):
-    """Yield (module, whether at the top level, whether only for type checkers)."""
-    tree = ast.parse(path.read_text())
+    """Return (module, whether at the top level, whether only for type checkers) of each import."""
+    return list(_imports(parsed(path)))
+
+
+def _imports(tree):
     parents = {child: node for node in ast.walk(tree) for child in ast.iter_child_nodes(node)}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -200,7 +210,7 @@ def test_every_public_argument_is_documented():
 def test_functions_stay_small():
     long = []
     for path in modules():
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 body = node.body[1:] if ast.get_docstring(node) else node.body
                 lines = node.end_lineno - body[0].lineno + 1 if body else 0

@@ -15,16 +15,12 @@ from hypothesis import HealthCheck, Phase, given, settings
 
 KINDS = INPUT_KINDS | COMMAND_KINDS | ARGUMENT_KINDS
 EXAMPLES = {
-    "values, identified": 12,
-    "job file": 25,
-    "result.json": 25,
-    "excite": 20,
-    "simulate": 20,
-    "drives of a job": 20,
-    "loop of a job": 5,
-    "report of result.json": 10,
-    "Python arguments": 150,
-}  # others: 40
+    "values, identified": 6,
+    "excite": 10,
+    "loop of a job": 3,
+    "report of result.json": 6,
+    "Python arguments": 60,
+}  # others: 15
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -32,7 +28,7 @@ def test_no_input_gives_a_traceback(kind):
     make, arguments, run = KINDS[kind]
 
     @settings(
-        max_examples=EXAMPLES.get(kind, 40),
+        max_examples=EXAMPLES.get(kind, 15),
         derandomize=True,
         database=None,
         deadline=None,

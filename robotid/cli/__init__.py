@@ -2,6 +2,7 @@
 
 import argparse
 import io
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -22,7 +23,7 @@ __all__ = ["COMMANDS", "main"]
 #: The commands in the order of the help; each is a module: SUMMARY, add_flags and run.
 COMMANDS = (
     "demo", "paper", "inspect", "identify", "track", "excite", "preview", "replay", "doctor",
-    "validate", "payload", "report", "compare", "export", "simulate", "convert",
+    "validate", "payload", "report", "compare", "export", "simulate", "convert", "schema",
 )  # fmt: skip
 
 
@@ -51,6 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: Sequence[str]) -> int:
     """Run a command line, tell what stops it, and return its exit code."""
+    _complete()
     options = _parser(words).parse_args(words, argparse.Namespace(words=words))
     try:
         with terminations_raised(), shown_log(is_verbose=getattr(options, "verbose", False)):
@@ -71,6 +73,15 @@ def _run(words: Sequence[str]) -> int:
         print_error(error, "interrupted")
         return 128 + error.number if isinstance(error, Terminated) else 130
     return code or 0
+
+
+def _complete() -> None:
+    """Print what may follow and end, if a shell asks for it as of argcomplete."""
+    if "_ARGCOMPLETE" in os.environ:
+        import argcomplete
+
+        line = os.environ.get("COMP_LINE", "")
+        argcomplete.autocomplete(_parser(line.split()[1:]))
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:

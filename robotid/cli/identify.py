@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
         report_stage(progress, "reading logs")  # before what takes the first second: its modules
         from robotid.commands.identify import run_job
         from robotid.identification.result import Identification
-        from robotid.report.advice import Origin, next_steps
+        from robotid.report.advice import Origin, loop_steps, next_steps
         from robotid.workers.plan import WorkPlan
 
         job = job_from_flags(options)
@@ -61,8 +61,12 @@ def run(options: argparse.Namespace) -> int:
         partial(show_result, is_verbose=options.verbose),
         [*result["outputs"].values(), "result.json"],
     )
-    if isinstance(found, Identification) and not options.json:
-        print_steps(next_steps(found, Origin(source, options.out)))
+    if not options.json:
+        origin = Origin(source, options.out)
+        if isinstance(found, Identification):
+            print_steps(next_steps(found, origin))
+        else:
+            print_steps(loop_steps(result, origin))
     return 1 if result["verdict"]["alarms"] else 0
 
 

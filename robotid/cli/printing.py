@@ -123,7 +123,7 @@ def print_open_loop(run: Mapping[str, Any], before: str = "") -> None:
         run: The run, as result.json has it.
         before: What its log is called after.
     """
-    from robotid.commanded.errors import DRIFTS  # imports numpy
+    from robotid.closed_loop.evaluation import DRIFTS  # imports numpy
 
     kinds = {"rmse": "open loop", "second_order_rmse": "2nd order", "urdf_rmse": "URDF",
              "rows_rmse": "torques alone", "command_rmse": "command",

@@ -4,17 +4,26 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from robotid._files import check_folder, folder_beside, write_json
 from robotid._settings import require_kind
-from robotid._typing import report_stage
+from robotid._typing import STAGES, ProgressCallback, ignore_progress, report_stage
+from robotid.closed_loop.fit import STAGES as LOOP_STAGES
+from robotid.closed_loop.identify import identify_loops
+from robotid.closed_loop.result import LoopIdentification
 from robotid.commands.job import Job, LogEntry
-from robotid.commands.logs import checkpoint_inputs, examine_logs, locked_as_logged, survey_logs
-from robotid.exceptions import DataError
+from robotid.commands.logs import (
+    checkpoint_inputs,
+    examine_logs,
+    locked_as_logged,
+    needed_of,
+    survey_logs,
+)
+from robotid.doctor.diagnosis import diagnose
+from robotid.exceptions import DataError, SettingsError
 from robotid.export.entries import build_result
 from robotid.export.urdf import DYNAMICS_TERMS, write_urdf
-from robotid.fitting.bands import fitted_moments
 from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import SimulationSettings
@@ -33,9 +42,6 @@ from robotid.robot.tree import read_tree
 from robotid.workers.checkpoint import Checkpoint, released_on_error
 from robotid.workers.plan import WorkPlan
 
-if TYPE_CHECKING:
-    from robotid.commanded.identify import Commanded
-
 __all__ = ["identify_job", "run_job", "save_result"]
 
 _log = logging.getLogger(__name__)
@@ -48,7 +54,7 @@ def run_job(
     plan: WorkPlan | None = None,
     source: Sequence[str] = (),
     beside: Mapping[str, str] | None = None,
-) -> "tuple[Identification | Commanded, dict[str, Any]]":
+) -> tuple[Identification | LoopIdentification, dict[str, Any]]:
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
     A job may want no report, and an impossible result has no URDF. Every file is made in a folder
@@ -66,8 +72,9 @@ def run_job(
 
     Raises:
         DataError: If a log cannot be used.
+        MissingDependencyError: If the estimator is "simulation" and Numba is not installed.
         ModelError: If the URDF cannot be used.
-        NotConvergedError: If a solver fails.
+        NotConvergedError: If a solver fails, or loops cannot be simulated.
         RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
         SettingsError: If a setting does not fit.
         WorkerError: If a worker ends before its work.
@@ -75,15 +82,18 @@ def run_job(
     require_kind(job, Job, "job", "a Job, as robotid.read_job returns it")
     require_kind(folder, (str, Path), "folder", "the path of a folder")
     chosen = plan or WorkPlan(job.workers or 1)
-    if isinstance(job.estimator, SimulationSettings):
-        from robotid.commands.commanded import run_commanded  # compiles roll-outs
-
-        return run_commanded(job, folder, progress=chosen.progress)
-    report_stage(chosen.progress, "reading logs")
+    is_simulated = isinstance(job.estimator, SimulationSettings)
+    stages = LOOP_STAGES if is_simulated else STAGES
+    report_stage(chosen.progress, "reading logs", stages)
     model, target = job.model(), Path(folder)
     check_folder(target, ["result.json", *_names(model)])
-    found, checkpoint = identify_job(job, model, chosen, target)
-    report_stage(chosen.progress, "writing")
+    found: Identification | LoopIdentification
+    checkpoint = None
+    if is_simulated:
+        found = _identify_loops(job, model, chosen.progress)
+    else:
+        found, checkpoint = identify_job(job, model, chosen, target)
+    report_stage(chosen.progress, "writing", stages)
     with released_on_error(checkpoint):
         saved = _write(found, _job_of(found), target, source=source, beside=beside)
     if checkpoint is not None:
@@ -126,39 +136,39 @@ def _names(model: RobotModel) -> tuple[str, str, str]:
 
 
 def _write(
-    identification: Identification,
+    found: Identification | LoopIdentification,
     job: Job,
     target: Path,
     *,
     source: Sequence[str] = (),
     beside: Mapping[str, str] | None = None,
-) -> tuple[Identification, dict[str, Any]]:
+) -> tuple[Identification | LoopIdentification, dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
-    report, name, sidecar = _names(identification.model)
+    report, name, sidecar = _names(found.model)
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
         outputs = {}
-        written = {"urdf": name, "sidecar": sidecar} if identification.has_urdf else {}
+        written = {"urdf": name, "sidecar": sidecar} if found.has_urdf else {}
         if job.report:
+            found = replace(found, report=str(target / report))
             links = {"result": "result.json", **written, **(beside or {})}
             origin = Origin(tuple(source), str(target))
-            write_report(identification, partial / report, files=links, origin=origin)
+            write_report(found, partial / report, files=links, origin=origin)
             outputs["report"] = report
-            identification = replace(identification, report=str(target / report))
         if written:
-            model, pi = identification.model, identification.standard
-            moments = fitted_moments(identification) if job.dynamics else {}
+            model, pi = found.model, found.standard
+            moments = found.moments if job.dynamics else {}
             dynamics = job.dynamics and project_friction(model, pi, moments, DYNAMICS_TERMS)
             write_urdf(model, pi, partial / name, dynamics=dynamics)
             outputs |= written
-        result = build_result(identification, job.to_dict(), outputs=outputs)
+        result = build_result(found, job.to_dict(), outputs=outputs)
         write_json(result, partial / "result.json")
     others = {report, name, sidecar} - set(outputs.values())
     _remove_stale(target / other for other in sorted(others))
-    return identification, result
+    return found, result
 
 
-def _job_of(identification: Identification) -> Job:
+def _job_of(identification: Identification | LoopIdentification) -> Job:
     """Return the job that an identification comes from, made in Python as far as it is known.
 
     Logs in memory have no file, and gains, units and names of columns are not in a ``Log``.
@@ -166,6 +176,10 @@ def _job_of(identification: Identification) -> Job:
     model, asked = identification.model, identification.asked
     if isinstance(asked.job, Job):
         return asked.job
+    if isinstance(identification, LoopIdentification):
+        raise SettingsError(
+            "an identification by simulation is saved by the job that made it: robotid.run_job"
+        )
     chosen = {drive.joint: drive for drive in identification.drives}
     wanted = wanted_families(asked.friction, model.joints)
     is_auto = all(names is None for names in wanted.values())
@@ -263,3 +277,21 @@ def identify_job(
         )
     asked = replace(concluded.asked, job=job)
     return replace(concluded, asked=asked, findings=(*there.notes, *concluded.findings)), checkpoint
+
+
+def _identify_loops(
+    job: Job, model: RobotModel, progress: ProgressCallback | None
+) -> LoopIdentification:
+    """Identify by simulation, from commands or logged torques, and write nothing."""
+    assert isinstance(job.estimator, SimulationSettings)
+    check_ignored(job.ignore)
+    logs, kept = (
+        [job.read(entry, model, needs=needed_of(job)) for entry in entries]
+        for entries in (job.identification, job.validation)
+    )
+    found = identify_loops(
+        model, logs, kept, job.controller, job.estimator, signals=job.signals,
+        chooses=AUTO in job.terms, examined=diagnose(model, logs, kept, job.signals),
+        ignore=job.ignore, progress=progress or ignore_progress,
+    )  # fmt: skip
+    return replace(found, asked=replace(found.asked, job=job))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from robotid._files import check_path, missing_file
 from robotid._settings import Entries, Range, Settings, check_keys, require_kind, setting
-from robotid.commanded.settings import LoopSettings
+from robotid.closed_loop.settings import LoopSettings
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.fitting.settings import (

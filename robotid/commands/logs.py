@@ -10,17 +10,20 @@ import numpy as np
 
 from robotid._files import file_sha256
 from robotid._typing import STAGES, ProgressCallback, report_stage
+from robotid.closed_loop.driven import driven_log
+from robotid.closed_loop.identify import with_gravity
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.locked_joints import STILL, check_locked
 from robotid.exceptions import DataError
-from robotid.export.result import load_result, stated_model, stated_parameters
+from robotid.export.result import Result, load_result, stated_model, stated_parameters
 from robotid.findings import Finding, by_severity
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import SurveyedLog, survey_log
 from robotid.identification.previews import Run
 from robotid.judgement.verdict import check_ignored
 from robotid.logs.columns import Needs
+from robotid.logs.data import Log
 from robotid.logs.read import LogLayout
 from robotid.logs.table import Table
 from robotid.regressor.base_parameters import structural_mapping
@@ -34,6 +37,8 @@ __all__ = [
     "examine_logs",
     "job_of_result",
     "locked_as_logged",
+    "log_of_commands",
+    "needed_of",
     "survey_logs",
 ]
 
@@ -293,3 +298,31 @@ def _count(found: tuple[LogLayout, Table] | DataError) -> int:
     if isinstance(found, DataError) or found[1].rows is None:
         return 0
     return found[1].rows.count()
+
+
+def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
+    """Return a log of commands as its robot hears them, the controller's own torque included.
+
+    Where its torque drives the robot, that is what it hears.
+
+    Args:
+        job: The job of the result.
+        entry: Which log.
+        result: What the job has found.
+
+    Raises:
+        DataError: If the file cannot be used, or has no commands.
+    """
+    log = job.read(entry, result.robot, needs=needed_of(job))
+    if job.controller.kind == "torque":
+        return driven_log(result.robot, log, job.signals)
+    return with_gravity(job.model(), log) if job.controller.gravity_compensation else log
+
+
+def needed_of(job: Job) -> Needs:
+    """Return what a log of a job that simulates must have beside positions.
+
+    Args:
+        job: The job.
+    """
+    return "torque" if job.controller.kind == "torque" else "commands"

@@ -9,8 +9,8 @@ import numpy as np
 
 from robotid._files import read_json
 from robotid._typing import Array
-from robotid.commands.commanded import log_of_commands
 from robotid.commands.job import Job, LogEntry, job_from_settings
+from robotid.commands.logs import log_of_commands
 from robotid.exceptions import DataError, SettingsError
 from robotid.excitation.clearance import Clearance
 from robotid.excitation.course import Course

@@ -7,22 +7,20 @@ from typing import Any
 
 from robotid._files import check_file, file_sha256
 from robotid._typing import ProgressCallback, report_stage
-from robotid.commanded.errors import run_open_loop
-from robotid.commands.commanded import log_of_commands
 from robotid.commands.identify import identify_job
 from robotid.commands.job import Job, job_from_settings
+from robotid.commands.logs import log_of_commands
 from robotid.exceptions import DataError, SettingsError
-from robotid.export.result import Result, load_result
+from robotid.export.result import load_result
 from robotid.findings import listed
 from robotid.identification.result import Identification
 from robotid.report.advice import Origin
-from robotid.report.commanded_page import Followed, write_commanded_report
 from robotid.report.document import write_report
-from robotid.simulation.loops import LoopedRobot, open_loops
+from robotid.report.loop_page import write_loop_report
 from robotid.versions import versions
 from robotid.workers.plan import WorkPlan
 
-__all__ = ["followed_logs", "rewrite_report"]
+__all__ = ["rewrite_report"]
 
 _SHARE = 1e-6  # of a base parameter ...
 _PART = 0.01  # ... or of its standard error, which is rounding: solvers stop somewhere
@@ -72,41 +70,14 @@ def rewrite_report(
     }
     origin = Origin((), str(folder))
     if found is None:
-        write_commanded_report(
-            content, followed_logs(loaded, job), goal, files=files, origin=origin
+        kept, fitted = (
+            [loaded.open_loop(log_of_commands(job, entry, loaded)) for entry in entries]
+            for entries in (job.validation, job.identification)
         )
+        write_loop_report(content, fitted, kept, goal, files=files, origin=origin)
     else:
         write_report(found, goal, files=files, origin=origin)
     return {"result": str(loaded.path), "report": str(goal)}
-
-
-def followed_logs(result: Result, job: Job) -> list[Followed]:
-    """Return the logs of a job beside what the identified robot does on their commands.
-
-    Args:
-        result: A result of drives that follow commands.
-        job: Its job.
-
-    Returns:
-        The logs that were kept apart first.
-
-    Raises:
-        DataError: If a log cannot be read, or has no commands.
-        MissingDependencyError: If Numba is not installed.
-    """
-    found = []
-    for is_kept, entries in ((True, job.validation), (False, job.identification)):
-        for entry in entries:
-            log = log_of_commands(job, entry, result)
-            name = f"{entry.path.name}, {log.t[0]:.4g} to {log.t[-1]:.4g} s"
-            if result.commanded:
-                q_ref, q_sim = log.q_ref, result.follow_commands(log)
-            else:
-                model, pi = result.identified
-                run = run_open_loop(LoopedRobot(model), open_loops(model, pi), log)
-                q_ref, q_sim = None, run.q
-            found.append(Followed(name, is_kept, log.t, q_ref, log.q, q_sim))
-    return found
 
 
 def _check_target(goal: Path) -> None:

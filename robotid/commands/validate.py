@@ -5,18 +5,13 @@ from itertools import compress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from robotid._files import file_sha256
-from robotid.commanded.errors import run_open_loop
-from robotid.commanded.open_loop_verdict import judge_open_loops
-from robotid.commands.commanded import log_of_commands
+from robotid.closed_loop.evaluation import position_metrics
 from robotid.commands.job import Job, LogEntry, job_from_settings
-from robotid.commands.logs import survey_logs
+from robotid.commands.logs import log_of_commands, survey_logs
 from robotid.doctor.diagnosis import diagnose
-from robotid.export.commanded import loops_of
-from robotid.export.commanded_entries import open_loop_entry
 from robotid.export.entries import recording_metrics
+from robotid.export.loops import open_loop_entry
 from robotid.export.result import (
     Result,
     load_result,
@@ -34,10 +29,10 @@ from robotid.fitting.evaluation import (
 )
 from robotid.fitting.metrics import Metrics
 from robotid.fitting.survey import SurveyedLog
+from robotid.judgement.positions import judge_positions
 from robotid.judgement.verdict import Doubt, Verdict, alarming, doubts_of, judge
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot, open_loops
 
 __all__ = ["validate_result"]
 
@@ -87,19 +82,17 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
 
 def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) -> dict[str, Any]:
     """Measure how far the open loops of a result run from other logs of commands."""
-    model, pi = loaded.identified
-    drives, signs = loaded.commanded, loaded.content["simulation"]["signs"]
-    sign = np.array([signs[joint] for joint in model.joints])
-    loops = loops_of(model, pi, drives, loaded.rate) if drives else open_loops(model, pi)
-    robot, runs, logs = LoopedRobot(model), [], []
-    for entry in entries:
-        logs.append(log_of_commands(job, entry, loaded))
-        runs.append(run_open_loop(robot, loops, logs[-1].turned(sign)))
+    model = loaded.robot
+    logs = [log_of_commands(job, entry, loaded) for entry in entries]
+    runs = [loaded.open_loop(log) for log in logs]
     hashes = {i["sha256"] for i in loaded.content["inputs"] if i["role"] == "identification"}
     is_kept = not any(file_sha256(entry.path) in hashes for entry in entries)
     alarms = alarming(diagnose(model, (), logs, job.signals), job.ignore)
-    verdict = judge_open_loops(
-        model.joints, runs, is_kept=is_kept, alarms=[finding.message for finding in alarms]
+    verdict = judge_positions(
+        position_metrics(model, runs, moving=True),
+        model.joints,
+        is_kept=is_kept,
+        alarms=[finding.message for finding in alarms],
     )
     return {
         "result": str(loaded.path),

@@ -20,7 +20,7 @@ from robotid.diagnosis.sample import Sample, Trial, take_sample, trials
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.fitting.drives import DriveChoice, FoundShape, Tried, with_shapes
-from robotid.fitting.result import Fit
+from robotid.fitting.result import Solution
 from robotid.regressor.memory import drive_motion_along
 from robotid.robot.drives import DriveMotion, DriveTerm
 from robotid.robot.families import FAMILIES, Family, Seen
@@ -70,7 +70,7 @@ class _Drive:
 
 
 def choose_drives(
-    fit: Fit,
+    fit: Solution,
     wanted: Mapping[str, Sequence[str] | None],
     balanced: Mapping[str, str] | None = None,
 ) -> tuple[DriveChoice, ...]:

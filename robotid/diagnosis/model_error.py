@@ -23,7 +23,7 @@ from robotid.diagnosis.misfit import Misfit
 from robotid.diagnosis.sample import Sample, Trial, take_sample, trials
 from robotid.fitting.joint_motion import JointMotion
 from robotid.fitting.open_terms import OpenTerm
-from robotid.fitting.result import Fit
+from robotid.fitting.result import Fit, Solution
 from robotid.regressor.memory import drive_motion_along
 from robotid.robot.drives import DriveMotion, DriveTerm
 
@@ -133,7 +133,7 @@ def _of_misfit(misfit: Misfit) -> _Move:
 
 
 def _shape_trial(
-    found: Fit, choice: "DriveChoice", sample: Sample, motions: Sequence[DriveMotion]
+    found: Solution, choice: "DriveChoice", sample: Sample, motions: Sequence[DriveMotion]
 ) -> Trial:
     """Return a trial of the columns d(torque)/d(shape) of a joint, beside all that was fitted."""
     j = sample.joints.index(choice.joint)
@@ -147,7 +147,7 @@ def _shape_trial(
     return whole
 
 
-def settled_shapes(found: Fit) -> "tuple[DriveChoice, ...] | None":
+def settled_shapes(found: Solution) -> "tuple[DriveChoice, ...] | None":
     """Return choices with shapes that fit better now that all joints have their terms.
 
     One step of Gauss and Newton: what a shape should be moved by is the parameter of its column.
@@ -200,7 +200,7 @@ def _of_terms(
     return np.asarray(np.column_stack([term.column(motion) for term in terms]) @ theta)
 
 
-def _motions(found: Fit) -> list[DriveMotion]:
+def _motions(found: Solution) -> list[DriveMotion]:
     """Return how the drives move along each recording, as ``Sample.taken`` counts them."""
     kept = [e for e in found.validation if not e.is_refitted]
     recordings = [e.recording for e in (*found.fitted, *kept)]
@@ -208,7 +208,7 @@ def _motions(found: Fit) -> list[DriveMotion]:
     return [drive_motion_along(model, x.trajectory) for x in recordings]
 
 
-def shape_slope(found: Fit, choice: "DriveChoice", which: int, motion: DriveMotion) -> Array:
+def shape_slope(found: Solution, choice: "DriveChoice", which: int, motion: DriveMotion) -> Array:
     """Return how the torque of a joint's drive changes with one of its shapes, shape (N,).
 
     Args:

@@ -20,7 +20,7 @@ from scipy.special import stdtr
 from robotid._typing import Array
 from robotid.fitting.evaluation import Evaluation, Recording
 from robotid.fitting.joint_motion import JointMotion, joint_motions, travelled
-from robotid.fitting.result import Fit
+from robotid.fitting.result import Solution
 from robotid.logs.data import Trajectory
 from robotid.regressor.torque import trajectory_regressor
 from robotid.regressor.used_rows import independent_share
@@ -117,7 +117,7 @@ class Sample:
         return np.asarray(np.linalg.inv(A + np.eye(A.shape[-1])))
 
 
-def take_sample(fit: Fit, *, is_steady: bool = True) -> Sample | None:
+def take_sample(fit: Solution, *, is_steady: bool = True) -> Sample | None:
     """Return rows spread over the recordings; None if there are too few, or static ones.
 
     Args:
@@ -138,7 +138,7 @@ def take_sample(fit: Fit, *, is_steady: bool = True) -> Sample | None:
     motion = [e.recording.trajectory.at(k) for e, k in parts]
     Y = np.concatenate([_regressor(model, m) for m in motion])  # (N, n, p)
     tau = np.concatenate([m.tau for m in motion])
-    r = tau - np.concatenate([e.torques["estimate"][k] for e, k in parts])
+    r = tau - Y @ fit.standard
     used = np.concatenate([e.recording.mask[k] for e, k in parts])
     if is_steady:
         used &= np.concatenate([_is_steady(e.recording)[k] for e, k in parts])

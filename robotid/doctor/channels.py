@@ -12,7 +12,7 @@ from robotid.logs.measured_velocity import (
     LATE,
     quantum,
     unlike_velocities,
-    velocity_lag,
+    velocity_lags,
 )
 from robotid.logs.settings import SignalSettings
 
@@ -50,12 +50,14 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         joints as its uncertainty, and "velocity_scale" per joint: an error where they are used,
         else a note.
     """
-    for kind, values in _channels(log):
+    channels = dict(_channels(log))
+    noise = {kind: _white_noise(log.t, values) for kind, values in channels.items()}
+    for kind, values in channels.items():
         yield from _quantisation(log, kind, values, signals.velocity)
-    for kind, values in _channels(log):
-        yield from _spikes(log, kind, values)
-    for kind, values in _channels(log):
-        yield from _noise(log, kind, values)
+    for kind, values in channels.items():
+        yield from _spikes(log, kind, values, noise[kind])
+    for kind, values in channels.items():
+        yield from _noise(log, kind, values, noise[kind])
     if log.v is not None:
         slope, v = _slopes(log, log.v)
         alike = _correlation(slope, v)  # (n, n): position j, velocity k
@@ -89,13 +91,14 @@ def _quantisation(log: Log, kind: str, values: Array, velocity: str) -> Iterator
         yield log_finding(log.name, "quantised", severity, message, kind, **evidence)
 
 
-def _spikes(log: Log, kind: str, values: Array) -> Iterator[Finding]:
+def _spikes(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding]:
     """Yield rows that jump away from both neighbours."""
-    reaches = [_reach(log.t, x) for x in values.T]
+    smooth = _without_spikes(values)
+    reaches = [_reach(*own) for own in zip(values.T, smooth.T, noise, strict=True)]
     least = _LEAST.get(kind, _LEAST_TORQUE * float(np.median(reaches)))
-    for joint, x, own in zip(log.joints, values.T, reaches, strict=True):
-        reach = max(own, least)
-        rows, height = _jumps(log.t, x, reach)
+    for j, (joint, x) in enumerate(zip(log.joints, values.T, strict=True)):
+        reach = max(reaches[j], least)
+        rows, height = _jumps(x - smooth[:, j], noise[j], reach)
         if len(rows) == 0:
             continue
         largest, first = np.abs(height).max(), log.t[rows[0]]
@@ -109,9 +112,8 @@ def _spikes(log: Log, kind: str, values: Array) -> Iterator[Finding]:
         yield log_finding(log.name, "spikes", severity, message, f"{kind}_{joint}", **evidence)
 
 
-def _noise(log: Log, kind: str, values: Array) -> Iterator[Finding]:
+def _noise(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding]:
     """Yield the noise level of a kind of channel, and torques in which it prevails."""
-    noise = np.array([_white_noise(log.t, x) for x in values.T])
     size = values.std(axis=0)
     share = np.divide(noise, size, out=np.zeros_like(noise), where=size > 0)
     message = (
@@ -164,9 +166,8 @@ def _unlike_velocity(log: Log, velocity: str) -> Iterator[Finding]:
 
 def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     """Yield how late the measured velocity is against the position, beyond what is stated [s]."""
-    lag = velocity_lag(log) - stated
-    single = [velocity_lag(log.select([joint])) for joint in log.joints]
-    used = np.array([x for x in single if x != 0.0]) - stated
+    common, single = velocity_lags(log)
+    lag, used = common - stated, single[single != 0.0] - stated
     scatter = float(np.median(np.abs(used - lag))) * 1.48 if len(used) else 0.0
     step = float(np.median(np.diff(log.t)))
     error = max(scatter / np.sqrt(max(len(used), 1)), 0.02 * step)
@@ -232,44 +233,49 @@ def _channels(log: Log) -> Iterator[tuple[str, Array]]:
             yield kind, values
 
 
-def _jumps(t: Array, x: Array, reach: float) -> tuple[Array, Array]:
+def _jumps(off: Array, noise: float, reach: float) -> tuple[Array, Array]:
     """Return the rows that jump away from their neighbours, and how far."""
-    off = x - _without_spikes(x)
-    usual = max(1.48 * float(np.median(np.abs(off))), _white_noise(t, x))
+    usual = max(1.48 * float(np.median(np.abs(off))), noise)
     rows = np.flatnonzero(np.abs(off) > max(_SPIKE * usual, _BEYOND * reach))
     return rows, off[rows]
 
 
-def _reach(t: Array, x: Array) -> float:
+def _reach(x: Array, smooth: Array, noise: float) -> float:
     """Return how far a channel goes from its usual value, spikes apart.
 
     A joint that rests most of the log is judged by the rest of it.
     """
     usual = np.median(x)
-    away = np.abs(_without_spikes(x) - usual)
-    away = away[away > _RESTING * _white_noise(t, x)]
+    away = np.abs(smooth - usual)
+    away = away[away > _RESTING * noise]
     ever = np.abs(x - usual)
     return max(float(np.quantile(part, 0.995)) for part in (ever, away) if len(part))
 
 
 def _without_spikes(x: Array) -> Array:
-    padded = np.pad(x, 2, mode="edge")
-    near = np.stack([padded[k : len(x) + k] for k in range(5)])
-    return np.asarray(np.sort(near, axis=0)[2])  # the median of five
+    """Return the median of each row and the two before and after it, shape (N, n)."""
+    padded = np.pad(x, ((2, 2), (0, 0)), mode="edge")
+    a, b, c, d, e = (padded[k : len(x) + k] for k in range(5))
+    # the median of five is that of e and of the middle two of the others
+    low = np.maximum(np.minimum(a, b), np.minimum(c, d))
+    high = np.minimum(np.maximum(a, b), np.maximum(c, d))
+    middle: Array = np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e))
+    return middle
 
 
-def _white_noise(t: Array, x: Array) -> float:
-    """Return the white noise of a smooth signal, from its third divided differences."""
-    if len(x) < 10:
-        return 0.0
+def _white_noise(t: Array, values: Array) -> Array:
+    """Return the white noise of smooth signals, from their third divided differences, (n,)."""
+    if len(t) < 10:
+        return np.zeros(values.shape[1])
     step = float(np.median(np.diff(t)))
     times = np.array([t[k : len(t) - 3 + k] for k in range(4)]) / step
-    values = np.array([x[k : len(x) - 3 + k] for k in range(4)])
     apart = times[:, None] - times[None]  # (4, 4, N - 3)
     apart[range(4), range(4)] = 1.0
     weight = 1 / apart.prod(axis=1)
     size = np.sqrt(np.einsum("kn,kn->n", weight, weight))
-    return 1.48 * float(np.median(np.abs(np.einsum("kn,kn->n", weight, values)) / size))
+    weight /= size
+    differences = sum(w[:, None] * values[k : len(t) - 3 + k] for k, w in enumerate(weight))
+    return np.asarray(1.48 * np.median(np.abs(differences), axis=0))
 
 
 def _correlation(one: Array, other: Array) -> Array:

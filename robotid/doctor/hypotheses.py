@@ -5,8 +5,9 @@ by the URDF, of the inertia and the frictions of its drive, and of a constant. M
 by any factor; signs, columns, gravity and positions may not.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -19,6 +20,7 @@ __all__ = ["Explanation", "compensated", "explanations", "own_share", "unexplain
 _FLOOR = 1e-3  # an unexplained share below this is as good as none
 _POOR = 0.08  # a share above this lets other readings of the positions be tried
 _CLEARLY = 2.0  # gain in misfit, a factor 7, over what needs no other position
+_ROWS, _QUARTER = 200, 4  # rows with which these are tried, and how many fewer before
 _OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] that a zero position may be off
 _EARTH = 9.81  # [m/s^2]
 _RINGING = 0.05  # of its top, that the filter makes a torque of one sign pass 0
@@ -63,9 +65,8 @@ def compensated(probe: Probe) -> tuple[Probe, Array]:
     """
     weight = probe.loads() - probe.loads(np.zeros(3))
     whole = replace(probe, tau=probe.tau + weight.sum(axis=2))
-    size, logged = _variation(whole), _variation(probe)
-    share = own_share(whole) * np.divide(size, logged, out=np.zeros_like(size), where=logged > 0)
-    return whole, np.minimum(share, 1.0)
+    size, logged = _variation(whole.tau), _variation(probe.tau)
+    return whole, _over(own_share(whole) * size, logged)
 
 
 def unexplained(probe: Probe) -> Array:
@@ -78,22 +79,10 @@ def unexplained(probe: Probe) -> Array:
         Shares of variance, shape (n, n, 2): torque column i, physics of joint k, with the column's
         sign as it is and reversed. 0 for a constant column.
     """
-    n = len(probe.model.joints)
-    own = {k: [(i, sign) for i in range(n) for sign in (1.0, -1.0)] for k in range(n)}
-    return np.stack(
-        [_shares(probe, k, columns).reshape(n, 2) for k, columns in own.items()], axis=1
-    )
-
-
-def _shares(probe: Probe, k: int, columns: Sequence[tuple[int, float]]) -> Array:
-    """Return which share of torque columns, of a sign each, the physics of a joint leaves."""
-    size = _variation(probe)
-    R, T = _compressed(np.hstack([probe.loads()[:, k], probe.drive(k)]), probe.tau)
-    left = [
-        _nonnegative_misfit(R, sign * T[:, i]) / size[i] if size[i] > 0 else 0.0
-        for i, sign in columns
-    ]
-    return np.minimum(left, 1.0)
+    N, n = probe.tau.shape
+    every = np.hstack([probe.tau, -probe.tau])
+    share = _shares(probe, np.broadcast_to(every, (n, N, 2 * n)))
+    return share.reshape(n, 2, n).transpose(2, 0, 1)
 
 
 def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanation]]:
@@ -111,9 +100,7 @@ def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanati
     others = [_signs(own), _unsigned(probe, own), _order(share), _gravity(probe)]
     loaded = Explanation("payload", np.minimum(own_share(probe, any_load=True), stated.share))
     if stated.share.max() > _POOR:
-        # more readings are tried, and with fewer rows: one of them must be clearly better
-        bound = min(e.misfit for e in [stated, *others]) - _CLEARLY
-        others += [e for e in _positions(probe) if e.misfit < bound]
+        others += _positions(probe, min(e.misfit for e in [stated, *others]))
     return stated, loaded, others
 
 
@@ -135,7 +122,7 @@ def _unsigned(probe: Probe, own: Array) -> Explanation:
     for j, tau in enumerate(probe.tau.T):
         if tau.min() < -_RINGING * tau.max() or share[j] < _POOR:
             continue
-        X = np.hstack([loads[:, j], probe.drive(j)])
+        X = np.hstack([loads[:, j], probe.drives[:, j]])
         starts = (loads[:, j].sum(axis=1), probe.v[:, j], probe.a[:, j])
         of_size, signed = min(_folded_misfit(X, tau, np.sign(start)) for start in starts)
         if of_size < _FOLDED * own[j].min():
@@ -153,8 +140,7 @@ def _folded_misfit(X: Array, tau: Array, sign: Array) -> tuple[float, float]:
     for _ in range(_TURNS):
         sign = np.where(_nonnegative_prediction(X, sign * tau) < 0, -1.0, 1.0)
     signed = sign * tau
-    R, T = _compressed(X, signed[:, None])
-    left = _nonnegative_misfit(R, T[:, 0])
+    left = float(_misfits(X[None], signed[None, :, None])[0, 0])
     of_size, of_signed = (float(np.sum((x - x.mean()) ** 2)) for x in (tau, signed))
     return (left / of_size, left / max(of_signed, left)) if of_size > 0 else (1.0, 1.0)
 
@@ -206,49 +192,75 @@ def _shares_by_gravity(probe: Probe) -> Callable[[Array], Array]:
 
     Loads are linear in gravity, so that one triangle of each joint serves for all of them.
     """
-    size, links, pulls = _variation(probe), probe.loads(), probe.parts.pulls
-    triangles = {}
-    for j in np.flatnonzero(size > 0).tolist():
-        X = [links[:, j], *pulls[:, :, j], probe.drive(j), probe.tau[:, [j]]]
-        triangles[j] = np.asarray(np.linalg.qr(np.hstack(X), mode="r"))
+    links, size = probe.loads(), _variation(probe.tau)
+    X = [links, *probe.parts.pulls, probe.drives, probe.tau[:, :, None]]
+    R = _triangles(np.concatenate(X, axis=2).swapaxes(0, 1))
     bodies = links.shape[2]
+    parts = R[:, :, : 4 * bodies].reshape(*R.shape[:2], 4, bodies)
 
     def shares(g: Array) -> Array:
-        share, more = np.zeros(len(size)), g - probe.gravity
-        for j, R in triangles.items():
-            parts = R[:, : 4 * bodies].reshape(-1, 4, bodies)
-            loads = parts[:, 0] + np.tensordot(more, parts[:, 1:], axes=(0, 1))
-            A, b = _compressed(np.hstack([loads, R[:, 4 * bodies : -1]]), R[:, -1:])
-            share[j] = min(_nonnegative_misfit(A, b[:, 0]) / size[j], 1.0)
-        return share
+        more = g - probe.gravity
+        loads = parts[:, :, 0] + np.tensordot(more, parts[:, :, 1:], axes=(0, 2))
+        columns = np.concatenate([loads, R[:, :, 4 * bodies : -1]], axis=2)
+        return _over(_misfits(columns, R[:, :, -1:])[:, 0], size)
 
     return shares
 
 
-def _positions(probe: Probe) -> Iterator[Explanation]:
-    """Yield readings in which a position column means something else."""
-    every = max(1, len(probe.rows) // 200)
-    small = probe.at(probe.rows[::every])
-    n = len(probe.model.joints)
-    for pair in combinations(range(n), 2):
-        order = [pair[1] if j == pair[0] else pair[0] if j == pair[1] else j for j in range(n)]
-        state = small.q[:, order], small.v[:, order], small.a[:, order]
-        moved = small.with_motion(state)
-        # of joint k its own torque, and that of the joint whose position it has
-        share = np.array([_shares(moved, k, [(k, 1.0), (order[k], 1.0)]) for k in range(n)])
-        yield Explanation("position_order", share[:, 0], pair)
-        yield Explanation("joint_order", share[order, 1], pair)
-    turning = [j for j in range(n) if probe.model.joints[j] not in probe.model.layout.prismatic]
-    for j in turning:
-        share = own_share(small.with_motion(_moved(small, j, -1.0, 0.0)))
-        yield Explanation("position_sign", share, (j,))
-    for j in range(n):
-        turned = small.with_motion(_moved(small, j, -1.0, 0.0))
-        sign = np.where(np.arange(n) == j, -1.0, 1.0)
-        yield Explanation("joint_axis", own_share(replace(turned, tau=sign * small.tau)), (j,))
-    offsets = [_offset(small, j, offset) for j in turning for offset in _OFFSETS]
-    if offsets:
-        yield _refined(small, min(offsets, key=lambda e: e.misfit))
+def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
+    """Yield readings in which a position column means something else, if one is clearly better.
+
+    They are tried with fewer rows, and with a quarter of these first: what is not half as much
+    better there is not tried further.
+    """
+    every = max(1, len(probe.rows) // _ROWS)
+    some, few = (probe.at(probe.rows[::k]) for k in (every, _QUARTER * every))
+    joints = range(len(probe.model.joints))
+    readings: list[Callable[[Probe], list[Explanation]]] = [
+        *(partial(_exchanged, pair=pair) for pair in combinations(joints, 2)),
+        *(partial(_reversed, j=j) for j in joints),
+        _displaced,
+    ]
+    for read in readings:
+        if any(e.misfit < best - 0.5 * _CLEARLY for e in read(few)):
+            yield from (e for e in read(some) if e.misfit < best - _CLEARLY)
+
+
+def _turning(probe: Probe) -> list[int]:
+    """Return the revolute joints."""
+    names = probe.model.joints
+    return [j for j in range(len(names)) if names[j] not in probe.model.layout.prismatic]
+
+
+def _exchanged(probe: Probe, pair: tuple[int, int]) -> list[Explanation]:
+    """Return the readings that the position columns of two joints, or all of theirs, are swapped.
+
+    Of each joint its own torque, and that of the joint whose position it has.
+    """
+    order = np.arange(len(probe.model.joints))
+    order[list(pair)] = pair[::-1]
+    moved = probe.with_motion((probe.q[:, order], probe.v[:, order], probe.a[:, order]))
+    share = _shares(moved, np.stack([probe.tau.T, probe.tau.T[order]], axis=2))
+    return [
+        Explanation("position_order", share[:, 0], pair),
+        Explanation("joint_order", share[order, 1], pair),
+    ]
+
+
+def _reversed(probe: Probe, j: int) -> list[Explanation]:
+    """Return the readings that a joint turns the other way, and its torque as well."""
+    turned = probe.with_motion(_moved(probe, j, -1.0, 0.0))
+    share = _shares(turned, np.stack([probe.tau.T, -probe.tau.T], axis=2))
+    is_j = np.arange(len(share)) == j
+    axis = Explanation("joint_axis", np.where(is_j, share[:, 1], share[:, 0]), (j,))
+    sign = Explanation("position_sign", share[:, 0], (j,))
+    return [sign, axis] if j in _turning(probe) else [axis]
+
+
+def _displaced(probe: Probe) -> list[Explanation]:
+    """Return the reading that the zero of a revolute joint is elsewhere, by the best offset."""
+    offsets = [_offset(probe, j, offset) for j in _turning(probe) for offset in _OFFSETS]
+    return [_refined(probe, min(offsets, key=lambda e: e.misfit))] if offsets else []
 
 
 def _offset(probe: Probe, j: int, offset: float) -> Explanation:
@@ -286,32 +298,49 @@ def own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False
         any_load: Whether the last link may also have any mass more, and any centre of it, in the
             model's gravity.
     """
+    return _shares(probe, probe.tau.T[:, :, None], gravity, any_load)[:, 0]
+
+
+def _shares(
+    probe: Probe, torques: Array, gravity: Array | None = None, any_load: bool = False
+) -> Array:
+    """Return which share of k torques, (n, N, k), each joint's physics leaves, shape (n, k)."""
     loads = probe.loads(gravity)
     if any_load:
         last = probe.last_body
         loads = np.concatenate([loads, last, -last[:, :, 1:]], axis=2)
-    size = _variation(probe)
-    share = np.zeros(len(size))
-    for j in np.flatnonzero(size > 0).tolist():
-        R, T = _compressed(np.hstack([loads[:, j], probe.drive(j)]), probe.tau[:, [j]])
-        share[j] = min(_nonnegative_misfit(R, T[:, 0]) / size[j], 1.0)
-    return share
+    X = np.concatenate([loads, probe.drives], axis=2).swapaxes(0, 1)  # (n, N, c)
+    return _over(_misfits(X, torques), _variation(torques.swapaxes(0, 1)))
 
 
-def _variation(probe: Probe) -> Array:
-    """Return the sum of squares of each torque about its mean, 0 of a constant one, shape (n,)."""
-    centred = probe.tau - probe.tau.mean(axis=0)
-    is_constant = np.ptp(probe.tau, axis=0) <= _CONSTANT * np.abs(probe.tau).max(axis=0)
-    size: Array = np.where(is_constant, 0.0, np.einsum("kn,kn->n", centred, centred))
-    return size
+def _over(left: Array, size: Array) -> Array:
+    """Return sums of squares as shares of a size, at most 1; 0 of none."""
+    share = np.divide(left, size, out=np.zeros_like(size), where=size > 0)
+    return np.minimum(share, 1.0)
 
 
-def _compressed(X: Array, tau: Array) -> tuple[Array, Array]:
-    """Return the triangular factor of the columns, of length 1 each, and the torques beside it."""
-    size = np.linalg.norm(X, axis=0)
-    used = size > 1e-9 * size.max(initial=1e-300)
-    R = np.asarray(np.linalg.qr(np.hstack([X[:, used] / size[used], tau]), mode="r"))
-    return R[:, : used.sum()], R[:, used.sum() :]
+def _variation(tau: Array) -> Array:
+    """Return the sum of squares of torques (N, ...) about their mean, 0 of a constant one."""
+    centred = tau - tau.mean(axis=0)
+    is_constant = np.ptp(tau, axis=0) <= _CONSTANT * np.abs(tau).max(axis=0)
+    return np.where(is_constant, 0.0, np.sum(centred**2, axis=0))
+
+
+def _misfits(X: Array, torques: Array) -> Array:
+    """Return the squares that columns, (n, N, c), with factors >= 0 leave of torques, (n, N, k)."""
+    from scipy.optimize import nnls
+
+    size = np.linalg.norm(X, axis=1, keepdims=True)
+    used = size > 1e-9 * size.max(axis=2, keepdims=True, initial=1e-300)
+    unit = np.divide(X, size, out=np.zeros_like(X), where=used)
+    R, c = _triangles(np.concatenate([unit, torques], axis=2)), X.shape[2]
+    left = [[nnls(R_j[:, :c], tau)[1] for tau in R_j[:, c:].T] for R_j in R]
+    return np.square(left)
+
+
+def _triangles(rows: Array) -> Array:
+    """Return the triangular factors of the rows of each joint, (n, N, c), shape (n, c, c)."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def _nonnegative_prediction(X: Array, tau: Array) -> Array:
@@ -322,9 +351,3 @@ def _nonnegative_prediction(X: Array, tau: Array) -> Array:
     columns = X / np.where(size > 0, size, 1.0)
     predicted: Array = columns @ nnls(columns, tau)[0]
     return predicted
-
-
-def _nonnegative_misfit(R: Array, tau: Array) -> float:
-    from scipy.optimize import nnls
-
-    return float(nnls(R, tau)[1] ** 2)

@@ -132,7 +132,7 @@ def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadMo
     told = (level > _CONSTANT * np.abs(probe.tau).max()) & (share < _EXPLAINED)
     R = np.zeros((n, bodies + 5, bodies + 5))
     for j in np.flatnonzero(told).tolist():
-        drive = np.delete(probe.drive(j), 4, axis=1)
+        drive = np.delete(probe.drives[:, j], 4, axis=1)
         length = np.linalg.norm(drive, axis=0)
         U, s, _ = np.linalg.svd(drive / np.where(length > 0, length, 1.0), full_matrices=False)
         Q = U[:, s > 1e-6 * s[0]]
@@ -254,7 +254,7 @@ def _cancelled(probe: Probe, j: int, theta: Array) -> float:
     """Return which share of a joint's gravity its counterbalance takes, by fitted links [-]."""
     Y = np.concatenate([probe.loads()[:, j], probe.last_body[:, j]], axis=1)
     swing = probe.swing(j)
-    X = np.hstack([probe.drive(j)[:, :4], swing])
+    X = np.hstack([probe.drives[:, j, :4], swing])
     size = np.linalg.norm(X, axis=0)
     x = np.linalg.lstsq(X / size, probe.tau[:, j] - Y @ theta)[0] / size
     gravity = (probe.loads() - probe.loads(np.zeros(3)))[:, j].sum(axis=1)

@@ -125,22 +125,21 @@ class Probe:
         more: Array = np.tensordot(gravity - self.gravity, self.parts.pulls, axes=1)
         return links + more
 
-    def drive(self, j: int) -> Array:
-        """Return what the drive of joint j may add: inertia, frictions, offset of either sign.
+    @cached_property
+    def drives(self) -> Array:
+        """What each drive may add: inertia, frictions, offset of either sign, shape (N, n, 5 + k).
 
-        Args:
-            j: Index of the joint.
-
-        Returns:
-            Columns a, v, sign v, 1, -1 and those of coupled drives and of a counterbalance, shape
-            (N, 5 + k).
+        Columns a, v, sign v, 1, -1, those of coupled drives, and those of a counterbalance if
+        there is one, 0 of other joints.
         """
-        v, one = self.v[:, j], np.ones(len(self.v))
-        least = _STILL * float(self.model.layout.drive_speeds[j])
-        still = min(least, _SLOW * float(np.abs(v).max())) or least
-        own = np.column_stack([self.a[:, j], v, np.tanh(v / still), one, -one])
-        swing = self.swing(j) if j in self.balanced else np.empty((len(v), 0))
-        return np.hstack([own, self.parts.coupled[:, j], swing, -swing])
+        v, one = self.v, np.ones_like(self.v)
+        least = _STILL * self.model.layout.drive_speeds[: v.shape[1]]
+        still = np.minimum(least, _SLOW * np.abs(v).max(axis=0))
+        own = [self.a, v, np.tanh(v / np.where(still > 0, still, least)), one, -one]
+        swings = np.zeros((*v.shape, 4 if self.balanced else 0))
+        for j in self.balanced:
+            swings[:, j] = np.hstack([self.swing(j), -self.swing(j)])
+        return np.concatenate([np.stack(own, axis=2), self.parts.coupled, swings], axis=2)
 
     def swing(self, j: int) -> Array:
         """Return what follows the position of a revolute joint, as a counterbalance does, (N, 2).

@@ -310,7 +310,7 @@ def _window(
     slow = turns | (np.abs(v) < _SLOW)
     steady = [_distance(at, t[slow[:, j]]) > _AWAY * period for j in range(v.shape[1])]
     tau = low_pass(motion.tau[rows], 1 / step, signals)
-    late = _interpolated(t, tau, [at + delay for delay in _GRID])
+    late = _interpolated(t, tau, at + _GRID[:, None])
     drive = np.concatenate([own, coupled], axis=2)
     return _Window(inertial, drive, np.column_stack(steady), late)
 
@@ -325,14 +325,13 @@ def _coupled(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
     return columns
 
 
-def _interpolated(t: Array, values: Array, times: Sequence[Array]) -> Array:
-    """Return values, shape (N, n), at each of several lists of times, shape (lists, M, n)."""
+def _interpolated(t: Array, values: Array, times: Array) -> Array:
+    """Return values, shape (N, n), at times of any shape, shape (..., n)."""
     from scipy.interpolate import CubicSpline
 
     if len(t) < 2:
-        return np.empty((len(times), 0, values.shape[1]))
-    spline = CubicSpline(t, values, axis=0)
-    return np.array([spline(at) for at in times])
+        return np.empty((*times.shape, values.shape[1]))
+    return np.asarray(CubicSpline(t, values, axis=0)(times))
 
 
 def _distance(at: Array, turns: Array) -> Array:

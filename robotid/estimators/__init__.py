@@ -5,6 +5,7 @@ from robotid.estimators.consistent.constraints import Constraints
 from robotid.estimators.consistent.fit import Consistent
 from robotid.estimators.consistent.log_cholesky import LogCholesky
 from robotid.estimators.estimator import BatchEstimator, Estimate, Estimator
+from robotid.estimators.output_error import OutputError
 from robotid.estimators.recursive.base import RecursiveEstimator, fold, load_state, save_state
 from robotid.estimators.recursive.descent import PRX, DescentState, NormalisedGradient
 from robotid.estimators.recursive.filters import RLS, Kalman, KalmanState, RLSState
@@ -25,6 +26,7 @@ __all__ = [
     "KalmanState",
     "LogCholesky",
     "NormalisedGradient",
+    "OutputError",
     "RLSState",
     "RecursiveEstimator",
     "fold",

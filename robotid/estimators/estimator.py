@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from html import escape
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from robotid.estimators.consistent.fit import Consistent
 
 __all__ = ["BatchEstimator", "Estimate", "Estimator", "Weighing", "require_rows"]
+
+DataT = TypeVar("DataT", contravariant=True)
 
 #: "alike"; "by joint", each by its noise level; "by age", as of a filter that forgets or gates; or
 #: "by step", as of a gradient method, which ends beside the minimum of least squares.
@@ -105,15 +107,15 @@ class Estimate:
         return zip(self.names, self.theta, self.std_error, strict=True)
 
 
-class Estimator(ABC):
+class Estimator(ABC, Generic[DataT]):
     """Settings go into the constructor, data only into ``fit``.
 
     Attributes:
-        reads: What it needs of the data: the "factors" that all rows come down to, or the
-            "samples" one by one.
+        reads: What it needs of the data: the "factors" that all rows come down to, the "samples"
+            one by one, or a "simulator" that is compared with them.
     """
 
-    reads: ClassVar[Literal["factors", "samples"]]
+    reads: ClassVar[Literal["factors", "samples", "simulator"]]
 
     @property
     def needs_mass(self) -> bool:
@@ -131,11 +133,12 @@ class Estimator(ABC):
         return None
 
     @abstractmethod
-    def fit(self, data: Problem) -> Estimate:
+    def fit(self, data: DataT) -> Estimate:
         """Estimate the parameters.
 
         Args:
-            data: A problem in base parameters; of a batch estimator also its factors.
+            data: A problem in base parameters; of a batch estimator also its factors. Of one that
+                reads a simulator, the simulator.
 
         Raises:
             DataError: If there are fewer rows than parameters, or a row cannot be used.
@@ -144,7 +147,7 @@ class Estimator(ABC):
         """
 
 
-class BatchEstimator(Estimator):
+class BatchEstimator(Estimator[Problem | Factors]):
     """An estimator to which the factors of the rows are enough."""
 
     reads: ClassVar[Literal["factors"]] = "factors"

@@ -9,13 +9,13 @@ beside what drifts.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array, ProgressCallback, ignore_progress
-from robotid.estimators.estimator import Estimate
+from robotid.estimators.estimator import Estimate, Estimator
 from robotid.estimators.stretches import FEWEST_STRETCHES, at_least, sandwich, scatter
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, triangle_of
@@ -120,7 +120,7 @@ class _Weights:
 
 
 @dataclass(frozen=True, eq=False)
-class OutputError:
+class OutputError(Estimator[Simulator]):
     """Least squares of a simulator's whitened residuals, with priors and bounds.
 
     A damped Gauss-Newton method (Levenberg, Marquardt) in rounds: weights of the residuals so far,
@@ -143,6 +143,8 @@ class OutputError:
         Ljung (1999), System identification, 4.3 and 10.2.
     """
 
+    reads: ClassVar[Literal["simulator"]] = "simulator"
+
     name: str = "output error"
     whitens: bool = True
     most: Array | None = None
@@ -153,7 +155,11 @@ class OutputError:
     progress: ProgressCallback = field(default=ignore_progress)
 
     def fit(
-        self, simulator: Simulator, start: Array, *, exact: Simulator | None = None
+        self,
+        data: Simulator,
+        start: Array | None = None,
+        *,
+        exact: Simulator | None = None,
     ) -> Estimate:
         """Estimate the parameters.
 
@@ -162,15 +168,16 @@ class OutputError:
         1 - (A'A)^-1 A'S of what it should correct; ``details`` has the largest, ``left``.
 
         Args:
-            simulator: What rolls out.
-            start: Where to begin, shape (c,).
+            data: What rolls out.
+            start: Initial values, shape (c,); the prior if None.
             exact: The same with exact derivatives, if its own are not.
 
         Raises:
             DataError: If there are fewer samples than parameters.
             NotConvergedError: If it cannot be simulated where it begins.
         """
-        theta = np.maximum(np.array(start, dtype=float), simulator.lowest)
+        simulator, begin = data, data.prior if start is None else start
+        theta = np.maximum(np.array(begin, dtype=float), simulator.lowest)
         weights, rounds, count, converged = self.weights(simulator, theta), 0, 0, False
         for rounds in range(1, self.rounds + 1):
             close = _ROUGH if rounds == 1 else _CLOSE

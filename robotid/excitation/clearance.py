@@ -32,6 +32,9 @@ _FIRST = 0.05  # [s] the intervals that a motion is first looked at in ...
 _SHORTEST = 1e-3  # [s] ... and the shortest that they are halved to
 _SURE = 5e-4  # [m] by which a lower bound may be too low
 _WIDE = 100.0  # [m] extent of the floor
+_SPARE = 0.002  # [m] of distances, that a design leaves for what lies between its instants ...
+_SPARE_ROOM = 0.25  # ... of the room that links have which are built near each other: at most that
+_SEEN = 0.01  # [m] short of which margins are reckoned
 _SIGNS = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T  # corners of a box, (8, 3)
 
 
@@ -242,6 +245,24 @@ class Clearance:
     def named(self) -> list[tuple[str, str]]:
         """The names of each pair."""
         return [(self._hulls[i].name, self._hulls[j].name) for i, j in self.pairs.tolist()]
+
+    @property
+    def spare(self) -> Array:
+        """What is left of distances for what lies between instants, shape (pairs, 1) [m]."""
+        spare: Array = np.minimum(_SPARE, _SPARE_ROOM * self.room)[:, None]
+        return spare
+
+    def margins(self, poses: Poses, spare: float, *, hints: Array | None = None) -> Array:
+        """Return margins of distances, shape (pairs, N) [m]; a lower bound of those over 1 cm.
+
+        Args:
+            poses: Where the bodies are at N instants.
+            spare: How many times what distances spare is taken off the margin.
+            hints: As of ``near``.
+        """
+        kept = self.kept[:, None] + spare * self.spare
+        seen = np.minimum(_SEEN, self.room[:, None] / 4)
+        return self.near(poses, kept + seen, hints=hints).distance - kept
 
     def poses(self, q: Array) -> Poses:
         """Return where the bodies are.

@@ -15,22 +15,23 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.estimators.determination import base_spread
-from robotid.exceptions import NotConvergedError, SettingsError
+from robotid.exceptions import NotConvergedError
 from robotid.excitation.basis import Basis, DesignedMotion
 from robotid.excitation.clearance import Clearance, Contact
 from robotid.excitation.information import Aim, MotionInformation, MotionRows, criterion
-from robotid.excitation.limits import LIMITS, MotionLimits
-from robotid.findings import listed
+from robotid.excitation.limits import MotionLimits
+from robotid.excitation.multipliers import SOFT, SPARE, Multipliers
+from robotid.excitation.postures import Postures
 from robotid.identification.assumptions import (
     CORRELATION,
     assumed_noise,
     assumed_parameters,
+    largest_gravity,
     largest_torques,
 )
 from robotid.identification.previews import Run
 from robotid.regressor.adjoint import Poses
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 from robotid.simulation.motions import Motion
@@ -44,7 +45,6 @@ _ROUNDS = 14  # of the augmented Lagrangian ...
 _LAST_ROUNDS = 8  # ... and on the finer grid
 _STEPS = 20  # of L-BFGS in each
 _WEIGHT = 3.0  # of what is violated at all instants together, at first
-_GROWTH = 3.0  # of that from one round to the next
 _LESS = 0.25  # of what a round broke: more weight is put on it if the next one breaks more
 _NEARLY = 1e-2  # change of the criterion from which on the finer grid is used ...
 _SETTLED = 2e-3  # ... and below which a design has converged
@@ -52,15 +52,7 @@ _LOST = 0.02  # of the criterion that may be lost where a motion is made to keep
 _OVER = 1.01  # share of a limit up to which a design that settled may use it before it is scaled
 _TRIALS = 10  # of shares of a motion, until the largest that keeps the limits is known ...
 _SHARE = 1e-3  # ... to within this, or as near to a limit
-_SPARE = 0.003  # of limits that a design leaves for what lies between its instants
-_SPARE_WAY = 0.002  # [m] the same of distances
-_SPARE_ROOM = 0.25  # of the room that links have which are built near each other: at most that
-_SEEN = 0.01  # [m] short of which distances are reckoned where a motion is made to keep them
-_SOFT = 0.05  # [m] of distance that weighs as much as a whole limit
 _USUAL = 0.3  # of the largest torque, speed and acceleration: about the rms of a motion
-_TRIED = 200  # random postures until one is found that the robot can rest in ...
-_AT_ONCE = 10  # ... so many at a time
-_REPAIRS = 300  # joints that are redrawn of a posture that breaks a limit, one after another
 _WIDEST = 0.25  # share of the base parameters that the criterion "widest" is about
 _STARTED = 10  # random motions of which the best is a start
 
@@ -165,7 +157,7 @@ class Designer:
         """
         criterion(name, np.eye(1))
         mapping = structural_mapping(model)
-        size, speed = largest_torques(model, _gravity(model)), limits.sizes[1]
+        size, speed = largest_torques(model, largest_gravity(model)), limits.sizes[1]
         pi = assumed_parameters(model, size, speed) if run is None else run.standard
         found = None if run is None else run.noise(mapping.K)
         density = assumed_noise(model, size, noise or {}, correlation, found).density(0.0)
@@ -227,12 +219,12 @@ class Designer:
         while len(followed) < starts and not is_over():
             random = [self.random(rng) for _ in range(_STARTED)]
             objective, k = min((self._objective(C), k) for k, C in enumerate(random))
-            held = _Multipliers(_WEIGHT / self._functions.shape[1])
+            held = Multipliers(_WEIGHT / self._functions.shape[1])
             begin = _State(random[k], objective, random[k], held)
             followed.append(follow(self, begin, _ROUNDS, _NEARLY))
         chosen = min(followed, key=lambda state: state.objective)
         fine, best = replace(self, finer=_POLISHED * self.finer), np.inf
-        kept, held = fine._feasible(chosen.kept, 1.0 - _SPARE), chosen.multipliers.finer(_POLISHED)
+        kept, held = fine._feasible(chosen.kept, 1.0 - SPARE), chosen.multipliers.finer(_POLISHED)
         begin = _State(kept, fine._objective(kept), chosen.away, held)
         polished = follow(fine, begin, _LAST_ROUNDS, _SETTLED)
         found = replace(self, finer=_FINER * self.finer).checked(polished.kept)
@@ -392,13 +384,6 @@ class Designer:
             return None
         return np.zeros((len(self.clearance.pairs), self._functions.shape[1], 3))
 
-    @cached_property
-    def _spare(self) -> Array:
-        """What is left of distances for what lies between instants, shape (pairs, 1) [m]."""
-        if self.clearance is None:
-            return np.zeros((0, 1))
-        return np.minimum(_SPARE_WAY, _SPARE_ROOM * self.clearance.room)[:, None]
-
     def _kept(self, C: Array, spare: float = 0.0) -> tuple[Array, float, MotionRows]:
         """Return shares of limits used (6, N, n), the least margin of distances and rows.
 
@@ -412,20 +397,17 @@ class Designer:
         return used, float(self._margins(rows.state, spare).min(initial=np.inf)), rows
 
     def _margins(self, poses: Poses, spare: float) -> Array:
-        """Return margins of distances, shape (pairs, N) [m]; a lower bound of those over 1 cm."""
+        """Return margins of distances, shape (pairs, N) [m], as of ``Clearance.margins``."""
         if self.clearance is None:
             return np.zeros((0, poses.p.shape[2]))
-        kept = self.clearance.kept[:, None] + spare * self._spare
-        seen = np.minimum(_SEEN, self.clearance.room[:, None] / 4)
-        hints = self._hints if poses.p.shape[2] == self._functions.shape[1] else None
-        return self.clearance.near(poses, kept + seen, hints=hints).distance - kept
+        return self.clearance.margins(poses, spare, hints=self._hints)
 
     def _objective(self, C: Array) -> float:
         """Return the criterion of a motion."""
         q, v, a, _ = self._functions @ C
         return self.judged(self.matrix(self.information.rows(q, v, a)))[0]
 
-    def _lagrangian(self, C: Array, multipliers: "_Multipliers") -> tuple[float, Array]:
+    def _lagrangian(self, C: Array, multipliers: Multipliers) -> tuple[float, Array]:
         """Return the augmented Lagrangian of a motion and its gradient, shape (h, n).
 
         References:
@@ -438,7 +420,7 @@ class Designer:
         value, by_F = self.judged(self.matrix(rows))
         used = self.limits.used(q, v, a, jerk, torque)
         cost, pushed = multipliers.of_limits(used)
-        by_value = pushed * 2.0 * used / (1.0 - _SPARE) ** 2 / self.limits.sizes[:, None]
+        by_value = pushed * 2.0 * used / (1.0 - SPARE) ** 2 / self.limits.sizes[:, None]
         by_q, by_v, by_a, by_jerk, by_torque, by_power = by_value
         by_v = by_v + by_power * torque
         by_torque = by_torque + by_power * v
@@ -448,7 +430,7 @@ class Designer:
             near = self.clearance.near(rows.state, multipliers.reach(aim), hints=self._hints)
             cost, pushed = multipliers.of_distances(near.distance, aim)
             value += cost
-            along = -pushed[near.pairs, near.samples, None] / _SOFT * near.gradient
+            along = -pushed[near.pairs, near.samples, None] / SOFT * near.gradient
             np.add.at(by_q, near.samples, along)
         scale = self._scale(self._step)
         by_W = 2.0 * scale * (by_F @ (scale * rows.W))
@@ -463,8 +445,13 @@ class Designer:
     def _wanted(self) -> Array:
         """Distances that the search aims at, shape (pairs, 1) [m]."""
         if self.clearance is None:
-            return self._spare
-        return self.clearance.kept[:, None] + 2.0 * self._spare
+            return np.zeros((0, 1))
+        return self.clearance.kept[:, None] + 2.0 * self.clearance.spare
+
+    @cached_property
+    def postures(self) -> Postures:
+        """The postures in which the robot can rest."""
+        return Postures(self.information, self.limits, self.clearance)
 
     def random(self, rng: np.random.Generator) -> Array:
         """Return the coefficients of a random motion that keeps the limits, shape (h, n).
@@ -478,140 +465,8 @@ class Designer:
         n = len(self.limits.middle)
         C = rng.standard_normal((self.basis.size, n)) * self.limits.sizes[0]
         C[:, ~self._moves] = 0.0
-        C[0] = self._posture(rng)
-        return self._feasible(C, 1.0 - _SPARE)
-
-    def postures(self, rng: np.random.Generator, tried: int = _TRIED) -> Array:
-        """Return those of random postures that keep limits and distances at rest, shape (k, n).
-
-        Args:
-            rng: Source of the postures.
-            tried: How many are tried.
-
-        Raises:
-            SettingsError: If none of them does.
-        """
-        q = self._drawn(rng, tried)
-        kept: Array = q[self.can_rest(q)]
-        if not len(kept):
-            kept = self._repaired(q[:_AT_ONCE], rng)
-        if not len(kept):
-            raise SettingsError(self._why_not(*self._at_rest(q)))
-        return kept
-
-    def _repaired(self, q: Array, rng: np.random.Generator) -> Array:
-        """Return the postures that keep all limits once joints of what they broke are redrawn.
-
-        Of each posture one such joint is redrawn at a time; what breaks more is not kept. Robots of
-        many joints have postures at rest, but one in a million random ones is one.
-
-        Args:
-            q: Postures, shape (N, n) [rad or m].
-            rng: Source of the joints and of their positions.
-
-        References:
-            Selman, Kautz, Cohen (1994), Noise strategies for improving local search.
-        """
-        q, broken = q.copy(), self._broken_by_joint(q)
-        for _ in range(_REPAIRS):
-            total = broken.sum(axis=1)
-            if not total.all():
-                break
-            share = broken.cumsum(axis=1) / total[:, None]
-            joint = (share < rng.uniform(size=(len(q), 1))).sum(axis=1)
-            other, rows = q.copy(), np.arange(len(q))
-            other[rows, joint] = self._drawn(rng, len(q))[rows, joint]
-            now = self._broken_by_joint(other)
-            is_kept = now.sum(axis=1) <= total
-            q[is_kept], broken[is_kept] = other[is_kept], now[is_kept]
-        kept: Array = q[self.can_rest(q)]
-        return kept
-
-    def _broken_by_joint(self, q: Array) -> Array:
-        """Return how much of what postures break each joint has part in, shape (N, n)."""
-        used, margins = self._at_rest(q)
-        found = np.maximum(used - 1.0, 0.0).sum(axis=0) @ self.information.chains
-        if self.clearance is not None:
-            movers = self.clearance.movers
-            movers = movers / np.maximum(movers.sum(axis=1, keepdims=True), 1)
-            found += np.maximum(-margins.T, 0.0) / _SOFT @ movers
-        by_joint: Array = found
-        return by_joint
-
-    def _posture(self, rng: np.random.Generator) -> Array:
-        """Return the first of ``postures``, which are tried a few at a time, shape (n,)."""
-        for _ in range(_TRIED // _AT_ONCE):
-            q = self._drawn(rng, _AT_ONCE)
-            kept: Array = q[self.can_rest(q)]
-            if len(kept):
-                break
-        else:
-            kept = self.postures(rng)
-        first: Array = kept[0]
-        return first
-
-    def _drawn(self, rng: np.random.Generator, count: int) -> Array:
-        """Return random postures, shape (count, n) [rad or m]."""
-        reach = rng.uniform(-0.8, 0.8, (count, len(self.limits.middle)))
-        reach[:, self.limits.sizes[0] > 2.0] *= 0.6
-        q: Array = self.limits.middle + reach * self.limits.sizes[0]
-        return q
-
-    def can_rest(self, q: Array) -> Array:
-        """Return whether postures keep limits and distances at rest, shape (N,), bool.
-
-        Args:
-            q: Postures, shape (N, n) [rad or m].
-        """
-        used, margins = self._at_rest(q)
-        is_clear = (margins >= 0.0).all(axis=0)
-        can: Array = (used.max(axis=(0, 2)) <= 1.0) & is_clear
-        return can
-
-    def _at_rest(self, q: Array) -> tuple[Array, Array]:
-        """Return shares of limits that postures use, (6, N, n), and margins, (pairs, N) [m]."""
-        still = np.zeros_like(q)
-        rows = self.information.rows(q, still, still)
-        used = np.abs(self.limits.used(q, still, still, still, self.information.torque(rows)))
-        return used, self._margins(rows.state, 1.0)
-
-    def _why_not(self, used: Array, margins: Array) -> str:
-        """Return what leaves no posture: a limit or a distance alone, or several together."""
-        broken = sorted(self._broken(used, margins), key=lambda entry: -entry[0])
-        tried = f"of {used.shape[1]} random postures none can be held at rest"
-        share, alone, _ = broken[0]
-        if share == 1.0:
-            return f"{tried}: {alone}"
-        most = [f"{words} in {100 * share:.0f} %" for share, _, words in broken]
-        return (
-            f"{tried}: each breaks a limit or a distance, though none of them breaks all. Most "
-            f"often {listed(most, 3)}; narrow the limits of these joints, lock joints that need "
-            "not move, lower the clearance, or --clearance none to leave collisions unlooked at"
-        )
-
-    def _broken(self, used: Array, margins: Array) -> list[tuple[float, str, str]]:
-        """Return each limit and distance that postures break: their share, and two wordings."""
-        found, names = [], self.information.model.joints
-        for kind, joint in np.argwhere((used > 1.0).any(axis=1)).tolist():
-            own = used[kind, :, joint]
-            least = (
-                f"{names[joint]} needs {_percent(own.min())} % of its {LIMITS[kind]} limit at the "
-                "least; state the limits that the robot has, or the load that it carries"
-            )
-            some = f"{names[joint]} needs more than its {LIMITS[kind]} limit"
-            found.append((float(np.mean(own > 1.0)), least, some))
-        for pair in np.flatnonzero((margins < 0.0).any(axis=1)).tolist():
-            two = " and ".join(self.clearance.named[pair]) if self.clearance else ""
-            wanted = float((self.clearance.kept if self.clearance else self._spare)[pair])
-            wanted += float(self._spare[pair, 0])
-            most = (
-                f"in the best of them {two} are {1e3 * (margins[pair].max() + wanted):.1f} mm "
-                f"apart, wanted {1e3 * wanted:.1f} mm; lower the clearance, or move the floor and "
-                "the boxes"
-            )
-            some = f"{two} are nearer than {1e3 * wanted:.1f} mm"
-            found.append((float(np.mean(margins[pair] < 0.0)), most, some))
-        return found
+        C[0] = self.postures.one(rng)
+        return self._feasible(C, 1.0 - SPARE)
 
     def _feasible(self, C: Array, most: float) -> Array:
         """Return the largest share of a motion about its middle that keeps the limits, (h, n).
@@ -638,7 +493,7 @@ class Designer:
         under, over = -1.0, np.inf  # by how much limits are broken at both
         for _ in range(_TRIALS):
             used, margin, _ = self._kept(kept + share * way, 1.0)
-            broken = max(float(np.abs(used).max()) / most - 1.0, -margin / _SOFT)
+            broken = max(float(np.abs(used).max()) / most - 1.0, -margin / SOFT)
             if broken <= 0.0:
                 low, under, over = share, broken, over / 2
             else:
@@ -698,10 +553,10 @@ class Designer:
         if self.clearance is not None:
             reach = held.reach(self._wanted)
             distance = self.clearance.near(rows.state, reach, hints=self._hints).distance
-        kept = self._feasible(C, 1.0 - _SPARE)
+        kept = self._feasible(C, 1.0 - SPARE)
         objective = self._objective(kept)
         if objective > state.objective - settled:
-            mixed = self._towards(state.kept, C, 1.0 - _SPARE)
+            mixed = self._towards(state.kept, C, 1.0 - SPARE)
             objective, kept = min(
                 [(objective, kept), (self._objective(mixed), mixed)], key=lambda pair: pair[0]
             )
@@ -710,74 +565,14 @@ class Designer:
         is_lost = not is_near and gain < _LOST  # the way from what keeps the limits leads farther
         if gain < 0.0:
             kept, objective = state.kept, state.objective
-        broken = max(float(np.abs(used).max()) - 1.0 + _SPARE, -margin / _SOFT, 0.0)
+        broken = max(float(np.abs(used).max()) - 1.0 + SPARE, -margin / SOFT, 0.0)
         held = held.raised(used, distance, self._wanted)
         is_settled = bool(is_near and gain < settled)
         return _State(kept, objective, kept if is_lost else C, held, is_settled), broken
 
 
-def _gravity(model: RobotModel) -> Array:
-    """Return the largest torque that gravity asks of each joint over random poses, shape (n,)."""
-    reach = [(j.lower, j.upper) if j.has_limits else (-np.pi, np.pi) for j in model.limits]
-    low, high = np.array(reach).T
-    q = np.random.default_rng(0).uniform(low, high, (_TRIED, len(reach)))
-    torque: Array = np.abs(predict_instants(model, model.standard_parameters(), q)).max(axis=0)
-    return torque
-
-
-def _percent(share: float) -> str:
-    """Return a share in per cent, in few digits however large it is."""
-    return f"{100 * share:.0f}" if share < 1e4 else f"{100 * share:.2g}"
-
-
 class _OutOfTime(Exception):
     """The time of a design is over."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Multipliers:
-    """Multipliers of the limits at each instant, and of distances.
-
-    Attributes:
-        weight: Of what is violated.
-        limits: Shape (6, N, n); 0 at first.
-        distances: Shape (pairs, N).
-    """
-
-    weight: float
-    limits: Array | float = 0.0
-    distances: Array | float = 0.0
-
-    def finer(self, times: int) -> "_Multipliers":
-        """Return the same on a grid of as many times the instants."""
-        limits, distances = _between(self.limits, times), _between(self.distances, times)
-        return _Multipliers(self.weight / times, limits, distances)
-
-    def heavier(self) -> "_Multipliers":
-        """Return the same with more weight."""
-        return replace(self, weight=_GROWTH * self.weight)
-
-    def raised(self, used: Array, distance: Array | None, aim: Array) -> "_Multipliers":
-        """Return the slopes as the new multipliers."""
-        distances = 0.0 if distance is None else self.of_distances(distance, aim)[1]
-        return replace(self, limits=self.of_limits(used)[1], distances=distances)
-
-    def of_limits(self, used: Array) -> tuple[float, Array]:
-        """Return the cost of limits and its slope by what they are over, shape (6, N, n)."""
-        return self._cost(used**2 / (1.0 - _SPARE) ** 2 - 1.0, self.limits)
-
-    def of_distances(self, distance: Array, aim: Array) -> tuple[float, Array]:
-        """Return the cost of distances and its slope by what they are short, shape (pairs, N)."""
-        return self._cost((aim - distance) / _SOFT, self.distances)
-
-    def reach(self, aim: Array) -> Array:
-        """Return the distances from which there is no cost, shape (pairs, N) or (pairs, 1) [m]."""
-        return aim + _SOFT / self.weight * self.distances
-
-    def _cost(self, over: Array, multipliers: Array | float) -> tuple[float, Array]:
-        pushed = np.maximum(0.0, multipliers + self.weight * over)
-        cost = float(np.sum(pushed**2 - np.square(multipliers))) / (2 * self.weight)
-        return cost, pushed
 
 
 @dataclass(frozen=True, eq=False)
@@ -795,24 +590,10 @@ class _State:
     kept: Array
     objective: float
     away: Array
-    multipliers: _Multipliers
+    multipliers: Multipliers
     is_settled: bool = False
 
 
 def _scaled(C: Array, share: float | Array) -> Array:
     """Return a motion with its way about the middle scaled, shape (h, n)."""
-    scaled = C * share
-    scaled[0] = C[0]
-    return scaled
-
-
-def _between(values: Array | float, times: int) -> Array | float:
-    """Return multipliers of instants, axis 1, spread over as many times the intervals."""
-    if isinstance(values, float):
-        return values
-    share = np.arange(times).reshape(-1, *[1] * (values.ndim - 2)) / times
-    steps = np.diff(values, axis=1)[:, :, None]
-    shape = len(values), times * (values.shape[1] - 1), *values.shape[2:]  # maybe of no pair
-    between = (values[:, :-1, None] + share * steps).reshape(shape)
-    fine: Array = np.concatenate([between, values[:, -1:]], axis=1) / times
-    return fine
+    return np.vstack([C[:1], C[1:] * share])

@@ -91,7 +91,7 @@ def design_sweeps(
     Raises:
         SettingsError: If no posture is found about which every joint can sweep.
     """
-    postures = designer.postures(rng, _CANDIDATES)[:_LOOKED_AT]
+    postures = designer.postures.resting(rng, _CANDIDATES)[:_LOOKED_AT]
     rooms = [_room(designer, posture) for posture in postures]  # (n, 2) each
     best = int(np.argmax([(room.sum(axis=1) / designer.limits.sizes[0]).min() for room in rooms]))
     share = _REACH
@@ -114,7 +114,7 @@ def _room(designer: Designer, posture: Array) -> Array:
     ways = np.linspace(low, high, _PLACES).T  # (n, places)
     q = np.repeat(posture[None], n * _PLACES, axis=0).reshape(n, _PLACES, n)
     q[np.arange(n), :, np.arange(n)] = ways
-    is_kept = designer.can_rest(q.reshape(-1, n)).reshape(n, _PLACES)
+    is_kept = designer.postures.can_rest(q.reshape(-1, n)).reshape(n, _PLACES)
     room = np.zeros((n, 2))
     for j, (way, kept) in enumerate(zip(ways, is_kept, strict=True)):
         blocked = way[~kept]
@@ -158,7 +158,7 @@ def design_stands(designer: Designer, rng: np.random.Generator, count: int = 20)
     References:
         Fedorov (1972), Theory of Optimal Experiments.
     """
-    q = designer.postures(rng, _CANDIDATES)
+    q = designer.postures.resting(rng, _CANDIDATES)
     still = np.zeros_like(q)
     rows = designer.information.rows(q, still, still)
     scale = np.sqrt(_HOLD / designer.noise)[:, None] * designer.spread

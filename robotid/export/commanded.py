@@ -9,21 +9,17 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
-from robotid.logs.data import Log, Trajectory
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
-from robotid.simulation.loops import LoopedRobot, Loops, cut_windows, open_loops
+from robotid.simulation.loops import Loops, open_loops
 
 __all__ = [
     "CommandedDrive",
     "commanded_drives",
-    "follow_commands",
     "limit_of",
-    "logged_motion",
     "loops_of",
 ]
 
-_GAP = 3.0  # median steps: across a longer one no speed is computed
 #: Parameters of a joint's controller, 0 where a result has none.
 _OF_CONTROLLER = ("kd", "delay", "zero")
 _OF_DRIVE = ("armature", "viscous", "coulomb", "offset")
@@ -128,39 +124,6 @@ def loops_of(
     return replace(found, kp=kp, kd=kd, delay=delay, zero=zero, limit=limit, rate=rate)
 
 
-def follow_commands(
-    model: RobotModel,
-    pi: Array,
-    drives: Sequence[CommandedDrive],
-    log: Log,
-    rate: float | None = None,
-) -> Array:
-    """Return the positions that a robot takes on the commands of a log, in open loop.
-
-    It starts as the log does, and again after each gap.
-
-    Args:
-        model: The identified robot.
-        pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        drives: Its drives.
-        log: The log, of its joints in its order, with commands.
-        rate: Ticks per second of a controller with a clock [Hz]; None: it has none.
-
-    Returns:
-        Positions that encoders would read, shape (N, n) [rad or m]; NaN of a sample between gaps.
-
-    Raises:
-        MissingDependencyError: If Numba is not installed.
-        NotConvergedError: If a step has no solution.
-        SettingsError: If a term of the drives cannot be rolled out.
-    """
-    robot, q = LoopedRobot(model), np.full_like(log.q, np.nan)
-    loops = loops_of(model, pi, drives, rate)
-    for out in robot.roll_out(loops, cut_windows(log, np.inf, 0.0)):
-        q[out.window.counted] = out.q
-    return q
-
-
 def limit_of(drive: CommandedDrive, joint: Joint) -> float:
     """Return the most that a drive gives: the controller's limit, else the URDF's, else inf.
 
@@ -169,21 +132,3 @@ def limit_of(drive: CommandedDrive, joint: Joint) -> float:
         joint: Its joint as the URDF describes it.
     """
     return min(drive.effort_limit, joint.effort if joint.effort > 0 else np.inf)
-
-
-def logged_motion(log: Log) -> Trajectory:
-    """Return the motion of a log of commands: positions, and their differences over time.
-
-    Args:
-        log: The log, of N samples; accelerations and torques of its motion are 0.
-    """
-    still = np.zeros_like(log.q)
-    dt = np.diff(log.t)
-    gaps = dt > _GAP * np.median(dt)
-    segment = np.append(0, np.cumsum(gaps))
-    v = still.copy()
-    for k in range(segment[-1] + 1):
-        rows = np.flatnonzero(segment == k)
-        if len(rows) > 1:
-            v[rows] = np.gradient(log.q[rows], log.t[rows], axis=0)
-    return Trajectory(log.t, log.q, v, still, still, log.joints, None, segment)

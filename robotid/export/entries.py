@@ -1,26 +1,24 @@
-"""What result.json holds of an identification from torques, and of a preview."""
+"""What result.json holds of an identification, and of a preview."""
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from robotid._files import file_sha256
+from robotid._files import finite, source_entry
+from robotid.closed_loop.result import LoopIdentification
+from robotid.export.loops import loop_entries, loop_inputs
 from robotid.export.ranges import parameter_ranges
-from robotid.fitting.bands import REACH, fitted_moments, usual_friction
+from robotid.fitting.bands import REACH, usual_friction
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.evaluation import Evaluation
+from robotid.fitting.identified import SOURCES, Identified
 from robotid.fitting.parameter_table import parameter_entries
-from robotid.fitting.result import SOURCES
 from robotid.identification.previews import Preview
 from robotid.identification.result import Identification
 from robotid.logs.transmission import Transmission
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.friction_projection import (
-    DriveMoments,
-)
 from robotid.robot.drives import TERMS
 from robotid.robot.parameters import pseudo_inertia
 from robotid.versions import __version__, versions
@@ -29,10 +27,8 @@ __all__ = [
     "SCHEMA_VERSION",
     "build_preview",
     "build_result",
-    "finite",
-    "plain_moments",
+    "input_entries",
     "recording_metrics",
-    "source_entry",
 ]
 
 SCHEMA_VERSION = 1
@@ -41,65 +37,78 @@ _EXTENT = ("samples", "rate", "start", "end", "rows_used", "segments")
 
 
 def build_result(
-    identification: Identification,
+    found: Identification | LoopIdentification,
     settings: Mapping[str, Any],
     outputs: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Return the content of result.json, plain values only and all of them finite.
 
     Args:
-        identification: What was found.
+        found: What was identified.
         settings: The job, in the shape of its file.
         outputs: Files written beside it, by kind.
     """
-    model, size = identification.model, identification.model.layout.n_inertial
-    bodies, drives = parameter_entries(identification)
-    return {
+    model, (bodies, drives) = found.model, parameter_entries(found)
+    if isinstance(found, LoopIdentification):
+        own = loop_entries(found)
+    else:
+        own = _torque_entries(found, settings)
+        beside = found.urdf_with_drives[len(bodies) :].tolist()
+        drives = [x | {"with_urdf": value} for x, value in zip(drives, beside, strict=True)]
+    common = {
         "schema_version": SCHEMA_VERSION,
         "robotid": __version__,
         "versions": versions(),
         "robot": model.name,
         "joints": list(model.joints),
         "settings": dict(settings),
-        "inputs": _inputs(identification),
+        "inputs": input_entries(found),
         "outputs": dict(outputs or {}),
-        "structure": _structure(identification),
-        "base_parameters": _base_parameters(identification),
-        "uncertainty": {
-            "method": identification.errors.method,
-            "stretches": identification.errors.stretches,
-            "inflation": identification.errors.inflation,
-        },
+        "structure": _structure(found) | own.pop("structure"),
+        "base_parameters": _base_parameters(found),
         "standard_parameters": bodies,
-        "drive_parameters": [
-            entry | {"with_urdf": float(value)}
-            for entry, value in zip(drives, identification.urdf_with_drives[size:], strict=True)
-        ],
-        "motors": _motors(identification, settings),
+        "drive_parameters": [*drives, *own.pop("loop_parameters", ())],
         "own_terms": model.options["own_terms"],
-        "drive_moments": plain_moments(fitted_moments(identification)),
-        "friction": {
-            drive.joint: _friction(identification, drive) for drive in identification.drives
-        },
-        "consistency": _consistency(identification),
-        **({"ranges": parameter_ranges(identification)} if identification.has_urdf else {}),
-        "identification": identification.metrics().to_dict(),
-        "validation": [
-            recording_metrics(e, "estimate") | {"band": _band(identification, e)}
-            for e in identification.validation
-        ],
+        "drive_moments": {name: moments.to_dict() for name, moments in found.moments.items()},
+        "consistency": _consistency(found) | own.pop("consistency", {}),
+        "identification": found.metrics().to_dict(),
         "warnings": [
             {"code": f.code, "severity": f.severity, "message": f.message, "where": f.where}
-            for f in identification.findings
+            for f in found.findings
+        ],
+        "verdict": found.verdict.to_dict(),
+    }
+    if found.has_urdf:
+        common["ranges"] = parameter_ranges(found) | own.pop("ranges", {})
+    return common | own
+
+
+def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what result.json has of an identification from torques, and of no other."""
+    return {
+        "structure": _determined(found),
+        "uncertainty": {
+            "method": found.errors.method,
+            "stretches": found.errors.stretches,
+            "inflation": found.errors.inflation,
+        },
+        "motors": _motors(found, settings),
+        "friction": {drive.joint: _friction(found, drive) for drive in found.drives},
+        "consistency": {
+            "mass_matrix": dataclasses.asdict(found.mass_matrix),
+            "fit": dict(found.estimate.details),
+            "sources": {kind: found.sources.count(kind) for kind in SOURCES},
+        },
+        "validation": [
+            recording_metrics(e, "estimate") | {"band": _band(found, e)} for e in found.validation
         ],
         "wls": {
-            "base_values": identification.wls.theta.tolist(),
-            "base_std_errors": [finite(error) for error in identification.wls.std_error],
-            "identification": identification.metrics("wls").to_dict(),
-            "validation": [recording_metrics(e, "wls") for e in identification.validation],
+            "base_values": found.wls.theta.tolist(),
+            "base_std_errors": [finite(error) for error in found.wls.std_error],
+            "identification": found.metrics("wls").to_dict(),
+            "validation": [recording_metrics(e, "wls") for e in found.validation],
         },
-        "witness": identification.witness.to_dict(),
-        "verdict": identification.verdict.to_dict(),
+        "witness": found.witness.to_dict(),
     }
 
 
@@ -134,7 +143,7 @@ def build_preview(preview: Preview) -> dict[str, Any]:
                 found.model.joints, noise.std, noise.correlation, noise.origins, strict=True
             )
         },
-        "structure": _structure(found),
+        "structure": _structure(found) | _determined(found),
         "undetermined": list(found.determination.undetermined),
         "words": preview.words,
         "base_parameters": base,
@@ -153,15 +162,6 @@ def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
     """
     recording = evaluation.recording
     return {"log": recording.log.path, "name": recording.name, **evaluation.metrics[name].to_dict()}
-
-
-def plain_moments(moments: Mapping[str, DriveMoments]) -> dict[str, Any]:
-    """Return the moments of drives as plain values, by name.
-
-    Args:
-        moments: The moments.
-    """
-    return {name: of_drive.to_dict() for name, of_drive in moments.items()}
 
 
 def _friction(found: Identification, drive: DriveChoice) -> dict[str, Any]:
@@ -186,15 +186,21 @@ def _curve(found: Identification, joint: str) -> dict[str, Any]:
     return {"curve": usual_friction(found, joint).to_dict()}
 
 
-def _structure(found: Identification) -> dict[str, Any]:
-    """Return how many parameters there are, and which the data determine."""
+def _structure(found: Identified) -> dict[str, Any]:
+    """Return how many parameters there are, and which the data leave open."""
     return {
         "standard": found.model.layout.n_inertial,
         "base_inertial": len(structural_mapping(found.model, inertial_only=True).K),
         "base": len(found.base),
+        "undetermined": list(found.undetermined),
+    }
+
+
+def _determined(found: Identification) -> dict[str, Any]:
+    """Return how many base parameters torques determine, and which only together."""
+    return {
         "rank": found.determination.rank,
         "condition": finite(found.wls.condition),
-        "undetermined": list(found.determination.undetermined),
         "poorly_excited": found.is_poorly_excited,
         "not_told_apart": found.determination.to_list(),
     }
@@ -224,11 +230,18 @@ def _expected_torque(preview: Preview) -> dict[str, dict[str, Any]]:
     }
 
 
-def _inputs(identification: Identification) -> list[dict[str, Any]]:
-    inputs = [{"role": "urdf", **source_entry(identification.model.tree.path)}]
+def input_entries(found: Identification | LoopIdentification) -> list[dict[str, Any]]:
+    """Return the files that were read, as result.json has them, the URDF first.
+
+    Args:
+        found: What was identified.
+    """
+    inputs = [{"role": "urdf", **source_entry(found.model.tree.path)}]
+    if isinstance(found, LoopIdentification):
+        return [*inputs, *loop_inputs(found)]
     for role, evaluations in (
-        ("identification", identification.fitted),
-        ("validation", identification.validation),
+        ("identification", found.fitted),
+        ("validation", found.validation),
     ):
         for evaluation in evaluations:
             recording = evaluation.recording
@@ -242,16 +255,7 @@ def _extent(evaluation: Evaluation) -> dict[str, Any]:
     return {key: getattr(evaluation.recording.extent, key) for key in _EXTENT}
 
 
-def source_entry(path: str) -> dict[str, Any]:
-    """Return the path of an input and the hash of its file, None if it has none.
-
-    Args:
-        path: The file; "" for what was in memory.
-    """
-    return {"path": str(path), "sha256": file_sha256(path) if path else None}
-
-
-def _base_parameters(found: Identification) -> list[dict[str, Any]]:
+def _base_parameters(found: Identified) -> list[dict[str, Any]]:
     mapping, units = found.mapping, found.model.layout.units
     return [
         {
@@ -285,7 +289,8 @@ def _motors(found: Identification, settings: Mapping[str, Any]) -> dict[str, dic
     }
 
 
-def _consistency(found: Identification) -> dict[str, Any]:
+def _consistency(found: Identified) -> dict[str, Any]:
+    """Return whether the bodies can be, and their masses."""
     layout = found.model.layout
     J = pseudo_inertia(found.standard[: layout.n_inertial])
     smallest = np.linalg.eigvalsh(J)[:, 0]
@@ -296,9 +301,6 @@ def _consistency(found: Identification) -> dict[str, Any]:
             for i, body in enumerate(layout.bodies)
         ],
         "total_mass": float(J[:, 3, 3].sum()),
-        "mass_matrix": dataclasses.asdict(found.mass_matrix),
-        "fit": dict(found.estimate.details),
-        "sources": {kind: found.sources.count(kind) for kind in SOURCES},
     }
 
 
@@ -316,12 +318,3 @@ def _band(identification: Identification, evaluation: Evaluation) -> dict[str, A
             identification.model.row_names, band.total.T, band.parameters.T, held, strict=True
         )
     }
-
-
-def finite(value: float) -> float | None:
-    """Return a number as JSON has it: None if it is not finite.
-
-    Args:
-        value: The number.
-    """
-    return float(value) if math.isfinite(value) else None

@@ -18,7 +18,8 @@ from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.export.urdf import link_parameters
 from robotid.export.yaml_text import yaml_text
-from robotid.fitting.bands import REACH, fitted_moments
+from robotid.fitting.bands import REACH
+from robotid.fitting.identified import Identified
 from robotid.identification.result import Identification
 from robotid.regressor.friction_projection import project_friction
 from robotid.robot.bodies import principal_moments
@@ -65,7 +66,7 @@ commands were identified.
 """
 
 
-def parameter_ranges(found: Identification) -> dict[str, Any]:
+def parameter_ranges(found: Identified) -> dict[str, Any]:
     """Return the ranges of the parameters of links and drives, plain values only.
 
     The intervals of centre and moments are to first order in those of the parameters.
@@ -97,7 +98,7 @@ def parameter_ranges(found: Identification) -> dict[str, Any]:
         "bodies": body_ranges(found.model, found.standard, covariance, sources, reach),
         "drives": drives,
         **projected_ranges(found),
-        "undetermined": list(found.determination.undetermined),
+        "undetermined": list(found.undetermined),
     }
 
 
@@ -125,7 +126,7 @@ def body_ranges(
     return bodies
 
 
-def projected_ranges(found: Identification) -> dict[str, Any]:
+def projected_ranges(found: Identified) -> dict[str, Any]:
     """Return the ranges of friction as exports for MuJoCo state it, of drives that need it.
 
     Args:
@@ -134,7 +135,7 @@ def projected_ranges(found: Identification) -> dict[str, Any]:
     Returns:
         {"projected_drives": {drive: {term: range}}}, or nothing if no drive needs it.
     """
-    moments = fitted_moments(found) if found.model.layout.own else {}
+    moments = found.moments if found.model.layout.own else {}
     drives = project_friction(found.model, found.standard, moments, _SIMULATED).drives
     ranges: dict[str, dict[str, Any]] = {}
     for drive in drives:

@@ -1,7 +1,7 @@
 """result.json: what an identification found, in the schema that other programs read."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,11 +13,12 @@ from numpy.typing import ArrayLike
 from robotid._files import check_path, read_json
 from robotid._settings import Range, require_kind
 from robotid._typing import Array
+from robotid.closed_loop.evaluation import HORIZONS, OpenLoop, run_open_loop
 from robotid.exceptions import DataError, ModelError
 from robotid.export.commanded import (
     CommandedDrive,
     commanded_drives,
-    follow_commands,
+    loops_of,
 )
 from robotid.export.entries import SCHEMA_VERSION
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
@@ -34,6 +35,7 @@ from robotid.regressor.friction_projection import (
 )
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
+from robotid.simulation.loops import LoopedRobot, open_loops
 
 __all__ = [
     "Result",
@@ -168,10 +170,31 @@ class Result:
             raise DataError(f"{self.path.name} has no gains of drives: it cannot follow commands")
         if log.q_ref is None:
             raise DataError(f"{log.name} has no commands, columns qref_ of each joint")
+        return self._signs * self.open_loop(log, horizons=()).q
+
+    def open_loop(self, log: Log, *, horizons: Sequence[float] = HORIZONS) -> OpenLoop:
+        """Return a log beside the positions simulated for it, in the URDF's sense of the joints.
+
+        Its commands move the robot; of a result without gains, its fed-forward torque.
+
+        Args:
+            log: The log, of its joints in its order, with commands.
+            horizons: Horizons of errors [s].
+
+        Raises:
+            MissingDependencyError: If Numba is not installed.
+            NotConvergedError: If a step has no solution.
+            SettingsError: If a term of the drives cannot be rolled out.
+        """
+        (model, pi), drives = self.identified, self.commanded
+        loops = loops_of(model, pi, drives, self.rate) if drives else open_loops(model, pi)
+        return run_open_loop(LoopedRobot(model), loops, log.turned(self._signs), horizons=horizons)
+
+    @property
+    def _signs(self) -> Array:
+        """Sense of each encoder against the URDF's, shape (n,): 1 or -1."""
         signs = self.content["simulation"].get("signs", {})
-        sign = np.array([signs.get(joint, 1.0) for joint in log.joints])
-        turned = log.turned(sign)
-        return sign * follow_commands(*self.identified, self.commanded, turned, self.rate)
+        return np.array([signs.get(joint, 1.0) for joint in self.robot.joints])
 
     def predict(
         self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None

@@ -139,6 +139,7 @@ def consistent_fit(
         constraints=make_constraints(bounds, geometry, extent),
         solver=settings.solver,
         check=settings.check,
+        wls_noise=prior.sigma,
     )
     folds = gather(prior.held_out, _FOLDS)
     how = "" if not isinstance(weight, str) else "cv" if weight == "auto" else weight

@@ -113,7 +113,7 @@ def evaluate_logs(
     fitted: Sequence[SurveyedLog],
     kept: Sequence[SurveyedLog],
     parameters: Mapping[str, Array],
-    prior: Array,
+    prior: Array | None,
     driven: Array | None = None,
     *,
     plan: WorkPlan | None = None,
@@ -124,7 +124,8 @@ def evaluate_logs(
         fitted: Logs that were fitted, surveyed with the model that predicts.
         kept: Logs kept apart.
         parameters: Standard parameters by name, each of shape (p,).
-        prior: Those of the URDF, shape (p,): the baselines are its torque, with and without motion.
+        prior: Those of the URDF, shape (p,): the baselines are its torque, with and without motion;
+            None: no baselines.
         driven: Those of the URDF with drives fitted to the logs, shape (p,): a baseline, if known.
         plan: Who works on the pieces of logs in files; this process if None.
 
@@ -271,24 +272,24 @@ def _score(
     threads: int | None,
     *,
     parameters: Mapping[str, Array],
-    prior: Array,
+    prior: Array | None,
     driven: Array | None,
     sought: Sequence[Array] = (),
 ) -> _Score:
     """Return what is known of a piece, with the torques of a part of it."""
     header, rows = whole.piece.header, whole.piece.read()
     model, motion, mask = header.model, rows.trajectory, rows.mask
-    moving = {"urdf": prior} if driven is None else {"urdf": prior, "urdf_with_drives": driven}
-    every = {**parameters, **moving}
-    torques = {name: np.empty((0, model.n_rows)) for name in (*every, "gravity_only")}
-    if len(motion.t):
-        torques = _predict_all(model, motion, every, prior, header.is_compiled)
-    baselines = {name: torques[name] for name in ("gravity_only", *moving)}
+    of_urdf = {"urdf": prior, "urdf_with_drives": driven}
+    moving = {name: pi for name, pi in of_urdf.items() if pi is not None}
+    torques = _predict_all(model, motion, {**parameters, **moving}, prior, header.is_compiled)
+    baselines = {x: torques[x] for x in ("gravity_only", *moving) if x in torques}
     shown: tuple[_Shown, ...] = ()
     if whole.shown is not None and len(motion.t):
-        part = slice(*whole.shown.indices(len(motion.t)))
-        kept = {name: torque[part] for name, torque in torques.items()}
-        shown = ((motion.part(part.start, part.stop), mask[part], kept),)
+        start, stop, _ = whole.shown.indices(len(motion.t))
+        kept = {name: torque[start:stop] for name, torque in torques.items()}
+        # all of it as it is, with what was computed of it
+        seen = motion if stop - start == len(motion.t) else motion.part(start, stop)
+        shown = ((seen, mask[start:stop], kept),)
     recorded = np.hstack([rows.positions, rows.torques])
     return _Score(
         sums={x: TorqueSums.of(motion.tau, torques[x], mask, baselines) for x in parameters},
@@ -306,16 +307,20 @@ def _predict_all(
     model: RobotModel,
     trajectory: Trajectory,
     parameters: Mapping[str, Array],
-    prior: Array,
+    prior: Array | None,
     compiled: bool | None,
 ) -> dict[str, Array]:
     """Return the torques that parameters and the URDF's gravity predict, each (N, n_rows)."""
+    names = [*parameters] if prior is None else [*parameters, "gravity_only"]
+    if not len(trajectory.t) or not names:
+        return {name: np.empty((0, model.n_rows)) for name in names}
     torques = predict(model, [*parameters.values()], trajectory, compiled=compiled)
-    inertial = np.where(np.arange(len(prior)) < model.layout.n_inertial, prior, 0.0)
-    still = np.zeros_like(trajectory.v)
-    at_rest = replace(trajectory, v=still, a=still, direction=None)  # no drive has a say in it
-    torques += predict(model, [inertial], at_rest, compiled=compiled)
-    return dict(zip((*parameters, "gravity_only"), torques, strict=True))
+    if prior is not None:
+        inertial = np.where(np.arange(len(prior)) < model.layout.n_inertial, prior, 0.0)
+        still = np.zeros_like(trajectory.v)
+        at_rest = replace(trajectory, v=still, a=still, direction=None)  # no drive has a say in it
+        torques += predict(model, [inertial], at_rest, compiled=compiled)
+    return dict(zip(names, torques, strict=True))
 
 
 def _conclude(log: SurveyedLog, score: _Score, is_refitted: bool = False) -> Evaluation:
@@ -342,6 +347,8 @@ def _conclude(log: SurveyedLog, score: _Score, is_refitted: bool = False) -> Eva
 
 def _joined(motions: Sequence[Trajectory]) -> Trajectory:
     """Return motions one after the other; what is shown never joins what is not beside it."""
+    if len(motions) == 1:
+        return motions[0]
     segments, number = [], 0
     for motion in motions:
         segments.append(np.unique(motion.segment, return_inverse=True)[1] + number)
@@ -349,7 +356,7 @@ def _joined(motions: Sequence[Trajectory]) -> Trajectory:
     joined: dict[str, Any] = {
         key: np.concatenate([getattr(motion, key) for motion in motions])
         for key in ("t", "q", "v", "a", "tau", "direction", "memory")
-        if len(motions) > 1 and getattr(motions[0], key) is not None
+        if getattr(motions[0], key) is not None
     }
     return replace(motions[0], **joined, segment=np.concatenate(segments))
 

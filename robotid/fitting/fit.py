@@ -1,6 +1,7 @@
 """Recordings of a robot and the estimator asked for -> Fit: its errors, and what it predicts."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from robotid.fitting.estimators import Known, consistent_fit, make_estimator
 from robotid.fitting.evaluation import evaluate_logs
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.regressor_noise import RegressorNoise, find_regressor_noise
-from robotid.fitting.result import Fit
+from robotid.fitting.result import Fit, Solution
 from robotid.fitting.robust import reweigh
 from robotid.fitting.settings import (
     BoundedSettings,
@@ -33,7 +34,7 @@ from robotid.fitting.standard_errors import (
 from robotid.regressor.factors import Factors, Reduction, join
 from robotid.robot.prior import prior_spread
 
-__all__ = ["fit_recordings", "rough_choice"]
+__all__ = ["Solved", "fit_recordings", "rough_choice", "solve_recordings"]
 
 _MOST_LOADS = 20  # fits until the load of the gears is that of the bodies found
 _DAMPED = 3  # of them, after which they go half way only
@@ -52,10 +53,25 @@ def rough_choice(choice: EstimatorSettings) -> EstimatorSettings:
     return replace(choice, prior_weight=weight, draws=0)
 
 
-def fit_recordings(
-    recordings: Recordings, choice: EstimatorSettings, *, is_last: bool = True
-) -> Fit:
+def fit_recordings(recordings: Recordings, choice: EstimatorSettings) -> Fit:
     """Return the fit of a robot's parameters to recordings.
+
+    Args:
+        recordings: The recordings.
+        choice: Which estimator.
+
+    Raises:
+        DataError: If a row of a log cannot be used.
+        RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
+        NotConvergedError: If a solver fails.
+    """
+    return solve_recordings(recordings, choice).with_errors()
+
+
+def solve_recordings(
+    recordings: Recordings, choice: EstimatorSettings, *, is_last: bool = True
+) -> "Solved":
+    """Return the parameters of a robot that fit recordings, their errors not yet measured.
 
     Args:
         recordings: The recordings.
@@ -64,52 +80,114 @@ def fit_recordings(
             data contradict are judged by held-out segments; not for fits in between.
 
     Raises:
-        DataError: If a row of a log cannot be used.
-        RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
-        NotConvergedError: If a solver fails.
+        DataError, RankDeficientError, NotConvergedError: As of ``fit_recordings``.
     """
     recordings = _under_own_load(recordings, choice)
-    model, mapping = recordings.model, recordings.mapping
     ground = _ground(recordings, choice, is_last=is_last)
     if is_last:
         ground = _without_regressor_noise(ground, choice)
-    prior, spread = ground.before.pi, ground.before.spread
-    estimate, wls, errors = _measured(ground, choice)
-    standard, covariance = standard_of(estimate, mapping, prior, spread)
-    base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
-    if model.layout.remembering:  # what is written predicts the torque by its own load
-        model = model.with_reference(standard)
-        recordings = recordings.with_model(model)
-    candidates = {"estimate": standard, "wls": mapping.to_standard(wls.theta, prior, spread)}
-    sigma = ground.before.sigma
-    driven = urdf_with_drives(model, mapping, ground.factors, sigma, ground.before.spread)
-    fitted, kept = evaluate_logs(
-        recordings.fitted, recordings.kept, candidates, prior, driven, plan=recordings.plan
-    )
-    is_base = estimate.names == mapping.base_names
-    base_error = estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0))
-    found = Fit(
-        model=model,
-        mapping=mapping,
-        estimator=choice,
-        estimate=estimate,
-        wls=wls,
-        prior=prior,
-        urdf_with_drives=driven,
-        prior_std=spread if estimate.prior_std is None else estimate.prior_std,
-        standard=standard,
-        standard_covariance=covariance,
-        base=mapping.to_base(standard),
-        base_error=base_error,
-        fitted=fitted,
-        validation=kept,
-        errors=errors,
-        factors=ground.factors,
-        determination=ground.determination,
-        regressor_noise=ground.noise,
-    )
-    hidden = (mapping.K[:, ~found.at_bound] == 0).all(axis=1)  # nothing but terms at their bounds
-    return replace(found, base_error=np.where(hidden, np.inf, base_error))
+    try:
+        estimate, in_cone, weighing = _run(choice, ground)
+    except RankDeficientError as error:
+        raise ground.determination.refusal(error) from error
+    standard, _ = standard_of(estimate, recordings.mapping, ground.before.pi, ground.before.spread)
+    if recordings.model.layout.remembering:  # what is written predicts the torque by its own load
+        recordings = recordings.with_model(recordings.model.with_reference(standard))
+    return Solved(choice, ground, recordings, estimate, in_cone, weighing)
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Parameters that fit recordings, and what their errors are measured by."""
+
+    choice: EstimatorSettings
+    ground: "_Ground"
+    recordings: Recordings  # loaded by the bodies found
+    estimate: Estimate
+    in_cone: Consistent | None  # what made it physically consistent, if it is
+    weighing: Weighing
+
+    @cached_property
+    def solution(self) -> Solution:
+        """The parameters, with the recordings that drives are judged by."""
+        recordings, before, prior_std = self.recordings, self.ground.before, self.estimate.prior_std
+        standard, _ = standard_of(self.estimate, recordings.mapping, before.pi, before.spread)
+        fitted, kept = evaluate_logs(
+            recordings.fitted, recordings.kept, {}, None, plan=recordings.plan
+        )
+        return Solution(
+            model=recordings.model,
+            mapping=recordings.mapping,
+            prior_std=before.spread if prior_std is None else prior_std,
+            standard=standard,
+            fitted=fitted,
+            validation=kept,
+        )
+
+    def with_errors(self) -> Fit:
+        """Return the fit: the parameters with their measured errors, and what they predict."""
+        ground, recordings = self.ground, self.recordings
+        model, mapping, before = recordings.model, recordings.mapping, ground.before
+        estimate, wls, errors = self._measured()
+        standard, covariance = standard_of(estimate, mapping, before.pi, before.spread)
+        base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
+        wls_standard = mapping.to_standard(wls.theta, before.pi, before.spread)
+        driven = urdf_with_drives(model, mapping, ground.factors, before.sigma, before.spread)
+        fitted, kept = evaluate_logs(
+            recordings.fitted, recordings.kept, {"estimate": standard, "wls": wls_standard},
+            before.pi, driven, plan=recordings.plan,
+        )  # fmt: skip
+        is_base = estimate.names == mapping.base_names
+        base_error = estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0))
+        found = Fit(
+            model=model,
+            mapping=mapping,
+            estimator=self.choice,
+            estimate=estimate,
+            wls=wls,
+            prior=before.pi,
+            urdf_with_drives=driven,
+            prior_std=before.spread if estimate.prior_std is None else estimate.prior_std,
+            standard=standard,
+            standard_covariance=covariance,
+            base=mapping.to_base(standard),
+            base_error=base_error,
+            fitted=fitted,
+            validation=kept,
+            errors=errors,
+            factors=ground.factors,
+            determination=ground.determination,
+            regressor_noise=ground.noise,
+        )
+        hidden = (mapping.K[:, ~found.at_bound] == 0).all(axis=1)  # nothing but terms at bounds
+        return replace(found, base_error=np.where(hidden, np.inf, base_error))
+
+    def _measured(self) -> tuple[Estimate, Estimate, StandardErrors]:
+        """Return the estimate and that of WLS with measured standard errors, and their ground."""
+        ground, choice, fit, estimate = self.ground, self.choice, self.in_cone, self.estimate
+        factors, rough, mapping = ground.factors, ground.rough, ground.recordings.mapping
+        segments, share, K = ground.segments, ground.before.share, mapping.K
+        more = None if ground.noise is None else ground.noise.meat
+        of_wls = more if self.weighing != "alike" else None  # which is of other weights
+        wls, errors = measured_errors(rough, segments, factors, share, K, rough.sigma, more=of_wls)
+        if self.weighing == "by step" and fit is None:
+            estimate = with_wls_errors(estimate, wls)
+        else:
+            sigma = np.ones_like(rough.sigma) if self.weighing == "alike" else rough.sigma
+            if estimate.names == mapping.names:
+                sigma = estimate.sigma
+            redraws, pull = None, 1.0  # of what no bound can bind
+            if fit is not None and isinstance(choice, BoundedSettings):
+                redraws, pull = Redraws(fit, choice.draws, np.random.default_rng(0)), fit.pull
+            is_filter = self.weighing == "by age"
+            estimate, errors = measured_errors(
+                estimate, segments, factors, share, K, sigma,
+                is_filter=is_filter, pull=pull, redraws=redraws, more=more,
+            )  # fmt: skip
+        if ground.grown != 1.0:
+            estimate = replace(estimate, covariance=ground.grown * estimate.covariance)
+            wls = replace(wls, covariance=ground.grown * wls.covariance)
+        return estimate, wls, errors
 
 
 def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Recordings:
@@ -216,39 +294,6 @@ def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Gro
         rough=replace(ground.rough, theta=theta - noise.shift),
         noise=noise,
     )
-
-
-def _measured(
-    ground: _Ground, choice: EstimatorSettings
-) -> tuple[Estimate, Estimate, StandardErrors]:
-    """Return the estimate and that of WLS with measured standard errors, and their ground."""
-    factors, rough, mapping = ground.factors, ground.rough, ground.recordings.mapping
-    try:
-        estimate, fit, weighing = _run(choice, ground)
-    except RankDeficientError as error:
-        raise ground.determination.refusal(error) from error
-    segments, share, K = ground.segments, ground.before.share, mapping.K
-    more = None if ground.noise is None else ground.noise.meat
-    of_wls = more if weighing != "alike" else None  # which is of other weights
-    wls, errors = measured_errors(rough, segments, factors, share, K, rough.sigma, more=of_wls)
-    if weighing == "by step" and fit is None:
-        estimate = with_wls_errors(estimate, wls)
-    else:
-        sigma = np.ones_like(rough.sigma) if weighing == "alike" else rough.sigma
-        if estimate.names == mapping.names:
-            sigma = estimate.sigma
-        redraws, pull = None, 1.0  # of what no bound can bind
-        if fit is not None and isinstance(choice, BoundedSettings):
-            redraws, pull = Redraws(fit, choice.draws, np.random.default_rng(0)), fit.pull
-        is_filter = weighing == "by age"
-        estimate, errors = measured_errors(
-            estimate, segments, factors, share, K, sigma,
-            is_filter=is_filter, pull=pull, redraws=redraws, more=more,
-        )  # fmt: skip
-    if ground.grown != 1.0:
-        estimate = replace(estimate, covariance=ground.grown * estimate.covariance)
-        wls = replace(wls, covariance=ground.grown * wls.covariance)
-    return estimate, wls, errors
 
 
 def _run(

@@ -1,4 +1,4 @@
-"""How good a predicted torque is, joint by joint, against baselines."""
+"""How good a predicted torque or position is, joint by joint, against baselines."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,17 +14,17 @@ __all__ = ["JointMetrics", "Metrics", "TorqueSums"]
 
 @dataclass(frozen=True)
 class JointMetrics:
-    """How well the torque of one joint is predicted, over the rows used.
+    """How well the torque of one joint is predicted, or its position, over the rows used.
 
     Attributes:
         rmse: Root mean square of the residual [unit].
-        unit: N m, or N for a joint that slides.
-        relative_error_pct: 100 |tau - prediction| / |tau| [%]; predicting 0 scores 100. None if
-            the measured torque is 0 throughout.
-        r2: Share of the torque's variance that is explained [-].
+        unit: N m or rad, of a prismatic joint N or m.
+        relative_error_pct: 100 |tau - prediction| / |tau| [%]; predicting 0 scores 100. Of a
+            position, over its motion about the mean. None if what was measured is 0 throughout.
+        r2: Share of its variance that is explained [-].
         rows: Number of rows used.
         baselines: relative_error_pct of other predictions, by name [%].
-        better_than_constant: Whether the residual is smaller than that of the mean torque.
+        better_than_constant: Whether the residual is smaller than that of the mean.
     """
 
     rmse: float

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from robotid.fitting.result import Fit
+from robotid._files import finite
+from robotid.fitting.identified import Identified
 from robotid.pages.html import code, number, table, text
 
 __all__ = [
@@ -43,11 +44,11 @@ class ParameterRows(list[dict[str, Any]]):
         return table("Parameters", HEADERS, cells)
 
 
-def correlated_parameters(found: Fit) -> dict[int, tuple[int, float]]:
+def correlated_parameters(found: Identified) -> dict[int, tuple[int, float]]:
     """Return drive parameters whose errors are strongly correlated with another's of the drive.
 
     Args:
-        found: The fit.
+        found: What was identified.
 
     Returns:
         By number of the standard parameter, that of the other one and their correlation, of which
@@ -70,21 +71,22 @@ def correlated_parameters(found: Fit) -> dict[int, tuple[int, float]]:
     return pairs
 
 
-def parameter_entries(found: Fit) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Return the parameters of the bodies and those of the drives, as result.json has them.
 
     Args:
-        found: The fit.
+        found: What was identified.
     """
     layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
-    errors, ends = found.standard_error, found.standard_interval
+    errors, ends, reach = found.standard_error, found.standard_interval, found.standard_reach
     pairs = correlated_parameters(found)
     entries = [
         {
             "name": name,
             "value": float(found.standard[i]),
-            "std_error": _finite(errors[i]),
-            "interval_95": [_finite(end) for end in ends[i]],
+            "std_error": finite(errors[i]),
+            "reach": float(reach[i]) if math.isfinite(errors[i]) else None,
+            "interval_95": [finite(end) for end in ends[i]],
             "unit": layout.units[i],
             "prior": float(found.prior[i]),
             "source": sources[i],
@@ -124,7 +126,3 @@ def parameter_table(
 
     frame = pandas.DataFrame(rows, columns=list(HEADERS))
     return frame.astype(dict.fromkeys(_NUMBERS, float))
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

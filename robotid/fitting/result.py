@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +22,7 @@ from robotid.fitting.bands import (
 )
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.evaluation import Evaluation, pool
+from robotid.fitting.identified import FROM_DATA, FROM_PRIOR, Identified, sources_of
 from robotid.fitting.metrics import Metrics
 from robotid.fitting.open_terms import OpenTerm
 from robotid.fitting.regressor_noise import RegressorNoise
@@ -31,95 +31,70 @@ from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.standard_errors import StandardErrors
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import Factors
-from robotid.regressor.friction_projection import projected_pinocchio_model
-from robotid.regressor.prediction import predict_instants
+from robotid.regressor.friction_projection import DriveMoments
 from robotid.robot.bodies import held_parameters
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-__all__ = ["SOURCES", "Fit"]
+__all__ = ["Fit", "Solution"]
 
-#: What may have determined a standard parameter.
-SOURCES = ("data", "mixed", "prior", "bound")
-
-_FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
 _KNOWN = 1e-300  # the spread of what was known exactly
-_FROM_PRIOR = 0.9  # ... and above this share, the prior's, if it stayed there
-_STAYED = 0.3  # spreads that such a parameter may have moved
+_STAYED = 0.3  # spreads that a parameter of the prior may have moved
 _AT_BOUND = 1e-6  # of its spread: a drive term that small is at its bound of 0
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A robot's parameters as fitted to recordings, before anything is concluded of them.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Solution:
+    """A robot's parameters as fitted to recordings, before their errors are known.
 
     Attributes:
         model: The robot as the URDF describes it.
         mapping: Standard to base parameters.
-        estimator: The estimator's settings.
-        estimate: What the estimator returned: base parameters, or standard ones ("consistent").
-        wls: Weighted least squares on the same factors, base parameters.
-        prior: Standard parameters of the URDF, shape (p,).
-        urdf_with_drives: The same with the drive terms that then fit best, shape (p,).
-        prior_std: How far they may plausibly be wrong, shape (p,).
+        prior_std: How far parameters may plausibly be wrong before the data, shape (p,).
         standard: Standard parameters, shape (p,).
-        standard_covariance: Their covariance given the prior, shape (p, p).
-        base: Base parameters, shape (b,).
-        base_error: Their standard errors, shape (b,); inf where the data say nothing.
-        fitted: The recordings that were fitted, with predictions "estimate" and "wls".
-        validation: The same of the recordings that were kept apart.
-        errors: What the standard errors rest on.
-        factors: What the fitted rows come down to, base parameters.
-        determination: Which base parameters the fitted rows determine.
+        fitted: The recordings that were fitted.
+        validation: Those that were kept apart.
         drives: What friction its joints have beside viscous and Coulomb's, and what was tried.
-        open_terms: What is open of its drives, which ``standard_covariance`` counts.
-        regressor_noise: What the steps of the positions do to least squares; None: next to nothing.
     """
 
     model: RobotModel
     mapping: BaseMapping
+    prior_std: Array
+    standard: Array
+    fitted: tuple[Evaluation, ...]
+    validation: tuple[Evaluation, ...]
+    drives: tuple[DriveChoice, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fit(Identified, Solution):
+    """A robot's parameters as fitted to recordings, before anything is concluded of them.
+
+    Its recordings have predictions "estimate" and "wls".
+
+    Attributes:
+        estimator: The estimator's settings.
+        estimate: What the estimator returned: base parameters, or standard ones ("consistent").
+        wls: Weighted least squares on the same factors, base parameters.
+        urdf_with_drives: The prior with the drive terms that then fit best, shape (p,).
+        errors: What the standard errors rest on.
+        factors: What the fitted rows come down to, base parameters.
+        determination: Which base parameters the fitted rows determine.
+        open_terms: What is open of its drives, which ``standard_covariance`` counts.
+        regressor_noise: What the steps of the positions do to least squares; None: next to nothing.
+    """
+
     estimator: EstimatorSettings
     estimate: Estimate
     wls: Estimate
-    prior: Array
     urdf_with_drives: Array
-    prior_std: Array
-    standard: Array
-    standard_covariance: Array
-    base: Array
-    base_error: Array
-    fitted: tuple[Evaluation, ...]
-    validation: tuple[Evaluation, ...]
     errors: StandardErrors
     factors: Factors
     determination: Determination
-    drives: tuple[DriveChoice, ...] = ()
     open_terms: tuple[OpenTerm, ...] = ()
     regressor_noise: RegressorNoise | None = None
     _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
-
-    def predict(
-        self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None
-    ) -> Array:
-        """Return the torques of motion, by the identified bodies, drives and chosen friction.
-
-        Friction acts by the sign of the speed: at rest, where it holds any torque up to its size,
-        it counts as 0. Drives whose friction has a memory (presliding) have moved one way for
-        long, and a torque that comes late (lag) is told as of an instant at which it stays.
-
-        Args:
-            q: Positions in the order of ``model.joints``, shape (n,) or (N, n) [rad, m].
-            v: Velocities, likewise [rad/s, m/s]; None: at rest.
-            a: Accelerations, likewise [rad/s^2, m/s^2]; None: 0.
-
-        Returns:
-            Torques, likewise [N m, N].
-
-        Raises:
-            DataError: If a shape does not fit, or a value is not finite.
-        """
-        return predict_instants(self.model, self.standard, q, v, a)
 
     def friction(
         self,
@@ -146,24 +121,6 @@ class Fit:
             DataError: If there is no such drive; or without speeds, if it stood still.
         """
         return usual_friction(self, joint, v, q=q, load=load)
-
-    def pinocchio_model(self) -> Any:  # noqa: ANN401
-        """Return a ``pinocchio.Model`` with the identified inertias, armature and friction.
-
-        ``damping`` has the viscous friction; ``lowerDryFrictionLimit`` and
-        ``upperDryFrictionLimit``, -Fc - offset and Fc - offset, have Coulomb friction and offset.
-        ``rnea`` knows of inertias and armature only; the torque of joints that move is
-
-        ``rnea(q, v, a) + damping v - where(v > 0, lowerDryFrictionLimit, upperDryFrictionLimit)``
-
-        which is that of ``predict``. Friction that depends on load, position, past or, other than
-        linearly, on speed is projected on these terms, nearest over the fitted rows: a warning
-        states the error. Drives that turn with several joints have no place. Locked joints are
-        part of the links that carry them; with mimic joints, or joints in another order than the
-        URDF's, ``model.configurations(q)`` and ``model.velocity_map`` lead to Pinocchio's
-        coordinates.
-        """
-        return projected_pinocchio_model(self.model, self.standard, fitted_moments(self))
 
     @property
     def is_consistent(self) -> bool:
@@ -221,10 +178,9 @@ class Fit:
         masses = self.estimator.bounds.masses.items()
         known = [f"{link}.m" for link, mass in masses if np.ptp(mass) == 0]
         kept = layout.owned_by(self.estimate.details.get("pinned", ()))
-        kept = kept | np.isin(layout.names, known) | ((share > _FROM_PRIOR) & ~moved)
-        held = self.at_bound | (held & moved & (share >= _FROM_DATA))
-        names = np.select([kept, held, share < _FROM_DATA], ["prior", "bound", "data"], "mixed")
-        return tuple(names.tolist())
+        kept = kept | np.isin(layout.names, known) | ((share > FROM_PRIOR) & ~moved)
+        held = self.at_bound | (held & moved & (share >= FROM_DATA))
+        return sources_of(share, kept, held)
 
     @property
     def standard_reach(self) -> Array:
@@ -238,22 +194,19 @@ class Fit:
         return reach
 
     @property
-    def standard_interval(self) -> Array:
-        """95 % interval of each standard parameter, shape (p, 2), by the prior; infinite at bounds.
-
-        It reaches as far as ``standard_reach`` says.
-        """
-        half = self.standard_reach * self.standard_error
-        return np.column_stack([self.standard - half, self.standard + half])
+    def base_reach(self) -> Array:
+        """How many standard errors the 95 % interval of each base parameter reaches, (b,)."""
+        return self.errors.reach
 
     @property
-    def base_interval(self) -> Array:
-        """95 % interval of each base parameter, shape (b, 2); infinite where it is open.
+    def undetermined(self) -> tuple[str, ...]:
+        """Base parameters that the data do not determine by themselves."""
+        return self.determination.undetermined
 
-        It is open where the data say nothing, and where the parameter is at its bound.
-        """
-        half = self.errors.reach * self.base_error
-        return np.column_stack([self.base - half, self.base + half])
+    @property
+    def moments(self) -> dict[str, DriveMoments]:
+        """What projects the friction of drives on simpler terms, from the fitted rows."""
+        return fitted_moments(self)
 
     def band(self, evaluation: Evaluation) -> TorqueBand:
         """Return how far the torques predicted for a recording can be trusted.

@@ -10,6 +10,7 @@ from robotid._typing import Array
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.logs.data import suggestion
+from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "TorqueNoise",
     "assumed_noise",
     "assumed_parameters",
+    "largest_gravity",
     "largest_torques",
 ]
 
@@ -25,6 +27,7 @@ __all__ = [
 CORRELATION = 0.1
 _NOISE = 0.01  # its standard deviation, as a share of the largest torque
 _FRICTION = 0.05  # assumed Coulomb friction, and viscous at full speed, likewise
+_POSES = 200  # random ones at which gravity is looked at
 #: Of the largest torque of all joints, that of one that carries nothing.
 FAINTEST = 1e-3
 
@@ -93,6 +96,19 @@ def assumed_noise(
     other = "assumed" if found is None else "found"
     origins = tuple("stated" if known else other for known in is_stated)
     return TorqueNoise(np.where(is_stated, values, std), time, origins)
+
+
+def largest_gravity(model: RobotModel) -> Array:
+    """Return the largest torque that gravity asks of each joint over random poses, shape (n,).
+
+    Args:
+        model: The robot.
+    """
+    reach = [(j.lower, j.upper) if j.has_limits else (-np.pi, np.pi) for j in model.limits]
+    low, high = np.array(reach).T
+    q = np.random.default_rng(0).uniform(low, high, (_POSES, len(reach)))
+    torque: Array = np.abs(predict_instants(model, model.standard_parameters(), q)).max(axis=0)
+    return torque
 
 
 def largest_torques(model: RobotModel, peak: Array) -> Array:

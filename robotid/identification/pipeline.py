@@ -25,9 +25,9 @@ from robotid.exceptions import (
 )
 from robotid.findings import Finding
 from robotid.fitting.drives import DriveChoice
-from robotid.fitting.fit import fit_recordings, rough_choice
+from robotid.fitting.fit import fit_recordings, rough_choice, solve_recordings
 from robotid.fitting.recordings import Recordings
-from robotid.fitting.result import Fit
+from robotid.fitting.result import Fit, Solution
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.result import Asked, Identification
@@ -224,23 +224,25 @@ def with_drives(
     """
     report, rough = progress or ignore_progress, rough_choice(choice)
     report("fits", 0, 1, "fits")
-    fit = fit_recordings(recordings, choice)
-    drives = choose_drives(fit, wanted, balanced)
+    solved = solve_recordings(recordings, choice)
+    drives = choose_drives(solved.solution, wanted, balanced)
     if not any(drive.terms for drive in drives):
-        return replace(fit, drives=drives)
+        return replace(solved.with_errors(), drives=drives)
     most = _MOST_SHAPES if any(drive.shapes for drive in drives) else 0
     for done in range(most):
         report("fits", 1 + done, 2 + most, "fits")
-        fit = fit_recordings(_with_own(recordings, fit, drives), rough, is_last=False)
-        moved = settled_shapes(replace(fit, drives=drives))
+        own = _with_own(recordings, solved.solution, drives)
+        solved = solve_recordings(own, rough, is_last=False)
+        moved = settled_shapes(replace(solved.solution, drives=drives))
         if moved is None:
             break
         drives = moved
     report("fits", 1 + most, 2 + most, "fits")
-    return replace(fit_recordings(_with_own(recordings, fit, drives), choice), drives=drives)
+    own = _with_own(recordings, solved.solution, drives)
+    return replace(fit_recordings(own, choice), drives=drives)
 
 
-def _with_own(recordings: Recordings, fit: Fit, drives: Sequence[DriveChoice]) -> Recordings:
+def _with_own(recordings: Recordings, fit: Solution, drives: Sequence[DriveChoice]) -> Recordings:
     """Return recordings of the robot whose drives have the terms chosen, loaded as a fit says."""
     plain, own = recordings.model, {drive.joint: drive.terms for drive in drives}
     model = plain.with_terms(

@@ -15,6 +15,7 @@ from robotid.fitting.metrics import JointMetrics, Metrics
 from robotid.judgement.witness import Witness
 
 __all__ = [
+    "BEATEN",
     "DOUBTFUL",
     "GOOD",
     "POOR",
@@ -23,10 +24,13 @@ __all__ = [
     "Verdict",
     "alarming",
     "check_ignored",
+    "concluded",
     "doubts_of",
+    "error_of",
     "is_beaten",
     "is_outvoted",
     "judge",
+    "on_joint",
     "refuted",
 ]
 
@@ -34,9 +38,10 @@ __all__ = [
 GOOD = 15.0
 #: [%] a joint predicted worse than this is not usable.
 POOR = 50.0
+#: A plainer model is better if it misses this many times less ...
+BEATEN = 1.05
 
-_BEATEN = 1.05  # the URDF with fitted drives is better if it misses this many times less, ...
-_TIE = 0.3  # [%] ... and by this share of the torque
+_TIE = 0.3  # [%] ... and, of the URDF with fitted drives, by this share of the torque
 _REFUTED = 5.0  # [%] a hypothesis on columns or masses is refuted by a prediction so good
 _SCALED = 2.0  # a gravity within this factor of the URDF's refutes another unit of the torque
 _OPTIMISM = 2.0  # an error this many times the fitted one on kept recordings shows over-fitting
@@ -156,7 +161,7 @@ class Verdict:
     """How far to trust a result.
 
     Attributes:
-        status: "good", "usable" or "poor".
+        status: "good", "usable", "poor" or "not evaluated".
         reasons: Why, the worst first; for "good" what was checked.
         joints: The same of each joint of the model.
         alarms: Faults of the recordings that it was told of.
@@ -225,7 +230,7 @@ def judge(
     names = dict.fromkeys([*joints, *moved])
     found = {joint: _found_on(joint, fit, validation) for joint in names}
     poor = sorted((reason for worse, _, _ in found.values() for reason in worse), key=_rank)
-    reasons = [*alarms, *poor]
+    reasons = []
     if not validation:
         held = f"{listed(refitted)} hold rows that were fitted"
         why = held if refitted else "no validation log given"
@@ -247,35 +252,82 @@ def judge(
             "base parameters predict torque all the same"
         )
     per_joint = {
-        joint: _joint_verdict(
+        joint: on_joint(
             sorted(worse, key=_rank),
             [*doubt, *_in_words([d for d in doubts if d.joint in ("", joint)])],
-            errors,
-            why=_why_unseen(joint not in moved, bool(validation)),
+            is_tested=bool(errors),
+            said=f"predicted within {max(errors):.1f} %, better than by a constant and than by the "
+            "URDF"
+            if errors
+            else _why_unseen(joint not in moved, bool(validation)),
         )
         for joint, (worse, doubt, errors) in found.items()
     }
-    status = "poor" if poor or alarms else "usable" if reasons else "good"
-    if not reasons:
-        worst = max(error for _, _, errors in found.values() for error in errors)
-        reasons = [
-            f"every joint is predicted within {worst:.1f} % on recordings that were not fitted, "
-            "better than by a constant and than by the URDF, and every parameter is physically "
-            "consistent"
-        ]
+    worst = max((error for _, _, errors in found.values() for error in errors), default=0.0)
+    notes = []
     if undetermined and not is_poorly_excited:
-        reasons.append(
+        notes.append(
             f"{len(undetermined)} base parameters are lost in the noise of a rich motion or known "
             "only in sums with others; what the data leave open keeps the URDF's values: "
             f"{listed(undetermined, _NAMED)}"
         )
     if witness is not None and not witness.is_against:
-        reasons.append(witness.message)
+        notes.append(witness.message)
     if hidden:
-        reasons.append(f"{listed(hidden)}: {_HIDDEN}: not evaluated")
-    reasons += [_STATIC] if is_static else []
+        notes.append(f"{listed(hidden)}: {_HIDDEN}: not evaluated")
+    notes += [_STATIC] if is_static else []
     per_joint |= {joint: JointVerdict("not evaluated", (_HIDDEN,)) for joint in hidden}
-    return Verdict(status, tuple(reasons), per_joint, tuple(alarms), tuple(doubts))
+    good = (
+        f"every joint is predicted within {worst:.1f} % on recordings that were not fitted, better "
+        "than by a constant and than by the URDF, and every parameter is physically consistent"
+    )
+    verdict = concluded(per_joint, poor=poor, doubts=reasons, good=good, notes=notes, alarms=alarms)
+    return replace(verdict, doubts=tuple(doubts))
+
+
+def concluded(
+    joints: Mapping[str, JointVerdict],
+    *,
+    poor: Sequence[str],
+    doubts: Sequence[str],
+    good: str,
+    notes: Sequence[str] = (),
+    alarms: Sequence[str] = (),
+    is_tested: bool = True,
+) -> Verdict:
+    """Return the verdict that reasons make up.
+
+    Args:
+        joints: The verdict on each joint.
+        poor: What makes the result poor.
+        doubts: What keeps it from being good.
+        good: What was checked, if it is good.
+        notes: What follows the reasons, and changes no verdict.
+        alarms: Faults of the recordings that make it poor, whatever else is found.
+        is_tested: Whether anything was evaluated; else a result that is not poor has no verdict.
+    """
+    status = "usable" if doubts else "good"
+    status = "poor" if poor or alarms else status if is_tested else "not evaluated"
+    reasons = (*alarms, *poor, *doubts) or (good,)
+    return Verdict(status, (*reasons, *notes), joints, tuple(alarms))
+
+
+def on_joint(
+    poor: Sequence[str], doubts: Sequence[str], *, is_tested: bool, said: str
+) -> JointVerdict:
+    """Return the verdict on a joint.
+
+    Args:
+        poor: What makes it poor.
+        doubts: What keeps it from being good.
+        is_tested: Whether a validation log tests it.
+        said: What was checked, if it is good; why nothing was, if it is not tested.
+    """
+    if not is_tested:  # never a pass
+        return JointVerdict("not evaluated", (said, *doubts))
+    if poor or doubts:
+        return JointVerdict("poor" if poor else "usable", (*poor, *doubts))
+    return JointVerdict("good", (said,))
 
 
 def check_ignored(ignore: Sequence[str]) -> None:
@@ -331,7 +383,7 @@ def refuted(
     errors: dict[str, float] = {}
     for metrics in kept.values():
         for joint, measured in metrics.per_joint.items():
-            errors[joint] = max(errors.get(joint, 0.0), _error(measured))
+            errors[joint] = max(errors.get(joint, 0.0), error_of(measured))
     if any(finding.code == "repeated_motion" for finding in findings):
         errors = {}  # the motion was seen
     found = []
@@ -403,7 +455,7 @@ def is_beaten(measured: JointMetrics) -> bool:
         measured: How well it is predicted.
     """
     driven = measured.baselines.get("urdf_with_drives")
-    return driven is not None and _error(measured) > max(_BEATEN * driven, driven + _TIE)
+    return driven is not None and error_of(measured) > max(BEATEN * driven, driven + _TIE)
 
 
 def _without(metrics: Metrics, joints: Sequence[str]) -> Metrics:
@@ -423,7 +475,7 @@ def _found_on(
             found = _judge_joint(joint, log, measured, fit.per_joint.get(joint))
             poor += found[0]
             doubts += found[1]
-            errors.append(_error(measured))
+            errors.append(error_of(measured))
     return poor, doubts, errors
 
 
@@ -450,18 +502,6 @@ def _why_unseen(is_still: bool, has_kept: bool) -> str:
     return "it does not move in any kept recording" if has_kept else "no recording was kept apart"
 
 
-def _joint_verdict(
-    poor: list[str], doubts: list[str], errors: list[float], *, why: str
-) -> JointVerdict:
-    """Return the verdict on a joint from what was found on each kept recording; why, if on none."""
-    if not errors:  # never a pass
-        return JointVerdict("not evaluated", (why, *doubts))
-    if poor or doubts:
-        return JointVerdict("poor" if poor else "usable", (*poor, *doubts))
-    said = f"predicted within {max(errors):.1f} %, better than by a constant and than by the URDF"
-    return JointVerdict("good", (said,))
-
-
 def _in_words(doubts: Sequence[Doubt]) -> list[str]:
     """Return one sentence per kind of doubt, with the joints that share it."""
     shared: dict[tuple[str, str], list[str]] = {}
@@ -477,7 +517,7 @@ def _judge_joint(
     joint: str, log: str, measured: JointMetrics, fitted: JointMetrics | None
 ) -> tuple[list[str], list[str]]:
     """Return what makes the result poor, and what makes it doubtful, on one joint."""
-    error = _error(measured)
+    error = error_of(measured)
     urdf = measured.baselines.get("urdf")
     if measured.relative_error_pct is None:
         return [f"{joint}: the torque on {log} is 0 throughout: nothing was predicted"], []
@@ -492,10 +532,10 @@ def _judge_joint(
     if error > GOOD:
         why = f"predicted to {error:.1f} % on {log} (wanted: {GOOD:g} %)"
         return [], [f"{joint}: {why}; see in the report what its residual holds"]
-    if fitted is not None and error > max(_OPTIMISM * _error(fitted), 5.0):
+    if fitted is not None and error > max(_OPTIMISM * error_of(fitted), 5.0):
         return [], [
-            f"{joint}: {error:.1f} % on {log} against {_error(fitted):.1f} % where it was fitted; "
-            "record a richer motion to fit"
+            f"{joint}: {error:.1f} % on {log} against {error_of(fitted):.1f} % where it was "
+            "fitted; record a richer motion to fit"
         ]
     if is_beaten(measured):
         driven = measured.baselines["urdf_with_drives"]
@@ -526,7 +566,12 @@ def _rank(reason: str) -> int:
     return 0 if "a constant" in reason else 1 if "the URDF" in reason else 2
 
 
-def _error(measured: JointMetrics) -> float:
+def error_of(measured: JointMetrics) -> float:
+    """Return the relative error of a joint [%], inf where nothing was measured.
+
+    Args:
+        measured: How well it is predicted.
+    """
     value = measured.relative_error_pct
     return float("inf") if value is None else value
 

@@ -8,7 +8,7 @@ from math import factorial
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.linalg.blas import dtbsv
+from scipy.linalg.lapack import dtbtrs
 
 from robotid._typing import Array
 
@@ -44,37 +44,35 @@ def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Ar
         rate: Rows per second.
         pad: Rows by which both ends are continued, below N.
     """
-    rows = x.reshape(len(x), -1).T  # (k, N): each signal in one piece of memory
+    if not x.size:
+        return x  # LAPACK writes beyond what is empty
+    # (k, N): each signal in one piece of memory
+    rows = np.ascontiguousarray(x.reshape(len(x), -1).T)
     first, last = rows[:, :1], rows[:, -1:]
     before, after = 2 * first - rows[:, pad:0:-1], 2 * last - rows[:, -2 : -pad - 2 : -1]
     y = np.concatenate([before, rows, after], axis=1)
-    sections = [_Section(pole, y.shape[1]) for pole in butterworth_poles(order, cutoff, rate)]
     for _ in range(2):
         start = y[:, :1].copy()
         y -= start
-        for section in sections:
-            section.filter(y)
-        y = np.ascontiguousarray((y + start)[:, ::-1])
+        for pole in butterworth_poles(order, cutoff, rate):
+            _filter(y, pole)
+        y += start
+        y = np.ascontiguousarray(y[:, ::-1])
     return np.asarray(y[:, pad : y.shape[1] - pad].T.reshape(x.shape))
 
 
-class _Section:
-    """One pole, or a pair of conjugate ones, with zeros at half the rate: y + a y' = g (x + x')."""
+def _filter(x: Array, pole: complex) -> None:
+    """Filter signals in place, shape (k, N), by one pole, or a pair of conjugate ones, at rest.
 
-    def __init__(self, pole: complex, samples: int) -> None:
-        is_real = abs(pole.imag) < 1e-12 * abs(pole)
-        a = np.array([1.0, -pole.real] if is_real else [1.0, -2 * pole.real, abs(pole) ** 2])
-        self.gain = a.sum() / (2.0 if is_real else 4.0)  # what is constant passes
-        self.band = np.tile(a, (samples, 1)).T  # of the triangle whose solution is the recursion
-
-    def filter(self, x: Array) -> None:
-        """Filter signals in place, shape (k, N), of a section that was at rest."""
-        order = len(self.band) - 1
-        for row in x:
-            for _ in range(order):
-                row[1:] += row[:-1].copy()
-            row *= self.gain
-            row[:] = dtbsv(order, self.band, row, lower=1, diag=1, overwrite_x=1)
+    With zeros at half the rate: y + a y' = g (x + x'), or y + a y' + b y'' = g (x + 2 x' + x'').
+    """
+    is_real = abs(pole.imag) < 1e-12 * abs(pole)
+    a = np.array([1.0, -pole.real] if is_real else [1.0, -2 * pole.real, abs(pole) ** 2])
+    for _ in a[1:]:
+        x[:, 1:] += x[:, :-1]
+    x *= a.sum() / 2.0 ** (len(a) - 1)  # what is constant passes
+    band = np.tile(a, (x.shape[1], 1)).T  # of the triangle whose solution is the recursion
+    x[:] = dtbtrs(band, x.T, uplo="L", diag="U", overwrite_b=1)[0].T
 
 
 def local_polynomial(

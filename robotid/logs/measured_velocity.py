@@ -15,6 +15,7 @@ __all__ = [
     "quantum",
     "unlike_velocities",
     "velocity_lag",
+    "velocity_lags",
 ]
 
 #: [s] A measured velocity that lags more than this is not used by "auto".
@@ -52,12 +53,27 @@ def is_timely(log: Log, stated: float = 0.0) -> bool:
 def velocity_lag(log: Log) -> float:
     """Return how late the measured velocity is against the derivative of the position [s].
 
-    The delay minimises the distance between the measured velocity and the delayed derivative,
-    summed over the joints; found on a uniform grid in stretches without gaps, and refined by a
-    parabola. It is positive if the measured velocity is late, and 0 if the joints stand still.
+    Args:
+        log: A log with measured velocities.
+
+    Raises:
+        DataError: If the log has no velocities.
+    """
+    return velocity_lags(log)[0]
+
+
+def velocity_lags(log: Log) -> tuple[float, Array]:
+    """Return how late measured velocities are against the derivatives of the positions [s].
+
+    The delay minimises the distance between the measured velocity and the delayed derivative;
+    found on a uniform grid in stretches without gaps, and refined by a parabola. It is positive if
+    the measured velocity is late, and 0 if the joints stand still.
 
     Args:
         log: A log with measured velocities.
+
+    Returns:
+        The delay by the distances summed over the joints, and that of each joint, shape (n,).
 
     Raises:
         DataError: If the log has no velocities.
@@ -68,20 +84,25 @@ def velocity_lag(log: Log) -> float:
     parts = np.split(np.arange(len(log.t)), np.flatnonzero(np.diff(log.t) > _GAP * step) + 1)
     longest = min(int(_LONGEST / step) + 1, max(map(len, parts)) // 4)
     shifts = np.arange(-longest, longest + 1)
-    total = np.zeros(len(shifts))
+    total = np.zeros((len(log.joints), len(shifts)))
     for part in (rows for rows in parts if len(rows) >= max(4 * longest, _FEWEST)):
         t = log.t[part]
         grid = np.arange(t[0], t[-1], step)
-        slope = np.gradient([np.interp(grid, t, x) for x in q[part].T], step, axis=1)
-        late = np.array([np.interp(grid, t, x) for x in v[part].T])  # (n, N)
-        total += [len(grid) * _distance(slope, late, int(shift)) for shift in shifts]
-    best = int(np.argmin(total))
-    if not v.any() or not 0 < best < len(shifts) - 1:
-        return 0.0
-    left, middle, right = total[best - 1 : best + 2]
-    curvature = left - 2 * middle + right
-    fraction = 0.5 * (left - right) / curvature if curvature > 0 else 0.0
-    return float((shifts[best] + fraction) * step)
+        for own, x, measured in zip(total, q[part].T, v[part].T, strict=True):
+            slope = np.gradient(np.interp(grid, t, x), step)
+            own += len(grid) * _distances(slope, np.interp(grid, t, measured), longest)
+
+    def delay(total: Array) -> float:
+        best = int(np.argmin(total))
+        if not 0 < best < len(shifts) - 1:
+            return 0.0
+        left, middle, right = total[best - 1 : best + 2]
+        curvature = left - 2 * middle + right
+        fraction = 0.5 * (left - right) / curvature if curvature > 0 else 0.0
+        return float((shifts[best] + fraction) * step)
+
+    single = [delay(own) if x.any() else 0.0 for own, x in zip(total, v.T, strict=True)]
+    return delay(total.sum(axis=0)) if v.any() else 0.0, np.array(single)
 
 
 def coarse_velocities(log: Log) -> tuple[str, ...]:
@@ -166,8 +187,15 @@ def _alike(moved: Array, swept: Array, shift: int) -> float:
     return abs(float(a @ b)) / size if size > 0 else 0.0
 
 
-def _distance(slope: Array, v: Array, shift: int) -> float:
-    """Return the mean square of v - slope delayed by shift samples."""
-    n = v.shape[1]
-    late, early = slice(max(shift, 0), n + min(shift, 0)), slice(max(-shift, 0), n - max(shift, 0))
-    return float(np.mean((v[:, late] - slope[:, early]) ** 2))
+def _distances(slope: Array, v: Array, longest: int) -> Array:
+    """Return the mean squares of v - slope delayed by -longest to longest samples."""
+    n, size = len(v), 1 << (len(v) + longest).bit_length()  # of a period, without overlap
+    spectrum = np.fft.rfft(v, size) * np.fft.rfft(slope, size).conj()
+    products = np.fft.irfft(spectrum, size)[np.arange(-longest, longest + 1)]
+    of_v, of_slope = (np.append(0.0, np.cumsum(x**2)) for x in (v, slope))  # of the first rows
+    k = np.arange(longest + 1)
+    late = of_v[n] - of_v[k] + of_slope[n - k]  # squares of what is compared k samples later
+    early = of_v[n - k] + of_slope[n] - of_slope[k]
+    squares = np.concatenate([early[:0:-1], late])
+    distances: Array = (squares - 2 * products) / (n - np.abs(np.arange(-longest, longest + 1)))
+    return distances

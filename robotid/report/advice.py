@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from robotid.diagnosis.misfit_findings import setting_of, with_entries
 from robotid.findings import Cause, grouped, listed, toml_key
@@ -18,11 +18,12 @@ from robotid.robot.families import COUNTERBALANCE, spring_family
 if TYPE_CHECKING:
     from robotid.identification.result import Identification
 
-__all__ = ["Origin", "Step", "next_steps"]
+__all__ = ["Origin", "Step", "loop_steps", "next_steps"]
 
 _MOST = 3  # steps
 _NAMED = 4  # joints that a step names
 _NEW = "NEW.csv"
+_EXPORTED = {"mjcf": ".xml", "isaac": "_actuators.yaml", "ranges": "_ranges.yaml"}  # ends of files
 _PLAIN = "viscous+coulomb"
 _APPENDED = ("--validate",)  # flags that add to what was stated before
 
@@ -136,6 +137,36 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
     urgent = sorted(asked, key=lambda k: (all(c.severity != "error" for c in asked[k]), k))
     steps = [_STEPS[number][0](found, origin, asked[number]) for number in urgent]
     return _once([*steps, *_uses(found, origin, steps)][:_MOST])
+
+
+def loop_steps(content: Mapping[str, Any], origin: Origin) -> tuple[Step, ...]:
+    """Return what may be done with what was identified by simulation; nothing if it is nowhere.
+
+    Args:
+        content: Content of its result.json.
+        origin: Where it is.
+    """
+    urdf, log = (
+        next((x["path"] for x in content["inputs"] if x["role"] == role), "")
+        for role in ("urdf", "identification")
+    )
+    result, robot = f"{origin.folder}/result.json", content["robot"] or "robot"
+    if content["simulation"]["controller"]["kind"] == "torque":  # which has no gains
+        seen, exports = "See measured and predicted torque.", {"mjcf": "Simulate it in MuJoCo."}
+    else:
+        seen, exports = (
+            "See commanded, measured and simulated robot.",
+            {
+                "mjcf": "Simulate it in MuJoCo, gains and delays included.",
+                "isaac": "Train with it in Isaac Lab.",
+                "ranges": "Draw its drives at random, within their intervals.",
+            },
+        )
+    steps = [Step(seen, origin.using("replay", urdf, log, result))]
+    for form, words in exports.items():
+        target = f"{robot}{_EXPORTED[form]}"
+        steps.append(Step(words, origin.using("export", result, "--format", form, "--out", target)))
+    return tuple(steps) if origin.folder else ()
 
 
 def _once(steps: Sequence[Step]) -> tuple[Step, ...]:

@@ -3,48 +3,42 @@
 from collections.abc import Sequence
 from html import escape
 
-from robotid.findings import Cause, grouped
-from robotid.identification.result import Identification
+from robotid.findings import Cause, Finding, grouped
 from robotid.pages.html import Cell, code, table
-from robotid.report.summary_screen import joint_errors
 
-__all__ = ["causes_html", "findings_line", "findings_section"]
+__all__ = ["findings_line", "findings_section"]
 
 
-def findings_line(found: Identification) -> str:
+def findings_line(findings: Sequence[Finding], joints: Sequence[str], worst: str = "") -> str:
     """Return how many findings there are of how many causes, and on which joint it is worst.
 
     Args:
-        found: The identification.
+        findings: The findings.
+        joints: Names of the robot's joints.
+        worst: The joint that is predicted worst; "" if none is.
     """
-    grave = [finding for finding in found.findings if finding.severity != "note"]
-    notes = len(found.findings) - len(grave)
+    grave = [finding for finding in findings if finding.severity != "note"]
+    notes = len(findings) - len(grave)
     noted = [_count(notes, "note")] if notes else []
     if not grave:
         return ", ".join(noted) or "none"
-    causes = grouped(grave, found.model.joints)
-    worst = next(iter(joint_errors(found)), "")
+    causes = grouped(grave, joints)
     said = f"{_count(len(grave), 'finding')}, {_count(len(causes), 'cause')}"
     return "; ".join([said, *([f"worst: {escape(worst)}"] if worst else []), *noted])
 
 
-def findings_section(found: Identification) -> str:
+def findings_section(
+    findings: Sequence[Finding], joints: Sequence[str], shown: Sequence[str]
+) -> str:
     """Return the causes with what was found, the gravest first, and the causes of each joint.
 
     Args:
-        found: The identification.
+        findings: The findings.
+        joints: Names of the robot's joints.
+        shown: Those that have errors, the worst first.
     """
-    causes = grouped(found.findings, found.model.joints)
-    return _by_joint(found, causes) + causes_html(causes)
-
-
-def causes_html(causes: Sequence[Cause]) -> str:
-    """Return causes with what was found, in their order.
-
-    Args:
-        causes: The causes.
-    """
-    return "".join(_cause(cause) for cause in causes) or "<p>None.</p>\n"
+    causes = grouped(findings, joints)
+    return _by_joint(shown, causes) + ("".join(map(_cause, causes)) or "<p>None.</p>\n")
 
 
 def _cause(cause: Cause) -> str:
@@ -63,9 +57,9 @@ def _cause(cause: Cause) -> str:
     )
 
 
-def _by_joint(found: Identification, causes: Sequence[Cause]) -> str:
+def _by_joint(shown: Sequence[str], causes: Sequence[Cause]) -> str:
     rows = []
-    for joint in joint_errors(found):
+    for joint in shown:
         mine = [cause for cause in causes if joint in cause.joints]
         if mine:
             grave, notes = (

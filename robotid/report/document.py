@@ -7,6 +7,8 @@ from pathlib import Path
 
 from robotid._files import write_text
 from robotid._settings import require_each, require_kind
+from robotid.closed_loop.result import LoopIdentification
+from robotid.export.entries import build_result
 from robotid.findings import listed
 from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.metrics import JointMetrics, Metrics
@@ -31,7 +33,8 @@ from robotid.report.diagnosis import (
     information_section,
     residual_section,
 )
-from robotid.report.summary_screen import summary_screen
+from robotid.report.loop_page import write_loop_report
+from robotid.report.summary_screen import joint_errors, summary_screen
 from robotid.report.tables import tables
 from robotid.report.torques import torques_section
 from robotid.report.why import why_section
@@ -41,7 +44,7 @@ __all__ = ["write_report"]
 
 
 def write_report(
-    identification: Identification,
+    identification: Identification | LoopIdentification,
     target: str | Path,
     *,
     files: Mapping[str, str] | None = None,
@@ -64,19 +67,30 @@ def write_report(
     Raises:
         DataError: If the folder of the target does not exist.
     """
-    require_kind(identification, Identification, "identification", "a robotid.Identification")
+    kinds = (Identification, LoopIdentification)
+    require_kind(identification, kinds, "identification", "a robotid.Identification")
     require_kind(target, (str, Path), "target", "the path of a page to write")
     require_kind(files, (Mapping, type(None)), "files", "a table of file names")
     for what, name in (files or {}).items():
         require_each([what, name], str, "an entry of files", "text, and the name of a file")
     require_kind(origin, (Origin, type(None)), "origin", "an Origin")
+    if isinstance(identification, LoopIdentification):
+        content = build_result(identification, {})
+        runs = identification.fitted, identification.validation
+        return write_loop_report(content, *runs, target, files=files, origin=origin)
     found, made = identification, tables(identification)
     header = summary_screen(found, origin or Origin(), files or {}) + _made(found)
     joints = len(found.verdict.joints)
+    worst = list(joint_errors(found))
     counts = [found.sources.count(source) for source in ("data", "mixed")]
     sections = {
         "errors": Section("Errors", _errors(found), f"{joints} joints, by recording", False),
-        "findings": Section("Findings", findings_section(found), findings_line(found), False),
+        "findings": Section(
+            "Findings",
+            findings_section(found.findings, found.model.joints, worst),
+            findings_line(found.findings, found.model.joints, next(iter(worst), "")),
+            False,
+        ),
         "torques": Section("Torques", torques_section(found)),
         "why": Section("Why each joint", why_section(found), "what its torque is made of", False),
         "parameters": Section(

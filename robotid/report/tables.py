@@ -1,32 +1,33 @@
 """The report's tables as HTML: parameters, changes, consistency, what is open, settings, inputs."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from html import escape
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from robotid._files import file_sha256
+from robotid.export.entries import input_entries
 from robotid.export.urdf import urdf_changes
 from robotid.findings import listed
 from robotid.fitting.evaluation import Recording
+from robotid.fitting.identified import SOURCES
 from robotid.fitting.parameter_table import correlated_parameters
-from robotid.fitting.result import SOURCES
 from robotid.identification.result import Identification
 from robotid.pages.html import Cell, code, number, percent, table, text, with_error
 from robotid.report.summary_screen import DETERMINED
 from robotid.robot.parameters import pseudo_inertia
 from robotid.versions import versions
 
-__all__ = ["tables"]
+__all__ = ["input_table", "tables", "version_table"]
 
 _METRICS = {
     "euclidean": "each parameter over its own spread (euclidean)",
     "riemannian": "the pull-back metric at the URDF's pseudo-inertias (riemannian)",
     "entropic": "the divergence of the pseudo-inertias (entropic)",
 }
+_ROLES = {"urdf": "URDF", "identification": "fitted", "validation": "validation"}
 _CHOSEN = {
     "cv": "chosen by predicting stretches of the fitted logs from the others",
     "evidence": "chosen by the evidence of the fitted logs",
@@ -46,8 +47,8 @@ def tables(found: Identification) -> dict[str, str]:
         "consistency": _consistency_section(found),
         "open": _open_section(found),
         "settings": _settings_tables(found),
-        "inputs": _input_table(found),
-        "versions": _version_table(),
+        "inputs": input_table(input_entries(found)),
+        "versions": version_table(versions()),
     }
 
 
@@ -239,19 +240,36 @@ def _settings_tables(found: Identification) -> str:
     )
 
 
-def _input_table(found: Identification) -> str:
-    """Return the table of the files that were read."""
-    urdf = found.model.tree.path
-    rows = [[text("URDF"), code(urdf), *[number(None)] * 5, code(_sha256(urdf))]]
-    for role, evaluations in (("fitted", found.fitted), ("validation", found.validation)):
-        rows += [[text(role), *_input_row(e.recording)] for e in evaluations]
+def input_table(inputs: Iterable[Mapping[str, Any]]) -> str:
+    """Return the table of the files that were read.
+
+    Args:
+        inputs: As in result.json.
+    """
+    rows = [
+        [
+            text(_ROLES[entry["role"]]),
+            code(entry["path"]),
+            number(entry.get("samples"), "d"),
+            number(entry.get("rate"), ".5g"),
+            number(entry.get("start"), ".6g"),
+            number(entry.get("end"), ".6g"),
+            number(entry.get("segments"), "d"),
+            code(entry["sha256"] or "not read from a file"),
+        ]
+        for entry in inputs
+    ]
     headers = ["role", "file", "samples", "rate Hz", "from s", "to s", "stretches", "SHA-256"]
     return table("Files read", headers, rows)
 
 
-def _version_table() -> str:
-    """Return the table of the versions that ran."""
-    rows = [[text(name), code(version)] for name, version in versions().items()]
+def version_table(ran: Mapping[str, str]) -> str:
+    """Return the table of the versions that ran.
+
+    Args:
+        ran: They, by what they are of.
+    """
+    rows = [[text(name), code(version)] for name, version in ran.items()]
     return table("Versions that ran", ["what", "version"], rows)
 
 
@@ -278,25 +296,6 @@ def _signal_row(recording: Recording) -> list[Cell]:
         number(s.min_velocity, ".3g"),
         number(s.max_gap, ".3g"),
     ]
-
-
-def _input_row(recording: Recording) -> list[Cell]:
-    extent = recording.extent
-    return [
-        code(str(recording.log.path)),
-        number(extent.samples, "d"),
-        number(extent.rate, ".5g"),
-        number(extent.start, ".6g"),
-        number(extent.end, ".6g"),
-        number(extent.segments, "d"),
-        code(_sha256(str(recording.log.path))),
-    ]
-
-
-def _sha256(path: str) -> str:
-    if not path or not Path(path).exists():
-        return "not read from a file"
-    return file_sha256(path)
 
 
 def _consistency_notes(found: Identification) -> str:

@@ -343,13 +343,13 @@ class RobotModel:
 
         False where the regressor is 0 for every motion.
         """
-        nv = self.pin_model.nv
-        carried = np.zeros((nv, self.layout.n_inertial), dtype=bool)
-        for body in range(1, self.pin_model.njoints):
-            for ancestor in list(self.pin_model.supports[body])[1:]:
-                joint = self.pin_model.joints[ancestor]
-                carried[joint.idx_v : joint.idx_v + joint.nv, 10 * (body - 1) : 10 * body] = True
-        inertial = (np.abs(self.velocity_map.T) > 0).astype(float) @ carried > 0
+        pin_model = self.pin_model
+        moves = np.zeros((pin_model.nv, pin_model.njoints), dtype=bool)  # which speeds, which body
+        for body in range(1, pin_model.njoints):
+            first = pin_model.idx_vs[body]
+            moves[:, body] = moves[:, pin_model.parents[body]]
+            moves[first : first + pin_model.nvs[body], body] = True
+        inertial = np.repeat((self.velocity_map.T != 0) @ moves[:, 1:], 10, axis=1)
         drive = np.zeros((self.n_rows, len(self.layout.drive_names)), dtype=bool)
         drive[self.n_rows - len(self.joints) :] = self.layout.drive_loads != 0.0
         return np.hstack([inertial, drive])

@@ -12,18 +12,17 @@ __all__ = ["thin"]
 
 _CREASE = np.radians(30.0)  # faces that meet at a sharper angle than this show an edge
 _WELD = 1e-6  # corners this near are one, over the size of the largest surface
-_FIRST_CELL = 1 / 4000  # the same where there are far too many: those of one cell of a grid ...
-_CHEAP = 0.5  # share of the edges that a pass may collapse
-_RIM = 20.0  # weight of the rim of a surface over that of the surface
-_FINE = 4  # ... until so many times too many triangles are left
+# whether rims stay, and how fast the bound on the error grows, until few enough are left
+_ATTEMPTS = ((True, 3.0), (False, 3.0), (False, 7.0))
+_APART = 3.0  # distance between patches that are simplified together, over their size
 
 
 def thin(solids: Sequence[Sequence[Surface]], most: int) -> list[list[Surface]]:
     """Return surfaces with so few triangles together: closed where they were, edges kept sharp.
 
-    Edges are collapsed, those first that change the shape least; an edge that becomes a point
-    opens no hole. The triangles of a surface turn the same way, outwards where it is closed, and
-    each side of a sharp edge has a corner of its own.
+    Edges are collapsed by fast-simplification, those first that change the shape least; an edge
+    that becomes a point opens no hole. The triangles of a surface turn the same way, outwards where
+    it is closed, and each side of a sharp edge has a corner of its own.
 
     Args:
         solids: The surfaces of each file of a robot, all in one scale; those of one file are
@@ -40,24 +39,17 @@ def thin(solids: Sequence[Sequence[Surface]], most: int) -> list[list[Surface]]:
     whole = joined(patches)
     patch = np.repeat(np.arange(len(patches)), [len(s.faces) for s in patches])
     of_vertex = np.repeat(solid, [len(s.vertices) for s in patches])
-    cell = _WELD * (float(np.ptp(whole.vertices, axis=0).max()) or 1.0)
-    which, V = _cells(whole.vertices, of_vertex, cell)
+    size = float(np.ptp(whole.vertices, axis=0).max()) or 1.0
+    which, V = _cells(whole.vertices, of_vertex, _WELD * size)
     F, patch = _proper(which[whole.faces], patch)
     if not len(F):  # all triangles are flat
         return [[] for _ in solids]
     F = _oriented(V, F)
-    of_vertex = np.rint(np.bincount(which, of_vertex) / np.bincount(which)).astype(int)
-    Q = _quadrics(V, F, patch)
-    cell *= _FIRST_CELL / _WELD
-    while len(F) > _FINE * most:  # collapsing half a million would take too long
-        which, V = _cells(V, of_vertex, cell)
-        F, patch = _proper(which[F], patch)
-        of_vertex = np.rint(np.bincount(which, of_vertex) / np.bincount(which)).astype(int)
-        Q = np.column_stack([np.bincount(which, x) for x in Q.reshape(-1, 16).T])
-        Q = Q.reshape(-1, 4, 4)
-        V = _lowest(Q, V, np.full(len(V), cell))
-        cell *= min(max(np.sqrt(len(F) / (_FINE * most)), 1.2), 2.0)
-    V, F, patch = _collapsed(V, F, patch, Q, most)
+    V, F, patch = _simplified(V / size, F, patch, most)
+    of_vertex = np.zeros(len(V), dtype=int)
+    of_vertex[F] = solid[patch][:, None]
+    which, V = _cells(size * V, of_vertex, _WELD * size)
+    F, patch = _proper(which[F], patch)
     is_open = np.unique(solid[patch[_open_faces(F)]])
     left = [
         _creased(Surface(V, F[patch == k], p.rgba, solid[k] not in is_open))
@@ -132,145 +124,32 @@ def _oriented(V: Array, F: Array) -> Array:
     return np.where(reverse[:, None], F[:, ::-1], F)
 
 
-def _collapsed(V: Array, F: Array, patch: Array, Q: Array, most: int) -> tuple[Array, Array, Array]:
-    """Return corners and triangles after so many edges became points that few enough are left."""
-    careful = True
-    while len(F) > most:
-        sides, face, _ = _edges(F)
-        first = np.r_[True, (sides[1:] != sides[:-1]).any(axis=1)]
-        ends = sides[first]
-        place, cost = _best_places(V, Q, ends)
-        chosen = _apart(len(V), F, ends, cost, (np.cumsum(first) - 1)[np.argsort(face)])
-        if careful:
-            chosen = chosen[_is_simple(len(V), ends, chosen)]
-            chosen = chosen[~_folds(V, F, ends[chosen], place[chosen])]
-            careful = len(chosen) > 0.002 * len(ends)  # or nothing is left that could be done well
-        chosen = chosen[: (len(F) - most + 1) // 2]
-        keep, drop = ends[chosen].T
-        V, which = V.copy(), np.arange(len(V))
-        V[keep], which[drop] = place[chosen], keep
-        Q[keep] += Q[drop]
-        F, patch = _proper(which[F], patch)
-    return V, F, patch
+def _simplified(V: Array, F: Array, patch: Array, most: int) -> tuple[Array, Array, Array]:
+    """Return corners, at most so many triangles, and their patches; no two share a corner.
 
-
-def _apart(n: int, F: Array, ends: Array, cost: Array, sides: Array) -> Array:
-    """Return the edges that cost less than all of the triangles at their ends, in order of cost.
-
-    Args:
-        n: Number of corners.
-        F: Triangles, shape (F, 3).
-        ends: Corners of each edge, shape (E, 2).
-        cost: What each costs, shape (E,).
-        sides: The edges of the triangles, three by three, shape (3 F,).
+    Rims of patches stay where they are, so that neighbours still meet, unless too many triangles
+    would be left. The library's bound on the error is of corners that are about 1 in size.
     """
-    order = np.argsort(cost)
-    rank = np.empty(len(ends), dtype=np.int64)
-    rank[order] = np.arange(len(ends))
-    lowest = rank[sides.reshape(-1, 3)].min(axis=1)  # of each triangle
-    about = np.full(n, len(ends))
-    np.minimum.at(about, F.ravel(), np.repeat(lowest, 3))
-    taken = (about[ends] == rank[:, None]).all(axis=1) & (rank < _CHEAP * len(ends))
-    apart: Array = order[taken[order]]
-    return apart
+    import fast_simplification
+    from scipy.spatial import cKDTree
 
-
-def _is_simple(n: int, ends: Array, chosen: Array) -> Array:
-    """Return which edges can be points without laying two triangles upon each other."""
-    from scipy.sparse import coo_array
-
-    both = np.vstack([ends, ends[:, ::-1]])
-    near = coo_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(n, n)).tocsr()
-    shared = near[ends[chosen, 0]].multiply(near[ends[chosen, 1]]).sum(axis=1)
-    is_simple: Array = np.asarray(shared).ravel() <= 2  # the tips of its triangles
-    owner = np.full(n, -1)
-    owner[ends[chosen].ravel()] = np.repeat(np.arange(len(chosen)), 2)
-    pairs = np.sort(owner[ends], axis=1)  # of chosen edges that another edge joins
-    pairs = pairs[(pairs[:, 0] >= 0) & (pairs[:, 0] < pairs[:, 1])]
-    _, first, count = np.unique(_keys(pairs), return_index=True, return_counts=True)
-    is_simple[pairs[first[count > 1], 1]] = False  # two do: the dearer one waits
-    return is_simple
-
-
-def _quadrics(V: Array, F: Array, patch: Array) -> Array:
-    """Return the quadric (4, 4) of each corner: squared distance to its triangles' planes."""
-    from scipy.sparse import coo_array
-
-    n = np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]])  # (F, 3), twice the area
-    area = np.linalg.norm(n, axis=1)
-    n /= np.maximum(area, 1e-30)[:, None]
-    ends, face, _ = _edges(F)
-    same = (ends[1:] == ends[:-1]).all(axis=1) & (patch[face[1:]] == patch[face[:-1]])
-    rim = ~(np.r_[False, same] | np.r_[same, False])  # of a surface, or of a colour
-    along = V[ends[rim, 1]] - V[ends[rim, 0]]
-    across = np.cross(along, n[face[rim]])
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
-    normals, weights = np.vstack([n, across]), np.r_[area, _RIM * (along**2).sum(axis=1)]
-    on = np.r_[V[F[:, 0]], V[ends[rim, 0]]]
-    plane = np.column_stack([normals, -(normals * on).sum(axis=1)])  # (P, 4)
-    K = weights[:, None, None] * plane[:, :, None] * plane[:, None, :]
-    rows = np.r_[F.T.ravel(), ends[rim].T.ravel()]
-    columns = np.r_[np.tile(np.arange(len(F)), 3), np.tile(np.arange(len(F), len(K)), 2)]
-    S = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(V), len(K)))
-    Q: Array = (S.tocsr() @ K.reshape(-1, 16)).reshape(-1, 4, 4)
-    return Q
-
-
-def _best_places(V: Array, Q: Array, ends: Array) -> tuple[Array, Array]:
-    """Return where each edge becomes a point, shape (E, 3), and the quadric there."""
-    q = Q[ends[:, 0]] + Q[ends[:, 1]]
-    one, other = V[ends[:, 0]], V[ends[:, 1]]
-    length = np.linalg.norm(other - one, axis=1)
-    place = _lowest(q, (one + other) / 2, length)
-    x = np.column_stack([place, np.ones(len(place))])
-    cost = np.einsum("ei,eij,ej->e", x, q, x)
-    # on a plane all cost nothing: short edges first, and not all those side by side
-    spread = 1.0 + (0.618034 * np.arange(len(ends))) % 1.0
-    size = q[:, 0, 0] + q[:, 1, 1] + q[:, 2, 2]
-    return place, np.maximum(cost, 0.0) + 1e-8 * size * length**2 * spread
-
-
-def _lowest(Q: Array, near: Array, far: Array) -> Array:
-    """Return the places of the least quadrics, shape (E, 3), those not too far from others."""
-    (a, b, c, g), (_, d, e, h), (_, _, f, k), _ = np.ascontiguousarray(Q.transpose(1, 2, 0))
-    x, y, z = np.ascontiguousarray(near.T)
-    ridge = 1e-6 * (a + d + f + 1e-30)  # along a plane they stay where they are
-    slope = a * x + b * y + c * z + g, b * x + d * y + e * z + h, c * x + e * y + f * z + k
-    step = _solved((a + ridge, b, c, d + ridge, e, f + ridge), slope)
-    long = np.sqrt(sum(s * s for s in step)) / np.maximum(far, 1e-30)
-    places: Array = near - np.column_stack(step) / np.maximum(long, 1.0)[:, None]
-    return places
-
-
-def _solved(A: Sequence[Array], s: Sequence[Array]) -> tuple[Array, Array, Array]:
-    """Return A^-1 s for many A = L D L^T, positive definite, as xx xy xz yy yz zz."""
-    a, b, c, d, e, f = A
-    p, q = b / a, c / a
-    d, e, f = d - p * b, e - q * b, f - q * c
-    r = e / d
-    y, z = s[1] - p * s[0], s[2] - q * s[0]
-    z = (z - r * y) / (f - r * e)
-    y = y / d - r * z
-    return s[0] / a - p * y - q * z, y, z
-
-
-def _folds(V: Array, F: Array, ends: Array, place: Array) -> Array:
-    """Return which collapses would turn a triangle over."""
-    moved, edge, which = V.copy(), np.full(len(V), -1), np.arange(len(V))
-    moved[ends.ravel()] = np.repeat(place, 2, axis=0)
-    edge[ends.ravel()] = np.repeat(np.arange(len(ends)), 2)
-    which[ends[:, 1]] = ends[:, 0]
-    left = F[(edge[F] >= 0).any(axis=1)]  # what moves
-    left = left[(which[left] != np.roll(which[left], 1, axis=1)).all(axis=1)]
-    before, after = (
-        np.cross(P[left[:, 1]] - P[left[:, 0]], P[left[:, 2]] - P[left[:, 0]]) for P in (V, moved)
-    )
-    sizes = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
-    over = (before * after).sum(axis=1) < 0.2 * sizes
-    guilty = edge[left[over]].ravel()
-    folds = np.zeros(len(ends), dtype=bool)
-    folds[guilty[guilty >= 0]] = True
-    return folds
+    if len(F) <= most:
+        return V, F, patch
+    own, F = np.unique(F + len(V) * patch[:, None], return_inverse=True)  # corners of patches
+    number, corner = np.divmod(own, len(V))
+    apart = np.array([_APART, 0.0, 0.0])
+    V = V[corner] + number[:, None] * apart  # the library knows nothing of patches
+    for keeps_rims, step in _ATTEMPTS:
+        places, faces = fast_simplification.simplify(
+            V, F.astype(np.int32), target_count=most, preserve_border=keeps_rims, agg=step
+        )
+        if len(faces) <= most:
+            break
+    nearest = cKDTree(V[F].mean(axis=1)).query(places[faces].mean(axis=1))[1]
+    patch = patch[nearest]
+    number = np.zeros(len(places), dtype=int)
+    number[faces] = patch[:, None]
+    return places - number[:, None] * apart, faces.astype(np.int64), patch
 
 
 def _creased(surface: Surface) -> Surface:

@@ -101,4 +101,3 @@ def _with_sliding_origins(model: pin.Model) -> tuple[pin.Model, list[int]]:
         joints.append(sliding.addJoint(origin, model.joints[i], turned, name))
         sliding.appendBodyToJoint(joints[-1], model.inertias[i], pin.SE3.Identity())
     return sliding, joints[1:]
-

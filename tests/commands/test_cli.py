@@ -7,16 +7,20 @@ from contextlib import redirect_stderr, redirect_stdout
 
 import numpy as np
 import pytest
+from helpers.paths import URDF as PLANAR
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
 from robotid.export.urdf import load_identified
-from robotid.logs.read import write_log
+from robotid.logs.read import read_log, write_log
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 URDF = str(example_urdf("ur5_robot.urdf"))
+ARM = str(PLANAR / "planar_2r.urdf")
+PLAIN = ("--friction", "viscous+coulomb", "--no-report")
 NOISE = np.array([0.5, 0.5, 0.25, 0.1, 0.1, 0.05])  # [N m]
 
 
@@ -121,12 +125,12 @@ def test_the_written_urdf_holds_the_identified_masses(identified):
 
 
 @pytest.fixture(scope="module")
-def alone(logs, tmp_path_factory):
+def alone(arm_logs, tmp_path_factory):
     """What is printed of one log without another to validate on, and the folder written."""
     out, printed, said = tmp_path_factory.mktemp("alone"), io.StringIO(), io.StringIO()
-    words = ["identify", URDF, str(logs / "fit.csv"), "--out", str(out), "--json"]
+    words = ["identify", ARM, str(arm_logs / "fit.csv"), "--out", str(out), "--json"]
     with redirect_stdout(printed), redirect_stderr(said):
-        assert main([*words, "--dynamics", "--no-report"]) == 0
+        assert main([*words, "--dynamics", *PLAIN]) == 0
     assert said.getvalue() == ""
     return json.loads(printed.getvalue()), out
 
@@ -135,8 +139,10 @@ def test_friction_goes_into_the_urdf_where_asked(alone):
     result, out = alone
     value = {p["name"]: p["value"] for p in result["drive_parameters"]}
     text = (out / result["outputs"]["urdf"]).read_text()
-    assert f'damping="{value["elbow_joint.viscous"]!r}"' in text
-    assert f'friction="{value["elbow_joint.coulomb"]!r}"' in text
+    for joint in ("joint_1", "joint_2"):
+        (own,) = re.findall(rf'<joint name="{joint}".*?<dynamics (.*?)/>', text, re.DOTALL)
+        viscous, coulomb = (value[f"{joint}.{term}"] for term in ("viscous", "coulomb"))
+        assert own == f'damping="{viscous!r}" friction="{coulomb!r}"'
 
 
 def test_json_prints_one_object_and_nothing_else(alone):
@@ -157,57 +163,58 @@ def test_without_validation_the_verdict_is_not_good(alone):
     assert "no validation log given" in str(result["verdict"]["reasons"])
 
 
-def test_wls_result_without_a_urdf_can_be_validated(logs, tmp_path, capsys):
-    # ten times the noise on a tenth of the rows: unconstrained parameters that cannot be
+def test_wls_result_without_a_urdf_can_be_validated(arm, arm_logs, tmp_path, capsys):
+    # noise as large as the torque on few rows: unconstrained parameters that cannot be
     out = tmp_path / "out"
-    model = RobotModel.from_urdf(URDF)
-    noisy = exact_log(model, truth(model), np.random.default_rng(1), noise=80 * NOISE)
+    noisy = exact_log(arm, truth(arm), np.random.default_rng(1), noise=50.0, samples=200)
     write_log(noisy, tmp_path / "noisy.csv")
-    words = ["identify", URDF, str(tmp_path / "noisy.csv"), "--estimator", "wls", "--no-report"]
+    words = ["identify", ARM, str(tmp_path / "noisy.csv"), "--estimator", "wls", *PLAIN]
     assert main([*words, "--out", str(out), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert "urdf" not in result["outputs"]
     assert "urdf_not_written" in [warning["code"] for warning in result["warnings"]]
-    assert main(["validate", str(out / "result.json"), str(logs / "keep.csv"), "--json"]) == 0
-    assert "result.json" in json.loads(capsys.readouterr().out)["predicted_with"]
+    keep = arm_logs / "keep.csv"
+    assert main(["validate", str(out / "result.json"), str(keep), "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert "result.json" in again["predicted_with"]
+    # the error of the base parameters, predicted by hand; the filter takes next to nothing
+    log, mapping = read_log(keep, arm.joints), structural_mapping(arm)
+    inside = (log.t > 0.5) & (log.t < log.t[-1] - 0.5)
+    W = joint_torque_regressor(arm, log.q[inside], log.v[inside], log.a[inside])
+    beta = np.array([entry["value"] for entry in result["base_parameters"]])
+    error = (log.tau[inside].ravel() - W[:, mapping.independent] @ beta).reshape(-1, 2)
+    wanted = np.linalg.norm(error, axis=0) / np.linalg.norm(log.tau[inside], axis=0)
+    found = [again["validation"][0]["per_joint"][j]["relative_error_pct"] for j in arm.joints]
+    assert found == pytest.approx(100 * wanted, rel=0.1)
 
 
-def test_a_log_validated_on_itself_is_named(logs, tmp_path, capsys):
-    log = str(logs / "fit.csv")
-    words = ["identify", URDF, log, "--validate", log, "--out", str(tmp_path), "--json"]
-    assert main([*words, "--no-report"]) == 0
+def test_a_log_validated_on_itself_is_named(arm_logs, tmp_path, capsys):
+    log = str(arm_logs / "fit.csv")
+    words = ["identify", ARM, log, "--validate", log, "--out", str(tmp_path), "--json"]
+    assert main([*words, *PLAIN]) == 0
     result = json.loads(capsys.readouterr().out)
     assert "validation_was_fitted" in [warning["code"] for warning in result["warnings"]]
     assert result["verdict"]["status"] != "good"
 
 
-def test_joints_left_to_stand_at_zero_are_named(logs, tmp_path, capsys):
-    arm = [f"panda_joint{i}" for i in range(1, 8)]
-    urdf = str(example_urdf("panda.urdf"))
-    model = RobotModel.from_urdf(urdf, joints=arm)
-    log = exact_log(model, truth(model), np.random.default_rng(0), samples=800)
-    write_log(log, tmp_path / "panda.csv")
-    words = ["identify", urdf, str(tmp_path / "panda.csv"), "--joints", ",".join(arm)]
-    words += ["--estimator", "wls", "--no-report", "--out", str(tmp_path / "out"), "--json"]
+def test_joints_left_to_stand_at_zero_are_named(tmp_path, capsys):
+    model = RobotModel.from_urdf(ARM, joints=["joint_1"])
+    write_log(exact_log(model, truth(model), np.random.default_rng(0)), tmp_path / "log.csv")
+    words = ["identify", ARM, str(tmp_path / "log.csv"), "--joints", "joint_1"]
+    words += ["--estimator", "wls", *PLAIN, "--out", str(tmp_path / "out"), "--json"]
     assert main(words) == 0
     result = json.loads(capsys.readouterr().out)
     (warning,) = [w for w in result["warnings"] if w["code"] == "locked_at_zero"]
-    assert "panda_finger_joint1" in warning["message"]
-    stated = ["--lock", "panda_finger_joint1=0.0", "--lock", "panda_finger_joint2=0.0"]
-    assert main([*words, *stated]) == 0
+    assert "joint_2" in warning["message"]
+    assert main([*words, "--lock", "joint_2=0.0"]) == 0
     codes = [w["code"] for w in json.loads(capsys.readouterr().out)["warnings"]]
     assert "locked_at_zero" not in codes
 
 
 def spoil(logs, tmp_path, change):
     """Write fit.csv with one thing wrong and return its path."""
-    model = RobotModel.from_urdf(URDF)
-    from robotid.logs.read import read_log
-
-    log = read_log(logs / "fit.csv", model.joints)
-    lines = (logs / "fit.csv").read_text().splitlines()
     path = tmp_path / "bad.csv"
-    path.write_text("\n".join(change(lines, log)) + "\n")
+    path.write_text("\n".join(change((logs / "fit.csv").read_text().splitlines())) + "\n")
     return path
 
 
@@ -240,44 +247,44 @@ def degrees(lines):
     return scaled(scaled(scaled(lines, "q_", factor), "dq_", factor), "ddq_", factor)
 
 
-TAU, Q = "tau_elbow_joint", "q_elbow_joint"
+TAU, Q = "tau_joint_2", "q_joint_2"
 # fmt: off
 BAD_LOGS = {
-    "NaN torque": (lambda x, _: cell(x, 18, TAU, "nan"), "tau_elbow_joint is NaN at row 17"),
-    "NaN position": (lambda x, _: cell(x, 5, Q, "nan"), "q_elbow_joint is NaN at row 4"),
-    "text": (lambda x, _: cell(x, 5, Q, "off"), Q),
-    "degrees": (lambda x, _: degrees(x), "degrees"),
-    "milliseconds": (lambda x, _: scaled(x, "time", 1000), "milliseconds"),
-    "two stamps swapped": (lambda x, _: [*x[:9], x[10], x[9], *x[11:]], "t must increase"),
-    "duplicate stamp": (lambda x, _: [*x[:9], x[8], *x[9:]], "duplicate time stamp"),
-    "too few rows": (lambda x, _: x[:49], "too few rows"),
-    "missing torque column": (lambda x, _: without(x, TAU), "elbow_joint"),
-    "header only": (lambda x, _: x[:1], "row"),
-    "velocity of opposite sign": (lambda x, _: scaled(x, "dq_", -1), "sign"),
+    "NaN torque": (lambda x: cell(x, 18, TAU, "nan"), "tau_joint_2 is NaN at row 17"),
+    "NaN position": (lambda x: cell(x, 5, Q, "nan"), "q_joint_2 is NaN at row 4"),
+    "text": (lambda x: cell(x, 5, Q, "off"), Q),
+    "degrees": (lambda x: degrees(x), "degrees"),
+    "milliseconds": (lambda x: scaled(x, "time", 1000), "milliseconds"),
+    "two stamps swapped": (lambda x: [*x[:9], x[10], x[9], *x[11:]], "t must increase"),
+    "duplicate stamp": (lambda x: [*x[:9], x[8], *x[9:]], "duplicate time stamp"),
+    "too few rows": (lambda x: x[:45], "too few rows"),
+    "missing torque column": (lambda x: without(x, TAU), "joint_2"),
+    "header only": (lambda x: x[:1], "row"),
+    "velocity of opposite sign": (lambda x: scaled(x, "dq_", -1), "sign"),
 }
 # fmt: on
 
 
 @pytest.mark.parametrize(("change", "message"), BAD_LOGS.values(), ids=BAD_LOGS)
 def test_a_bad_log_is_refused_by_name_and_nothing_is_written(
-    logs, tmp_path, capsys, change, message
+    arm_logs, tmp_path, capsys, change, message
 ):
-    path = spoil(logs, tmp_path, change)
+    path = spoil(arm_logs, tmp_path, change)
     out = tmp_path / "out"
-    assert main(["identify", URDF, str(path), "--out", str(out)]) == 1
+    assert main(["identify", ARM, str(path), "--out", str(out)]) == 1
     printed = capsys.readouterr()
     assert message in printed.err
     assert printed.out == ""
     assert not out.exists()
 
 
-def test_a_stated_unit_overrides_the_suspicion(logs, tmp_path, capsys):
-    path = spoil(logs, tmp_path, lambda lines, _: degrees(lines))
-    words = ["identify", URDF, str(path), "--out", str(tmp_path / "out"), "--json"]
-    words += ["--estimator", "wls", "--no-report"]
+def test_a_stated_unit_overrides_the_suspicion(arm_logs, tmp_path, capsys):
+    path = spoil(arm_logs, tmp_path, lambda lines: degrees(lines))
+    words = ["identify", ARM, str(path), "--out", str(tmp_path / "out"), "--json"]
+    words += ["--estimator", "wls", *PLAIN]
     assert main([*words, "--angle-unit", "deg"]) == 0
     base = json.loads(capsys.readouterr().out)["base_parameters"]
-    assert main(["identify", URDF, str(logs / "fit.csv"), *words[3:]]) == 0
+    assert main(["identify", ARM, str(arm_logs / "fit.csv"), *words[3:]]) == 0
     expected = json.loads(capsys.readouterr().out)["base_parameters"]
     values = ([p["value"] for p in base], [p["value"] for p in expected])
     np.testing.assert_allclose(*values, rtol=0, atol=1e-6)
@@ -287,24 +294,24 @@ WRONG_USE = {
     "unknown estimator": (["--estimator", "magic"], 2, "estimator is 'magic'"),
     "bad gain": (["--gain", "elbow"], 2, "wanted JOINT=NUMBER"),
     "bad cutoff": (["--cutoff", "no"], 2, "wanted a frequency [Hz] or false"),
-    "unknown joint": (["--joints", "elbow"], 1, "joint 'elbow' is not in ur5_robot.urdf"),
+    "unknown joint": (["--joints", "elbow"], 1, "joint 'elbow' is not in planar_2r.urdf"),
     "cutoff beyond half the rate": (["--cutoff", "80"], 2, "not below half the rate"),
     "unknown unit": (["--time-unit", "min"], 2, "time is 'min', wanted one of"),
 }
 
 
 @pytest.mark.parametrize(("flags", "code", "message"), WRONG_USE.values(), ids=WRONG_USE)
-def test_wrong_use_has_its_exit_code_and_message(logs, tmp_path, capsys, flags, code, message):
-    words = ["identify", URDF, str(logs / "fit.csv"), "--out", str(tmp_path / "out"), *flags]
+def test_wrong_use_has_its_exit_code_and_message(arm_logs, tmp_path, capsys, flags, code, message):
+    words = ["identify", ARM, str(arm_logs / "fit.csv"), "--out", str(tmp_path / "out"), *flags]
     assert main(words) == code
     assert message in capsys.readouterr().err
 
 
-def test_a_job_file_states_its_logs_itself(logs, tmp_path, capsys):
+def test_a_job_file_states_its_logs_itself(arm_logs, tmp_path, capsys):
     job = tmp_path / "job.toml"
     job.write_text(
-        f'urdf = "{URDF}"\n[[identification]]\nlog = "{logs / "fit.csv"}"\n'
-        f'[[validation]]\nlog = "{logs / "keep.csv"}"\n[output]\nreport = false\n'
+        f'urdf = "{ARM}"\n[[identification]]\nlog = "{arm_logs / "fit.csv"}"\n'
+        f'[[validation]]\nlog = "{arm_logs / "keep.csv"}"\n[output]\nreport = false\n'
     )
     assert main(["identify", str(job), "--out", str(tmp_path / "out")]) == 0
     assert "verdict: good" in capsys.readouterr().out
@@ -319,8 +326,15 @@ def test_rounded_angles_are_named_and_snapped_where_asked(tmp_path, rng, capsys)
     model = RobotModel.from_urdf(source, snap_angles=True)
     pi = truth(model)
     write_log(exact_log(model, pi, rng, samples=400), tmp_path / "log.csv")
-    words = ["identify", str(source), str(tmp_path / "log.csv"), "--estimator", "wls", "--json"]
-    words.append("--no-report")
+    words = [
+        "identify",
+        str(source),
+        str(tmp_path / "log.csv"),
+        "--estimator",
+        "wls",
+        "--json",
+        *PLAIN,
+    ]
     # the directions that rounding adds carry WLS away, to links that weigh less than nothing
     assert main([*words, "--out", str(tmp_path / "plain")]) == 1
     plain = json.loads(capsys.readouterr().out)
@@ -376,7 +390,7 @@ def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys):
     assert str(out / "report.html") in printed
 
 
-def test_nothing_stays_behind_when_a_run_fails_late(logs, tmp_path, monkeypatch):
+def test_nothing_stays_behind_when_a_run_fails_late(arm_logs, tmp_path, monkeypatch):
     import robotid.commands.identify
 
     def broken(*_args, **_options):
@@ -384,16 +398,25 @@ def test_nothing_stays_behind_when_a_run_fails_late(logs, tmp_path, monkeypatch)
 
     monkeypatch.setattr(robotid.commands.identify, "write_json", broken)
     out = tmp_path / "out"
-    words = ["identify", URDF, str(logs / "fit.csv"), "--out", str(out), "--estimator", "wls"]
+    words = [
+        "identify",
+        ARM,
+        str(arm_logs / "fit.csv"),
+        "--out",
+        str(out),
+        "--estimator",
+        "wls",
+        *PLAIN,
+    ]
     assert main(words) == 1
     assert list(out.iterdir()) == []
 
 
-def test_a_result_can_be_validated_from_any_folder(logs, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(logs)
+def test_a_result_can_be_validated_from_any_folder(arm_logs, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(arm_logs)
     out = tmp_path / "out"
-    words = ["identify", URDF, "fit.csv", "--out", str(out), "--estimator", "wls", "--no-report"]
+    words = ["identify", ARM, "fit.csv", "--out", str(out), "--estimator", "wls", *PLAIN]
     assert main(words) == 0
     monkeypatch.chdir(tmp_path)
-    assert main(["validate", "out/result.json", str(logs / "keep.csv")]) == 0
+    assert main(["validate", "out/result.json", str(arm_logs / "keep.csv")]) == 0
     assert "predicted with" in capsys.readouterr().out

@@ -1,8 +1,11 @@
 import json
+from contextlib import redirect_stdout
+from io import StringIO
 
 import pytest
 
 from robotid.cli import main
+from robotid.cli.identify import show_result
 from robotid.robot.examples import example_urdf
 from robotid.robot.tree import read_tree
 
@@ -42,13 +45,20 @@ end = 12.0
 
 
 @pytest.fixture(scope="module")
-def folder(job, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("found") / "out"
-    assert main(["identify", str(job), "--out", str(folder)]) == 0
-    return folder
+def found(job, tmp_path_factory):
+    """The folder of its results, and what was printed."""
+    folder, said = tmp_path_factory.mktemp("found") / "out", StringIO()
+    with redirect_stdout(said):
+        assert main(["identify", str(job), "--out", str(folder), "--json"]) == 0
+    return folder, said.getvalue()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
+def folder(found):
+    return found[0]
+
+
+@pytest.fixture
 def result(folder):
     return json.loads((folder / "result.json").read_text())
 
@@ -95,26 +105,36 @@ def test_the_written_urdf_has_the_bodies_that_were_found(folder, result):
         assert name in tree.links
 
 
-def test_what_was_found_is_printed_with_its_values(folder, result, job, capsys, tmp_path):
+def test_what_was_found_is_printed_with_its_values(folder, result, capsys, tmp_path):
     assert main(["report", str(folder), "--out", str(tmp_path / "again.html")]) == 0
     capsys.readouterr()
-    assert main(["identify", str(job), "--out", str(tmp_path / "out")]) == 0
+    show_result(result)
     printed = capsys.readouterr().out
     for role, words in (("identification", "fitted"), ("validation", "not fitted")):
         assert f"{words}: chirp.parquet" in printed
-        own = result["simulation"][role][0]["per_joint"][LEG[2]]
-        row = [line for line in printed.splitlines() if line.split()[:1] == [LEG[2]]]
-        wanted = [f"{1e3 * own[key]:.2f}" for key in ("rmse", "second_order_rmse", "command_rmse")]
-        assert any(all(word in line.split() for word in wanted) for line in row)
-    [armature] = [e for e in result["drive_parameters"] if e["name"] == f"{LEG[0]}.armature"]
-    assert f"{armature['value']:.4g}" in printed
-    assert result["verdict"]["status"] in printed
+        part = printed.partition(f"\n{words}: chirp.parquet")[2].partition("\n\n")[0]
+        for joint, own in result["simulation"][role][0]["per_joint"].items():
+            [row] = [line.split() for line in part.splitlines() if line.split()[:1] == [joint]]
+            wanted = ("rmse", "second_order_rmse", "urdf_rmse", "command_rmse")
+            assert row[1:] == [*(f"{1e3 * own[key]:.2f}" for key in wanted), "mrad"]
+    fit = result["simulation"]["fit"]
+    assert f"go2_description: 3 joints, {fit['parameters']} unknowns; " in " ".join(printed.split())
+    table = printed.partition("\n  parameter ")[2].partition("\n\n")[0].splitlines()[1:]
+    lines = {line.split()[0]: line.split()[1:] for line in table}
+    for entry in result["drive_parameters"]:
+        if entry["std_error"] is None:
+            assert entry["name"] not in lines
+            continue
+        value, error, *unit = lines[entry["name"]]
+        assert value == f"{entry['value']:.4g}"
+        assert error == f"{entry['std_error']:.2g}"
+        assert " ".join(unit) == entry["unit"]
+    assert len(lines) > 9
+    assert f"verdict: {result['verdict']['status']}" in printed
 
 
-def test_json_is_the_result(job, result, capsys, tmp_path):
-    assert main(["identify", str(job), "--out", str(tmp_path / "out"), "--json"]) == 0
-    again = json.loads(capsys.readouterr().out)
-    assert again["drive_parameters"] == result["drive_parameters"]
+def test_json_is_the_result(found, result):
+    assert json.loads(found[1]) == result
 
 
 def test_a_log_without_commands_ends_with_one_sentence(tmp_path, job, capsys, ur5):

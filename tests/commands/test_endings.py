@@ -1,6 +1,7 @@
 """How a command ends that cannot go on: outputs in the way, readers that leave, full disks."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,11 +14,9 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
 from robotid.logs.read import write_log
-from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 URDF = str(ROOT / "urdf" / "planar_2r.urdf")
-UR5 = str(example_urdf("ur5_robot.urdf"))
 OUTPUTS = [
     *("result.json", "report.html"),
     *("planar_2r.identified.urdf", "planar_2r.identified.drive.json"),
@@ -32,11 +31,19 @@ def log(tmp_path_factory):
     return str(path)
 
 
+@pytest.fixture(scope="module")
+def made(log, tmp_path_factory):
+    """What is written from the log."""
+    folder = tmp_path_factory.mktemp("made")
+    assert main(["identify", URDF, log, "--friction", "viscous", "--out", str(folder)]) == 0
+    return folder
+
+
 @pytest.mark.parametrize("name", OUTPUTS)
 def test_a_folder_in_the_place_of_an_output_is_refused_before_the_work(
-    log, tmp_path, capsys, monkeypatch, name
+    log, made, tmp_path, capsys, monkeypatch, name
 ):
-    assert main(["identify", URDF, log, "--out", str(tmp_path)]) == 0
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     assert sorted(before) == sorted(OUTPUTS)
     (tmp_path / name).unlink()
@@ -75,7 +82,7 @@ def robotid(*words, **where):
     [
         (["--help"], 0),
         (["simulate", "--help"], 0),
-        (["inspect", UR5, "--json"], 0),
+        (["inspect", URDF, "--json"], 0),
         (["doctor", URDF, "{zeros}"], 1),
     ],
     ids=["help", "simulate", "json", "doctor"],
@@ -93,14 +100,15 @@ def test_a_reader_that_leaves_is_no_error_and_hides_none(log, tmp_path, words, c
 
 def test_a_standard_output_that_is_full_is_said():
     with open("/dev/full", "w") as full:
-        run = robotid("inspect", UR5, stdout=full)
+        run = robotid("inspect", URDF, stdout=full)
     assert (run.returncode, run.stderr) == (1, "robotid: [Errno 28] No space left on device\n")
 
 
 def test_a_warning_that_nobody_reads_does_not_end_the_work(log, tmp_path):
     read, write = os.pipe()
     os.close(read)
-    words = ["identify", URDF, log, "--workers", "2", "--out", str(tmp_path)]
+    words = ["identify", URDF, log, "--workers", "2", "--friction", "viscous", "--out"]
+    words.append(str(tmp_path))
     run = subprocess.run([sys.executable, "-m", "robotid", *words], stdout=write, stderr=write)
     os.close(write)
     assert run.returncode == 0

@@ -13,10 +13,10 @@ from helpers.synthetic import exact_log, truth
 
 from robotid._files import file_sha256
 from robotid.cli import main
-from robotid.commanded.settings import LoopSettings
-from robotid.commands.commanded import log_of_commands
+from robotid.closed_loop.settings import LoopSettings
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
+from robotid.commands.logs import log_of_commands
 from robotid.export.result import load_result
 from robotid.fitting.settings import SimulationSettings
 from robotid.logs.read import write_log

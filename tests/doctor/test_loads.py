@@ -91,7 +91,7 @@ def test_the_fit_is_the_least_squares_of_all_joints_and_drives(ur5, ur5_log):
     for j in range(n):
         sigma = np.sqrt(0.05**2 + share[j]) * probe.tau[:, j].std() / np.sqrt(20.0 / N)
         own = np.column_stack([np.einsum("kbi,bi->kb", Y[:, j], pi), Y[:, j, -1, :4]])
-        drive = np.delete(probe.drive(j), 4, axis=1)
+        drive = np.delete(probe.drives[:, j], 4, axis=1)
         others = np.zeros((N, n * drive.shape[1]))
         others[:, j * drive.shape[1] : (j + 1) * drive.shape[1]] = drive
         rows.append(np.hstack([own, others]) / scale[j] / sigma)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from robotid.estimators import Estimator
 from robotid.estimators.output_error import OutputError, Residual, linearised
 from robotid.exceptions import DataError, NotConvergedError
 
@@ -338,3 +339,13 @@ def test_standard_errors_of_what_drifts_are_the_scatter_of_many_drifts():
     theta = np.array([d.theta for d in draws])
     ratio = np.mean([d.std_error for d in draws], axis=0) / theta.std(axis=0)
     assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
+
+
+def test_it_is_an_estimator_that_reads_a_simulator_and_begins_with_its_prior(rng):
+    estimator, lag = OutputError(), lagging(rng)
+    assert isinstance(estimator, Estimator)
+    assert estimator.reads == "simulator"
+    near = replace(lag, prior=1.1 * TRUTH, prior_std=np.full(3, np.inf))
+    found, begun = estimator.fit(near), estimator.fit(near, near.prior)
+    np.testing.assert_array_equal(found.theta, begun.theta)
+    assert not np.array_equal(found.theta, estimator.fit(near, START).theta), "to the last bit"

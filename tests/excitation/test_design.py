@@ -6,8 +6,9 @@ import pytest
 from robotid.exceptions import SettingsError
 from robotid.excitation.basis import BSplineBasis, FourierBasis
 from robotid.excitation.clearance import Box, Clearance
-from robotid.excitation.design import Designer, _Multipliers
+from robotid.excitation.design import Designer
 from robotid.excitation.limits import LIMITS, MotionLimits
+from robotid.excitation.multipliers import Multipliers
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -56,7 +57,7 @@ def test_the_gradient_of_the_lagrangian_is_that_of_differences(designer, wrist, 
     shape = (len(LIMITS), 43, 3)
     pairs = (len(around.pairs), 43)
     held = rng.uniform(0.0, 0.05, shape), rng.uniform(0.0, 0.1, pairs) * (rng.random(pairs) < 0.3)
-    multipliers, h = _Multipliers(0.2, *held), 1e-6
+    multipliers, h = Multipliers(0.2, *held), 1e-6
     up, down = (designer._lagrangian(C + s * h * D, multipliers)[0] for s in (1, -1))
     slope = np.sum(designer._lagrangian(C, multipliers)[1] * D)
     assert slope == pytest.approx((up - down) / (2 * h), rel=1e-4)
@@ -159,7 +160,7 @@ def test_a_motion_whose_middle_collides_is_mixed_with_one_that_keeps_the_limits(
     kept = near.random(np.random.default_rng(5))
     C = kept.copy()
     C[0] += np.pi / 2 * np.array([1.0, 1.0, 0.0])  # the middle, about which it would be scaled
-    assert not near.can_rest(C[:1])[0]
+    assert not near.postures.can_rest(C[:1])[0]
     mixed = near._towards(kept, C, 0.997)
     used, margin, _ = near._kept(mixed, 1.0)
     share = np.linalg.norm(mixed - kept) / np.linalg.norm(C - kept)
@@ -173,7 +174,7 @@ def test_a_motion_whose_middle_collides_is_mixed_with_one_that_keeps_the_limits(
 def test_multipliers_push_as_hard_on_a_finer_grid():
     limits = np.random.default_rng(0).uniform(0.0, 0.1, (6, 61, 3))
     distances = np.random.default_rng(1).uniform(0.0, 0.1, (4, 61))
-    fine = _Multipliers(0.2, limits, distances).finer(3)
+    fine = Multipliers(0.2, limits, distances).finer(3)
     assert fine.limits.shape == (6, 181, 3)
     np.testing.assert_allclose(fine.limits[:, ::3], limits / 3)
     between = (2 * distances[:, :-1] + distances[:, 1:]) / 9
@@ -188,7 +189,7 @@ def test_distances_without_a_cost_are_not_looked_at_and_change_nothing(wrist, de
     C = near.random(rng)
     _, _, rows = near._kept(C)
     pairs = len(around.pairs), 43
-    held = _Multipliers(0.2, 0.0, rng.uniform(0.0, 0.05, pairs) * (rng.random(pairs) < 0.5))
+    held = Multipliers(0.2, 0.0, rng.uniform(0.0, 0.05, pairs) * (rng.random(pairs) < 0.5))
     aim = near._wanted
     some, every = (
         held.of_distances(around.near(rows.state, within).distance, aim)
@@ -212,7 +213,7 @@ def test_the_compiled_way_finds_the_same(wrist, designer):
         for is_fast in (False, True)
     )
     C = 1.5 * plain.random(np.random.default_rng(6))
-    held = _Multipliers(0.2)
+    held = Multipliers(0.2)
     one, other = plain._lagrangian(C, held), fast._lagrangian(C, held)
     assert other[0] == pytest.approx(one[0], rel=1e-9)
     np.testing.assert_allclose(other[1], one[1], rtol=1e-9, atol=1e-9 * np.abs(one[1]).max())

@@ -5,9 +5,10 @@ import pytest
 
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.excitation.basis import FourierBasis
-from robotid.excitation.design import Designer, _Multipliers
+from robotid.excitation.design import Designer
 from robotid.excitation.information import Aim
 from robotid.excitation.limits import MotionLimits
+from robotid.excitation.multipliers import Multipliers
 from robotid.excitation.payload_motion import _check_bare, design_payload
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.bodies import link_transfer
@@ -54,7 +55,7 @@ def test_the_gradient_of_a_motion_for_a_payload_is_that_of_differences(designer,
     np.testing.assert_array_equal(C[1:, ~moving], 0.0)
     D = rng.standard_normal(C.shape)
     D[1:, ~moving] = 0.0
-    h, multipliers = 1e-6, _Multipliers(0.2)
+    h, multipliers = 1e-6, Multipliers(0.2)
     up, down = (limited._lagrangian(C + s * h * D, multipliers)[0] for s in (1, -1))
     gradient = limited._lagrangian(C, multipliers)[1]
     np.testing.assert_array_equal(gradient[1:, ~moving], 0.0)

@@ -15,8 +15,9 @@ from helpers.commanded_results import by_position, written_result
 from helpers.mujoco_plant import LEG, ROBOTS, followed, loaded, multisine, plant, recorded
 
 from robotid.cli import main
+from robotid.closed_loop.result import logged_motion
 from robotid.exceptions import DataError, SettingsError
-from robotid.export.commanded import logged_motion, loops_of
+from robotid.export.commanded import loops_of
 from robotid.export.isaac import isaac_actuators
 from robotid.export.mjcf import write_mjcf
 from robotid.export.ranges import stated_ranges

@@ -113,6 +113,7 @@ def test_standard_and_drive_parameters_have_value_error_prior_and_source(result,
             "std_error": None
             if entry["at_bound"]
             else pytest.approx(np.sqrt(identified.standard_covariance[i, i])),
+            "reach": None if entry["at_bound"] else identified.standard_reach[i],
             "interval_95": [None, None]
             if entry["at_bound"]
             else list(identified.standard_interval[i]),

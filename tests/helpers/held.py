@@ -3,6 +3,7 @@
 Then it writes the file MARK and waits for a signal, so that a test never races with the work.
 """
 
+import signal
 import sys
 import time
 from pathlib import Path
@@ -24,5 +25,9 @@ def held(mark, count):
 
 
 if __name__ == "__main__":
+    # as from a terminal, whatever the shell of the tests ignores
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
     Checkpoint.save = held(Path(sys.argv[1]), int(sys.argv[2]))
     sys.exit(main(sys.argv[3:]))

@@ -31,7 +31,7 @@ from helpers.hostile_inputs import (
     write_csv,
 )
 from helpers.recorders import write_lerobot
-from robotid.commanded.settings import LoopSettings
+from robotid.closed_loop.settings import LoopSettings
 from robotid.logs.data import Log
 from robotid.logs.read import write_log
 from robotid.robot.families import FAMILIES

@@ -111,3 +111,14 @@ def _unpacked(packed):
     values = packed["low"] + codes / (last - 1) * (packed["high"] - packed["low"])
     values = np.where(codes == last, np.nan, values)
     return 10.0**values if packed["log"] else values
+
+
+def bars(html):
+    """Return by joint, in order, where its bar ends and where each mark stands [%]."""
+    found = {}
+    for row in re.findall(r"<li class=\"[\w-]*\">(<a .*?)</li>", html, flags=re.DOTALL):
+        name = re.sub(r"<[^>]*>", "", row[: row.index("</a>")])
+        width = re.search(r'<rect y="4" width="([\d.]*)%"', row)
+        marks = [float(x) for x in re.findall(r'<svg x="([\d.]*)%"', row)]
+        found[name] = (float(width[1]), marks)
+    return found

@@ -139,4 +139,6 @@ def main(folder, workers, word):
 
 
 if __name__ == "__main__":
+    # as from a terminal, whatever the shell of the tests ignores
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     main(*sys.argv[1:])

@@ -12,6 +12,7 @@ from robotid.logs.measured_velocity import (
     quantum,
     unlike_velocities,
     velocity_lag,
+    velocity_lags,
 )
 
 T = np.arange(0, 10, 0.01)
@@ -36,6 +37,33 @@ def test_full_turns_are_no_motion():
     turned = replace(log, q=(far + np.pi) % (2 * np.pi) - np.pi, v=np.gradient(far, T, axis=0))
     assert abs(velocity_lag(turned)) < 1e-3
     assert unlike_velocities(turned) == {}
+
+
+@pytest.mark.parametrize("step", [0.01, 0.013])
+def test_lags_of_joints_minimise_the_mean_distance_to_the_delayed_derivative(step):
+    log, lags = log_of_two(np.arange(0.0, 4.0, step)), [0.105, -0.048]
+    late = np.column_stack(
+        [np.interp(log.t - lag, log.t, x) for lag, x in zip(lags, log.v.T, strict=True)]
+    )
+    log = replace(log, v=late)
+    common, single = velocity_lags(log)
+    assert single == pytest.approx([velocity_lag(log.select([joint])) for joint in "ab"])
+    step = float(np.median(np.diff(log.t)))
+    grid = np.arange(log.t[0], log.t[-1], step)
+    slopes = [np.gradient(np.interp(grid, log.t, x), step) for x in log.q.T]
+    late = [np.interp(grid, log.t, x) for x in late.T]
+    pairs = list(zip(slopes, late, strict=True))
+    distances = np.array([[distance(*pair, k) for k in range(-20, 21)] for pair in pairs])
+    for found, own in zip([common, *single], [distances.sum(axis=0), *distances], strict=True):
+        k = int(np.argmin(own))
+        square, slope, _ = np.polyfit([-1, 0, 1], own[k - 1 : k + 2], 2)
+        assert found == pytest.approx((k - 20 - slope / (2 * square)) * step, abs=1e-9)
+
+
+def distance(slope, v, shift):
+    """Return the mean square of v - slope delayed by a number of rows."""
+    pairs = [(v[i], slope[i - shift]) for i in range(len(v)) if 0 <= i - shift < len(v)]
+    return np.mean([(x - y) ** 2 for x, y in pairs])
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.1, 0.2])

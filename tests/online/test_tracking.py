@@ -7,6 +7,7 @@ import pytest
 from helpers.synthetic import payload_log
 
 from robotid.cli import main
+from robotid.cli import track as command
 from robotid.commands.job import read_job
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.logs import parquet_files
@@ -31,6 +32,16 @@ def words(panda, log_file, out):
 def test_track_writes_the_history_and_says_when_the_load_came(panda, log_file, tmp_path, capsys):
     assert main([*words(panda, log_file, str(tmp_path)), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
+    command._show(printed)
+    text = capsys.readouterr().out
+    rows = {line.split()[0]: line.split()[1:] for line in text.splitlines() if " +- " in line}
+    for entry in printed["base_parameters"]:
+        value, _, error, *unit = rows[entry["name"]]
+        assert float(value) == pytest.approx(entry["value"], abs=0.06 * entry["std_error"])
+        assert float(error) == pytest.approx(entry["std_error"], rel=0.06)
+        assert " ".join(unit) == entry["unit"]
+    assert "estimate 47 ms behind" in text
+    assert "step change at 9.99 s, flagged at 10.17 s; as a load on panda_link7" in text
     assert printed == json.loads((tmp_path / "track.json").read_text())
     (change,) = printed["changes"]
     assert change["onset"] == pytest.approx(10.0, abs=0.05)
@@ -44,13 +55,6 @@ def test_track_writes_the_history_and_says_when_the_load_came(panda, log_file, t
     assert len(history.column_names) == 1 + 2 * len(printed["base_parameters"]) + 2
     # 20 rows a second from the first estimate on
     assert history.num_rows == pytest.approx(20 * (15 - printed["first_estimate"]), abs=5)
-
-
-def test_track_tells_it_in_words(panda, log_file, tmp_path, capsys):
-    assert main(words(panda, log_file, str(tmp_path))) == 0
-    text = capsys.readouterr().out
-    assert "estimate 47 ms behind" in text
-    assert "step change at 9.99 s, flagged at 10.17 s; as a load on panda_link7" in text
 
 
 def test_without_pyarrow_the_history_is_csv(panda, log_file, tmp_path, monkeypatch, capsys):

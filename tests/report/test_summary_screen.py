@@ -5,9 +5,10 @@ from dataclasses import replace
 from html import unescape
 
 import pytest
+from helpers.pages import bars
 
 from robotid.judgement.verdict import GOOD, POOR
-from robotid.report import summary_screen as first
+from robotid.report import bars as errors
 from robotid.report.advice import Origin, next_steps
 from robotid.report.summary_screen import joint_errors, summary_screen
 
@@ -17,17 +18,6 @@ ORIGIN = Origin(("arm.toml",), "out")
 @pytest.fixture(scope="module")
 def screen(identified):
     return summary_screen(identified, ORIGIN, {"urdf": "arm identified.urdf"})
-
-
-def bars(html):
-    """Return by joint, in order, where its bar ends and where each mark stands [%]."""
-    found = {}
-    for row in re.findall(r"<li class=\"[\w-]*\">(<a .*?)</li>", html, flags=re.DOTALL):
-        name = re.sub(r"<[^>]*>", "", row[: row.index("</a>")])
-        width = re.search(r'<rect y="4" width="([\d.]*)%"', row)
-        marks = [float(x) for x in re.findall(r'<svg x="([\d.]*)%"', row)]
-        found[name] = (float(width[1]), marks)
-    return found
 
 
 def test_each_joint_has_a_bar_of_its_error_the_worst_first(screen, identified):
@@ -98,7 +88,7 @@ def test_the_steps_stand_in_order_with_what_to_copy(screen, identified):
 
 
 def test_the_best_of_many_joints_are_folded_away(identified, screen, monkeypatch):
-    monkeypatch.setattr(first, "_ROWS", 4)
+    monkeypatch.setattr(errors, "_ROWS", 4)
     html = summary_screen(identified, ORIGIN, {})
     shown, folded = html.split("2 more joints, which are predicted better")
     assert [*bars(shown), *bars(folded)] == list(bars(screen))

@@ -82,6 +82,19 @@ def test_a_sheet_keeps_its_rim_and_is_not_called_closed():
     ((thinned,),) = thin([[sheet]], 200)
     assert trimesh.Trimesh(thinned.vertices, thinned.faces).area == pytest.approx(2.0, rel=1e-3)
     assert not thinned.is_closed
+    ((thinned,),) = thin([[sheet]], 60)  # its rim alone has 156 sides
+    assert 50 < len(thinned.faces) <= 60
+
+
+def test_solids_that_lie_in_each_other_stay_apart():
+    ball, scale = trimesh.creation.icosphere(subdivisions=4), 1e3
+    sizes = scale * np.array([1.0, 1.02, 1.0])
+    solids = [[Surface(size * ball.vertices, ball.faces, None)] for size in sizes]
+    for (solid,), size in zip(thin(solids, 6000), sizes, strict=True):
+        mesh = trimesh.Trimesh(solid.vertices, solid.faces)
+        assert mesh.volume == pytest.approx(ball.volume * size**3, rel=0.01)
+        assert 1700 < len(solid.faces) < 2300
+        np.testing.assert_allclose(np.linalg.norm(solid.vertices, axis=1), size, rtol=3e-3)
 
 
 def test_sharp_edges_get_a_corner_for_each_side_and_smooth_ones_do_not():

@@ -499,7 +499,8 @@ def test_a_notebook_s_frame_plays(browser, ur5, tmp_path):
 
 # the command as it is, but the page is told nothing after 6 s of the log until a file is there
 HELD = """
-import pathlib, runpy, time
+import pathlib, runpy, signal, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # whatever the shell of the tests ignores
 from robotid.viewer.server import LivePage
 send = LivePage.send
 def held(self, message):

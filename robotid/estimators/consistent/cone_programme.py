@@ -1,5 +1,6 @@
 """The convex programme of a consistent fit: data and prior over the cone, at any weight."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,6 +18,7 @@ __all__ = ["Programme"]
 
 _EXACT = 1e-12  # decrease of the objective by another step at which a fit is exact, relative
 _ROUGH = 1e-6  # ... and at which it will do for a prediction
+_TOGETHER = 2**17  # numbers of data sets that are fitted in one pass: more leave a cache
 _NOISE_STEPS, _NOISE_SETTLED = 50, 1e-4  # a noise level need not be known better
 _FLOOR = 1e-6  # smallest noise level, as a share of the torque: noise-free data have none
 _LEAST_FREEDOM = 0.1  # share of the rows that are left to tell the noise
@@ -71,19 +73,46 @@ class Programme:
         Raises:
             NotConvergedError: If it is not solved.
         """
+        starts = None if start is None else [start]
+        return self.minimise_each(rows[None], weight, is_exact=is_exact, starts=starts)[0]
+
+    def minimise_each(
+        self,
+        rows: Array,
+        weight: float,
+        *,
+        is_exact: bool = True,
+        starts: Sequence[ConeSolution] | None = None,
+    ) -> list[ConeSolution]:
+        """Return the minimum of each data set, as of ``minimise``, in one pass.
+
+        Args:
+            rows: Information on the base parameters, shape (f, k, b + 1).
+            weight: Weight of the penalty [-].
+            is_exact: Whether to solve beyond 1e-3 standard deviations.
+            starts: Minima of nearly the same rows, or at another weight.
+
+        Raises:
+            NotConvergedError: If one is not solved.
+        """
         if not isinstance(self.penalty, Entropic):
-            return self.expanded(rows, weight, self.penalty.centre, is_exact=is_exact)
+            centre = self.penalty.centre
+            return [self.expanded(own, weight, centre, is_exact=is_exact) for own in rows]
         tolerance = _EXACT if is_exact else _ROUGH
-        if start is not None:
-            start = replace(start, x=start.x / self.scale)
-        A, d = rows[:, :-1] @ self.K * self.scale, rows[:, -1]
+        if starts is not None:
+            starts = [replace(start, x=start.x / self.scale) for start in starts]
+        A, d = rows[:, :, :-1] @ (self.K * self.scale), rows[:, :, -1]
+        solutions: list[ConeSolution] = []
+        most = max(1, _TOGETHER // A[0].size)
         try:
-            solution = self._entropic.minimise(A, d, weight, tolerance, start)
+            for k in (slice(first, first + most) for first in range(0, len(A), most)):
+                near = None if starts is None else starts[k]
+                solutions += self._entropic.minimise(A[k], d[k], weight, tolerance, near)
         except NotConvergedError:
             # the cone solver knows whether the bounds leave room for possible bodies
-            self.expanded(rows, weight, self.penalty.centre, within=self.cone)
+            self.expanded(rows[0], weight, self.penalty.centre, within=self.cone)
             raise
-        return replace(solution, x=solution.x * self.scale)
+        return [replace(solution, x=solution.x * self.scale) for solution in solutions]
 
     @cached_property
     def _entropic(self) -> EntropicProblem:

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.estimators.batch import WLS
+from robotid.estimators.batch import WLS, solve_factor
 from robotid.estimators.consistent.cone_programme import Programme
 from robotid.estimators.consistent.cones import SOLVERS, Subspace
 from robotid.estimators.consistent.constraints import Constraints
@@ -66,6 +66,8 @@ class Consistent(BatchEstimator):
         solver: "clarabel" or "scs", of priors that are not entropic and of the check.
         choice: How ``prior_weight`` was chosen, if it was.
         check: Whether the other solver solves it, too; its difference is stated in the details.
+        wls_noise: Noise levels of weighted least squares of the rows that are fitted, shape (n,)
+            [N m or N]; None: to be found.
 
     References:
         Sousa, Cortesao (2014), Physical feasibility of robot base inertial parameter
@@ -87,6 +89,7 @@ class Consistent(BatchEstimator):
     constraints: Constraints = field(default_factory=Constraints)
     solver: str = "clarabel"
     check: bool = False
+    wls_noise: Array | None = None
     choice: WeightChoice | None = None
 
     def __post_init__(self) -> None:
@@ -114,8 +117,9 @@ class Consistent(BatchEstimator):
         return self
 
     def _fit(self, factors: Factors) -> Estimate:
-        wls = self._wls(factors)
-        sigma = self.noise(factors, wls.sigma)
+        start = self._wls_noise(factors)
+        wls = solve_factor(factors, start, self.K @ self.prior)
+        sigma = self.programme.noise(factors, start, self.independent_share, self.prior_weight)
         rows = self.rows(factors, sigma)
         solution = self.programme.minimise(rows, self.prior_weight)
         covariance = self.programme.covariance(self.prior_weight, rows, solution.x)
@@ -171,14 +175,13 @@ class Consistent(BatchEstimator):
             details=self._details(solution.x),
         )
 
-    def noise(self, factors: Factors, sigma: Array | None = None) -> Array:
+    def noise(self, factors: Factors) -> Array:
         """Return the noise levels, shape (n,) [N m or N], by the fit without the inequalities.
 
         Args:
             factors: The factors, of base parameters.
-            sigma: Those of weighted least squares, shape (n,), if they are known [N m or N].
         """
-        start = self._wls(factors).sigma if sigma is None else sigma
+        start = self._wls_noise(factors)
         return self.programme.noise(factors, start, self.independent_share, self.prior_weight)
 
     def rows(self, factors: Factors, sigma: Array) -> Array:
@@ -263,10 +266,11 @@ class Consistent(BatchEstimator):
         before = base_spread(self.K, self.prior_std, known)
         return determine(base_names, rows[:, :-1], before).undetermined
 
-    def _wls(self, factors: Factors) -> Estimate:
-        """Return weighted least squares; directions that the data leave open keep the prior."""
-        prior = self.K @ self.prior
-        return WLS(prior=prior, independent_share=self.independent_share).fit(factors)
+    def _wls_noise(self, factors: Factors) -> Array:
+        """Return the noise levels of weighted least squares, shape (n,) [N m or N]."""
+        if self.wls_noise is not None:
+            return self.wls_noise
+        return WLS(self.K @ self.prior, self.independent_share).fit(factors).sigma
 
     def _details(self, pi: Array) -> dict[str, Any]:
         """Return how it was fitted, as plain values."""

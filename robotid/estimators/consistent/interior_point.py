@@ -9,12 +9,16 @@ s = G x + h. Both are followed along one central path, Z_i J_i = t 1 and lambda_
 coordinates z of Nesterov and Todd, J_i = R_i (diag(l_i) + z_i) R_i^T, the Hessian of the barrier
 is the identity, however thin a body is.
 
+Several data sets, as the folds of a cross-validation, are fitted in one pass: their minima are the
+first axis, f, of every array.
+
 References:
     Nesterov, Todd (1998), Primal-dual interior-point methods for self-scaled cones; Mehrotra
     (1992), On the implementation of a primal-dual interior point method; Colombo, Gondzio (2008),
     Further development of multiple centrality correctors for interior point methods.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -69,33 +73,47 @@ class EntropicProblem:
     origin: Array
 
     def minimise(
-        self, A: Array, d: Array, weight: float, tolerance: float, start: ConeSolution | None = None
-    ) -> ConeSolution:
-        """Return the minimum.
+        self,
+        A: Array,
+        d: Array,
+        weight: float,
+        tolerance: float,
+        starts: Sequence[ConeSolution] | None = None,
+    ) -> list[ConeSolution]:
+        """Return the minimum of each data set.
 
         Args:
-            A: Coefficients of the data, shape (m, p).
-            d: Their right-hand side, shape (m,).
+            A: Coefficients of the data, shape (f, m, p).
+            d: Their right-hand sides, shape (f, m).
             weight: Weight w of the prior.
             tolerance: Share of the objective by which another step would lower it at most.
-            start: Minimum of nearly the same data, or at another weight.
+            starts: Minima of nearly the same data, or at another weight.
 
         Raises:
-            NotConvergedError: If it is not found in 100 steps, as where inequalities contradict
+            NotConvergedError: If one is not found in 100 steps, as where inequalities contradict
                 each other.
         """
-        point = self._first(A, d, weight) if start is None else self._near(start, weight)
+        point = self._first(A, d, weight) if starts is None else self._near(starts, weight)
+        found: dict[int, ConeSolution] = {}
+        left = np.arange(len(A))  # data sets that are not settled
         for step in range(1, _MOST + 1):
             try:
                 system = _System.of(self, point, A, d, weight)
             except np.linalg.LinAlgError:  # where inequalities contradict each other
                 break
             ahead = system.direction(weight, 0.0)
-            share = min(1.0, system.reach(ahead))
-            if system.is_settled(ahead, share, tolerance):
-                x = point.x + min(share, _BACK * system.reach_of_bodies(ahead)) * ahead.x
-                return ConeSolution(x, step, f"interior point, {step} steps", point.multipliers)
+            share = np.minimum(1.0, system.reach(ahead))
+            settled = system.is_settled(ahead, share, tolerance)
+            if settled.any():
+                length = np.minimum(share, _BACK * system.reach_of_bodies(ahead))
+                x, name = point.x + length[:, None] * ahead.x, f"interior point, {step} steps"
+                for k in np.flatnonzero(settled):
+                    found[left[k]] = ConeSolution(x[k], step, name, point.multipliers[k])
+            if settled.all():
+                return [found[k] for k in range(len(found))]
             point = system.corrected(ahead, share)
+            if settled.any():
+                A, d, left, point = A[~settled], d[~settled], left[~settled], point.of(~settled)
         raise NotConvergedError(
             f"the fit still changes after {step} steps at a prior weight of {weight:g}; use the "
             "'euclidean' prior or a larger weight",
@@ -113,109 +131,115 @@ class EntropicProblem:
         return np.asarray(np.linalg.inv(self.P))
 
     def bodies(self, x: Array) -> Array:
-        """Return the pseudo-inertias beside what is held, shape (n, 4, 4).
+        """Return the pseudo-inertias beside what is held, shape (f, n, 4, 4).
 
         Args:
-            x: A point, shape (p,).
+            x: Points, shape (f, p).
         """
-        own = (x[: self.inertial] - self.held) * self.scale[: self.inertial]
-        J: Array = (own.reshape(-1, _ENTRIES) @ _BASIS).reshape(-1, _SIZE, _SIZE)
-        return J
+        own = (x[:, : self.inertial] - self.held) * self.scale[: self.inertial]
+        J: Array = own.reshape(len(x), -1, _ENTRIES) @ _BASIS
+        return J.reshape(*J.shape[:2], _SIZE, _SIZE)
 
     def _first(self, A: Array, d: Array, weight: float) -> "_Point":
         """Return the prior, at a t by which it is about as far from the data as from itself."""
-        best = np.linalg.lstsq(A, d, rcond=None)[0]
-        missed = float(np.sum((A @ (self.centre - best)) ** 2))
-        t = max(weight, _FIRST * missed / max(_SIZE * len(self.P), 1))
-        return self._centred(self.centre, np.zeros(len(self.h)), t, t, weight)
+        missed = np.sum((A @ self.centre - d) ** 2, axis=1)
+        t = np.maximum(weight, _FIRST * missed / max(_SIZE * len(self.P), 1))[:, None]
+        x = np.broadcast_to(self.centre, (len(A), len(self.centre)))
+        return self._centred(x, np.zeros((len(A), len(self.h))), t, t, weight)
 
-    def _near(self, start: ConeSolution, weight: float) -> "_Point":
-        """Return a point beside a minimum."""
-        multipliers = np.zeros(len(self.h)) if start.multipliers is None else start.multipliers
-        return self._centred(start.x, multipliers, weight, _WARM * weight, weight)
+    def _near(self, starts: Sequence[ConeSolution], weight: float) -> "_Point":
+        """Return points beside minima."""
+        none, x = np.zeros(len(self.h)), np.array([start.x for start in starts])
+        multipliers = [none if s.multipliers is None else s.multipliers for s in starts]
+        t = np.full((len(x), 1), weight)
+        return self._centred(x, np.array(multipliers), t, _WARM * t, weight)
 
     def _centred(
-        self, x: Array, multipliers: Array, t: float, mu: float, weight: float
+        self, x: Array, multipliers: Array, t: Array, mu: Array, weight: float
     ) -> "_Point":
-        """Return the centred point that is nearest: Z J = t 1, and s lambda = mu of each row."""
+        """Return the centred points that are nearest: Z J = t 1, and s lambda = mu of each row."""
         inverse = np.linalg.inv(np.linalg.cholesky(self.bodies(x)))
         flat = _Coordinates.of(np.linalg.inv(inverse), self, weight)
-        unit = 1.0 / np.maximum((flat.into(self.G) ** 2).sum(axis=1), 1e-300)
-        gap = self.G @ x + self.h - unit * multipliers
+        unit = 1.0 / np.maximum((flat.into(self.G) ** 2).sum(axis=2), 1e-300)
+        gap = x @ self.G.T + self.h - unit * multipliers
         s = 0.5 * (gap + np.hypot(gap, 2.0 * np.sqrt(unit * mu)))
         s = np.maximum(s, _LEAST / np.sqrt(unit))
-        return _Point(x, t * inverse.swapaxes(1, 2) @ inverse, s, mu / s)
+        return _Point(x, t[:, :, None, None] * _transposed(inverse) @ inverse, s, mu / s)
 
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """A point of the path, or a step along it."""
+    """Points of the paths."""
 
-    x: Array  # (p,)
-    Z: Array  # (n, 4, 4)
-    s: Array  # (k,)
-    multipliers: Array  # (k,), lambda
+    x: Array  # (f, p)
+    Z: Array  # (f, n, 4, 4)
+    s: Array  # (f, k)
+    multipliers: Array  # (f, k), lambda
+
+    def of(self, which: Array) -> "_Point":
+        """Return some of them."""
+        return _Point(self.x[which], self.Z[which], self.s[which], self.multipliers[which])
 
 
 @dataclass(frozen=True, eq=False)
 class _Direction:
-    """A step, of the bodies in coordinates in which J and Z are diag(l)."""
+    """Steps, of the bodies in coordinates in which J and Z are diag(l)."""
 
-    z: Array  # (p,)
-    x: Array  # (p,)
-    J: Array  # (n, 4, 4)
-    Z: Array  # (n, 4, 4)
-    s: Array  # (k,)
-    multipliers: Array  # (k,)
+    z: Array  # (f, p)
+    x: Array  # (f, p)
+    J: Array  # (f, n, 4, 4)
+    Z: Array  # (f, n, 4, 4)
+    s: Array  # (f, k)
+    multipliers: Array  # (f, k)
 
 
 @dataclass(frozen=True, eq=False)
 class _Coordinates:
     """x = M z: of bodies J = R unsvec(z) R^T, of drives in units of their penalty."""
 
-    M: Array  # (n, 10, 10)
+    M: Array  # (f, n, 10, 10)
     drives: Array  # (p - 10 n,)
 
     @classmethod
     def of(cls, R: Array, problem: EntropicProblem, weight: float) -> "_Coordinates":
-        moved = svec(R[:, None] @ _UNITS @ R.swapaxes(1, 2)[:, None]) @ _TO_PARAMETERS
+        moved = svec(R[:, :, None] @ _UNITS @ _transposed(R)[:, :, None]) @ _TO_PARAMETERS
         own = problem.scale[: problem.inertial].reshape(-1, _ENTRIES, 1)
-        return cls(moved.swapaxes(1, 2) / own, 1.0 / (np.sqrt(weight) * problem.stiffness))
+        return cls(_transposed(moved) / own, 1.0 / (np.sqrt(weight) * problem.stiffness))
 
     def into(self, rows: Array) -> Array:
-        """Return rows of coefficients of x as those of z, shape (k, p)."""
-        n = len(self.M)
-        found = rows.copy()
-        by_body = rows[:, : _ENTRIES * n].reshape(-1, n, _ENTRIES).swapaxes(0, 1)
-        found[:, : _ENTRIES * n] = (by_body @ self.M).swapaxes(0, 1).reshape(-1, _ENTRIES * n)
-        found[:, _ENTRIES * n :] *= self.drives
+        """Return rows of coefficients of x as those of z, shape (f, k, p)."""
+        f, n = self.M.shape[:2]
+        k, size = rows.shape[-2], _ENTRIES * n
+        by_body = rows[..., :size].reshape(*rows.shape[:-1], n, _ENTRIES).swapaxes(-3, -2)
+        found = np.empty((f, k, rows.shape[-1]))
+        found[:, :, :size] = (by_body @ self.M).swapaxes(1, 2).reshape(f, k, size)
+        found[:, :, size:] = rows[..., size:] * self.drives
         return found
 
     def back(self, z: Array) -> Array:
-        """Return x, shape (p,)."""
-        n = len(self.M)
-        bodies = self.M @ z[: _ENTRIES * n].reshape(n, _ENTRIES, 1)
-        return np.concatenate([bodies.reshape(-1), self.drives * z[_ENTRIES * n :]])
+        """Return x, shape (f, p)."""
+        f, n = self.M.shape[:2]
+        bodies = self.M @ z[:, : _ENTRIES * n].reshape(f, n, _ENTRIES, 1)
+        return np.hstack([bodies.reshape(f, -1), self.drives * z[:, _ENTRIES * n :]])
 
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """The equations of a step from a point, factorised."""
+    """The equations of a step from each point, factorised."""
 
     problem: EntropicProblem
     point: _Point
     weight: float
-    R: Array  # (n, 4, 4): R^-1 J R^-T = R^T Z R = diag(l)
-    R_inverse: Array
-    length: Array  # (n, 4), l
+    R_inverse: Array  # (f, n, 4, 4): R^-1 J R^-T = R^T Z R = diag(l)
+    length: Array  # (f, n, 4), l
     coordinates: _Coordinates
     A: Array  # coefficients in z
     G: Array
     N: Array
-    gradient: Array  # (p,), of all but log det and inequalities, in z
-    value: float  # of the objective, its square of the residual not halved
-    ratio: Array  # (k,), lambda / s
-    factor: tuple[Array, bool]  # of the Hessian
+    gradient: Array  # (f, p), of all but log det and inequalities, in z
+    value: Array  # (f,), of the objective, its square of the residual not halved
+    ratio: Array  # (f, k), lambda / s
+    roots: list[Array]  # lower triangles of the Hessians
 
     @classmethod
     def of(
@@ -223,121 +247,156 @@ class _System:
     ) -> "_System":
         x, J = point.x, problem.bodies(point.x)
         L, Q = np.linalg.cholesky(J), np.linalg.cholesky(point.Z)
-        U, length, Vt = np.linalg.svd(Q.swapaxes(1, 2) @ L)
-        R = L @ Vt.swapaxes(1, 2) / np.sqrt(length)[:, None, :]
-        R_inverse = U.swapaxes(1, 2) @ Q.swapaxes(1, 2) / np.sqrt(length)[:, :, None]
+        U, length, Vt = np.linalg.svd(_transposed(Q) @ L)
+        R = L @ _transposed(Vt) / np.sqrt(length)[..., None, :]
+        R_inverse = _transposed(Q @ U) / np.sqrt(length)[..., None]
         coordinates = _Coordinates.of(R, problem, weight)
         A_z, G_z, N_z = (coordinates.into(rows) for rows in (A, problem.G, problem.N.T))
-        residual, drives = A @ x - d, problem.stiffness * (x - problem.centre)[problem.inertial :]
-        slope = weight * svec(R.swapaxes(1, 2) @ problem.P_inverse @ R).reshape(-1)
-        gradient = A_z.T @ residual + np.concatenate([slope, np.sqrt(weight) * drives])
+        residual = _times(A, x) - d
+        drives = problem.stiffness * (x - problem.centre)[:, problem.inertial :]
+        slope = weight * svec(_transposed(R) @ problem.P_inverse @ R).reshape(len(x), -1)
+        gradient = _times(_transposed(A_z), residual)
+        gradient += np.hstack([slope, np.sqrt(weight) * drives])
         ratio = point.multipliers / point.s
-        rows = np.concatenate([A_z, np.sqrt(ratio)[:, None] * G_z])
-        H = rows.T @ rows
-        H[np.diag_indices(len(x))] += 1.0
-        divergence = (
-            np.vdot(problem.P_inverse, J) - np.linalg.slogdet(problem.P_inverse @ J)[1].sum()
-        )
-        penalty = 2.0 * (divergence - length.size) + drives @ drives
+        rows = np.concatenate([A_z, np.sqrt(ratio)[:, :, None] * G_z], axis=1)
+        PJ = problem.P_inverse @ J
+        divergence = PJ.trace(axis1=2, axis2=3) - np.linalg.slogdet(PJ)[1] - _SIZE
+        penalty = 2.0 * divergence.sum(axis=1) + (drives**2).sum(axis=1)
         return cls(
-            problem, point, weight, R, R_inverse, length, coordinates, A_z, G_z, N_z, gradient,
-            float(residual @ residual + weight * penalty), ratio,
-            scipy.linalg.cho_factor(H, lower=True, check_finite=False),
+            problem, point, weight, R_inverse, length, coordinates, A_z, G_z, N_z, gradient,
+            (residual**2).sum(axis=1) + weight * penalty, ratio,
+            [_root(B.T @ B) for B in rows],
         )  # fmt: skip
 
     def direction(
-        self, t: float, mu: float, cross: Array | None = None, pairs: Array | float = 0.0
+        self,
+        t: Array | float,
+        mu: Array | float,
+        cross: Array | None = None,
+        pairs: Array | float = 0.0,
     ) -> _Direction:
-        """Return the step to where Z J = t 1 and lambda s = mu.
+        """Return the steps to where Z J = t 1 and lambda s = mu.
 
         Args:
-            t: Product of the bodies that is aimed at.
-            mu: That of the inequalities.
-            cross: Products of the changes of J and Z that are expected, shape (n, 4, 4).
-            pairs: Those of s and lambda, shape (k,).
+            t: Product of the bodies that is aimed at, shape (f, 1).
+            mu: That of the inequalities, shape (f, 1).
+            cross: Products of the changes of J and Z that are expected, shape (f, n, 4, 4).
+            pairs: Those of s and lambda, shape (f, k).
         """
-        point, length = self.point, self.length
-        bodies = np.zeros_like(self.R)  # what J and Z change by together, but for -diag(l)
+        point, length, size = self.point, self.length, self.problem.inertial
+        bodies = np.zeros_like(self.R_inverse)  # what J and Z change by together, but for -diag(l)
         if cross is not None:
-            bodies -= 2.0 * cross / (length[:, :, None] + length[:, None, :])
-        bodies[:, _EYE, _EYE] += t / length
-        short = self.problem.G @ point.x + self.problem.h - point.s
+            bodies -= 2.0 * cross / (length[..., :, None] + length[..., None, :])
+        bodies[..., _EYE, _EYE] += np.reshape(t, (-1, 1, 1)) / length
+        short = point.x @ self.problem.G.T + self.problem.h - point.s
         aim = (mu - pairs) / point.s
-        right = self.G.T @ (aim - self.ratio * short) - self.gradient
-        right[: self.problem.inertial] += svec(bodies).reshape(-1)
-        z = scipy.linalg.cho_solve(self.factor, right, check_finite=False)
-        if len(self.N):
+        right = _times(_transposed(self.G), aim - self.ratio * short) - self.gradient
+        right[:, :size] += svec(bodies).reshape(len(right), -1)
+        z = self._solve(right)
+        if self.N.shape[1]:
             columns, small = self._held
-            off = self.problem.N.T @ (point.x - self.problem.origin)
-            z = z - columns @ np.linalg.solve(small, self.N @ z + off)
-        J = unsvec(z[: self.problem.inertial])
+            off = (point.x - self.problem.origin) @ self.problem.N
+            z = z - _times(columns @ np.linalg.inv(small), _times(self.N, z) + off)
+        J = unsvec(z[:, :size]).reshape(bodies.shape)
         Z = bodies - J
-        Z[:, _EYE, _EYE] -= length
-        s = self.G @ z + short
+        Z[..., _EYE, _EYE] -= length
+        s = _times(self.G, z) + short
         multipliers = aim - point.multipliers - self.ratio * s
         return _Direction(z, self.coordinates.back(z), J, Z, s, multipliers)
 
     @cached_property
     def _held(self) -> tuple[Array, Array]:
-        """What the equalities' multipliers do to a step, shape (p, e), and to the equalities."""
-        columns = scipy.linalg.cho_solve(self.factor, self.N.T, check_finite=False)
+        """What the equalities' multipliers do to a step, shape (f, p, e), and to the equalities."""
+        columns = self._solve(_transposed(self.N))
         return columns, self.N @ columns
 
-    def corrected(self, ahead: _Direction, share: float) -> _Point:
-        """Return the point after a step that counts what the step ahead shows.
+    def _solve(self, right: Array) -> Array:
+        """Return the solutions of the equations of each point."""
+        pairs = zip(self.roots, right, strict=True)
+        return np.array([scipy.linalg.lapack.dpotrs(L, b, lower=True)[0] for L, b in pairs])
+
+    def corrected(self, ahead: _Direction, share: Array) -> _Point:
+        """Return the points after a step that counts what the step ahead shows.
 
         Args:
-            ahead: The step to the minimum.
-            share: How much of it keeps inside.
+            ahead: The steps to the minima.
+            share: How much of them keeps inside, shape (f,).
         """
-        point = self.point
-        mean, mu = float((self.length**2).mean()), _mean(point.multipliers * point.s)
-        left = (1.0 - share) ** 3
+        point, share = self.point, share[:, None]
+        mean = (self.length**2).mean(axis=(1, 2))[:, None]
+        mu = _mean(point.multipliers * point.s)
+        left, crossed = (1.0 - share) ** 3, 0.5 * (ahead.J @ ahead.Z + ahead.Z @ ahead.J)
 
-        def aimed(left: float, trust: float) -> tuple[_Direction, float]:
-            cross = 0.5 * trust * (ahead.J @ ahead.Z + ahead.Z @ ahead.J)
+        def aimed(left: Array, trust: Array) -> tuple[_Direction, Array]:
             pairs = trust * ahead.s * ahead.multipliers
-            t = self.weight + left * max(mean - self.weight, 0.0)
-            step = self.direction(t, left * mu, cross, pairs)
-            return step, min(1.0, _BACK * self.reach(step))
+            t = self.weight + left * np.maximum(mean - self.weight, 0.0)
+            step = self.direction(t, left * mu, trust[:, :, None, None] * crossed, pairs)
+            return step, np.minimum(1.0, _BACK * self.reach(step))[:, None]
 
         step, length = aimed(left, share)
-        if length < min(_SHORT, 0.5 * share):
-            step, length = aimed(max(left, _CENTRED), 0.0)
-        inverse = self.R_inverse
+        short = length < np.minimum(_SHORT, 0.5 * share)
+        if short.any():
+            left = np.where(short, np.maximum(left, _CENTRED), left)
+            step, length = aimed(left, np.where(short, 0.0, share))
+        Z = _transposed(self.R_inverse) @ step.Z @ self.R_inverse
         return _Point(
             point.x + length * step.x,
-            point.Z + length * inverse.swapaxes(1, 2) @ step.Z @ inverse,
-            np.maximum(point.s + length * step.s, _LEAST * np.sqrt((self.G**2).sum(axis=1))),
+            point.Z + length[:, :, None, None] * Z,
+            np.maximum(point.s + length * step.s, _LEAST * np.sqrt((self.G**2).sum(axis=2))),
             point.multipliers + length * step.multipliers,
         )
 
-    def reach(self, step: _Direction) -> float:
-        """Return the largest multiple of a step that keeps all positive."""
-        pairs = ((self.point.s, step.s), (self.point.multipliers, step.multipliers))
-        shortest = [float((-x[dx < 0] / dx[dx < 0]).min(initial=np.inf)) for x, dx in pairs]
-        return min(self.reach_of_bodies(step), *shortest)
+    def reach(self, step: _Direction) -> Array:
+        """Return the largest multiple of each step that keeps all positive, shape (f,)."""
+        x = np.hstack([self.point.s, self.point.multipliers])
+        rows = _to_zero(x, np.hstack([step.s, step.multipliers]))
+        return np.minimum(self.reach_of_bodies(step), rows)
 
-    def reach_of_bodies(self, step: _Direction) -> float:
-        """Return the largest multiple of a step that keeps J and Z positive definite."""
+    def reach_of_bodies(self, step: _Direction) -> Array:
+        """Return the largest multiple of each step that keeps J and Z positive definite."""
         root = np.sqrt(self.length)
-        unit = root[:, :, None] * root[:, None, :]
-        both = np.concatenate([step.J / unit, step.Z / unit])
-        lowest = float(np.linalg.eigvalsh(both)[:, 0].min(initial=0.0))
-        return -1.0 / lowest if lowest < 0 else float("inf")
+        unit = root[..., :, None] * root[..., None, :]
+        lowest = np.linalg.eigvalsh(np.hstack([step.J / unit, step.Z / unit]))[..., 0]
+        return _to_zero(np.ones_like(lowest), lowest)
 
-    def is_settled(self, ahead: _Direction, share: float, tolerance: float) -> bool:
-        """Return whether the step to the minimum changes nothing any more.
+    def is_settled(self, ahead: _Direction, share: Array, tolerance: float) -> Array:
+        """Return whether the step to each minimum changes nothing any more, shape (f,), bool.
 
         Args:
-            ahead: The step.
-            share: How much of it keeps inside.
+            ahead: The steps.
+            share: How much of them keeps inside, shape (f,).
             tolerance: Share of the objective that counts as nothing.
         """
         nothing = tolerance * (1.0 + self.value)
-        decrease = float(np.sum((self.A @ ahead.z) ** 2) + ahead.z @ ahead.z)
-        return share > 0.5 and decrease <= nothing
+        decrease = (_times(self.A, ahead.z) ** 2).sum(axis=1) + (ahead.z**2).sum(axis=1)
+        settled: Array = (share > 0.5) & (decrease <= nothing)
+        return settled
 
 
-def _mean(x: Array) -> float:
-    return float(x.mean()) if len(x) else 0.0
+def _root(A: Array) -> Array:
+    """Return L of L L^T = A + 1, shape (p, p), in its lower triangle."""
+    A.flat[:: len(A) + 1] += 1.0
+    L, info = scipy.linalg.lapack.dpotrf(A.T, lower=True, clean=False, overwrite_a=True)
+    if info:
+        raise np.linalg.LinAlgError(f"the Hessian is not positive definite in row {info}")
+    return np.asarray(L)
+
+
+def _mean(x: Array) -> Array:
+    """Return the means along the last axis, which is kept; 0 of nothing."""
+    return np.asarray(x.sum(axis=-1, keepdims=True) / max(x.shape[-1], 1))
+
+
+def _to_zero(x: Array, step: Array) -> Array:
+    """Return the largest multiple of each step that keeps positive x positive, shape (f,)."""
+    multiples = np.divide(-x, step, out=np.full_like(x, np.inf), where=step < 0)
+    return np.asarray(multiples.min(axis=-1, initial=np.inf))
+
+
+def _times(A: Array, x: Array) -> Array:
+    """Return the product of each matrix and vector, shape (f, m)."""
+    return np.asarray((A @ x[..., None])[..., 0])
+
+
+def _transposed(A: Array) -> Array:
+    return A.swapaxes(-1, -2)

@@ -58,13 +58,11 @@ class Segments:
         return cls(tuple(stretches), level, fit.rows(whole, level), fit.independent_share)
 
     @cached_property
-    def others(self) -> tuple[Array, ...]:
-        """Information of all segments but one, K arrays of shape (b + 1, b + 1)."""
+    def others(self) -> Array:
+        """Information of all segments but one, shape (K, b + 1, b + 1)."""
         level = self.sigma / np.sqrt(self.share)
-        return tuple(
-            merge([*self.kept[:k], *self.kept[k + 1 :]]).weighted(level)
-            for k in range(len(self.kept))
-        )
+        rest = [merge([*self.kept[:k], *self.kept[k + 1 :]]) for k in range(len(self.kept))]
+        return np.array([factors.weighted(level) for factors in rest])
 
 
 def choose_weight(fit: Consistent, segments: Segments, how: str) -> WeightChoice:
@@ -177,11 +175,9 @@ def _held_out(
             f"the prior's weight cannot be chosen from {len(segments.kept)} stretch; fit longer "
             "logs, or use prior_weight = 'evidence'"
         )
-    squares, fits = [], []
-    for k, (kept, others) in enumerate(zip(segments.kept, segments.others, strict=True)):
-        start = None if starts is None else starts[k]
-        fits.append(fit.programme.minimise(others, weight, is_exact=False, start=start))
-        squares.append(kept.residual_squares(fit.K @ fits[-1].x) / segments.sigma**2)
+    fits = fit.programme.minimise_each(segments.others, weight, is_exact=False, starts=starts)
+    pairs = zip(segments.kept, fits, strict=True)
+    squares = [kept.residual_squares(fit.K @ x.x) / segments.sigma**2 for kept, x in pairs]
     rows = np.sum([kept.rows for kept in segments.kept], axis=0)  # (n,)
     return np.array(squares) / np.maximum(rows, 1), fits
 

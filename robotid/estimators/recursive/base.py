@@ -28,7 +28,7 @@ __all__ = [
 StateT = TypeVar("StateT")
 
 
-class RecursiveEstimator(Estimator, Generic[StateT]):
+class RecursiveEstimator(Estimator[Problem], Generic[StateT]):
     """Settings go into the constructor, everything learnt into a state that is never changed.
 
     A state is a frozen dataclass of arrays and numbers: ``save_state`` and

@@ -144,3 +144,24 @@ def test_bounds_that_contradict_each_other_are_named(rng):
     fit = replace(fit, constraints=apart)
     with pytest.raises(NotConvergedError, match=r"no parameters meet all constraints .*extent"):
         fit.programme.minimise(rows, 1.0)
+
+
+@pytest.mark.parametrize("together", [2**17, 1])
+def test_data_sets_in_one_pass_are_fitted_as_one_by_one(together, rng, monkeypatch):
+    monkeypatch.setattr("robotid.estimators.consistent.cone_programme._TOGETHER", together)
+    fit, rows = random_fit("ur10_robot.urdf", rng)
+    body = fit.layout.bodies[4]
+    fit = replace(fit, constraints=Constraints(mass={body: (1.5, 1.5)}))
+    sets = np.array([size * rows for size in (1.0, 1e-3, 0.1)])
+    alone = [fit.programme.minimise(own, 1.0) for own in sets]
+    assert len({solution.n_iter for solution in alone}) > 1  # they settle at different steps
+    for starts in (None, alone):
+        every = fit.programme.minimise_each(sets, 0.3, starts=starts)
+        for k, (own, found) in enumerate(zip(sets, every, strict=True)):
+            start = None if starts is None else starts[k]
+            expected = fit.programme.minimise(own, 0.3, start=start)
+            assert found.n_iter == expected.n_iter
+            np.testing.assert_allclose(
+                found.x / fit.prior_std, expected.x / fit.prior_std, atol=1e-9
+            )
+            np.testing.assert_allclose(found.multipliers, expected.multipliers, atol=1e-6)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, recorded
 
-from robotid.commanded.fit import fit_loops
-from robotid.commanded.identify import identify_commands
-from robotid.commanded.settings import LoopSettings
+from robotid.closed_loop.fit import fit_loops
+from robotid.closed_loop.identify import identify_loops
+from robotid.closed_loop.settings import LoopSettings
 from robotid.exceptions import DataError, SettingsError
 from robotid.fitting.settings import SimulationSettings
 
@@ -133,7 +133,7 @@ def test_a_loop_that_is_soft_for_the_direct_method_is_named():
     robot = plant("planar", rng, kp=100.0, kd=20.0, delay=0.0)
     log, _ = recorded(robot, rng, duration=1.0, rate=250.0, torque=0.05)
     loop = LoopSettings(kp=100.0, kd=20.0, delay=0.0)
-    found = identify_commands(
+    found = identify_loops(
         robot.model, [log], [], loop, settings(error="direct", step=4e-3), chooses=False
     )
     [soft] = [f for f in found.findings if f.code == "soft_loop"]
@@ -151,7 +151,7 @@ def test_torques_that_are_not_of_the_loop_are_named():
 
     def missed(tau, loop):
         own = replace(log, tau=tau)
-        found = identify_commands(
+        found = identify_loops(
             robot.model, [own], [], loop, settings(torques=True, step=4e-3), chooses=False
         )
         return {f.where: f for f in found.findings if f.code == "torque_missed"}

@@ -1,17 +1,20 @@
 """The page of drives found from commands: its figures are those of the result and the logs."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.commanded_results import by_position, written_result
 from helpers.mujoco_plant import LEG, plant
-from helpers.pages import chart, charts, tables
+from helpers.pages import bars, chart, charts, tables
 
+from robotid.closed_loop.evaluation import OpenLoop
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
+from robotid.logs.data import Log
 from robotid.report.advice import Origin
-from robotid.report.commanded_page import Followed, _undetermined, write_commanded_report
+from robotid.report.loop_page import _undetermined, write_loop_report
 
 ERRORS = {"rmse": (2e-3, 4e-3, 8e-3), "command_rmse": (0.02, 0.05, 0.08), "urdf_rmse": (0.01,) * 3}
 REASON = "the calf is <i>off</i>"
@@ -31,7 +34,9 @@ def entry(log, scale):
 def followed():
     t, rng = np.linspace(1.0, 5.0, 400), np.random.default_rng(0)
     q = np.cumsum(rng.standard_normal((400, 3)), axis=0) * 0.01
-    return Followed("kept.csv", True, t, q + 0.03, q, q - 0.002 * np.arange(1, 4))
+    log = Log(t, q, 0.0 * q, LEG, path="kept.csv", q_ref=q + 0.03, has_torque=False)
+    none = np.zeros(3)
+    return OpenLoop(log, q - 0.002 * np.arange(1, 4), none, {"command": none}, {}, none)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +53,11 @@ def content(tmp_path_factory):
         position={LEG[2]: by_position(0.05, 0.3, -2.5, -1.0)},
         simulation=simulation,
         structure={"base": 0, "undetermined": ["FL_calf.Ixx"]},
-        verdict={"status": "usable", "reasons": [REASON]},
+        verdict={
+            "status": "usable",
+            "reasons": [REASON],
+            "per_joint": {LEG[2]: {"status": "usable", "reasons": [f"{LEG[2]}: it is soft"]}},
+        },
         warnings=[
             {
                 "code": "saturation",
@@ -58,14 +67,22 @@ def content(tmp_path_factory):
             }
         ],
     )
-    return load_result(folder).content
+    per_joint = {
+        joint: {
+            "relative_error_pct": 2.0 * (j + 1), "rmse": ERRORS["rmse"][j], "unit": "rad",
+            "command_relative_error_pct": 40.0, "urdf_relative_error_pct": 10.0,
+        }
+        for j, joint in enumerate(LEG)
+    }  # fmt: skip
+    kept = {"log": "logs/kept.csv", "per_joint": per_joint}
+    return {**load_result(folder).content, "validation": [kept]}
 
 
 @pytest.fixture(scope="module")
 def page(content, followed, tmp_path_factory):
     target = tmp_path_factory.mktemp("pages") / "report.html"
-    page = write_commanded_report(
-        content, [followed], target, files={"URDF": "a.urdf"}, origin=Origin((), "out")
+    page = write_loop_report(
+        content, [], [followed], target, files={"URDF": "a.urdf"}, origin=Origin((), "out")
     )
     return page.read_text()
 
@@ -85,9 +102,14 @@ def test_errors_are_those_of_the_result_in_mrad(page):
 
 
 def test_charts_show_commanded_measured_and_simulated_and_the_worst_joint_first(page, followed):
-    bars = chart(page, "open-loop position error of each joint")
-    assert bars["x_names"] == [*LEG[::-1]]
-    np.testing.assert_allclose(bars["series"][0]["y"], [8.0, 4.0, 2.0], rtol=1e-4)
+    found = bars(page)
+    assert list(found) == [*LEG[::-1]]
+    for width, (joint, (end, marks)) in zip((6.0, 4.0, 2.0), found.items(), strict=True):
+        assert 1.5 * end**2 / 100 == pytest.approx(width, rel=2e-3), joint
+        assert [1.5 * x**2 / 100 for x in marks] == pytest.approx([10.0, 40.0], rel=2e-3)
+    assert '<strong>usable</strong><span class="why">it is soft</span>' in page
+    assert ">5 good<" in page
+    assert ">30 usable<" in page
     horizon = chart(page, "position error over the horizon")
     np.testing.assert_allclose(horizon["x"], [0.1, 0.5, 4.0], rtol=1e-6)
     mean = horizon["series"][-1]
@@ -97,13 +119,14 @@ def test_charts_show_commanded_measured_and_simulated_and_the_worst_joint_first(
     assert [c["title"] for c in shown] == [f"position of {joint}" for joint in LEG[::-1]]
     lines = {series["label"]: series["y"] for series in shown[0]["series"]}
     for label, values in (
-        ("commanded", followed.q_ref), ("measured", followed.q), ("simulated", followed.q_sim),
+        ("commanded", followed.log.q_ref), ("measured", followed.log.q),
+        ("simulated", followed.q),
     ):  # fmt: skip
         np.testing.assert_allclose(lines[label], values[:, 2], atol=1e-4)
     error = chart(page, f"position error of {LEG[2]}")
     left = {series["label"]: series["y"] for series in error["series"]}
     np.testing.assert_allclose(left["measured − simulated"], 6.0, atol=1e-3)  # [mrad]
-    assert "kept.csv, kept apart: RMSE 6 mrad" in page
+    assert "kept.csv, 1 to 5 s, kept apart: RMSE 6 mrad" in page
 
 
 def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content):
@@ -124,6 +147,10 @@ def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content
     said = page[page.index("The logs leave these open") :]
     assert "FL_calf.Ixx" in said
     assert "kp of every joint, kd of every joint, masses of the URDF" in said
+    files = tables(page)["Files read"]
+    assert files.column("role") == ["URDF", "fitted"]
+    assert files.column("SHA-256") == ["not read from a file"] * 2
+    assert tables(page)["Versions that ran"].rows[0] == ["robotid", "0"]
 
 
 def test_proportional_commands_leave_no_claim_that_all_is_determined():
@@ -146,10 +173,16 @@ def test_findings_and_commands_are_shown(page):
 
 
 def test_logs_that_do_not_fit_are_refused(content, followed, tmp_path):
-    other = Followed("b.csv", True, followed.t, *[x[:, :2] for x in 3 * [followed.q]])
-    with pytest.raises(DataError, match=r"b.csv has 2 joints, the result 3"):
-        write_commanded_report(content, [other], tmp_path / "a.html")
-    with pytest.raises(DataError, match=r"c.csv: q_sim has shape \(399, 3\), wanted \(400, n\)"):
-        Followed("c.csv", True, followed.t, followed.q_ref, followed.q, followed.q_sim[1:])
-    write_commanded_report(content, [], tmp_path / "a.html")
+    other = replace(followed, q=followed.q[:, :2])
+    with pytest.raises(DataError, match=r"kept.csv has 2 joints, the result 3"):
+        write_loop_report(content, [other], [], tmp_path / "a.html")
+    write_loop_report(content, [], [], tmp_path / "a.html")
     assert "No log is at hand" in (tmp_path / "a.html").read_text()
+    write_loop_report(content, [followed], [], tmp_path / "a.html")
+    page = (tmp_path / "a.html").read_text()
+    assert "kept.csv, 1 to 5 s, fitted: RMSE 6 mrad" in page
+    driven = replace(followed, baselines={"steady": np.zeros(3)})
+    write_loop_report(content, [], [driven], tmp_path / "a.html")
+    shown = chart((tmp_path / "a.html").read_text(), f"position of {LEG[0]}")
+    labels = [line["label"] for line in shown["series"]]
+    assert labels == ["measured", "simulated"], "the torque drives it, no command"

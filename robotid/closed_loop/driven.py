@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robotid.commanded.unknowns import TorqueRows
+from robotid.closed_loop.unknowns import TorqueRows
 from robotid.exceptions import DataError
 from robotid.identification.pipeline import identify
 from robotid.identification.result import Identification

@@ -1,8 +1,7 @@
-"""The report of drives found from commands and positions: how well they follow, what they are."""
+"""The report of an identification by simulation: errors of positions, and the drives found."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -10,40 +9,43 @@ from typing import Any
 import numpy as np
 
 from robotid._files import write_text
-from robotid._typing import Array
-from robotid.commanded.errors import DRIFTS
+from robotid.closed_loop.evaluation import DRIFTS, OpenLoop
 from robotid.exceptions import DataError
 from robotid.export.ranges import stated_ranges
-from robotid.findings import Finding, grouped, listed
+from robotid.findings import Finding, listed
+from robotid.judgement.positions import GOOD, POOR
+from robotid.judgement.verdict import JointVerdict
 from robotid.pages.charts import Chart, Series, chart_html
 from robotid.pages.html import (
     Cell,
     Section,
     code,
-    facts_html,
     folded,
     number,
     page,
-    steps_html,
     table,
     text,
-    verdict_html,
     with_error,
 )
-from robotid.report.advice import Origin
-from robotid.report.causes import causes_html
+from robotid.report.advice import Origin, loop_steps
+from robotid.report.bars import Bar, Mark, bars_html
+from robotid.report.causes import findings_line, findings_section
+from robotid.report.summary_screen import first_screen
+from robotid.report.tables import input_table, version_table
 from robotid.versions import __version__
 
-__all__ = ["Followed", "write_commanded_report"]
+__all__ = ["write_loop_report"]
 
-#: What predicts a position beside the identified robot: key of its error, name, tone.
-_OTHERS = {
-    "second_order_rmse": ("second order", "tone-3"),
-    "rows_rmse": ("torques alone", "tone-3"),
-    "urdf_rmse": ("URDF", "urdf"),
-    "command_rmse": ("command", "quiet"),
-    "steady_rmse": ("same speed", "quiet"),
+#: What predicts a position beside the identified robot, by name of the baseline.
+_MARKS = {
+    "second_order": Mark("second order", "M-5 -1h10l-5 6z", "fill"),
+    "rows": Mark("torques alone", "M-5 19h10l-5 -6z", "fill"),
+    "urdf": Mark("URDF", "M0 0v18", "line"),
+    "command": Mark("command", "M-3 6l6 6m0 -6l-6 6", "line"),
+    "steady": Mark("same speed", "M-3 9h6", "line"),
 }
+#: The same by key of its error in result.json.
+_OTHERS = {f"{key}_rmse": mark.words for key, mark in _MARKS.items()}
 #: What the error of a joint is a share of, as a column says it.
 _SHARES = {"command_rmse": "% of command's", "steady_rmse": "% of same speed"}
 _ROWS = 24_000  # of all charts together: about half a MB
@@ -56,42 +58,10 @@ _FIRST_TERMS = ("kp", "kd", "delay", "limit", "zero")
 _ROLES = {"validation": "kept apart", "identification": "fitted"}
 
 
-@dataclass(frozen=True, eq=False)
-class Followed:
-    """A log of commands beside what the identified robot does on the same commands.
-
-    Attributes:
-        name: Its file and window, for captions.
-        is_kept: Whether it was kept apart from the fit.
-        t: Times, shape (N,) [s].
-        q_ref: Commanded positions, shape (N, n) [rad or m]; None where the logged torque drives
-            the robot.
-        q: Measured ones, likewise.
-        q_sim: Simulated ones, likewise: an open loop from the first sample on, or from where it
-            was put back to what was measured.
-    """
-
-    name: str
-    is_kept: bool
-    t: Array
-    q_ref: Array | None
-    q: Array
-    q_sim: Array
-
-    def __post_init__(self) -> None:
-        for key in ("q_ref", "q", "q_sim"):
-            if key == "q_ref" and self.q_ref is None:
-                continue
-            shape = getattr(self, key).shape
-            if shape != self.q.shape or len(shape) != 2 or shape[0] != len(self.t):
-                raise DataError(
-                    f"{self.name}: {key} has shape {shape}, wanted ({len(self.t)}, n) as q has"
-                )
-
-
-def write_commanded_report(
+def write_loop_report(
     content: Mapping[str, Any],
-    followed: Sequence[Followed],
+    fitted: Sequence[OpenLoop],
+    kept: Sequence[OpenLoop],
     target: str | Path,
     *,
     files: Mapping[str, str] | None = None,
@@ -103,7 +73,8 @@ def write_commanded_report(
 
     Args:
         content: Content of the result.json.
-        followed: The logs to show.
+        fitted: The fitted logs, with the positions simulated for them.
+        kept: The same of logs kept apart.
         target: The file to write.
         files: Files beside it to link to, by what they are, as "URDF".
         origin: Where the results are, for the commands that it shows; none if not said.
@@ -115,22 +86,33 @@ def write_commanded_report(
         DataError: If a log has other joints than the result, or the target has no folder.
     """
     joints = content["joints"]
-    for log in followed:
-        if log.q.shape[1] != len(joints):
-            raise DataError(f"{log.name} has {log.q.shape[1]} joints, the result {len(joints)}")
-    worst = [*_shown(content)["per_joint"]]
+    for run in (*kept, *fitted):
+        if run.q.shape[1] != len(joints):
+            raise DataError(f"{run.log.name} has {run.q.shape[1]} joints, the result {len(joints)}")
+    bars = _bars(content)
+    worst = [bar.joint for bar in bars]
+    findings = [
+        Finding(entry["code"], entry["severity"], entry["where"], entry["message"])
+        for entry in content.get("warnings", [])
+    ]
+    line = findings_line(findings, joints, worst[0])
+    drives = content["drive_parameters"]
+    known = sum(entry.get("std_error") is not None for entry in drives)
     sections = {
-        "errors": Section("Errors", _errors(content)),
-        "positions": Section("Positions", _positions(content, followed, worst)),
-        "drives": Section("Drives", _drives(content)),
-        "open": Section("What cannot be told", _undetermined(content)),
-        "findings": Section("Findings", _findings(content)),
+        "errors": Section("Errors", _errors(content), f"{len(joints)} joints, by recording", False),
+        "findings": Section("Findings", findings_section(findings, joints, worst), line, False),
+        "positions": Section("Positions", _positions(content, fitted, kept, worst)),
+        "drives": Section("Drives", _drives(content), f"{known} of {len(drives)} found", False),
         "appendix": Section("Appendix", _appendix(content)),
     }
-    verdict = content["verdict"]
-    header = verdict_html(content["robot"], verdict["status"], verdict["reasons"])
-    header += _facts(content, files or {}) + _first_charts(content)
-    header += _next(content, origin or Origin())
+    others = {key for bar in bars for key, error in bar.others.items() if error is not None}
+    marks = {key: mark for key, mark in _MARKS.items() if key in others}
+    note = "of its motion, not fitted" if content["validation"] else "of its motion, fitted logs"
+    header = first_screen(
+        content["robot"], content["verdict"], _facts(content), files or {},
+        bars_html("Simulated position error", note, bars, marks, (GOOD, POOR)),
+        loop_steps(content, origin or Origin()),
+    )  # fmt: skip
     source = "roll-outs of its torques" if _is_driven(content) else "commands"
     title = f"{content['robot']}: drives from {source}"
     return write_text(page(title, header, sections), target)
@@ -171,7 +153,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return math.exp(float(np.mean(np.log(np.array(values, dtype=float)))))
 
 
-def _facts(content: Mapping[str, Any], files: Mapping[str, str]) -> str:
+def _facts(content: Mapping[str, Any]) -> dict[str, str]:
     role, entry = _entries(content)[0]
     joints = entry["per_joint"].values()
     ours = _mean([each["rmse"] for each in joints])
@@ -185,7 +167,7 @@ def _facts(content: Mapping[str, Any], files: Mapping[str, str]) -> str:
     }
     times = [
         f"{label} {(ratio := theirs / ours):{'.2g' if ratio < 99.5 else '.0f'}} ×"
-        for key, (label, _) in _OTHERS.items()
+        for key, label in _OTHERS.items()
         if ours and (theirs := _mean([each.get(key) for each in joints]))
     ]
     if times:
@@ -193,68 +175,30 @@ def _facts(content: Mapping[str, Any], files: Mapping[str, str]) -> str:
     found = sum(entry.get("std_error") is not None for entry in content["drive_parameters"])
     stated = len(content["drive_parameters"]) - found
     facts["Drive parameters"] = f"{found} found, {stated} stated or held"
-    return facts_html(facts, files)
+    return facts
 
 
-def _first_charts(content: Mapping[str, Any]) -> str:
-    """Return errors by joint beside those of models, and errors over the horizon."""
-    role, shown = _entries(content)[0][0], _shown(content)
-    joints = shown["per_joint"]
-    kinds = {"rmse": ("identified", "predicted"), **_OTHERS}
-    series = tuple(
-        Series(label, np.array([_scaled(each.get(key)) for each in joints.values()]), tone, "bars")
-        for key, (label, tone) in kinds.items()
-        if key not in ("command_rmse", "steady_rmse")
-        and any(each.get(key) is not None for each in joints.values())
-    )
-    bars = Chart(
-        "open-loop position error of each joint", np.arange(len(joints), dtype=float), series,
-        "", f"RMSE [{_unit(shown)}]", height=220, x_names=tuple(joints),
-    )  # fmt: skip
-    said = f"{escape(_name(shown))}, {_ROLES[role]}"
-    return (
-        f'<div class="plots">\n{chart_html(bars, f"Position missed in open loop: {said}")}'
-        f"{_horizon_chart(shown, said)}</div>\n"
-    )
+def _bars(content: Mapping[str, Any]) -> list[Bar]:
+    """Return the errors of joints on the log kept apart where each is worst, the worst first."""
+    errors: dict[str, Mapping[str, Any]] = {}
+    for metrics in content["validation"] or [content["identification"]]:
+        for joint, own in metrics["per_joint"].items():
+            if joint not in errors or _share(own) > _share(errors[joint]):
+                errors[joint] = own
+    verdicts, joints, found = content["verdict"].get("per_joint", {}), content["joints"], []
+    for joint in sorted(joints, key=lambda joint: -_share(errors.get(joint, {}))):
+        own, j = errors.get(joint, {}), joints.index(joint)
+        others = {key: own.get(f"{key}_relative_error_pct") for key in _MARKS}
+        stated = verdicts.get(joint, {"status": "not evaluated", "reasons": ()})
+        verdict = JointVerdict(stated["status"], tuple(stated["reasons"]))
+        error = own.get("relative_error_pct")
+        found.append(Bar(j, joint, error, others, verdict, f"position-{j}"))
+    return found
 
 
-def _next(content: Mapping[str, Any], origin: Origin) -> str:
-    """Return what may be done with the result, as commands to copy."""
-    urdf, log = (
-        next((x["path"] for x in content["inputs"] if x["role"] == role), "")
-        for role in ("urdf", "identification")
-    )
-    result, robot = f"{origin.folder}/result.json", content["robot"] or "robot"
-    uses = {
-        "See commanded, measured and simulated robot.": ("replay", urdf, log, result),
-        "Simulate it in MuJoCo, gains and delays included.": (
-            "export", result, "--format", "mjcf", "--out", f"{robot}.xml",
-        ),
-        "Train with it in Isaac Lab.": (
-            "export", result, "--format", "isaac", "--out", f"{robot}_actuators.yaml",
-        ),
-        "Draw its drives at random, within their intervals.": (
-            "export", result, "--format", "ranges", "--out", f"{robot}_ranges.yaml",
-        ),
-    }  # fmt: skip
-    if _is_driven(content):  # which has no gains
-        uses = {
-            "See measured and predicted torque.": ("replay", urdf, log, result),
-            "Simulate it in MuJoCo.": (
-                "export", result, "--format", "mjcf", "--out", f"{robot}.xml",
-            ),
-        }  # fmt: skip
-    return steps_html(
-        (words, origin.using(*command)) for words, command in uses.items() if origin.folder
-    )
-
-
-def _findings(content: Mapping[str, Any]) -> str:
-    findings = [
-        Finding(entry["code"], entry["severity"], entry["where"], entry["message"])
-        for entry in content.get("warnings", [])
-    ]
-    return causes_html(grouped(findings, content["joints"]))
+def _share(measured: Mapping[str, Any]) -> float:
+    value = measured.get("relative_error_pct")
+    return -1.0 if value is None else float(value)
 
 
 def _scaled(value: float | None) -> float:
@@ -300,16 +244,17 @@ def _errors(content: Mapping[str, Any]) -> str:
             "tell by themselves, the URDF with drives fitted to them, and going on at the speed of "
             "the start."
         )
-    return f"<p>{words}</p>\n" + "".join(
-        _error_table(role, entry) for role, entry in _entries(content)
-    )
+    (role, _), shown = _entries(content)[0], _shown(content)
+    chart = _horizon_chart(shown, f"{escape(_name(shown))}, {_ROLES[role]}")
+    tables = "".join(_error_table(role, entry) for role, entry in _entries(content))
+    return f"<p>{words}</p>\n{chart}{tables}"
 
 
 def _error_table(role: str, entry: Mapping[str, Any]) -> str:
     joints, horizons = entry["per_joint"], entry.get("horizons", {})
     others = [key for key in _OTHERS if any(each.get(key) is not None for each in joints.values())]
     plain = "steady_rmse" if "steady_rmse" in others else "command_rmse"
-    headers = ["joint", "RMSE", _SHARES[plain], *(_OTHERS[key][0] for key in others)]
+    headers = ["joint", "RMSE", _SHARES[plain], *(_OTHERS[key] for key in others)]
     headers += [f"over {float(h):g} s" for h in horizons]
 
     def cells(first: Cell, own: Mapping[str, Any], short: Sequence[float | None]) -> list[Cell]:
@@ -332,13 +277,17 @@ def _error_table(role: str, entry: Mapping[str, Any]) -> str:
 
 
 def _positions(
-    content: Mapping[str, Any], followed: Sequence[Followed], worst: Sequence[str]
+    content: Mapping[str, Any],
+    fitted: Sequence[OpenLoop],
+    kept: Sequence[OpenLoop],
+    worst: Sequence[str],
 ) -> str:
     """Return charts of each joint in every log, the worst joints open."""
     joints = content["joints"]
-    if not followed:
+    runs = [*((run, "kept apart") for run in kept), *((run, "fitted") for run in fitted)]
+    if not runs:
         return "<p>No log is at hand to be shown.</p>\n"
-    points = min(_LONGEST, max(200, _ROWS // (2 * len(joints) * len(followed))))
+    points = min(_LONGEST, max(200, _ROWS // (2 * len(joints) * len(runs))))
     units = {name: each["unit"] for _, entry in _entries(content)
              for name, each in entry["per_joint"].items()}  # fmt: skip
     words = (
@@ -353,26 +302,27 @@ def _positions(
     for joint in [*worst, *(name for name in joints if name not in worst)]:
         j = joints.index(joint)
         charts = "".join(
-            _charts(log, j, joint, units.get(joint, "rad"), link=f"log {k}", points=points)
-            for k, log in enumerate(followed)
+            _charts(run, kind, j, joint, units.get(joint, "rad"), link=f"log {k}", points=points)
+            for k, (run, kind) in enumerate(runs)
         )
         summary, is_open = f"<strong>{code(joint).html}</strong>", joint in worst[:_OPEN]
         parts.append(folded(f"position-{j}", summary, charts, is_open=is_open))
     return "".join(parts)
 
 
-def _charts(log: Followed, j: int, joint: str, unit: str, *, link: str, points: int) -> str:
+def _charts(
+    run: OpenLoop, kind: str, j: int, joint: str, unit: str, *, link: str, points: int
+) -> str:
     """Return positions of a joint in a log, and how far they are from what was measured."""
-    q, q_sim = log.q[:, j], log.q_sim[:, j]
+    log, q, q_sim = run.log, run.log.q[:, j], run.q[:, j]
     positions = [Series("measured", q, "text"), Series("simulated", q_sim, "predicted")]
     left = [Series("measured − simulated", (q - q_sim) / _SMALL, "residual")]
-    if log.q_ref is not None:
+    if log.q_ref is not None and not run.is_driven:
         q_ref = log.q_ref[:, j]
         positions.insert(0, Series("commanded", q_ref, "tone-5"))
         far = (q - q_ref) / _SMALL
         left.insert(0, Series("measured − commanded", far, "tone-5", is_hidden=True))
     rmse = float(np.sqrt(np.nanmean((q - q_sim) ** 2))) / _SMALL
-    kind = "kept apart" if log.is_kept else "fitted"
     above = Chart(
         f"position of {joint}", log.t, tuple(positions), "time [s]", f"position [{unit}]", link=link
     )
@@ -380,7 +330,8 @@ def _charts(log: Followed, j: int, joint: str, unit: str, *, link: str, points: 
         f"position error of {joint}", log.t, tuple(left), "time [s]", f"error [m{unit}]",
         link=link, height=110,
     )  # fmt: skip
-    caption = f"{escape(log.name)}, {kind}: RMSE {rmse:.3g} m{unit}"
+    window = f"{escape(log.name)}, {log.t[0]:.4g} to {log.t[-1]:.4g} s"
+    caption = f"{window}, {kind}: RMSE {rmse:.3g} m{unit}"
     return chart_html(above, caption, points=points) + chart_html(below, "", points=points)
 
 
@@ -473,7 +424,7 @@ def _undetermined(content: Mapping[str, Any]) -> str:
     else:
         parts.append("<p>The logs determine all that was to be found.</p>\n")
     for entry in structure.get("not_told_apart", []):
-        parts.append(f"<p>{escape(_told(entry))}</p>\n")
+        parts.append(f"<p>Only together: {escape(listed(entry['names']))}.</p>\n")
     if _is_driven(content):
         return "".join(parts)
     parts.append(
@@ -499,27 +450,20 @@ def _held(content: Mapping[str, Any]) -> str:
     return listed([*said, "masses of the URDF"])
 
 
-def _told(entry: Any) -> str:  # noqa: ANN401
-    """Return in words parameters that are known only together."""
-    if isinstance(entry, Mapping):
-        names = entry.get("names") or entry.get("parameters") or list(map(str, entry.values()))
-        return f"Only together: {listed(map(str, names))}."
-    return f"Only together: {entry}."
-
-
 def _appendix(content: Mapping[str, Any]) -> str:
     controller = content["simulation"]["controller"]
     rows = [[text(key), text(_words(value))] for key, value in controller.items()]
-    inputs = [
-        [text(entry["role"]), code(entry["path"]), code((entry["sha256"] or "")[:16])]
-        for entry in content["inputs"]
-    ]
-    versions = {"robotid": content["robotid"], **content.get("versions", {})}
-    return (
-        table("Controller", ["setting", "value"], rows)
-        + table("Inputs", ["role", "file", "SHA-256 begins with"], inputs)
-        + table("Versions", ["of", "version"], [[text(k), text(v)] for k, v in versions.items()])
-        + f'<p class="note">Written by robotid {__version__}.</p>\n'
+    parts = {
+        "open": ("What the data do not determine", _undetermined(content)),
+        "settings": ("Controller", table("Controller", ["setting", "value"], rows)),
+        "inputs": ("Inputs", input_table(content["inputs"])),
+        "versions": (
+            "Versions",
+            version_table({"robotid": content["robotid"], **content.get("versions", {})}),
+        ),
+    }
+    return "".join(folded(key, title, html) for key, (title, html) in parts.items()) + (
+        f'<p class="note">Written by robotid {__version__}.</p>\n'
     )
 
 

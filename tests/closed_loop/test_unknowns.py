@@ -5,10 +5,10 @@ import pinocchio as pin
 import pytest
 from helpers.mujoco_plant import multisine, plant, recorded
 
-from robotid.commanded.drive_torques import drive_torques, find_gains, measured_motion
-from robotid.commanded.fit import stated_loops
-from robotid.commanded.settings import LoopSettings
-from robotid.commanded.unknowns import LoopSimulator, Unknown, body_unknowns
+from robotid.closed_loop.drive_torques import drive_torques, find_gains, measured_motion
+from robotid.closed_loop.fit import stated_loops
+from robotid.closed_loop.settings import LoopSettings
+from robotid.closed_loop.unknowns import LoopSimulator, Unknown, body_unknowns
 from robotid.estimators.output_error import OutputError
 from robotid.export.commanded import loops_of
 from robotid.logs.data import Log

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 from helpers.mujoco_plant import multisine, plant
 
-from robotid.commanded.unknowns import LoopSimulator, Unknown
+from robotid.closed_loop.unknowns import LoopSimulator, Unknown
 from robotid.export.commanded import loops_of
 from robotid.logs.data import Log
 from robotid.simulation.loops import LoopedRobot, cut_windows

@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 
 from robotid._typing import Array
-from robotid.commanded.unknowns import LoopSimulator, Unknown
+from robotid.closed_loop.unknowns import LoopSimulator, Unknown
 from robotid.estimators.output_error import OutputError
 from robotid.exceptions import NotConvergedError
 from robotid.robot.drives import TERMS
@@ -101,7 +101,7 @@ def fit_second_order(
     unknowns = _unknowns(robot, start, torque, finds_delay)
     some = windows[:: max(1, len(windows) // _FITTED)]
     simulator = LoopSimulator(robot, some, start, unknowns)
-    theta = OutputError(whitens=False, steps=_STEPS).fit(simulator, simulator.prior).theta
+    theta = OutputError(whitens=False, steps=_STEPS).fit(simulator).theta
     return SecondOrder(simulator, theta, simulator.loops(theta), torque)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.commanded.unknowns import LoopSimulator, Unknown
+from robotid.closed_loop.unknowns import LoopSimulator, Unknown
 from robotid.estimators.estimator import Estimate
 from robotid.estimators.output_error import OutputError
 

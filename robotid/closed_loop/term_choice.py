@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.commanded.unknowns import LoopSimulator, Unknown
+from robotid.closed_loop.unknowns import LoopSimulator, Unknown
 from robotid.estimators.output_error import OutputError, linearised
 from robotid.robot.drives import DriveTerm, LoadFriction, PositionCoulomb, Stribeck
 

@@ -5,16 +5,16 @@ import pytest
 from helpers.mujoco_plant import held, multisine, plant, recorded
 from helpers.single_joint import slider
 
-from robotid.commanded.errors import run_open_loop
-from robotid.commanded.fit import stated_loops
-from robotid.commanded.identify import identify_commands
-from robotid.commanded.open_loop_verdict import judge_open_loops
-from robotid.commanded.second_order import SecondOrder
-from robotid.commanded.settings import LoopSettings
-from robotid.commanded.term_choice import _Fold, _gains
+from robotid.closed_loop.evaluation import position_metrics, run_open_loop
+from robotid.closed_loop.fit import stated_loops
+from robotid.closed_loop.identify import identify_loops
+from robotid.closed_loop.second_order import SecondOrder
+from robotid.closed_loop.settings import LoopSettings
+from robotid.closed_loop.term_choice import _Fold, _gains
 from robotid.exceptions import DataError
 from robotid.findings import Finding
 from robotid.fitting.settings import SimulationSettings
+from robotid.judgement.positions import judge_positions
 from robotid.logs.data import Log
 from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Presliding, Viscous
 from robotid.simulation.loops import LoopedRobot, cut_windows
@@ -44,7 +44,7 @@ def found(leg):
     robot, log, kept = leg
     evidence = {"frequency": 2.0, "shortest": 0.0, "longest": 0.09}
     slow = Finding("slow_command", "warning", "log", "any delay explains it", evidence)
-    return identify_commands(
+    return identify_loops(
         robot.model, [log], [kept], stated(robot), SETTINGS, chooses=False, examined=[slow]
     )
 
@@ -54,11 +54,11 @@ def scaleless(leg):
     """What is found without gains, hip and thigh having the same drives."""
     robot, log, kept = leg
     loop = LoopSettings(groups={"upper": list(robot.model.joints[:2])})
-    return identify_commands(robot.model, [log], [kept], loop, SETTINGS, chooses=False)
+    return identify_loops(robot.model, [log], [kept], loop, SETTINGS, chooses=False)
 
 
 def test_the_drives_of_a_leg_are_recovered_within_their_errors(leg, found):
-    truth, estimate = leg[0].truth, found.fitted.estimate
+    truth, estimate = leg[0].truth, found.fit.estimate
     assert estimate.converged
     assert {name.rpartition(".")[2] for name in estimate.names} == {
         "armature", "viscous", "coulomb", "offset", "delay",
@@ -67,7 +67,7 @@ def test_the_drives_of_a_leg_are_recovered_within_their_errors(leg, found):
         assert abs(value - truth[name]) < 3.3 * error, name
         if not name.endswith("offset"):  # which is 0
             assert error < 0.15 * truth[name], name
-    windows = found.fitted.simulator.windows
+    windows = found.fit.simulator.windows
     assert {len(window.log.t) for window in windows} == {len(leg[1].t)}, "kept ones are not fitted"
 
 
@@ -80,13 +80,13 @@ def test_drives_behind_a_slow_clock_are_recovered_once_it_is_stated(rng):
     worst = {}
     for rate in (100.0, None):
         loop = stated(robot, rate=rate)
-        found = identify_commands(robot.model, [log], [], loop, SETTINGS, chooses=False)
-        values = dict(zip(found.fitted.estimate.names, found.fitted.estimate.theta, strict=True))
+        found = identify_loops(robot.model, [log], [], loop, SETTINGS, chooses=False)
+        values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
         off = {
             what: max(abs(values[f"{d.joint}.{what}"] / getattr(d, what) - 1) for d in robot.drives)
             for what in ("armature", "viscous")
         }
-        worst[rate] = (max(off.values()), found.errors[0].rmse.max())
+        worst[rate] = (max(off.values()), found.fitted[0].rmse.max())
         late = max(value for name, value in values.items() if name.endswith("delay"))
         assert rate is None or late < 2e-4
     assert worst[100.0] == pytest.approx((0.0, 1e-4), abs=0.02), worst
@@ -98,8 +98,8 @@ def test_the_drives_of_an_arm_are_recovered_with_steps_that_are_halved():
     rng = np.random.default_rng(1)
     robot = plant("planar", rng)
     log, truth = recorded(robot, rng, duration=4.0, rate=250.0, noise=3e-4, step=1e-4)
-    found = identify_commands(robot.model, [log], [], stated(robot), COARSE, chooses=False)
-    estimate, fine = found.fitted.estimate, found.fitted.simulator.fine
+    found = identify_loops(robot.model, [log], [], stated(robot), COARSE, chooses=False)
+    estimate, fine = found.fit.estimate, found.fit.simulator.fine
     errors = np.array(
         [value - truth[n] for n, value in zip(estimate.names, estimate.theta, strict=True)]
     )
@@ -115,7 +115,7 @@ def test_the_drives_of_an_arm_are_recovered_with_steps_that_are_halved():
 def test_the_standard_parameters_are_what_was_found(leg, found):
     names = found.model.layout.names
     values = dict(zip(names, found.standard, strict=True))
-    estimate = found.fitted.estimate
+    estimate = found.fit.estimate
     errors = dict(zip(names, np.sqrt(np.diag(found.standard_covariance)), strict=True))
     for name, value, error in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
         if name in values:
@@ -126,15 +126,18 @@ def test_the_standard_parameters_are_what_was_found(leg, found):
 
 
 def test_open_loops_beat_plainer_models(leg, found):
-    [run] = found.kept
+    [run] = found.validation
     assert found.verdict.status == "good"
     assert (run.rmse < 1.2 * NOISE).all()
-    for other in (run.command, run.urdf, run.second_order):
+    assert list(run.baselines) == ["command", "urdf", "second_order"]
+    for other in run.baselines.values():
         assert (run.rmse < 0.9 * other).all()
-    np.testing.assert_allclose(run.command, np.sqrt(np.mean((run.log.q_ref - run.log.q) ** 2, 0)))
+    np.testing.assert_allclose(
+        run.baselines["command"], np.sqrt(np.mean((run.log.q_ref - run.log.q) ** 2, 0))
+    )
     np.testing.assert_allclose(run.rmse, np.sqrt(np.mean((run.log.q - run.q) ** 2, axis=0)))
     assert list(run.horizons) == [0.1, 0.5, 2.0]
-    robot, loops = found.fitted.simulator.robot, found.fitted.loops
+    robot, loops = found.fit.simulator.robot, found.fit.loops
     for horizon, error in run.horizons.items():
         assert (error < 3 * NOISE).all()
         outs = robot.roll_out(loops, cut_windows(run.log, horizon, 0.0))
@@ -144,32 +147,37 @@ def test_open_loops_beat_plainer_models(leg, found):
 
 def test_each_kept_log_is_judged(leg, found):
     _, log, kept = leg
-    robot, loops = found.fitted.simulator.robot, found.fitted.loops
+    robot, loops = found.fit.simulator.robot, found.fit.loops
     n = 400  # 0.8 s
     short = replace(log, t=log.t[:n], q=log.q[:n], tau=log.tau[:n], q_ref=log.q_ref[:n])
     assert list(run_open_loop(robot, loops, short).horizons) == [0.1, 0.5], "as long as the log"
-    [good], otherwise = found.kept, replace(kept, q=kept.q[::-1].copy())
+    [good], otherwise = found.validation, replace(kept, q=kept.q[::-1].copy())
     poor = run_open_loop(robot, loops, otherwise)
     for runs in ((good, poor), (poor, good)):
-        verdict = replace(found, kept=runs).verdict
+        verdict = replace(found, validation=runs).verdict
         assert verdict.status == "poor"
         assert "the open loop misses" in verdict.reasons[0]
-    verdict = replace(found, kept=()).verdict
+    verdict = replace(found, validation=()).verdict
     assert verdict.status == "not evaluated"
     assert verdict.reasons[0].startswith("no log was kept apart")
 
 
 def test_a_joint_that_is_told_to_stand_is_not_evaluated(leg, found):
-    joints, [run] = leg[0].model.joints, found.kept
+    model, [run] = leg[0].model, found.validation
+    joints = model.joints
+
+    def judged(runs):
+        return judge_positions(position_metrics(model, runs, moving=True), joints, is_kept=True)
+
     still = replace(run.log, q_ref=np.where([True, True, False], run.log.q_ref, run.log.q_ref[0]))
     stands = replace(run, log=still, spread=np.array([*run.spread[:2], 1e-4]))
-    verdict = judge_open_loops(joints, [stands], is_kept=True)
+    verdict = judged([stands])
     assert [verdict.joints[joint].status for joint in joints] == ["good", "good", "not evaluated"]
     assert verdict.status == "usable"
     assert verdict.reasons == (f"{joints[2]} is told to stand still: nothing tests it",)
-    assert judge_open_loops(joints, [stands, run], is_kept=True).status == "good"
+    assert judged([stands, run]).status == "good"
     nobody = replace(run, log=replace(still, q_ref=np.tile(still.q_ref[0], (len(still.t), 1))))
-    assert judge_open_loops(joints, [nobody], is_kept=True).status == "not evaluated"
+    assert judged([nobody]).status == "not evaluated"
 
 
 def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(scaleless):
@@ -177,12 +185,12 @@ def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(scaleless):
     [scale] = [f for f in scaleless.findings if f.code == "scale"]
     assert scale.severity == "warning"
     assert "state kp in [controller]" in scale.message
-    assert scaleless.kept[0].urdf is None, "without gains, the URDF has no open loop"
+    assert scaleless.validation[0].baselines["urdf"] is None, "no open loop without gains"
 
 
 def test_joints_of_a_group_share_their_drive(leg, scaleless):
     hip, thigh, calf = leg[0].model.joints
-    names, loops = scaleless.fitted.estimate.names, scaleless.fitted.loops
+    names, loops = scaleless.fit.estimate.names, scaleless.fit.loops
     for shared in ("kp", "armature", "viscous"):
         assert f"upper.{shared}" in names
         assert f"{calf}.{shared}" in names
@@ -197,7 +205,7 @@ def test_of_many_scales_that_suit_the_positions_the_urdfs_is_taken():
     robot = plant("planar", rng)
     log, truth = recorded(robot, rng, duration=3.0, rate=250.0, step=2e-4)
     settings, loop = replace(COARSE, bodies=0.1), LoopSettings(delays="group")
-    fitted = identify_commands(robot.model, [log], [], loop, settings, chooses=False).fitted
+    fitted = identify_loops(robot.model, [log], [], loop, settings, chooses=False).fit
     gains = [unknown.what == "kp" for unknown in fitted.simulator.unknowns]
     exact = np.array([truth[name] for name in np.array(fitted.estimate.names)[gains]])
     np.testing.assert_allclose(fitted.estimate.theta[gains], exact, rtol=0.02)
@@ -214,7 +222,7 @@ def test_a_joint_whose_inertia_does_not_show_begins_as_the_fastest_loop(leg):
 def test_a_stated_delay_that_is_wrong_is_no_good_result(leg):
     robot, log, kept = leg
     wrong = stated(robot, delay=0.03)
-    found = identify_commands(robot.model, [log], [kept], wrong, SETTINGS, chooses=False)
+    found = identify_loops(robot.model, [log], [kept], wrong, SETTINGS, chooses=False)
     [bound] = [f for f in found.findings if f.code == "at_bound"]
     assert bound.severity == "warning"
     assert "armature" in bound.message
@@ -233,12 +241,12 @@ def test_a_stated_gain_is_named_as_what_the_scale_rests_on(found):
 def test_stated_gains_that_the_bodies_contradict_are_named(leg, found):
     robot, log, kept = leg
     assert not [f for f in found.findings if f.code == "gains_contradicted"]
-    scale = found.fitted.scale
+    scale = found.fit.scale
     assert (np.abs(scale.change) < 4.0 * scale.error).all()
     assert abs(scale.common) < 4.0 * scale.common_error < 0.05
     gains = {k: {d.joint: 1.25 * getattr(d, k) for d in robot.drives} for k in ("kp", "kd")}
     wrong = stated(robot, **gains)
-    other = identify_commands(robot.model, [log], [kept], wrong, SETTINGS, chooses=False)
+    other = identify_loops(robot.model, [log], [kept], wrong, SETTINGS, chooses=False)
     [named] = [f for f in other.findings if f.code == "gains_contradicted"]
     assert named.severity == "warning"
     assert named.where == "controller"
@@ -253,7 +261,7 @@ def test_a_slow_command_does_not_contradict_the_delay_that_was_found(found):
     [settled] = [f for f in found.findings if f.code == "slow_command"]
     assert settled.severity == "note"
     assert "any delay" not in settled.message
-    names, errors = found.fitted.estimate.names, found.fitted.estimate.std_error
+    names, errors = found.fit.estimate.names, found.fit.estimate.std_error
     worst = max(e for n, e in zip(names, errors, strict=True) if n.endswith("delay"))
     assert settled.evidence["std_error"] == pytest.approx(worst)
     assert f"{1e3 * worst:.2g} ms" in settled.message
@@ -279,13 +287,13 @@ def test_friction_by_position_is_found_where_it_is_and_nowhere_else(leg):
     told = Log(t, q_ref, np.zeros_like(q_ref), model.joints, q_ref=q_ref, has_torque=False)
     [out] = LoopedRobot(model, step=5e-4).roll_out(loops, cut_windows(told, np.inf, 0.0))
     log = replace(told, q=out.q + 3e-4 * rng.standard_normal(out.q.shape))
-    found = identify_commands(model, [log], [], stated(robot), COARSE)
-    chosen = {(t.joint, t.terms) for t in found.fitted.tried if t.is_chosen}
+    found = identify_loops(model, [log], [], stated(robot), COARSE)
+    chosen = {(t.joint, t.terms) for t in found.fit.tried if t.is_chosen}
     assert {joint for joint, _ in chosen} == {model.joints[2]}
-    values = dict(zip(found.fitted.estimate.names, found.fitted.estimate.theta, strict=True))
+    values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
     [name] = [f.where for f in found.findings if f.code == "friction_found"]
     assert name == model.joints[2]
-    terms = [t for t in found.fitted.loops.terms[2] if isinstance(t, PositionCoulomb)]
+    terms = [t for t in found.fit.loops.terms[2] if isinstance(t, PositionCoulomb)]
     parts = zip((1, 2), terms, strict=True)
     q = np.linspace(centre - 0.2, centre + 0.2, 9)
     size = values[f"{name}.coulomb"] + sum(
@@ -309,8 +317,8 @@ def test_friction_with_a_stated_way_is_recovered(tmp_path, rng):
     told = Log(t, q_ref, 0 * q_ref, ("j",), q_ref=q_ref, has_torque=False)
     [out] = LoopedRobot(model, step=5e-4).roll_out(loops, cut_windows(told, np.inf, 0.0))
     log = replace(told, q=out.q + 1e-4 * rng.standard_normal(out.q.shape))
-    found = identify_commands(model, [log], [], loop, SETTINGS, chooses=False)
-    values = dict(zip(found.fitted.estimate.names, found.fitted.estimate.theta, strict=True))
+    found = identify_loops(model, [log], [], loop, SETTINGS, chooses=False)
+    values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
     for name, value in (("armature", 0.5), ("viscous", 5.0), ("presliding", 8.0)):
         assert values[f"j.{name}"] == pytest.approx(value, rel=0.05)
     assert "j.presliding" in found.model.layout.names
@@ -320,9 +328,9 @@ def test_a_log_without_commands_is_refused(leg):
     robot, log, _ = leg
     bare = replace(log, q_ref=None)
     with pytest.raises(DataError, match=r"has no commands, which the estimator 'simulation'"):
-        identify_commands(robot.model, [bare], [], stated(robot), SETTINGS)
+        identify_loops(robot.model, [bare], [], stated(robot), SETTINGS)
     with pytest.raises(DataError, match="no log was given"):
-        identify_commands(robot.model, [], [], stated(robot), SETTINGS)
+        identify_loops(robot.model, [], [], stated(robot), SETTINGS)
 
 
 def test_terms_that_no_other_window_judges_gain_nothing():

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, recorded
 
-from robotid.commanded.fit import stated_loops
-from robotid.commanded.identify import identify_commands
-from robotid.commanded.settings import LoopSettings
-from robotid.commanded.unknowns import LoopSimulator, body_unknowns
-from robotid.commanded.zeros import CLEAR, find_encoders, parallel_axes
+from robotid.closed_loop.fit import stated_loops
+from robotid.closed_loop.identify import identify_loops
+from robotid.closed_loop.settings import LoopSettings
+from robotid.closed_loop.unknowns import LoopSimulator, body_unknowns
+from robotid.closed_loop.zeros import CLEAR, find_encoders, parallel_axes
 from robotid.fitting.settings import SimulationSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -57,8 +57,8 @@ def test_a_zero_is_found_to_the_grid_and_then_by_the_fit(moved):
     loop = LoopSettings(
         kp={d.joint: d.kp for d in drives}, kd={d.joint: d.kd for d in drives}, zeros="find"
     )
-    found = identify_commands(robot.model, [log], [], loop, SETTINGS, chooses=False)
-    zero = dict(zip(found.fitted.estimate.names, found.fitted.estimate.theta, strict=True))
+    found = identify_loops(robot.model, [log], [], loop, SETTINGS, chooses=False)
+    zero = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
     assert zero["FL_thigh_joint.zero"] == pytest.approx(AWAY, abs=0.03)
     [said] = [f for f in found.findings if f.code == "encoder"]
     assert said.where == "FL_thigh_joint"
@@ -103,23 +103,21 @@ def test_torques_tell_the_gains_that_positions_leave_open():
     log, truth = recorded(robot, rng, duration=3.4, rate=250.0, noise=1e-4, torque=0.5, step=1e-4)
     settings, loop = replace(SETTINGS, bodies=0.1), LoopSettings(delays="group")
     open_, told = (
-        identify_commands(robot.model, [each], [], loop, settings, chooses=False)
+        identify_loops(robot.model, [each], [], loop, settings, chooses=False)
         for each in (replace(log, tau=0 * log.tau, has_torque=False), log)
     )
     for joint in robot.model.joints:
         name = f"{joint}.kp"
-        k, m = (list(f.fitted.estimate.names).index(name) for f in (open_, told))
-        assert told.fitted.estimate.theta[m] == pytest.approx(truth[name], rel=0.001)
-        assert told.fitted.simulator.prior[m] == pytest.approx(truth[name], rel=0.01), (
-            "begins there"
-        )
-        error, before = told.fitted.estimate.std_error[m], open_.fitted.estimate.std_error[k]
+        k, m = (list(f.fit.estimate.names).index(name) for f in (open_, told))
+        assert told.fit.estimate.theta[m] == pytest.approx(truth[name], rel=0.001)
+        assert told.fit.simulator.prior[m] == pytest.approx(truth[name], rel=0.01), "begins there"
+        error, before = told.fit.estimate.std_error[m], open_.fit.estimate.std_error[k]
         assert error < 0.01 * before
-    estimate = told.fitted.estimate
+    estimate = told.fit.estimate
     np.testing.assert_allclose(estimate.sigma[2:], 0.5, rtol=0.05)  # of torques: nothing is left
     for name, value, std in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
         if not name.endswith("offset") and name in truth:  # the plant's friction creeps
             assert abs(value - truth[name]) < 4 * std, name
-    assert f"{robot.model.joints[0]}.kd" in told.fitted.estimate.names
+    assert f"{robot.model.joints[0]}.kd" in told.fit.estimate.names
     assert "scale" in {f.code for f in open_.findings}
     assert "scale" not in {f.code for f in told.findings}

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robotid._typing import Array
-from robotid.commanded.second_order import SecondOrder
-from robotid.commanded.settings import LoopSettings
-from robotid.commanded.unknowns import Unknown
-from robotid.commanded.zeros import Encoders
+from robotid.closed_loop.second_order import SecondOrder
+from robotid.closed_loop.settings import LoopSettings
+from robotid.closed_loop.unknowns import Unknown
+from robotid.closed_loop.zeros import Encoders
 from robotid.robot.drives import DriveTerm, Viscous
 from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
-from robotid.commanded.drive_torques import find_gains, measured_motion
-from robotid.commanded.driven import identified_rows, torque_rows
-from robotid.commanded.errors import DRIFTS
-from robotid.commanded.gain_check import GainScale, gain_scale
-from robotid.commanded.initial_values import (
+from robotid.closed_loop.drive_torques import find_gains, measured_motion
+from robotid.closed_loop.driven import identified_rows, torque_rows
+from robotid.closed_loop.evaluation import DRIFTS
+from robotid.closed_loop.gain_check import GainScale, gain_scale
+from robotid.closed_loop.initial_values import (
     drive_unknowns,
     first_loops,
     is_stated,
@@ -19,11 +19,11 @@ from robotid.commanded.initial_values import (
     usual_sizes_of_torques,
     zero_unknowns,
 )
-from robotid.commanded.second_order import SecondOrder, fit_second_order
-from robotid.commanded.settings import LoopSettings, groups_of
-from robotid.commanded.term_choice import Tried, candidates, choose
-from robotid.commanded.unknowns import LoopSimulator, Unknown, body_unknowns, with_terms
-from robotid.commanded.zeros import Encoders, find_encoders, same_encoders
+from robotid.closed_loop.second_order import SecondOrder, fit_second_order
+from robotid.closed_loop.settings import LoopSettings, groups_of
+from robotid.closed_loop.term_choice import Tried, candidates, choose
+from robotid.closed_loop.unknowns import LoopSimulator, Unknown, body_unknowns, with_terms
+from robotid.closed_loop.zeros import Encoders, find_encoders, same_encoders
 from robotid.doctor.command_channels import largest_speeds
 from robotid.estimators.estimator import Estimate
 from robotid.estimators.output_error import OutputError
@@ -127,7 +127,7 @@ def fit_loops(
         unknowns=tuple(simulator.unknowns[k] for k in drives),
     )
     theta = simulator.prior.copy()
-    theta[drives] = replace(estimator, rounds=1).fit(few, few.prior).theta
+    theta[drives] = replace(estimator, rounds=1).fit(few).theta
     simulator = replace(simulator, error=settings.error)
     for left in reversed(range(_STARTS)):
         simulator = simulator.begun_better(theta)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robotid.commanded.gain_check import GainScale
+from robotid.closed_loop.gain_check import GainScale
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from helpers.mujoco_plant import loaded, plant, rolled_out
 
-from robotid.commanded.fit import fit_loops
-from robotid.commanded.identify import identify_commands
-from robotid.commanded.settings import LoopSettings
+from robotid.closed_loop.fit import fit_loops
+from robotid.closed_loop.identify import identify_loops
+from robotid.closed_loop.settings import LoopSettings
 from robotid.doctor.command_channels import largest_speeds
 from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
@@ -52,17 +52,17 @@ def test_a_drive_at_its_limit_has_it_found(limited):
     assert largest_speeds(log).keys() == {calf}
     coulomb = robot.drives[2].coulomb
     assert largest_speeds(log)[calf] == pytest.approx((LIMIT - coulomb) / VISCOUS, rel=0.15)
-    found = identify_commands(robot.model, [log], [], gains(robot), SETTINGS, chooses=False)
-    estimate = found.fitted.estimate
+    found = identify_loops(robot.model, [log], [], gains(robot), SETTINGS, chooses=False)
+    estimate = found.fit.estimate
     values = dict(zip(estimate.names, estimate.theta, strict=True))
     assert [name for name in values if name.endswith("limit")] == [f"{calf}.limit"]
     assert values[f"{calf}.limit"] == pytest.approx(LIMIT, rel=0.03)
     assert values[f"{calf}.viscous"] == pytest.approx(VISCOUS, rel=0.03)
     assert values[f"{calf}.coulomb"] == pytest.approx(coulomb, rel=0.3)
-    np.testing.assert_array_equal(found.fitted.loops.limit[:2], np.inf)
+    np.testing.assert_array_equal(found.fit.loops.limit[:2], np.inf)
     assert [name for name in values if name.endswith("delay")] == ["robot.delay"]
     assert values["robot.delay"] == pytest.approx(DELAY, abs=2e-4)
-    np.testing.assert_array_equal(found.fitted.loops.delay, values["robot.delay"])
+    np.testing.assert_array_equal(found.fit.loops.delay, values["robot.delay"])
     [said] = [f for f in found.findings if f.code == "limit"]
     assert said.where == calf
     assert said.evidence["limit"] == values[f"{calf}.limit"]

@@ -1,6 +1,6 @@
 import pytest
 
-from robotid.commanded.settings import LoopSettings, groups_of
+from robotid.closed_loop.settings import LoopSettings, groups_of
 from robotid.exceptions import SettingsError
 
 JOINTS = ("FL_hip_joint", "FL_calf_joint", "FR_hip_joint", "FR_calf_joint", "tail")

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, torque_log
 
-from robotid.commanded.driven import driven_log, torque_rows
-from robotid.commanded.errors import DRIFTS, run_open_loop
-from robotid.commanded.identify import identify_commands
-from robotid.commanded.settings import LoopSettings
+from robotid.closed_loop.driven import driven_log, torque_rows
+from robotid.closed_loop.evaluation import DRIFTS, run_open_loop
+from robotid.closed_loop.identify import identify_loops
+from robotid.closed_loop.settings import LoopSettings
 from robotid.exceptions import DataError
 from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
@@ -39,7 +39,7 @@ def arm():
 def found_by(arm, **settings):
     robot, log, kept = arm
     chosen = SimulationSettings(bodies=0.0, step=4e-3, **settings)
-    return identify_commands(
+    return identify_loops(
         robot.model, [log], [kept], DRIVEN, chosen, signals=SIGNALS, chooses=False
     )
 
@@ -87,49 +87,49 @@ def assert_drives_are_found(robot, estimate, share):
 
 
 def test_roll_outs_alone_find_the_drives_of_an_arm(arm, alone):
-    estimate = alone.fitted.estimate
+    estimate = alone.fit.estimate
     assert estimate.converged
     kinds = {name.rpartition(".")[2] for name in estimate.names}
     assert kinds == {"armature", "viscous", "coulomb", "offset"}, "no gain, no delay"
-    assert alone.fitted.simulator.torque is None
+    assert alone.fit.simulator.torque is None
     assert_drives_are_found(arm[0], estimate, 0.04)
     urdf = arm[0].model.standard_parameters()[:20]
     np.testing.assert_array_equal(alone.standard[:20], urdf)  # bodies stay: bodies=0
 
 
 def test_rows_of_torque_and_roll_outs_weigh_in_one_estimate(arm, alone, both):
-    simulator, estimate = both.fitted.simulator, both.fitted.estimate
+    simulator, estimate = both.fit.simulator, both.fit.estimate
     assert estimate.converged
     assert_drives_are_found(arm[0], estimate, 0.04)
     A, _ = simulator.rows(estimate.theta)
     # each row counts by half, for what it drives counts, too
-    whole = torque_rows(both.fitted.linear)
+    whole = torque_rows(both.fit.linear)
     np.testing.assert_allclose(np.sqrt(2.0) * simulator.torque.R, whole.R, atol=1e-9)
     # one noise is in both: they tell no more than the better of them, by itself
     rows = np.linalg.inv(2.0 * A.T @ A + np.diag(1.0 / simulator.prior_std**2))
-    best = np.minimum(np.sqrt(np.diag(rows)), alone.fitted.estimate.std_error)
+    best = np.minimum(np.sqrt(np.diag(rows)), alone.fit.estimate.std_error)
     assert (estimate.std_error > 0.5 * best).all()
 
 
 def test_open_loops_of_torques_are_put_back_and_beside_plainer_models(arm, both):
-    [run] = both.kept
-    robot, loops = both.fitted.simulator.robot, both.fitted.loops
+    [run] = both.validation
+    robot, loops = both.fit.simulator.robot, both.fit.loops
     windows = cut_windows(run.log, DRIFTS, 0.0)
     assert {round(w.log.t[w.stop - 1] - w.log.t[w.first], 2) for w in windows} == {0.5}
     q = np.concatenate([out.q for out in robot.roll_out(loops, windows)])
     np.testing.assert_allclose(run.rmse, np.sqrt(np.mean((run.log.q - q) ** 2, axis=0)))
-    assert run.command is None
-    assert run.second_order is None
+    assert run.baselines["command"] is None
+    assert run.baselines["second_order"] is None
     start = np.concatenate([np.tile(w.start[0], (w.stop - w.first, 1)) for w in windows])
     speed = np.concatenate([
         np.outer(w.log.t[w.counted] - w.log.t[w.first], w.start[1]) for w in windows
     ])  # fmt: skip
     np.testing.assert_allclose(run.spread, np.sqrt(np.mean((run.log.q - start) ** 2, axis=0)))
     on = np.sqrt(np.mean((run.log.q - start - speed) ** 2, axis=0))
-    np.testing.assert_allclose(run.steady, on)
-    for other in (run.steady, run.urdf, run.rows):
+    np.testing.assert_allclose(run.baselines["steady"], on)
+    for other in map(run.baselines.get, ("steady", "urdf", "rows")):
         assert (run.rmse < 1.05 * other).all()
-    assert (run.rmse < 0.02 * run.steady).all()
+    assert (run.rmse < 0.02 * run.baselines["steady"]).all()
     assert both.verdict.status in ("good", "usable")
 
 
@@ -150,4 +150,4 @@ def test_a_log_without_torque_drives_nothing(arm):
     robot, log, _ = arm
     bare = Log(log.t, log.q, np.zeros_like(log.q), log.joints, has_torque=False)
     with pytest.raises(DataError, match=r"has no torque, which drives the robot"):
-        identify_commands(robot.model, [bare], [], DRIVEN, SimulationSettings())
+        identify_loops(robot.model, [bare], [], DRIVEN, SimulationSettings())

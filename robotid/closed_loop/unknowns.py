@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from robotid._typing import Array
-from robotid.commanded.drive_torques import drive_torques
+from robotid.closed_loop.drive_torques import drive_torques
 from robotid.estimators.output_error import Residual
 from robotid.exceptions import NotConvergedError
 from robotid.logs.data import Trajectory

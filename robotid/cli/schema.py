@@ -1,0 +1,30 @@
+"""robotid schema: the JSON schema of job files, for editors."""
+
+import argparse
+import json
+
+__all__ = ["SUMMARY", "add_flags", "run"]
+
+SUMMARY = "print the JSON schema of job files, for editors"
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the command: it has none.
+
+    Args:
+        parser: Its parser.
+    """
+    parser.epilog = (
+        "robotid schema > job.schema.json; then `#:schema job.schema.json` in a job file"
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the command.
+
+    Args:
+        options: Its flags.
+    """
+    from robotid.commands.schema import job_schema
+
+    print(json.dumps(job_schema(), indent=2))

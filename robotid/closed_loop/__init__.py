@@ -1,0 +1,3 @@
+"""Closed-loop identification: drives, loops and bodies by simulation, compared with positions."""
+
+__all__: list[str] = []

@@ -1,0 +1,126 @@
+"""identify_loops(): from a model and logs of commands to drives, loops, bodies and trust."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from robotid._typing import ProgressCallback, ignore_progress, report_stage
+from robotid.closed_loop.driven import driven_log
+from robotid.closed_loop.evaluation import run_open_loop
+from robotid.closed_loop.findings import loop_findings
+from robotid.closed_loop.fit import STAGES, Fitted, fit_loops, stated_loops
+from robotid.closed_loop.result import LoopIdentification, identified_loops
+from robotid.closed_loop.settings import LoopSettings
+from robotid.exceptions import DataError
+from robotid.findings import Finding
+from robotid.fitting.settings import SimulationSettings
+from robotid.identification.result import Asked
+from robotid.judgement.verdict import alarming
+from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.prediction import predict_instants
+from robotid.robot.model import RobotModel
+from robotid.simulation.loops import Loops, open_loops
+
+__all__ = ["identify_loops", "with_gravity"]
+
+
+def identify_loops(
+    model: RobotModel,
+    logs: Sequence[Log],
+    kept: Sequence[Log],
+    loop: LoopSettings,
+    settings: SimulationSettings,
+    *,
+    signals: SignalSettings | None = None,
+    chooses: bool = True,
+    examined: Sequence[Finding] = (),
+    ignore: Sequence[str] = (),
+    progress: ProgressCallback = ignore_progress,
+) -> LoopIdentification:
+    """Identify drives, loops and bodies from logs of commands and positions.
+
+    Args:
+        model: The robot.
+        logs: Logs to fit, of its joints in its order, with commands, or with torques if these
+            drive the robot.
+        kept: Logs kept apart.
+        loop: What is known of the loops.
+        settings: The estimator's.
+        signals: How torques become rows, and how late they are.
+        chooses: Whether further friction is tried.
+        examined: What the doctor found in the logs.
+        ignore: Codes of its errors that you know better.
+        progress: Told of the stages.
+
+    Raises:
+        DataError: If there is no log, or one has no commands.
+        MissingDependencyError: If Numba is not installed.
+        NotConvergedError: If it cannot be rolled out.
+        SettingsError: If a setting does not fit the robot.
+    """
+    if not logs:
+        raise DataError("no log was given; at least one is needed to identify anything")
+    told = signals or SignalSettings()
+    if loop.kind == "torque":
+        logs, kept = ([driven_log(model, log, told) for log in part] for part in (logs, kept))
+    for log in (*logs, *kept):
+        if log.q_ref is None:
+            raise DataError(
+                f"{log.name} has no commands, which the estimator 'simulation' follows; record "
+                "columns qref_ of each joint, or have its torque drive the robot: [controller] "
+                "kind = 'torque'"
+            )
+    if loop.gravity_compensation:
+        logs, kept = ([with_gravity(model, log) for log in part] for part in (logs, kept))
+    fitted = fit_loops(
+        model, logs, loop, settings, signals=signals, chooses=chooses, progress=progress
+    )
+    report_stage(progress, "testing", STAGES)
+    sign = fitted.encoders.sign
+    runs = [
+        [
+            run_open_loop(
+                fitted.simulator.robot, fitted.loops, log.turned(sign),
+                _others(model, loop, fitted),
+            )
+            for log in part
+        ]
+        for part in (logs, kept)
+    ]  # fmt: skip
+    found = identified_loops(model, loop, settings, fitted, *map(tuple, runs))
+    found = replace(
+        found,
+        alarms=tuple(finding.message for finding in alarming(examined, ignore)),
+        asked=Asked(told, ignore=tuple(ignore)),
+    )
+    return replace(found, findings=loop_findings(found, examined))
+
+
+def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, Loops]:
+    """Return plainer models by name, as ``run_open_loop`` takes them.
+
+    With the stated gains the URDF has no friction, and rotors that weigh nothing.
+    """
+    if fitted.linear is not None:
+        driven, found = fitted.linear.urdf_with_drives, fitted.linear.standard
+        return {"urdf": open_loops(model, driven), "rows": open_loops(model, found)}
+    others = {} if fitted.plain is None else {"second_order": fitted.plain.loops}
+    if loop.kp is not None and not any(u.what == "kp" for u in fitted.simulator.unknowns):
+        n, stated = len(model.joints), stated_loops(model, loop)
+        bare = replace(stated, terms=((),) * n, values=np.zeros(0), armature=np.full(n, 1e-9))
+        others["urdf"] = bare
+    return others
+
+
+def with_gravity(model: RobotModel, log: Log) -> Log:
+    """Return a log whose fed-forward torque has that of gravity by the URDF, as measured.
+
+    Args:
+        model: The robot as its URDF says.
+        log: The log, of its joints in its order, with commands.
+    """
+    torque = predict_instants(model, model.standard_parameters(), log.q)
+    fed = torque if log.tau_ref is None else log.tau_ref + torque
+    return replace(log, tau_ref=fed)

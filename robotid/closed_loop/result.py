@@ -1,0 +1,246 @@
+"""What is identified from commands and positions, or from roll-outs of logged torques."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.closed_loop.evaluation import OpenLoop, position_metrics
+from robotid.closed_loop.fit import Fitted
+from robotid.closed_loop.settings import LoopSettings
+from robotid.closed_loop.unknowns import with_terms
+from robotid.estimators.estimator import Estimate
+from robotid.findings import Finding
+from robotid.fitting.bands import REACH
+from robotid.fitting.identified import FROM_PRIOR, Identified, sources_of
+from robotid.fitting.metrics import Metrics
+from robotid.fitting.settings import SimulationSettings
+from robotid.identification.result import Asked
+from robotid.judgement.positions import judge_positions
+from robotid.judgement.verdict import Verdict
+from robotid.logs.data import Log, Trajectory
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.friction_projection import DriveMoments, drive_moments
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import pseudo_inertia
+
+__all__ = ["STATED_SCALE", "LoopIdentification", "identified_loops", "logged_motion"]
+
+#: What positions and stated gains leave open.
+STATED_SCALE = (
+    "positions do not show the scale: all drive and inertial parameters scale with kp as stated "
+    "(kp stated 20 % too large makes all 20 % too large); log a torque to test it"
+)
+_TOGETHER = 0.98  # correlation from which two parameters are told together only
+_CAUTIONS = ("at_bound", "coarse_steps", "gains_contradicted")  # keep a result from being good
+_GAP = 3.0  # median steps: across a longer one no speed is computed
+_MOVING = 0.05  # of a joint's largest speed, below which differences of positions are noise
+
+
+@dataclass(frozen=True, eq=False)
+class LoopIdentification(Identified):
+    """Everything that an identification by simulation found.
+
+    Attributes:
+        loop: What was stated of the loops.
+        estimator: The estimator's settings.
+        fit: The fit.
+        fitted: The fitted logs, with the positions simulated for them.
+        validation: The same of the logs that were kept apart.
+        findings: What the user should know.
+        alarms: Faults of the logs that make the result wrong, as the doctor found them.
+        report: File of the report, if one was written with the result.
+        asked: Signals and findings to ignore, as they were asked for.
+    """
+
+    loop: LoopSettings
+    estimator: SimulationSettings
+    fit: Fitted
+    fitted: tuple[OpenLoop, ...]
+    validation: tuple[OpenLoop, ...]
+    findings: tuple[Finding, ...] = ()
+    alarms: tuple[str, ...] = ()
+    report: str = ""
+    asked: Asked = field(default_factory=Asked)
+
+    @property
+    def estimate(self) -> Estimate:
+        """What the estimator returned: the unknowns of loops, drives and bodies."""
+        return self.fit.estimate
+
+    @cached_property
+    def _slopes(self) -> Array:
+        """Standard parameters by unknowns, shape (p, c)."""
+        return self.fit.simulator.standard(self.model, self.estimate.theta)[1]
+
+    @property
+    def standard_error(self) -> Array:
+        """Standard errors of the standard parameters, shape (p,); inf of what was not fitted."""
+        return _errors(self.standard_covariance)
+
+    @cached_property
+    def standard_reach(self) -> Array:
+        """How many standard errors the 95 % interval of each standard parameter reaches, (p,).
+
+        The quantile is that of the unknown, of those it follows from, whose standard error has the
+        fewest degrees of freedom.
+        """
+        own = np.where(self._slopes != 0.0, self.estimate.reach, REACH)
+        reach: Array = own.max(axis=1, initial=REACH)
+        return reach
+
+    @property
+    def base_reach(self) -> Array:
+        """The same of each base parameter, (b,), of the standard parameters that it sums."""
+        reach: Array = np.where(self.mapping.K != 0.0, self.standard_reach, REACH).max(axis=1)
+        return reach
+
+    @property
+    def at_bound(self) -> Array:
+        """Which standard parameters came out at the bound of their range, shape (p,), bool."""
+        return np.isin(self.model.layout.names, self.estimate.details["at_bound"])
+
+    @cached_property
+    def shrunk(self) -> Array:
+        """How far the data shrink what each unknown may be, shape (c,): 1 not at all [-]."""
+        share: Array = self.estimate.std_error / self.fit.simulator.prior_std
+        return share
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """What determined each standard parameter; "mixed" of bodies, and of drives that share."""
+        own = dict(zip(self.fit.simulator.names, self.shrunk.tolist(), strict=True))
+        share = np.array([own.get(name, np.nan) for name in self.model.layout.names])
+        is_prior = np.isinf(self.standard_error) | ((share > FROM_PRIOR) & ~self.at_bound)
+        return sources_of(share, is_prior, self.at_bound)
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Unknowns that the logs say nothing of, bodies left out."""
+        return tuple(
+            unknown.name
+            for unknown, share in zip(self.fit.simulator.unknowns, self.shrunk, strict=True)
+            if share > FROM_PRIOR and unknown.what != "body"
+        )
+
+    @property
+    def told_together(self) -> tuple[tuple[str, ...], ...]:
+        """Unknowns of loops whose errors go together, so that their ratios alone are known."""
+        unknowns, errors = self.fit.simulator.unknowns, self.estimate.std_error
+        own = [k for k, u in enumerate(unknowns) if u.what != "body" and errors[k] > 0]
+        covariance = self.estimate.covariance[np.ix_(own, own)]
+        correlation = covariance / np.outer(errors[own], errors[own])
+        sets: list[set[int]] = []
+        for a, b in np.argwhere(np.triu(np.abs(correlation) > _TOGETHER, 1)):
+            joined = [s for s in sets if s & {int(a), int(b)}]
+            sets = [s for s in sets if s not in joined] + [set().union({int(a), int(b)}, *joined)]
+        return tuple(tuple(unknowns[own[k]].name for k in sorted(s)) for s in sets)
+
+    @property
+    def moments(self) -> dict[str, DriveMoments]:
+        """What projects the friction of drives on simpler terms, from positions of fitted logs."""
+        model = self.model.with_reference(self.standard)
+        motions = [logged_motion(run.log) for run in self.fitted] if model.layout.own else []
+        moving = [np.abs(m.v) > _MOVING * np.abs(m.v).max(axis=0) for m in motions]
+        return drive_moments(model, zip(motions, moving, strict=True))
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether every body can be."""
+        bodies = pseudo_inertia(self.standard[: self.model.layout.n_inertial])
+        return bool((np.linalg.eigvalsh(bodies) >= 0).all())
+
+    @property
+    def has_urdf(self) -> bool:
+        """Whether a URDF is written of it: always, for its roll-outs show what is wrong."""
+        return True
+
+    @property
+    def has_gains(self) -> bool:
+        """Whether the gains of the position were stated, of every joint."""
+        return not any(unknown.what == "kp" for unknown in self.fit.simulator.unknowns)
+
+    @property
+    def is_scaled_by_gain(self) -> bool:
+        """Whether stated gains alone set the scale: no torque was logged that shows it."""
+        simulator = self.fit.simulator
+        return self.loop.kind != "torque" and self.has_gains and not simulator.knows_torques
+
+    def metrics(self) -> Metrics:
+        """Return the metrics of positions over all fitted logs."""
+        return position_metrics(self.model, self.fitted)
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """How far to trust it."""
+        return judge_positions(
+            position_metrics(self.model, self.validation or self.fitted, moving=True),
+            self.model.joints,
+            is_kept=bool(self.validation),
+            is_settled=self.estimate.converged,
+            alarms=self.alarms,
+            cautions=[f.message for f in self.findings if f.code in _CAUTIONS],
+            scale=STATED_SCALE if self.is_scaled_by_gain else "",
+        )
+
+
+def identified_loops(
+    model: RobotModel,
+    loop: LoopSettings,
+    estimator: SimulationSettings,
+    fit: Fitted,
+    fitted: tuple[OpenLoop, ...],
+    validation: tuple[OpenLoop, ...],
+) -> LoopIdentification:
+    """Return what a fit identified, before anything is concluded of it.
+
+    Args:
+        model: The robot as its URDF and job say.
+        loop: What was stated of the loops.
+        estimator: The estimator's settings.
+        fit: The fit.
+        fitted: The fitted logs, with the positions simulated for them.
+        validation: The same of the logs that were kept apart.
+    """
+    model = with_terms(model, fit.loops)
+    standard, slopes = fit.simulator.standard(model, fit.estimate.theta)
+    covariance, mapping = slopes @ fit.estimate.covariance @ slopes.T, structural_mapping(model)
+    return LoopIdentification(
+        model=model,
+        mapping=mapping,
+        prior=model.standard_parameters(),
+        standard=standard,
+        standard_covariance=covariance,
+        base=mapping.to_base(standard),
+        base_error=_errors(mapping.K @ covariance @ mapping.K.T),
+        loop=loop,
+        estimator=estimator,
+        fit=fit,
+        fitted=fitted,
+        validation=validation,
+    )
+
+
+def _errors(covariance: Array) -> Array:
+    """Return standard errors, inf of what has no variance."""
+    variance = np.diag(covariance)
+    return np.where(variance > 0.0, np.sqrt(np.maximum(variance, 0.0)), np.inf)
+
+
+def logged_motion(log: Log) -> Trajectory:
+    """Return the motion of a log of commands: positions, and their differences over time.
+
+    Args:
+        log: The log, of N samples; accelerations and torques of its motion are 0.
+    """
+    still = np.zeros_like(log.q)
+    dt = np.diff(log.t)
+    gaps = dt > _GAP * np.median(dt)
+    segment = np.append(0, np.cumsum(gaps))
+    v = still.copy()
+    for k in range(segment[-1] + 1):
+        rows = np.flatnonzero(segment == k)
+        if len(rows) > 1:
+            v[rows] = np.gradient(log.q[rows], log.t[rows], axis=0)
+    return Trajectory(log.t, log.q, v, still, still, log.joints, None, segment)

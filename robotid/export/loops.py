@@ -1,0 +1,145 @@
+"""What result.json holds of an identification by simulation, and of no other."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from robotid._files import finite, source_entry
+from robotid.closed_loop.evaluation import OpenLoop, position_metrics, position_units
+from robotid.closed_loop.result import LoopIdentification
+from robotid.robot.model import RobotModel
+
+__all__ = ["loop_entries", "loop_inputs", "open_loop_entry"]
+
+
+def loop_entries(found: LoopIdentification) -> dict[str, Any]:
+    """Return what result.json has of it beside what it has of all identifications.
+
+    Args:
+        found: What was identified.
+    """
+    model, estimate = found.model, found.estimate
+    runs = {"identification": found.fitted, "validation": found.validation}
+    bodies = zip(found.mapping.base_names, found.mapping.independent, found.base_error, strict=True)
+    unfitted = [
+        name for name, i, error in bodies if i < model.layout.n_inertial and math.isinf(error)
+    ]
+    return {
+        "structure": {
+            "rank": estimate.rank,
+            "condition": finite(estimate.condition),
+            "not_told_apart": [{"names": list(names)} for names in found.told_together],
+        },
+        "uncertainty": {
+            "method": "scatter of the scores of stretches of the whitened residual",
+            "inflation": estimate.details["inflation"],
+        },
+        "ranges": {"undetermined": [*unfitted, *found.undetermined]},
+        "loop_parameters": _loop_parameters(found),
+        "validation": [
+            {"log": run.log.path, "name": run.log.name, **position_metrics(model, (run,)).to_dict()}
+            for run in found.validation
+        ],
+        "simulation": {
+            "controller": _controller(found),
+            "signs": dict(zip(model.joints, found.fit.encoders.sign.tolist(), strict=True)),
+            "fit": {
+                "message": estimate.message,
+                "converged": estimate.converged,
+                "parameters": len(estimate.theta),
+                "correlation": [float(rho) for rho in estimate.details["correlation"]],
+            },
+            "friction_tried": [dataclasses.asdict(tried) for tried in found.fit.tried],
+            **{role: [open_loop_entry(model, run) for run in own] for role, own in runs.items()},
+        },
+    }
+
+
+def loop_inputs(found: LoopIdentification) -> list[dict[str, Any]]:
+    """Return the logs that were read, as result.json has them.
+
+    Args:
+        found: What was identified.
+    """
+    every = {"identification": found.fitted, "validation": found.validation}
+    return [
+        {
+            "role": role, **source_entry(log.path), "samples": len(log.t),
+            "rate": 1.0 / float(np.median(np.diff(log.t))), "start": float(log.t[0]),
+            "end": float(log.t[-1]), "rows_used": len(log.t), "segments": 1, "signals": {},
+        }
+        for role, runs in every.items() for log in (run.log for run in runs)
+    ]  # fmt: skip
+
+
+def _loop_parameters(found: LoopIdentification) -> list[dict[str, Any]]:
+    """Return gains, delay, limit and zero of each joint, those that were stated without error."""
+    if found.loop.kind == "torque":
+        return []
+    loops, estimate = found.fit.loops, found.fit.estimate
+    errors = {
+        (unknown.what, j): (float(error), float(reach))
+        for unknown, error, reach in zip(
+            found.fit.simulator.unknowns, estimate.std_error, estimate.reach, strict=True
+        )
+        for j in unknown.joints
+    }
+    entries = []
+    for j, joint in enumerate(found.model.limits):
+        force, way = ("N", "m") if joint.type == "prismatic" else ("N m", "rad")
+        units = {
+            "kp": f"{force}/{way}", "kd": f"{force} s/{way}", "delay": "s", "limit": force,
+            "zero": way,
+        }  # fmt: skip
+        for what, unit in units.items():
+            value = float(getattr(loops, what)[j])
+            if math.isfinite(value):
+                error, reach = errors.get((what, j), (None, None))
+                entries.append(
+                    {"name": f"{joint.name}.{what}", "value": value, "std_error": error,
+                     "reach": reach,
+                     "unit": unit, "source": "stated" if error is None else "data"}
+                )  # fmt: skip
+    return entries
+
+
+def _controller(found: LoopIdentification) -> dict[str, Any]:
+    """Return what was stated of the controller beside gains and delay."""
+    limits = dict(zip(found.model.joints, found.fit.loops.limit.tolist(), strict=True))
+    stated = {joint: x for joint, x in limits.items() if math.isfinite(x)} or None
+    return {"kind": found.loop.kind, "effort_limit": stated, "rate": found.loop.rate}
+
+
+def open_loop_entry(model: RobotModel, run: OpenLoop) -> dict[str, Any]:
+    """Return the errors of open loops on one log, joint by joint and by horizon.
+
+    What goes on at its speed, and what the torques tell by themselves, stand there where the logged
+    torque drives the robot.
+
+    Args:
+        model: The robot.
+        run: The open loops beside the log.
+    """
+    units = position_units(model)
+    return {
+        "log": run.log.path,
+        "start": float(run.log.t[0]),
+        "end": float(run.log.t[-1]),
+        "per_joint": {
+            joint: {
+                "rmse": float(run.rmse[j]),
+                "unit": units[j],
+                **{
+                    f"{key}_rmse": None if x is None else float(x[j])
+                    for key, x in run.baselines.items()
+                },
+            }
+            for j, joint in enumerate(model.joints)
+        },
+        "horizons": {
+            f"{h:g}": dict(zip(model.joints, map(float, errors), strict=True))
+            for h, errors in run.horizons.items()
+        },
+    }

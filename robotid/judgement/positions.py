@@ -1,0 +1,87 @@
+"""The verdict on positions that are simulated from commands or torques, beside plainer models."""
+
+from collections.abc import Sequence
+
+from robotid.findings import listed
+from robotid.fitting.metrics import JointMetrics, Metrics
+from robotid.judgement.verdict import BEATEN, JointVerdict, Verdict, concluded, error_of, on_joint
+
+__all__ = ["GOOD", "POOR", "judge_positions"]
+
+#: [%] of its motion that the simulation of a joint misses on validation logs: good, not usable.
+GOOD, POOR = 5.0, 30.0
+#: Plainer models, by name of the baseline; the URDF has drives fitted to torques that drive it.
+_PLAINER = {
+    "command": "the command itself",
+    "second_order": "the plain model of second order",
+    "urdf": "the URDF with the stated gains",
+    "rows": "what the torques tell by themselves",
+    "steady": "going on at the speed of the start",
+}
+_DRIVEN = {**_PLAINER, "urdf": "the URDF with fitted drives"}
+
+
+def judge_positions(
+    metrics: Metrics,
+    joints: Sequence[str],
+    *,
+    is_kept: bool,
+    is_settled: bool = True,
+    alarms: Sequence[str] = (),
+    cautions: Sequence[str] = (),
+    scale: str = "",
+) -> Verdict:
+    """Return the verdict on simulated positions.
+
+    Args:
+        metrics: Those of positions, all logs together, of the joints that are commanded to move.
+        joints: Names of the model's joints; one without metrics is not evaluated.
+        is_kept: Whether the logs were kept apart from the fit.
+        is_settled: Whether the fit has settled.
+        alarms: Faults of the logs that make the result wrong.
+        cautions: What keeps a result from being good, whatever its errors are.
+        scale: What the scale of all parameters rests on, if nothing measured shows it.
+    """
+    found = {joint: _judge_joint(joint, metrics.per_joint.get(joint), is_kept) for joint in joints}
+    reasons = {
+        status: [why for own in found.values() if own.status == status for why in own.reasons]
+        for status in ("poor", "not evaluated", "usable")
+    }
+    doubts = list(cautions)
+    if not is_kept:
+        doubts.append("no log was kept apart: nothing tests the open loop; add [[validation]]")
+    if not is_settled:
+        doubts.append("the fit has not settled")
+    worst = max(map(error_of, metrics.per_joint.values()), default=0.0)
+    return concluded(
+        found,
+        poor=reasons["poor"],
+        doubts=[*doubts, *reasons["not evaluated"], *reasons["usable"]],
+        good=f"open loops miss at most {worst:.2g} % of the motion of any joint on logs kept "
+        "apart, and less than plainer models",
+        notes=[scale] if scale else [],
+        alarms=alarms,
+        is_tested=is_kept and bool(metrics.per_joint),
+    )
+
+
+def _judge_joint(joint: str, measured: JointMetrics | None, is_kept: bool) -> JointVerdict:
+    """Return the verdict on one joint; measured is None if no log commands it to move."""
+    if measured is None:
+        still = f"{joint} is told to stand still: nothing tests it"
+        return on_joint([], [], is_tested=False, said=still)
+    error, baselines = error_of(measured), measured.baselines
+    names = _DRIVEN if "steady" in baselines else _PLAINER
+    beaten = [
+        key
+        for key in names
+        if (plainer := baselines.get(key)) is not None and error > BEATEN * plainer
+    ]
+    said = f"{joint}: the open loop misses {error:.2g} % of its motion"
+    if beaten:
+        said += f"; {listed(names[key] for key in beaten)} misses less"
+    if not is_kept:
+        return on_joint([], [], is_tested=False, said=said)
+    if error > POOR or "command" in beaten:
+        return on_joint([said], [], is_tested=True, said="")
+    return on_joint([], [said] if error > GOOD or beaten else [], is_tested=True, said=said)

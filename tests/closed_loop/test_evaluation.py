@@ -1,0 +1,61 @@
+"""Metrics of simulated positions: those of all logs together, in the unit of each joint."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.single_joint import slider
+
+from robotid.closed_loop.evaluation import OpenLoop, position_metrics
+from robotid.logs.data import Log
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+
+def run(joints, rmse, spread, moves, n=50, **baselines):
+    """Return an open loop with the errors that are given, on a log of n samples."""
+    q_ref = np.outer(np.linspace(0.0, 1.0, n), moves)
+    log = Log(np.arange(n) / 100.0, q_ref, 0.0 * q_ref, joints, q_ref=q_ref, has_torque=False)
+    others = {key: None if x is None else np.array(x) for key, x in baselines.items()}
+    return OpenLoop(log, q_ref, np.array(rmse), others, {}, np.array(spread))
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=["elbow_joint"])
+
+
+def test_logs_count_alike_and_errors_are_shares_of_the_motion(arm):
+    one = run(arm.joints, [3e-3], [0.3], [1.0], n=50, command=[0.06], urdf=None)
+    two = run(arm.joints, [4e-3], [0.4], [1.0], n=70, command=[0.08], urdf=[0.01])
+    [(joint, found)] = position_metrics(arm, [one, two]).per_joint.items()
+    assert (joint, found.unit, found.rows) == ("elbow_joint", "rad", 120)
+    assert found.rmse == pytest.approx(np.sqrt((3e-3**2 + 4e-3**2) / 2))
+    assert found.relative_error_pct == pytest.approx(1.0)
+    assert found.r2 == pytest.approx(1.0 - 1e-4)
+    assert found.better_than_constant
+    assert found.baselines == {"command": pytest.approx(20.0), "urdf": None}
+    assert position_metrics(arm, [one, two]).pooled_rmse == pytest.approx(found.rmse)
+    off = position_metrics(arm, [replace(one, rmse=np.array([0.31]))]).per_joint[joint]
+    assert not off.better_than_constant
+    assert off.r2 < 0
+
+
+def test_a_joint_that_no_log_moves_is_left_out_where_motion_is_wanted(arm):
+    still = run(arm.joints, [3e-3], [1e-4], [0.0])
+    moved = run(arm.joints, [4e-3], [0.4], [1.0])
+    assert position_metrics(arm, [still], moving=True).per_joint == {}
+    [found] = position_metrics(arm, [still, moved], moving=True).per_joint.values()
+    assert found.relative_error_pct == pytest.approx(1.0)
+    [both] = position_metrics(arm, [still, moved]).per_joint.values()
+    assert both.relative_error_pct > 1.0
+    driven = run(arm.joints, [3e-3], [1e-4], [0.0], steady=[0.1])
+    assert len(position_metrics(arm, [driven], moving=True).per_joint) == 1, "by its torque"
+
+
+def test_a_motion_of_no_size_has_no_share_and_a_rail_has_metres(tmp_path):
+    rail = slider(tmp_path)
+    [found] = position_metrics(rail, [run(rail.joints, [1e-3], [0.0], [0.0])]).per_joint.values()
+    assert found.unit == "m"
+    assert found.relative_error_pct is None
+    assert not found.better_than_constant
