@@ -1,16 +1,19 @@
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.mujoco_plant import held, multisine, plant, recorded
 from helpers.single_joint import slider
 
 from robotid.closed_loop.evaluation import position_metrics, run_open_loop
 from robotid.closed_loop.fit import stated_loops
-from robotid.closed_loop.identify import identify_loops
+from robotid.closed_loop.gain_check import gain_scale
+from robotid.closed_loop.identify import identify_loops, with_gravity
 from robotid.closed_loop.second_order import SecondOrder
 from robotid.closed_loop.settings import LoopSettings
 from robotid.closed_loop.term_choice import _Fold, _gains
+from robotid.estimators.output_error import OutputError
 from robotid.exceptions import DataError
 from robotid.findings import Finding
 from robotid.fitting.settings import SimulationSettings
@@ -97,8 +100,13 @@ def test_the_drives_of_an_arm_are_recovered_with_steps_that_are_halved():
     """From commands that last as long as the steps to begin with, which are too long by far."""
     rng = np.random.default_rng(1)
     robot = plant("planar", rng)
-    log, truth = recorded(robot, rng, duration=4.0, rate=250.0, noise=3e-4, step=1e-4)
-    found = identify_loops(robot.model, [log], [], stated(robot), COARSE, chooses=False)
+    usual = {"rate": 250.0, "noise": 3e-4, "step": 1e-4}
+    first, second = (recorded(robot, rng, duration=d, **usual)[0] for d in (2.4, 1.6))
+    logs, truth = [first, replace(second, t=second.t + 7.0)], robot.truth
+    found = identify_loops(robot.model, logs, [], stated(robot), COARSE, chooses=False)
+    assert [len(run.q) for run in found.fitted] == [600, 400]
+    windows = found.fit.simulator.windows
+    assert [sum(w.stop - w.first for w in windows if w.log.t[0] == t) for t in (0, 7)] == [600, 400]
     estimate, fine = found.fit.estimate, found.fit.simulator.fine
     errors = np.array(
         [value - truth[n] for n, value in zip(estimate.names, estimate.theta, strict=True)]
@@ -136,6 +144,8 @@ def test_open_loops_beat_plainer_models(leg, found):
         run.baselines["command"], np.sqrt(np.mean((run.log.q_ref - run.log.q) ** 2, 0))
     )
     np.testing.assert_allclose(run.rmse, np.sqrt(np.mean((run.log.q - run.q) ** 2, axis=0)))
+    middle = run.log.q.mean(axis=0)
+    np.testing.assert_allclose(run.spread, np.sqrt(np.mean((run.log.q - middle) ** 2, axis=0)))
     assert list(run.horizons) == [0.1, 0.5, 2.0]
     robot, loops = found.fit.simulator.robot, found.fit.loops
     for horizon, error in run.horizons.items():
@@ -251,6 +261,9 @@ def test_stated_gains_that_the_bodies_contradict_are_named(leg, found):
     assert named.severity == "warning"
     assert named.where == "controller"
     assert named.evidence["scale"] == pytest.approx(0.8, abs=0.08)
+    each = other.fit.scale
+    assert (np.abs(each.change + 0.2) < 4.0 * each.error).all()
+    assert (each.error > each.common_error).all(), "together they show it better"
     kp = 1.25 * robot.drives[0].kp * named.evidence["scale"]
     assert f"{robot.drives[0].joint} = {kp:.3g}" in named.message
     assert other.verdict.status != "good"
@@ -341,3 +354,27 @@ def test_terms_that_no_other_window_judges_gain_nothing():
     assert _gains([blind, blind], [0, 1], {5: [2]})[5].tolist() == [0.0, 0.0]
     known = _gains([alone, alone], [0, 1], {5: [2]})[5]
     assert known == pytest.approx([1.0, 1.0])  # of each fold 2 y - y^2, y = 1
+
+
+def test_gravity_that_a_controller_compensates_is_fed_forward(leg):
+    robot, log, _ = leg
+    pin_model, data = robot.model.pin_model, robot.model.pin_model.createData()
+    few = replace(log, **{key: getattr(log, key)[:5] for key in ("t", "q", "tau", "q_ref")})
+    weight = [pin.computeGeneralizedGravity(pin_model, data, q).copy() for q in few.q]
+    np.testing.assert_allclose(with_gravity(robot.model, few).tau_ref, weight, atol=1e-10)
+    more = replace(few, tau_ref=np.arange(15.0).reshape(5, 3))
+    np.testing.assert_allclose(
+        with_gravity(robot.model, more).tau_ref - more.tau_ref, weight, atol=1e-10
+    )
+
+
+def test_what_whitening_leaves_correlated_widens_the_scale_of_gains(found):
+    simulator, estimate = found.fit.simulator, found.fit.estimate
+    plain, twice, less = (
+        gain_scale(simulator, OutputError(), replace(estimate, details={"inflation": inflation}))
+        for inflation in (1.0, 4.0, 0.25)
+    )
+    np.testing.assert_allclose(twice.change, plain.change)
+    np.testing.assert_allclose(twice.error, 2.0 * plain.error)
+    assert twice.common_error == pytest.approx(2.0 * plain.common_error)
+    np.testing.assert_allclose(less.error, plain.error)

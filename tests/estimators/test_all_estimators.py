@@ -101,7 +101,7 @@ def test_fewer_rows_than_parameters_are_refused(make, ur5, rng):
 
 @makers(EXACT_COVARIANCE)
 def test_standard_errors_match_monte_carlo(make, ur5, rng):
-    case = Case(ur5, rng, np.zeros(6), samples=400)
+    case = Case(ur5, rng, np.zeros(6), samples=150)
     case.sigma = NOISE
     estimates, stated = [], []
     for _ in range(60):

@@ -99,11 +99,11 @@ def test_no_more_correlation_is_taken_out_than_is_allowed(rng):
 
 def test_standard_errors_are_the_scatter_of_many_noises():
     rng = np.random.default_rng(5)
-    draws = [OutputError().fit(lagging(rng), TRUTH) for _ in range(200)]
+    draws = [OutputError().fit(lagging(rng), TRUTH) for _ in range(100)]
     theta = np.array([d.theta for d in draws])
     ratio = np.mean([d.std_error for d in draws], axis=0) / theta.std(axis=0)
     assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
-    bias = (theta.mean(axis=0) - TRUTH) / (theta.std(axis=0) / np.sqrt(200))
+    bias = (theta.mean(axis=0) - TRUTH) / (theta.std(axis=0) / np.sqrt(100))
     assert np.abs(bias).max() < 4
 
 

@@ -34,11 +34,12 @@ def test_ros_reads_it_as_a_joint_trajectory(motion, tmp_path):
     content = yaml.safe_load(path.read_text())
     assert content["joint_names"] == list(JOINTS)
     assert len(content["points"]) == 21
-    point = content["points"][7]
-    assert point["time_from_start"] == {"sec": 0, "nanosec": 700_000_000}
-    q, v, a = motion.evaluate(np.array([0.7]))
-    for name, values in (("positions", q), ("velocities", v), ("accelerations", a)):
-        np.testing.assert_allclose(point[name], values[0], atol=1e-6)
+    for k, seconds in ((7, 0), (17, 1)):
+        point = content["points"][k]
+        assert point["time_from_start"] == {"sec": seconds, "nanosec": 700_000_000}
+        q, v, a = motion.evaluate(np.array([k / 10]))
+        for name, values in (("positions", q), ("velocities", v), ("accelerations", a)):
+            np.testing.assert_allclose(point[name], values[0], atol=1e-6)
 
 
 def test_joints_of_any_name_are_names_in_yaml(motion, tmp_path):

@@ -86,3 +86,17 @@ def test_criteria_have_their_values_and_gradients(name, rng):
 def test_a_criterion_that_there_is_not_is_refused():
     with pytest.raises(SettingsError, match="criterion is 'F', wanted one of D, A, E, condition"):
         criterion("F", np.eye(2))
+
+
+def test_gravity_at_a_joint_is_shared_by_the_joints_of_its_chain():
+    joints = ["torso_lift_joint", "arm_1_joint", "arm_2_joint", "head_1_joint"]
+    model = RobotModel.from_urdf(example_urdf("tiago_no_hand.urdf"), joints=joints)
+    mapping = structural_mapping(model)
+    information = MotionInformation(model, mapping, mapping.to_base(model.standard_parameters()))
+    linked = {"torso": "torso arm_1 arm_2 head", "arm_1": "torso arm_1 arm_2"}
+    linked |= {"arm_2": "torso arm_1 arm_2", "head": "torso head"}
+    short = [joint.replace("_joint", "").replace("_lift", "").replace("head_1", "head")
+             for joint in model.joints]  # fmt: skip
+    for name, row in zip(short, information.chains, strict=True):
+        own = linked[name].split()
+        np.testing.assert_allclose(row, [1 / len(own) if x in own else 0.0 for x in short])

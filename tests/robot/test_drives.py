@@ -204,7 +204,7 @@ def test_friction_that_holds_any_load_is_refused_by_the_plant():
                          ids=lambda term: term.name)  # fmt: skip
 def test_a_simulated_robot_is_identified(model, rng):
     pi = truth(model)
-    log = simulate(model, pi, random_fourier(model, rng), rate=500.0, duration=6.0, rng=rng)
+    log = simulate(model, pi, random_fourier(model, rng), rate=250.0, duration=4.0, rng=rng)
     found = identify(model, [log], signals=SignalSettings(cutoff=20.0), estimator="wls")
     beta = found.mapping.to_base(pi)
     assert np.linalg.norm(found.base - beta) < 0.02 * np.linalg.norm(beta)

@@ -32,7 +32,9 @@ def test_a_massless_link_still_has_a_spread(rng, ur5):
 
 
 def test_the_spread_is_what_the_docstring_says(ur5):
-    squares, samples = np.array([4.0, 9.0, 25.0])[:, None] * np.ones((3, 6)), 1
+    rms = np.array([2.0, 3.0, 5.0])[:, None] * np.ones((3, 6))
+    rms[0] *= np.arange(1, 7)  # each joint has its own torque
+    squares, samples = 16 * rms**2, 16
     spread = dict(zip(ur5.layout.names, prior_spread(ur5, squares, samples), strict=True))
     inertial = ur5.tree.inertials["forearm_link"]
     mass, centre = inertial.mass, np.linalg.norm(ur5.standard_parameters()[21:24]) / inertial.mass
@@ -40,12 +42,14 @@ def test_the_spread_is_what_the_docstring_says(ur5):
     radius = centre + np.sqrt(np.trace(J[:3, :3]) / mass)
     assert spread["forearm_link.mcx"] == pytest.approx(mass * radius)
     assert spread["forearm_link.Ixx"] == pytest.approx(mass * radius**2)
-    assert spread["elbow_joint.viscous"] == pytest.approx(2.0 / 3.0)
+    assert spread["elbow_joint.viscous"] == pytest.approx(6.0 / 3.0)
+    assert spread["wrist_1_joint.coulomb"] == pytest.approx(8.0)
     carried = dict(zip(ur5.joints, carried_inertia(ur5), strict=True))
     heavy, light = "shoulder_lift_joint", "wrist_3_joint"
-    assert carried[heavy] > 2.0 / 5.0 > carried[light]
+    assert carried[heavy] > 4.0 / 5.0
+    assert carried[light] < 12.0 / 5.0
     assert spread[f"{heavy}.armature"] == pytest.approx(carried[heavy])
-    assert spread[f"{light}.armature"] == pytest.approx(2.0 / 5.0)
+    assert spread[f"{light}.armature"] == pytest.approx(12.0 / 5.0)
 
 
 def test_a_light_link_may_be_wrong_by_a_tenth_of_the_mean_mass(ur5):

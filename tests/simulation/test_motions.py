@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robotid.exceptions import DataError, SettingsError
-from robotid.simulation.motions import ProgramMotion
+from robotid.simulation.motions import ProgramMotion, SampledMotion
 
 
 def test_a_motion_of_seven_joints_has_the_coefficients_of_equation_28():
@@ -30,6 +30,26 @@ def test_many_motions_at_once_are_the_motions_one_by_one(rng):
         alone = ProgramMotion(A[r], T[r]).evaluate(t[r])
         for many, one in zip(together, alone, strict=True):
             np.testing.assert_array_equal(many[r], one)
+
+
+@pytest.mark.parametrize("knows_more", [False, True])
+def test_a_motion_through_samples_begins_with_the_first(knows_more):
+    """Polynomials of order 5 are what both kinds of curve between samples are made of."""
+    C = np.array([[0.3, -1.0, 0.5, 0.8, -0.6, 0.1], [1.0, 0.2, 0.0, -0.4, 0.3, -0.2]]).T  # (6, 2)
+
+    def true(t):
+        q, v, a = (
+            np.stack([np.polyval(np.polyder(c[::-1], k), t) for c in C.T], axis=1) for k in range(3)
+        )
+        return q, v, a
+
+    t = np.linspace(0.0, 1.5, 12) ** 1.1
+    q, v, a = true(t)
+    motion = SampledMotion(t + 7.0, q, v, a) if knows_more else SampledMotion(t + 7.0, q)
+    assert motion.duration == pytest.approx(t[-1])
+    between = np.linspace(0.0, t[-1], 40)
+    for found, exact in zip(motion.evaluate(between), true(between), strict=True):
+        np.testing.assert_allclose(found, exact, atol=1e-9)
 
 
 ERRORS = {

@@ -37,7 +37,7 @@ def test_forgetting_does_not_wind_up_where_nothing_moves():
     Y = np.zeros((2, c))
     Y[:, :2] = [[1.0, 0.5], [0.0, 1.0]]
     truth = np.array([3.0, -1.0])
-    for _ in range(100_000):
+    for _ in range(30_000):  # 0.95^n is below the smallest double by far
         tau = Y[:, :2] @ truth + 1e-3 * rng.standard_normal(2)
         state = estimator.update(state, Sample(Y, tau, np.ones(2)))
     assert np.isfinite(state.R).all()
@@ -249,10 +249,10 @@ def test_what_is_not_seen_walks_as_far_as_the_walk_says(full):
     np.testing.assert_allclose(state.P, np.diag(std**2 * (1 + 7 * 0.01)), rtol=1e-12)
 
 
-@pytest.mark.parametrize("gate", [0.5, 0.9, 0.99])
+@pytest.mark.parametrize("gate", [0.5, 0.99])
 def test_the_gate_turns_away_as_many_good_rows_as_it_says(rng, gate):
     known = Kalman(np.array([2.0, 0.5]), np.ones(3), np.full(3, 1e-9), gate=gate)
-    state, count = known.init(3), 5000
+    state, count = known.init(3), 3000
     for Y in rng.standard_normal((count, 2, 3)):
         tau = Y.sum(axis=1) + known.sigma * rng.standard_normal(2)
         state = known.update(state, Sample(Y, tau, np.ones(2)))
