@@ -178,21 +178,21 @@ def factor(work, n, H):
 
 
 @compiled
-def solve(work, n, H, x, step):
-    """Solve H y = x with the factor of H, in place; the entries of x are ``step`` apart."""
+def solve(work, n, H, x):
+    """Solve H y = x with the factor of H, in place."""
     for i in range(n):
         for k in range(i):
             for lane in range(width(work)):
-                y = get(work, H + i * n + k, lane) * get(work, x + k * step, lane)
-                put(work, x + i * step, lane, get(work, x + i * step, lane) - y)
+                y = get(work, H + i * n + k, lane) * get(work, x + k, lane)
+                put(work, x + i, lane, get(work, x + i, lane) - y)
         for lane in range(width(work)):
-            y = get(work, x + i * step, lane) / get(work, H + i * n + i, lane)
-            put(work, x + i * step, lane, y)
+            y = get(work, x + i, lane) / get(work, H + i * n + i, lane)
+            put(work, x + i, lane, y)
     for i in range(n - 1, -1, -1):
         for k in range(i + 1, n):
             for lane in range(width(work)):
-                y = get(work, H + k * n + i, lane) * get(work, x + k * step, lane)
-                put(work, x + i * step, lane, get(work, x + i * step, lane) - y)
+                y = get(work, H + k * n + i, lane) * get(work, x + k, lane)
+                put(work, x + i, lane, get(work, x + i, lane) - y)
         for lane in range(width(work)):
-            y = get(work, x + i * step, lane) / get(work, H + i * n + i, lane)
-            put(work, x + i * step, lane, y)
+            y = get(work, x + i, lane) / get(work, H + i * n + i, lane)
+            put(work, x + i, lane, y)

@@ -56,8 +56,9 @@ __all__ = [
     "work_space",
 ]
 
-# what of one body is at hand: q, v, a of its joint; what its rows share; ten columns
-_MOTION, _D, _X, _Y, _Z, _DW, _WW, _COLUMNS, _WORLD = 0, 3, 6, 9, 12, 15, 18, 21, 31
+# what of one body is at hand: q, v, a of its joint; what its rows share; ten columns. No int of
+# Python's, for which Numba would compile a function once more for each number that it is given.
+_MOTION, _D, _X, _Y, _Z, _DW, _WW, _COLUMNS, _WORLD = np.array([0, 3, 6, 9, 12, 15, 18, 21, 31])
 
 
 def rows_size(bodies: int, depth: int) -> int:
@@ -67,7 +68,7 @@ def rows_size(bodies: int, depth: int) -> int:
         bodies: Number of bodies.
         depth: Largest number of rows that one body loads.
     """
-    return _WORLD + (bodies + 1) * (FRAME + 12 * depth + 12)
+    return int(_WORLD) + (bodies + 1) * (FRAME + 12 * depth + 12)
 
 
 @compiled

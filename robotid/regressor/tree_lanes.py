@@ -210,12 +210,12 @@ def _momentum(body, x):
 
 
 @compiled
-def _force(work, own, body, at):
+def _force(work, own, body, to):
     """Write the force J A + V x* J V on a body."""
     for lane in range(width(work)):
         V, A = get6(work, own + VELOCITY, lane), get6(work, own + ACCELERATION, lane)
         f = joined(_momentum(body, A), _force_cross(V, _momentum(body, V)))
-        put6(work, own + at, lane, f)
+        put6(work, to, lane, f)
 
 
 @compiled
@@ -233,7 +233,7 @@ def inverse_dynamics(work, tree, bodies, v, a, tau):
     for i in range(n):
         own, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
         move(work, own, up, tree.joints[i], v + i, a + i)
-        _force(work, own, bodies[i], _F)
+        _force(work, own, bodies[i], own + _F)
     for i in range(n - 1, -1, -1):
         own, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
         _give(work, own + _F, tree.joints[i], tau + i)
@@ -348,38 +348,50 @@ def _clear(work, at):
 
 
 @compiled
-def derivatives(work, tree, bodies, v, T, is_speed):
-    """Write the derivatives of the torques by positions or speeds, T[i, k] = d tau_i / d q_k."""
-    n, is_below = len(tree.parents), tree.is_below
-    for k in range(n):
-        for i in range(n):
-            own, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
-            if is_below[i, k]:
-                _change_motion(work, own, up, tree.joints[i], v + i, i == k, is_speed)
-                _change_force(work, own, bodies[i])
-            elif is_below[k, i]:
-                _clear(work, own + _TF)
-        for i in range(n - 1, -1, -1):
-            own, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
-            if not (is_below[i, k] or is_below[k, i]):
-                for lane in range(width(work)):
-                    put(work, T + i * n + k, lane, 0.0)
-                continue
-            _give(work, own + _TF, tree.joints[i], T + i * n + k)
-            if i == k and not is_speed:  # its force turns with it
-                s = axis(tree.joints[k])
-                for lane in range(width(work)):
-                    bent = _force_cross(s, get6(work, own + _F, lane))
-                    gather(work, own + _TF, lane, bent)
-            if tree.parents[i] >= 0:
-                pass_up(work, own, own + _TF, up + _TF)
+def derivatives(work, tree, bodies, v, T):
+    """Write the derivatives of the torques by positions and speeds, for placed and moved bodies.
+
+    T[i, k] = d tau_i / d q_k; n^2 entries further stands d tau_i / d v_k.
+    """
+    n = len(tree.parents)
+    for kind in range(2):
+        for k in range(n):
+            _change_bodies(work, tree, bodies, v, k, kind == 1)
+            for i in range(n):
+                if not (tree.is_below[i, k] or tree.is_below[k, i]):
+                    for lane in range(width(work)):
+                        put(work, T + (kind * n + i) * n + k, lane, 0.0)
+            for i in range(n - 1, -1, -1):
+                if not (tree.is_below[i, k] or tree.is_below[k, i]):
+                    continue
+                own, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
+                _give(work, own + _TF, tree.joints[i], T + (kind * n + i) * n + k)
+                if i == k and kind == 0:  # its force turns with it
+                    s = axis(tree.joints[k])
+                    for lane in range(width(work)):
+                        bent = _force_cross(s, get6(work, own + _F, lane))
+                        gather(work, own + _TF, lane, bent)
+                if tree.parents[i] >= 0:
+                    pass_up(work, own, own + _TF, up + _TF)
+
+
+@compiled
+def _change_bodies(work, tree, bodies, v, k, is_speed):
+    """Write how forces on bodies change with the position or speed of joint k."""
+    for i in range(len(tree.parents)):
+        own, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
+        if tree.is_below[i, k]:
+            _change_motion(work, own, up, tree.joints[i], v + i, i == k, is_speed)
+            _change_force(work, own, bodies[i])
+        elif tree.is_below[k, i]:
+            _clear(work, own + _TF)
 
 
 @compiled
 def inertial_column(work, tree, change, body, own):
     """Write the torques of a change of a body's ten parameters."""
-    _force(work, (body + 1) * BODY, change, _TF)
     i = body
+    _force(work, (i + 1) * BODY, change, (i + 1) * BODY + _TF)
     while i >= 0:
         at, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
         _give(work, at + _TF, tree.joints[i], own + i)

@@ -238,7 +238,7 @@ def _newton(work, n, at, drives, terms, step, command):
         factor(work, n, H)
         if is_found:
             return True
-        solve(work, n, H, G, 1)
+        solve(work, n, H, G)
         is_found = True
         for i in range(n):
             for lane in range(LANES):
@@ -469,7 +469,7 @@ def _advance_column(work, n, at, sweeps, step, p, P):
                 x = get(work, T_v + i * n + j, lane) * get(work, S + (n + j) * P + p, lane)
                 x -= get(work, T_q + i * n + j, lane) * get(work, S + j * P + p, lane)
                 put(work, change + i, lane, get(work, change + i, lane) + x)
-    solve(work, n, H, change, 1)
+    solve(work, n, H, change)
     for i in range(n):
         for lane in range(LANES):
             du, dv = get(work, change + i, lane), get(work, S + (n + i) * P + p, lane)
@@ -559,8 +559,7 @@ def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, cor
                     moved = get(work, u + i, lane) - get(work, v + i, lane)
                     put(work, a + i, lane, moved / (THETA * step[lane]))
             inverse_dynamics(work, tree, bodies, v, a, h)
-            derivatives(work, tree, bodies, v, T_q, False)
-            derivatives(work, tree, bodies, v, T_v, True)
+            derivatives(work, tree, bodies, v, T_q)  # and T_v behind it
             _propagate(work, n, at, sweeps, columns, drives, terms, step, command[k], tree)
         _advance(work, n, at, step)
         if (k + 1) % every == 0:

@@ -60,8 +60,7 @@ def found(model):
         tree_lanes.place(work, own, tree.joints[i], at_q + i, ZERO)
     tree_lanes.inverse_dynamics(work, tree, bodies, at_v, at_a, tau)
     tree_lanes.mass_matrix(work, tree, bodies, M)
-    tree_lanes.derivatives(work, tree, bodies, at_v, by_q, False)
-    tree_lanes.derivatives(work, tree, bodies, at_v, by_v, True)
+    tree_lanes.derivatives(work, tree, bodies, at_v, by_q)
     columns = []
     for body in range(n):
         change = np.cos(np.arange(10.0))
