@@ -15,10 +15,12 @@ from robotid.closed_loop.settings import LoopSettings
 from robotid.closed_loop.term_choice import _Fold, _gains
 from robotid.estimators.output_error import OutputError
 from robotid.exceptions import DataError
+from robotid.export.entries import build_result
 from robotid.findings import Finding
 from robotid.fitting.settings import SimulationSettings
 from robotid.judgement.positions import judge_positions
 from robotid.logs.data import Log
+from robotid.report.document import write_report
 from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Presliding, Viscous
 from robotid.simulation.loops import LoopedRobot, cut_windows
 
@@ -131,6 +133,44 @@ def test_the_standard_parameters_are_what_was_found(leg, found):
             assert errors[name] == pytest.approx(error, rel=1e-6)
     urdf = leg[0].model.standard_parameters()
     np.testing.assert_array_equal(found.standard[:30], urdf[:30])  # bodies stay: bodies=0
+
+
+def test_it_is_an_identification_as_others_are(found, tmp_path):
+    layout, estimate = found.model.layout, found.estimate
+    size, count = layout.n_inertial, len(found.base)
+    name = f"Identification of {found.model.name}: {count} base parameters"
+    assert repr(found) == f"<{name} by simulation, verdict good>"
+    assert set(found.sources[:size]) == {"prior"}, "bodies stay: bodies=0"
+    assert np.isinf(found.standard_error[:size]).all()
+    content = build_result(found, {"estimator": {"name": "simulation"}})
+    entries = {entry["name"]: entry for entry in content["drive_parameters"]}
+    share = dict(zip(estimate.names, found.shrunk, strict=True))
+    known = zip(estimate.names, estimate.theta, estimate.std_error, estimate.reach, strict=True)
+    for key, value, error, reach in known:
+        own = entries[key]
+        assert (own["value"], own["reach"]) == (value, reach)
+        assert own["std_error"] == pytest.approx(error, rel=1e-6)
+        if key in layout.names:
+            ends = [value - reach * error, value + reach * error]
+            assert own["interval_95"] == pytest.approx(ends, rel=1e-6)
+            assert own["source"] == ("data" if share[key] < 0.3 else "mixed")
+            i = layout.names.index(key)
+            ends = content["ranges"]["drives"][key.rpartition(".")[0]][key.rpartition(".")[2]]
+            assert ends["high"] == pytest.approx(found.standard_interval[i, 1])
+    stated = entries[f"{found.model.joints[0]}.kp"]
+    assert (stated["std_error"], stated["source"]) == (None, "stated")
+    of_bodies = ~found.mapping.K[:, size:].any(axis=1)
+    unfitted = [entry["std_error"] is None for entry in content["base_parameters"]]
+    np.testing.assert_array_equal(unfitted, np.isinf(found.base_error))
+    np.testing.assert_array_equal(unfitted, of_bodies)
+    joint = content["validation"][0]["per_joint"][found.model.joints[1]]
+    [run] = found.validation
+    assert joint["relative_error_pct"] == pytest.approx(100 * run.rmse[1] / run.spread[1])
+    command = run.baselines["command"][1]
+    assert joint["command_relative_error_pct"] == pytest.approx(100 * command / run.spread[1])
+    page = write_report(found, tmp_path / "report.html").read_text()
+    assert "<strong>good</strong>" in page
+    assert f"{found.model.name}: drives from commands" in page
 
 
 def test_open_loops_beat_plainer_models(leg, found):
