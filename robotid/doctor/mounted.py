@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import scipy.special
@@ -116,6 +115,10 @@ def check_payload_change(
         (last, np.full(10, np.nan), size),
         share=min(1.0, 2.0 * (signals.cutoff or np.inf) * seconds / whole.samples),
     )
+    theta, covariance = runs.alike()
+    least = -float(scipy.special.ndtri(_CHANCE)) * float(np.sqrt(covariance[-10, -10]))
+    if abs(theta[-10]) <= max(least, _NOTHING * size[0]):
+        return  # errors that count what changes with time are no smaller
     # whether there is one at all is asked of what changes with time; scales are tried below
     found = runs.compare(by_joint=False)
     mass, error = float(found.theta[-10]), float(np.sqrt(found.covariance[-10, -10]))
@@ -140,11 +143,7 @@ def _stretches(
     model: RobotModel, mapping: BaseMapping, motion: Trajectory, min_velocity: float
 ) -> Iterator[Reduction]:
     """Yield what stretches of some rows of a motion come down to."""
-    every = max(1, len(motion.t) // _ROWS)
-    own = ("t", "q", "v", "a", "tau", "segment", "direction")
-    values = {key: getattr(motion, key) for key in own}
-    kept: dict[str, Any] = {k: x if x is None else x[::every] for k, x in values.items()}
-    thin = replace(motion, **kept)
+    thin = motion.every(max(1, len(motion.t) // _ROWS))
     count = int(np.clip(np.ptp(thin.t) / _STRETCH, 1, _STRETCHES))
     length = -(-len(thin.t) // count)
     rows = row_mask(model, thin, min_velocity)
