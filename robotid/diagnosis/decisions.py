@@ -1,6 +1,6 @@
 """What this room decides by: p-values, shares and sizes from which something is found and said.
 
-Each group names the benchmark that shows what it finds of what is there, and of what is not.
+Each group names what shows how often it finds what is there, and what is not.
 """
 
 from robotid.diagnosis.selection import Rule
@@ -58,8 +58,8 @@ MAIN = 50.0
 #: Times by which a standard error grows that stands on a misfit.
 GROWN = 1.3
 
-# What recordings or URDF have otherwise than stated: benchmarks/bench_misfit.py. The best of all is
-# tested, or none.
+# What recordings or URDF have otherwise than stated: benchmarks/bench_verdict.py. The best of all
+# is tested, or none.
 ALTERATION = Rule(most=3, share=-float("inf"), chance=None, alike=_ALIKE)
 ALTERATION_CHANCE, ALTERATION_SHARE = 3e-4, 0.1
 #: A smaller share is named, too, if validation shows no less of it, by chance hardly ever, and its
@@ -68,5 +68,5 @@ FAINT, FAINT_CHANCE, FAINT_SIZE = 0.03, 1e-5, 2.0
 #: Standard errors that its size is from nothing.
 SURE = 5.0
 
-# A residual that follows a quantity: benchmarks/bench_misfit.py
+# A residual that follows a quantity: no benchmark, tests/diagnosis/test_torque_split.py
 DEPENDENCE_SHARE, DEPENDENCE_CHANCE = 0.1, 1e-3

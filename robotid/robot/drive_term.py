@@ -6,7 +6,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -146,23 +146,17 @@ class MemorylessTerm(DriveTerm):
 
     Class attributes:
         speed_law: The law a of the speed.
+        speed_shape: Fields that shape it, up to four.
         position_law: The law b of the position.
+        position_shape: Fields that shape it, up to four.
         bears_load: Whether the size of the gear's load multiplies it, as direction does.
     """
 
     speed_law: ClassVar[int] = CONSTANT
+    speed_shape: ClassVar[tuple[str, ...]] = ()
     position_law: ClassVar[int] = CONSTANT
+    position_shape: ClassVar[tuple[str, ...]] = ()
     bears_load: ClassVar[bool] = False
-
-    @property
-    def speed_shape(self) -> tuple[float, ...]:
-        """Up to four numbers of a(v)."""
-        return ()
-
-    @property
-    def position_shape(self) -> tuple[float, ...]:
-        """Up to four numbers of b(q)."""
-        return ()
 
     @property
     def kind(self) -> int:
@@ -180,10 +174,13 @@ class MemorylessTerm(DriveTerm):
     @cached_property
     def numbers(self) -> tuple[float, ...]:
         """Four numbers of a(v), four of b(q), the largest size of v, the range of q."""
-        shapes = ((*shape, *_NONE)[:4] for shape in (self.speed_shape, self.position_shape))
+        a, b = (
+            (*(float(getattr(self, name)) for name in names), *_NONE)[:4]
+            for names in (self.speed_shape, self.position_shape)
+        )
         fastest = self.seen[1] if self.guards == "v" else np.inf
         seen = self.seen if self.guards == "q" else ANYWHERE
-        return tuple(map(float, (*chain(*shapes), fastest, *seen)))
+        return (*a, *b, fastest, *seen)
 
     def amplitude(self, q: Array, v: Array) -> Array:
         """Return a(v) b(q), within the range seen: the column of positive direction and load 1.

@@ -155,14 +155,15 @@ class Stribeck(MemorylessTerm):
 
     label = "stribeck"
     speed_law = laws.FADING
+    speed_shape = ("speed", "slowest")
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"speed": _POSITIVE}
     follows_direction = True
     guards = "v"
 
     @property
-    def speed_shape(self) -> tuple[float, ...]:
-        """Its speed, and that below which no data show how it goes on to 0."""
-        return self.speed, self.seen[0]
+    def slowest(self) -> float:
+        """The speed below which no data show how it goes on to 0."""
+        return self.seen[0]
 
 
 @dataclass(frozen=True)
@@ -173,14 +174,10 @@ class Tanh(MemorylessTerm):
 
     label = "tanh"
     speed_law = laws.TANH
+    speed_shape = ("speed",)
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"speed": _POSITIVE}
     is_nonnegative = True
     guards = "v"
-
-    @property
-    def speed_shape(self) -> tuple[float, ...]:
-        """Its speed."""
-        return (self.speed,)
 
 
 @dataclass(frozen=True)
@@ -191,15 +188,11 @@ class Power(MemorylessTerm):
 
     label = "power"
     speed_law = laws.POWER
+    speed_shape = ("exponent",)
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"exponent": (0.0, 10.0)}
     units = ("N m (s/rad)^p", "N (s/m)^p")
     follows_direction = True
     guards = "v"
-
-    @property
-    def speed_shape(self) -> tuple[float, ...]:
-        """Its exponent."""
-        return (self.exponent,)
 
 
 @dataclass(frozen=True)
@@ -211,6 +204,7 @@ class Ramp(MemorylessTerm):
     high: float = 1.0
 
     speed_law = laws.RISE
+    speed_shape = ("low", "high")
     rising: ClassVar[tuple[str, ...]] = ("low", "high")
     is_nonnegative = True
     follows_direction = True
@@ -218,11 +212,6 @@ class Ramp(MemorylessTerm):
     @property
     def name(self) -> str:
         return f"rise{self.number}"
-
-    @property
-    def speed_shape(self) -> tuple[float, ...]:
-        """Where it rises."""
-        return self.low, self.high
 
 
 @dataclass(frozen=True)
@@ -235,6 +224,7 @@ class Harmonic(MemorylessTerm):
     order: float = 1.0
     is_sine: bool = False
 
+    position_shape = ("order",)
     is_shared = False
     guards = "q"
     part = "ripple"
@@ -248,11 +238,6 @@ class Harmonic(MemorylessTerm):
         """Sine or cosine."""
         return laws.SINE if self.is_sine else laws.COSINE
 
-    @property
-    def position_shape(self) -> tuple[float, ...]:
-        """Its order."""
-        return (self.order,)
-
 
 @dataclass(frozen=True)
 class PositionCoulomb(MemorylessTerm):
@@ -262,6 +247,7 @@ class PositionCoulomb(MemorylessTerm):
     centre: float = 0.0
 
     position_law = laws.POLYNOMIAL
+    position_shape = ("order", "centre")
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"order": (0, 10)}
     follows_direction = True
     is_shared = False
@@ -270,11 +256,6 @@ class PositionCoulomb(MemorylessTerm):
     @property
     def name(self) -> str:
         return f"coulomb_q{self.order}"
-
-    @property
-    def position_shape(self) -> tuple[float, ...]:
-        """Its order and centre."""
-        return self.order, self.centre
 
 
 @dataclass(frozen=True)
@@ -364,17 +345,12 @@ class Spring(MemorylessTerm):
     """A linear spring, tau = k q; the torque at q = 0 is the offset's."""
 
     label = "spring"
-    position_law = laws.POLYNOMIAL
+    position_law = laws.LINEAR
     units = ("N m/rad", "N/m")
     is_shared = False
     is_friction = True
     guards = "q"
     part = "spring"
-
-    @property
-    def position_shape(self) -> tuple[float, ...]:
-        """Its order and centre."""
-        return 1.0, 0.0
 
 
 @dataclass(frozen=True)
@@ -387,6 +363,7 @@ class Hat(MemorylessTerm):
     after: float = 1.0
 
     position_law = laws.HAT
+    position_shape = ("before", "at", "after")
     rising: ClassVar[tuple[str, ...]] = ("before", "at", "after")
     is_shared = False
     guards = "q"
@@ -395,11 +372,6 @@ class Hat(MemorylessTerm):
     @property
     def name(self) -> str:
         return f"spring{self.number}"
-
-    @property
-    def position_shape(self) -> tuple[float, ...]:
-        """Its position and its neighbours'."""
-        return self.before, self.at, self.after
 
 
 @dataclass(frozen=True)
@@ -417,17 +389,13 @@ class Counterbalance(MemorylessTerm):
 
     label = "counterbalance"
     position_law = laws.LEVER
+    position_shape = ("arm", "base", "angle", "rest")
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"arm": _POSITIVE, "base": _POSITIVE}
     units = ("N/m", "N/m")
     is_nonnegative = True
     is_shared = False
     usual = (50.0, 90.0)
     part = "spring"
-
-    @property
-    def position_shape(self) -> tuple[float, ...]:
-        """Its arm, base, angle and rest."""
-        return self.arm, self.base, self.angle, self.rest
 
 
 @dataclass(frozen=True)
