@@ -53,11 +53,26 @@ def loud(findings):
 
 
 def spoil(name, table, folder):
+    """Return the job of a table as a case changes it."""
     case = CASES[name]
     path = folder / "run.csv"
     write_columns(case.change(table), path)
     urdf = example_urdf(case.urdf)
-    return case, Job(urdf=urdf, gravity=case.gravity, identification=(LogEntry(path),))
+    return Job(urdf=urdf, gravity=case.gravity, identification=(LogEntry(path),))
+
+
+@pytest.fixture(scope="module")
+def spoilt(table, tmp_path_factory):
+    """The job of each spoilt table and what is found of it, examined once."""
+    made = {}
+
+    def examined_once(name):
+        if name not in made:
+            job = spoil(name, table, tmp_path_factory.mktemp("spoilt"))
+            made[name] = job, examine(job)
+        return made[name]
+
+    return examined_once
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -84,42 +99,41 @@ BESIDES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_each_corruption_is_found_by_its_own_code(name, table, tmp_path):
-    case, job = spoil(name, table, tmp_path)
-    findings = examine(job)
+def test_each_corruption_is_found_by_its_own_code(name, spoilt):
+    case, (_, findings) = CASES[name], spoilt(name)
     assert set(case.codes) & loud(findings)  # a note is not read
     assert loud(findings) - set(case.codes) <= BESIDES.get(name, set())
     json.dumps(findings_to_dict(findings), allow_nan=False)
 
 
-def test_a_coarse_velocity_that_is_not_used_is_a_note(table, tmp_path):
-    _, job = spoil("velocity of a 12-bit encoder", table, tmp_path)
+def test_a_coarse_velocity_that_is_not_used_is_a_note(spoilt):
+    job, _ = spoilt("velocity of a 12-bit encoder")
     job = replace(job, signals=replace(job.signals, velocity="differentiated"))
     assert "quantised" not in loud(examine(job))
 
 
-def test_where_names_the_joint_and_the_evidence_says_how_much(table, tmp_path):
-    _, job = spoil("one torque negated", table, tmp_path)
-    (found,) = [f for f in examine(job) if f.code == "torque_sign"]
+def test_where_names_the_joint_and_the_evidence_says_how_much(spoilt):
+    _, findings = spoilt("one torque negated")
+    (found,) = [f for f in findings if f.code == "torque_sign"]
     assert found.where == "run.csv: elbow_joint"
     assert found.evidence["unexplained"] > 0.5 > 0.1 > found.evidence["unexplained_if_negated"]
     assert "negate tau_elbow_joint" in found.message
-    _, job = spoil("two torque columns swapped", table, tmp_path)
-    (found,) = [f for f in examine(job) if f.code == "torque_order"]
+    _, findings = spoilt("two torque columns swapped")
+    (found,) = [f for f in findings if f.code == "torque_order"]
     assert found.where == "run.csv: shoulder_lift_joint, wrist_1_joint"
     assert "tau_wrist_1_joint is that of shoulder_lift_joint" in found.message
 
 
-def test_delays_are_measured_and_corrected_only_on_request(table, tmp_path):
-    _, job = spoil("torque 30 ms late", table, tmp_path)
-    (found,) = [f for f in examine(job) if f.code == "torque_delay"]
+def test_delays_are_measured_and_corrected_only_on_request(spoilt):
+    job, findings = spoilt("torque 30 ms late")
+    (found,) = [f for f in findings if f.code == "torque_delay"]
     delay, error = found.evidence["delay"], found.evidence["std_error"]
     # 5 ms: unmodelled friction near a change of direction imitates a few
     assert abs(delay - 0.03) < max(3 * error, 0.005)
     stated = replace(job, signals=SignalSettings(torque_delay=0.03))
     assert "torque_delay" not in loud(examine(stated))
-    _, job = spoil("velocity 30 ms late", table, tmp_path)
-    (found,) = [f for f in examine(job) if f.code == "velocity_delay"]
+    job, findings = spoilt("velocity 30 ms late")
+    (found,) = [f for f in findings if f.code == "velocity_delay"]
     assert found.evidence["delay"] == pytest.approx(0.03, abs=0.001)
     stated = replace(job, signals=SignalSettings(velocity_delay=0.03))
     assert "velocity_delay" not in {f.code for f in examine(stated)}

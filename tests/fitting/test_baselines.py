@@ -8,7 +8,7 @@ from scipy.optimize import lsq_linear
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
 
-EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0, velocity="measured")
 
 
 def test_the_drives_of_a_true_urdf_are_found_exactly(ur5, rng):

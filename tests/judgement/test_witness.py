@@ -13,7 +13,7 @@ from robotid.judgement.findings import fit_findings
 from robotid.judgement.witness import Witness, call_witness
 from robotid.logs.settings import SignalSettings
 
-EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0, velocity="measured")
 NOISE = 0.05 * np.array([4, 4, 2, 1, 1, 0.5])
 
 
