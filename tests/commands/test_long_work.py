@@ -65,12 +65,18 @@ def expected(job, tmp_path_factory):
     return (out / "result.json").read_text()
 
 
-def test_two_workers_give_the_same_result_to_the_last_bit(job, expected, tmp_path, capsys):
-    words = ["identify", job, "--workers", "2", "--out", str(tmp_path), "--verbose", "--json"]
+def test_two_workers_of_the_job_give_the_same_result_to_the_last_bit(
+    job, expected, tmp_path, capsys
+):
+    two = Path(job).with_name("two.toml")
+    two.write_text(Path(job).read_text().replace("[reduction]", "[reduction]\nworkers = 2"))
+    words = ["identify", str(two), "--out", str(tmp_path), "--verbose", "--json"]
     assert main(words) == 0
-    assert (tmp_path / "result.json").read_text() == expected
+    found = json.loads((tmp_path / "result.json").read_text())
     shown = capsys.readouterr()
-    assert json.loads(shown.out) == json.loads(expected)
+    assert json.loads(shown.out) == found
+    assert found["settings"]["reduction"].pop("workers") == 2
+    assert found == json.loads(expected)
     assert "reducing 8 pieces" in shown.err
     assert "2000 samples in all: 2 worker processes, one BLAS thread each" in shown.err
     assert shown.err.count("samples: Pinocchio (fewer than") == 1  # once for all pieces
