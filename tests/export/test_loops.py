@@ -1,0 +1,123 @@
+"""What result.json holds of loops, figure by figure, for two joints of two kinds and three logs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.mujoco_plant import multisine
+
+from robotid.closed_loop.fit import stated_loops
+from robotid.closed_loop.identify import identify_loops
+from robotid.closed_loop.settings import LoopSettings
+from robotid.export.loops import loop_entries, loop_inputs
+from robotid.fitting.settings import SimulationSettings
+from robotid.logs.data import Log
+from robotid.robot.drives import Viscous
+from robotid.robot.model import RobotModel
+from robotid.simulation.loops import LoopedRobot, cut_windows
+
+INERTIAL = """<inertial><mass value="2"/><origin xyz="0.1 0 0"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>"""
+CRANE = f"""<robot name="crane"><link name="base"/><link name="cart">{INERTIAL}</link>
+<link name="boom">{INERTIAL}</link>
+<joint name="rail" type="prismatic"><parent link="base"/><child link="cart"/><axis xyz="1 0 0"/>
+<limit lower="-9" upper="9" effort="90" velocity="9"/></joint>
+<joint name="turn" type="revolute"><parent link="cart"/><child link="boom"/><axis xyz="0 0 1"/>
+<limit lower="-9" upper="9" effort="90" velocity="9"/></joint></robot>"""
+LOOP = LoopSettings(kp={"rail": 300.0, "turn": 40.0}, kd={"rail": 30.0, "turn": 3.0},
+                    limit={"rail": 80.0})  # fmt: skip
+STARTS, RATES = (0.0, 5.0, -2.0), (250.0, 200.0, 125.0)  # of two logs and one kept apart
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    path, rng = tmp_path_factory.mktemp("crane") / "crane.urdf", np.random.default_rng(0)
+    path.write_text(CRANE)
+    model = RobotModel.from_urdf(path, terms=("armature", "viscous"))
+    loops = replace(
+        stated_loops(model, LOOP), armature=np.array([0.5, 0.05]), delay=np.full(2, 0.006),
+        terms=((Viscous(),),) * 2, values=np.array([5.0, 0.5]),
+    )  # fmt: skip
+    logs = []
+    for start, rate in zip(STARTS, RATES, strict=True):
+        t = start + np.arange(round(1.5 * rate)) / rate
+        q_ref = multisine(t - start, np.zeros(2), np.array([0.2, 0.5]), rng)
+        told = Log(t, q_ref, 0 * q_ref, model.joints, q_ref=q_ref, has_torque=False)
+        [out] = LoopedRobot(model, step=1e-3).roll_out(loops, cut_windows(told, np.inf, 0.0))
+        logs.append(replace(told, q=out.q + 3e-4 * rng.standard_normal(out.q.shape)))
+    settings = SimulationSettings(window=0.75, lead=0.2, bodies=0.0, step=4e-3)
+    return identify_loops(model, logs[:2], logs[2:], LOOP, settings, chooses=False)
+
+
+@pytest.fixture(scope="module")
+def entries(found):
+    return loop_entries(found)
+
+
+def test_what_was_stated_has_no_error_and_what_was_found_has_its_own(found, entries):
+    estimate, loops = found.fit.estimate, found.fit.loops
+    [k] = [k for k, name in enumerate(estimate.names) if name.endswith("delay")]
+    units = {"kp": ("N/m", "N m/rad"), "kd": ("N s/m", "N m s/rad"), "delay": ("s", "s"),
+             "limit": ("N", "N m"), "zero": ("m", "rad")}  # fmt: skip
+    wanted = []
+    for j, joint in enumerate(("rail", "turn")):
+        for what, unit in units.items():
+            if (joint, what) == ("turn", "limit"):
+                continue  # it has none
+            is_found = what == "delay"  # of all drives together
+            wanted.append({
+                "name": f"{joint}.{what}", "value": getattr(loops, what)[j],
+                "std_error": estimate.std_error[k] if is_found else None,
+                "reach": estimate.reach[k] if is_found else None,
+                "unit": unit[j], "source": "data" if is_found else "stated",
+            })  # fmt: skip
+    assert entries["loop_parameters"] == wanted
+    assert loops.delay == pytest.approx(np.full(2, 0.006), abs=4 * estimate.std_error[k])
+    assert entries["simulation"]["controller"] == {
+        "kind": "pd", "effort_limit": {"rail": 80.0}, "rate": None,
+    }  # fmt: skip
+
+
+def test_each_log_has_its_times_rate_and_role(found):
+    inputs = loop_inputs(found)
+    assert [entry["role"] for entry in inputs] == ["identification"] * 2 + ["validation"]
+    for entry, start, rate in zip(inputs, STARTS, RATES, strict=True):
+        rows = round(1.5 * rate)
+        assert entry["samples"] == entry["rows_used"] == rows
+        assert entry["rate"] == pytest.approx(rate)
+        assert entry["start"] == start
+        assert entry["end"] == pytest.approx(start + (rows - 1) / rate)
+
+
+def test_open_loops_have_the_errors_of_each_joint_and_horizon(found, entries):
+    for role, runs in (("identification", found.fitted), ("validation", found.validation)):
+        shown = entries["simulation"][role]
+        assert len(shown) == len(runs) == {"identification": 2, "validation": 1}[role]
+        for entry, run in zip(shown, runs, strict=True):
+            assert (entry["start"], entry["end"]) == (run.log.t[0], run.log.t[-1])
+            error = np.sqrt(np.mean((run.log.q - run.q) ** 2, axis=0))
+            off = np.sqrt(np.mean((run.log.q_ref - run.log.q) ** 2, axis=0))
+            for j, joint in enumerate(("rail", "turn")):
+                own = entry["per_joint"][joint]
+                assert own["unit"] == ("m", "rad")[j]
+                assert own["rmse"] == pytest.approx(error[j])
+                assert own["command_rmse"] == pytest.approx(off[j])
+                assert own["urdf_rmse"] == run.baselines["urdf"][j]
+            assert list(entry["horizons"]) == ["0.1", "0.5"]
+            for horizon, errors in run.horizons.items():
+                assert entry["horizons"][f"{horizon:g}"] == dict(
+                    zip(("rail", "turn"), errors, strict=True)
+                )
+    [kept] = entries["validation"]
+    share = 100 * found.validation[0].rmse / found.validation[0].log.q.std(axis=0)
+    for joint, own in zip(("rail", "turn"), share, strict=True):
+        assert kept["per_joint"][joint]["relative_error_pct"] == pytest.approx(own)
+
+
+def test_the_fit_says_what_it_is(found, entries):
+    fit, estimate = entries["simulation"]["fit"], found.fit.estimate
+    assert fit["converged"] is True
+    assert fit["parameters"] == len(estimate.names) == 5  # two armatures and frictions, one delay
+    assert entries["structure"]["rank"] == estimate.rank == 5
+    assert entries["uncertainty"]["inflation"] == estimate.details["inflation"]
+    assert entries["simulation"]["signs"] == {"rail": 1.0, "turn": 1.0}
