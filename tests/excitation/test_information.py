@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from helpers.robots import ROBOTS
+from helpers.robots import ROBOTS, WRIST
 
 from robotid.exceptions import SettingsError
 from robotid.excitation.information import CRITERIA, MotionInformation, criterion
@@ -17,7 +17,10 @@ CASES = {
     "coupled drives": ROBOTS["coupled drives"],
     "terms of their own": ("ur5_robot.urdf", OWN),
     "mimic joint coupled": ROBOTS["mimic joint coupled"],
-}
+    "a coupled drive that feels its load": (
+        "ur5_robot.urdf", {"couplings": (WRIST,), "own_terms": {WRIST.name: [LoadFriction()]}}
+    ),
+}  # fmt: skip
 
 
 @pytest.fixture(params=CASES)

@@ -47,6 +47,13 @@ def test_a_course_has_the_values_of_the_motion_and_shares_of_its_limits(course):
     at = found.peak("acceleration", 1)
     peak = np.abs(design.motion.evaluate(np.array([at]))[2][0, 1])
     assert peak == pytest.approx(4.0 * found.largest[k, 1], rel=1e-9)
+    signs = set()
+    for kind, used in zip(LIMITS, found.used, strict=True):  # the largest, of either sign
+        for j in range(3):
+            at = used[found.t == found.peak(kind, j), j]
+            assert np.abs(at) == np.abs(used[:, j]).max()
+            signs |= set(np.sign(at))
+    assert {-1.0, 1.0} <= signs
 
 
 def test_torques_of_a_course_are_those_of_the_bodies_and_the_friction_assumed(course):

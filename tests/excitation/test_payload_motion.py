@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -109,6 +110,10 @@ def test_standard_errors_are_those_of_both_runs_fitted_at_once(designer, found):
     information = (both / size).T @ (both / size) + 1e-10 * np.eye(len(size))
     error = np.sqrt(np.diag(np.linalg.inv(information))[-10:]) / size[-10:]
     np.testing.assert_allclose(found.std_error, error, rtol=0.05)
+    mass, centre, inertia = error[0], error[1:4].max(), error[4:].max()
+    [said] = [x for x in found.in_words() if x.startswith("Standard errors")]
+    numbers = [float(x) for x in re.findall(r" ([\d.e-]+) kg", said)]
+    np.testing.assert_allclose(numbers, [mass, centre, inertia], rtol=0.12)  # of two digits
 
 
 def test_a_motion_of_stated_joints_says_what_it_leaves_open(designer):

@@ -6,7 +6,7 @@ from robotid.excitation.clearance import Clearance
 from robotid.excitation.course import Course
 from robotid.excitation.design import Designer
 from robotid.excitation.limits import LIMITS, MotionLimits
-from robotid.excitation.routes import Route, design_stands, design_sweeps
+from robotid.excitation.routes import _PLACES, Route, _room, _sweeps, design_stands, design_sweeps
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -35,6 +35,40 @@ def test_a_route_rests_cruises_and_its_derivatives_are_true():
         assert np.abs(v[k]).max() == 0.0
     cruise = (t > 0.71) & (t < 2.29)  # 0.5 + 0.2 to 2.5 - 0.2
     np.testing.assert_allclose(v[cruise, 0], 1.0 / (2.0 * 0.9), rtol=1e-12)
+
+
+def test_room_ends_at_the_nearest_place_where_the_robot_cannot_rest(designer):
+    low, high = (designer.limits.middle + s * designer.limits.sizes[0] for s in (-1, 1))
+    step, blocked = (high - low) / (_PLACES - 1), 0
+    for posture in designer.postures.resting(np.random.default_rng(0), 200)[:5]:
+        for j, room in enumerate(_room(designer, posture)):
+            for way, left in zip((-1.0, 1.0), room, strict=True):
+                q = np.tile(posture, (50, 1))
+                q[:, j] += way * np.linspace(0.0, max(left - step[j], 0.0), 50)
+                assert designer.postures.can_rest(q).mean() > 0.95  # but between the places
+                q[0, j] = posture[j] + way * left
+                if min(q[0, j] - low[j], high[j] - q[0, j]) > 1e-9:
+                    assert not designer.postures.can_rest(q[:1])[0]
+                    blocked += 1
+    assert blocked > 10
+
+
+def test_a_sweep_lasts_three_seconds_if_there_is_room(designer):
+    posture, fastest = np.array([0.1, 0.2, 0.3]), designer.limits.sizes[1]
+    room = np.array([[0.2, 9.0], [9.0, 0.3], [9.0, 9.0]])
+    route = _sweeps(designer, posture, room, (0.1, 0.4))
+    k = 0
+    for j in range(3):
+        for share in (0.1, 0.4):
+            speed = share * fastest[j]
+            down, up = np.minimum(room[j], 1.5 * speed)  # half of it either way
+            wanted = np.array([posture[j], posture[j] + up, posture[j] - down, posture[j]])
+            np.testing.assert_allclose(route.places[k : k + 4, j], wanted)
+            way = np.abs(np.diff(wanted))
+            np.testing.assert_allclose(route.times[k : k + 3], way / speed + 0.25)
+            np.testing.assert_allclose(route.ramps[k : k + 3] * route.times[k : k + 3], 0.25)
+            k += 3
+    assert len(route.places) == k + 1
 
 
 def test_sweeps_go_both_ways_at_each_speed_while_the_others_rest(designer, rng):

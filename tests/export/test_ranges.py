@@ -1,15 +1,25 @@
 """Ranges for randomisation: the intervals of what was identified, possible whatever is drawn."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
+from helpers.robots import motion
 from scipy.spatial.transform import Rotation
 
 from robotid.export.entries import build_result
-from robotid.export.ranges import parameter_ranges, ranges_text, write_ranges
+from robotid.export.ranges import (
+    parameter_ranges,
+    projected_ranges,
+    ranges_text,
+    write_ranges,
+)
 from robotid.export.yaml_text import yaml_text
+from robotid.logs.data import Trajectory
+from robotid.regressor.friction_projection import drive_moments, project_friction
+from robotid.robot.drives import Stribeck
 from robotid.robot.parameters import pseudo_inertia
 
 AXES = ("x", "y", "z")
@@ -140,3 +150,38 @@ def test_names_of_any_characters_are_read_back_from_yaml(name):
     text = yaml_text(table, "# head")
     assert yaml.safe_load(text) == table
     assert len(text.splitlines()) == text.count("\n")
+
+
+def test_projected_friction_is_as_wide_as_draws_of_what_it_replaces(ur5):
+    """Of terms whose intervals reach differently far, the farthest."""
+    elbow, rng = "elbow_joint", np.random.default_rng(3)
+    model = ur5.with_terms({elbow: (Stribeck(seen=(0.05, 2.0), speed=0.3),)})
+    names, pi = list(model.layout.names), model.standard_parameters()
+    own = [names.index(f"{elbow}.{term}") for term in ("viscous", "coulomb", "stribeck", "offset")]
+    pi[own] = 3.0, 9.0, 2.0, 0.4
+    m = motion(model, rng, 400)
+    still = np.zeros_like(m.q)
+    log = Trajectory(
+        np.arange(400) / 100.0, m.q, m.v, m.a, still, m.joints, None, np.zeros(400, dtype=int)
+    )
+    moments = drive_moments(model.with_reference(pi), [(log, np.ones(m.q.shape, dtype=bool))])
+    A, covariance = 0.1 * rng.standard_normal((4, 4)), np.zeros((len(pi), len(pi)))
+    covariance[np.ix_(own, own)] = A @ A.T
+    reach = np.full(len(pi), 5.0)  # of other drives
+    reach[own] = 2.0, 2.1, 2.6, 2.2
+    found = SimpleNamespace(
+        model=model, standard=pi, moments=moments, standard_covariance=covariance,
+        standard_reach=reach,
+    )  # fmt: skip
+    ranges = projected_ranges(found)["projected_drives"][elbow]
+    simple = ("viscous", "coulomb", "offset")
+    drawn = []
+    for _ in range(500):
+        x = pi.copy()
+        x[own] += A @ rng.standard_normal(4)
+        [drive] = project_friction(model, x, moments, simple).drives
+        drawn.append([drive.values[term] for term in simple])
+    for term, values in zip(simple, np.transpose(drawn), strict=True):
+        width = ranges[term]["high"] - ranges[term]["low"]
+        # 500 draws know a standard deviation to 3 %
+        assert width == pytest.approx(2 * 2.6 * values.std(), rel=0.1), term

@@ -1,0 +1,90 @@
+"""Figures that are derived of a fit of loops, with errors that are given."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.stats
+from helpers.crane import identified_crane
+
+from robotid.closed_loop.initial_values import _speed
+from robotid.closed_loop.result import logged_motion
+from robotid.fitting.bands import REACH
+from robotid.logs.data import Log
+from robotid.simulation.loops import cut_windows
+
+#: Names of the unknowns, in the order of the fit.
+NAMES = ("rail.armature", "turn.armature", "robot.delay", "rail.viscous", "turn.viscous")
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    return identified_crane(tmp_path_factory.mktemp("crane"))
+
+
+def of(found, **changes):
+    """Return the same with another estimate."""
+    return replace(found, fit=replace(found.fit, estimate=replace(found.estimate, **changes)))
+
+
+def test_intervals_reach_as_far_as_those_of_what_they_follow_from(found):
+    assert found.estimate.names == NAMES
+    freedom = np.array([5.0, 4.0, 3.0, 8.0, 12.0])
+    own = of(found, details={**found.estimate.details, "freedom": freedom})
+    reach = dict(zip(found.model.layout.names, own.standard_reach, strict=True))
+    stated = dict(zip(NAMES, scipy.stats.t.ppf(0.975, freedom), strict=True))
+    assert reach == pytest.approx({name: stated.get(name, REACH) for name in reach}, rel=1e-6)
+    sums = found.mapping.K != 0.0
+    assert sums.sum(axis=1).max() > 1, "a base parameter sums several"
+    for row, base in zip(sums, own.base_reach, strict=True):
+        assert base == own.standard_reach[row].max()
+
+
+def test_errors_of_sums_are_those_of_their_parameters(found):
+    variance = dict(zip(NAMES, np.diag(found.estimate.covariance), strict=True))
+    C = np.diag([variance.get(name, 0.0) for name in found.model.layout.names])
+    standard = dict(zip(found.model.layout.names, found.standard_error, strict=True))
+    for name, error in standard.items():
+        assert error == pytest.approx(np.sqrt(variance[name]) if name in variance else np.inf)
+    k = [found.model.layout.names.index(name) for name in NAMES if name in standard]
+    places = [NAMES.index(found.model.layout.names[i]) for i in k]
+    C[np.ix_(k, k)] = found.estimate.covariance[np.ix_(places, places)]
+    for row, error in zip(found.mapping.K, found.base_error, strict=True):
+        size = np.sqrt(row @ C @ row)
+        assert error == (pytest.approx(size) if size > 0 else np.inf)
+
+
+def test_unknowns_whose_errors_go_together_are_sets(found):
+    R = np.eye(5)
+    for a, b, rho in ((0, 3, 0.99), (3, 4, -0.985), (1, 2, 0.97)):
+        R[a, b] = R[b, a] = rho
+    std = np.array([1e-3, 10.0, 0.1, 2.0, 5e-2])
+    other = of(found, covariance=R * np.outer(std, std))
+    assert other.told_together == (("rail.armature", "rail.viscous", "turn.viscous"),)
+
+
+def test_what_the_data_hardly_shrink_is_undetermined(found):
+    spread = found.fit.simulator.prior_std
+    assert (found.shrunk < 0.3).all()
+    assert found.undetermined == ()
+    share = np.array([0.85, 0.95, 0.2, 0.92, 0.1])
+    other = of(found, covariance=np.diag((share * spread) ** 2))
+    np.testing.assert_allclose(other.shrunk, share)
+    assert other.undetermined == ("turn.armature", "rail.viscous")
+
+
+def test_speeds_of_a_log_are_those_between_its_gaps():
+    t = 3.0 + np.concatenate([np.arange(50), 80 + np.arange(30)]) / 100.0
+    q = np.column_stack([2.0 * t, -0.5 * t**2])
+    q[50:] += 7.0  # while nothing was recorded
+    log = Log(t, q, 0 * q, ("a", "b"), q_ref=q, has_torque=False)
+    motion = logged_motion(log)
+    np.testing.assert_array_equal(motion.segment, np.repeat([0, 1], [50, 30]))
+    np.testing.assert_allclose(motion.v[:, 0], 2.0)
+    inner = np.delete(np.arange(80), [0, 49, 50, 79])  # ends have half a step
+    np.testing.assert_allclose(motion.v[inner, 1], -t[inner])
+    np.testing.assert_allclose(motion.v[:, 1], -t, atol=0.0051)
+    assert not motion.a.any()
+    windows = cut_windows(log, 0.2, 0.0)
+    rms = np.sqrt(np.mean(t**2))
+    np.testing.assert_allclose(_speed(windows), [2.0, rms], rtol=1e-2)

@@ -1,0 +1,86 @@
+"""What result.json holds of loops, figure by figure, for two joints of two kinds and three logs."""
+
+import numpy as np
+import pytest
+from helpers.crane import RATES, STARTS, identified_crane
+
+from robotid.export.loops import loop_entries, loop_inputs
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    return identified_crane(tmp_path_factory.mktemp("crane"))
+
+
+@pytest.fixture(scope="module")
+def entries(found):
+    return loop_entries(found)
+
+
+def test_what_was_stated_has_no_error_and_what_was_found_has_its_own(found, entries):
+    estimate, loops = found.fit.estimate, found.fit.loops
+    [k] = [k for k, name in enumerate(estimate.names) if name.endswith("delay")]
+    units = {"kp": ("N/m", "N m/rad"), "kd": ("N s/m", "N m s/rad"), "delay": ("s", "s"),
+             "limit": ("N", "N m"), "zero": ("m", "rad")}  # fmt: skip
+    wanted = []
+    for j, joint in enumerate(("rail", "turn")):
+        for what, unit in units.items():
+            if (joint, what) == ("turn", "limit"):
+                continue  # it has none
+            is_found = what == "delay"  # of all drives together
+            wanted.append({
+                "name": f"{joint}.{what}", "value": getattr(loops, what)[j],
+                "std_error": estimate.std_error[k] if is_found else None,
+                "reach": estimate.reach[k] if is_found else None,
+                "unit": unit[j], "source": "data" if is_found else "stated",
+            })  # fmt: skip
+    assert entries["loop_parameters"] == wanted
+    assert loops.delay == pytest.approx(np.full(2, 0.006), abs=4 * estimate.std_error[k])
+    assert entries["simulation"]["controller"] == {
+        "kind": "pd", "effort_limit": {"rail": 80.0}, "rate": None,
+    }  # fmt: skip
+
+
+def test_each_log_has_its_times_rate_and_role(found):
+    inputs = loop_inputs(found)
+    assert [entry["role"] for entry in inputs] == ["identification"] * 2 + ["validation"]
+    for entry, start, rate in zip(inputs, STARTS, RATES, strict=True):
+        rows = round(1.5 * rate)
+        assert entry["samples"] == entry["rows_used"] == rows
+        assert entry["rate"] == pytest.approx(rate)
+        assert entry["start"] == start
+        assert entry["end"] == pytest.approx(start + (rows - 1) / rate)
+
+
+def test_open_loops_have_the_errors_of_each_joint_and_horizon(found, entries):
+    for role, runs in (("identification", found.fitted), ("validation", found.validation)):
+        shown = entries["simulation"][role]
+        assert len(shown) == len(runs) == {"identification": 2, "validation": 1}[role]
+        for entry, run in zip(shown, runs, strict=True):
+            assert (entry["start"], entry["end"]) == (run.log.t[0], run.log.t[-1])
+            error = np.sqrt(np.mean((run.log.q - run.q) ** 2, axis=0))
+            off = np.sqrt(np.mean((run.log.q_ref - run.log.q) ** 2, axis=0))
+            for j, joint in enumerate(("rail", "turn")):
+                own = entry["per_joint"][joint]
+                assert own["unit"] == ("m", "rad")[j]
+                assert own["rmse"] == pytest.approx(error[j])
+                assert own["command_rmse"] == pytest.approx(off[j])
+                assert own["urdf_rmse"] == run.baselines["urdf"][j]
+            assert list(entry["horizons"]) == ["0.1", "0.5"]
+            for horizon, errors in run.horizons.items():
+                assert entry["horizons"][f"{horizon:g}"] == dict(
+                    zip(("rail", "turn"), errors, strict=True)
+                )
+    [kept] = entries["validation"]
+    share = 100 * found.validation[0].rmse / found.validation[0].log.q.std(axis=0)
+    for joint, own in zip(("rail", "turn"), share, strict=True):
+        assert kept["per_joint"][joint]["relative_error_pct"] == pytest.approx(own)
+
+
+def test_the_fit_says_what_it_is(found, entries):
+    fit, estimate = entries["simulation"]["fit"], found.fit.estimate
+    assert fit["converged"] is True
+    assert fit["parameters"] == len(estimate.names) == 5  # two armatures and frictions, one delay
+    assert entries["structure"]["rank"] == estimate.rank == 5
+    assert entries["uncertainty"]["inflation"] == estimate.details["inflation"]
+    assert entries["simulation"]["signs"] == {"rail": 1.0, "turn": 1.0}
