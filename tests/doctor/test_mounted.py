@@ -94,6 +94,14 @@ def test_joints_with_friction_of_their_own_are_examined_like_others(arm_and_log)
     assert found[0] == found[1]
 
 
+def test_each_validation_log_is_compared_with_the_fitted_ones(arm_and_log):
+    model, fitted, other = arm_and_log
+    late = replace(other, path="late", tau=np.roll(other.tau, 5, axis=0))
+    alone = [diagnose(model, [fitted], [log], SignalSettings()) for log in (other, late)]
+    both = diagnose(model, [fitted], [other, late], SignalSettings())
+    assert set(map(str, both)) == {str(finding) for found in alone for finding in found}
+
+
 def test_a_load_is_named_beside_a_urdf_of_another_robot(arm_and_log):
     """Links that weigh half or twice what the URDF says are no reason to miss a load."""
     model, *_ = arm_and_log
