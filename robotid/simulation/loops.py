@@ -399,6 +399,8 @@ class LoopedRobot:
 
     def _course(self, part: _Part, windows: Sequence[Window], loops: Loops) -> "Course":
         """Return what the joints of a part are told in a block of windows."""
+        from robotid.simulation.course_lanes import average_command  # imports Numba
+
         lanes = _lanes()
         samples = max(window.stop - window.begin for window in windows)
         grids = [_Grid.of(window, samples, loops.rate) for window in windows]
@@ -425,7 +427,7 @@ class LoopedRobot:
                     continue
                 for i, j in enumerate(part.joints):
                     x = np.ascontiguousarray(values[:, j])
-                    lanes.average_command(log.t, x, told, loops.delay[j], mean, change)
+                    average_command(log.t, x, told, loops.delay[j], mean, change)
                     command[:, i, k, lane] = mean[of_step]
                     command[:, i, by_delay, lane] = change[of_step]
         course: Course = lanes.Course(command, steps, ticks, every, start)
@@ -474,7 +476,9 @@ class _Grid:
         """Return where steps begin and end, and which begin with a tick."""
         size = (len(self.stamps) - 1) * every
         times, is_tick = np.empty(size + 1), np.empty(size, dtype=bool)
-        _lanes().divide_rows(self.stamps, self.ticks, times, is_tick)
+        from robotid.simulation.course_lanes import divide_rows  # imports Numba
+
+        divide_rows(self.stamps, self.ticks, times, is_tick)
         return times, is_tick
 
 
