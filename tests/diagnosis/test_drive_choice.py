@@ -14,6 +14,7 @@ from helpers.driven import (
     arm,
     driven,
     driven_log,
+    fitted_in,
     found_in,
 )
 
@@ -28,7 +29,7 @@ from robotid.fitting.bands import friction_curve
 from robotid.fitting.parameter_table import parameter_entries
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
-from robotid.identification.pipeline import conclude, identify
+from robotid.identification.pipeline import identify, with_drives
 from robotid.logs.read import write_log
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
@@ -124,7 +125,7 @@ def test_a_family_that_is_stated_is_found_within_its_intervals(plain, cases, nam
 
 @pytest.mark.parametrize("name", [name for name in CASES if FAMILIES[name].is_automatic])
 def test_the_family_is_chosen_on_its_joint_and_nothing_on_others(plain, cases, name):
-    found = found_in(plain, [cases(name)[2]], friction=AUTO)
+    found = fitted_in(plain, [cases(name)[2]], friction=AUTO)
     assert set(chosen(found)) == {ELBOW}
     (family,) = chosen(found)[ELBOW]
     assert family in ALIKE.get(name, {name})
@@ -144,14 +145,14 @@ def test_a_shape_between_the_sizes_of_the_grid_needs_no_second_family(plain):
     speed = low * (high / low) ** (3.5 / 5)  # of 6 sizes
     terms = [Stribeck(speed=speed)]
     true, pi = driven(plain, {ELBOW: terms}, {f"{ELBOW}.stribeck": 6.0})
-    found = found_in(plain, [driven_log(true, pi, SEED, reach=REACH)], estimator="wls")
+    found = fitted_in(plain, [driven_log(true, pi, SEED, reach=REACH)], estimator="wls")
     assert chosen(found) == {ELBOW: ("stribeck",)}
 
 
 def test_a_robot_of_viscous_and_coulomb_friction_gets_no_more(plain):
     true, pi = driven(plain, {}, {})
     for seed in range(2):
-        found = found_in(plain, [driven_log(true, pi, seed, reach=REACH, noise=0.02)])
+        found = fitted_in(plain, [driven_log(true, pi, seed, reach=REACH, noise=0.02)])
         assert [c.joint for c in found.drives] == list(JOINTS)
         assert chosen(found) == {}
         assert found.model.layout == plain.layout
@@ -204,7 +205,7 @@ def rising_logs(found):
 
 def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
     """Beside the columns of a term, and of its shape's derivative."""
-    found = found_in(plain, [cases("stribeck")[2]], friction="none")
+    found = fitted_in(plain, [cases("stribeck")[2]], friction="none")
     sample = take_sample(found, is_steady=False)
     j, speed = sample.joints.index(ELBOW), 0.1
     own = [drive_motion_along(found.model, found.fitted[0].recording.trajectory).of(j)]
@@ -235,7 +236,7 @@ def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
 
 def test_a_counterbalance_that_is_known_is_in_the_model_before_others_are_tried(plain, cases):
     log = cases("load")[2]
-    fit = found_in(plain, [log], friction="none")
+    fit = fitted_in(plain, [log], friction="none")
     first = {ELBOW: "harmonics1"}
     wanted = dict.fromkeys(JOINTS)
     choices = {c.joint: c for c in choose_drives(fit, wanted, first)}
@@ -244,7 +245,7 @@ def test_a_counterbalance_that_is_known_is_in_the_model_before_others_are_tried(
     assert choices[ELBOW].tried[0].is_taken
     assert choices[LIFT].families == ()
     # what explains far more of the same kind replaces it
-    fit = found_in(plain, [cases("harmonics4")[2]], friction="none")
+    fit = fitted_in(plain, [cases("harmonics4")[2]], friction="none")
     choices = {c.joint: c for c in choose_drives(fit, wanted, first)}
     assert choices[ELBOW].families == ("harmonics4",)
     assert [x.families for x in choices[ELBOW].tried if x.is_taken] == [
@@ -273,12 +274,12 @@ def test_harmonics_are_for_joints_that_turn_far_enough(plain):
     waves = [Harmonic(order=2.0), Harmonic(order=2.0, is_sine=True)]
     true, pi = driven(plain, {ELBOW: waves}, {f"{ELBOW}.cos2": 2.0, f"{ELBOW}.sin2": 1.5})
     log = driven_log(true, pi, SEED, reach=1.0)  # 2.4 rad
-    found = found_in(plain, [log])
+    found = fitted_in(plain, [log])
     names = {family for families in chosen(found).values() for family in families}
     assert not names & {"harmonics2", "harmonics4"}
     assert not any("harmonics" in f for c in found.drives for x in c.tried for f in x.families)
     with pytest.raises(SettingsError, match=r"elbow_joint has harmonics4, but .* half a turn"):
-        found_in(plain, [log], friction={ELBOW: "harmonics4"})
+        fitted_in(plain, [log], friction={ELBOW: "harmonics4"})
 
 
 def test_a_shape_beyond_its_bounds_is_named(plain):
@@ -338,9 +339,9 @@ def test_a_joint_that_moves_in_one_of_several_logs_is_judged_by_that(plain, case
         ({"elbow": "load"}, "friction is stated for elbow, not among the joints to identify: "),
     ],
 )
-def test_names_that_are_none_are_refused(plain, cases, stated, message):
+def test_names_that_are_none_are_refused(stated, message):
     with pytest.raises(SettingsError, match=message):
-        found_in(plain, [cases("load")[2]], friction=stated)
+        wanted_families(stated, JOINTS)
 
 
 def test_friction_is_stated_for_all_joints_or_for_some():
@@ -356,7 +357,7 @@ def test_friction_is_stated_for_all_joints_or_for_some():
 def test_the_load_of_the_gears_is_that_of_the_bodies_found(plain, estimator, tmp_path):
     true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": 0.35})
     log = driven_log(true, pi, SEED, reach=REACH)
-    found = found_in(plain, [log], friction={"*": "load"}, estimator=estimator)
+    found = fitted_in(plain, [log], friction={"*": "load"}, estimator=estimator)
     np.testing.assert_array_equal(found.model.reference, found.standard)
     motion = process(log, EXACT)
     wanted = predict(found.model, [found.standard], remember(found.model, motion))[0]
@@ -368,7 +369,7 @@ def test_the_load_of_the_gears_is_that_of_the_bodies_found(plain, estimator, tmp
         np.testing.assert_allclose(again, wanted, atol=1e-8)
     # one more fit under that load leaves it as it is
     start = found.model.with_reference(found.standard)
-    again = found_in(start, [log], friction="none", estimator=estimator)
+    again = fitted_in(start, [log], friction="none", estimator=estimator)
     moved = predict(again.model, [again.standard], remember(again.model, motion))[0] - wanted
     assert np.abs(moved).max() < 0.003 * np.abs(wanted).max()
 
@@ -377,13 +378,13 @@ def test_a_load_that_does_not_settle_is_refused(plain, cases, monkeypatch):
     monkeypatch.setattr("robotid.fitting.fit._SETTLED", -1.0)
     monkeypatch.setattr("robotid.fitting.fit._MOST_LOADS", 3)
     with pytest.raises(NotConvergedError, match="load of the gears still changes after 3 fits"):
-        found_in(plain, [cases("load")[2]], friction={ELBOW: "load"}, estimator="wls")
+        fitted_in(plain, [cases("load")[2]], friction={ELBOW: "load"}, estimator="wls")
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_logs_in_files_choose_as_in_memory(plain, cases, tmp_path, workers):
     """Two workers are sent the robot with its own terms."""
-    held = found_in(plain, [cases("presliding")[2]], estimator="wls")
+    held = fitted_in(plain, [cases("presliding")[2]], estimator="wls")
     write_log(cases("presliding")[2], tmp_path / "fit.parquet")
     table = {
         "urdf": plain.tree.path,
@@ -396,7 +397,7 @@ def test_logs_in_files_choose_as_in_memory(plain, cases, tmp_path, workers):
     fitted, kept = survey_logs(job, plain, job.identification, job.validation)
     recordings = Recordings(plain, structural_mapping(plain), fitted, kept)
     assert not recordings.is_held
-    found = conclude(recordings, EstimatorSettings("wls"))
+    found = with_drives(recordings, EstimatorSettings("wls"), wanted_families(AUTO, JOINTS))
     assert chosen(found) == chosen(held) == {ELBOW: ("presliding",)}
     ((shape,), (alike,)) = ([s for c in x.drives for s in c.shapes] for x in (found, held))
     # other rows of the log are looked at
@@ -417,7 +418,7 @@ def test_a_robot_with_terms_of_its_own_can_be_sent_to_workers():
 @pytest.mark.parametrize("load", [-0.05, 0.7])
 def test_friction_that_would_be_negative_or_hold_any_load_is_none(plain, load):
     true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": load})
-    found = found_in(plain, [driven_log(true, pi, SEED, reach=REACH)])
+    found = fitted_in(plain, [driven_log(true, pi, SEED, reach=REACH)])
     assert "load" not in chosen(found).get(ELBOW, ())
     assert ("load",) not in {x.families for x in found.drives[1].tried}
 
@@ -446,4 +447,4 @@ def test_what_is_nearly_chosen_widens_the_intervals_it_would_move(plain):
 def test_identify_chooses_unless_told_otherwise(plain, cases):
     log = cases("load")[2]
     assert chosen(identify(plain, [log], signals=EXACT, doctor=False)) == {ELBOW: ("load",)}
-    assert found_in(plain, [log], friction="viscous+coulomb").drives == ()
+    assert fitted_in(plain, [log], friction="viscous+coulomb").drives == ()

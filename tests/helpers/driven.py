@@ -5,15 +5,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from helpers.synthetic import perfect
-from robotid.identification.pipeline import identify
+from robotid.fitting.recordings import Recordings
+from robotid.fitting.settings import EstimatorSettings
+from robotid.fitting.survey import hold_log
+from robotid.identification.pipeline import identify, with_drives
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
+from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 from robotid.simulation.closed_loop import Noise, another_robot
 from robotid.simulation.motions import random_fourier
 from robotid.simulation.settings import Sensors
 
 EXACT = SignalSettings(cutoff=None, trim=0.0)
+FIT = EstimatorSettings(draws=0)  # bounds of bodies have no part in what drives have
 JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")
 LIFT, ELBOW, WRIST = JOINTS
 
@@ -79,6 +85,15 @@ class _Scaled:
         return q, v, a
 
 
-def found_in(model, logs, **options):
+def found_in(model, logs, *, estimator=FIT, **options):
     """Return what is identified of logs without a filter, the doctor aside."""
-    return identify(model, logs, signals=EXACT, doctor=False, **options)
+    return identify(model, logs, signals=EXACT, doctor=False, estimator=estimator, **options)
+
+
+def fitted_in(model, logs, *, estimator=FIT, friction=AUTO):
+    """Return the fit of such logs with the friction that they show, before it is judged."""
+    recordings = Recordings(
+        model, structural_mapping(model), [hold_log(model, log, EXACT) for log in logs]
+    )
+    choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
+    return with_drives(recordings, choice, wanted_families(friction, model.joints))
