@@ -199,3 +199,10 @@ def test_correlations_are_drawn_in_their_cell_with_their_sign_and_strength(repor
     wanted = np.rint(8 * np.tril(r, -1)) / 8
     np.testing.assert_allclose(drawn, wanted, atol=1e-3)
     assert (wanted > 0).sum() != (wanted < 0).sum()
+
+
+def test_the_shares_of_the_data_are_said_in_the_mean_and_of_the_weakest(identified, report):
+    shares = [round(100 * share) for share in information(identified).data_share]
+    assert min(shares) < np.mean(shares) < 99.5
+    said = f"the data give {np.mean(shares):.0f} % in the mean and {min(shares)} % of the weakest"
+    assert said in report
