@@ -21,7 +21,7 @@ from robotid.export.entries import build_result
 from robotid.export.result import read_result
 from robotid.logs.read import write_log
 from robotid.pages.html import code
-from robotid.report.comparison import compare_results, write_comparison
+from robotid.report.comparison import _friction_curves, compare_results, write_comparison
 from robotid.robot.drives import LoadFriction, Stribeck
 from robotid.robot.model import RobotModel
 
@@ -375,3 +375,25 @@ def test_the_page_in_the_browser(folder, tmp_path, browser, size):
         assert shown == sorted(shown, reverse=shown[0] > shown[-1])
         assert not seen.errors
         assert not seen.requests
+
+
+def test_friction_is_compared_up_to_the_fastest_speed_of_any_result():
+    def result(viscous, coulomb, fastest, other):
+        values = {"one.viscous": viscous, "one.coulomb": coulomb, "two.viscous": other}
+        return {
+            "joints": ["two", "one"],
+            "friction": {joint: {"seen": {"v": [0.1, fastest]}} for joint in ("one", "two")},
+            "drive_parameters": [{"name": k, "value": x} for k, x in values.items()],
+            "identification": {"per_joint": {"one": {"unit": "N m"}, "two": {"unit": "N"}}},
+        }
+
+    first, second = _friction_curves([result(2.0, 1.0, 2.0, 1.0), result(4.0, 0.5, 3.0, 1.1)])
+    assert (first["joint"], first["unit"]) == ("one", "N m")  # differs the most
+    assert (second["joint"], second["unit"]) == ("two", "N")
+    v = np.array(first["speeds"])
+    np.testing.assert_allclose(v, np.linspace(-3.0, 3.0, len(v)))
+    for torque, (viscous, coulomb) in zip(first["torques"], ((2.0, 1.0), (4.0, 0.5)), strict=True):
+        np.testing.assert_allclose(torque, viscous * v + coulomb * np.sign(v), atol=1e-12)
+    # at 3 rad/s: 7 N m and 12.5 N m; 3 N and 3.3 N
+    assert first["difference"] == pytest.approx(5.5 / 12.5)
+    assert second["difference"] == pytest.approx(0.3 / 3.3)

@@ -199,3 +199,28 @@ def test_correlations_are_drawn_in_their_cell_with_their_sign_and_strength(repor
     wanted = np.rint(8 * np.tril(r, -1)) / 8
     np.testing.assert_allclose(drawn, wanted, atol=1e-3)
     assert (wanted > 0).sum() != (wanted < 0).sum()
+
+
+def test_the_shares_of_the_data_are_said_in_the_mean_and_of_the_weakest(identified, report):
+    shares = [round(100 * share) for share in information(identified).data_share]
+    assert min(shares) < np.mean(shares) < 99.5
+    said = f"the data give {np.mean(shares):.0f} % in the mean and {min(shares)} % of the weakest"
+    assert said in report
+
+
+def test_captions_say_error_and_how_much_the_band_holds(identified, report):
+    """Of each joint in the recording that was kept apart, by hand."""
+    (kept,) = identified.validation
+    motion, band = kept.recording.trajectory, identified.band(kept)
+    residual = np.abs(motion.tau - kept.torques["estimate"])[band.samples]
+    inside = residual <= 1.959964 * np.sqrt(band.parameters**2 + band.noise**2)
+    said = []
+    for j, joint in enumerate(identified.model.joints):
+        own, used = kept.metrics["estimate"].per_joint[joint], kept.recording.mask[band.samples, j]
+        share = 100 * inside[used, j].mean()
+        said.append(
+            f"error {own.relative_error_pct:.1f} %, RMSE {own.rmse:.3g} N m; "
+            f"95 % band holds {share:.0f} %"
+        )
+    assert all(words in report for words in said), said
+    assert len(set(said)) == len(said)

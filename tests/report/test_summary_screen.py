@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from html import unescape
 
+import numpy as np
 import pytest
 from helpers.pages import bars
 
@@ -93,3 +94,13 @@ def test_the_best_of_many_joints_are_folded_away(identified, screen, monkeypatch
     shown, folded = html.split("2 more joints, which are predicted better")
     assert [*bars(shown), *bars(folded)] == list(bars(screen))
     assert len(bars(shown)) == 4
+
+
+def test_the_total_mass_changes_by_its_share(identified, report):
+    names = identified.model.layout.names
+    is_mass = np.array([name.endswith("_link.m") for name in names])
+    before, after = (pi[is_mass].sum() for pi in (identified.prior, identified.standard))
+    change = 100 * (after - before) / before
+    assert abs(change) > 1
+    said = f"<strong>{before:.2f} → {after:.2f} kg</strong> ({change:+.0f} %)"
+    assert said.replace("(-", "(−") in report

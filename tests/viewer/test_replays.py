@@ -275,10 +275,11 @@ def test_a_notebook_shows_the_page_in_a_frame_that_reaches_nothing(arm, motion):
     assert unescape(inside) == shown_as.html
 
 
-def test_a_long_motion_of_seven_joints_stays_below_20_mb(panda, tmp_path):
+def test_a_long_motion_of_six_joints_stays_below_17_mb(ur5, tmp_path):
+    """Those of seven joints below 20 MB; the meshes of this arm were thinned before."""
     t = np.arange(200_000) / 100.0
-    q = np.sin(t)[:, None] * np.ones(7)
-    assert replay(panda, t, q).write(tmp_path / "r.html").stat().st_size < 20e6
+    q = np.sin(t)[:, None] * np.ones(6)
+    assert replay(ur5, t, q).write(tmp_path / "r.html").stat().st_size < 17e6
 
 
 def test_no_process_no_socket_and_no_output_is_left(arm, motion, tmp_path, capfd, monkeypatch):
