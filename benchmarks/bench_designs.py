@@ -1,11 +1,10 @@
-"""One start of a design: how fast it settles, plain and compiled, and what it leaves of limits.
+"""One start of a design: how fast it settles, and what it leaves of limits.
 
     python benchmarks/bench_designs.py [--quick]
 
 The cases of ``bench_excitation.py``. All times are of the processor, of one thread: another load of
 the machine adds little to them. Margins are those on a grid ten times as fine as that of the last
-rounds. "compiled": with the extra ``fast``, whose code is compiled once per installation; to
-import Numba and read that code takes the time that is said below the table.
+rounds. Code is compiled once per installation, before; to import Numba takes the time below.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -22,11 +21,12 @@ from robotid.excitation.multipliers import Multipliers
 from robotid.excitation.information import criterion
 from robotid.excitation.limits import LIMITS
 from robotid.logs.data import Trajectory
+from robotid.regressor.compiled import row_lanes
 
 FINE = 30  # ten times 3 times the grid of the first rounds
 
 
-def design_row(name, way, task, best, seeds):
+def design_row(name, task, best, seeds):
     """Return how one start went: the median over some seeds, margins of the first."""
     found = [task.design(np.random.default_rng(seed), starts=1) for seed in range(seeds)]
     passed = [next((t for t, value in f.history if value < best), np.inf) for f in found]
@@ -37,14 +37,14 @@ def design_row(name, way, task, best, seeds):
     most = np.abs(used).max(axis=(1, 2))
     shown = [f"{100 * (1 - most[LIMITS.index(k)]):.2f} %" for k in LIMITS[:2] + LIMITS[4:5]]
     return (
-        f"| {name} | {way} | {best:.3f} | {np.median([f.objective for f in found]):.3f} | "
+        f"| {name} | {best:.3f} | {np.median([f.objective for f in found]):.3f} | "
         f"{found[0].condition:.0f} | {np.median(passed):.2f} s | {np.median(seconds):.1f} s "
         f"({min(seconds):.1f} to {max(seconds):.1f}), {settled} of {seeds} | {' | '.join(shown)} | "
         f"{f'{1e3 * margin:.1f} mm' if margin < 0.01 else '> 10 mm'} |"
     )
 
 
-def gradient_row(name, way, task, repeats):
+def gradient_row(name, task, repeats):
     """Return the times of value, value with gradient, and Pinocchio's regressors."""
     finer = round(500 / (task._functions.shape[1] - 1))
     whole = replace(task, clearance=None, finer=finer)
@@ -69,7 +69,7 @@ def gradient_row(name, way, task, repeats):
     ]
     times = 1e3 * np.array(setting.side_by_side(functions, repeats))
     return (
-        f"| {name} | {way} | {v.shape[1]} x {len(t) - 1} | {times[0]:.1f} | {times[1]:.1f} | "
+        f"| {name} | {v.shape[1]} x {len(t) - 1} | {times[0]:.1f} | {times[1]:.1f} | "
         f"{times[1] / times[0]:.1f} | {times[2]:.1f} |"
     )
 
@@ -79,30 +79,25 @@ def main():
     parser.add_argument("--quick", action="store_true", help="one robot, few motions: a try-out")
     options = parser.parse_args()
     cases, count, seeds = (CASES[1:], 20, 1) if options.quick else (CASES, 500, 5)
-    tasks, built = {}, {}
-    for name in cases:
-        for way in ("plain", "compiled"):
-            begun = time.process_time()
-            tasks[name, way] = task = designer(name, way == "compiled")
-            task._lagrangian(task.random(np.random.default_rng(0)), Multipliers(0.1))
-            built[name, way] = time.process_time() - begun
-    start = built[cases[0], "compiled"] - built[cases[0], "plain"]
+    begun = time.process_time()
+    row_lanes()
+    start = time.process_time() - begun
+    tasks = {name: designer(name) for name in cases}
     print(
-        f"| robot | way | best of {count} random | design | condition | better than those after "
+        f"| robot | best of {count} random | design | condition | better than those after "
         "| settled: median of some seeds | margin: position | velocity | torque | distance |"
     )
-    print("|---" * 11 + "|")
-    for name in cases:
-        task, rng = tasks[name, "compiled"], np.random.default_rng(1)
+    print("|---" * 10 + "|")
+    for name, task in tasks.items():
+        rng = np.random.default_rng(1)
         best = min(task._objective(task.random(rng)) for _ in range(count))
         with mock.patch.object(time, "monotonic", time.process_time):
-            for way in ("plain", "compiled"):
-                print(design_row(name, way, tasks[name, way], best, seeds), flush=True)
-    print("\n| robot | way | joints x instants | value, ms | with gradient | ratio | Pinocchio |")
-    print("|---" * 7 + "|")
-    for (name, way), task in tasks.items():
-        print(gradient_row(name, way, task, 3 if options.quick else 20))
-    print(f"\nTo import Numba and read the compiled code: {start:.1f} s.\n\n{setting.machine()}")
+            print(design_row(name, task, best, seeds), flush=True)
+    print("\n| robot | joints x instants | value, ms | with gradient | ratio | Pinocchio |")
+    print("|---" * 6 + "|")
+    for name, task in tasks.items():
+        print(gradient_row(name, task, 3 if options.quick else 20))
+    print(f"\nTo import Numba: {start:.1f} s.\n\n{setting.machine()}")
 
 
 if __name__ == "__main__":

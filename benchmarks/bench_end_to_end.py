@@ -20,7 +20,6 @@ from bench_figaroh import compare
 from setting import ROBOTS, full_qr, identify, machine, motion, peak_memory, robot, side_by_side
 
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.compiled import is_installed
 
 PANDA_SIZES = (10_000, 100_000, 1_000_000)
 LARGEST = 2**30  # [bytes] of W that full QR is asked to hold
@@ -69,23 +68,24 @@ def measure(name, samples, threads, clock):
     model = robot(name)
     trajectory = motion(model, samples, np.random.default_rng(0))
     mapping = structural_mapping(model)
-    ways = {"plain": lambda: identify(model, trajectory, False, 1)}
-    if is_installed():
-        identify(model, trajectory, True, 1)  # reads the compiled code
-        ways["compiled"] = lambda: identify(model, trajectory, True, 1)
-        if clock is time.perf_counter:  # threads save no processor time
-            ways["threads"] = lambda: identify(model, trajectory, True, threads)
+    identify(model, trajectory, True, 1)  # reads the compiled code
+    ways = {
+        "plain": lambda: identify(model, trajectory, False, 1),
+        "compiled": lambda: identify(model, trajectory, True, 1),
+    }
+    if clock is time.perf_counter:  # threads save no processor time
+        ways["threads"] = lambda: identify(model, trajectory, True, threads)
     if 8 * samples * model.n_rows * len(model.layout.names) < LARGEST:
         ways["full"] = lambda: full_qr(model, mapping, trajectory)
     seconds = side_by_side(list(ways.values()), 1 if samples > 100_000 else 3, clock)
-    memory = peak_memory(lambda: identify(model, trajectory, is_installed(), threads))
+    memory = peak_memory(lambda: identify(model, trajectory, True, threads))
     return dict(zip(ways, seconds, strict=True)), memory
 
 
 def panda_table(threads, clock, python):
     """Return the table of the panda at 1e4, 1e5 and 1e6 samples."""
-    ways = {"full": "numpy's full QR", "plain": "plain", "compiled": "with `fast`"}
-    ways |= {"threads": f"`fast`, {threads} threads"} if clock is time.perf_counter else {}
+    ways = {"full": "numpy's full QR", "plain": "plain", "compiled": "compiled"}
+    ways |= {"threads": f"compiled, {threads} threads"} if clock is time.perf_counter else {}
     figaroh = ["FIGAROH"] if python else []
     head = ["panda, friction, armature, offset", *figaroh, *ways.values(), "memory over the input"]
     lines = [head, ["---"] * len(head)]

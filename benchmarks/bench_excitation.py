@@ -56,12 +56,12 @@ ROBOTS = {  # the joints that move, if not all
 }
 
 
-def designer(name, is_fast=False):
+def designer(name):
     model = setting.robot(name)
     limits = MotionLimits.of_model(model)
-    clearance = Clearance(model, floor=0.0, is_fast=is_fast)
+    clearance = Clearance(model, floor=0.0)
     basis = FourierBasis(DURATION, HARMONICS)
-    return Designer.of_model(model, basis, limits, clearance=clearance, is_fast=is_fast)
+    return Designer.of_model(model, basis, limits, clearance=clearance)
 
 
 def run(*words):

@@ -86,8 +86,6 @@ def compare(python, samples):
     """Return wall-clock and processor time [s], memory [MiB] and version of each way."""
     from setting import motion, robot
 
-    from robotid.regressor.compiled import is_installed
-
     model = robot("panda")
     trajectory = motion(model, samples, np.random.default_rng(0))
     results, predicted = {}, {}
@@ -97,8 +95,6 @@ def compare(python, samples):
         arrays = {key: getattr(trajectory, key) for key in ("t", "q", "v", "a", "tau")}
         np.savez(log, configurations=model.configurations(trajectory.q), **arrays)
         for name, way in WAYS.items():
-            if way == "compiled" and not is_installed():
-                continue
             interpreter = python if way == "figaroh" else sys.executable
             run = subprocess.run(
                 [interpreter, __file__, "--child", way, str(log)],

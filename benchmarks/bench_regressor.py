@@ -2,7 +2,7 @@
 
 The bare loop calls Pinocchio's computeJointTorqueRegressor from Python into an array made before.
 "blocks" is what ``build_problem(...).blocks()`` yields, "rows" the same joint by joint, both from
-Pinocchio; "compiled" the rows from the extra ``fast``, on one thread. All inertial columns, no
+Pinocchio; "compiled" the rows of compiled code, on one thread. All inertial columns, no
 drive columns. The four are run in turn, the shortest time of each counts.
 
     python benchmarks/bench_regressor.py [--quick]
@@ -13,7 +13,6 @@ import argparse
 import numpy as np
 from setting import ROBOTS, bare_loop, exhaust, machine, motion, robot, rows_of, side_by_side
 
-from robotid.regressor.compiled import is_installed
 from robotid.regressor.torque import build_problem
 
 
@@ -36,18 +35,21 @@ def row(name, model, trajectory, repeats):
     W = np.empty((512, n, model.layout.n_inertial))
 
     plain = build_problem(model, trajectory, compiled=False)
+    compiled = build_problem(model, trajectory, compiled=True)
+    exhaust(rows_of(compiled))  # reads the compiled code
     functions = [
         lambda: bare_loop(model, trajectory, W),
         lambda: exhaust(plain.blocks()),
         lambda: exhaust(rows_of(plain)),
+        lambda: exhaust(rows_of(compiled)),
     ]
-    if is_installed():
-        compiled = build_problem(model, trajectory, compiled=True)
-        exhaust(rows_of(compiled))  # reads the compiled code
-        functions.append(lambda: exhaust(rows_of(compiled)))
-    loop, *others = side_by_side(functions, repeats)
-    cells = [f"{others[0] / loop:.2f}", f"{others[1] / loop:.2f}"]
-    cells += [f"{others[2] / N * 1e6:.2f}", f"{others[2] / loop:.3f}"] if len(others) > 2 else "--"
+    loop, blocks, rows, fast = side_by_side(functions, repeats)
+    cells = (
+        f"{blocks / loop:.2f}",
+        f"{rows / loop:.2f}",
+        f"{fast / N * 1e6:.2f}",
+        f"{fast / loop:.3f}",
+    )
     return f"| {name} | {n} | {loop / N * 1e6:.2f} | " + " | ".join(cells) + " |"
 
 

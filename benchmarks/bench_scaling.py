@@ -16,7 +16,6 @@ import numpy as np
 from setting import full_qr, identify, machine, motion, peak_memory, robot, side_by_side
 
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.compiled import is_installed
 
 BY_JOINTS = ("planar 2R", "UR10", "panda", "Solo12", "TIAGo", "TALOS reduced", "TALOS")
 
@@ -49,12 +48,13 @@ def row(name, samples, threads, clock, largest):
         motion(model, samples, np.random.default_rng(0)),
         structural_mapping(model),
     )
-    ways = {"plain": lambda: identify(model, trajectory, False, 1)}
-    if is_installed():
-        identify(model, trajectory, True, 1)  # reads the compiled code
-        ways["compiled"] = lambda: identify(model, trajectory, True, 1)
-        if threads > 1:
-            ways["threads"] = lambda: identify(model, trajectory, True, threads)
+    identify(model, trajectory, True, 1)  # reads the compiled code
+    ways = {
+        "plain": lambda: identify(model, trajectory, False, 1),
+        "compiled": lambda: identify(model, trajectory, True, 1),
+    }
+    if threads > 1:
+        ways["threads"] = lambda: identify(model, trajectory, True, threads)
     # numpy holds W, its selected columns, their copy with tau and the one it works on
     if 4 * 8 * samples * model.n_rows * len(model.layout.names) < largest:
         ways["full"] = lambda: full_qr(model, mapping, trajectory)
@@ -67,7 +67,7 @@ def row(name, samples, threads, clock, largest):
         cells.append(f"{full / times[key]:.1f}" if full and key in times else "-")
     cells.append(f"{times['threads']:.3f}" if "threads" in times else "-")
     cells.append(f"{min(times[key] for key in ways if key != 'full') / samples * 1e6:.1f}")
-    memory = peak_memory(lambda: identify(model, trajectory, is_installed(), threads))
+    memory = peak_memory(lambda: identify(model, trajectory, True, threads))
     head = f"| {name} | {len(model.joints)} | {len(mapping.independent)} | {samples:.0e} | "
     return head + " | ".join(cells) + f" | {memory:.0f} |"
 

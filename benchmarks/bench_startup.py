@@ -18,8 +18,6 @@ import time
 
 from setting import machine
 
-from robotid.regressor.compiled import is_installed
-
 PROGRAMS = {
     "bare Python": ["-c", ""],
     "import numpy": ["-c", "import numpy"],
@@ -60,10 +58,8 @@ def main():
         print(f"| {name} | {value:.3f} | {value - bare:.3f} | {value / pinocchio:.2f} |")
     print("\n64 samples of UR10 to factors, imports not counted:")
     with tempfile.TemporaryDirectory() as folder:
-        uses = [("Pinocchio", False)]
-        if is_installed():
-            uses += [("compiled, first ever", True), ("compiled, first in a process", True)]
-        for name, compiled in uses:
+        first, later = ("compiled, first ever", True), ("compiled, first in a process", True)
+        for name, compiled in (("Pinocchio", False), first, later):
             first, second = first_uses(compiled, folder)
             print(f"{name}: {first:.3f} s, then {second * 1e3:.2f} ms")
     print(f"\nwall-clock time; {machine()}")

@@ -90,7 +90,9 @@ def try_fault(fault: dict[str, Any]) -> bool:
 def forget(tree: Path, faulty: Path) -> None:
     """Remove what was compiled with the text that a fault replaces."""
     compiled = [*faulty.parent.glob(f"__pycache__/{faulty.stem}.*")]
-    if faulty.stem.endswith("lanes"):  # Numba's; one of these files is compiled into the others
+    if faulty.stem.endswith(
+        ("lanes", "laws")
+    ):  # Numba's; one of these files is compiled into the others
         compiled += [*tree.rglob("*.nbi"), *tree.rglob("*.nbc")]
     for path in compiled:
         path.unlink(missing_ok=True)

@@ -247,7 +247,7 @@ def add_settings(flags: "argparse._ActionsContainer", wanted: Sequence[str]) -> 
 
 
 def _friction_words() -> str:
-    from robotid.robot.families import FAMILIES
+    from robotid.robot.drives import FAMILIES
 
     return (
         "auto (default: chosen by the logs), none, viscous, viscous+coulomb, or some of these "

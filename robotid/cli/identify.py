@@ -10,7 +10,6 @@ from robotid.cli.flags import OUTPUT, add_job, add_out, add_progress, job_from_f
 from robotid.cli.printing import (
     print_block,
     print_causes,
-    print_open_loop,
     print_steps,
     print_verdict,
     recordings_of,
@@ -77,25 +76,17 @@ def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
         result: The content of result.json.
         is_verbose: Whether to print notes, too.
     """
-    from robotid.identification.summary import error_lines, friction_lines
+    from robotid.identification.summary import error_lines
 
-    if "simulation" in result:
-        _print_commanded(result, is_verbose=is_verbose)
-        return
-    structure, wls, width = result["structure"], result["wls"], terminal_width()
-    before, after, _ = result["witness"]["masses"]
-    say(
-        f"\n{result['robot']}: {len(result['joints'])} joints, {structure['base']} base parameters "
-        f"({structure['base_inertial']} inertial), condition number {structure['condition']:.3g}, "
-        f"total mass {before:.2f} -> {after:.2f} kg"
-    )
+    width, wls = terminal_width(), result.get("wls")
+    say(f"\n{result['robot']}: {len(result['joints'])} joints, {_found(result)}")
     fitted, kept = (recordings_of(result["inputs"], of) for of in ("identification", "validation"))
     say(f"\nfitted: {', '.join(fitted)}", "  ")
-    print("\n".join(error_lines(result["identification"], wls["identification"], width)))
-    for name, ours, theirs in zip(kept, result["validation"], wls["validation"], strict=True):
+    print("\n".join(error_lines(result["identification"], wls and wls["identification"], width)))
+    for k, (name, ours) in enumerate(zip(kept, result["validation"], strict=True)):
         say(f"\nnot fitted: {name}", "  ")
-        print("\n".join(error_lines(ours, theirs, width)))
-    if lines := friction_lines(result["friction"]):
+        print("\n".join(error_lines(ours, wls and wls["validation"][k], width)))
+    if lines := _drive_lines(result):
         print_block(*(wrapped(line, width, "  ") for line in lines))
     print()
     verdict = result["verdict"]
@@ -109,36 +100,49 @@ def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
     print_verdict(verdict)
 
 
-def _print_commanded(result: dict[str, Any], *, is_verbose: bool) -> None:
-    """Print what was found from commands: open loops beside plainer models, drives, the verdict."""
-    found, fit = result["simulation"], result["simulation"]["fit"]
-    say(
-        f"\n{result['robot']}: {len(result['joints'])} joints, {fit['parameters']} unknowns; "
-        f"{fit['message']}"
+def _found(result: Mapping[str, Any]) -> str:
+    """Return in words how much was found."""
+    if "simulation" in result:
+        from robotid.closed_loop.evaluation import DRIFTS  # imports numpy
+
+        fit, kind = (result["simulation"][key] for key in ("fit", "controller"))
+        over = f" over {DRIFTS:g} s" if kind["kind"] == "torque" else ""
+        said = f"{fit['parameters']} unknowns; {fit['message']}; errors are those of positions"
+        return said + over
+    structure, (before, after, _) = result["structure"], result["witness"]["masses"]
+    return (
+        f"{structure['base']} base parameters ({structure['base_inertial']} inertial), condition "
+        f"number {structure['condition']:.3g}, total mass {before:.2f} -> {after:.2f} kg"
     )
-    for role, words in (("identification", "fitted"), ("validation", "not fitted")):
-        for run in found[role]:
-            print_open_loop(run, f"{words}: ")
-    rows = []
-    for entry in result["drive_parameters"]:
-        error = entry["std_error"]
-        if error is not None:
-            rows.append((entry["name"], f"{entry['value']:.4g}", f"{error:.2g}", entry["unit"]))
-    heads = ("parameter", "value", "+-", "unit")
-    print("\n" + "\n".join(columns(heads, rows)) + "\n")
-    print_causes(result["warnings"], result["joints"], is_verbose=is_verbose)
-    print_verdict(result["verdict"])
+
+
+def _drive_lines(result: Mapping[str, Any]) -> list[str]:
+    """Return the friction that was chosen; of a simulation all parameters of drives and loops."""
+    from robotid.identification.summary import friction_lines
+
+    if "simulation" not in result:
+        return friction_lines(result["friction"])
+    rows = [
+        (entry["name"], f"{entry['value']:.4g}", f"{entry['std_error']:.2g}", entry["unit"])
+        for entry in result["drive_parameters"]
+        if entry["std_error"] is not None
+    ]
+    return columns(("parameter", "value", "+-", "unit"), rows)
 
 
 def _worst(result: Mapping[str, Any]) -> str:
-    """Return the joint whose torque is explained least, and how much of it is missed."""
+    """Return the joint that is predicted worst, and how much of it is missed."""
+    is_motion = "simulation" in result
     errors = [
         (m["relative_error_pct"], joint)
         for metrics in result["validation"] or [result["identification"]]
         for joint, m in metrics["per_joint"].items()
         if m["relative_error_pct"] is not None
     ]
-    return "{1}, {0:.1f} % of its torque is missed".format(*max(errors)) if errors else ""
+    if not errors:
+        return ""
+    error, joint = max(errors)
+    return f"{joint}, {error:.1f} % of its {'motion' if is_motion else 'torque'} is missed"
 
 
 def _add_work(parser: argparse.ArgumentParser) -> None:

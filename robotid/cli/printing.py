@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotid._text import columns, terminal_width, tinted, wrapped
+from robotid._text import terminal_width, tinted, wrapped
 from robotid.findings import Finding, grouped
 
 if TYPE_CHECKING:
@@ -17,7 +17,6 @@ __all__ = [
     "print_block",
     "print_causes",
     "print_files",
-    "print_open_loop",
     "print_steps",
     "print_verdict",
     "recordings_of",
@@ -114,34 +113,6 @@ def as_finding(found: Mapping[str, Any]) -> dict[str, Any]:
 
 def _some(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
-
-
-def print_open_loop(run: Mapping[str, Any], before: str = "") -> None:
-    """Print how far open loops run from a log, beside plainer models.
-
-    Args:
-        run: The run, as result.json has it.
-        before: What its log is called after.
-    """
-    from robotid.closed_loop.evaluation import DRIFTS  # imports numpy
-
-    kinds = {"rmse": "open loop", "second_order_rmse": "2nd order", "urdf_rmse": "URDF",
-             "rows_rmse": "torques alone", "command_rmse": "command",
-             "steady_rmse": "same speed"}  # fmt: skip
-    joints = run["per_joint"]
-    kinds = {
-        k: v for k, v in kinds.items() if any(own.get(k) is not None for own in joints.values())
-    }
-    is_driven = any("steady_rmse" in own for own in joints.values())
-    over = f" over {DRIFTS:g} s" if is_driven else ""
-    say(
-        f"\n{before}{window_name(Path(run['log']).name or 'log', run)}, position missed{over}", "  "
-    )
-    rows = []
-    for joint, own in joints.items():
-        shown = ("-" if own[key] is None else f"{1e3 * own[key]:.2f}" for key in kinds)
-        rows.append((joint, *shown, f"m{own['unit']}"))
-    print("\n".join(columns(("joint", *kinds.values(), ""), rows)))
 
 
 def recordings_of(inputs: Sequence[Mapping[str, Any]], role: str) -> list[str]:

@@ -5,7 +5,7 @@ from typing import Any
 
 from robotid._text import terminal_width
 from robotid.cli.flags import add_json
-from robotid.cli.printing import print_open_loop, print_verdict, say
+from robotid.cli.printing import print_verdict, say
 from robotid.cli.running import show_found
 
 __all__ = ["SUMMARY", "add_flags", "run"]
@@ -41,9 +41,6 @@ def _show(found: dict[str, Any]) -> None:
 
     say(f"predicted with {found['predicted_with']}")
     for recording in found["validation"]:
-        if "horizons" in recording:
-            print_open_loop(recording)
-            continue
         say(f"\n{recording['name']}", "  ")
         print("\n".join(error_lines(recording, width=terminal_width())))
     print_verdict(found["verdict"])

@@ -50,6 +50,11 @@ class OpenLoop:
     spread: Array
 
     @property
+    def name(self) -> str:
+        """Name of the log's file and the window of it, as ``run3.parquet 5-7.4 s``."""
+        return f"{self.log.name} {self.log.t[0]:.4g}-{self.log.t[-1]:.4g} s"
+
+    @property
     def is_driven(self) -> bool:
         """Whether the logged torque drives the robot, which no loop is closed on."""
         return "steady" in self.baselines

@@ -111,7 +111,6 @@ def fit_loops(
 
     Raises:
         DataError: If a log lacks what is to be compared.
-        MissingDependencyError: If Numba is not installed.
         NotConvergedError: If nothing that is tried can be rolled out.
         SettingsError: If a setting does not fit the robot.
     """

@@ -17,6 +17,7 @@ from robotid.fitting.identified import FROM_PRIOR, Identified, sources_of
 from robotid.fitting.metrics import Metrics
 from robotid.fitting.settings import SimulationSettings
 from robotid.identification.result import Asked
+from robotid.identification.summary import identification_line
 from robotid.judgement.positions import judge_positions
 from robotid.judgement.verdict import Verdict
 from robotid.logs.data import Log, Trajectory
@@ -38,7 +39,7 @@ _GAP = 3.0  # median steps: across a longer one no speed is computed
 _MOVING = 0.05  # of a joint's largest speed, below which differences of positions are noise
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LoopIdentification(Identified):
     """Everything that an identification by simulation found.
 
@@ -63,6 +64,9 @@ class LoopIdentification(Identified):
     alarms: tuple[str, ...] = ()
     report: str = ""
     asked: Asked = field(default_factory=Asked)
+
+    def __repr__(self) -> str:
+        return identification_line(self)
 
     @property
     def estimate(self) -> Estimate:
@@ -92,13 +96,11 @@ class LoopIdentification(Identified):
 
     @property
     def base_reach(self) -> Array:
-        """The same of each base parameter, (b,), of the standard parameters that it sums."""
         reach: Array = np.where(self.mapping.K != 0.0, self.standard_reach, REACH).max(axis=1)
         return reach
 
     @property
     def at_bound(self) -> Array:
-        """Which standard parameters came out at the bound of their range, shape (p,), bool."""
         return np.isin(self.model.layout.names, self.estimate.details["at_bound"])
 
     @cached_property

@@ -5,7 +5,7 @@ slopes of all candidates tells, for any of them, what a fit to some windows woul
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,12 +13,16 @@ import scipy.linalg
 
 from robotid._typing import Array
 from robotid.closed_loop.unknowns import LoopSimulator, Unknown
+from robotid.diagnosis.selection import Round, Rule
 from robotid.estimators.output_error import OutputError, linearised
-from robotid.robot.drives import DriveTerm, LoadFriction, PositionCoulomb, Stribeck
+from robotid.robot.drive_term import ANYWHERE
+from robotid.robot.drives import FAMILIES, LoadFriction, PositionCoulomb
 
 __all__ = ["Tried", "candidates", "choose"]
 
-_GAIN = 0.02  # of a joint's squared residual, by which a term must lower that of other windows
+_OFFERED = ("stribeck", "load", "position")  # families beside viscous and Coulomb friction
+# Of a joint's squared residual in other windows, whose noise level is 1 a row: bench_commands.py
+_RULE = Rule(most=len(_OFFERED), share=0.02, chance=None, alike=0.0)
 _FOLDS = 6
 _FEWEST = 2  # windows: one is judged by what others were fitted to
 _SLOW = 0.3  # of a joint's usual speed, over which Stribeck's hook fades
@@ -62,28 +66,18 @@ def candidates(simulator: LoopSimulator, torque: Array) -> list[tuple[Unknown, .
         low, high, speed = q[:, j].min(), q[:, j].max(), float(np.sqrt(np.mean(v[:, j] ** 2)))
         if speed <= 0.0:
             continue
-        centre, seen = float((low + high) / 2), (float(low), float(high))
-        half = (high - low) / 2
-        sets: list[tuple[DriveTerm, ...]] = [(Stribeck(speed=_SLOW * speed),), (LoadFriction(),)]
-        if half > _WIDE:
-            sets.append(tuple(PositionCoulomb(order=k, centre=centre, seen=seen) for k in (1, 2)))
-        for terms in sets:
+        seen, half = {"q": (float(low), float(high)), "v": ANYWHERE}, (high - low) / 2
+        for family in map(FAMILIES.__getitem__, _OFFERED):
+            terms = family.make(seen, *[_SLOW * speed for _ in family.shapes])
+            if half <= _WIDE and any(term.guards == "q" for term in terms):
+                continue
             unknowns = []
             for term in terms:
-                size = torque[j] if isinstance(term, LoadFriction) else 1.0
-                if isinstance(term, PositionCoulomb):
-                    size = half**term.order
-                unknowns.append(
-                    Unknown(
-                        f"{joint}.{term.name}",
-                        "term",
-                        (j,),
-                        0.0,
-                        torque[j] / size,
-                        0.0 if term.is_nonnegative else -np.inf,
-                        term=term,
-                    )
-                )
+                size = half**term.order if isinstance(term, PositionCoulomb) else 1.0
+                spread = 1.0 if isinstance(term, LoadFriction) else torque[j] / size
+                lowest = 0.0 if term.is_nonnegative else -np.inf
+                name = f"{joint}.{term.name}"
+                unknowns.append(Unknown(name, "term", (j,), 0.0, spread, lowest, term=term))
             found.append(tuple(unknowns))
     return found
 
@@ -121,17 +115,15 @@ def choose(
     open_sets, chosen = set(range(len(sets))), set[int]()
     gains: dict[int, float] = {}
     while open_sets:
-        found = _gains(folds, columns, {s: sets[s] for s in open_sets})
-        gains |= {s: gain / rows for s, gain in found.items()}
-        best: dict[int, int] = {}
-        for s in sorted(open_sets, key=lambda s: -gains[s]):
-            if gains[s] > _GAIN:
-                best.setdefault(offered[s][0].joints[0], s)
+        removed = _gains(folds, columns, {s: sets[s] for s in open_sets})
+        rounds = _by_joint(offered, removed, rows)
+        gains |= {s: this.share(s) for this in rounds for s in this.left}
+        best = [s for this in rounds for s in [this.best(_RULE)] if s is not None]
         if not best:
             break
-        for s in best.values():
+        for s in sorted(best, key=lambda s: -gains[s]):
             columns += sets[s]
-        chosen |= set(best.values())
+        chosen |= set(best)
         open_sets -= chosen
     return [
         Tried(
@@ -142,6 +134,17 @@ def choose(
         )
         for s, unknowns in enumerate(offered)
     ]
+
+
+def _by_joint(
+    offered: Sequence[tuple[Unknown, ...]], removed: Mapping[int, Array], rows: int
+) -> list[Round[int]]:
+    """Return the round of each joint's candidates, by what they remove from each fold."""
+    joints: dict[int, dict[int, Array]] = {}
+    for s, gain in removed.items():
+        joints.setdefault(offered[s][0].joints[0], {})[s] = -gain
+    folds = max(map(len, removed.values()))
+    return [Round(np.zeros(folds), left, folds, rows) for left in joints.values()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,21 +175,21 @@ def _folds(simulator: LoopSimulator, theta: Array, estimator: OutputError) -> li
 
 def _gains(
     folds: Sequence[_Fold], columns: list[int], sets: dict[int, list[int]]
-) -> dict[int, float]:
-    """Return by how much each set of further columns lowers the squares of folds left out.
+) -> dict[int, Array]:
+    """Return by how much each set of further columns lowers the squares of each fold left out.
 
     0 of all if the other folds leave a parameter open, as those of short logs: then nothing shows
     what a term gains where it was not fitted.
     """
-    gains = dict.fromkeys(sets, 0.0)
+    gains = {s: np.zeros(len(folds)) for s in sets}
     H, g = sum(fold.H for fold in folds), sum(fold.g for fold in folds)
     base = np.array(columns)
-    for fold in folds:
+    for k, fold in enumerate(folds):
         H_f, g_f = H - fold.H, g - fold.g  # of the others
         try:
             factor = scipy.linalg.cho_factor(H_f[np.ix_(base, base)])
         except scipy.linalg.LinAlgError:  # not positive definite
-            return dict.fromkeys(sets, 0.0)
+            return {s: np.zeros(len(folds)) for s in sets}
         move = scipy.linalg.cho_solve(factor, g_f[base])
         slope = fold.H[np.ix_(base, base)] @ move - fold.g[base]
         for s, own in sets.items():
@@ -199,5 +202,5 @@ def _gains(
             change = 2 * slope @ d + d @ fold.H[np.ix_(base, base)] @ d
             across = fold.H[np.ix_(further, base)] @ (move + d) - fold.g[further]
             change += 2 * y @ across + y @ fold.H[np.ix_(further, further)] @ y
-            gains[s] -= float(change)
+            gains[s][k] = -float(change)
     return gains

@@ -82,11 +82,11 @@ def parallel_axes(model: RobotModel) -> list[tuple[str, ...]]:
     """
     tree = flatten(model)
     joined: dict[int, list[int]] = {}
-    for body in range(1, len(tree.parents)):
+    for body in range(len(tree.parents)):
         above, placement = int(tree.parents[body]), tree.joints[body]
         turn = placement[36:39]
         in_parent = (placement[:9] + placement[9:18]).reshape(3, 3).T @ turn  # it stays there
-        parallel = above > 0 and abs(float(in_parent @ tree.joints[above][36:39])) > _SAME
+        parallel = above >= 0 and abs(float(in_parent @ tree.joints[above][36:39])) > _SAME
         joined[body] = joined[above] if parallel else []
         joined[body].append(int(tree.leaders[body]))
     chains = {id(own): tuple(model.joints[j] for j in own) for own in joined.values()}

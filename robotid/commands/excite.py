@@ -25,15 +25,12 @@ from robotid.excitation.settings import ROUTES, MotionSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.previews import Preview, Run, preview_logs
 from robotid.logs.data import Log
-from robotid.regressor.compiled import is_installed, why_not
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
     from robotid._typing import ProgressCallback
 
 __all__ = ["design_motion"]
-
-_START = 2.0  # [s] of design from which compiled code pays
 
 
 def design_motion(
@@ -132,15 +129,14 @@ def _designer(job: Job, settings: MotionSettings, given: str | None) -> tuple[De
         jerk=settings.jerk,
         power=settings.power,
     )
-    clearance, is_fast = None, _pays(model, settings)
+    clearance = None
     if settings.clearance is not None:
         clearance = Clearance(
-            model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes,
-            is_fast=is_fast,
-        )  # fmt: skip
+            model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes
+        )
     designer = Designer.of_model(
         model, _basis(settings), limits, name=name, clearance=clearance, noise=settings.noise,
-        run=run, is_fast=is_fast,
+        run=run,
     )  # fmt: skip
     return designer, run
 
@@ -155,12 +151,6 @@ def _designed(
     if settings.kind == "stands":
         return design_stands(designer, rng)
     return designer.design(rng, starts=settings.starts, seconds=settings.seconds, progress=progress)
-
-
-def _pays(model: RobotModel, settings: MotionSettings) -> bool:
-    """Return whether compiled code can be used and pays its start of about half a second."""
-    is_long = settings.kind not in ROUTES and settings.seconds > _START
-    return is_long and is_installed() and why_not(model) is None
 
 
 def _check_jerk(course: Course, joints: Sequence[str]) -> None:

@@ -21,7 +21,7 @@ from robotid.commands.logs import (
     survey_logs,
 )
 from robotid.doctor.diagnosis import diagnose
-from robotid.exceptions import DataError, SettingsError
+from robotid.exceptions import DataError
 from robotid.export.entries import build_result
 from robotid.export.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.fitting.evaluation import Evaluation
@@ -88,14 +88,14 @@ def run_job(
     model, target = job.model(), Path(folder)
     check_folder(target, ["result.json", *_names(model)])
     found: Identification | LoopIdentification
-    checkpoint = None
     if is_simulated:
-        found = _identify_loops(job, model, chosen.progress)
+        found, checkpoint, used = _identify_loops(job, model, chosen.progress), None, job
     else:
         found, checkpoint = identify_job(job, model, chosen, target)
+        used = _job_of(found)
     report_stage(chosen.progress, "writing", stages)
     with released_on_error(checkpoint):
-        saved = _write(found, _job_of(found), target, source=source, beside=beside)
+        saved = _write(found, used, target, source=source, beside=beside)
     if checkpoint is not None:
         checkpoint.remove()
     return saved
@@ -168,7 +168,7 @@ def _write(
     return found, result
 
 
-def _job_of(identification: Identification | LoopIdentification) -> Job:
+def _job_of(identification: Identification) -> Job:
     """Return the job that an identification comes from, made in Python as far as it is known.
 
     Logs in memory have no file, and gains, units and names of columns are not in a ``Log``.
@@ -176,10 +176,6 @@ def _job_of(identification: Identification | LoopIdentification) -> Job:
     model, asked = identification.model, identification.asked
     if isinstance(asked.job, Job):
         return asked.job
-    if isinstance(identification, LoopIdentification):
-        raise SettingsError(
-            "an identification by simulation is saved by the job that made it: robotid.run_job"
-        )
     chosen = {drive.joint: drive for drive in identification.drives}
     wanted = wanted_families(asked.friction, model.joints)
     is_auto = all(names is None for names in wanted.values())

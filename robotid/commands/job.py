@@ -23,8 +23,8 @@ from robotid.logs.read import LogLayout, lay_out, read_log
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.table import Table
 from robotid.logs.transmission import Transmission, check_transmissions
-from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveTerm, term_from_dict
-from robotid.robot.families import AUTO, FAMILIES
+from robotid.robot.drives import DRIVE_TERMS, FAMILIES, TERMS, DriveTerm
+from robotid.robot.families import AUTO, term_from_dict
 from robotid.robot.parameters import DYNAMICS, Coupling
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from robotid._files import file_sha256
-from robotid.closed_loop.evaluation import position_metrics
+from robotid.closed_loop.evaluation import OpenLoop, position_metrics
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import log_of_commands, survey_logs
 from robotid.doctor.diagnosis import diagnose
@@ -97,9 +97,16 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
     return {
         "result": str(loaded.path),
         "predicted_with": loaded.content["outputs"]["urdf"],
-        "validation": [open_loop_entry(model, run) for run in runs],
+        "validation": [_errors_of(model, run) for run in runs],
         "verdict": verdict.to_dict(),
     }
+
+
+def _errors_of(model: RobotModel, run: OpenLoop) -> dict[str, Any]:
+    """Return metrics and errors of a log of commands, joint by joint."""
+    metrics, errors = position_metrics(model, (run,)).to_dict(), open_loop_entry(model, run)
+    per_joint = {joint: m | errors["per_joint"][joint] for joint, m in metrics["per_joint"].items()}
+    return {"name": run.name, **metrics, **errors, "per_joint": per_joint}
 
 
 def _fitted_logs(

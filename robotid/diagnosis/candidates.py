@@ -9,17 +9,14 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.fitting.joint_motion import JointMotion
-from robotid.robot.drives import DriveTerm, Harmonic
-from robotid.robot.families import COUNTERBALANCE
+from robotid.robot.drives import FAMILIES, DriveMotion, DriveTerm, Family, Harmonic
 
 __all__ = ["CANDIDATES", "Candidate", "couplings", "ripples"]
 
-_HARMONICS = 4  # of a torque that is periodic in the position
 _RIPPLES = np.arange(5, 241)  # times a turn that it may repeat beyond: 200 of a gear of 100 : 1
 _PEAKS = 6  # of them are tried, those at which the residual is most periodic
 _STEEP = 8  # twice the order of the filter, which runs both ways
-_STRIBECK = (0.05, 0.2)  # of the usual speed, over which friction falls from its value at rest
-_PRESLIDING = (0.03, 0.15)  # of the usual speed, over which friction changes its sign
+_TURNS_OVER = 0.05  # of the usual speed, over which the sign of a coupling's speed turns
 _WINDUP = (0.02, 0.1)  # of the usual way between two reversals, on which a torque is taken up
 _TURNED = 0.05  # of the usual rigid torque, over which the side of a gear changes
 
@@ -68,20 +65,21 @@ def _usual(m: JointMotion, of: Callable[[JointMotion], Array]) -> float:
     return float(np.sqrt(np.mean(of(m.scale or m) ** 2))) or 1.0
 
 
-def _stribeck(m: JointMotion) -> Array:
-    v = np.abs(m.v)[:, None] / (np.array(_STRIBECK) * _usual(m, attrgetter("v")))
-    falling: Array = m.direction[:, None] * np.exp(-v)
-    return falling
+def _of_terms(m: JointMotion, family: Family) -> Array:
+    """Return the columns of a family's terms, shape (N, c)."""
+    motion = DriveMotion(m.q, m.v, m.a, m.direction, m.load, np.zeros_like(m.v))
+    terms = family.tested_terms(_usual(m, attrgetter("v")))
+    return np.column_stack([term.column(motion) for term in terms])
 
 
-def _presliding(m: JointMotion) -> Array:
-    setting_in: Array = np.tanh(m.v[:, None] / (np.array(_PRESLIDING) * _usual(m, attrgetter("v"))))
-    return setting_in
-
-
-def _periodic(m: JointMotion, harmonics: int = _HARMONICS) -> Array:
-    angle = np.outer(m.q, np.arange(1, harmonics + 1))
-    return np.hstack([np.cos(angle), np.sin(angle)])
+def _of_family(family: Family) -> Candidate:
+    """Return the candidate of a family that what a fit leaves is tested for."""
+    units = family.tested_terms(1.0)[0].units if family.has_size else None
+    return Candidate(
+        family.name, family.code, partial(_of_terms, family=family), family.meaning, family.advice,
+        units=units, turns=family.needs > 0, families=(family.name, *family.instead),
+        is_imitated=family.is_imitated,
+    )  # fmt: skip
 
 
 def _ripple(m: JointMotion, count: int) -> Array:
@@ -142,69 +140,19 @@ def _coupled(m: JointMotion, other: str, ratio: float) -> Array:
 
     if other not in m.others:  # it is at rest
         none = np.zeros_like(m.v)
-        return np.column_stack([none, none, np.tanh(m.v / (_STRIBECK[0] * _usual(m, turned)))])
+        return np.column_stack([none, none, np.tanh(m.v / (_TURNS_OVER * _usual(m, turned)))])
     beside, w = m.others[other], turned(m)
-    return np.column_stack([beside.a, beside.v, np.tanh(w / (_STRIBECK[0] * _usual(m, turned)))])
+    return np.column_stack([beside.a, beside.v, np.tanh(w / (_TURNS_OVER * _usual(m, turned)))])
 
 
-_FRICTION = "friction that is not viscous and Coulomb"
-#: The candidates of each joint, those of couplings aside.
+#: The candidates of each joint, those of couplings aside: Coulomb friction where it is left out,
+#: the families of drive terms, and what no term is like.
 CANDIDATES = (
     Candidate(
         "coulomb", "friction_shape", lambda m: m.direction[:, None], "Coulomb friction",
         "Set friction = 'viscous+coulomb' in [model]",
     ),
-    Candidate(
-        "stribeck", "friction_shape", _stribeck,
-        f"{_FRICTION} but rises towards standstill (Stribeck)",
-        "Raise min_velocity to leave the slow rows out",
-        families=("stribeck",),
-    ),
-    Candidate(
-        "presliding", "friction_shape", _presliding,
-        f"{_FRICTION} but sets in with speed, or a drive that sticks",
-        "Set friction_band, or raise min_velocity to leave the slow rows out",
-        is_imitated=True,
-        families=("tanh",),
-    ),
-    Candidate(
-        "power", "friction_shape", lambda m: (m.direction * np.cbrt(np.abs(m.v)))[:, None],
-        f"{_FRICTION} but bends with speed, as |v|^(1/3) does",
-        families=("power",),
-    ),
-    Candidate(
-        "cubic", "friction_shape", lambda m: m.v[:, None] ** 3,
-        f"{_FRICTION} but bends with speed, as v^3 does",
-        families=("cubic",),
-    ),
-    Candidate(
-        "asymmetric", "friction_shape", lambda m: np.abs(m.v)[:, None],
-        "viscous friction that differs by direction",
-        units=("N m s/rad", "N s/m"),
-        families=("asymmetric",),
-    ),
-    Candidate(
-        "load", "load_friction", lambda m: (m.direction * np.abs(m.load))[:, None],
-        "friction that grows with the load",
-        units=("N m per N m of load", "N per N of load"),
-        families=("load",),
-    ),
-    Candidate(
-        "periodic", "position_periodic", _periodic,
-        "a torque that repeats with the joint's position (cogging, an eccentric gear)",
-        turns=True,
-        families=("harmonics4",),
-    ),
-    Candidate(
-        "linear spring", "spring", lambda m: m.q[:, None], "a spring on the joint",
-        units=("N m/rad", "N/m"),
-        families=("spring",),
-    ),
-    Candidate(
-        "counterbalance", "spring", lambda m: _periodic(m, 2),
-        "a spring or counterbalance that follows the joint's position", turns=True,
-        families=("harmonics2", COUNTERBALANCE, "spring"),
-    ),
+    *(_of_family(family) for family in FAMILIES.values() if family.code),
     Candidate(
         "windup", "backlash", _windup,
         "a torque that changes after each reversal, or with the side of the gear that is loaded "

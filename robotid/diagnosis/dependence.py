@@ -9,17 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid._typing import Array
-from robotid.diagnosis.sample import chance
+from robotid.diagnosis.decisions import DEPENDENCE_CHANCE, DEPENDENCE_SHARE
+from robotid.diagnosis.selection import chance
 
-__all__ = ["FEWEST", "LEAST", "Dependence", "even_bins", "follow"]
+__all__ = ["FEWEST", "Dependence", "even_bins", "follow"]
 
 #: Stretches to judge by, at least.
 FEWEST = 6
-#: Share of the squared residual from which it follows something.
-LEAST = 0.1
 
 _BINS = 10  # of a quantity, each of as many rows
-_CHANCE = 1e-3  # that a residual follows what it does not
 _SEEN_IN = 3  # stretches, from which the scatter of a bin's mean is told
 
 
@@ -50,7 +48,11 @@ class Dependence:
     @property
     def is_sure(self) -> bool:
         """Whether the residual follows the quantity beyond chance, and by enough to matter."""
-        return self.share is not None and self.share >= LEAST and self.chance < _CHANCE
+        return (
+            self.share is not None
+            and self.share >= DEPENDENCE_SHARE
+            and self.chance < DEPENDENCE_CHANCE
+        )
 
     @property
     def where(self) -> float:

@@ -16,8 +16,19 @@ from functools import partial
 import numpy as np
 
 from robotid._typing import Array
+from robotid.diagnosis.decisions import (
+    ALTERATION,
+    ALTERATION_CHANCE,
+    ALTERATION_SHARE,
+    CONFIRMED,
+    FAINT,
+    FAINT_CHANCE,
+    FAINT_SIZE,
+    SURE,
+)
 from robotid.diagnosis.misfit import Misfit, find_misfits
-from robotid.diagnosis.sample import Sample, along, chance, trials
+from robotid.diagnosis.sample import Sample, along, trials
+from robotid.diagnosis.selection import Round, select
 from robotid.findings import Finding, listed
 from robotid.fitting.result import Fit
 from robotid.logs.data import Trajectory
@@ -30,17 +41,6 @@ _Applied = Callable[[Array], tuple[RobotModel, Sequence[Trajectory]]]
 
 _STEP = 1e-5  # of a derivative [-, rad or m]
 _STEPS = 5  # of sizes that are sought anew from where they were found
-_MOST = 3  # that are named of a result
-_CHANCE = 3e-4  # that one is named which is not there, each time that one is tried
-_LEAST = 0.1  # share of the squared residual from which one is named
-_ALIKE = 0.02  # of the squared residual, within which two explain alike: the simpler is named
-_CONFIRMED = 0.25  # of that share, that recordings kept apart must show of it
-# A smaller share is named, too, if recordings kept apart show no less of it, by chance hardly ever,
-# and its size is twice what changes a result: noise that hides it does not keep it out of masses
-_FAINT = 0.03
-_FAINT_CHANCE = 1e-5
-_FAINT_SIZE = 2.0
-_SURE = 5.0  # standard errors that its size is from nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,35 +244,35 @@ def _found(fit: Fit, sample: Sample, own: Sequence[_Alteration]) -> Iterator[_Fo
     apart, whole = trials(sample, slice(None), Z)
     chosen: list[int] = []
     total = before = apart.left([])
+    of_fitted, of_kept = (float(part.sum()) for part in np.split(total, [sample.fitted]))
     untried = dict(zip(own, place, strict=True))
-    for _ in range(_MOST):
+
+    def offered() -> Round[_Alteration]:
         left = {one: apart.left([*chosen, *which]) for one, which in untried.items()}
-        least = min(float(x[: sample.fitted].sum()) for x in left.values())
-        bound = least + _ALIKE * total[: sample.fitted].sum()
-        alike = [one for one, x in left.items() if x[: sample.fitted].sum() <= bound]
-        best = min(alike, key=lambda one: (*_complexity(one), left[one][: sample.fitted].sum()))
-        gain, after = before - left[best], left[best]
-        share = float(gain[: sample.fitted].sum() / total[: sample.fitted].sum())
-        kept = gain[sample.fitted :].sum() / max(total[sample.fitted :].sum(), 1e-300)
-        is_confirmed = len(gain) == sample.fitted or kept > _CONFIRMED * share
-        by_chance = chance(before, after, sample.fitted)
-        is_faint = share < _LEAST
+        return Round(before, left, sample.fitted, of_fitted)
+
+    for this, best in select(offered, ALTERATION, _complexity):
+        if best is None:
+            return
+        kept = float((before - this.left[best])[sample.fitted :].sum()) / max(of_kept, 1e-300)
+        share, by_chance = this.share(best), this.chance(best)
+        has_kept, is_faint = len(total) > sample.fitted, share < ALTERATION_SHARE
+        is_confirmed = not has_kept or kept > CONFIRMED * share
         if is_faint:
-            is_shown = len(gain) > sample.fitted and kept > share > _FAINT
-            is_confirmed = is_shown and by_chance < _FAINT_CHANCE
-        if by_chance > _CHANCE or not is_confirmed:
+            is_confirmed = has_kept and kept > share > FAINT and by_chance < FAINT_CHANCE
+        if by_chance > ALTERATION_CHANCE or not is_confirmed:
             return
         which = untried.pop(best)
-        chosen, before = [*chosen, *which], after
+        chosen, before = [*chosen, *which], this.left[best]
         sizes, covariance = whole.estimate(chosen, sample.fitted)
         size, error = (x[-len(which) :] for x in (sizes, np.sqrt(np.diag(covariance))))
-        least = best.least * (_FAINT_SIZE if is_faint else 1.0)
-        if np.linalg.norm(size) < max(least, _SURE * float(np.linalg.norm(error))):
+        least = best.least * (FAINT_SIZE if is_faint else 1.0)
+        if np.linalg.norm(size) < max(least, SURE * float(np.linalg.norm(error))):
             return
         there = sample
         if best.applied is not None and len(chosen) == len(which):
             size, error, there = _refined(best.applied, size, fit.standard, sample)
-        others = [one for one in alike if one is not best]
+        others = [one for one in this.alike(ALTERATION) if one is not best]
         yield _Found(best, _finding(best, size, error, share, others), there)
 
 

@@ -13,38 +13,27 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy.special import stdtr
 
 from robotid._typing import Array
+from robotid.diagnosis.decisions import AT_BOUND, DOUBTED, FAMILY, FAMILY_SEEN, TENFOLD
 from robotid.diagnosis.sample import Sample, Trial, take_sample, trials
+from robotid.diagnosis.selection import Round, select
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.fitting.drives import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.fitting.result import Solution
 from robotid.regressor.memory import drive_motion_along
-from robotid.robot.drives import DriveMotion, DriveTerm
-from robotid.robot.families import FAMILIES, Family, Seen
+from robotid.robot.drives import FAMILIES, DriveMotion, DriveTerm, Family, MemorylessTerm, Seen
 
-__all__ = ["TENFOLD", "choose_drives"]
+__all__ = ["choose_drives"]
 
-#: Times that terms may make the standard error of another parameter grow, unreported.
-TENFOLD = 10.0
 _GRID = 6  # sizes of a shape that are tried, over its bounds
 _SPAN = 100.0  # from the smallest of them to the largest; a bound beyond is tried, too
-_FAMILIES = 4  # chosen for a joint, at most
-_CHANCE = 0.01  # that a family is chosen that is not there, each time that one is tried
-_DOUBTED = 0.25  # that a family is counted as open, which is likelier by chance than one taken
-_LEAST = 0.05  # of the squared residual that is left, from which a family is worth its parameters
-_SEEN = 0.006  # of the torque: a gain that is smaller may be of how signs pass the filter
-_ALIKE = 0.02  # of the squared residual, within which two families explain alike
-_EDGE = 0.02  # of the logarithm of its range, within which a shape is at its bound
 _SLOWEST = 0.0  # share of the rows that are slower than what counts as seen
 _TURN = 2 * np.pi  # [rad]
 _ROUNDING = 1e-10  # share of a column that is rounding: shapes and their errors know no other
 _STEP = 1e-3  # relative, of a derivative
 _STEPS = 40  # of the search for all shapes of a joint together
-_STILL = 1e-9  # of the squared residual of another stretch: the joint stands still in it
-_FEWEST = 3  # stretches that show chance
 _SHARPEST = 1e-6  # of the squared residual: exact data leave nothing to weigh by
 _NOTHING = 1e-300
 
@@ -191,11 +180,10 @@ def _reach(drive: _Drive, term: DriveTerm) -> float:
 
     Behind a filter directions are small where a drive is slow, and hide how large a curve is there.
     """
-    if term.guards != "v":
+    if term.guards != "v" or not isinstance(term, MemorylessTerm):
         return _NOTHING
     v = np.linspace(*drive.seen["v"], 50)
-    one, none = np.ones_like(v), np.zeros_like(v)
-    return float(np.abs(term.column(DriveMotion(none, v, none, one, none, none))).max()) + _NOTHING
+    return float(np.abs(term.amplitude(np.zeros_like(v), v)).max()) + _NOTHING
 
 
 def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoice:
@@ -208,24 +196,33 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
     chosen = list(range(len(known)))
     doubted: list[tuple[Family, list[float]]] = []
     before = every.left(chosen)
+    beside: dict[int, list[int]] = {}
     names = tuple(family.name for family, _ in known)
     tried = [Tried(names, _percent(before, torque), 1.0, True)]
-    for _ in range(_FAMILIES):
+
+    def offered() -> Round[int]:
+        nonlocal beside
         beside = _beside(every, chosen, len(known))
         left = {
             i: every.left([*others, i])
             for i, others in beside.items()
             if every.is_possible([*others, i])
         }
-        best = _best(every, left, before, torque)
+        whole = float(before.sum())
+        return Round(before, left, len(before), whole, FAMILY_SEEN**2 * torque)
+
+    def cost(i: int) -> tuple[int, int]:
+        return _simplicity(every, i)
+
+    for this, best in select(offered, FAMILY, cost):
         found = None
         if best is not None:
-            found = _conditioned(sample, drive, every, left, beside, before, best)
+            found = _conditioned(sample, drive, every, this, beside, best)
             best = found.number
-        tried += list(_told(every, left, before, torque, beside, best))
+        tried += list(_told(every, this, torque, beside, best))
         if found is None or best is None:
-            nearest = min(left, key=lambda i: float(left[i].sum()), default=None)
-            if nearest is not None and _chance(before, left[nearest]) < _DOUBTED:
+            nearest = min(this.left, key=lambda i: float(this.left[i].sum()), default=None)
+            if nearest is not None and this.chance(nearest) < DOUBTED:
                 doubted = [every.own[nearest]]
             break
         own = found.own
@@ -256,19 +253,6 @@ def _group(family: Family) -> str:
     return family.name.rstrip("0123456789")
 
 
-def _best(every: _Trials, left: Mapping[int, Array], before: Array, torque: float) -> int | None:
-    """Return the simplest of the candidates that explain as much as the best; None without one."""
-    whole = float(before.sum())
-    gains = {i: float((before - after).sum()) for i, after in left.items()}
-    sure = {
-        i: gain
-        for i, gain in gains.items()
-        if gain > _LEAST * whole and gain > _SEEN**2 * torque and _chance(before, left[i]) < _CHANCE
-    }
-    alike = [i for i, gain in sure.items() if gain >= max(sure.values()) - _ALIKE * whole]
-    return min(alike, key=lambda i: (*_simplicity(every, i), -sure[i]), default=None)
-
-
 def _simplicity(every: _Trials, i: int) -> tuple[int, int]:
     """Return how many columns a candidate has, and where its family is in the order of them."""
     return len(every.place[i]), list(FAMILIES).index(every.own[i][0].name)
@@ -287,9 +271,8 @@ def _conditioned(
     sample: Sample,
     drive: _Drive,
     every: _Trials,
-    left: Mapping[int, Array],
+    this: Round[int],
     beside: Mapping[int, Sequence[int]],
-    before: Array,
     best: int,
 ) -> _Refined:
     """Return the best candidate, or one of another family that is as good and better conditioned.
@@ -312,12 +295,13 @@ def _conditioned(
     if not any(first.faults):
         return first
     by_family: dict[str, int] = {}
+    left, whole = this.left, float(this.before.sum())
     for i in sorted(left, key=lambda i: float(left[i].sum())):
         by_family.setdefault(every.own[i][0].name, i)
     by_family.pop(every.own[best][0].name)
-    others = [refined(i) for i in by_family.values() if left[i].sum() < before.sum()]
+    others = [refined(i) for i in by_family.values() if left[i].sum() < whole]
     better = [other for other in others if other.faults < first.faults]
-    least, slack = left_of(first), _ALIKE * float(before.sum())
+    least, slack = left_of(first), FAMILY.alike * whole
     alike = [other for other in better if _is_alike(least, left_of(other), slack)]
     return min((first, *alike), key=lambda x: (x.faults, *_simplicity(every, x.number)))
 
@@ -329,30 +313,16 @@ def _is_alike(best: Array, other: Array, slack: float) -> bool:
     return bool(float(more.sum()) <= max(slack, scatter))
 
 
-def _chance(before: Array, after: Array) -> float:
-    """Return how likely stretches gain that much, in the mean of their shares, by chance [-].
-
-    Stretches in which the joint stands still have no say.
-    """
-    moves = before > _STILL * before.max()
-    if moves.sum() < _FEWEST:
-        return 1.0
-    before, after = before[moves], after[moves]
-    gain = (before - after) / np.maximum(np.maximum(before, after), _NOTHING)
-    spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), _NOTHING)
-    return float(stdtr(len(gain) - 1, -gain.mean() / spread))
-
-
 def _told(
     every: _Trials,
-    left: Mapping[int, Array],
-    before: Array,
+    this: Round[int],
     torque: float,
     beside: Mapping[int, Sequence[int]],
     best: int | None,
 ) -> Iterator[Tried]:
     """Yield what each family would leave, at its best shape."""
     by_family: dict[str, int] = {}
+    left = this.left
     for i, after in left.items():
         name = every.own[i][0].name
         if i == best or (
@@ -360,9 +330,8 @@ def _told(
         ):
             by_family[name] = i
     for name, i in by_family.items():
-        chance = _chance(before, left[i])
         names = [every.own[k][0].name for k in beside[i]]
-        yield Tried((*names, name), _percent(left[i], torque), chance, i == best)
+        yield Tried((*names, name), _percent(left[i], torque), this.chance(i), i == best)
 
 
 def _percent(left: Array, torque: float) -> float:
@@ -439,7 +408,7 @@ def _flat(chosen: Sequence[tuple[Family, Sequence[float]]]) -> Array:
 def _at_bound(drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]) -> Array:
     """Return which shapes are at the end of the range in which they are sought, shape (k,)."""
     bounds = _log_bounds(drive, [family for family, _ in chosen])
-    margin = _EDGE * np.ptp(bounds, axis=1)
+    margin = AT_BOUND * np.ptp(bounds, axis=1)
     is_near: Array = np.min(np.abs(np.log(_flat(chosen))[:, None] - bounds), axis=1) < margin
     return is_near
 

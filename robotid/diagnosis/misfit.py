@@ -1,32 +1,28 @@
 """What the drive model lacks: the residual of a fit against terms that drives may have."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from operator import attrgetter
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.diagnosis.candidates import CANDIDATES, Candidate, couplings, ripples
-from robotid.diagnosis.sample import Sample, Trial, chance, trials
+from robotid.diagnosis.decisions import (
+    CONFIRMED,
+    MISFIT,
+    MISFIT_MATTERS,
+    MISFIT_SEEN,
+    MISFIT_WARNS,
+    ONE_SIDED,
+)
+from robotid.diagnosis.sample import Sample, Trial, trials
+from robotid.diagnosis.selection import Round, select
 from robotid.fitting.joint_motion import JointMotion
 from robotid.robot.drives import DriveTerm
 from robotid.robot.families import has_turned
 
-if TYPE_CHECKING:
-    pass
-
 __all__ = ["Misfit", "find_misfits"]
-
-_TERMS = 3  # found of one joint, at most
-_CHANCE = 3e-4  # that a term is named which is not there, each time that one is tried
-_LEAST = 0.1  # share of the squared residual from which a term is named
-_MOST = 0.25  # ... and from which it is a warning
-_ONE_SIDED = 0.6  # share from which a coupling is named that the other joint does not show
-_SEEN = 0.005  # of the torque: a term smaller than this is not named
-_MATTERS = 0.02  # ... and than this is no warning
-_ALIKE = 0.02  # of the squared residual, within which two terms explain alike
-_CONFIRMED = 0.25  # of the share, that a validation must show of it for a warning
 
 
 @dataclass(frozen=True)
@@ -77,9 +73,9 @@ class Misfit:
     def matters(self) -> bool:
         """Whether it is a warning."""
         explained = np.sqrt(self.share) * self.error
-        is_denied = self.confirmed is not None and self.confirmed < _CONFIRMED * self.share
+        is_denied = self.confirmed is not None and self.confirmed < CONFIRMED * self.share
         is_doubted = is_denied or self.term.is_imitated
-        return bool(self.share >= _MOST and explained >= _MATTERS and not is_doubted)
+        return bool(self.share >= MISFIT_WARNS and explained >= MISFIT_MATTERS and not is_doubted)
 
 
 def find_misfits(sample: "Sample | None") -> tuple[Misfit, ...]:
@@ -95,7 +91,7 @@ def find_misfits(sample: "Sample | None") -> tuple[Misfit, ...]:
     # a drive that turns with two joints loads both
     return tuple(
         m for m in found
-        if not m.term.coupled or m.share > _ONE_SIDED or (m.term.coupled, m.joint) in coupled
+        if not m.term.coupled or m.share > ONE_SIDED or (m.term.coupled, m.joint) in coupled
     )  # fmt: skip
 
 
@@ -117,38 +113,39 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
     apart, whole = trials(sample, slice(j, j + 1), np.hstack(columns)[:, None])
     chosen: list[int] = []
     total = before = apart.left([])
-    error = float(np.sqrt(total[: sample.fitted].sum() / sample.torque[j]))
-    for _ in range(_TERMS):
+    squares = float(total[: sample.fitted].sum())
+    error = float(np.sqrt(squares / sample.torque[j]))
+
+    def offered() -> Round[Candidate]:
         left = {c: apart.left([*chosen, *place[c]]) for c in own}
-        best = _best(left, before, place, total, sample.fitted)
+        return Round(before, left, sample.fitted, squares)
+
+    found = select(offered, MISFIT, lambda c: len(place[c]), attrgetter("tried"))
+    for this, best in found:
         if best is None:
             return
-        gain = (before - left[best])[: sample.fitted]
-        share = float(gain.sum() / total[: sample.fitted].sum())
-        size, std_error, unit = _size(sample, j, best, whole, chosen, place[best])
-        theta = whole.parameters([*chosen, *place[best]])[len(chosen) :]
-        kept = [
-            whole.left(which)[sample.fitted :].sum()
-            for which in ([], chosen, [*chosen, *place[best]])
-        ]
-        if np.sqrt(share) * error >= _SEEN:
+        share, new = this.share(best), place[best]
+        size, std_error, unit = _size(sample, j, best, whole, chosen, new)
+        theta = whole.parameters([*chosen, *new])[len(chosen) :]
+        kept = [whole.left(which)[sample.fitted :].sum() for which in ([], chosen, [*chosen, *new])]
+        if np.sqrt(share) * error >= MISFIT_SEEN:
             yield Misfit(
                 joint=sample.joints[j],
                 term=best,
                 share=share,
-                chance=chance(before, left[best], sample.fitted),
+                chance=this.chance(best),
                 confirmed=float((kept[1] - kept[2]) / kept[0]) if kept[0] > 0 else None,
                 size=size,
                 std_error=std_error,
                 unit=unit,
                 error=error,
-                shift=-whole.T[: len(sample.U), place[best]] @ theta,
+                shift=-whole.T[: len(sample.U), new] @ theta,
                 theta=theta,
                 scale=motion,
                 entries=_entries(sample, j, best),
             )
-        chosen += place[best]
-        before, own = left[best], [c for c in own if c.code != best.code]
+        chosen += new
+        before, own = this.left[best], [c for c in own if c.code != best.code]
 
 
 def _entries(sample: Sample, j: int, term: Candidate) -> tuple[str | DriveTerm, ...]:
@@ -156,25 +153,6 @@ def _entries(sample: Sample, j: int, term: Candidate) -> tuple[str | DriveTerm, 
     turned = 0.0 if sample.slides[j] else float(np.ptp(sample.motions[j].q[: sample.rows]))
     families = [name for name in term.families if has_turned(name, turned)]
     return tuple(families[:1]) or term.terms
-
-
-def _best(
-    left: Mapping[Candidate, Array],
-    before: Array,
-    place: Mapping[Candidate, Sequence[int]],
-    total: Array,
-    fitted: int,
-) -> Candidate | None:
-    """Return the simplest of the terms that explain as much as the best does; None without one."""
-    whole = float(total[:fitted].sum())
-    gains = {c: float((before - after)[:fitted].sum()) / whole for c, after in left.items()}
-    sure = {
-        candidate: gain
-        for candidate, gain in gains.items()
-        if gain > _LEAST and candidate.tried * chance(before, left[candidate], fitted) < _CHANCE
-    }
-    alike = [c for c, gain in sure.items() if gain > max(sure.values()) - _ALIKE]
-    return min(alike, key=lambda c: (len(place[c]), -sure[c]), default=None)
 
 
 def _size(

@@ -5,11 +5,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from robotid.diagnosis.candidates import Candidate
+from robotid.diagnosis.decisions import MAIN
 from robotid.diagnosis.misfit import Misfit
 from robotid.findings import Finding, listed, toml_key
 from robotid.fitting.result import Fit
-from robotid.robot.drives import DriveTerm
-from robotid.robot.families import COUNTERBALANCE, drive_line, spring_family
+from robotid.robot.drives import COUNTERBALANCE, DriveTerm
+from robotid.robot.families import drive_line, spring_family
 
 __all__ = [
     "counterbalanced",
@@ -20,7 +21,6 @@ __all__ = [
     "with_known_springs",
 ]
 
-_MAIN = 50.0  # [%] of the squared residual: a term that explains more outranks a guess
 _OF_POSITION = ("position_periodic", "spring", "position_offset")
 _OF_MASSES = ("counterbalance", "current_for_torque", "urdf_mismatch")
 _SPRINGS = ("ripple", "spring")  # parts of the torque that follow the position
@@ -135,7 +135,7 @@ def settled(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding
 
 def _explains(term: Finding, guess: Finding) -> bool:
     """Return whether a term that the fit found explains what was found before the fit."""
-    if term.evidence.get("share_pct", 0.0) < _MAIN:
+    if term.evidence.get("share_pct", 0.0) < MAIN:
         return False
     if guess.code == "unexplained_torque":
         return guess.where.rpartition(": ")[2] == term.where

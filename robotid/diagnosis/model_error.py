@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotid._typing import Array
+from robotid.diagnosis.decisions import GROWN
 from robotid.diagnosis.misfit import Misfit
 from robotid.diagnosis.sample import Sample, Trial, take_sample, trials
 from robotid.fitting.joint_motion import JointMotion
@@ -36,7 +37,6 @@ _STEP = 1e-3  # relative, of a derivative
 _ROUNDING = 1e-10  # share of a column that is rounding
 _MOVES = 0.2  # standard errors by which a shape moves that is worth another fit
 _PINNED = 1e-6  # of the smallest spread: that of a parameter that is known
-_GROWN = 1.3  # times by which a standard error grows that stands on a misfit
 
 
 def with_model_error(
@@ -60,7 +60,7 @@ def with_model_error(
     wider = _wider(found, sample, [_of_misfit(misfit) for misfit in misfits])
     before, after = found.standard_error, wider.standard_error
     drives = np.arange(len(before)) >= found.model.layout.n_inertial
-    grown = np.flatnonzero(drives & np.isfinite(before) & (after > _GROWN * before))
+    grown = np.flatnonzero(drives & np.isfinite(before) & (after > GROWN * before))
     return wider, tuple(found.mapping.names[i] for i in grown)
 
 

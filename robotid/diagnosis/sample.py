@@ -15,7 +15,6 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy.special import stdtr
 
 from robotid._typing import Array
 from robotid.fitting.evaluation import Evaluation, Recording
@@ -26,7 +25,7 @@ from robotid.regressor.torque import trajectory_regressor
 from robotid.regressor.used_rows import independent_share
 from robotid.robot.model import RobotModel
 
-__all__ = ["Sample", "Trial", "along", "chance", "take_sample", "trials"]
+__all__ = ["Sample", "Trial", "along", "take_sample", "trials"]
 
 _ROWS = 3000  # of all fitted logs, and of all kept ones, that are read
 _NUMBERS = 2**24  # of the regressor in them
@@ -34,7 +33,6 @@ _PER_INDEPENDENT = 2.0  # rows for each that is independent behind the filter
 _STRETCHES = 16  # left out in turn
 _SHORTEST = 10  # independent rows in a stretch
 _FEWEST = 6  # stretches to judge by
-_NOTHING = 1e-300
 _NEAR = 0.5  # periods of the filter's cut-off
 _OUTLIER = 12.0  # usual residuals from which a row is left out
 _RIDGE = 1e-4  # share of a column that the regressor must leave of it
@@ -136,7 +134,7 @@ def take_sample(fit: Solution, *, is_steady: bool = True) -> Sample | None:
         return None
     parts = list(zip([*fit.fitted, *kept], rows, strict=True))
     motion = [e.recording.trajectory.at(k) for e, k in parts]
-    Y = np.concatenate([_regressor(model, m) for m in motion])  # (N, n, p)
+    Y = np.concatenate([_regressor(model, e.recording.trajectory, k) for e, k in parts])
     tau = np.concatenate([m.tau for m in motion])
     r = tau - Y @ fit.standard
     used = np.concatenate([e.recording.mask[k] for e, k in parts])
@@ -225,9 +223,10 @@ def _stretches(fitted: int, kept: int, independent: float) -> tuple[slice, ...]:
     return tuple(slice(*pair) for pair in pairwise(edges))
 
 
-def _regressor(model: RobotModel, motion: Trajectory) -> Array:
-    """Return the regressor of the standard parameters, shape (N, n, p)."""
-    return trajectory_regressor(model, motion).reshape(len(motion.t), model.n_rows, -1)
+def _regressor(model: RobotModel, motion: Trajectory, samples: Array | None = None) -> Array:
+    """Return the regressor of the standard parameters at some samples, shape (N, n, p)."""
+    Y = trajectory_regressor(model, motion, samples)
+    return Y.reshape(-1, model.n_rows, Y.shape[1])
 
 
 def _usual_size(r: Array, used: Array) -> Array:
@@ -344,22 +343,3 @@ def trials(sample: Sample, joints: slice, Z: Array, ridge: float = _RIDGE) -> tu
         return Trial(S, np.array([E_k.T @ E_k for E_k in E]), T)
 
     return trial(*sample.apart), trial(*sample.whole)
-
-
-def chance(before: Array, after: Array, fitted: int) -> float:
-    """Return how likely stretches gain that much, in the mean of their shares, by chance [-].
-
-    By Student's test of the shares, each between -1 and 1, of the fitted logs' stretches or of all,
-    whichever is surer.
-
-    Args:
-        before: Squared residual of each stretch, shape (K,).
-        after: The same with the term.
-        fitted: How many of the stretches are of fitted logs.
-    """
-    gain = (before - after) / np.maximum(np.maximum(before, after), _NOTHING)
-    chances = [
-        stdtr(len(x) - 1, -x.mean() / max(np.std(x, ddof=1) / np.sqrt(len(x)), _NOTHING))
-        for x in (gain, gain[:fitted])
-    ]
-    return float(min(chances))

@@ -5,6 +5,7 @@ unless its code is ignored.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from robotid._settings import require_kind
@@ -12,7 +13,7 @@ from robotid.doctor.channels import check_channels
 from robotid.doctor.clock import check_clock, check_rest
 from robotid.doctor.command_channels import check_commands
 from robotid.doctor.motions import check_excitation, check_repeated_motion
-from robotid.doctor.mounted import check_payload_change
+from robotid.doctor.mounted import Segments, check_payload_change
 from robotid.doctor.sample import Probe, smooth_motion, take_probe
 from robotid.doctor.torque_channels import check_torque_channels
 from robotid.doctor.torque_delay import check_torque_delay
@@ -93,17 +94,17 @@ def diagnose(
     probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
     mapping = structural_mapping(model) if probes else None
     moving = [probe.motion for probe in probes]
+    names = ", ".join(log.name for log in fitted)
+    excitation = list(check_excitation(model, mapping, moving, signals, names)) if mapping else []
+    segments = Segments(model, mapping, moving, signals.min_velocity) if mapping else None
     for log, (motion, probe) in zip(kept, motions[len(fitted) :], strict=True):
         if motion is not None:
             findings += check_repeated_motion(first, motion, log.name)
-        if probe is not None and mapping is not None:
-            findings += check_payload_change(
-                model, mapping, moving, probe.motion, signals, log.name
-            )
+        if probe is not None and segments is not None:
+            own = replace(segments, motions=[probe.motion])
+            findings += check_payload_change(segments, own, signals, log.name)
     if mapping is not None:
-        names = ", ".join(log.name for log in fitted)
-        findings += check_excitation(model, mapping, moving, signals, names)
-        findings += rounded_robot(model, mapping)
+        findings += [*excitation, *rounded_robot(model, mapping)]
     return by_severity(findings)
 
 

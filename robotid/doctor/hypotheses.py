@@ -216,14 +216,21 @@ def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
     every = max(1, len(probe.rows) // _ROWS)
     some, few = (probe.at(probe.rows[::k]) for k in (every, _QUARTER * every))
     joints = range(len(probe.model.joints))
+    enough, likely = best - _CLEARLY, best - 0.5 * _CLEARLY
     readings: list[Callable[[Probe], list[Explanation]]] = [
         *(partial(_exchanged, pair=pair) for pair in combinations(joints, 2)),
         *(partial(_reversed, j=j) for j in joints),
-        _displaced,
     ]
     for read in readings:
-        if any(e.misfit < best - 0.5 * _CLEARLY for e in read(few)):
-            yield from (e for e in read(some) if e.misfit < best - _CLEARLY)
+        if any(e.misfit < likely for e in read(few)):
+            yield from (e for e in read(some) if e.misfit < enough)
+    offsets = [_offset(few, j, offset) for j in _turning(few) for offset in _OFFSETS]
+    first = min(offsets, key=lambda e: e.misfit, default=None)
+    if first is not None and _refined(few, first).misfit < likely:
+        near = [e for e in offsets if e.misfit < first.misfit + 0.5 * _CLEARLY]
+        tried = [_offset(some, e.joints[0], e.values[0]) for e in near]
+        found = _refined(some, min(tried, key=lambda e: e.misfit))
+        yield from [found] if found.misfit < enough else []
 
 
 def _turning(probe: Probe) -> list[int]:
@@ -255,12 +262,6 @@ def _reversed(probe: Probe, j: int) -> list[Explanation]:
     axis = Explanation("joint_axis", np.where(is_j, share[:, 1], share[:, 0]), (j,))
     sign = Explanation("position_sign", share[:, 0], (j,))
     return [sign, axis] if j in _turning(probe) else [axis]
-
-
-def _displaced(probe: Probe) -> list[Explanation]:
-    """Return the reading that the zero of a revolute joint is elsewhere, by the best offset."""
-    offsets = [_offset(probe, j, offset) for j in _turning(probe) for offset in _OFFSETS]
-    return [_refined(probe, min(offsets, key=lambda e: e.misfit))] if offsets else []
 
 
 def _offset(probe: Probe, j: int, offset: float) -> Explanation:

@@ -13,7 +13,8 @@ from robotid._typing import Array
 from robotid.doctor.hypotheses import compensated, own_share
 from robotid.doctor.sample import Probe
 from robotid.findings import Finding, listed, log_finding
-from robotid.robot.families import COUNTERBALANCE, drive_line, spring_family
+from robotid.robot.drives import COUNTERBALANCE
+from robotid.robot.families import drive_line, spring_family
 
 __all__ = [
     "NO_GRAVITY",

@@ -1,8 +1,8 @@
 """What is mounted on the last link: parts that the URDF has, loads that only some logs have."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.special
@@ -16,12 +16,13 @@ from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import Reduction, compress_stretches, join
+from robotid.regressor.rows import thinned
 from robotid.regressor.used_rows import base_problem, row_mask
 from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import payload_spread, prior_spread
 
-__all__ = ["check_payload_change", "check_unmounted_parts"]
+__all__ = ["Segments", "check_payload_change", "check_unmounted_parts"]
 
 _LIGHTER = 4.0  # drop of the misfit, of a factor 7 in likelihood, from which a part is missed
 _ALIKE = 2.0  # misfits that differ by less are alike
@@ -73,13 +74,45 @@ def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Fin
     yield log_finding(name, "unmounted_part", "warning", message, last, **evidence)
 
 
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Motions of a robot, and what segments of some of their rows come down to.
+
+    Attributes:
+        model: The robot.
+        mapping: Standard to base parameters.
+        motions: The motions.
+        min_velocity: Bound on the speed of the rows that count.
+    """
+
+    model: RobotModel
+    mapping: BaseMapping
+    motions: Sequence[Trajectory]
+    min_velocity: float
+
+    @property
+    def seconds(self) -> float:
+        """How long they are [s]."""
+        return sum(float(np.ptp(motion.t)) for motion in self.motions)
+
+    @cached_property
+    def reductions(self) -> tuple[Reduction, ...]:
+        """What each segment comes down to, in order."""
+        return tuple(part for motion in self.motions for part in self._of(motion))
+
+    def _of(self, motion: Trajectory) -> Iterator[Reduction]:
+        thin = thinned(self.model, motion, max(1, len(motion.t) // _ROWS))
+        count = int(np.clip(np.ptp(thin.t) / _STRETCH, 1, _STRETCHES))
+        length = -(-len(thin.t) // count)
+        rows = row_mask(self.model, thin, self.min_velocity)
+        problem = base_problem(self.model, self.mapping, thin, rows, compiled=False)
+        for i, factors in enumerate(compress_stretches(problem, length)):
+            part = thin.part(i * length, (i + 1) * length)
+            yield Reduction(factors, part.squares, len(part.t))
+
+
 def check_payload_change(
-    model: RobotModel,
-    mapping: BaseMapping,
-    fitted: Sequence[Trajectory],
-    kept: Trajectory,
-    signals: SignalSettings,
-    name: str,
+    fitted: Segments, kept: Segments, signals: SignalSettings, name: str
 ) -> Iterator[Finding]:
     """Yield a warning "payload_change" if a validation log has another load than the fitted ones.
 
@@ -87,25 +120,17 @@ def check_payload_change(
     validation log has. It is believed if it makes one robot of both.
 
     Args:
-        model: The robot.
-        mapping: Standard to base parameters.
         fitted: Motions that are fitted.
         kept: The motion that is kept apart.
         signals: How logs become trajectories.
         name: What its log is called.
     """
-    first, second = (
-        [
-            part
-            for motion in some
-            for part in _stretches(model, mapping, motion, signals.min_velocity)
-        ]
-        for some in (fitted, [kept])
-    )
+    model, mapping = fitted.model, fitted.mapping
+    first, second = fitted.reductions, kept.reductions
     layout, whole = model.layout, join([*first, *second])
     size = payload_spread(model)
     last = mapping.K[:, layout.n_inertial - 10 : layout.n_inertial]
-    seconds = sum(float(np.ptp(motion.t)) for motion in (*fitted, kept))
+    seconds = fitted.seconds + kept.seconds
     runs = payload_runs(
         first,
         second,
@@ -116,6 +141,10 @@ def check_payload_change(
         (last, np.full(10, np.nan), size),
         share=min(1.0, 2.0 * (signals.cutoff or np.inf) * seconds / whole.samples),
     )
+    theta, covariance = runs.alike()
+    least = -float(scipy.special.ndtri(_CHANCE)) * float(np.sqrt(covariance[-10, -10]))
+    if abs(theta[-10]) <= max(least, _NOTHING * size[0]):
+        return  # errors that count what changes with time are no smaller
     # whether there is one at all is asked of what changes with time; scales are tried below
     found = runs.compare(by_joint=False)
     mass, error = float(found.theta[-10]), float(np.sqrt(found.covariance[-10, -10]))
@@ -134,24 +163,6 @@ def check_payload_change(
     )
     evidence = {"mass": mass, "std_error": error}
     yield log_finding(name, "payload_change", "warning", message, link, **evidence)
-
-
-def _stretches(
-    model: RobotModel, mapping: BaseMapping, motion: Trajectory, min_velocity: float
-) -> Iterator[Reduction]:
-    """Yield what stretches of some rows of a motion come down to."""
-    every = max(1, len(motion.t) // _ROWS)
-    own = ("t", "q", "v", "a", "tau", "segment", "direction")
-    values = {key: getattr(motion, key) for key in own}
-    kept: dict[str, Any] = {k: x if x is None else x[::every] for k, x in values.items()}
-    thin = replace(motion, **kept)
-    count = int(np.clip(np.ptp(thin.t) / _STRETCH, 1, _STRETCHES))
-    length = -(-len(thin.t) // count)
-    rows = row_mask(model, thin, min_velocity)
-    problem = base_problem(model, mapping, thin, rows, compiled=False)
-    for i, factors in enumerate(compress_stretches(problem, length)):
-        part = thin.part(i * length, (i + 1) * length)
-        yield Reduction(factors, part.squares, len(part.t))
 
 
 def _misfit_without_load(model: LoadModel) -> float:

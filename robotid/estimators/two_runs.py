@@ -98,7 +98,7 @@ class TwoRuns:
         """
         size, u = len(self.mean), len(self.unknown)
         gain = self._first_gains()
-        theta = self._minimum(self._both(gain), self._level(gain))[0]
+        theta = self.alike(gain)[0]
         for _ in range(_STEPS if u else 1):
             at = theta if u else None
             solution, bread = self._minimum(self._both(gain, at), self._level(gain))
@@ -116,6 +116,19 @@ class TwoRuns:
         squares = self._both(gain, at).residual_squares(solution)
         torque = np.maximum(np.abs(gain) * np.sqrt(self._logged.torque_squares()), 1e-300)
         return Compared(theta, gain, covariance, freedom, np.sqrt(squares) / torque)
+
+    def alike(self, gain: Array | None = None) -> tuple[Array, Array]:
+        """Return beta and x as all rows that are independent by ``share`` have them.
+
+        Args:
+            gain: Gains, shape (n,); None: 1.
+
+        Returns:
+            beta and x, shape (b + d,), and their covariance, whose variances are at most those of
+            ``compare``.
+        """
+        gain = np.ones(len(self._logged.rows)) if gain is None else gain
+        return self._minimum(self._both(gain), self._level(gain))
 
     def held_together(self, theta: Array) -> Array:
         """Return what the runs leave together over what each joint leaves by itself, shape (n,).

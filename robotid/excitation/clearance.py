@@ -15,7 +15,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
-from robotid.regressor.adjoint import MotionRegressor, Poses
+from robotid.regressor.along import Placements, fixed_tree
 from robotid.robot.geometry import link_clouds
 from robotid.robot.model import RobotModel
 from robotid.simulation.motions import Motion
@@ -125,8 +125,6 @@ class Clearance:
         floor: Height below which nothing that moves may go, in the frame of the root link [m].
         boxes: What stands around the robot.
         seed: Of the random poses that say which links may meet.
-        is_fast: Whether hulls that are far enough apart are left out by compiled code, which needs
-            the extra ``fast``; what is near has the same distances.
 
     Attributes:
         pairs: Numbers of the two hulls of each pair.
@@ -139,8 +137,8 @@ class Clearance:
         built_near: Links that are built near each other, by two, with the distance they keep.
 
     Raises:
-        DataError: If no link has a shape that can be read.
-        SettingsError: If a number is not usable.
+        DataError: If no link has a shape that can be read, or the base floats.
+        SettingsError: If a number is not usable, or a joint is of a kind that is not compiled.
     """
 
     def __init__(
@@ -151,15 +149,13 @@ class Clearance:
         floor: float | None = None,
         boxes: Sequence[Box] = (),
         seed: int = 0,
-        is_fast: bool = False,
     ) -> None:
         import coal
 
         if not least >= 0:
             raise SettingsError(f"clearance is {least}, wanted 0 m or more")
-        self.least, self._model, self._regressor = least, model, MotionRegressor(model)
-        self._is_fast = is_fast
-        self._ratios = model.velocity_map[self._regressor.places]  # of joints by body, (m, n)
+        self.least, self._model, self._tree = least, model, fixed_tree(model)
+        self._ratios = model.velocity_map  # of joints by body, (m, n)
         clouds, self.unread = link_clouds(model)
         if not clouds:
             raise DataError(
@@ -192,7 +188,7 @@ class Clearance:
         low = [j.lower if j.has_limits else -np.pi for j in self._model.limits]
         high = [j.upper if j.has_limits else np.pi for j in self._model.limits]
         q = np.vstack([np.clip(0.0, low, high), rng.uniform(low, high, (_TRIED, len(low)))])
-        distance = self.near(self.poses(q), self.least + _APART, self.everything).distance
+        distance = self.near(self.placed(q), self.least + _APART, self.everything).distance
         is_link = np.array([hull.name in self._model.tree.links for hull in self._hulls])
         are_links = np.all(is_link[self.pairs], axis=1)
         touch = np.less(distance, _TOUCH)
@@ -224,11 +220,8 @@ class Clearance:
     @cached_property
     def _supports(self) -> Array:
         """Which joints move which body, shape (m + 1, m), bool; the last row stands still."""
-        tree = self._model.pin_model
-        moved = np.zeros((tree.njoints, tree.njoints - 1), dtype=bool)
-        for i in range(1, tree.njoints):
-            moved[i - 1, [j - 1 for j in list(tree.supports[i])[1:]]] = True
-        return moved
+        is_below = self._tree.is_below
+        return np.vstack([is_below, np.zeros(len(is_below), dtype=bool)])
 
     @cached_property
     def movers(self) -> Array:
@@ -252,30 +245,29 @@ class Clearance:
         spare: Array = np.minimum(_SPARE, _SPARE_ROOM * self.room)[:, None]
         return spare
 
-    def margins(self, poses: Poses, spare: float, *, hints: Array | None = None) -> Array:
+    def margins(self, placed: Placements, spare: float, *, hints: Array | None = None) -> Array:
         """Return margins of distances, shape (pairs, N) [m]; a lower bound of those over 1 cm.
 
         Args:
-            poses: Where the bodies are at N instants.
+            placed: Where the bodies are at N instants.
             spare: How many times what distances spare is taken off the margin.
             hints: As of ``near``.
         """
         kept = self.kept[:, None] + spare * self.spare
         seen = np.minimum(_SEEN, self.room[:, None] / 4)
-        return self.near(poses, kept + seen, hints=hints).distance - kept
+        return self.near(placed, kept + seen, hints=hints).distance - kept
 
-    def poses(self, q: Array) -> Poses:
+    def placed(self, q: Array) -> Placements:
         """Return where the bodies are.
 
         Args:
             q: Joint coordinates, shape (N, n) [rad or m].
         """
-        G, shift = self._model.velocity_map, self._model.position_offset
-        return self._regressor.poses(q @ G.T + shift)
+        return Placements.along(self._tree, q)
 
     def near(
         self,
-        poses: Poses,
+        placed: Placements,
         within: float | Array,
         chosen: Array | None = None,
         hints: Array | None = None,
@@ -283,7 +275,7 @@ class Clearance:
         """Return the distances of pairs along a motion, exact where they are near.
 
         Args:
-            poses: Where the bodies are at N instants.
+            placed: Where the bodies are at N instants.
             within: Distance from which a lower bound will do, one, or one per pair and instant,
                 shape (pairs, N) or one that broadcasts to it [m].
             chosen: Which pairs to look at, shape (pairs,), bool; those that may meet if None.
@@ -292,34 +284,29 @@ class Clearance:
         """
         import coal
 
+        from robotid.excitation.gap_lanes import lower_bounds  # imports Numba
+
         chosen = self.likely if chosen is None else chosen
-        bound = np.full((len(self.pairs), poses.p.shape[2]), np.inf)
+        bound = np.full((len(self.pairs), placed.p.shape[2]), np.inf)
         limit = np.broadcast_to(within, bound.shape)
         hints = np.zeros((*bound.shape, 3)) if hints is None else hints
-        if self._is_fast:
-            from robotid.excitation.gap_lanes import lower_bounds  # imports Numba
-
-            numbers, enough = np.flatnonzero(chosen), np.array(limit, order="C")
-            lower_bounds(
-                numbers, self.pairs, enough, hints, bound, poses.R, poses.p, *self._corners
-            )
-        else:
-            bound[chosen] = self._bounds(poses, self.pairs[chosen], limit[chosen], hints[chosen])
+        numbers, enough = np.flatnonzero(chosen), np.array(limit, order="C")
+        lower_bounds(numbers, self.pairs, enough, hints, bound, placed.R, placed.p, *self._corners)
         pairs, samples = np.nonzero(bound < limit)
         hulls = self.pairs[pairs].T  # (2, k)
-        centres, turns = self._placed(poses, hulls.ravel(), np.tile(samples, 2))
+        centres, turns = self._stands(placed, hulls.ravel(), np.tile(samples, 2))
         shapes = [self._hulls[k].shape for k in hulls.ravel().tolist()]
-        placed = [coal.Transform3s(R, x) for R, x in zip(turns, centres, strict=True)]
+        poses = [coal.Transform3s(R, x) for R, x in zip(turns, centres, strict=True)]
         count, result, exact = len(pairs), coal.DistanceResult(), np.empty(len(pairs))
         witness, normals = np.empty((2, count, 3)), np.empty((count, 3))
         for k in range(count):
-            one, other = (shapes[k], placed[k]), (shapes[count + k], placed[count + k])
+            one, other = (shapes[k], poses[k]), (shapes[count + k], poses[count + k])
             result.clear()
             exact[k] = coal.distance(*one, *other, self._request, result)
             witness[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
             normals[k] = result.normal
         bound[pairs, samples], hints[pairs, samples] = exact, normals
-        gradient = self._gradient(poses, pairs, samples, witness, normals)
+        gradient = self._gradient(placed, pairs, samples, witness, normals)
         return Nearness(bound, pairs, samples, gradient)
 
     def nearest(self, motion: Motion, duration: float) -> Contact | None:
@@ -349,7 +336,7 @@ class Clearance:
             q, v, _ = motion.evaluate(middles)
             way = np.abs(v @ self._ratios.T) * h + fastest * h**2 / 2  # of each joint, (N, m)
             moved = self._levers @ way.T  # (pairs, N)
-            near = self.near(self.poses(q), kept + seen + moved, self.everything)
+            near = self.near(self.placed(q), kept + seen + moved, self.everything)
             exact = near.distance[near.pairs, near.samples] - self.kept[near.pairs]
             if exact.min(initial=np.inf) < seen:
                 k = int(np.argmin(exact))
@@ -369,7 +356,7 @@ class Clearance:
     @cached_property
     def _levers(self) -> Array:
         """How far each joint moves the hulls of a pair against each other at most, (pairs, m)."""
-        tree, slides = self._model.pin_model, self._regressor.slides
+        tree, slides = self._model.pin_model, self._tree.slides
         lengths = np.linalg.norm([M.translation for M in tree.jointPlacements], axis=1)[1:]
         travel = {joint.name: max(-joint.lower, joint.upper) for joint in self._model.limits}
         for i in np.flatnonzero(slides).tolist():
@@ -386,42 +373,6 @@ class Clearance:
                     body = int(tree.parents[body + 1]) - 1
         return out
 
-    def _bounds(self, poses: Poses, pairs: Array, limit: Array, hints: Array) -> Array:
-        """Return lower bounds of distances by spheres, where too low by boxes, then by hints.
-
-        Args:
-            poses: Where the bodies are.
-            pairs: Numbers of two hulls, shape (k, 2).
-            limit: What a bound need not exceed, shape (k, N) [m].
-            hints: Directions that may part the hulls, shape (k, N, 3).
-        """
-        N, count = limit.shape[1], len(self._hulls)
-        every = np.repeat(np.arange(count), N), np.tile(np.arange(N), count)
-        placed = self._placed(poses, *every)
-        centres, turns = placed[0].reshape(count, N, 3), placed[1].reshape(count, N, 3, 3)
-        i, j = pairs.T
-        radii = np.array([hull.radius for hull in self._hulls])
-        bound: Array = np.linalg.norm(centres[i] - centres[j], axis=2)
-        bound -= (radii[i] + radii[j])[:, None]
-        k, samples = np.nonzero(bound < limit)
-        bound[k, samples] = self._box_bound(centres, turns, pairs[k], samples)
-        k, samples = np.nonzero((bound < limit) & hints.any(axis=2))
-        way = hints[k, samples]  # from the first hull to the second
-        i, j = pairs[k].T
-        gap = np.einsum("kc,kc->k", way, centres[j, samples] - centres[i, samples])
-        gap -= self._reach(i, turns[i, samples], way) + self._reach(j, turns[j, samples], -way)
-        bound[k, samples] = np.maximum(bound[k, samples], gap)
-        return bound
-
-    def _reach(self, hulls: Array, turns: Array, ways: Array) -> Array:
-        """Return how far k hulls reach from their middles along directions, shape (k,) [m]."""
-        own = np.einsum("kba,kb->ka", turns, ways)
-        out = np.empty(len(hulls))
-        for hull in np.unique(hulls):
-            rows = hulls == hull
-            out[rows] = (own[rows] @ self._hulls[hull].corners.T).max(axis=1)
-        return out
-
     @cached_property
     def _corners(self) -> tuple[Array, ...]:
         """The hulls as ``lower_bounds`` takes them."""
@@ -431,43 +382,28 @@ class Clearance:
         points = np.vstack([hull.corners for hull in hulls])
         return *map(np.array, of_each), points, starts
 
-    def _box_bound(self, centres: Array, turns: Array, pairs: Array, samples: Array) -> Array:
-        """Return lower bounds of distances by the boxes around hulls, shape (k,) [m].
-
-        Their shadows on an axis are as far apart, for any axis: the line of centres and the sides.
-        """
-        i, j = pairs.T
-        way = centres[j, samples] - centres[i, samples]
-        R_i, R_j = turns[i, samples], turns[j, samples]
-        line = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
-        axes = np.concatenate([line[:, None], R_i.swapaxes(1, 2), R_j.swapaxes(1, 2)], axis=1)
-        half = np.array([hull.half for hull in self._hulls])
-        shadow = (np.abs(axes @ R_i) @ half[i][:, :, None])[..., 0]
-        shadow += (np.abs(axes @ R_j) @ half[j][:, :, None])[..., 0]
-        apart: Array = (np.abs(axes @ way[:, :, None])[..., 0] - shadow).max(axis=1)
-        return apart
-
-    def _placed(self, poses: Poses, hulls: Array, samples: Array) -> tuple[Array, Array]:
+    def _stands(self, placed: Placements, hulls: Array, samples: Array) -> tuple[Array, Array]:
         """Return where centres of k hulls are at k instants, (k, 3), and how they are turned."""
         bodies = np.array([hull.body for hull in self._hulls])[hulls]
         middles = np.array([hull.centre for hull in self._hulls])[hulls]
-        turns = np.moveaxis(poses.R[:, :, bodies, samples], -1, 0)  # (k, 3, 3)
-        centres = poses.p[:, bodies, samples].T + (turns @ middles[..., None])[..., 0]
+        turns = np.moveaxis(placed.R[:, :, bodies, samples], -1, 0)  # (k, 3, 3)
+        centres = placed.p[:, bodies, samples].T + (turns @ middles[..., None])[..., 0]
         stands = bodies < 0
         turns = np.where(stands[:, None, None], np.eye(3), turns)
         return np.where(stands[:, None], middles, centres), np.ascontiguousarray(turns)
 
     def _gradient(
-        self, poses: Poses, pairs: Array, samples: Array, witness: Array, normals: Array
+        self, placed: Placements, pairs: Array, samples: Array, witness: Array, normals: Array
     ) -> Array:
         """Return what distances change by with each joint: normal . (velocity of the points)."""
-        linear, angular = (x[:, :, samples] for x in poses.screw)  # (3, m, k)
+        slides = self._tree.slides[:, None]
+        axes = np.einsum("cdjk,jd->kjc", placed.R[..., samples], self._tree.axes)  # in the world
+        origins = placed.p[..., samples].T  # (k, m, 3)
         bodies = np.array([hull.body for hull in self._hulls])[self.pairs[pairs]]  # (k, 2)
-        out = np.zeros((len(pairs), linear.shape[1]))
+        out = np.zeros(axes.shape[:2])
         for side, sign in ((0, -1.0), (1, 1.0)):
-            turning = np.cross(witness[side], normals)  # n . (w x p) = w . (p x n)
-            along = np.einsum("cjk,kc->kj", linear, normals)
-            along += np.einsum("cjk,kc->kj", angular, turning)
+            levers = np.cross(axes, witness[side][:, None] - origins)
+            along = np.einsum("kjc,kc->kj", np.where(slides, axes, levers), normals)
             out += sign * np.where(self._supports[bodies[:, side]], along, 0.0)
         by_joint: Array = out @ self._ratios
         return by_joint

@@ -109,8 +109,8 @@ class Course:
         left = np.arange(len(self.t) if chosen.any() else 0)
         within = _WITHIN
         while self.clearance is not None and len(left):
-            poses = self.clearance.poses(self.values[0][left])
-            near = self.clearance.near(poses, within, chosen).distance  # (pairs, left)
+            placed = self.clearance.placed(self.values[0][left])
+            near = self.clearance.near(placed, within, chosen).distance  # (pairs, left)
             least = near.min(axis=0)
             is_known = least < within
             distance[left[is_known]] = least[is_known]
@@ -125,8 +125,10 @@ class Course:
             clearance: The pairs; one of bodies that turn about their own axis keeps its distance.
         """
         few = np.unique(np.linspace(0, len(self.t) - 1, _LOOKED_AT).astype(int))
-        poses = clearance.poses(self.values[0][few])
-        change: Array = np.ptp(clearance.near(poses, np.inf, clearance.everything).distance, axis=1)
+        placed = clearance.placed(self.values[0][few])
+        change: Array = np.ptp(
+            clearance.near(placed, np.inf, clearance.everything).distance, axis=1
+        )
         return change > _STILL
 
     @cached_property

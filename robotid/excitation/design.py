@@ -30,7 +30,6 @@ from robotid.identification.assumptions import (
     largest_torques,
 )
 from robotid.identification.previews import Run
-from robotid.regressor.adjoint import Poses
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
@@ -137,7 +136,6 @@ class Designer:
         noise: Mapping[str, float] | None = None,
         correlation: float = CORRELATION,
         run: Run | None = None,
-        is_fast: bool = False,
     ) -> "Designer":
         """Return a designer that assumes of friction and noise what a preview does.
 
@@ -150,7 +148,6 @@ class Designer:
             noise: Standard deviation of the torque's noise by joint [N m or N].
             correlation: Time over which it is correlated [s].
             run: What was recorded before: the motion then tells what it did not.
-            is_fast: Whether compiled code is used, which needs the extra ``fast``.
 
         Raises:
             SettingsError: If a setting is unusable.
@@ -168,7 +165,7 @@ class Designer:
         if run is not None:
             told = run.factors.information(run.step / density)
             given = np.eye(len(spread)) + spread[:, None] * told * spread
-        information = MotionInformation(model, mapping, mapping.to_base(pi), is_fast)
+        information = MotionInformation(model, mapping, mapping.to_base(pi))
         return cls(
             information, limits, basis, density, spread, standard_spread, given, name, clearance
         )
@@ -394,13 +391,13 @@ class Designer:
         q, v, a, jerk = self._functions @ C
         rows = self.information.rows(q, v, a)
         used = self.limits.used(q, v, a, jerk, self.information.torque(rows))
-        return used, float(self._margins(rows.state, spare).min(initial=np.inf)), rows
+        return used, float(self._margins(q, spare).min(initial=np.inf)), rows
 
-    def _margins(self, poses: Poses, spare: float) -> Array:
+    def _margins(self, q: Array, spare: float) -> Array:
         """Return margins of distances, shape (pairs, N) [m], as of ``Clearance.margins``."""
         if self.clearance is None:
-            return np.zeros((0, poses.p.shape[2]))
-        return self.clearance.margins(poses, spare, hints=self._hints)
+            return np.zeros((0, len(q)))
+        return self.clearance.margins(self.clearance.placed(q), spare, hints=self._hints)
 
     def _objective(self, C: Array) -> float:
         """Return the criterion of a motion."""
@@ -427,7 +424,8 @@ class Designer:
         value += cost
         if self.clearance is not None:
             aim = self._wanted
-            near = self.clearance.near(rows.state, multipliers.reach(aim), hints=self._hints)
+            placed = self.clearance.placed(q)
+            near = self.clearance.near(placed, multipliers.reach(aim), hints=self._hints)
             cost, pushed = multipliers.of_distances(near.distance, aim)
             value += cost
             along = -pushed[near.pairs, near.samples, None] / SOFT * near.gradient
@@ -552,7 +550,8 @@ class Designer:
         distance = None
         if self.clearance is not None:
             reach = held.reach(self._wanted)
-            distance = self.clearance.near(rows.state, reach, hints=self._hints).distance
+            placed = self.clearance.placed(rows.motion[0])
+            distance = self.clearance.near(placed, reach, hints=self._hints).distance
         kept = self._feasible(C, 1.0 - SPARE)
         objective = self._objective(kept)
         if objective > state.objective - settled:

@@ -2,21 +2,17 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
-from robotid.regressor.adjoint import MotionRegressor, RegressorState
+from robotid.regressor.along import MotionRegressor
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import drive_motion
 from robotid.robot.drives import DriveMotion, DriveTerm
 from robotid.robot.model import RobotModel
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 __all__ = ["CRITERIA", "Aim", "MotionInformation", "MotionRows", "criterion"]
 
@@ -35,7 +31,6 @@ class MotionRows:
     """
 
     W: Array
-    state: RegressorState
     motion: tuple[Array, Array, Array]  # q, v, a, shape (N, n) each
     load: Array  # torque of the bodies, (N, n)
 
@@ -51,44 +46,19 @@ class MotionInformation:
         model: The robot, with a fixed base.
         mapping: Its base parameters.
         beta: Base parameters that torques are reckoned by, shape (b,).
-        is_fast: Whether the rows are computed by compiled code, as of ``MotionRegressor``.
     """
 
     model: RobotModel
     mapping: BaseMapping
     beta: Array
-    is_fast: bool = False
     _regressor: MotionRegressor = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         wanted = (len(self.mapping.independent),)
         if self.beta.shape != wanted:
             raise DataError(f"beta has shape {self.beta.shape}, wanted {wanted}")
-        object.__setattr__(self, "_regressor", MotionRegressor(self.model, is_fast=self.is_fast))
-
-    @cached_property
-    def _gather(self) -> "csr_array":
-        """What makes the rows, (n b, N), of the entries of all pairs, (pairs 10, N): sparse."""
-        from scipy.sparse import csr_array
-
-        size = self.model.layout.n_inertial
-        places, bodies = self._regressor.pairs
-        kept = self.mapping.independent
-        found = []
-        for column in np.flatnonzero(kept < size):
-            body, entry = divmod(int(kept[column]), 10)
-            for pair in np.flatnonzero(bodies == body):
-                for row in np.flatnonzero(self.model.velocity_map[places[pair]]):
-                    factor = self.model.velocity_map[places[pair], row]
-                    found.append((factor, row * len(kept) + column, 10 * pair + entry))
-        factors, to, source = map(np.array, zip(*found, strict=True))
-        shape = (len(self.model.joints) * len(kept), 10 * len(bodies))
-        return csr_array((factors, (to, source)), shape=shape)
-
-    @cached_property
-    def _scatter(self) -> "csr_array":
-        """The transpose of ``_gather``."""
-        return self._gather.T.tocsr()
+        regressor = MotionRegressor(self.model, self.mapping.independent)
+        object.__setattr__(self, "_regressor", regressor)
 
     @cached_property
     def _drives(self) -> tuple[Array, Array]:
@@ -114,7 +84,7 @@ class MotionInformation:
 
         The same of all joints before and behind it, 0 of others.
         """
-        ratios = self.model.velocity_map[self._regressor.places] != 0.0  # (m, n)
+        ratios = self.model.velocity_map != 0.0  # (m, n)
         chain = np.eye(len(ratios), dtype=bool)
         for i in range(len(ratios)):
             chain[i, [j - 1 for j in list(self.model.pin_model.supports[i + 1])[1:]]] = True
@@ -130,15 +100,12 @@ class MotionInformation:
             v: Velocities, shape (N, n) [rad/s or m/s].
             a: Accelerations, shape (N, n) [rad/s^2 or m/s^2].
         """
-        G = self.model.velocity_map
-        state = self._regressor(q @ G.T + self.model.position_offset, v @ G.T, a @ G.T)
-        flat = self._gather @ state.rows.reshape(-1, len(q))
-        W = flat.reshape(len(self.model.joints), -1, len(q))
+        W = self._regressor(q, v, a)
         load = (self.beta @ W).T  # drive columns are still 0
         columns, parameters = self._drives
         values = self._drive_values(self._drive_motion(q, v, a, load))
         W[:, columns] = self.model.layout.drive_loads[:, parameters, None] * values
-        return MotionRows(W, state, (q, v, a), load)
+        return MotionRows(W, (q, v, a), load)
 
     def _drive_motion(self, q: Array, v: Array, a: Array, load: Array) -> DriveMotion:
         """Return how the drives move, with smooth signs, arrays of shape (d, N)."""
@@ -179,10 +146,8 @@ class MotionInformation:
         by_value = np.einsum("rk,rkn->kn", loads, weights[:, columns])
         *direct, by_load = self._pull_drives(rows, by_value)
         entries = weights + by_load.T[:, None] * self.beta[:, None]
-        own = self._scatter @ entries.reshape(-1, weights.shape[2])
-        G = self.model.velocity_map
-        bodies = self._regressor.pull(rows.state, own.reshape(rows.state.rows.shape))
-        q, v, a = (x @ G + y for x, y in zip(bodies, direct, strict=True))
+        bodies = self._regressor.pull(*rows.motion, entries)
+        q, v, a = (x + y for x, y in zip(bodies, direct, strict=True))
         return q, v, a
 
     def _pull_drives(self, rows: MotionRows, weights: Array) -> list[Array]:

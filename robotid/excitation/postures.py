@@ -11,7 +11,6 @@ from robotid.excitation.information import MotionInformation
 from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.excitation.multipliers import SOFT
 from robotid.findings import listed
-from robotid.regressor.adjoint import Poses
 
 __all__ = ["Postures"]
 
@@ -133,13 +132,13 @@ class Postures:
         still = np.zeros_like(q)
         rows = self.information.rows(q, still, still)
         used = np.abs(self.limits.used(q, still, still, still, self.information.torque(rows)))
-        return used, self._margins(rows.state)
+        return used, self._margins(q)
 
-    def _margins(self, poses: Poses) -> Array:
+    def _margins(self, q: Array) -> Array:
         """Return margins of distances with what a design spares, shape (pairs, N) [m]."""
         if self.clearance is None:
-            return np.zeros((0, poses.p.shape[2]))
-        return self.clearance.margins(poses, 1.0)
+            return np.zeros((0, len(q)))
+        return self.clearance.margins(self.clearance.placed(q), 1.0)
 
     def _why_not(self, used: Array, margins: Array) -> str:
         """Return what leaves no posture: a limit or a distance alone, or several together."""

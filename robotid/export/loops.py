@@ -39,7 +39,7 @@ def loop_entries(found: LoopIdentification) -> dict[str, Any]:
         "ranges": {"undetermined": [*unfitted, *found.undetermined]},
         "loop_parameters": _loop_parameters(found),
         "validation": [
-            {"log": run.log.path, "name": run.log.name, **position_metrics(model, (run,)).to_dict()}
+            {"log": run.log.path, "name": run.name, **position_metrics(model, (run,)).to_dict()}
             for run in found.validation
         ],
         "simulation": {
@@ -115,7 +115,7 @@ def _controller(found: LoopIdentification) -> dict[str, Any]:
 def open_loop_entry(model: RobotModel, run: OpenLoop) -> dict[str, Any]:
     """Return the errors of open loops on one log, joint by joint and by horizon.
 
-    What goes on at its speed, and what the torques tell by themselves, stand there where the logged
+    The errors of going on at its speed, and of the fit of torques alone, stand there if the logged
     torque drives the robot.
 
     Args:

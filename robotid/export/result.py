@@ -164,7 +164,6 @@ class Result:
 
         Raises:
             DataError: If the result has no gains of drives, or the log no commands.
-            MissingDependencyError: If Numba is not installed.
         """
         if not self.commanded:
             raise DataError(f"{self.path.name} has no gains of drives: it cannot follow commands")

@@ -100,7 +100,7 @@ def torque_band(
     """
     count = len(trajectory.t)
     samples = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int))
-    W = trajectory_regressor(model, trajectory.at(samples))[:, mapping.independent]
+    W = trajectory_regressor(model, trajectory, samples)[:, mapping.independent]
     variance = np.einsum("ij,ij->i", W @ covariance, W)
     for x, z in errors(samples):
         variance += (W @ x + z.ravel()) ** 2

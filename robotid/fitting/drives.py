@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from robotid._typing import Array
-from robotid.robot.drives import DriveTerm
-from robotid.robot.families import FAMILIES, Family
+from robotid.robot.drives import FAMILIES, DriveTerm, Family
 
 __all__ = ["DriveChoice", "FoundShape", "Tried", "with_shapes"]
 

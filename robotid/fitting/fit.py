@@ -93,7 +93,7 @@ def solve_recordings(
     standard, _ = standard_of(estimate, recordings.mapping, ground.before.pi, ground.before.spread)
     if recordings.model.layout.remembering:  # what is written predicts the torque by its own load
         recordings = recordings.with_model(recordings.model.with_reference(standard))
-    return Solved(choice, ground, recordings, estimate, in_cone, weighing)
+    return Solved(choice, ground, recordings, estimate, in_cone, weighing, standard)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,20 +106,24 @@ class Solved:
     estimate: Estimate
     in_cone: Consistent | None  # what made it physically consistent, if it is
     weighing: Weighing
+    standard: Array  # (p,), standard parameters
+
+    @property
+    def prior_std(self) -> Array:
+        """How far parameters may plausibly be wrong before the data, shape (p,)."""
+        of_estimate = self.estimate.prior_std
+        return self.ground.before.spread if of_estimate is None else of_estimate
 
     @cached_property
     def solution(self) -> Solution:
         """The parameters, with the recordings that drives are judged by."""
-        recordings, before, prior_std = self.recordings, self.ground.before, self.estimate.prior_std
-        standard, _ = standard_of(self.estimate, recordings.mapping, before.pi, before.spread)
-        fitted, kept = evaluate_logs(
-            recordings.fitted, recordings.kept, {}, None, plan=recordings.plan
-        )
+        own = self.recordings
+        fitted, kept = evaluate_logs(own.fitted, own.kept, {}, None, plan=own.plan)
         return Solution(
-            model=recordings.model,
-            mapping=recordings.mapping,
-            prior_std=before.spread if prior_std is None else prior_std,
-            standard=standard,
+            model=own.model,
+            mapping=own.mapping,
+            prior_std=self.prior_std,
+            standard=self.standard,
             fitted=fitted,
             validation=kept,
         )
@@ -129,12 +133,12 @@ class Solved:
         ground, recordings = self.ground, self.recordings
         model, mapping, before = recordings.model, recordings.mapping, ground.before
         estimate, wls, errors = self._measured()
-        standard, covariance = standard_of(estimate, mapping, before.pi, before.spread)
+        _, covariance = standard_of(estimate, mapping, before.pi, before.spread)
         base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
         wls_standard = mapping.to_standard(wls.theta, before.pi, before.spread)
         driven = urdf_with_drives(model, mapping, ground.factors, before.sigma, before.spread)
         fitted, kept = evaluate_logs(
-            recordings.fitted, recordings.kept, {"estimate": standard, "wls": wls_standard},
+            recordings.fitted, recordings.kept, {"estimate": self.standard, "wls": wls_standard},
             before.pi, driven, plan=recordings.plan,
         )  # fmt: skip
         is_base = estimate.names == mapping.base_names
@@ -147,10 +151,10 @@ class Solved:
             wls=wls,
             prior=before.pi,
             urdf_with_drives=driven,
-            prior_std=before.spread if estimate.prior_std is None else estimate.prior_std,
-            standard=standard,
+            prior_std=self.prior_std,
+            standard=self.standard,
             standard_covariance=covariance,
-            base=mapping.to_base(standard),
+            base=mapping.to_base(self.standard),
             base_error=base_error,
             fitted=fitted,
             validation=kept,
@@ -199,14 +203,14 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
     if not model.layout.remembering:
         return recordings
     choice = rough_choice(choice)
+    own = replace(recordings, kept=())  # nothing is predicted meanwhile
     for step in range(_MOST_LOADS):
-        ground = _ground(recordings, choice, is_last=False)
+        ground = _ground(own, choice, is_last=False)
         before = ground.before
         standard, _ = standard_of(ground.rough, mapping, before.pi, before.spread)
-        moved = standard - recordings.model.carried_by
+        moved = standard - own.model.carried_by
         if step >= _DAMPED:  # friction that takes a large share of the load may overshoot
             standard = standard - 0.5 * moved
-        recordings = recordings.with_model(model.with_reference(standard))
         loads = [_size_of(ground, x) for x in (moved, standard)]
         if (loads[0] <= _SETTLED * loads[1]).all():
             estimator = make_estimator(choice, model, mapping, before)
@@ -214,6 +218,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
                 estimate = estimator.fit(ground.factors)
                 standard, _ = standard_of(estimate, mapping, before.pi, before.spread)
             return recordings.with_model(model.with_reference(standard))
+        own = own.with_model(model.with_reference(standard))
     raise NotConvergedError(
         f"the load of the gears still changes after {_MOST_LOADS} fits; use friction = "
         "'viscous+coulomb', or record motion that determines more",

@@ -195,7 +195,6 @@ class Fit(Identified, Solution):
 
     @property
     def base_reach(self) -> Array:
-        """How many standard errors the 95 % interval of each base parameter reaches, (b,)."""
         return self.errors.reach
 
     @property

@@ -10,6 +10,7 @@ from robotid._text import columns
 from robotid.pages.html import code, number, percent, table, text
 
 if TYPE_CHECKING:
+    from robotid.closed_loop.result import LoopIdentification
     from robotid.fitting.metrics import Metrics
     from robotid.identification.result import Identification
 
@@ -24,10 +25,21 @@ __all__ = [
     "verdict_lines",
 ]
 
+#: Heads of the errors of other predictions, by name: of torques, then of positions.
+_BESIDE = {
+    "urdf_with_drives": "URDF +\ndrives %",
+    "wls": "WLS\n%",
+    "second_order": "2nd\norder %",
+    "rows": "torques\nalone %",
+    "urdf": "URDF\n%",
+    "gravity_only": "gravity\nonly %",
+    "command": "command\n%",
+    "steady": "same\nspeed %",
+}
 _NO_REPORT = "robotid.write_report(found, 'report.html') writes the whole report"
 
 
-def identification_line(found: Identification) -> str:
+def identification_line(found: Identification | LoopIdentification) -> str:
     """Return an identification in one line.
 
     Args:
@@ -64,22 +76,22 @@ def error_lines(
         wls: Those of weighted least squares, or none.
         width: Characters of a line; columns beyond it are left out, and named.
     """
-    heads = ["joint\n", "error\n%", "rmse\n", "\n", "URDF +\ndrives %", "WLS\n%", "URDF\n%"]
     others = {} if wls is None else wls["per_joint"]
+    joints = {
+        joint: {**m, "wls_relative_error_pct": others.get(joint, {}).get("relative_error_pct")}
+        for joint, m in metrics["per_joint"].items()
+    }
+    keys = [f"{name}_relative_error_pct" for name in _BESIDE]
+    shown = [key for key in keys if any(m.get(key) is not None for m in joints.values())]
     rows, is_worse = [], False
-    for joint, m in metrics["per_joint"].items():
+    for joint, m in joints.items():
         mark = "" if m["better_than_constant"] else " *"
         is_worse = is_worse or bool(mark)
-        error, driven, urdf, gravity = (
-            cell(m.get(f"{of}relative_error_pct"))
-            for of in ("", "urdf_with_drives_", "urdf_", "gravity_only_")
-        )
-        least = cell(others.get(joint, {}).get("relative_error_pct"))
         rmse = f"{m['rmse']:#.3g}".rstrip(".")
-        rows.append([joint + mark, error, rmse, m["unit"], driven, least, urdf, gravity])
-    heads.append("gravity\nonly %")
-    if wls is None:
-        heads, *rows = ([*line[:5], *line[6:]] for line in (heads, *rows))
+        error, *beside = (cell(m.get(key)) for key in ("relative_error_pct", *shown))
+        rows.append([joint + mark, error, rmse, m["unit"], *beside])
+    named = dict(zip(keys, _BESIDE.values(), strict=True))
+    heads = ["joint\n", "error\n%", "rmse\n", "\n", *(named[key] for key in shown)]
     lines = columns(heads, rows, width=width, needed=4, left=(0, 3))
     return lines + (["  * worse than a constant"] if is_worse else [])
 

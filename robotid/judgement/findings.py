@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from robotid._typing import Array
-from robotid.diagnosis.drive_choice import TENFOLD
+from robotid.diagnosis.decisions import TENFOLD
 from robotid.diagnosis.misfit import Misfit
 from robotid.diagnosis.misfit_findings import misfit_findings
 from robotid.doctor.urdf_geometry import audit_bodies

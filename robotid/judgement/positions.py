@@ -15,7 +15,7 @@ _PLAINER = {
     "command": "the command itself",
     "second_order": "the plain model of second order",
     "urdf": "the URDF with the stated gains",
-    "rows": "what the torques tell by themselves",
+    "rows": "the fit of torques alone",
     "steady": "going on at the speed of the start",
 }
 _DRIVEN = {**_PLAINER, "urdf": "the URDF with fitted drives"}
@@ -49,7 +49,7 @@ def judge_positions(
     }
     doubts = list(cautions)
     if not is_kept:
-        doubts.append("no log was kept apart: nothing tests the open loop; add [[validation]]")
+        doubts.append("the prediction of a new motion was not evaluated: no validation log given")
     if not is_settled:
         doubts.append("the fit has not settled")
     worst = max(map(error_of, metrics.per_joint.values()), default=0.0)
@@ -57,8 +57,8 @@ def judge_positions(
         found,
         poor=reasons["poor"],
         doubts=[*doubts, *reasons["not evaluated"], *reasons["usable"]],
-        good=f"open loops miss at most {worst:.2g} % of the motion of any joint on logs kept "
-        "apart, and less than plainer models",
+        good=f"simulated position error on validation logs: at most {worst:.2g} % of each joint's "
+        "RMS motion, smaller than that of plainer models",
         notes=[scale] if scale else [],
         alarms=alarms,
         is_tested=is_kept and bool(metrics.per_joint),
@@ -68,7 +68,7 @@ def judge_positions(
 def _judge_joint(joint: str, measured: JointMetrics | None, is_kept: bool) -> JointVerdict:
     """Return the verdict on one joint; measured is None if no log commands it to move."""
     if measured is None:
-        still = f"{joint} is told to stand still: nothing tests it"
+        still = f"{joint}: commanded to stand still in all logs: not evaluated"
         return on_joint([], [], is_tested=False, said=still)
     error, baselines = error_of(measured), measured.baselines
     names = _DRIVEN if "steady" in baselines else _PLAINER
@@ -77,9 +77,9 @@ def _judge_joint(joint: str, measured: JointMetrics | None, is_kept: bool) -> Jo
         for key in names
         if (plainer := baselines.get(key)) is not None and error > BEATEN * plainer
     ]
-    said = f"{joint}: the open loop misses {error:.2g} % of its motion"
+    said = f"{joint}: simulated position error {error:.2g} % of its RMS motion"
     if beaten:
-        said += f"; {listed(names[key] for key in beaten)} misses less"
+        said += f"; smaller with {listed(names[key] for key in beaten)}"
     if not is_kept:
         return on_joint([], [], is_tested=False, said=said)
     if error > POOR or "command" in beaten:

@@ -6,6 +6,7 @@ Reading and writing files is in `robotid.logs.read`.
 import difflib
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -220,8 +221,8 @@ class Trajectory:
         Args:
             memory: What drives remember, as of ``memory``.
         """
-        same = replace(self, memory=memory)
-        vars(same)["derived"] = self.derived
+        same = copy(self)
+        vars(same).update(memory=memory, derived=self.derived)
         return same
 
     @property
@@ -236,7 +237,7 @@ class Trajectory:
             start: First sample.
             stop: Sample after the last one; beyond the end means to the end.
         """
-        return replace(self, **self._rows(slice(start, stop)))
+        return self.at(slice(start, stop))
 
     def every(self, step: int) -> "Trajectory":
         """Return every so many samples, without a rate.
@@ -244,22 +245,26 @@ class Trajectory:
         Args:
             step: How many samples one stands for.
         """
-        return (
-            self if step == 1 else replace(self, rate=None, **self._rows(slice(None, None, step)))
-        )
+        if step == 1:
+            return self
+        thinned = self.at(slice(None, None, step))
+        vars(thinned)["rate"] = None
+        return thinned
 
-    def at(self, rows: Array) -> "Trajectory":
-        """Return some samples.
+    def at(self, rows: Array | slice) -> "Trajectory":
+        """Return some samples. Their values were checked when those of the motion were.
 
         Args:
             rows: Their numbers.
         """
-        return replace(self, **self._rows(rows))
-
-    def _rows(self, rows: slice | Array) -> dict[str, Any]:
-        names = ["t", "q", "v", "a", "tau", "segment"]
-        names += [name for name in ("direction", "memory") if getattr(self, name) is not None]
-        return {name: getattr(self, name)[rows] for name in names}
+        some = copy(self)
+        vars(some).pop("derived", None)
+        for name in ("t", "q", "v", "a", "tau", "segment", "direction", "memory"):
+            values = getattr(self, name)
+            if values is not None:
+                vars(some)[name] = own = values[rows]
+                own.flags.writeable = False
+        return some
 
 
 def suggestion(name: str, known: Collection[str]) -> str:

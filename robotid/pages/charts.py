@@ -458,7 +458,7 @@ def _whiskers(x: Array, y: Array, half: Array | None, across: _Axis, up: _Axis, 
     known = np.isfinite(at + low + high)
     path = "".join(
         f"M{a:.1f} {b:.1f}V{c:.1f}"
-        for a, b, c in zip(at[known], low[known], high[known], strict=True)
+        for a, b, c in zip(*(z[known].tolist() for z in (at, low, high)), strict=True)
     )
     return f'<path d="{path}" stroke="{colour}" stroke-width="1.2"/>'
 
@@ -470,7 +470,7 @@ def _runs(y: Array) -> list[slice]:
 
 
 def _path(x: Array, y: Array) -> str:
-    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
+    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
 
 
 def _finite(x: Array, y: Array) -> Iterator[tuple[float, float]]:

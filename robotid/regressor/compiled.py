@@ -1,15 +1,13 @@
-"""The compiled way to the inertial columns of the regressor, where Numba is installed.
+"""The compiled way to the inertial columns of the regressor.
 
 A robot's tree is flattened to arrays that ``lanes`` works on. Any joint's placement is
 R(q) = A + B cos q + C sin q, p(q) = p0 + d q, with the axis measured from Pinocchio's own joint, so
 that aligned and unaligned, turning and sliding joints are one case.
 """
 
-from dataclasses import dataclass
 from functools import cache
-from importlib.util import find_spec
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -19,14 +17,17 @@ from robotid.logs.data import Trajectory
 from robotid.regressor.columns import RowPlan
 
 if TYPE_CHECKING:
+    from robotid.regressor.lanes import Work
     from robotid.robot.model import RobotModel
 
 __all__ = [
     "LONG_ENOUGH",
     "Tree",
     "flatten",
-    "is_installed",
     "joint_constants",
+    "keeps_code",
+    "own_motion",
+    "row_lanes",
     "why_not",
     "work_per_sample",
 ]
@@ -35,11 +36,7 @@ __all__ = [
 #: half a second in every process (importing Numba, reading the compiled code). For seven joints in
 #: a row that is 1e5 samples. Compiling it takes some 10 s, once per installation.
 LONG_ENOUGH = 3_500_000
-
-
-def is_installed() -> bool:
-    """Return whether the extra ``fast`` is installed; nothing is imported."""
-    return find_spec("numba") is not None
+_DOUBLINGS = 6
 
 
 def work_per_sample(model: "RobotModel") -> int:
@@ -64,13 +61,16 @@ def why_not(model: "RobotModel") -> str | None:
     for name, joint in list(zip(model.pin_model.names, joints, strict=True))[first:]:
         if joint.nv != 1 or not _is_simple(_joint_axis(model.pin_model, joint.id)):
             return f"joint {name!r} is a {joint.shortname()}, which is not compiled"
-    if np.any(np.sum(model.velocity_map != 0, axis=1) > 1):
-        return "a joint follows several others, which is not compiled"
     try:
-        _lanes()
-    except (ImportError, RuntimeError) as error:  # RuntimeError: no folder to keep the code in
+        row_lanes()
+    except ImportError as error:
         return f"Numba does not run here: {error}"
     return None
+
+
+def keeps_code() -> bool:
+    """Return whether there is a folder for compiled code, which is else lost with the process."""
+    return row_lanes().inertial_rows.stats.cache_path is not None
 
 
 class CompiledWriter:
@@ -78,8 +78,6 @@ class CompiledWriter:
 
     def __init__(self, model: "RobotModel", tree: "Tree", plan: RowPlan, out: Array) -> None:
         """Prepare to write to ``out``, shape (C, k), k a multiple of 64; see ``why_not`` before."""
-        lanes = _lanes()
-        bodies, depth = tree.rows.shape
         self._model, self._tree, self._out = model, tree, out
         self._places = _places(tree, plan)
         drives = [drive for row in plan.drives for drive in row]
@@ -88,9 +86,7 @@ class CompiledWriter:
         self._ends = np.array([*(place for place, _, _ in drives), *plan.torques])
         self._widths = np.diff(plan.first)
         self._root = np.zeros(out.shape[1])
-        self._work = np.zeros(lanes.state_size(bodies, depth))
-        states = self._work[-bodies * (12 + 6 * depth) * lanes.LANES :]
-        _prepare(states.reshape(bodies, 12 + 6 * depth, lanes.LANES), model, tree)
+        self._work = tree.work_space()
 
     def load(self, motion: Trajectory, part: slice, values: Array, weights: Array | None) -> None:
         """Take the samples of the next blocks, and what drive parameters multiply in them.
@@ -102,12 +98,10 @@ class CompiledWriter:
             weights: Weight of each row; None: all 1.
         """
         q, v, a, tau = motion.q[part], motion.v[part], motion.a[part], motion.tau[part]
-        self._base = np.zeros((12, 0))
-        if self._model.free_flyer:
-            self._base = _base_state(self._model, q, v, a)
-            q = q[:, 1:]  # the pose has one entry more than the twist
-        # copies that Numba finds writable and in C order: another kind would be compiled again
-        self._q, self._v, self._a = (np.array(x, dtype=float, order="C") for x in (q, v, a))
+        if self._model.free_flyer:  # the pose has one entry more than the twist
+            self._motion = own_motion(q[:, 1:], v, a, _base_state(self._model, q, v, a))
+        else:
+            self._motion = own_motion(q, v, a)
         values = values[self._drives]
         if (self._ratios != 1.0).any():
             values *= self._ratios
@@ -116,31 +110,90 @@ class CompiledWriter:
 
     def write(self, start: int, stop: int) -> None:
         """Write the rows of samples start to stop of those loaded, at most k."""
-        lanes, tree, motion = _lanes(), self._tree, (self._q, self._v, self._a)
-        lanes.inertial_rows(
-            tree.parents, tree.depths, tree.slots, tree.leaders, tree.joints, self._places,
-            *motion, self._base, self._work, self._out, (start, stop),
-        )  # fmt: skip
+        lanes, span = row_lanes(), (start, stop)
+        lanes.inertial_rows(self._tree, self._places, self._motion, self._work, self._out, span)
         lanes.finish_rows(
-            self._values, self._ends, self._widths, self._weights, self._root, self._out,
-            (start, stop),
-        )  # fmt: skip
+            self._values, self._ends, self._widths, self._weights, self._root, self._out, span
+        )
 
 
-@dataclass(frozen=True)
-class Tree:
-    """A robot as arrays over its bodies, the world first, as ``inertial_rows`` takes them.
+class Tree(NamedTuple):
+    """A robot's B bodies as arrays, as compiled code takes them. Bodies follow their parents.
 
     Attributes:
+        parents: Parent of each body, shape (B,), int; -1: the world.
+        joints: Constants of each joint, its ratio to its coordinate and its offset, shape (B, 41).
+        leaders: Coordinate that moves each joint, shape (B,), int.
         rows: Row of the regressor of each slot of each body, shape (B, D), int; -1 beyond.
+        depths: Number of rows that each body loads, shape (B,), int.
+        slots: Which of a body's rows its own joint belongs to, shape (B,), int; -1: floating base.
+        is_below: Whether joint k carries body i, itself included, shape (B, B), bool, [i, k].
+        gravity: Shape (3,) [m/s^2].
     """
 
     parents: Array
+    joints: Array
+    leaders: Array
+    rows: Array
     depths: Array
     slots: Array
-    leaders: Array
-    joints: Array
-    rows: Array
+    is_below: Array
+    gravity: Array
+
+    @property
+    def slides(self) -> Array:
+        """Which joints are prismatic, shape (B,), bool."""
+        slides: Array = np.any(self.joints[:, 33:36], axis=1)
+        return slides
+
+    @property
+    def axes(self) -> Array:
+        """Directions of the joints in the frames of their bodies, shape (B, 3)."""
+        axes: Array = self.joints[:, 33:36] + self.joints[:, 36:39]  # of which one is 0
+        return axes
+
+    def work_space(self) -> "Work":
+        """Return a new work space for ``row_lanes``."""
+        lanes = row_lanes()
+        work: Work = lanes.work_space(lanes.rows_size(*self.rows.shape), _DOUBLINGS)
+        return work
+
+    def places(self, wanted: Array) -> Array:
+        """Return where the columns of each body in each of its rows go, shape (B, D, 10).
+
+        Args:
+            wanted: Place of each inertial column in each row, shape (n_rows, 10 B), int; -1: none.
+        """
+        by_body = wanted.reshape(len(wanted), -1, 10).swapaxes(0, 1)  # (B, n_rows, 10)
+        found = np.take_along_axis(by_body, self.rows.clip(min=0)[..., None], axis=1)
+        return np.where(self.rows[..., None] >= 0, found, -1)
+
+    def part(self, bodies: Array) -> "Tree":
+        """Return some bodies as a tree of their own.
+
+        Args:
+            bodies: Their numbers, ascending, shape (k,); none hangs on one that is left out.
+        """
+        place = {-1: -1} | {int(body): k for k, body in enumerate(bodies)}
+        parents = np.array([place[int(i)] for i in self.parents[bodies]])
+        own = {name: getattr(self, name)[bodies] for name in self._fields[1:-2]}
+        is_below = np.ascontiguousarray(self.is_below[np.ix_(bodies, bodies)])
+        return self._replace(parents=parents, is_below=is_below, **own)
+
+
+def own_motion(
+    q: Array, v: Array, a: Array, base: Array | None = None
+) -> tuple[Array, Array, Array, Array]:
+    """Return copies that Numba finds writable and in C order: others would be compiled again.
+
+    Args:
+        q: Coordinates, shape (N, n_rows) [rad, m].
+        v: Velocities, shape (N, n_rows) [rad/s, m/s].
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+        base: State of a floating base, shape (12, N), as of ``inertial_rows``; None: it is fixed.
+    """
+    q, v, a = (np.array(x, dtype=float, order="C") for x in (q, v, a))
+    return q, v, a, np.zeros((12, 0)) if base is None else base
 
 
 def flatten(model: "RobotModel") -> Tree:
@@ -150,49 +203,38 @@ def flatten(model: "RobotModel") -> Tree:
         model: The robot; ``why_not`` must return None for it.
     """
     pin_model, G = model.pin_model, model.velocity_map
-    bodies = pin_model.njoints
-    parents = np.array([int(parent) for parent in pin_model.parents])
-    rows: list[list[int]] = [[]]
-    slots, leaders = np.zeros(bodies, dtype=int), np.zeros(bodies, dtype=int)
-    joints = np.zeros((bodies, 41))
-    for body in range(1, bodies):
-        joint, above = pin_model.joints[body], rows[parents[body]]
+    size = pin_model.njoints - 1
+    parents = np.array([int(parent) - 1 for parent in pin_model.parents])[1:]
+    slots, leaders = np.zeros((2, size), dtype=int)
+    joints, is_below = np.zeros((size, 41)), np.eye(size, dtype=bool)
+    rows: list[list[int]] = []
+    for i, parent in enumerate(parents):
+        above = rows[parent] if parent >= 0 else []
+        is_below[i] |= is_below[parent] if parent >= 0 else False
+        joint = pin_model.joints[i + 1]
         if joint.nv == 6:
             rows.append(list(range(6)))
-            slots[body] = -1
+            slots[i] = -1
             continue
         leader = int(np.flatnonzero(G[joint.idx_v])[0]) if G[joint.idx_v].any() else 0
         rows.append(above if leader in above else [*above, leader])
-        slots[body], leaders[body] = rows[-1].index(leader), leader
+        slots[i], leaders[i] = rows[-1].index(leader), leader
         ratio, offset = G[joint.idx_v, leader], model.position_offset[joint.idx_v]
-        joints[body] = np.append(joint_constants(pin_model, body), [ratio, offset])
-    table = np.full((bodies, max(map(len, rows))), -1)
-    for body, own in enumerate(rows):
-        table[body, : len(own)] = own
+        joints[i] = np.append(joint_constants(pin_model, i + 1), [ratio, offset])
+    table = np.full((size, max(map(len, rows))), -1)
+    for i, own in enumerate(rows):
+        table[i, : len(own)] = own
     depths = np.array([len(own) for own in rows])
-    return Tree(parents, depths, slots, leaders, joints, table)
+    gravity = np.array(pin_model.gravity.linear)
+    return Tree(parents, joints, leaders, table, depths, slots, is_below, gravity)
 
 
 def _places(tree: Tree, plan: RowPlan) -> Array:
     """Return where each body's columns in each of its rows go, shape (B, D, 10); -1: nowhere."""
-    table = np.full((*tree.rows.shape, 10), -1)
-    for j, (wanted, place) in enumerate(zip(plan.inertial, plan.places, strict=True)):
-        body = wanted // 10 + 1
-        slot = np.argmax(tree.rows[body] == j, axis=1)
-        table[body, slot, wanted % 10] = place
-    return table
-
-
-def _prepare(state: Array, model: "RobotModel", tree: Tree) -> None:
-    """Write what never changes: the world's acceleration, axes in their own bodies."""
-    state[0, 9:12] = -model.pin_model.gravity.linear[:, None]
-    for body in range(1, len(state)):
-        slot = tree.slots[body]
-        if slot < 0:
-            state[body, 12:48] = np.eye(6).reshape(36, 1)
-        elif slot >= tree.depths[tree.parents[body]]:
-            axis = tree.joints[body, 33:39] * tree.joints[body, 39]
-            state[body, 12 + 6 * slot : 18 + 6 * slot] = axis[:, None]
+    table = np.full((len(plan.inertial), 10 * len(tree.parents)), -1)
+    for row, wanted, place in zip(table, plan.inertial, plan.places, strict=True):
+        row[wanted] = place
+    return tree.places(table)
 
 
 def joint_constants(pin_model: pin.Model, body: int) -> Array:
@@ -229,16 +271,17 @@ def _is_simple(axis: Array) -> bool:
 
 
 def _base_state(model: "RobotModel", q: Array, v: Array, a: Array) -> Array:
-    """Return w, v, dw, a - g of the floating base in its own frame, shape (12, k)."""
+    """Return v, w, a - g, dw of the floating base in its own frame, shape (12, k)."""
     g = model.pin_model.gravity.linear
     # R^T g with the rotation matrix of the quaternion, as Pinocchio forms it
     u = np.cross(g, q[:, 3:6])
     gravity = g + 2 * (q[:, 6:7] * u + np.cross(u, q[:, 3:6]))
-    return np.vstack([v[:, 3:6].T, v[:, :3].T, a[:, 3:6].T, (a[:, :3] - gravity).T])
+    return np.vstack([v[:, :6].T, (a[:, :3] - gravity).T, a[:, 3:6].T])
 
 
 @cache
-def _lanes() -> ModuleType:
-    import robotid.regressor.lanes  # imports Numba
+def row_lanes() -> ModuleType:
+    """Return the compiled code of rows; it imports Numba."""
+    import robotid.regressor.row_lanes
 
-    return robotid.regressor.lanes
+    return robotid.regressor.row_lanes

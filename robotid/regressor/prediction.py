@@ -49,7 +49,6 @@ def predict(
 
     Raises:
         DataError: If the trajectory's joints are not the model's.
-        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
 
     References:
         Luh, Walker, Paul (1980), On-Line Computational Scheme for Mechanical Manipulators.

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
-from robotid.exceptions import DataError, MissingDependencyError
+from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import RowPlan, plan_rows, trajectory_values
@@ -19,7 +19,7 @@ from robotid.regressor.compiled import (
     CompiledWriter,
     Tree,
     flatten,
-    is_installed,
+    keeps_code,
     why_not,
     work_per_sample,
 )
@@ -34,6 +34,7 @@ __all__ = [
     "choose_engine",
     "keep_inertial_rows",
     "kept_rows",
+    "thinned",
     "trajectory_rows",
 ]
 
@@ -54,24 +55,19 @@ def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str
     Args:
         model: The robot.
         samples: Number of samples.
-        compiled: Whether to compile; None: if installed and worth it.
+        compiled: Whether to compile; None: if it is worth it.
 
     Returns:
         ``COMPILED``, or "Pinocchio" with the reason where the compiled path was to be used.
-
-    Raises:
-        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
     """
-    if compiled and not is_installed():
-        raise MissingDependencyError("the compiled regressor", "numba", "fast")
     enough = -(-LONG_ENOUGH // work_per_sample(model))
     engine = "Pinocchio"
-    if compiled is not False and not is_installed():
-        engine += " (robotid[fast] is not installed)"
-    elif compiled is None and samples < enough:
+    if compiled is None and samples < enough:
         engine += f" (fewer than {enough} samples do not pay the start of the compiled path)"
     elif compiled is not False:
         reason = why_not(model)
+        if reason is None and compiled is None and not keeps_code():
+            reason = "no folder to keep compiled code in; name one as NUMBA_CACHE_DIR"
         engine = COMPILED if reason is None else f"{engine} ({reason})"
     _log.info("%s: regressor of %d samples: %s", model.name, samples, engine)
     return engine
@@ -104,6 +100,17 @@ class InertialRows:
             stop: Sample after the last one.
         """
         return replace(self, values=self.values[:, start:stop])
+
+    def write(self, samples: Array | slice, Y: Array) -> None:
+        """Write those of N samples into regressors, shape (N, n_rows, p).
+
+        Args:
+            samples: Which samples.
+            Y: The regressors, 0 where nothing is written.
+        """
+        rows = zip(self.columns, pairwise(self.first), strict=True)
+        for j, (own, (first, stop)) in enumerate(rows):
+            Y[:, j, own] = self.values[first:stop, samples].T
 
     def torque(self, stacked: Array) -> Array:
         """Return the torques of bodies, shape (k, N, n_rows) [N m, N].
@@ -151,6 +158,20 @@ def kept_rows(model: RobotModel, trajectory: Trajectory) -> InertialRows | None:
     """
     rows: InertialRows | None = trajectory.derived.get("inertial rows")
     return rows if rows is not None and rows.pin_model is model.pin_model else None
+
+
+def thinned(model: RobotModel, trajectory: Trajectory, step: int) -> Trajectory:
+    """Return every so many samples of a trajectory, with the inertial columns kept with it.
+
+    Args:
+        model: The robot.
+        trajectory: The trajectory.
+        step: How many samples one stands for.
+    """
+    thin, rows = trajectory.every(step), kept_rows(model, trajectory)
+    if rows is not None:
+        thin.derived["inertial rows"] = replace(rows, values=rows.values[:, ::step])
+    return thin
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +268,6 @@ def trajectory_rows(
 
     Raises:
         DataError: If joints or shapes do not fit the model.
-        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
     """
     if trajectory.joints != model.joints:
         raise DataError(

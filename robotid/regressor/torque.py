@@ -13,7 +13,7 @@ from robotid.exceptions import DataError
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import drive_values, friction_directions, instant_memory
 from robotid.regressor.problem import Block, Problem
-from robotid.regressor.rows import BLOCK, trajectory_rows
+from robotid.regressor.rows import BLOCK, kept_rows, trajectory_rows
 from robotid.robot.drives import TERMS, DriveMotion
 from robotid.robot.model import RobotModel
 
@@ -112,15 +112,26 @@ def carried_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
     return found
 
 
-def trajectory_regressor(model: RobotModel, trajectory: Trajectory) -> Array:
-    """Return the regressor of a trajectory, shape (N n_rows, p), as ``joint_torque_regressor``.
+def trajectory_regressor(
+    model: RobotModel, trajectory: Trajectory, samples: Array | None = None
+) -> Array:
+    """Return the regressor of N samples of a trajectory, shape (N n_rows, p).
+
+    As ``joint_torque_regressor``; inertial columns that are kept with it are not computed again.
 
     Args:
         model: The robot.
-        trajectory: N samples, with what the model's drives remember.
+        trajectory: The trajectory, with what the model's drives remember.
+        samples: Which samples; None: all.
     """
-    m = trajectory
-    return joint_torque_regressor(model, m.q, m.v, m.a, m.direction, m.memory)
+    m = trajectory if samples is None else trajectory.at(samples)
+    kept, layout = kept_rows(model, trajectory), model.layout
+    if kept is None or (m.memory is None and layout.remembering):
+        return joint_torque_regressor(model, m.q, m.v, m.a, m.direction, m.memory)
+    Y = np.zeros((len(m.t), model.n_rows, len(layout.names)))
+    kept.write(slice(None) if samples is None else samples, Y)
+    _write_drives(model, m.q, m.v, m.a, m.direction, m.memory, Y[:, :, layout.n_inertial :])
+    return Y.reshape(len(m.t) * model.n_rows, -1)
 
 
 def mass_regressor(model: RobotModel, q: Array) -> Array:
@@ -235,12 +246,11 @@ def build_problem(
         trajectory: N samples of q, v, a, tau.
         weight: Weight of each row, shape (N, n_rows), 0 to leave it out; all 1 if None.
         with_mass: Whether each sample also carries the regressor of its mass matrix.
-        compiled: Whether to use the compiled path where it supports the robot; None: where it is
-            installed and the trajectory is long enough to pay its start.
+        compiled: Whether to use the compiled path where it supports the robot; None: where the
+            trajectory is long enough to pay its start.
 
     Raises:
         DataError: If joints or shapes do not fit the model.
-        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
     """
     source = trajectory_rows(model, trajectory, weight, compiled)
     shape, weights = source.weights.shape, source.weights

@@ -1,403 +1,401 @@
-"""One compiled tree of bodies: placements, inverse dynamics, mass matrix and their derivatives.
+"""One compiled tree of bodies: placements, motions, inverse dynamics, mass matrix, derivatives.
 
-Imported only where the extra ``fast`` is installed. A work space holds ``LANES`` states of one
-tree: all numbers of one quantity stand in neighbouring places, so that the processor works on
-several states at a time. Entry ``at`` of a work space is one such quantity. The first ``BODY``
-entries are the world's, those of body i begin at ``(i + 1) * BODY``.
+Spatial vectors are pairs, of motion (linear, angular) and of force (force, moment), in the frame of
+a body, and stand in six neighbouring entries of a work space. The entries of the world come first,
+those of body i begin ``BODY`` further each. ``FRAME`` entries of a body are its placement in its
+parent, its velocity and its acceleration; the world's acceleration is the negative of gravity.
+
+    V_i = X^-1 V + s v_i,    A_i = X^-1 A + s a_i + V_i x s v_i    from those of the parent.
+
+As joint i turns its body by d q_i, whatever the body sees of a motion m changes by m x s d q_i.
 
 Arguments that the kernels share:
 
-- work: The work space, shape (entries * LANES,).
-- parents: Parent of each joint, shape (n,), int; -1: the world.
-- joints: Constants of each joint, as of ``compiled``, shape (n, 41).
+- work: The work space.
+- tree: The bodies and their joints; see ``compiled.Tree``.
+- own, up: Where the entries of a body and of its parent begin.
+- joint: Constants of a joint; see ``compiled.joint_constants``.
 - bodies: Ten inertial parameters of each joint's body, shape (n, 10).
-- is_below: Whether joint k carries body i, itself included, shape (n, n), bool, [i, k].
+- v, a: Where speeds and accelerations of the joints stand.
+
+References:
+    Featherstone (2008), Rigid Body Dynamics Algorithms, chapters 2, 5 and 6.
 """
 
-import math
-
-import numpy as np
-
-from robotid.regressor.lanes import add, compiled, cos_sin, cross, dot, into_child, scale
+from robotid.regressor.lanes import (
+    add,
+    compiled,
+    cos_sin,
+    cross,
+    dot,
+    get,
+    get3,
+    put,
+    put3,
+    scale,
+    times,
+    width,
+)
 
 __all__ = [
+    "ACCELERATION",
     "BODY",
-    "GRAVITY",
-    "LANES",
+    "FRAME",
+    "VELOCITY",
+    "along",
+    "axis",
+    "carry",
     "derivatives",
-    "factor",
-    "get",
+    "gather",
+    "get6",
     "inertial_column",
     "inverse_dynamics",
+    "joined",
     "mass_matrix",
+    "motion_cross",
+    "move",
+    "pass_up",
     "place",
-    "put",
-    "put3",
-    "solve",
+    "placement",
+    "put6",
+    "times6",
+    "turned",
 ]
 
-LANES = 8
-_R, _P, _W, _V, _DW, _A, _XV, _XA, _F, _C, _TV, _TA, _TF = (
-    0, 9, 12, 15, 18, 21, 24, 30, 36, 42, 52, 58, 64,
-)  # fmt: skip
-BODY = 70
-GRAVITY = _A  # where the negative of gravity stands, the acceleration of the world
+_R, _P, VELOCITY, ACCELERATION, FRAME = 0, 9, 12, 18, 24
+_F, _C, _TV, _TA, _TF, BODY = 24, 30, 40, 46, 52, 58  # of derivatives, T: changes
 
 
 @compiled
-def get(x, at, lane):
-    """Return a quantity of one lane."""
-    return x[np.uintp(at * LANES + lane)]
+def get6(work, at, lane):
+    """Return a spatial vector of one lane."""
+    return get3(work, at, lane), get3(work, at + 3, lane)
 
 
 @compiled
-def put(x, at, lane, value):
-    """Write a quantity of one lane."""
-    x[np.uintp(at * LANES + lane)] = value
+def put6(work, at, lane, x):
+    """Write a spatial vector of one lane."""
+    put3(work, at, lane, x[0])
+    put3(work, at + 3, lane, x[1])
 
 
 @compiled
-def _get3(x, at, lane):
-    return get(x, at, lane), get(x, at + 1, lane), get(x, at + 2, lane)
+def gather(work, at, lane, x):
+    """Add to a spatial vector of one lane."""
+    put6(work, at, lane, joined(get6(work, at, lane), x))
 
 
 @compiled
-def put3(x, at, lane, u):
-    """Write three neighbouring quantities of one lane."""
-    put(x, at, lane, u[0])
-    put(x, at + 1, lane, u[1])
-    put(x, at + 2, lane, u[2])
+def joined(x, y):
+    """Return x + y."""
+    return add(x[0], y[0]), add(x[1], y[1])
 
 
 @compiled
-def _into_parent(X, Y, Z, u):
-    """Return R u; X, Y, Z are the columns of R."""
+def times6(s, x):
+    """Return s x."""
+    return scale(s, x[0]), scale(s, x[1])
+
+
+@compiled
+def along(x, f):
+    """Return the power of a force along a motion."""
+    return dot(x[0], f[0]) + dot(x[1], f[1])
+
+
+@compiled
+def motion_cross(x, y):
+    """Return x x y, the change of the motion y that moves as x."""
+    return add(cross(x[1], y[0]), cross(x[0], y[1])), cross(x[1], y[1])
+
+
+@compiled
+def _force_cross(x, f):
+    """Return x x* f, the change of the force f that moves as x."""
+    return cross(x[1], f[0]), add(cross(x[1], f[1]), cross(x[0], f[0]))
+
+
+@compiled
+def axis(joint):
+    """Return the motion of a joint at the speed 1, in its body's frame."""
+    return (joint[33], joint[34], joint[35]), (joint[36], joint[37], joint[38])
+
+
+@compiled
+def placement(work, own, lane):
+    """Return columns of R and p of a body in its parent."""
+    return (
+        get3(work, own + _R, lane), get3(work, own + _R + 3, lane),
+        get3(work, own + _R + 6, lane), get3(work, own + _P, lane),
+    )  # fmt: skip
+
+
+@compiled
+def _into_child(T, x):
+    """Return a motion of the parent as the body sees it: X^-1 x."""
+    X, Y, Z, p = T
+    u, e = add(x[0], cross(x[1], p)), x[1]
+    return (dot(X, u), dot(Y, u), dot(Z, u)), (dot(X, e), dot(Y, e), dot(Z, e))
+
+
+@compiled
+def turned(T, u):
+    """Return R u."""
+    X, Y, Z, _ = T
     return add(add(scale(u[0], X), scale(u[1], Y)), scale(u[2], Z))
 
 
 @compiled
-def _turn(J, u):
-    """Return J u of a symmetric matrix xx xy yy xz yz zz."""
-    return (
-        J[0] * u[0] + J[1] * u[1] + J[3] * u[2],
-        J[1] * u[0] + J[2] * u[1] + J[4] * u[2],
-        J[3] * u[0] + J[4] * u[1] + J[5] * u[2],
-    )
-
-
-@compiled
-def _momentum(m, c, J, w, v):
-    """Return m v + w x mc and mc x v + J w: a body's momentum, or its force of an acceleration."""
-    return add(scale(m, v), cross(w, c)), add(cross(c, v), _turn(J, w))
+def _into_parent(T, f):
+    """Return a force on the body as its parent sees it: X^-T f."""
+    force = turned(T, f[0])
+    return force, add(turned(T, f[1]), cross(T[3], force))
 
 
 @compiled
 def place(work, own, joint, q, zero):
-    """Write placement of a joint's body in its parent; q is where its coordinates stand."""
-    A, B, C = joint[0:9], joint[9:18], joint[18:27]
-    for lane in range(LANES):
-        angle = get(work, q, lane) + zero
-        cosine, sine = cos_sin(angle)
-        for k in range(9):
-            put(work, own + _R + k, lane, A[k] + B[k] * cosine + C[k] * sine)
-        for k in range(3):
-            put(work, own + _P + k, lane, joint[27 + k] + joint[30 + k] * angle)
+    """Write R = A + B cos q + C sin q and p = p0 + d q of a body; q is where coordinates stand."""
+    cosine, sine = own + VELOCITY, own + VELOCITY + 1  # of which there is none yet
+    for lane in range(width(work)):
+        c, s = cos_sin(get(work, q, lane) + zero)
+        put(work, cosine, lane, c)
+        put(work, sine, lane, s)
+    for k in range(9):
+        A, B, C = joint[k], joint[9 + k], joint[18 + k]
+        for lane in range(width(work)):
+            turned = A + B * get(work, cosine, lane) + C * get(work, sine, lane)
+            put(work, own + _R + k, lane, turned)
+    for k in range(3):
+        p, d = joint[27 + k], joint[30 + k]
+        for lane in range(width(work)):
+            put(work, own + _P + k, lane, p + d * (get(work, q, lane) + zero))
 
 
 @compiled
-def _move(work, own, up, joint, v, a):
-    """Write velocity and acceleration of a body; v and a are where the joints' rates stand."""
-    slide, turn = (joint[33], joint[34], joint[35]), (joint[36], joint[37], joint[38])
-    for lane in range(LANES):
-        X, Y = _get3(work, own + _R, lane), _get3(work, own + _R + 3, lane)
-        Z, p = _get3(work, own + _R + 6, lane), _get3(work, own + _P, lane)
-        w0, v0 = _get3(work, up + _W, lane), _get3(work, up + _V, lane)
-        dw0, a0 = _get3(work, up + _DW, lane), _get3(work, up + _A, lane)
-        rate, change = get(work, v, lane), get(work, a, lane)
-        w1, v1 = into_child(X, Y, Z, w0), into_child(X, Y, Z, add(v0, cross(w0, p)))
-        dw1, a1 = into_child(X, Y, Z, dw0), into_child(X, Y, Z, add(a0, cross(dw0, p)))
-        sw, sv = scale(rate, turn), scale(rate, slide)
-        w, v_ = add(w1, sw), add(v1, sv)
-        put3(work, own + _XV, lane, w1)
-        put3(work, own + _XV + 3, lane, v1)
-        put3(work, own + _XA, lane, dw1)
-        put3(work, own + _XA + 3, lane, a1)
-        put3(work, own + _W, lane, w)
-        put3(work, own + _V, lane, v_)
-        put3(work, own + _DW, lane, add(dw1, add(scale(change, turn), cross(w, sw))))
-        bent = add(cross(w, sv), cross(v_, sw))
-        put3(work, own + _A, lane, add(a1, add(scale(change, slide), bent)))
+def move(work, own, up, joint, v, a):
+    """Write velocity and acceleration of a body."""
+    s = axis(joint)
+    for lane in range(width(work)):
+        T = placement(work, own, lane)
+        moved = times6(get(work, v, lane), s)
+        V = joined(_into_child(T, get6(work, up + VELOCITY, lane)), moved)
+        changed = joined(times6(get(work, a, lane), s), motion_cross(V, moved))
+        put6(work, own + VELOCITY, lane, V)
+        A = joined(_into_child(T, get6(work, up + ACCELERATION, lane)), changed)
+        put6(work, own + ACCELERATION, lane, A)
 
 
 @compiled
-def _force(work, own, body, at):
-    """Write the force J A + V x* J V on a body; body has its ten parameters."""
-    m, c, J = body[0], (body[1], body[2], body[3]), body[4:10]
-    for lane in range(LANES):
-        w, v = _get3(work, own + _W, lane), _get3(work, own + _V, lane)
-        dw, a = _get3(work, own + _DW, lane), _get3(work, own + _A, lane)
-        f, n = _momentum(m, c, J, dw, a)
-        lin, ang = _momentum(m, c, J, w, v)
-        put3(work, own + at, lane, add(f, cross(w, lin)))
-        put3(work, own + at + 3, lane, add(n, add(cross(w, ang), cross(v, lin))))
+def carry(work, own, seen, to):
+    """Write a motion that the parent sees as the body sees it."""
+    for lane in range(width(work)):
+        T = placement(work, own, lane)
+        put6(work, to, lane, _into_child(T, get6(work, seen, lane)))
 
 
 @compiled
-def _pass_up(work, own, up, at):
-    """Add a force of a body, seen from its parent, to the parent's."""
-    for lane in range(LANES):
-        X, Y = _get3(work, own + _R, lane), _get3(work, own + _R + 3, lane)
-        Z, p = _get3(work, own + _R + 6, lane), _get3(work, own + _P, lane)
-        f = _into_parent(X, Y, Z, _get3(work, own + at, lane))
-        n = add(_into_parent(X, Y, Z, _get3(work, own + at + 3, lane)), cross(p, f))
-        put3(work, up + at, lane, add(_get3(work, up + at, lane), f))
-        put3(work, up + at + 3, lane, add(_get3(work, up + at + 3, lane), n))
+def pass_up(work, own, force, to):
+    """Add a force on the body to one that the parent sees."""
+    for lane in range(width(work)):
+        T = placement(work, own, lane)
+        gather(work, to, lane, _into_parent(T, get6(work, force, lane)))
 
 
 @compiled
-def _along(work, own, at, joint, lane):
-    """Return the part of a body's force that its joint has to give."""
-    slide, turn = (joint[33], joint[34], joint[35]), (joint[36], joint[37], joint[38])
-    return dot(slide, _get3(work, own + at, lane)) + dot(turn, _get3(work, own + at + 3, lane))
+def _momentum(body, x):
+    """Return J x of ten inertial parameters: momentum of a velocity, force of an acceleration."""
+    m, c = body[0], (body[1], body[2], body[3])
+    J = body[4], body[5], body[6], body[7], body[8], body[9]
+    return add(scale(m, x[0]), cross(x[1], c)), add(cross(c, x[0]), times(J, x[1]))
 
 
 @compiled
-def inverse_dynamics(work, parents, joints, bodies, v, a, tau):
-    """Write the torques of the bodies for the placements, rates v and their changes a."""
-    n = len(parents)
+def _force(work, own, body, to):
+    """Write the force J A + V x* J V on a body."""
+    for lane in range(width(work)):
+        V, A = get6(work, own + VELOCITY, lane), get6(work, own + ACCELERATION, lane)
+        f = joined(_momentum(body, A), _force_cross(V, _momentum(body, V)))
+        put6(work, to, lane, f)
+
+
+@compiled
+def _give(work, force, joint, to):
+    """Write the part of a body's force that its joint has to give."""
+    s = axis(joint)
+    for lane in range(width(work)):
+        put(work, to, lane, along(s, get6(work, force, lane)))
+
+
+@compiled
+def inverse_dynamics(work, tree, bodies, v, a, tau):
+    """Write the torques of the bodies for the placements, speeds and accelerations."""
+    n = len(tree.parents)
     for i in range(n):
-        _move(work, (i + 1) * BODY, (parents[i] + 1) * BODY, joints[i], v + i, a + i)
-        _force(work, (i + 1) * BODY, bodies[i], _F)
+        own, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
+        move(work, own, up, tree.joints[i], v + i, a + i)
+        _force(work, own, bodies[i], own + _F)
     for i in range(n - 1, -1, -1):
-        own = (i + 1) * BODY
-        for lane in range(LANES):
-            put(work, tau + i, lane, _along(work, own, _F, joints[i], lane))
-        _pass_up(work, own, (parents[i] + 1) * BODY, _F)
+        own, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
+        _give(work, own + _F, tree.joints[i], tau + i)
+        pass_up(work, own, own + _F, up + _F)
 
 
 @compiled
-def mass_matrix(work, parents, joints, bodies, M):
+def mass_matrix(work, tree, bodies, M):
     """Write the mass matrix by composite bodies (Featherstone 2008, table 6.2)."""
-    n = len(parents)
+    n, parents, joints = len(tree.parents), tree.parents, tree.joints
     for i in range(n):
         for k in range(10):
-            for lane in range(LANES):
+            for lane in range(width(work)):
                 put(work, (i + 1) * BODY + _C + k, lane, bodies[i, k])
     for i in range(n - 1, -1, -1):
-        own, up = (i + 1) * BODY, (parents[i] + 1) * BODY
-        slide = (joints[i, 33], joints[i, 34], joints[i, 35])
-        turn = (joints[i, 36], joints[i, 37], joints[i, 38])
-        for lane in range(LANES):
-            m, c = get(work, own + _C, lane), _get3(work, own + _C + 1, lane)
-            J = (
-                get(work, own + _C + 4, lane), get(work, own + _C + 5, lane),
-                get(work, own + _C + 6, lane), get(work, own + _C + 7, lane),
-                get(work, own + _C + 8, lane), get(work, own + _C + 9, lane),
-            )  # fmt: skip
-            f, t = _momentum(m, c, J, turn, slide)
-            put3(work, own + _TF, lane, f)
-            put3(work, own + _TF + 3, lane, t)
-            put(work, M + i * n + i, lane, dot(slide, f) + dot(turn, t))
+        own, s = (i + 1) * BODY, axis(joints[i])
+        for lane in range(width(work)):
+            put6(work, own + _TF, lane, _momentum(_composite(work, own, lane), s))
+        _give(work, own + _TF, joints[i], M + i * n + i)
         j = i
         while parents[j] >= 0:
-            below, at = (j + 1) * BODY, (parents[j] + 1) * BODY
-            for lane in range(LANES):
-                X, Y = _get3(work, below + _R, lane), _get3(work, below + _R + 3, lane)
-                Z, p = _get3(work, below + _R + 6, lane), _get3(work, below + _P, lane)
-                f = _into_parent(X, Y, Z, _get3(work, below + _TF, lane))
-                t = _into_parent(X, Y, Z, _get3(work, below + _TF + 3, lane))
-                put3(work, at + _TF, lane, f)
-                put3(work, at + _TF + 3, lane, add(t, cross(p, f)))
-            j = parents[j]
-            for lane in range(LANES):
-                value = _along(work, at, _TF, joints[j], lane)
-                put(work, M + i * n + j, lane, value)
-                put(work, M + j * n + i, lane, value)
+            below, j = (j + 1) * BODY, parents[j]
+            at = (j + 1) * BODY
+            for lane in range(width(work)):
+                T = placement(work, below, lane)
+                put6(work, at + _TF, lane, _into_parent(T, get6(work, below + _TF, lane)))
+            _give(work, at + _TF, joints[j], M + i * n + j)
+            for lane in range(width(work)):
+                put(work, M + j * n + i, lane, get(work, M + i * n + j, lane))
         if parents[i] >= 0:
-            _join_bodies(work, own, up)
+            _join_bodies(work, own, (parents[i] + 1) * BODY)
+
+
+@compiled
+def _composite(work, own, lane):
+    """Return the ten parameters of a body and all that it carries."""
+    at = own + _C
+    return (
+        get(work, at, lane), get(work, at + 1, lane), get(work, at + 2, lane),
+        get(work, at + 3, lane), get(work, at + 4, lane), get(work, at + 5, lane),
+        get(work, at + 6, lane), get(work, at + 7, lane), get(work, at + 8, lane),
+        get(work, at + 9, lane),
+    )  # fmt: skip
 
 
 @compiled
 def _join_bodies(work, own, up):
     """Add a composite body, seen from its parent, to the parent's."""
-    for lane in range(LANES):
-        X, Y = _get3(work, own + _R, lane), _get3(work, own + _R + 3, lane)
-        Z, p = _get3(work, own + _R + 6, lane), _get3(work, own + _P, lane)
-        m = get(work, own + _C, lane)
-        c = _into_parent(X, Y, Z, _get3(work, own + _C + 1, lane))
-        I0, I1, I2 = _get3(work, own + _C + 4, lane)
-        I3, I4, I5 = _get3(work, own + _C + 7, lane)
-        # R J: its columns are R applied to the columns of J
-        U = _into_parent(X, Y, Z, (I0, I1, I3))
-        V = _into_parent(X, Y, Z, (I1, I2, I4))
-        W = _into_parent(X, Y, Z, (I3, I4, I5))
-        row0, row1, row2 = (X[0], Y[0], Z[0]), (X[1], Y[1], Z[1]), (X[2], Y[2], Z[2])
-        u0, u1, u2 = (U[0], V[0], W[0]), (U[1], V[1], W[1]), (U[2], V[2], W[2])
-        pc, pp = dot(p, c), dot(p, p)
-        s = 2.0 * pc + m * pp
+    for lane in range(width(work)):
+        T = placement(work, own, lane)
+        p = T[3]
+        m, c0, c1, c2, xx, xy, yy, xz, yz, zz = _composite(work, own, lane)
+        c = turned(T, (c0, c1, c2))
+        # R J R^T: R times the columns of J, then times the rows of that
+        U, V, W = turned(T, (xx, xy, xz)), turned(T, (xy, yy, yz)), turned(T, (xz, yz, zz))
+        u = turned(T, (U[0], V[0], W[0]))
+        v = turned(T, (U[1], V[1], W[1]))
+        w = turned(T, (U[2], V[2], W[2]))
+        s = 2.0 * dot(p, c) + m * dot(p, p)
         put(work, up + _C, lane, get(work, up + _C, lane) + m)
-        c0 = _get3(work, up + _C + 1, lane)
-        put3(work, up + _C + 1, lane, add(c0, add(c, scale(m, p))))
-        first, second = _get3(work, up + _C + 4, lane), _get3(work, up + _C + 7, lane)
-        xx = dot(u0, row0) + s - 2.0 * p[0] * c[0] - m * p[0] * p[0]
-        xy = dot(u0, row1) - p[0] * c[1] - p[1] * c[0] - m * p[0] * p[1]
-        yy = dot(u1, row1) + s - 2.0 * p[1] * c[1] - m * p[1] * p[1]
-        xz = dot(u0, row2) - p[0] * c[2] - p[2] * c[0] - m * p[0] * p[2]
-        yz = dot(u1, row2) - p[1] * c[2] - p[2] * c[1] - m * p[1] * p[2]
-        zz = dot(u2, row2) + s - 2.0 * p[2] * c[2] - m * p[2] * p[2]
-        put3(work, up + _C + 4, lane, add(first, (xx, xy, yy)))
-        put3(work, up + _C + 7, lane, add(second, (xz, yz, zz)))
+        moment = add(get3(work, up + _C + 1, lane), add(c, scale(m, p)))
+        put3(work, up + _C + 1, lane, moment)
+        xx = u[0] + s - 2.0 * p[0] * c[0] - m * p[0] * p[0]
+        xy = u[1] - p[0] * c[1] - p[1] * c[0] - m * p[0] * p[1]
+        yy = v[1] + s - 2.0 * p[1] * c[1] - m * p[1] * p[1]
+        xz = u[2] - p[0] * c[2] - p[2] * c[0] - m * p[0] * p[2]
+        yz = v[2] - p[1] * c[2] - p[2] * c[1] - m * p[1] * p[2]
+        zz = w[2] + s - 2.0 * p[2] * c[2] - m * p[2] * p[2]
+        put3(work, up + _C + 4, lane, add(get3(work, up + _C + 4, lane), (xx, xy, yy)))
+        put3(work, up + _C + 7, lane, add(get3(work, up + _C + 7, lane), (xz, yz, zz)))
 
 
 @compiled
-def _seed(work, own, joint, v, is_speed):
-    """Write how velocity and acceleration of a joint's body change with its position or speed."""
-    slide, turn = (joint[33], joint[34], joint[35]), (joint[36], joint[37], joint[38])
-    for lane in range(LANES):
-        if is_speed:
-            w, u = _get3(work, own + _W, lane), _get3(work, own + _V, lane)
-            put3(work, own + _TV, lane, turn)
-            put3(work, own + _TV + 3, lane, slide)
-            put3(work, own + _TA, lane, cross(w, turn))
-            put3(work, own + _TA + 3, lane, add(cross(w, slide), cross(u, turn)))
+def _change_motion(work, own, up, joint, v, is_first, is_speed):
+    """Write how velocity and acceleration of a body change with a position or speed.
+
+    That is its own joint's if it is the first of the bodies that change.
+    """
+    s = axis(joint)
+    for lane in range(width(work)):
+        V, A = get6(work, own + VELOCITY, lane), get6(work, own + ACCELERATION, lane)
+        if is_first and is_speed:
+            TV, TA = s, motion_cross(V, s)
+        elif is_first:
+            TV, TA = motion_cross(V, s), motion_cross(A, s)
         else:
-            rate = get(work, v, lane)
-            w, u = _get3(work, own + _XV, lane), _get3(work, own + _XV + 3, lane)
-            dw, du = _get3(work, own + _XA, lane), _get3(work, own + _XA + 3, lane)
-            tw, tv = cross(w, turn), add(cross(w, slide), cross(u, turn))
-            ta = add(cross(dw, slide), cross(du, turn))
-            bent = add(cross(tw, scale(rate, slide)), cross(tv, scale(rate, turn)))
-            put3(work, own + _TV, lane, tw)
-            put3(work, own + _TV + 3, lane, tv)
-            put3(work, own + _TA, lane, add(cross(dw, turn), cross(tw, scale(rate, turn))))
-            put3(work, own + _TA + 3, lane, add(ta, bent))
+            T = placement(work, own, lane)
+            TV = _into_child(T, get6(work, up + _TV, lane))
+            bent = motion_cross(TV, times6(get(work, v, lane), s))
+            TA = joined(_into_child(T, get6(work, up + _TA, lane)), bent)
+        put6(work, own + _TV, lane, TV)
+        put6(work, own + _TA, lane, TA)
 
 
 @compiled
-def _carry(work, own, up, joint, v):
-    """Write the same of a body below, from its parent's."""
-    slide, turn = (joint[33], joint[34], joint[35]), (joint[36], joint[37], joint[38])
-    for lane in range(LANES):
-        X, Y = _get3(work, own + _R, lane), _get3(work, own + _R + 3, lane)
-        Z, p = _get3(work, own + _R + 6, lane), _get3(work, own + _P, lane)
-        w0, v0 = _get3(work, up + _TV, lane), _get3(work, up + _TV + 3, lane)
-        dw0, a0 = _get3(work, up + _TA, lane), _get3(work, up + _TA + 3, lane)
-        rate = get(work, v, lane)
-        w, u = into_child(X, Y, Z, w0), into_child(X, Y, Z, add(v0, cross(w0, p)))
-        dw, a = into_child(X, Y, Z, dw0), into_child(X, Y, Z, add(a0, cross(dw0, p)))
-        sw, sv = scale(rate, turn), scale(rate, slide)
-        put3(work, own + _TV, lane, w)
-        put3(work, own + _TV + 3, lane, u)
-        put3(work, own + _TA, lane, add(dw, cross(w, sw)))
-        put3(work, own + _TA + 3, lane, add(a, add(cross(w, sv), cross(u, sw))))
-
-
-@compiled
-def _force_change(work, own, body):
+def _change_force(work, own, body):
     """Write how the force on a body changes, from the changes of velocity and acceleration."""
-    m, c, J = body[0], (body[1], body[2], body[3]), body[4:10]
-    for lane in range(LANES):
-        w, v = _get3(work, own + _W, lane), _get3(work, own + _V, lane)
-        tw, tv = _get3(work, own + _TV, lane), _get3(work, own + _TV + 3, lane)
-        f, n = _momentum(m, c, J, _get3(work, own + _TA, lane), _get3(work, own + _TA + 3, lane))
-        lin, ang = _momentum(m, c, J, w, v)
-        tlin, tang = _momentum(m, c, J, tw, tv)
-        put3(work, own + _TF, lane, add(f, add(cross(tw, lin), cross(w, tlin))))
-        n = add(n, add(cross(tw, ang), cross(w, tang)))
-        put3(work, own + _TF + 3, lane, add(n, add(cross(tv, lin), cross(v, tlin))))
+    for lane in range(width(work)):
+        V, TV = get6(work, own + VELOCITY, lane), get6(work, own + _TV, lane)
+        f = _momentum(body, get6(work, own + _TA, lane))
+        f = joined(f, _force_cross(TV, _momentum(body, V)))
+        f = joined(f, _force_cross(V, _momentum(body, TV)))
+        put6(work, own + _TF, lane, f)
 
 
 @compiled
-def derivatives(work, parents, joints, bodies, is_below, v, T, is_speed):
-    """Write the derivatives of the torques by positions or speeds, T[i, k] = d tau_i / d q_k."""
-    n = len(parents)
-    for k in range(n):
-        for i in range(k, n):
-            own = (i + 1) * BODY
-            if i == k:
-                _seed(work, own, joints[k], v + k, is_speed)
-            elif is_below[i, k]:
-                _carry(work, own, (parents[i] + 1) * BODY, joints[i], v + i)
-            else:
-                continue
-            _force_change(work, own, bodies[i])
-        for i in range(n):
-            if not is_below[i, k]:
-                for lane in range(LANES):
-                    put(work, T + i * n + k, lane, 0.0)
-                if is_below[k, i]:
-                    for e in range(6):
-                        for lane in range(LANES):
-                            put(work, (i + 1) * BODY + _TF + e, lane, 0.0)
-        slide = (joints[k, 33], joints[k, 34], joints[k, 35])
-        turn = (joints[k, 36], joints[k, 37], joints[k, 38])
-        for i in range(n - 1, -1, -1):
-            if not (is_below[i, k] or is_below[k, i]):
-                continue
-            own = (i + 1) * BODY
-            for lane in range(LANES):
-                put(work, T + i * n + k, lane, _along(work, own, _TF, joints[i], lane))
-            if i == k and not is_speed:
-                for lane in range(LANES):
-                    f, t = _get3(work, own + _F, lane), _get3(work, own + _F + 3, lane)
-                    tf = add(_get3(work, own + _TF, lane), cross(turn, f))
-                    tt = add(cross(turn, t), cross(slide, f))
-                    put3(work, own + _TF, lane, tf)
-                    put3(work, own + _TF + 3, lane, add(_get3(work, own + _TF + 3, lane), tt))
-            if parents[i] >= 0:
-                _pass_up(work, own, (parents[i] + 1) * BODY, _TF)
+def _clear(work, at):
+    """Write a spatial vector of 0."""
+    for k in range(6):
+        for lane in range(width(work)):
+            put(work, at + k, lane, 0.0)
 
 
 @compiled
-def inertial_column(work, parents, joints, works, body, index, own):
+def derivatives(work, tree, bodies, v, T):
+    """Write the derivatives of the torques by positions and speeds, for placed and moved bodies.
+
+    T[i, k] = d tau_i / d q_k; n^2 entries further stands d tau_i / d v_k.
+    """
+    n = len(tree.parents)
+    for kind in range(2):
+        for k in range(n):
+            _change_bodies(work, tree, bodies, v, k, kind == 1)
+            for i in range(n):
+                if not (tree.is_below[i, k] or tree.is_below[k, i]):
+                    for lane in range(width(work)):
+                        put(work, T + (kind * n + i) * n + k, lane, 0.0)
+            for i in range(n - 1, -1, -1):
+                if not (tree.is_below[i, k] or tree.is_below[k, i]):
+                    continue
+                own, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
+                _give(work, own + _TF, tree.joints[i], T + (kind * n + i) * n + k)
+                if i == k and kind == 0:  # its force turns with it
+                    s = axis(tree.joints[k])
+                    for lane in range(width(work)):
+                        bent = _force_cross(s, get6(work, own + _F, lane))
+                        gather(work, own + _TF, lane, bent)
+                if tree.parents[i] >= 0:
+                    pass_up(work, own, own + _TF, up + _TF)
+
+
+@compiled
+def _change_bodies(work, tree, bodies, v, k, is_speed):
+    """Write how forces on bodies change with the position or speed of joint k."""
+    for i in range(len(tree.parents)):
+        own, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
+        if tree.is_below[i, k]:
+            _change_motion(work, own, up, tree.joints[i], v + i, i == k, is_speed)
+            _change_force(work, own, bodies[i])
+        elif tree.is_below[k, i]:
+            _clear(work, own + _TF)
+
+
+@compiled
+def inertial_column(work, tree, change, body, own):
     """Write the torques of a change of a body's ten parameters."""
-    _force(work, (body + 1) * BODY, works[index], _TF)
     i = body
+    _force(work, (i + 1) * BODY, change, (i + 1) * BODY + _TF)
     while i >= 0:
-        at, up = (i + 1) * BODY, (parents[i] + 1) * BODY
-        for lane in range(LANES):
-            put(work, own + i, lane, _along(work, at, _TF, joints[i], lane))
-        if parents[i] >= 0:
-            for e in range(6):
-                for lane in range(LANES):
-                    put(work, up + _TF + e, lane, 0.0)
-            _pass_up(work, at, up, _TF)
-        i = parents[i]
-
-
-@compiled
-def factor(work, n, H):
-    """Write the lower Cholesky factor of the symmetric positive definite H, in place."""
-    for j in range(n):
-        for k in range(j):
-            for i in range(j, n):
-                for lane in range(LANES):
-                    x = get(work, H + j * n + k, lane) * get(work, H + i * n + k, lane)
-                    put(work, H + i * n + j, lane, get(work, H + i * n + j, lane) - x)
-        for lane in range(LANES):
-            put(work, H + j * n + j, lane, math.sqrt(get(work, H + j * n + j, lane)))
-        for i in range(j + 1, n):
-            for lane in range(LANES):
-                x = get(work, H + i * n + j, lane) / get(work, H + j * n + j, lane)
-                put(work, H + i * n + j, lane, x)
-
-
-@compiled
-def solve(work, n, H, x, step):
-    """Solve H y = x with the factor of H, in place; the entries of x are ``step`` apart."""
-    for i in range(n):
-        for k in range(i):
-            for lane in range(LANES):
-                y = get(work, H + i * n + k, lane) * get(work, x + k * step, lane)
-                put(work, x + i * step, lane, get(work, x + i * step, lane) - y)
-        for lane in range(LANES):
-            y = get(work, x + i * step, lane) / get(work, H + i * n + i, lane)
-            put(work, x + i * step, lane, y)
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            for lane in range(LANES):
-                y = get(work, H + k * n + i, lane) * get(work, x + k * step, lane)
-                put(work, x + i * step, lane, get(work, x + i * step, lane) - y)
-        for lane in range(LANES):
-            y = get(work, x + i * step, lane) / get(work, H + i * n + i, lane)
-            put(work, x + i * step, lane, y)
+        at, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
+        _give(work, at + _TF, tree.joints[i], own + i)
+        if tree.parents[i] >= 0:
+            _clear(work, up + _TF)
+            pass_up(work, at, at + _TF, up + _TF)
+        i = tree.parents[i]

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from robotid.diagnosis.misfit_findings import setting_of, with_entries
 from robotid.findings import Cause, grouped, listed, toml_key
 from robotid.judgement.verdict import GOOD, is_beaten
-from robotid.robot.drives import DriveTerm
-from robotid.robot.families import COUNTERBALANCE, spring_family
+from robotid.robot.drives import COUNTERBALANCE, DriveTerm
+from robotid.robot.families import spring_family
 
 if TYPE_CHECKING:
     from robotid.identification.result import Identification

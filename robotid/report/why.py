@@ -2,7 +2,7 @@
 
 from html import escape
 
-from robotid.diagnosis.dependence import LEAST
+from robotid.diagnosis.decisions import DEPENDENCE_SHARE
 from robotid.diagnosis.torque_split import JointTorque, joint_torques
 from robotid.identification.result import Identification
 from robotid.identification.why_pictures import why_charts
@@ -87,7 +87,7 @@ def _caption(torque: JointTorque, name: str) -> str:
         said = "too little was recorded to tell"
     elif dependence.is_sure:
         said = f"<strong>explains {share} % of its variance</strong>"
-    elif dependence.share >= LEAST:
+    elif dependence.share >= DEPENDENCE_SHARE:
         said = f"explains {share} %, perhaps by chance"
     return f"Residual against {name}: {said}"
 

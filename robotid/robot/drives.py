@@ -1,159 +1,49 @@
 """The terms of a drive's torque: one class each, and the rest of the package loops over them.
 
-A term adds ``parameter * column`` to the torque of a drive. To add one, write its class and enter
-it in ``TERMS`` if it has no shape of its own, else in ``families``: its regressor, prior spread,
-plant, sidecar, tables and job key follow.
+A term adds ``parameter * column`` to the torque of a drive. To add one, write its class with the
+laws of ``drive_laws`` that it is made of, and enter it in ``TERMS`` if it has no shape of its own,
+else in ``_CLASSES`` and ``FAMILIES``: its regressor, prior spread, plant, roll-outs with their
+sensitivities, choice, sidecar, tables, exports and job key follow.
 
 The columns of many terms are guarded: beyond the speeds or positions that the fit has seen they
 stay as they were at the end of that range, for no data say how they go on.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from robotid._settings import is_number
 from robotid._typing import Array
-from robotid.exceptions import SettingsError
-from robotid.findings import listed
+from robotid.robot import drive_laws as laws
+from robotid.robot.drive_term import (
+    DriveMotion,
+    DriveTerm,
+    Family,
+    MemorylessTerm,
+    Seen,
+    Shape,
+)
 
 __all__ = [
+    "COUNTERBALANCE",
     "DRIVE_TERMS",
+    "FAMILIES",
     "TERMS",
+    "TERM_CLASSES",
     "Bristles",
     "DriveMotion",
     "DriveTerm",
+    "Family",
     "Lag",
     "LoadFriction",
-    "term_from_dict",
+    "MemorylessTerm",
+    "Seen",
 ]
 
-_ANYWHERE = (-np.inf, np.inf)
 _POSITIVE = (1e-9, 1e9)  # numbers of a term's shape that it is divided by
-_ENDS = (-1e9, 1e9)  # other numbers of a term's shape
-
-
-@dataclass(frozen=True, slots=True)
-class DriveMotion:
-    """How drives move, and what loads them; all arrays of one shape, time along the last axis.
-
-    Attributes:
-        q: Angles or ways [rad or m].
-        v: Speeds w [rad/s or m/s].
-        a: Their changes dw/dt [rad/s^2 or m/s^2].
-        direction: Which way friction acts: the signs of w, or what stands for them [-].
-        load: Torque of the rigid bodies [N m or N].
-        rate: Change of the whole torque [N m/s or N/s].
-        begins: Where a stretch without gaps begins, bool; None of instants that do not follow each
-            other, whose drives have slid for long.
-    """
-
-    q: Array
-    v: Array
-    a: Array
-    direction: Array
-    load: Array
-    rate: Array
-    begins: Array | None = None
-
-    def of(self, drive: int | list[int]) -> "DriveMotion":
-        """Return the motion of one drive or of several, of arrays with a row for each.
-
-        Args:
-            drive: Which one, or which.
-        """
-        q, v, a = self.q[drive], self.v[drive], self.a[drive]
-        direction, load, rate = self.direction[drive], self.load[drive], self.rate[drive]
-        return DriveMotion(q, v, a, direction, load, rate, self.begins)
-
-
-@dataclass(frozen=True)
-class DriveTerm:
-    """One term of a drive's torque, linear in its parameter.
-
-    Attributes:
-        seen: From where to where the fit has seen what ``guards`` names: q, or the size of v.
-
-    Class attributes:
-        label: Its name in parameters, as ``"elbow.viscous"``.
-        units: Unit of the parameter for a drive that turns, and for one that slides.
-        is_nonnegative: Whether the parameter cannot be negative by physics.
-        highest: The largest parameter that a drive which moves can have.
-        is_shared: Whether a drive that turns with several joints has it too.
-        is_inertia: Whether it multiplies the acceleration and so adds to the mass matrix.
-        is_friction: Whether a job's ``friction`` chooses it; if not, it has a switch of its own.
-        follows_direction: Whether its column holds the direction of friction.
-        remembers: Whether its column needs more than q, v, a and direction of an instant.
-        guards: "v" or "q" if its column stays as it is beyond the range seen, else "".
-        preference: How much it is favoured as the name of a base parameter [-].
-        usual: From where to where it usually lies, for simulated robots.
-        dynamics: Attribute of the URDF's ``<dynamics>`` that states it, or None.
-        part: What it counts as where a torque is split: "friction", "spring" and the like.
-        ends: Smallest and largest value of its numbers, by name; -1e9 and 1e9 of others.
-        rising: Names of numbers that increase in this order.
-    """
-
-    seen: tuple[float, float] = _ANYWHERE
-
-    label: ClassVar[str] = ""
-    units: ClassVar[tuple[str, str]] = ("N m", "N")
-    is_nonnegative: ClassVar[bool] = False
-    highest: ClassVar[float] = np.inf
-    is_shared: ClassVar[bool] = True
-    is_inertia: ClassVar[bool] = False
-    is_friction: ClassVar[bool] = True
-    follows_direction: ClassVar[bool] = False
-    remembers: ClassVar[bool] = False
-    guards: ClassVar[str] = ""
-    preference: ClassVar[float] = 1.0
-    usual: ClassVar[tuple[float, float]] = (0.2, 0.9)
-    dynamics: ClassVar[str | None] = None
-    part: ClassVar[str] = "friction"
-    ends: ClassVar[Mapping[str, tuple[float, float]]] = {}
-    rising: ClassVar[tuple[str, ...]] = ()
-
-    def __post_init__(self) -> None:
-        kind = type(self).__name__
-        if not (len(self.seen) == 2 and self.seen[0] <= self.seen[1]):
-            raise SettingsError(f"{kind}: seen is {self.seen!r}, wanted (lowest, highest)")
-        shape = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "seen"}
-        for key, value in shape.items():
-            low, high = self.ends.get(key, _ENDS)
-            if not isinstance(value, bool) and not (is_number(value) and low <= value <= high):
-                raise SettingsError(f"{kind}: {key} is {value!r}, wanted {low:g} to {high:g}")
-        if any(shape[low] >= shape[high] for low, high in pairwise(self.rising)):
-            found = ", ".join(f"{key} = {shape[key]:g}" for key in self.rising)
-            raise SettingsError(f"{kind}: {found}, wanted each larger than the one before")
-
-    @property
-    def name(self) -> str:
-        """Its name in parameters, as ``"elbow.viscous"``."""
-        return self.label
-
-    def column(self, motion: DriveMotion) -> Array:
-        """Return what the parameter multiplies, element by element, within the range seen.
-
-        Args:
-            motion: How a drive moves.
-        """
-        low, high = self.seen
-        if self.guards == "v":  # of either sign
-            motion = replace(motion, v=np.clip(motion.v, -high, high))
-        elif self.guards == "q":
-            motion = replace(motion, q=np.clip(motion.q, low, high))
-        return self._column(motion)
-
-    def _column(self, motion: DriveMotion) -> Array:
-        raise NotImplementedError
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the term as plain values, which ``term_from_dict`` reads."""
-        shape = {key: value for key, value in asdict(self).items() if key != "seen"}
-        guard = {} if self.seen == _ANYWHERE else {"seen": list(self.seen)}
-        return {"term": type(self).__name__, **shape, **guard}
 
 
 @dataclass(frozen=True)
@@ -169,26 +59,29 @@ class Armature(DriveTerm):
     usual = (0.1, 0.5)
     part = "motor inertia"
 
-    def _column(self, motion: DriveMotion) -> Array:
+    def column(self, motion: DriveMotion) -> Array:
+        """Return the acceleration of the drive.
+
+        Args:
+            motion: How a drive moves.
+        """
         return motion.a
 
 
 @dataclass(frozen=True)
-class Viscous(DriveTerm):
+class Viscous(MemorylessTerm):
     """Viscous friction, tau = Fv w."""
 
     label = "viscous"
+    speed_law = laws.LINEAR
     units = ("N m s/rad", "N s/m")
     is_nonnegative = True
     usual = (0.5, 4.0)
     dynamics = "damping"
 
-    def _column(self, motion: DriveMotion) -> Array:
-        return motion.v
-
 
 @dataclass(frozen=True)
-class Coulomb(DriveTerm):
+class Coulomb(MemorylessTerm):
     """Coulomb friction, tau = Fc sign(w)."""
 
     label = "coulomb"
@@ -197,12 +90,9 @@ class Coulomb(DriveTerm):
     usual = (0.5, 5.0)
     dynamics = "friction"
 
-    def _column(self, motion: DriveMotion) -> Array:
-        return motion.direction
-
 
 @dataclass(frozen=True)
-class Offset(DriveTerm):
+class Offset(MemorylessTerm):
     """A constant torque: of a sensor's zero, or of Coulomb friction that differs by direction."""
 
     label = "offset"
@@ -211,23 +101,18 @@ class Offset(DriveTerm):
     usual = (-0.3, 0.3)
     part = "offset"
 
-    def _column(self, motion: DriveMotion) -> Array:
-        return np.ones_like(motion.v)
-
 
 @dataclass(frozen=True)
-class Asymmetric(DriveTerm):
+class Asymmetric(MemorylessTerm):
     """Viscous friction that differs by direction, tau = x |w|; of Coulomb's, see ``Offset``."""
 
     label = "asymmetric"
+    speed_law = laws.SIZE
     units = ("N m s/rad", "N s/m")
-
-    def _column(self, motion: DriveMotion) -> Array:
-        return np.abs(motion.v)
 
 
 @dataclass(frozen=True)
-class LoadFriction(DriveTerm):
+class LoadFriction(MemorylessTerm):
     """Coulomb friction that grows with the load of the gear, tau = mu sign(w) |tau_rigid|.
 
     References:
@@ -240,27 +125,23 @@ class LoadFriction(DriveTerm):
     is_nonnegative = True
     highest = 0.5  # a gear that loses more holds what it should lower
     follows_direction = True
+    bears_load = True
     remembers = True
     usual = (0.04, 0.1)
 
-    def _column(self, motion: DriveMotion) -> Array:
-        return motion.direction * np.abs(motion.load)
-
 
 @dataclass(frozen=True)
-class Cubic(DriveTerm):
+class Cubic(MemorylessTerm):
     """Friction that bends with speed, tau = x w^3."""
 
     label = "cubic"
+    speed_law = laws.CUBIC
     units = ("N m s^3/rad^3", "N s^3/m^3")
     guards = "v"
 
-    def _column(self, motion: DriveMotion) -> Array:
-        return motion.v**3
-
 
 @dataclass(frozen=True)
-class Stribeck(DriveTerm):
+class Stribeck(MemorylessTerm):
     """Friction beside Coulomb's that fades with speed, tau = x sign(w) exp(-|w| / w_s).
 
     Above 0 it is Stribeck's hook at low speed; below 0 friction sets in slowly and saturates.
@@ -273,54 +154,57 @@ class Stribeck(DriveTerm):
     speed: float = 0.1
 
     label = "stribeck"
+    speed_law = laws.FADING
+    speed_shape = ("speed", "slowest")
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"speed": _POSITIVE}
     follows_direction = True
     guards = "v"
 
-    def _column(self, motion: DriveMotion) -> Array:
-        speed = np.maximum(np.abs(motion.v), self.seen[0])  # no data say how it goes on to 0
-        return motion.direction * np.exp(-speed / self.speed)
+    @property
+    def slowest(self) -> float:
+        """The speed below which no data show how it goes on to 0."""
+        return self.seen[0]
 
 
 @dataclass(frozen=True)
-class Tanh(DriveTerm):
+class Tanh(MemorylessTerm):
     """Friction that sets in over a speed, tau = x tanh(w / w_t)."""
 
     speed: float = 0.1
 
     label = "tanh"
+    speed_law = laws.TANH
+    speed_shape = ("speed",)
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"speed": _POSITIVE}
     is_nonnegative = True
     guards = "v"
 
-    def _column(self, motion: DriveMotion) -> Array:
-        return np.tanh(motion.v / self.speed)
-
 
 @dataclass(frozen=True)
-class Power(DriveTerm):
+class Power(MemorylessTerm):
     """Friction that grows with a power of the speed, tau = x sign(w) |w|^p."""
 
     exponent: float = 1.0 / 3.0
 
     label = "power"
+    speed_law = laws.POWER
+    speed_shape = ("exponent",)
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"exponent": (0.0, 10.0)}
     units = ("N m (s/rad)^p", "N (s/m)^p")
     follows_direction = True
     guards = "v"
 
-    def _column(self, motion: DriveMotion) -> Array:
-        return motion.direction * np.abs(motion.v) ** self.exponent
-
 
 @dataclass(frozen=True)
-class Ramp(DriveTerm):
+class Ramp(MemorylessTerm):
     """One rise of a monotone piecewise-linear curve: from 0 at one speed to 1 at the next."""
 
     number: int = 1
     low: float = 0.0
     high: float = 1.0
 
+    speed_law = laws.RISE
+    speed_shape = ("low", "high")
     rising: ClassVar[tuple[str, ...]] = ("low", "high")
     is_nonnegative = True
     follows_direction = True
@@ -329,13 +213,9 @@ class Ramp(DriveTerm):
     def name(self) -> str:
         return f"rise{self.number}"
 
-    def _column(self, motion: DriveMotion) -> Array:
-        risen = (np.abs(motion.v) - self.low) / (self.high - self.low)
-        return motion.direction * np.clip(risen, 0.0, 1.0)
-
 
 @dataclass(frozen=True)
-class Harmonic(DriveTerm):
+class Harmonic(MemorylessTerm):
     """A torque that repeats with the angle of joint or motor: cos or sin of ``order`` turns.
 
     With ``order`` the gear ratio, or a multiple of it, the angle is that of the motor.
@@ -344,6 +224,7 @@ class Harmonic(DriveTerm):
     order: float = 1.0
     is_sine: bool = False
 
+    position_shape = ("order",)
     is_shared = False
     guards = "q"
     part = "ripple"
@@ -352,18 +233,21 @@ class Harmonic(DriveTerm):
     def name(self) -> str:
         return f"{'sin' if self.is_sine else 'cos'}{self.order:g}"
 
-    def _column(self, motion: DriveMotion) -> Array:
-        angle = self.order * motion.q
-        return np.sin(angle) if self.is_sine else np.cos(angle)
+    @property
+    def position_law(self) -> int:  # type: ignore[override]
+        """Sine or cosine."""
+        return laws.SINE if self.is_sine else laws.COSINE
 
 
 @dataclass(frozen=True)
-class PositionCoulomb(DriveTerm):
+class PositionCoulomb(MemorylessTerm):
     """Coulomb friction that depends on position, tau = x sign(w) (q - q_0)^k, q_0 mid-range."""
 
     order: int = 1
     centre: float = 0.0
 
+    position_law = laws.POLYNOMIAL
+    position_shape = ("order", "centre")
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"order": (0, 10)}
     follows_direction = True
     is_shared = False
@@ -372,9 +256,6 @@ class PositionCoulomb(DriveTerm):
     @property
     def name(self) -> str:
         return f"coulomb_q{self.order}"
-
-    def _column(self, motion: DriveMotion) -> Array:
-        return motion.direction * (motion.q - self.centre) ** self.order
 
 
 @dataclass(frozen=True)
@@ -388,18 +269,39 @@ class Bristles(DriveTerm):
     follows_direction = True
     remembers = True
 
+    @property
+    def numbers(self) -> tuple[float, float, float]:
+        """Way, speed and excess of ``drive_laws.bristles``."""
+        return self.displacement, 1.0, 0.0
+
     def level(self, v: Array) -> Array:
         """Return g, what z ends at beside its sign, as v.
 
         Args:
             v: Speeds [rad/s or m/s].
         """
-        raise NotImplementedError
+        return laws.bristles(self.numbers, np.zeros_like(v), v)[0]
 
-    def _column(self, motion: DriveMotion) -> Array:
+    def column(self, motion: DriveMotion) -> Array:
+        """Return z along stretches, from sliding where they begin.
+
+        Exact between two samples if v keeps its sign and level there.
+
+        Args:
+            motion: How a drive moves; of instants that do not follow each other z is that of
+                sliding.
+        """
         if motion.begins is None:
             return motion.direction * self.level(motion.v)
-        return _taken_up(motion, self.level, self.displacement)
+        way = np.diff(motion.q, prepend=motion.q[:1])
+        level, _, kept = laws.bristles(self.numbers, way, motion.v)
+        ends, start = np.sign(way) * level, motion.direction * level
+        z, state = np.empty(len(way)), 0.0
+        steps = zip(*(x.tolist() for x in (ends, kept, start, motion.begins)), strict=True)
+        for k, (end, share, first, is_first) in enumerate(steps):
+            state = first if is_first else end + (state - end) * share if share < 1.0 else state
+            z[k] = state
+        return z
 
 
 @dataclass(frozen=True)
@@ -413,9 +315,6 @@ class Presliding(Bristles):
     """
 
     label = "presliding"
-
-    def level(self, v: Array) -> Array:
-        return np.ones_like(v)
 
 
 @dataclass(frozen=True)
@@ -435,45 +334,27 @@ class LuGre(Bristles):
         "displacement": _POSITIVE, "speed": _POSITIVE, "excess": (-0.99, 1e3),
     }  # fmt: skip
 
-    def level(self, v: Array) -> Array:
-        return 1.0 + self.excess * np.exp(-((v / self.speed) ** 2))
-
-
-def _taken_up(motion: DriveMotion, level: Callable[[Array], Array], displacement: float) -> Array:
-    """Return the state z of presliding along stretches, from sliding where they begin.
-
-    Exact between two samples if v keeps its sign and level there.
-    """
-    way = np.diff(motion.q, prepend=motion.q[:1])
-    towards = np.sign(way) * level(motion.v)
-    kept = np.exp(-np.abs(way) / (displacement * level(motion.v)))
-    begins = np.zeros(len(way), dtype=bool) if motion.begins is None else motion.begins
-    start = motion.direction * level(motion.v)
-    z, state = np.empty(len(way)), 0.0
-    steps = zip(towards.tolist(), kept.tolist(), start.tolist(), begins.tolist(), strict=True)
-    for k, (end, share, first, is_first) in enumerate(steps):
-        state = first if is_first else end + (state - end) * share if share < 1.0 else state
-        z[k] = state
-    return z
+    @property
+    def numbers(self) -> tuple[float, float, float]:
+        """Way, speed and excess of ``drive_laws.bristles``."""
+        return self.displacement, self.speed, self.excess
 
 
 @dataclass(frozen=True)
-class Spring(DriveTerm):
+class Spring(MemorylessTerm):
     """A linear spring, tau = k q; the torque at q = 0 is the offset's."""
 
     label = "spring"
+    position_law = laws.LINEAR
     units = ("N m/rad", "N/m")
     is_shared = False
     is_friction = True
     guards = "q"
     part = "spring"
 
-    def _column(self, motion: DriveMotion) -> Array:
-        return motion.q
-
 
 @dataclass(frozen=True)
-class Hat(DriveTerm):
+class Hat(MemorylessTerm):
     """One entry of a tabulated spring: 1 at its position, 0 at its neighbours', linear between."""
 
     number: int = 1
@@ -481,6 +362,8 @@ class Hat(DriveTerm):
     before: float = -1.0
     after: float = 1.0
 
+    position_law = laws.HAT
+    position_shape = ("before", "at", "after")
     rising: ClassVar[tuple[str, ...]] = ("before", "at", "after")
     is_shared = False
     guards = "q"
@@ -490,14 +373,9 @@ class Hat(DriveTerm):
     def name(self) -> str:
         return f"spring{self.number}"
 
-    def _column(self, motion: DriveMotion) -> Array:
-        knots, values = [self.before, self.at, self.after], [0.0, 1.0, 0.0]
-        hat: Array = np.interp(motion.q, knots, values)
-        return hat
-
 
 @dataclass(frozen=True)
-class Counterbalance(DriveTerm):
+class Counterbalance(MemorylessTerm):
     """A spring between two points of stated place, tau = k (L - L_0) dL/dq.
 
     One point turns with the joint at a distance a from its axis, the other stands at a distance b;
@@ -510,19 +388,14 @@ class Counterbalance(DriveTerm):
     rest: float = 0.0
 
     label = "counterbalance"
+    position_law = laws.LEVER
+    position_shape = ("arm", "base", "angle", "rest")
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"arm": _POSITIVE, "base": _POSITIVE}
     units = ("N/m", "N/m")
     is_nonnegative = True
     is_shared = False
     usual = (50.0, 90.0)
     part = "spring"
-
-    def _column(self, motion: DriveMotion) -> Array:
-        turned = motion.q - self.angle
-        length = np.sqrt(self.arm**2 + self.base**2 - 2 * self.arm * self.base * np.cos(turned))
-        change = self.arm * self.base * np.sin(turned) / length
-        column: Array = (length - self.rest) * change
-        return column
 
 
 @dataclass(frozen=True)
@@ -532,11 +405,17 @@ class Lag(DriveTerm):
     label = "lag"
     units = ("s", "s")
     remembers = True
+    is_measured = True
     is_friction = True
     usual = (0.005, 0.02)
     part = "delay"
 
-    def _column(self, motion: DriveMotion) -> Array:
+    def column(self, motion: DriveMotion) -> Array:
+        """Return the change of the whole torque.
+
+        Args:
+            motion: How a drive moves.
+        """
         return -motion.rate
 
 
@@ -548,7 +427,8 @@ TERMS: dict[str, DriveTerm] = {
 DRIVE_TERMS = tuple(TERMS)
 
 
-_CLASSES: dict[str, type[DriveTerm]] = {
+#: The terms that have a shape of their own, or are in no model unless stated, by class.
+TERM_CLASSES: dict[str, type[DriveTerm]] = {
     kind.__name__: kind
     for kind in (
         Asymmetric, LoadFriction, Cubic, Stribeck, Tanh, Power, Ramp, Harmonic, PositionCoulomb,
@@ -557,40 +437,101 @@ _CLASSES: dict[str, type[DriveTerm]] = {
 }  # fmt: skip
 
 
-def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:
-    """Return a term of its plain values, as ``DriveTerm.to_dict`` gives them.
+#: Family of a counterbalance that opposes gravity.
+COUNTERBALANCE = "harmonics1"
+_SPEED = Shape("speed", ("rad/s", "m/s"), (0.005, 0.5), "v")
+_RISE = Shape("speed", ("rad/s", "m/s"), (0.005, 1.0), "v")
+_WAY = Shape("displacement", ("rad", "m"), (0.0005, 0.015), "q")
+_KNOTS = 4  # of a piecewise-linear curve of friction
+_TABLE = 8  # entries of a tabulated spring
 
-    Args:
-        table: Its class under "term", and the fields that are not left as they are.
 
-    Raises:
-        SettingsError: If there is no such term, or a field of it is unknown or no number.
-    """
-    if not isinstance(table, Mapping):
-        raise SettingsError(
-            f"a drive term is {table!r}, wanted a table, as {{ term = 'Stribeck', speed = 0.1 }}"
+def _curve(seen: Seen) -> tuple[DriveTerm, ...]:
+    """Return the rises of a monotone curve over the speeds seen, closer together at low speed."""
+    knots = seen["v"][1] * np.linspace(0.0, 1.0, _KNOTS + 1) ** 2
+    return tuple(
+        Ramp(number=k, low=a, high=b) for k, (a, b) in enumerate(pairwise(knots.tolist()), start=1)
+    )
+
+
+def _table(seen: Seen) -> tuple[DriveTerm, ...]:
+    """Return the entries of a tabulated spring but the middle one, which is the offset's."""
+    knots = np.linspace(*seen["q"], _TABLE + 1).tolist()
+    step = knots[1] - knots[0]
+    return tuple(
+        Hat(seen=seen["q"], number=k, at=x, before=x - step, after=x + step)
+        for k, x in enumerate(knots, start=1)
+        if k != _TABLE // 2 + 1
+    )
+
+
+def _harmonics(highest: int) -> Callable[[Seen], tuple[DriveTerm, ...]]:
+    def make(seen: Seen) -> tuple[DriveTerm, ...]:
+        return tuple(
+            Harmonic(seen=seen["q"], order=float(k), is_sine=is_sine)
+            for k in range(1, highest + 1)
+            for is_sine in (False, True)
         )
-    kind = _CLASSES.get(str(table.get("term")))
-    if kind is None:
-        raise SettingsError(f"term is {table.get('term')!r}, wanted one of {listed(_CLASSES)}")
-    known = {field.name: field.default for field in fields(kind)}
-    values: dict[str, Any] = {}
-    for key, value in table.items():
-        if key == "term":
-            continue
-        if key not in known:
-            raise SettingsError(f"{kind.__name__} has no {key!r}; it has {listed(known)}")
-        values[key] = _read_field(kind, key, value, known[key])
-    return kind(**values)
+
+    return make
 
 
-def _read_field(kind: type[DriveTerm], key: str, value: object, default: object) -> object:
-    if key == "seen":
-        if isinstance(value, Sequence) and len(value) == 2 and all(map(is_number, value)):
-            return (float(value[0]), float(value[1]))
-        raise SettingsError(f"{kind.__name__}: seen is {value!r}, wanted [lowest, highest]")
-    is_flag = isinstance(default, bool)
-    if is_flag is not isinstance(value, bool) or not (is_flag or is_number(value)):
-        wanted = "true or false" if is_flag else "a finite number"
-        raise SettingsError(f"{kind.__name__}: {key} is {value!r}, wanted {wanted}")
-    return type(default)(value)  # type: ignore[call-arg]
+def _once_a_turn() -> tuple[DriveTerm, ...]:
+    """Return cosine and sine of the position: gravity has a part of them, beyond the range, too."""
+    return (Harmonic(), Harmonic(is_sine=True))
+
+
+def _by_position(seen: Seen) -> tuple[DriveTerm, ...]:
+    centre = 0.5 * (seen["q"][0] + seen["q"][1])
+    return tuple(PositionCoulomb(seen=seen["q"], order=k, centre=centre) for k in (1, 2))
+
+
+_OTHER = "friction that is not viscous and Coulomb"
+_SLOW = "raise min_velocity to leave the slow rows out"
+#: What a job's ``friction`` may name beside viscous and Coulomb friction, by name.
+FAMILIES: dict[str, Family] = {
+    family.name: family
+    for family in (
+        Family("load", "friction that grows with the load", lambda seen: (LoadFriction(),),
+               is_automatic=True, code="load_friction", has_size=True),
+        Family("stribeck", f"{_OTHER} but rises towards standstill (Stribeck)",
+               lambda seen, speed: (Stribeck(seen=seen["v"], speed=speed),), (_SPEED,),
+               is_automatic=True, code="friction_shape", tested=((0.05,), (0.2,)),
+               advice=f"{_SLOW[0].upper()}{_SLOW[1:]}"),
+        Family("tanh", f"{_OTHER} but sets in with speed, or a drive that sticks",
+               lambda seen, speed: (Tanh(seen=seen["v"], speed=speed),), (_RISE,),
+               is_automatic=True, code="friction_shape", tested=((0.03,), (0.15,)),
+               advice=f"Set friction_band, or {_SLOW}", is_imitated=True),
+        Family("presliding", "friction that is taken up after each reversal",
+               lambda seen, way: (Presliding(displacement=way),), (_WAY,), is_automatic=True),
+        Family("lag", "a torque that comes late (a delay, an elastic gear)",
+               lambda seen: (Lag(),), is_automatic=True),
+        Family(COUNTERBALANCE, "a torque that repeats once a turn, as a counterbalance's",
+               lambda seen: _once_a_turn(), needs=0.1),
+        Family("harmonics2", "a spring or counterbalance that follows the joint's position",
+               _harmonics(2), needs=0.5, is_automatic=True, code="spring",
+               instead=(COUNTERBALANCE, "spring")),
+        Family("harmonics4",
+               "a torque that repeats with the joint's position (cogging, an eccentric gear)",
+               _harmonics(4), needs=0.5, is_automatic=True, code="position_periodic"),
+        Family("asymmetric", "viscous friction that differs by direction",
+               lambda seen: (Asymmetric(),), is_automatic=True, code="friction_shape",
+               has_size=True),
+        Family("power", f"{_OTHER} but bends with speed, as |v|^(1/3) does",
+               lambda seen, exponent: (Power(seen=seen["v"], exponent=exponent),),
+               (Shape("exponent", ("-", "-"), (0.1, 0.9)),), code="friction_shape",
+               tested=((1.0 / 3.0,),)),
+        Family("cubic", f"{_OTHER} but bends with speed, as v^3 does",
+               lambda seen: (Cubic(seen=seen["v"]),), code="friction_shape"),
+        Family("curve", "friction by a monotone curve over speed", _curve),
+        Family("lugre", "presliding with a hook at low speed",
+               lambda seen, way, speed, excess: (
+                   LuGre(displacement=way, speed=speed, excess=excess),
+               ),
+               (_WAY, _SPEED, Shape("excess", ("-", "-"), (0.01, 3.0)))),
+        Family("position", "Coulomb friction that depends on the position", _by_position),
+        Family("spring", "a spring on the joint", lambda seen: (Spring(seen=seen["q"]),),
+               code="spring", has_size=True),
+        Family("spring_table", "a spring of any curve", _table),
+    )
+}  # fmt: skip

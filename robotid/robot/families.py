@@ -1,198 +1,30 @@
-"""Families of drive terms, which the friction of joints is chosen from, and their shapes."""
+"""What a job says of drives: names of families in ``friction``, terms and families in [drives]."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
-from robotid._settings import require_kind
-from robotid._typing import Array
+from robotid._settings import is_number, require_kind
 from robotid.exceptions import SettingsError
 from robotid.findings import listed, toml_key
-from robotid.robot.drives import (
-    Asymmetric,
-    Cubic,
-    DriveTerm,
-    Harmonic,
-    Hat,
-    Lag,
-    LoadFriction,
-    LuGre,
-    PositionCoulomb,
-    Power,
-    Presliding,
-    Ramp,
-    Spring,
-    Stribeck,
-    Tanh,
-)
+from robotid.robot.drives import FAMILIES, TERM_CLASSES, DriveTerm
 
 __all__ = [
     "AUTO",
-    "COUNTERBALANCE",
-    "FAMILIES",
-    "Family",
-    "Seen",
-    "Shape",
     "drive_line",
     "has_turned",
     "spring_family",
+    "term_from_dict",
     "wanted_families",
 ]
 
 #: What ``friction`` says to have the families of each joint chosen.
 AUTO = "auto"
-#: Family of a counterbalance that opposes gravity.
-COUNTERBALANCE = "harmonics1"
 _OF_MODEL = ("none", "viscous", "coulomb")  # named in ``friction``, and terms of the model
-
-#: Ranges of position "q" and of the size of speed "v" that a fit has seen.
-Seen = Mapping[str, tuple[float, float]]
-
-
-@dataclass(frozen=True)
-class Shape:
-    """A shape parameter that terms are not linear in.
-
-    Attributes:
-        name: Field of the terms that holds it.
-        units: Its unit for a drive that turns, and for one that slides.
-        bounds: Where it is sought, in units of what it is measured by.
-        of: What it is measured by: "v", the largest speed seen, "q", the range seen; "": itself.
-    """
-
-    name: str
-    units: tuple[str, str]
-    bounds: tuple[float, float]
-    of: str = ""
-
-    def within(self, seen: Seen) -> tuple[float, float]:
-        """Return the bounds in the shape's own unit.
-
-        Args:
-            seen: Ranges of position "q" and of the size of speed "v" that the fit has seen.
-        """
-        low, high = self.bounds
-        if not self.of:
-            return low, high
-        first, last = seen[self.of]
-        scale = last if self.of == "v" else last - first
-        return low * scale, high * scale
-
-
-@dataclass(frozen=True)
-class Family:
-    """Terms that come together, with the shape that they share.
-
-    Attributes:
-        name: Its name in a job's ``friction``.
-        meaning: What it is, in words of a finding.
-        make: Returns the terms of the ranges seen and of a shape.
-        shapes: Its shape parameters.
-        needs: What the motion must have seen of the position, in full turns; 0: anything.
-        is_automatic: Whether ``friction = "auto"`` tries it.
-    """
-
-    name: str
-    meaning: str
-    make: Callable[..., tuple[DriveTerm, ...]]
-    shapes: tuple[Shape, ...] = ()
-    needs: float = 0.0
-    is_automatic: bool = False
-
-
-_SPEED = Shape("speed", ("rad/s", "m/s"), (0.005, 0.5), "v")
-_RISE = Shape("speed", ("rad/s", "m/s"), (0.005, 1.0), "v")
-_WAY = Shape("displacement", ("rad", "m"), (0.0005, 0.015), "q")
-_KNOTS = 4  # of a piecewise-linear curve of friction
 _SPARE = 1.1  # times what a family needs of the position, from which it is advised
-_TABLE = 8  # entries of a tabulated spring
-
-
-def _curve(seen: Seen) -> tuple[DriveTerm, ...]:
-    """Return the rises of a monotone curve over the speeds seen, closer together at low speed."""
-    knots = seen["v"][1] * np.linspace(0.0, 1.0, _KNOTS + 1) ** 2
-    return tuple(Ramp(number=k, low=a, high=b) for k, (a, b) in enumerate(_pairs(knots), start=1))
-
-
-def _pairs(knots: Array) -> list[tuple[float, float]]:
-    return list(pairwise(knots.tolist()))
-
-
-def _table(seen: Seen) -> tuple[DriveTerm, ...]:
-    """Return the entries of a tabulated spring but the middle one, which is the offset's."""
-    knots = np.linspace(*seen["q"], _TABLE + 1).tolist()
-    step = knots[1] - knots[0]
-    return tuple(
-        Hat(seen=seen["q"], number=k, at=x, before=x - step, after=x + step)
-        for k, x in enumerate(knots, start=1)
-        if k != _TABLE // 2 + 1
-    )
-
-
-def _harmonics(highest: int) -> Callable[[Seen], tuple[DriveTerm, ...]]:
-    def make(seen: Seen) -> tuple[DriveTerm, ...]:
-        return tuple(
-            Harmonic(seen=seen["q"], order=float(k), is_sine=is_sine)
-            for k in range(1, highest + 1)
-            for is_sine in (False, True)
-        )
-
-    return make
-
-
-def _once_a_turn() -> tuple[DriveTerm, ...]:
-    """Return cosine and sine of the position: gravity has a part of them, beyond the range, too."""
-    return (Harmonic(), Harmonic(is_sine=True))
-
-
-def _by_position(seen: Seen) -> tuple[DriveTerm, ...]:
-    centre = 0.5 * (seen["q"][0] + seen["q"][1])
-    return tuple(PositionCoulomb(seen=seen["q"], order=k, centre=centre) for k in (1, 2))
-
-
-#: What a job's ``friction`` may name beside viscous and Coulomb friction, by name.
-FAMILIES: dict[str, Family] = {
-    family.name: family
-    for family in (
-        Family("load", "friction that grows with the load", lambda seen: (LoadFriction(),),
-               is_automatic=True),
-        Family("stribeck", "friction that changes with speed and levels off",
-               lambda seen, speed: (Stribeck(seen=seen["v"], speed=speed),), (_SPEED,),
-               is_automatic=True),
-        Family("tanh", "friction that sets in with speed",
-               lambda seen, speed: (Tanh(seen=seen["v"], speed=speed),), (_RISE,),
-               is_automatic=True),
-        Family("presliding", "friction that is taken up after each reversal",
-               lambda seen, way: (Presliding(displacement=way),), (_WAY,), is_automatic=True),
-        Family("lag", "a torque that comes late (a delay, an elastic gear)",
-               lambda seen: (Lag(),), is_automatic=True),
-        Family(COUNTERBALANCE, "a torque that repeats once a turn, as a counterbalance's",
-               lambda seen: _once_a_turn(), needs=0.1),
-        Family("harmonics2", "a torque that repeats once and twice a turn", _harmonics(2),
-               needs=0.5, is_automatic=True),
-        Family("harmonics4", "a torque that repeats one to four times a turn", _harmonics(4),
-               needs=0.5, is_automatic=True),
-        Family("asymmetric", "viscous friction that differs by direction",
-               lambda seen: (Asymmetric(),), is_automatic=True),
-        Family("power", "friction that bends with speed",
-               lambda seen, exponent: (Power(seen=seen["v"], exponent=exponent),),
-               (Shape("exponent", ("-", "-"), (0.1, 0.9)),)),
-        Family("cubic", "friction that grows with the cube of the speed",
-               lambda seen: (Cubic(seen=seen["v"]),)),
-        Family("curve", "friction by a monotone curve over speed", _curve),
-        Family("lugre", "presliding with a hook at low speed",
-               lambda seen, way, speed, excess: (
-                   LuGre(displacement=way, speed=speed, excess=excess),
-               ),
-               (_WAY, _SPEED, Shape("excess", ("-", "-"), (0.01, 3.0)))),
-        Family("position", "Coulomb friction that depends on the position", _by_position),
-        Family("spring", "a linear spring", lambda seen: (Spring(seen=seen["q"]),)),
-        Family("spring_table", "a spring of any curve", _table),
-    )
-}  # fmt: skip
 
 
 def spring_family(turned: float, *families: str) -> str:
@@ -269,3 +101,42 @@ def wanted_families(
             )
         wanted[joint] = None if names == AUTO else tuple(own)
     return wanted
+
+
+def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:
+    """Return a term of its plain values, as ``DriveTerm.to_dict`` gives them.
+
+    Args:
+        table: Its class under "term", and the fields that are not left as they are.
+
+    Raises:
+        SettingsError: If there is no such term, or a field of it is unknown or no number.
+    """
+    if not isinstance(table, Mapping):
+        raise SettingsError(
+            f"a drive term is {table!r}, wanted a table, as {{ term = 'Stribeck', speed = 0.1 }}"
+        )
+    kind = TERM_CLASSES.get(str(table.get("term")))
+    if kind is None:
+        raise SettingsError(f"term is {table.get('term')!r}, wanted one of {listed(TERM_CLASSES)}")
+    known = {field.name: field.default for field in fields(kind)}
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        if key == "term":
+            continue
+        if key not in known:
+            raise SettingsError(f"{kind.__name__} has no {key!r}; it has {listed(known)}")
+        values[key] = _read_field(kind, key, value, known[key])
+    return kind(**values)
+
+
+def _read_field(kind: type[DriveTerm], key: str, value: object, default: object) -> object:
+    if key == "seen":
+        if isinstance(value, Sequence) and len(value) == 2 and all(map(is_number, value)):
+            return (float(value[0]), float(value[1]))
+        raise SettingsError(f"{kind.__name__}: seen is {value!r}, wanted [lowest, highest]")
+    is_flag = isinstance(default, bool)
+    if is_flag is not isinstance(value, bool) or not (is_flag or is_number(value)):
+        wanted = "true or false" if is_flag else "a finite number"
+        raise SettingsError(f"{kind.__name__}: {key} is {value!r}, wanted {wanted}")
+    return type(default)(value)  # type: ignore[call-arg]

@@ -1,66 +1,69 @@
 """Laws of drives for roll-outs, with their derivatives, in Numba: friction, and position control.
 
-Imported only where the extra ``fast`` is installed. ``drives`` states what the terms mean.
+Imported only where the extra ``fast`` is installed. ``drive_laws`` states the laws.
 """
 
 import math
 
 from robotid.regressor.lanes import compiled
+from robotid.robot import drive_laws
+from robotid.robot.drive_laws import CONSTANT, PLAIN
 
-__all__ = ["BRISTLES", "LOAD", "loop_torque", "taken_up", "term"]
+__all__ = ["loop_torque", "slid", "taken_up", "term", "turned"]
 
-LOAD = 9  # code of the term that multiplies the load of the gear
-BRISTLES = 10  # code of terms that are taken up over a way
 _SIGN = 1e-5  # [rad/s or m/s]: the speed over which friction turns
 
-
-@compiled
-def term(code, shape, q, u):
-    """Return what a term's parameter multiplies, and its derivatives by speed and position."""
-    x0, x1 = shape[0], shape[1]
-    root = math.sqrt(u * u + _SIGN * _SIGN)
-    s, s_u = u / root, _SIGN * _SIGN / (root * root * root)
-    y, y_u, y_q = 1.0, 0.0, 0.0  # code 2: offset
-    if code == LOAD or code == 1:  # coulomb, and what multiplies the load
-        y, y_u = s, s_u
-    elif code == 0:  # viscous
-        y, y_u = u, 1.0
-    elif code == 3:  # coulomb times a power of the position
-        seen = min(max(q, shape[2]), shape[3])  # beyond what the fit has seen it stays as it is
-        p = (seen - x1) ** (x0 - 1.0)
-        y, y_u = s * p * (seen - x1), s_u * p * (seen - x1)
-        y_q = s * x0 * p if seen == q else 0.0
-    elif code == 4:  # stribeck, x0 the speed
-        e = math.exp(-(root - _SIGN) / x0)
-        y, y_u = s * e, (s_u - s * s / x0) * e
-    elif code == 5:  # asymmetric
-        y, y_u = root, s
-    elif code == 6:  # cubic
-        y, y_u = u * u * u, 3.0 * u * u
-    elif code == 7:  # tanh, x0 the speed
-        y = math.tanh(u / x0)
-        y_u = (1.0 - y * y) / x0
-    elif code == 8:  # a harmonic of order x0, from phase x1
-        y, y_q = math.cos(x0 * q - x1), -x0 * math.sin(x0 * q - x1)
-    elif code == BRISTLES:  # of their own state
-        y = 0.0
-    return y, y_u, y_q
+_law = compiled(drive_laws.law)
+_bristles = compiled(drive_laws.bristles)
 
 
 @compiled
-def taken_up(shape, before, u, span):
-    """Return z after a time at the speed u, and its derivatives by u and by z before.
+def term(codes, shapes, k, q, u, s, s_u):
+    """Return what a term's parameter multiplies, and its derivatives by speed and position.
 
-    dz/dt = (u - |u| z / g(u)) / s_0, g = 1 + c exp(-(u / w)^2); see ``drives.Bristles``.
+    ``s`` and ``s_u`` are of ``turned``; the load of the gear is left out.
     """
-    w, extra = shape[1], shape[2] * math.exp(-((u / shape[1]) ** 2))
-    g, g_u = 1.0 + extra, -2.0 * u / (w * w) * extra
+    by_speed, by_position, kind = codes[k, 0], codes[k, 1], codes[k, 2]
+    x, a, a_u, b, b_q = shapes[k], 1.0, 0.0, 1.0, 0.0
+    if by_speed != CONSTANT:
+        w = min(max(u, -x[8]), x[8])  # beyond what was seen it stays as it is
+        a, a_u = _law(by_speed, x[0], x[1], x[2], x[3], w)
+        a_u = a_u if w == u else 0.0
+    if by_position != CONSTANT:
+        p = min(max(q, x[9]), x[10])
+        b, b_q = _law(by_position, x[4], x[5], x[6], x[7], p)
+        b_q = b_q if p == q else 0.0
+    if kind == PLAIN:
+        return a * b, a_u * b, a * b_q
+    return s * a * b, (s_u * a + s * a_u) * b, s * a * b_q
+
+
+@compiled
+def turned(u, over=_SIGN):
+    """Return the direction of friction, which turns over a speed, and its derivative."""
+    root = math.sqrt(u * u + over * over)
+    return u / root, over * over / (root * root * root)
+
+
+@compiled
+def taken_up(x, before, u, span):
+    """Return z after a time at the speed u, and its derivatives by u and by z before."""
+    g, g_u, kept = _bristles(x, span * u, u)
     s = 1.0 if u > 0.0 or (u == 0.0 and before < 0.0) else -1.0  # at rest, of the stiffer side
-    way = span / (shape[0] * g)
-    kept = math.exp(-s * u * way)
-    kept_u = -kept * s * way * (1.0 - u * g_u / g)
+    kept_u = -kept * s * span / (x[0] * g) * (1.0 - u * g_u / g)
     z_u = s * g_u * (1.0 - kept) + (before - s * g) * kept_u
     return s * g + (before - s * g) * kept, z_u, kept
+
+
+@compiled
+def slid(x, v, time):
+    """Return z of a drive that has moved for a time, and its derivative by the speed v.
+
+    It is that of long sliding, but of one that takes longer to go its way.
+    """
+    g, g_v, _ = _bristles(x, 0.0, v)
+    s, s_v = turned(v, x[0] / time)
+    return s * g, s_v * g + s * g_v
 
 
 @compiled

@@ -25,37 +25,32 @@ which change at ticks alone.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from robotid.regressor.lanes import compiled
+from robotid._typing import Array
+from robotid.regressor.lanes import Work, compiled, factor, get, put, put3, solve, work_space
 from robotid.regressor.tree_lanes import (
+    ACCELERATION,
     BODY,
-    GRAVITY,
-    LANES,
     derivatives,
-    factor,
-    get,
     inertial_column,
     inverse_dynamics,
     mass_matrix,
     place,
-    put,
-    put3,
-    solve,
 )
-from robotid.simulation.law_lanes import BRISTLES, LOAD, loop_torque, taken_up, term
+from robotid.robot.drive_laws import BRISTLES, LOADED
+from robotid.simulation.law_lanes import loop_torque, slid, taken_up, term, turned
 
 __all__ = [
     "ARMATURE",
-    "BRISTLES",
     "INERTIAL",
     "KD",
     "KP",
     "LANES",
     "LATE",
     "LIMIT",
-    "LOAD",
     "SPEED",
     "START",
     "TERM",
@@ -63,9 +58,11 @@ __all__ = [
     "average_command",
     "divide_rows",
     "roll_out",
-    "work_size",
+    "work_of",
 ]
 
+_DOUBLINGS = 3  # of lanes
+LANES = 1 << _DOUBLINGS
 THETA = 0.5  # of a step, where its forces act: exact to second order
 _SLID = 0.1  # [s] for which drives are taken to have moved before a roll-out begins
 _NEWTON = 60  # steps, of which three or four are usual
@@ -75,8 +72,73 @@ _CLOSE = 1e-12  # of the speed, relative to 1 + its size
 ARMATURE, KP, KD, LIMIT, TERM, LATE, ZERO, INERTIAL, START, SPEED = range(10)
 
 
-def work_size(joints: int, columns: int, memories: int) -> int:
-    """Return the number of entries of the work space.
+class Terms(NamedTuple):
+    """Friction and offset of the joints: T terms, joint by joint.
+
+    Attributes:
+        codes: Law of speed, law of position and kind of each, shape (T, 3), int.
+        shapes: Numbers of its laws, or those of bristles and its number among them, shape (T, 11).
+        values: Its parameter, shape (T,).
+        spans: Where the terms of a joint begin, where those do that are bristles or are in the
+            drives' numbers, and where they end, shape (n, 3), int.
+    """
+
+    codes: Array
+    shapes: Array
+    values: Array
+    spans: Array
+
+
+class Columns(NamedTuple):
+    """What roll-outs are differentiated by.
+
+    Attributes:
+        kinds: Kind, joint and index of each sensitivity, shape (P, 3), int.
+        directions: Changes of a body's ten parameters, shape (D, 10).
+    """
+
+    kinds: Array
+    directions: Array
+
+
+class Course(NamedTuple):
+    """What roll-outs are told, step by step.
+
+    Attributes:
+        command: Position, its derivative by the delay, speed, torque, and the derivatives of speed
+            and torque by the delay, on average over each step, or those of its tick, shape
+            (K, n, 6, LANES).
+        steps: Length of each step, shape (K, LANES) [s].
+        ticks: Where the controllers have a tick as the step begins, shape (K, LANES), bool, all at
+            the first; of no entries if they have no clock.
+        every: Steps from a sample to the next.
+        start: Positions and speeds, shape (2, n, LANES).
+    """
+
+    command: Array
+    steps: Array
+    ticks: Array
+    every: int
+    start: Array
+
+
+class Motion(NamedTuple):
+    """What comes out, at N samples.
+
+    Attributes:
+        q: Positions, shape (N, n, LANES).
+        v: Speeds, likewise.
+        S: Sensitivities of position, shape (N, n, P, LANES), or of position and then of speed,
+            shape (N, 2n, P, LANES).
+    """
+
+    q: Array
+    v: Array
+    S: Array
+
+
+def work_of(joints: int, columns: int, memories: int) -> Work:
+    """Return a new work space.
 
     Args:
         joints: Number of joints.
@@ -85,7 +147,7 @@ def work_size(joints: int, columns: int, memories: int) -> int:
     """
     n = joints
     own = (n + 1) * BODY + 4 * n * n + 16 * n + 3 * n * columns
-    return LANES * (own + memories * (5 + columns))
+    return work_space(own + memories * (5 + columns), _DOUBLINGS)
 
 
 @compiled
@@ -96,7 +158,7 @@ def _balance(work, n, at, drives, terms, step, command):
     load multiplies the bodies' torque tau: so H stays symmetric.
     """
     q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip = at
-    codes, shapes, values, first = terms
+    codes, shapes, values, spans = terms
     if memory >= 0:
         _hold_on(work, n, at, terms, step)
     for i in range(n):
@@ -109,17 +171,21 @@ def _balance(work, n, at, drives, terms, step, command):
                 put(work, load + i, lane, get(work, load + i, lane) + m * moved)
                 put(work, H + i * n + j, lane, m)
         armature, kp, kd = drives[i, 0], drives[i, 1], drives[i, 2]
+        offset, viscous, coulomb = drives[i, 4], drives[i, 5], drives[i, 6]
         for lane in range(LANES):
             span, tau = THETA * step[lane], get(work, load + i, lane)
             speed, angle = get(work, u + i, lane), get(work, middle + i, lane)
-            f, f_u = get(work, grip + i, lane), get(work, grip + n + i, lane)
+            s, s_u = turned(speed)
+            f = get(work, grip + i, lane) + offset + viscous * speed + coulomb * s
+            f_u = get(work, grip + n + i, lane) + viscous + coulomb * s_u
             f_q, e, e_u = 0.0, 1.0, 0.0
-            for k in range(first[i], first[i + 1]):
-                y, y_u, y_q = term(codes[k], shapes[k], angle, speed)
-                if codes[k] == LOAD:
+            for k in range(spans[i, 0], spans[i, 1]):
+                y, y_u, y_q = term(codes, shapes, k, angle, speed, s, s_u)
+                if codes[k, 2] == LOADED:
                     side = math.copysign(values[k], tau)
                     e += side * y
                     e_u += side * y_u
+                    f_q += side * y_q * tau
                 else:
                     f += values[k] * y
                     f_u += values[k] * y_u
@@ -144,12 +210,12 @@ def _balance(work, n, at, drives, terms, step, command):
 def _hold_on(work, n, at, terms, step):
     """Write the friction of memories for the speeds u, and its derivative."""
     u, memory, grip = at[2], at[13], at[14]
-    codes, shapes, values, first = terms
+    codes, shapes, values, spans = terms
     for i in range(n):
         for lane in range(LANES):
             speed, f, f_u = get(work, u + i, lane), 0.0, 0.0
-            for k in range(first[i], first[i + 1]):
-                if codes[k] == BRISTLES:
+            for k in range(spans[i, 0], spans[i, 2]):
+                if codes[k, 2] == BRISTLES:
                     before = get(work, memory + 5 * int(shapes[k, 3]), lane)
                     z, z_u, _ = taken_up(shapes[k], before, speed, THETA * step[lane])
                     f += values[k] * z
@@ -172,7 +238,7 @@ def _newton(work, n, at, drives, terms, step, command):
         factor(work, n, H)
         if is_found:
             return True
-        solve(work, n, H, G, 1)
+        solve(work, n, H, G)
         is_found = True
         for i in range(n):
             for lane in range(LANES):
@@ -198,33 +264,34 @@ def _advance(work, n, at, step):
 
 
 @compiled
-def _centre(work, n, at, step, parents, joints, bodies, zeros, a):
+def _centre(work, n, at, step, tree, bodies, zeros, a):
     """Write M and h of the middle of the step, where the speeds of a solution lead to."""
     q, u, middle, h, M = at[0], at[2], at[3], at[4], at[5]
     for i in range(n):
         for lane in range(LANES):
             ahead = THETA * step[lane] * get(work, u + i, lane)
             put(work, middle + i, lane, get(work, q + i, lane) + ahead)
-        place(work, (i + 1) * BODY, joints[i], middle + i, zeros[i])
-    inverse_dynamics(work, parents, joints, bodies, u, a, h)
-    mass_matrix(work, parents, joints, bodies, M)
+        place(work, (i + 1) * BODY, tree.joints[i], middle + i, zeros[i])
+    inverse_dynamics(work, tree, bodies, u, a, h)
+    mass_matrix(work, tree, bodies, M)
 
 
 @compiled
-def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, parents, joints, works):
+def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, tree):
     """Advance the sensitivities S of q and v, shape (2n, P), over a step that is solved."""
     q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip = at
     T_q, T_v, S, own, change, by_hold, by_memory = sweeps
-    codes, shapes, values, first = terms
-    P = len(columns)
+    codes, shapes, values, spans = terms
+    kinds, directions = columns
+    P = len(kinds)
     _combine(work, n, at, sweeps, drives, step)
     for p in range(P):
-        kind, j, index = columns[p, 0], columns[p, 1], columns[p, 2]
+        kind, j, index = kinds[p, 0], kinds[p, 1], kinds[p, 2]
         for i in range(n):
             for lane in range(LANES):
                 put(work, own + i, lane, 0.0)
         if kind == INERTIAL:
-            inertial_column(work, parents, joints, works, j, index, own)
+            inertial_column(work, tree, directions[index], j, own)
         elif kind == ZERO:  # what position does but for gain and friction
             for i in range(n):
                 for lane in range(LANES):
@@ -239,11 +306,12 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, paren
                 span, speed, x = THETA * step[lane], get(work, u + j, lane), 0.0
                 if kind == ARMATURE:
                     x = (speed - get(work, v + j, lane)) / span
-                elif kind == TERM and codes[index] == BRISTLES:
+                elif kind == TERM and codes[index, 2] == BRISTLES:
                     x = get(work, memory + 5 * int(shapes[index, 3]) + 1, lane)
                 elif kind == TERM:
-                    x, _, _ = term(codes[index], shapes[index], get(work, middle + j, lane), speed)
-                    x *= abs(get(work, load + j, lane)) if codes[index] == LOAD else 1.0
+                    angle, (s, s_u) = get(work, middle + j, lane), turned(speed)
+                    x, _, _ = term(codes, shapes, index, angle, speed, s, s_u)
+                    x *= abs(get(work, load + j, lane)) if codes[index, 2] == LOADED else 1.0
                 elif held < 0:
                     reach = command[j, 0, lane] - get(work, q + j, lane) - span * speed
                     slip = command[j, 2, lane] - speed
@@ -270,10 +338,10 @@ def _remember(work, n, at, terms, step):
     These are of what acts by z before, of z after by the speed u, and by z before.
     """
     u, memory = at[2], at[13]
-    codes, shapes, values, first = terms
+    codes, shapes, values, spans = terms
     for i in range(n):
-        for k in range(first[i], first[i + 1]):
-            if codes[k] == BRISTLES:
+        for k in range(spans[i, 0], spans[i, 2]):
+            if codes[k, 2] == BRISTLES:
                 z = memory + 5 * int(shapes[k, 3])
                 for lane in range(LANES):
                     speed, before = get(work, u + i, lane), get(work, z, lane)
@@ -291,20 +359,15 @@ def _slide(work, n, at, by_memory, columns, terms):
     It is that of long sliding, but for joints that take longer than ``_SLID`` to go their way.
     """
     v, memory = at[1], at[13]
-    codes, shapes, values, first = terms
+    codes, shapes, values, spans = terms
     for i in range(n):
-        for k in range(first[i], first[i + 1]):
-            if codes[k] != BRISTLES:
+        for k in range(spans[i, 0], spans[i, 2]):
+            if codes[k, 2] != BRISTLES:
                 continue
             slot, P = int(shapes[k, 3]), len(columns)
             for lane in range(LANES):
-                speed = get(work, v + i, lane)
-                extra = shapes[k, 2] * math.exp(-((speed / shapes[k, 1]) ** 2))
-                slow = shapes[k, 0] / _SLID
-                root = math.sqrt(speed * speed + slow * slow)
-                put(work, memory + 5 * slot, lane, speed / root * (1.0 + extra))
-                by_speed = slow * slow / root**3 * (1.0 + extra)
-                by_speed -= 2.0 * speed * speed / (root * shapes[k, 1] ** 2) * extra
+                z, by_speed = slid(shapes[k], get(work, v + i, lane), _SLID)
+                put(work, memory + 5 * slot, lane, z)
                 for p in range(P):
                     if columns[p, 0] == SPEED and columns[p, 1] == i:
                         put(work, by_memory + slot * P + p, lane, by_speed)
@@ -315,10 +378,10 @@ def _recall(work, n, at, sweeps, terms, p, P, is_after):
     """Add to one column what memories make of their past; after the step, advance theirs."""
     loss, memory = at[11], at[13]
     own, change, by_memory = sweeps[3], sweeps[4], sweeps[6]
-    codes, shapes, values, first = terms
+    codes, shapes, values, spans = terms
     for i in range(n):
-        for k in range(first[i], first[i + 1]):
-            if codes[k] != BRISTLES:
+        for k in range(spans[i, 0], spans[i, 2]):
+            if codes[k, 2] != BRISTLES:
                 continue
             slot = int(shapes[k, 3])
             z, Z = memory + 5 * slot, by_memory + slot * P + p
@@ -406,7 +469,7 @@ def _advance_column(work, n, at, sweeps, step, p, P):
                 x = get(work, T_v + i * n + j, lane) * get(work, S + (n + j) * P + p, lane)
                 x -= get(work, T_q + i * n + j, lane) * get(work, S + j * P + p, lane)
                 put(work, change + i, lane, get(work, change + i, lane) + x)
-    solve(work, n, H, change, 1)
+    solve(work, n, H, change)
     for i in range(n):
         for lane in range(LANES):
             du, dv = get(work, change + i, lane), get(work, S + (n + i) * P + p, lane)
@@ -416,94 +479,76 @@ def _advance_column(work, n, at, sweeps, step, p, P):
 
 
 @compiled
-def _begin(work, n, at, sweeps, columns, terms, gravity, start, out_S):
+def _begin(work, n, at, sweeps, kinds, terms, gravity, start, out_S):
     """Write where roll-outs begin, and how that changes with itself."""
-    q, v, u, S, P = at[0], at[1], at[2], sweeps[2], len(columns)
+    q, v, u, S, P = at[0], at[1], at[2], sweeps[2], len(kinds)
     for lane in range(LANES):
         for k in range(3):
-            put(work, GRAVITY + k, lane, -gravity[k])
+            put(work, ACCELERATION + k, lane, -gravity[k])
         for i in range(n):
             put(work, q + i, lane, start[0, i, lane])
             put(work, v + i, lane, start[1, i, lane])
             put(work, u + i, lane, start[1, i, lane])
         for p in range(P):
-            if columns[p, 0] == START or columns[p, 0] == SPEED:
-                row = columns[p, 1] + (n if columns[p, 0] == SPEED else 0)
+            if kinds[p, 0] == START or kinds[p, 0] == SPEED:
+                row = kinds[p, 1] + (n if kinds[p, 0] == SPEED else 0)
                 put(work, S + row * P + p, lane, 1.0)
                 if row < out_S.shape[1]:
                     out_S[0, row, p, lane] = 1.0
     if at[13] >= 0:
-        _slide(work, n, at, sweeps[6], columns, terms)
+        _slide(work, n, at, sweeps[6], kinds, terms)
 
 
 @compiled
-def roll_out(
-    parents, joints, zeros, bodies, is_below, gravity, drives, codes, shapes, values, first,
-    columns, directions, command, steps, ticks, every, start, out_q, out_v, out_S, work, corrects,
-):  # fmt: skip
+def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, corrects):
     """Roll out a block of lanes; return the first step that had no solution, -1 if all had.
 
     Args:
-        parents: Parent of each joint, shape (n,), int; -1: the world.
-        joints: Constants of each joint, as of ``regressor.compiled``, shape (n, 41).
+        tree: The n joints, in the order of their bodies.
         zeros: Angle of the URDF where an encoder reads 0, shape (n,) [rad or m].
         bodies: Ten inertial parameters of each joint's body, shape (n, 10).
-        is_below: Whether joint k carries body i, itself included, shape (n, n), bool, [i, k].
-        gravity: Shape (3,) [m/s^2].
-        drives: Armature, kp, kd and largest torque of each joint, shape (n, 4).
-        codes: Kind of each term of friction, shape (T,), int.
-        shapes: What shapes it, two numbers and the range of positions seen, shape (T, 4); way,
-            speed and excess of a term that is taken up, and its number among those.
-        values: Its parameter, shape (T,).
-        first: Where the terms of a joint begin, shape (n + 1,), int.
-        columns: Kind, joint and index of each sensitivity, shape (P, 3), int.
-        directions: Changes of a body's parameters, shape (D, 10).
-        command: Position, its derivative by the delay, speed, torque, and the derivatives of speed
-            and torque by the delay, on average over each step, or those of its tick, shape
-            (K, n, 6, LANES).
-        steps: Length of each step, shape (K, LANES) [s].
-        ticks: Where the controllers have a tick as the step begins, shape (K, LANES), bool, all at
-            the first; of no entries if they have no clock.
-        every: Steps from a sample to the next.
-        start: Positions and speeds, shape (2, n, LANES).
-        out_q: Positions of the samples, shape (N, n, LANES); written.
-        out_v: Speeds, likewise; written.
-        out_S: Sensitivities of position, shape (N, n, P, LANES), or of position and then of speed,
-            shape (N, 2n, P, LANES); written.
-        work: Work space of ``work_size``.
+        drives: Armature, kp, kd and largest torque of each joint, and the sums of its parameters of
+            1, the speed and its direction, shape (n, 7).
+        terms: ``Terms`` of the drives.
+        columns: ``Columns`` of sensitivities.
+        course: ``Course`` of what is told.
+        out: ``Motion``; written.
+        work: Work space of ``work_of``.
         corrects: Whether each step is solved once more, at its middle; without columns alone.
     """
-    n, P = len(parents), len(columns)
+    command, steps, ticks, every, start = course
+    out_q, out_v, out_S = out
+    codes, kinds = terms.codes, columns.kinds
+    n, P = len(tree.parents), len(kinds)
     q = (n + 1) * BODY
     v, u, middle, h, a = q + n, q + 2 * n, q + 3 * n, q + 4 * n, q + 5 * n
     G, by_q, gains, own, change = a + n, a + 2 * n, a + 3 * n, a + 4 * n, a + 5 * n
     load, loss, M = change + n, change + 2 * n, change + 3 * n
     H, T_q, T_v, S = M + n * n, M + 2 * n * n, M + 3 * n * n, M + 4 * n * n
     by_hold, held = S + 2 * n * P, S + 3 * n * P if len(ticks) else -1
-    memories = (codes == BRISTLES).sum()
+    memories = (codes[:, 2] == BRISTLES).sum()
     grip = S + (3 * P + 1) * n
     memory, by_memory = grip + 2 * n if memories else -1, grip + 2 * n + 5 * memories
     at = (q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip)
     sweeps = (T_q, T_v, S, own, change, by_hold, by_memory)
-    terms = (codes, shapes, values, first)
-    work[:] = 0.0
-    _begin(work, n, at, sweeps, columns, terms, gravity, start, out_S)
+    work.numbers[:] = 0.0
+    _begin(work, n, at, sweeps, kinds, terms, tree.gravity, start, out_S)
     for k in range(len(steps)):
         step = steps[k]
         if held >= 0 and ticks[k].any():
-            _hold(work, n, at, sweeps, columns, drives, command[k], ticks[k])
+            _hold(work, n, at, sweeps, kinds, drives, command[k], ticks[k])
         for i in range(n):
             for lane in range(LANES):
                 ahead = THETA * step[lane] * get(work, v + i, lane)
                 put(work, middle + i, lane, get(work, q + i, lane) + ahead)
                 put(work, a + i, lane, 0.0)
-            place(work, (i + 1) * BODY, joints[i], middle + i, zeros[i])
-        inverse_dynamics(work, parents, joints, bodies, v, a, h)
-        mass_matrix(work, parents, joints, bodies, M)
+            place(work, (i + 1) * BODY, tree.joints[i], middle + i, zeros[i])
+        inverse_dynamics(work, tree, bodies, v, a, h)
+        mass_matrix(work, tree, bodies, M)
         if not _newton(work, n, at, drives, terms, step, command[k]):
             return k
         if corrects:
-            _centre(work, n, at, step, parents, joints, bodies, zeros, a)
+            _centre(work, n, at, step, tree, bodies, zeros, a)
             if not _newton(work, n, at, drives, terms, step, command[k]):
                 return k
         if memory >= 0:
@@ -513,13 +558,9 @@ def roll_out(
                 for lane in range(LANES):
                     moved = get(work, u + i, lane) - get(work, v + i, lane)
                     put(work, a + i, lane, moved / (THETA * step[lane]))
-            inverse_dynamics(work, parents, joints, bodies, v, a, h)
-            derivatives(work, parents, joints, bodies, is_below, v, T_q, False)
-            derivatives(work, parents, joints, bodies, is_below, v, T_v, True)
-            _propagate(
-                work, n, at, sweeps, columns, drives, terms, step, command[k], parents, joints,
-                directions,
-            )  # fmt: skip
+            inverse_dynamics(work, tree, bodies, v, a, h)
+            derivatives(work, tree, bodies, v, T_q)  # and T_v behind it
+            _propagate(work, n, at, sweeps, columns, drives, terms, step, command[k], tree)
         _advance(work, n, at, step)
         if (k + 1) % every == 0:
             sample = (k + 1) // every

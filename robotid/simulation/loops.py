@@ -12,34 +12,33 @@ from functools import cached_property
 from itertools import pairwise
 from os import cpu_count
 from types import ModuleType
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from robotid._typing import Array
-from robotid.exceptions import MissingDependencyError, NotConvergedError, SettingsError
+from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.findings import listed
 from robotid.logs.data import Log
-from robotid.regressor.compiled import Tree, flatten, is_installed, why_not
-from robotid.robot.drives import (
-    Asymmetric,
-    Coulomb,
-    Cubic,
-    DriveTerm,
-    Harmonic,
-    LoadFriction,
-    LuGre,
-    Offset,
-    PositionCoulomb,
-    Presliding,
-    Stribeck,
-    Tanh,
-    Viscous,
-)
+from robotid.regressor.compiled import Tree, flatten, why_not
+from robotid.robot.drive_laws import BRISTLES, CONSTANT
+from robotid.robot.drives import Bristles, DriveTerm, MemorylessTerm
 from robotid.robot.mass_matrix import rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
-__all__ = ["Column", "LoopedRobot", "Loops", "RollOut", "Window", "cut_windows", "open_loops"]
+if TYPE_CHECKING:
+    from robotid.simulation.loop_lanes import Course
+
+__all__ = [
+    "Column",
+    "LoopedRobot",
+    "Loops",
+    "RollOut",
+    "Window",
+    "coded_term",
+    "cut_windows",
+    "open_loops",
+]
 
 #: Kind, joint and index of what a roll-out is differentiated by; see ``loop_lanes``.
 Column: TypeAlias = tuple[int, int, int]
@@ -50,10 +49,6 @@ _FEWEST = 2  # samples on each side for it
 _SHORT = 0.5  # of a window: a rest of that size joins the window before it
 _SAME = 1e-3  # of a tick, by which it may be off a row that is sent at it
 _FASTEST = 1e6  # [rad/s or m/s] of a joint whose held loop runs away
-_CODES: dict[type[DriveTerm], int] = {
-    Viscous: 0, Coulomb: 1, Offset: 2, PositionCoulomb: 3, Stribeck: 4, Asymmetric: 5, Cubic: 6,
-    Tanh: 7, Harmonic: 8, LoadFriction: 9, Presliding: 10, LuGre: 10,
-}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,9 +220,7 @@ class _Part:
 
     joints: Array  # rows of its joints in the model, (k,)
     bodies: Array  # their bodies in the layout, (k,)
-    parents: Array
-    constants: Array
-    is_below: Array
+    tree: Tree
 
 
 class LoopedRobot:
@@ -242,12 +235,9 @@ class LoopedRobot:
             corrects: Whether each step is solved once more, at its middle; it has no derivatives.
 
         Raises:
-            MissingDependencyError: If Numba is not installed.
             SettingsError: If the robot floats, a drive turns with several joints, or a joint is of
                 a kind that is not compiled.
         """
-        if not is_installed():
-            raise MissingDependencyError("rolling out closed loops", "numba", "fast")
         if model.free_flyer or model.layout.couplings or model.mimic == "coupled":
             raise SettingsError(
                 f"{model.name}: a floating base, drives that turn with several joints and coupled "
@@ -258,7 +248,6 @@ class LoopedRobot:
             raise SettingsError(f"{model.name} cannot be rolled out: {why}")
         self.model, self.step, self.corrects = model, step, corrects
         self._parts = _parts(flatten(model))
-        self._gravity = np.array(model.pin_model.gravity.linear)
 
     @property
     def kinds(self) -> dict[str, int]:
@@ -355,35 +344,33 @@ class LoopedRobot:
         columns_of = np.flatnonzero(np.isin(wanted[:, 1], own))
         columns = wanted[columns_of]
         columns[:, 1] = [np.flatnonzero(own == j)[0] for j in columns[:, 1]]
-        terms = [term for j in own for term in loops.terms[j]]
-        first = np.cumsum([0, *(len(loops.terms[j]) for j in own)])
-        begins = np.cumsum([0, *map(len, loops.terms)])
-        places = np.concatenate([np.arange(begins[j], begins[j + 1]) for j in own]).astype(int)
+        places, spans, affine = _arranged(loops, own)
         is_term = columns[:, 0] == lanes.TERM
         columns[is_term, 2] = [np.flatnonzero(places == k)[0] for k in columns[is_term, 2]]
-        coded = [_coded(term) for term in terms]
-        codes = np.array([code for code, *_ in coded], dtype=np.int64)
-        shapes = np.array([shape for _, *shape in coded]).reshape(-1, 4)
-        remembers = codes == lanes.BRISTLES
+        every_term = [term for terms in loops.terms for term in terms]
+        coded = [coded_term(every_term[k]) for k in places]
+        codes = np.array([code for code, _ in coded], dtype=np.int64).reshape(-1, 3)
+        shapes = np.array([numbers for _, numbers in coded]).reshape(-1, 11)
+        remembers = codes[:, 2] == BRISTLES
         shapes[remembers, 3] = np.arange(remembers.sum())
         drives = np.column_stack(
-            [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)]
+            [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)] + [affine]
         )
-        command, steps, ticks, every, start = self._commands(part, windows, loops)
-        samples = len(steps) // every + 1
+        course = self._course(part, windows, loops)
+        samples = len(course.steps) // course.every + 1
         q, v = np.zeros((2, samples, n, lanes.LANES))
         S = np.zeros((samples, outputs * n, len(columns), lanes.LANES))
-        q[0], v[0] = start
+        q[0], v[0] = course.start
         failed = lanes.roll_out(
-            part.parents, part.constants, loops.zero[own], loops.bodies[part.bodies],
-            part.is_below, self._gravity, drives, codes, shapes, loops.values[places],
-            first, columns, along, command, steps, ticks, every, start, q, v, S,
-            np.zeros(lanes.work_size(n, len(columns), int(remembers.sum()))), self.corrects,
+            part.tree, loops.zero[own], loops.bodies[part.bodies], drives,
+            lanes.Terms(codes, shapes, loops.values[places], spans),
+            lanes.Columns(columns, along), course, lanes.Motion(q, v, S),
+            lanes.work_of(n, len(columns), int(remembers.sum())), self.corrects,
         )  # fmt: skip
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
             raise NotConvergedError(
                 self._why_not(own, loops, windows[0].start[0]),
-                f"step {failed % len(steps) + 1} of {len(steps)}",
+                f"step {failed % len(course.steps) + 1} of {len(course.steps)}",
             )
         return columns_of, q, v, S
 
@@ -410,10 +397,8 @@ class LoopedRobot:
             "the rate at which the drives close their loops in [controller], or leave it out"
         )
 
-    def _commands(
-        self, part: _Part, windows: Sequence[Window], loops: Loops
-    ) -> tuple[Array, Array, Array, int, Array]:
-        """Return commands and lengths by step and lane, ticks, steps a sample, and the start."""
+    def _course(self, part: _Part, windows: Sequence[Window], loops: Loops) -> "Course":
+        """Return what the joints of a part are told in a block of windows."""
         lanes = _lanes()
         samples = max(window.stop - window.begin for window in windows)
         grids = [_Grid.of(window, samples, loops.rate) for window in windows]
@@ -443,7 +428,8 @@ class LoopedRobot:
                     lanes.average_command(log.t, x, told, loops.delay[j], mean, change)
                     command[:, i, k, lane] = mean[of_step]
                     command[:, i, by_delay, lane] = change[of_step]
-        return command, steps, ticks, every, start
+        course: Course = lanes.Course(command, steps, ticks, every, start)
+        return course
 
 
 @dataclass(frozen=True, eq=False)
@@ -494,44 +480,57 @@ class _Grid:
 
 def _parts(tree: Tree) -> list[_Part]:
     """Return the parts of a robot that the world alone joins."""
-    parents, rows = tree.parents[1:] - 1, tree.leaders[1:]
     root: list[int] = []
-    for i, parent in enumerate(parents):
+    for i, parent in enumerate(tree.parents):
         root.append(i if parent < 0 else root[parent])
     parts = []
     for r in sorted(set(root)):
-        bodies = [i for i, own in enumerate(root) if own == r]
-        place = {body: k for k, body in enumerate(bodies)}
-        above = np.array([place.get(int(parents[i]), -1) for i in bodies], dtype=np.int64)
-        is_below = np.eye(len(bodies), dtype=bool)
-        for k, parent in enumerate(above):
-            if parent >= 0:
-                is_below[k] |= is_below[parent]
-        constants = np.ascontiguousarray(tree.joints[1:][bodies])
-        parts.append(_Part(rows[bodies], np.array(bodies), above, constants, is_below))
+        bodies = np.flatnonzero(np.array(root) == r)
+        parts.append(_Part(tree.leaders[bodies], bodies, tree.part(bodies)))
     return parts
 
 
-def _coded(term: DriveTerm) -> tuple[int, float, float, float, float]:
-    """Return code, two numbers of its shape, and the range seen of a term; three of a memory."""
-    code = _CODES.get(type(term))
-    if code is None:
-        known = listed(kind.__name__ for kind in _CODES)
-        raise SettingsError(
-            f"the term {type(term).__name__} has no place in roll-outs; they have {known}"
-        )
-    if isinstance(term, Presliding):
-        return code, term.displacement, 1.0, 0.0, 0.0
-    if isinstance(term, LuGre):
-        return code, term.displacement, term.speed, term.excess, 0.0
-    shape = (0.0, 0.0)
-    if isinstance(term, PositionCoulomb):
-        shape = float(term.order), term.centre
-    elif isinstance(term, Stribeck | Tanh):
-        shape = term.speed, 0.0
-    elif isinstance(term, Harmonic):
-        shape = term.order, math.pi / 2 if term.is_sine else 0.0
-    return code, *shape, *term.seen
+def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
+    """Return where the terms of joints stand in ``loops.values``, those of a joint side by side.
+
+    With where in that row the terms of each joint begin, where bristles and affine terms follow,
+    and the end, shape (n, 3); and what affine terms sum up to, by 1, the speed and its direction,
+    shape (n, 3).
+    """
+    first = np.cumsum([0, *map(len, loops.terms)])
+    places, spans, affine = list[int](), [], np.zeros((len(joints), 3))
+    for i, j in enumerate(joints):
+        others, rest = list[int](), list[int]()
+        for k, term in enumerate(loops.terms[j], start=first[j]):
+            if isinstance(term, MemorylessTerm) and term.affine is not None:
+                affine[i, term.affine] += loops.values[k]
+                rest.append(k)
+            else:
+                (rest if isinstance(term, Bristles) else others).append(k)
+        spans.append([len(places), len(places) + len(others)])
+        places += [*others, *rest]
+        spans[-1].append(len(places))
+    return np.array(places, dtype=int), np.array(spans, dtype=np.int64), affine
+
+
+def coded_term(term: DriveTerm) -> tuple[tuple[int, int, int], tuple[float, ...]]:
+    """Return a term's law of speed, law of position and kind, and its numbers, eleven.
+
+    Args:
+        term: The term.
+
+    Raises:
+        SettingsError: If roll-outs have no such term.
+    """
+    if isinstance(term, Bristles):
+        return (CONSTANT, CONSTANT, BRISTLES), (*term.numbers, *[0.0] * 8)
+    if isinstance(term, MemorylessTerm):
+        return (term.speed_law, term.position_law, term.kind), term.numbers
+    raise SettingsError(
+        f"the term {type(term).__name__} has no place in roll-outs: it delays the measured torque, "
+        "and in a roll-out the commands are late; leave it out, and set delay in [controller] or "
+        "have it identified"
+    )
 
 
 def _lanes() -> ModuleType:

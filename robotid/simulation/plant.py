@@ -8,16 +8,7 @@ import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, NotConvergedError
-from robotid.robot.drives import (
-    Bristles,
-    Coulomb,
-    DriveMotion,
-    DriveTerm,
-    Lag,
-    LoadFriction,
-    Offset,
-    Viscous,
-)
+from robotid.robot.drives import Bristles, Coulomb, DriveTerm, MemorylessTerm, Offset, Viscous
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
@@ -33,20 +24,17 @@ _SIGN_SPEED = 2e-4  # [rad/s or m/s] speed over which the plant's Coulomb fricti
 class _Group:
     """Drives that have one term in common."""
 
-    term: DriveTerm
+    term: Bristles | MemorylessTerm
     drives: Array | slice  # their k numbers
     theta: Array  # its parameters, shape (k,)
     states: slice  # their places among the states of bristles; empty without any
-    none: Array  # zeros, shape (k,)
-    one: Array  # ones, shape (k,)
 
     def torque(self, angle: Array, w: Array) -> Array:
         """Return what it adds, for positive direction and unit load, shape (k,)."""
-        d = self.drives
-        column = self.term.column(
-            DriveMotion(angle[d], w[d], self.none, self.one, self.one, self.none)
-        )
-        return self.theta * column
+        speed = w[self.drives]
+        if isinstance(self.term, Bristles):
+            return self.theta * self.term.level(speed)
+        return self.theta * self.term.amplitude(angle[self.drives], speed)
 
 
 @dataclass(frozen=True)
@@ -91,7 +79,7 @@ class RobotPlant:
         self._share = self.ratios / np.sum(self.ratios**2, axis=1, keepdims=True).clip(min=1e-300)
         self._simple, self._groups = _grouped(model, pi)
         self.n_states = sum(g.states.stop - g.states.start for g in self._groups)
-        self.is_loaded = any(isinstance(g.term, LoadFriction) for g in self._groups)
+        self.is_loaded = any(_bears_load(g.term) for g in self._groups)
         G, A = model.velocity_map, self.armature
         # joints that are Pinocchio's own, each with a rotor of its own: its ABA does it all
         self._is_plain = np.array_equal(G, np.eye(len(G))) and np.array_equal(
@@ -154,7 +142,7 @@ class RobotPlant:
             term = group.term
             if z is not None and isinstance(term, Bristles):
                 rest[group.drives] += group.theta * z[group.states]
-            elif isinstance(term, LoadFriction):
+            elif _bears_load(term):
                 loaded[group.drives] += group.torque(angle, w)
             elif term.follows_direction:
                 along[group.drives] += group.torque(angle, w)
@@ -280,11 +268,11 @@ def _grouped(model: RobotModel, pi: Array) -> tuple[Array, tuple[_Group, ...]]:
     motion but the speed itself; then the others.
     """
     theta, simple = pi[model.layout.n_inertial :], np.zeros((3, len(model.layout.drives)))
-    terms: dict[DriveTerm, list[int]] = {}
+    terms: dict[Bristles | MemorylessTerm, list[int]] = {}
     for k, (d, term) in enumerate(model.layout.drive_parameters):
         if type(term) in _SIMPLE:
             simple[_SIMPLE.index(type(term)), d] += theta[k]
-        elif theta[k] != 0.0 and not term.is_inertia and not isinstance(term, Lag):
+        elif theta[k] != 0.0 and isinstance(term, Bristles | MemorylessTerm):
             terms.setdefault(term, []).append(k)
     groups, states = [], 0
     for term, numbers in terms.items():
@@ -297,12 +285,14 @@ def _grouped(model: RobotModel, pi: Array) -> tuple[Array, tuple[_Group, ...]]:
                 slice(None) if is_all else np.array(drives),
                 theta[numbers],
                 slice(states, states + more),
-                np.zeros(len(numbers)),
-                np.ones(len(numbers)),
             )
         )
         states += more
     return simple, tuple(groups)
+
+
+def _bears_load(term: DriveTerm) -> bool:
+    return isinstance(term, MemorylessTerm) and term.bears_load
 
 
 def rk4(

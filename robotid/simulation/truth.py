@@ -6,7 +6,7 @@ from robotid._typing import Array
 from robotid.exceptions import ModelError, SettingsError
 from robotid.findings import listed
 from robotid.logs.data import suggestion
-from robotid.robot.drives import Lag, LoadFriction
+from robotid.robot.drives import MemorylessTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 from robotid.simulation.settings import Truth
@@ -38,7 +38,8 @@ def draw_parameters(model: RobotModel, settings: Truth, rng: np.random.Generator
     for i, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
         drawn = rng.uniform(*term.usual)
         own = [x / _USUAL_EFFORT for j, _ in layout.drives[d].ratios if (x := effort[j]) > 0]
-        size = 1.0 if isinstance(term, Lag | LoadFriction) else min([1.0, *own])
+        is_share = isinstance(term, MemorylessTerm) and term.bears_load
+        size = 1.0 if is_share or term.is_measured else min([1.0, *own])
         pi[i] = usual * size * drawn
     for name, value in settings.values.items():
         if name not in layout.names:

@@ -15,10 +15,12 @@ from robotid.closed_loop.settings import LoopSettings
 from robotid.closed_loop.term_choice import _Fold, _gains
 from robotid.estimators.output_error import OutputError
 from robotid.exceptions import DataError
+from robotid.export.entries import build_result
 from robotid.findings import Finding
 from robotid.fitting.settings import SimulationSettings
 from robotid.judgement.positions import judge_positions
 from robotid.logs.data import Log
+from robotid.report.document import write_report
 from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Presliding, Viscous
 from robotid.simulation.loops import LoopedRobot, cut_windows
 
@@ -133,6 +135,44 @@ def test_the_standard_parameters_are_what_was_found(leg, found):
     np.testing.assert_array_equal(found.standard[:30], urdf[:30])  # bodies stay: bodies=0
 
 
+def test_it_is_an_identification_as_others_are(found, tmp_path):
+    layout, estimate = found.model.layout, found.estimate
+    size, count = layout.n_inertial, len(found.base)
+    name = f"Identification of {found.model.name}: {count} base parameters"
+    assert repr(found) == f"<{name} by simulation, verdict good>"
+    assert set(found.sources[:size]) == {"prior"}, "bodies stay: bodies=0"
+    assert np.isinf(found.standard_error[:size]).all()
+    content = build_result(found, {"estimator": {"name": "simulation"}})
+    entries = {entry["name"]: entry for entry in content["drive_parameters"]}
+    share = dict(zip(estimate.names, found.shrunk, strict=True))
+    known = zip(estimate.names, estimate.theta, estimate.std_error, estimate.reach, strict=True)
+    for key, value, error, reach in known:
+        own = entries[key]
+        assert (own["value"], own["reach"]) == (value, reach)
+        assert own["std_error"] == pytest.approx(error, rel=1e-6)
+        if key in layout.names:
+            ends = [value - reach * error, value + reach * error]
+            assert own["interval_95"] == pytest.approx(ends, rel=1e-6)
+            assert own["source"] == ("data" if share[key] < 0.3 else "mixed")
+            i = layout.names.index(key)
+            ends = content["ranges"]["drives"][key.rpartition(".")[0]][key.rpartition(".")[2]]
+            assert ends["high"] == pytest.approx(found.standard_interval[i, 1])
+    stated = entries[f"{found.model.joints[0]}.kp"]
+    assert (stated["std_error"], stated["source"]) == (None, "stated")
+    of_bodies = ~found.mapping.K[:, size:].any(axis=1)
+    unfitted = [entry["std_error"] is None for entry in content["base_parameters"]]
+    np.testing.assert_array_equal(unfitted, np.isinf(found.base_error))
+    np.testing.assert_array_equal(unfitted, of_bodies)
+    joint = content["validation"][0]["per_joint"][found.model.joints[1]]
+    [run] = found.validation
+    assert joint["relative_error_pct"] == pytest.approx(100 * run.rmse[1] / run.spread[1])
+    command = run.baselines["command"][1]
+    assert joint["command_relative_error_pct"] == pytest.approx(100 * command / run.spread[1])
+    page = write_report(found, tmp_path / "report.html").read_text()
+    assert "<strong>good</strong>" in page
+    assert f"{found.model.name}: drives from commands" in page
+
+
 def test_open_loops_beat_plainer_models(leg, found):
     [run] = found.validation
     assert found.verdict.status == "good"
@@ -166,10 +206,10 @@ def test_each_kept_log_is_judged(leg, found):
     for runs in ((good, poor), (poor, good)):
         verdict = replace(found, validation=runs).verdict
         assert verdict.status == "poor"
-        assert "the open loop misses" in verdict.reasons[0]
+        assert "simulated position error" in verdict.reasons[0]
     verdict = replace(found, validation=()).verdict
     assert verdict.status == "not evaluated"
-    assert verdict.reasons[0].startswith("no log was kept apart")
+    assert verdict.reasons[0].endswith("no validation log given")
 
 
 def test_a_joint_that_is_told_to_stand_is_not_evaluated(leg, found):
@@ -184,7 +224,7 @@ def test_a_joint_that_is_told_to_stand_is_not_evaluated(leg, found):
     verdict = judged([stands])
     assert [verdict.joints[joint].status for joint in joints] == ["good", "good", "not evaluated"]
     assert verdict.status == "usable"
-    assert verdict.reasons == (f"{joints[2]} is told to stand still: nothing tests it",)
+    assert verdict.reasons == (f"{joints[2]}: commanded to stand still in all logs: not evaluated",)
     assert judged([stands, run]).status == "good"
     nobody = replace(run, log=replace(still, q_ref=np.tile(still.q_ref[0], (len(still.t), 1))))
     assert judged([nobody]).status == "not evaluated"
@@ -349,11 +389,11 @@ def test_a_log_without_commands_is_refused(leg):
 def test_terms_that_no_other_window_judges_gain_nothing():
     """Of one window the others are none; of two, one alone may leave a parameter open."""
     alone = _Fold(np.eye(3), np.ones(3), 10)
-    assert _gains([alone], [0, 1], {5: [2]}) == {5: 0.0}
+    assert _gains([alone], [0, 1], {5: [2]})[5].tolist() == [0.0]
     blind = _Fold(np.diag([1.0, 0.0, 1.0]), np.ones(3), 10)
-    assert _gains([blind, blind], [0, 1], {5: [2]}) == {5: 0.0}
+    assert _gains([blind, blind], [0, 1], {5: [2]})[5].tolist() == [0.0, 0.0]
     known = _gains([alone, alone], [0, 1], {5: [2]})[5]
-    assert known == pytest.approx(2.0)  # of two folds 2 y - y^2, y = 1
+    assert known == pytest.approx([1.0, 1.0])  # of each fold 2 y - y^2, y = 1
 
 
 def test_gravity_that_a_controller_compensates_is_fed_forward(leg):

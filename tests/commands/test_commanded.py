@@ -113,10 +113,13 @@ def test_what_was_found_is_printed_with_its_values(folder, result, capsys, tmp_p
     for role, words in (("identification", "fitted"), ("validation", "not fitted")):
         assert f"{words}: chirp.parquet" in printed
         part = printed.partition(f"\n{words}: chirp.parquet")[2].partition("\n\n")[0]
-        for joint, own in result["simulation"][role][0]["per_joint"].items():
+        measured = result[role] if role == "identification" else result[role][0]
+        for joint, own in measured["per_joint"].items():
             [row] = [line.split() for line in part.splitlines() if line.split()[:1] == [joint]]
-            wanted = ("rmse", "second_order_rmse", "urdf_rmse", "command_rmse")
-            assert row[1:] == [*(f"{1e3 * own[key]:.2f}" for key in wanted), "mrad"]
+            whose = ("", "second_order_", "urdf_", "command_")
+            keys = [f"{one}relative_error_pct" for one in whose]
+            error, *others = [f"{own[key]:.1f}" for key in keys]
+            assert row[1:] == [error, f"{own['rmse']:#.3g}", "rad", *others]
     fit = result["simulation"]["fit"]
     assert f"go2_description: 3 joints, {fit['parameters']} unknowns; " in " ".join(printed.split())
     table = printed.partition("\n  parameter ")[2].partition("\n\n")[0].splitlines()[1:]

@@ -22,21 +22,20 @@ from robotid.cli import doctor, main
 from robotid.cli.console import terminal_progress
 from robotid.identification.pipeline import identify
 from robotid.logs.read import write_log
-from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
-URDF = str(example_urdf("ur5_robot.urdf"))
+ARM = str(ROOT / "urdf" / "planar_2r.urdf")
 
 
 @pytest.fixture(scope="module")
 def log():
-    model, rng = RobotModel.from_urdf(URDF), np.random.default_rng(0)
+    model, rng = RobotModel.from_urdf(ARM), np.random.default_rng(0)
     return exact_log(model, truth(model), rng, samples=900, rate=100.0, noise=0.1)
 
 
 def test_python_hears_of_each_stage_of_logs_in_memory(log):
     heard = []
-    model = RobotModel.from_urdf(URDF)
+    model = RobotModel.from_urdf(ARM)
     identify(
         model, [log], estimator="wls", friction="viscous", progress=lambda *told: heard.append(told)
     )
@@ -46,7 +45,8 @@ def test_python_hears_of_each_stage_of_logs_in_memory(log):
 
 def test_verbose_says_the_stages_where_there_is_no_terminal(log, tmp_path, capsys):
     write_log(log, tmp_path / "fit.csv")
-    words = ["identify", URDF, str(tmp_path / "fit.csv"), "--estimator", "wls", "--no-report"]
+    words = ["identify", ARM, str(tmp_path / "fit.csv"), "--estimator", "wls", "--no-report"]
+    words += ["--friction", "viscous"]
     assert main([*words, "--out", str(tmp_path / "out"), "--json", "--verbose"]) == 0
     assert "1/5" not in capsys.readouterr().err, "beside JSON nothing is said"
     assert main([*words, "--out", str(tmp_path / "out"), "--verbose"]) == 0
@@ -61,19 +61,6 @@ def test_a_stage_stays_above_the_work_it_consists_of(capsys):
         show("fitting", 2, 5, "stages")
         show("reducing", 50, 100, "samples")
     assert re.search(r"3/5 fitting.*\n.*    reducing.*50 %", capsys.readouterr().err)
-
-
-ARM = str(ROOT / "urdf" / "planar_2r.urdf")
-
-
-@pytest.fixture(scope="module")
-def arm_logs(tmp_path_factory):
-    folder, model = tmp_path_factory.mktemp("arm"), RobotModel.from_urdf(ARM)
-    rng = np.random.default_rng(0)
-    for name in ("fit", "keep"):
-        log = exact_log(model, truth(model), rng, samples=800, rate=100.0, noise=0.1)
-        write_log(log, folder / f"{name}.csv")
-    return folder
 
 
 def on_a_terminal(words, columns, **environment):

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from robotid.cli import excite, main
+from robotid.commands.excite import _designer
+from robotid.commands.job import Job
 from robotid.excitation.clearance import Box
 from robotid.excitation.design import Designer
 from robotid.excitation.settings import MotionSettings
@@ -261,6 +263,69 @@ def test_a_robot_without_links_to_keep_apart_moves_too(tmp_path, kind, capsys):
     q = np.loadtxt(out, delimiter=",", skiprows=1)[:, 1:3]
     assert (np.ptp(q, axis=0) > 0.2).all()
     assert (np.abs(q) <= [2.0, 1.0]).all()
+
+
+@pytest.fixture
+def pan_tilt(tmp_path):
+    urdf = tmp_path / "pan_tilt.urdf"
+    urdf.write_text(PAN_TILT.replace("</link>", SHAPE))
+    return urdf
+
+
+def test_every_setting_reaches_what_designs(pan_tilt):
+    each = {"a": 3.0, "b": 0.5}
+    settings = MotionSettings(
+        kind="bspline", duration=4.0, harmonics=3, criterion="E", share=0.5, clearance=0.1,
+        floor=-0.25, acceleration=each, jerk={"a": 40.0, "b": 50.0}, power={"a": 6.0, "b": 7.0},
+        noise={"a": 0.2, "b": 0.6}, seconds=1.0, boxes=(Box("post", (1, 1, 0), (2, 3, 4)),),
+    )  # fmt: skip
+    designer, run = _designer(Job(pan_tilt), settings, None)
+    assert run is None
+    assert designer.name == "E"
+    np.testing.assert_allclose(
+        designer.limits.sizes,
+        # half the range, speed and effort of the URDF, and what is stated
+        [[1.0, 0.5], [1.0, 1.0], [3.0, 0.5], [40.0, 50.0], [5.0, 5.0], [6.0, 7.0]],
+    )
+    assert (designer.basis.duration, designer.basis.pieces) == (4.0, 6)
+    assert designer.noise[1] / designer.noise[0] == pytest.approx(9.0)  # variances
+    clearance = designer.clearance
+    assert clearance.least == 0.1
+    post, floor = clearance._hulls[-2:]
+    assert (post.name, floor.name) == ("post", "the floor")
+    assert post.centre.tolist() == [1.5, 2.0, 2.0]
+    assert post.half.tolist() == [0.5, 1.0, 2.0]
+    assert floor.centre[2] + floor.half[2] == pytest.approx(-0.25)
+    basis = _designer(
+        Job(pan_tilt), MotionSettings(duration=4.0, harmonics=3, clearance=None), None
+    )
+    assert (basis[0].basis.duration, basis[0].basis.harmonics) == (4.0, 3)
+    assert (basis[0].name, basis[0].clearance) == ("D", None)
+
+
+def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt, capsys):
+    """The tilting link is a cube of 5 cm that turns about its centre: a wall is 6 cm from it."""
+
+    def designed(*words):
+        out = pan_tilt.with_name("motion.csv")
+        quick = ["--duration", "2", "--seconds", "0.1", "--starts", "1", "--points", "1000"]
+        command = ["excite", str(pan_tilt), "--out", str(out), *quick, "--json", *words]
+        assert main(command) == 0
+        return json.loads(capsys.readouterr().out)["limits"]["collision"], out.read_text()
+
+    wall = ["--box", "post=5,5,5,6,6,6", "--box", "wall=0.06,-1,-1,0.2,1,1"]
+    near, first = designed(*wall, "--seed", "3")
+    assert near["where"] == "tilt and wall"
+    assert near["kept"] == 0.02
+    # the distance by hand: how far the farthest corner of the cube reaches, turned by b, then by a
+    x, y, z = 0.025 * np.stack(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8, 1)
+    a, b = np.loadtxt(first.splitlines(), delimiter=",", skiprows=1)[:, 1:3].T
+    reach = (np.cos(a) * (np.cos(b) * x + np.sin(b) * z) - np.sin(a) * y).max(axis=0)
+    apart = 0.06 - reach.max()
+    assert apart - 0.001 <= near["margin"] + near["kept"] <= apart + 1e-6  # a bound to 1 mm
+    assert 0.0 <= near["margin"] < 0.01
+    assert designed(*wall, "--seed", "3")[1] == first
+    assert designed(*wall, "--seed", "4")[1] != first
 
 
 def test_a_motion_too_short_for_its_page_is_not_written_either(tmp_path, capsys):

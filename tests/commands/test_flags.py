@@ -5,11 +5,11 @@ import argparse
 import pytest
 
 from robotid.cli import doctor, identify, preview, track
-from robotid.cli.flags import job_from_flags
+from robotid.cli.flags import job_from_flags, source_words
 from robotid.exceptions import SettingsError
 from robotid.fitting.settings import ESTIMATORS
-from robotid.logs.settings import SignalSettings
-from robotid.robot.families import FAMILIES
+from robotid.logs.settings import LogSource, SignalSettings
+from robotid.robot.drives import FAMILIES
 
 
 def job(command, *words):
@@ -31,6 +31,41 @@ def test_every_setting_of_the_signals_has_a_flag():
     for command in (identify, doctor):
         found = job(command, *flags).signals
         assert found == SignalSettings(rate=200.0, max_gap=0.3, **stated)
+
+
+def test_every_other_flag_states_its_key_too():
+    """Each with a value that is not the default; two where there may be several, out of order."""
+    words = [
+        *("second.csv", "--validate", "kept.csv", "also.csv"),
+        *("--joints", "b,a", "--lock", "d=0.5", "--lock", "c=-1", "--snap-angles"),
+        *("--gain", "b=2", "--gain", "a=-3", "--friction", "viscous", "--estimator", "ols"),
+        *("--time-unit", "ms", "--angle-unit", "deg", "--topic", "/arm"),
+        *("--command-topic", "/wanted", "--effort", "current", "--stamp", "log"),
+        *("--ignore", "late", "--ignore", "clipped", "--dynamics", "--no-report"),
+    ]
+    found = job(identify, *words)
+    assert [entry.path.name for entry in found.identification] == ["run.csv", "second.csv"]
+    assert [entry.path.name for entry in found.validation] == ["kept.csv", "also.csv"]
+    assert found.joints == ("b", "a")
+    assert found.locked == {"d": 0.5, "c": -1.0}
+    assert found.snap_angles is True
+    assert found.gains == {"b": 2.0, "a": -3.0}
+    assert found.terms == ("armature", "viscous", "offset")
+    assert found.estimator.name == "ols"
+    assert (found.units.time, found.units.angle) == ("ms", "deg")
+    assert found.source == LogSource("/arm", command="/wanted", effort="current", stamp="log")
+    assert tuple(found.ignore) == ("late", "clipped")
+    assert (found.dynamics, found.report) == (True, False)
+    usual = job(identify)
+    assert (usual.joints, usual.locked, usual.gains) == (None, {}, {})
+    assert (usual.dynamics, usual.report, usual.snap_angles) == (False, True, False)
+    assert usual.source == LogSource()
+
+
+def test_words_that_identify_again_leave_out_what_is_only_shown():
+    words = ["identify", "arm.urdf", "a.csv", "--out", "there", "--json", "--cutoff", "5"]
+    words += ["--verbose", "--out=here", "--validate", "b.csv", "--progress", "--resume"]
+    assert source_words(words) == ("arm.urdf", "a.csv", "--cutoff", "5", "--validate", "b.csv")
 
 
 def test_a_flag_that_a_command_has_no_use_for_is_not_there(capsys):

@@ -44,7 +44,7 @@ def logs(tmp_path_factory):
     """A folder with two motions of an arm, the first of many pieces."""
     folder = tmp_path_factory.mktemp("logs")
     model, rng = RobotModel.from_urdf(URDF), np.random.default_rng(0)
-    for name, samples in (("fit", 6_000), ("keep", 1_000)):
+    for name, samples in (("fit", 2_000), ("keep", 600)):
         log = exact_log(model, truth(model), rng, samples=samples, rate=100.0, noise=0.1)
         write_log(log, folder / f"{name}.csv")
     return folder
@@ -52,7 +52,7 @@ def logs(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def job(logs):
-    """A job file that cuts the log into two dozen pieces."""
+    """A job file that cuts the log into eight pieces."""
     return write_job(logs, 1024)
 
 
@@ -65,14 +65,20 @@ def expected(job, tmp_path_factory):
     return (out / "result.json").read_text()
 
 
-def test_two_workers_give_the_same_result_to_the_last_bit(job, expected, tmp_path, capsys):
-    words = ["identify", job, "--workers", "2", "--out", str(tmp_path), "--verbose", "--json"]
+def test_two_workers_of_the_job_give_the_same_result_to_the_last_bit(
+    job, expected, tmp_path, capsys
+):
+    two = Path(job).with_name("two.toml")
+    two.write_text(Path(job).read_text().replace("[reduction]", "[reduction]\nworkers = 2"))
+    words = ["identify", str(two), "--out", str(tmp_path), "--verbose", "--json"]
     assert main(words) == 0
-    assert (tmp_path / "result.json").read_text() == expected
+    found = json.loads((tmp_path / "result.json").read_text())
     shown = capsys.readouterr()
-    assert json.loads(shown.out) == json.loads(expected)
-    assert "reducing 24 pieces" in shown.err
-    assert "6000 samples in all: 2 worker processes, one BLAS thread each" in shown.err
+    assert json.loads(shown.out) == found
+    assert found["settings"]["reduction"].pop("workers") == 2
+    assert found == json.loads(expected)
+    assert "reducing 8 pieces" in shown.err
+    assert "2000 samples in all: 2 worker processes, one BLAS thread each" in shown.err
     assert shown.err.count("samples: Pinocchio (fewer than") == 1  # once for all pieces
     assert "%" not in shown.err  # progress is for terminals
 
@@ -121,22 +127,24 @@ def test_a_killed_run_resumes_to_the_same_bits_and_does_only_what_is_missing(
     out = tmp_path / "out"
     assert cut_off(job, out, signal.SIGKILL, "1")[0] == -signal.SIGKILL
     assert [path.name for path in out.iterdir()] == [CHECKPOINT]
-    words = ["identify", job, "--workers", "2", "--out", str(out)]
+    words = ["identify", job, "--workers", "1", "--out", str(out)]
     assert main([*words, "--resume", "--verbose"]) == 0
-    assert "reducing 24 pieces, 3 of them kept from before" in capsys.readouterr().err
+    assert "reducing 8 pieces, 3 of them kept from before" in capsys.readouterr().err
     assert (out / "result.json").read_text() == expected
     assert not (out / CHECKPOINT).exists()
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_a_signal_to_end_is_heard_as_ctrl_c_is(job, tmp_path, number, code):
+@pytest.mark.parametrize(
+    ("number", "code", "count"), [(signal.SIGTERM, 143, 2), (signal.SIGHUP, 129, 1)]
+)
+def test_a_signal_to_end_is_heard_as_ctrl_c_is(job, tmp_path, number, code, count):
     out, workers = tmp_path / "out", []
-    found, error = cut_off(job, out, number, "2", workers)
+    found, error = cut_off(job, out, number, str(count), workers)
     assert found == code
     assert error.count("\n") == 1
     assert error.startswith("robotid: interrupted; finished pieces are kept in ")
     assert [path.name for path in out.iterdir()] == [CHECKPOINT]
-    assert len(workers) >= 2
+    assert len(workers) >= (count if count > 1 else 0)
     end = time.monotonic() + 10
     while alive := [pid for pid in workers if Path(f"/proc/{pid}").exists()]:
         assert time.monotonic() < end, alive

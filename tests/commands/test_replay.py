@@ -318,6 +318,9 @@ def test_drives_that_follow_commands_are_played_with_their_ghosts(tmp_path):
     np.testing.assert_allclose(data["torques"]["scale"]["of"], error, rtol=1e-6)
     assert data["torques"]["scale"]["unit"] == "the command's error"
     assert data["notes"][0] == "Motion: log.csv, as measured; ghosts on its commands."
+    left = 1e3 * np.sqrt(np.nanmean((load_result(out).follow_commands(log) - log.q) ** 2, axis=0))
+    worst = ", ".join(f"{arm.model.joints[j]} {left[j]:.2g}" for j in np.argsort(left)[::-1])
+    assert data["notes"][1] == f"Position missed in open loop, rms [mrad or mm]: {worst}."
 
     bare = [e for e in drive_entries(arm) if not e["name"].endswith((".kp", ".kd"))]
     other = load_result(written_result(arm, tmp_path / "bare", drive_parameters=bare))

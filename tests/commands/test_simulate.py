@@ -1,18 +1,29 @@
 """`simulate` writes a log and what it was made from; identify finds that again."""
 
+import argparse
 import json
 
 import numpy as np
 import pytest
 
 from robotid._files import file_sha256
-from robotid.cli import main
+from robotid.cli import main, simulate
 from robotid.export.urdf import load_identified
 from robotid.identification.pipeline import identify
 from robotid.logs.formats import write_columns
 from robotid.logs.read import read_log
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
 from robotid.simulation.motions import SampledMotion, random_fourier
+from robotid.simulation.settings import (
+    Actuator,
+    Controller,
+    Noise,
+    Payload,
+    Sensors,
+    Simulation,
+    Truth,
+)
 
 URDF = str(example_urdf("ur5_robot.urdf"))
 PLANT = """
@@ -204,3 +215,59 @@ def test_a_flag_is_not_named_as_a_key_of_the_plants_file(folder, capsys):
         "wrong.toml: drives.elbow_joint: Tanh: speed is 'x', wanted a finite number"
         in capsys.readouterr().err
     )
+
+
+def test_every_flag_states_its_setting():
+    words = {"seed": "7", "rate": "50", "duration": "3", "perturb": "0.3", "controller": "pd",
+             "torque-noise": "0.02", "limits": "0.4", "payload": "1.5"}  # fmt: skip
+    parser = argparse.ArgumentParser()
+    simulate.add_flags(parser)
+    flags = [word for name, value in words.items() for word in (f"--{name}", value)]
+    robot = ["--lock", "wrist_3_joint=0.25", "--time-unit", "ms"]
+    files = ["arm.urdf", "motion.csv", "--out", "log.csv"]
+    job, settings = simulate.simulation_from_flags(parser.parse_args([*files, *flags, *robot]))
+    assert settings == Simulation(
+        seed=7, rate=50.0, duration=3.0, truth=Truth(inertials=0.3), controller=Controller("pd"),
+        sensors=Sensors(noise=Noise(tau=0.02)), actuator=Actuator(effort=0.4),
+        payload=Payload(mass=1.5),
+    )  # fmt: skip
+    assert (job.locked, job.units.time) == ({"wrist_3_joint": 0.25}, "ms")
+
+
+def test_a_limit_and_a_load_do_what_they_say_and_the_truth_states_it(arm, tmp_path):
+    """A load at the origin of the last link: by hand, three times its mass in the columns."""
+    write_motion(tmp_path / "motion.csv", arm, 3, duration=4.0)
+    words = ["--controller", "pd", "--rate", "100", "--seed", "3", "--duration", "3"]
+    words += ["--limits", "0.02", "--payload", "3", "--perturb", "0.2"]
+    files = [arm.tree.path, str(tmp_path / "motion.csv"), "--out", str(tmp_path / "log.csv")]
+    assert main(["simulate", *files, *words]) == 0
+    truth = json.loads((tmp_path / "log.truth.json").read_text())
+    log = read_log(tmp_path / "log.csv", arm.joints)
+    assert len(log.t) == 301
+    most = 0.02 * np.array([joint.effort for joint in arm.limits])
+    held = np.isclose(np.abs(log.tau), most, rtol=1e-9)
+    assert (np.abs(log.tau) <= most * (1 + 1e-9)).all()
+    assert held.any()
+    q_ref = SampledMotion(*motion_of(tmp_path / "motion.csv", arm)).evaluate(log.t)[0]
+    error = np.abs(log.q - q_ref)
+    assert ((log.q - q_ref).max(axis=0) < error.max(axis=0)).any()  # the largest is a lag
+    for j, entry in enumerate(truth["following"]):
+        assert entry["joint"] == arm.joints[j]
+        assert entry["unit"] == "rad"
+        assert entry["rms"] == pytest.approx(np.sqrt(np.mean(error[:, j] ** 2)), rel=1e-6)
+        assert entry["largest"] == pytest.approx(error[:, j].max(), rel=1e-6)
+        assert entry["at_limit"] == pytest.approx(held[:, j].mean(), abs=0.05)
+    mapping = structural_mapping(arm)
+    load = np.zeros(len(arm.layout.names))
+    load[arm.layout.names.index("link_2.m")] = 3.0
+    bare, loaded = (
+        np.array([entry["value"] for entry in truth[key]])
+        for key in ("base_parameters", "base_parameters_with_payload")
+    )
+    np.testing.assert_allclose(loaded - bare, mapping.to_base(load), atol=1e-9)
+
+
+def motion_of(path, model):
+    """Return instants, positions, velocities and accelerations of a motion's table."""
+    log = read_log(path, model.joints, needs="motion")
+    return log.t, log.q, log.v, log.a

@@ -134,3 +134,32 @@ def test_a_longer_log_that_holds_the_fitted_rows_is_no_new_one(here):
     for log in (longer, rows(first, slice(0, 60))):
         found = verdict(folder, log)
         assert "hold rows that were fitted" in found["reasons"][0]
+
+
+def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_does(here):
+    folder, first, other = here
+    for name, log in (("new", other), ("old", first)):
+        write_log(log, folder / f"{name}.csv")
+    result = folder / "out" / "result.json"
+    alone = validate_result(result, [folder / "new.csv"])
+    for names in (("new", "old"), ("old", "new")):
+        found = validate_result(result, [folder / f"{name}.csv" for name in names])
+        assert [entry["log"] for entry in found["validation"]] == [
+            str(folder / f"{name}.csv") for name in names
+        ]
+        own = found["validation"][names.index("new")]
+        assert own["per_joint"] == alone["validation"][0]["per_joint"]
+        assert found["verdict"] == alone["verdict"]
+    write_log(rows(first, slice(0, 700)), folder / "cut.csv")
+    found = validate_result(result, [folder / "old.csv", folder / "cut.csv"])
+    assert "old.csv 0-9.99 s, cut.csv 0-6.99 s hold rows that" in found["verdict"]["reasons"][0]
+
+
+def test_what_the_result_ignores_is_no_doubt(here, rng):
+    folder, first, _ = here
+    path = folder / "out" / "result.json"
+    result = json.loads(path.read_text())
+    result["settings"]["doctor"] = {"ignore": ["repeated_motion"]}
+    path.write_text(json.dumps(result))
+    tau = first.tau + 0.01 * NOISE * rng.standard_normal(first.tau.shape)
+    assert verdict(folder, replace(first, tau=tau))["doubts"] == []

@@ -13,9 +13,15 @@ from helpers.paths import ROOT
 from robotid.diagnosis.discrepancies import explain_residual
 from robotid.diagnosis.misfit import find_misfits
 from robotid.diagnosis.sample import along, take_sample, trials
+from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
+from robotid.fitting.survey import hold_log
+from robotid.identification.pipeline import with_drives
 from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
+from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 
 sys.path.append(str(ROOT / "benchmarks"))
@@ -27,26 +33,27 @@ def model():
     return RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
 
 
+SETTINGS = EstimatorSettings(prior_weight=1.0, draws=0)
+
+
 def fitted(model, logs):
-    """Return what is found of a log and one kept apart, at a weight of the prior that is stated."""
-    settings = EstimatorSettings(prior_weight=1.0)
-    return identify(model, logs[:1], validation=logs[1:], estimator=settings)
+    """Return the fit of a log beside one kept apart, with the friction that it shows."""
+    own, kept = ([hold_log(model, log, SignalSettings())] for log in logs)
+    recordings = Recordings(model, structural_mapping(model), own, kept)
+    return with_drives(recordings, SETTINGS, wanted_families(AUTO, model.joints))
 
 
 def found(model, change, robot="ur5_robot.urdf", turn=None):
     """Return the findings on logs of a robot near its URDF that a change spoilt alike."""
     arm, logs = build(replace(ROBOTS["ur5"], urdf=str(robot)), (3,), turn=turn), []
     for part in (0, 1):
-        run = move(arm.model, np.random.default_rng([3, part]), 100.0, 25.0)
+        run = move(arm.model, np.random.default_rng([3, part]), 50.0, 25.0)
         run = replace(run, tau=arm.rigid(run) + arm.drives(run))
         run = measured(run, "usual", np.random.default_rng([4, part]))
         log = Log(run.t, run.q, run.tau, model.joints, run.v, path=f"run{part}.csv")
         logs.append(change(log))
-    identification = fitted(model, logs)
-    _, findings = explain_residual(identification, take_sample(identification))
-    doubted = {doubt.code for doubt in identification.doubts}
-    assert {finding.code for finding in findings} <= doubted
-    return findings
+    fit = fitted(model, logs)
+    return explain_residual(fit, take_sample(fit))[1]
 
 
 def times(log, **factors):
@@ -64,7 +71,7 @@ def test_nothing_is_said_of_a_robot_that_only_weighs_differently(model):
 
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_nothing_is_said_of_drives_that_do_more_than_their_model(model, effect):
-    logs = [log_with(model, 3, effect, part=part) for part in (0, 1)]
+    logs = [log_with(model, 3, effect, part=part, rate=50.0) for part in (0, 1)]
     found = fitted(model, logs)
     _, discrepancies = explain_residual(found, take_sample(found))
     assert discrepancies == ()
@@ -110,14 +117,18 @@ def test_a_large_offset_of_a_zero_has_its_size_and_makes_no_other_finding(model,
     assert 0 < finding.evidence["std_error"] < 0.05 * abs(offset)
 
 
-def both(truth, model, seed, joint, offset, **effect):
-    """Return what is found of logs with the effect on a joint, whose position is off besides."""
+def recorded(truth, model, seed, joint, offset, **effect):
+    """Return logs with the effect on a joint, whose position is off besides."""
     moved = offset * np.eye(len(model.joints))[joint]
     logs = [log_with(truth, seed, joint=joint, part=part, **effect) for part in (0, 1)]
-    found = fitted(model, [replace(log, q=log.q + moved) for log in logs])
-    misfits, discrepancies = explain_residual(found, take_sample(found))
-    assert discrepancies == tuple(f for f in found.findings if f in discrepancies)
-    return find_misfits(take_sample(found)), misfits, discrepancies
+    return [replace(log, q=log.q + moved) for log in logs]
+
+
+def both(*args, rate=50.0, **effect):
+    """Return the terms found alone, and terms and discrepancies found together, of such logs."""
+    fit = fitted(args[1], recorded(*args, rate=rate, **effect))
+    sample = take_sample(fit)
+    return find_misfits(sample), *explain_residual(fit, sample)
 
 
 def named(findings):
@@ -127,23 +138,37 @@ def named(findings):
 def test_a_zero_that_is_off_makes_no_spring_of_another_joint():
     joints = [f"panda_joint{i}" for i in range(1, 8)]
     panda = RobotModel.from_urdf(example_urdf("panda.urdf"), joints=joints)
-    alone, misfits, others = both(panda, panda, 2, 1, 0.15, rate=50.0)
+    alone, misfits, others = both(panda, panda, 2, 1, 0.15)
     assert [(m.joint, m.term.code, m.matters) for m in alone] == [("panda_joint3", "spring", True)]
     assert misfits == ()
     assert named(others) == [("position_offset", "panda_joint2")]
 
 
-@pytest.mark.parametrize(("offset", "size"), [(0.1, 1.0), (0.03, 3.0)])  # what explains more
-def test_a_spring_is_named_beside_a_zero_that_is_off(model, offset, size):
-    alone, (spring,), others = both(model, model, 3, 2, offset, effect="spring", size=size)
-    assert (spring.joint, spring.term.name) == ("elbow_joint", "linear spring")
+@pytest.mark.parametrize(
+    ("offset", "size", "rate"), [(0.1, 1.0, 50.0), (0.03, 3.0, 100.0)]
+)  # what explains more
+def test_a_spring_is_named_beside_a_zero_that_is_off(model, offset, size, rate):
+    how = {"effect": "spring", "size": size, "rate": rate}
+    alone, (spring,), others = both(model, model, 3, 2, offset, **how)
+    assert (spring.joint, spring.term.name) == ("elbow_joint", "spring")
     assert spring.size == pytest.approx(alone[0].size, rel=0.01)
     assert named(others) == [("position_offset", "elbow_joint")]
     assert others[0].evidence["size"] == pytest.approx(-offset, rel=0.04)
 
 
+def test_what_is_found_is_said_of_the_result_and_doubts_it(model):
+    logs = recorded(model, model, 3, 2, 0.1, effect="spring", rate=50.0)
+    result = identify(model, logs[:1], validation=logs[1:], estimator=SETTINGS, friction=AUTO)
+    said = [(f.code, f.where) for f in result.findings if f.severity == "warning"]
+    assert {("spring", "elbow_joint"), ("position_offset", "elbow_joint")} <= set(said)
+    assert [(m.joint, m.term.code) for m in result.misfits] == [("elbow_joint", "spring")]
+    assert {"spring", "position_offset"} <= {doubt.code for doubt in result.doubts}
+
+
 def test_columns_beside_the_base_parameters_are_refitted_with_them(model, rng):
-    found = fitted(model, [log_with(model, 3, "spring", part=part) for part in (0, 1)])
+    found = fitted(
+        model, [log_with(model, 3, "spring", part=part, duration=12.0) for part in (0, 1)]
+    )
     sample = take_sample(found)
     Z = rng.standard_normal((*sample.r.shape, 2)) + sample.r[..., None]
     together, _ = trials(sample, slice(None), Z)[1].estimate([0, 1], sample.fitted)

@@ -5,7 +5,6 @@ import re
 
 import numpy as np
 import pytest
-import scipy.stats
 from helpers.driven import (
     ELBOW,
     EXACT,
@@ -21,7 +20,7 @@ from helpers.driven import (
 from robotid.commands.job import job_from_settings
 from robotid.commands.logs import survey_logs
 from robotid.diagnosis import drive_choice
-from robotid.diagnosis.drive_choice import _chance, choose_drives
+from robotid.diagnosis.drive_choice import choose_drives
 from robotid.diagnosis.sample import take_sample
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.export.urdf import load_identified, write_urdf
@@ -35,8 +34,8 @@ from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.memory import drive_motion_along, remember
 from robotid.regressor.prediction import predict
-from robotid.robot.drives import DriveMotion, Harmonic, LoadFriction, Stribeck, Tanh
-from robotid.robot.families import AUTO, FAMILIES, wanted_families
+from robotid.robot.drives import FAMILIES, DriveMotion, Harmonic, LoadFriction, Stribeck, Tanh
+from robotid.robot.families import AUTO, wanted_families
 
 SEED, REACH = 3, 1.5  # of the motion: the elbow turns more than half a turn
 SURE = 2.6  # standard errors, of a few hundred figures that are looked at
@@ -413,17 +412,6 @@ def test_a_robot_with_terms_of_its_own_can_be_sent_to_workers():
     motion = process(log, EXACT)
     wanted, again = (predict(m, [pi], remember(m, motion))[0] for m in (true, sent))
     np.testing.assert_array_equal(again, wanted)
-
-
-def test_chance_is_students(rng):
-    before = rng.uniform(1.0, 2.0, 16)
-    after = before * rng.uniform(0.6, 1.2, 16)
-    gain = (before - after) / np.maximum(before, after)
-    wanted = scipy.stats.ttest_1samp(gain, 0.0, alternative="greater").pvalue
-    assert _chance(before, after) == pytest.approx(wanted)
-    still = np.append(before, np.zeros(8)), np.append(after, np.zeros(8))
-    assert _chance(*still) == pytest.approx(wanted)  # where the joint stands there is no say
-    assert _chance(before[:2], after[:2]) == 1.0
 
 
 @pytest.mark.parametrize("load", [-0.05, 0.7])

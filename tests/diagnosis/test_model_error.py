@@ -43,13 +43,30 @@ def hooked(plain):
     return names, driven_log(true, pi, 3, reach=REACH)
 
 
+@pytest.fixture(scope="module")
+def fits(plain, request):
+    """Fits of these robots by name and friction, each made when it is first asked for."""
+    made = {}
+
+    def fit(robot, friction):
+        key = robot, str(friction)
+        if key not in made:
+            _, log = request.getfixturevalue(robot)
+            slower = replace(log, t=1.4 * log.t, v=None, a=None)  # at other speeds, other loads
+            made[key] = found_in(
+                plain, [log], validation=[slower], friction=friction, estimator="wls"
+            )
+        return made[key]
+
+    return fit
+
+
 def at(found, name):
     return list(found.model.layout.names).index(name)
 
 
-def test_coulomb_friction_that_stands_on_a_misfit_covers_the_truth(plain, loaded):
-    true, log = loaded
-    found = found_in(plain, [log], friction=PLAIN, estimator="wls")
+def test_coulomb_friction_that_stands_on_a_misfit_covers_the_truth(loaded, fits):
+    true, found = loaded[0], fits("loaded", PLAIN)
     (misfit,) = found.misfits
     assert (misfit.joint, misfit.term.code) == (ELBOW, "load_friction")
     assert misfit.size == pytest.approx(0.1, abs=0.015)
@@ -66,11 +83,9 @@ def test_coulomb_friction_that_stands_on_a_misfit_covers_the_truth(plain, loaded
     assert f"{coulomb} stand" in said.message or f"{coulomb}, " in said.message
 
 
-def test_what_a_misfit_moves_is_what_a_fit_with_the_term_finds(plain, loaded):
+def test_what_a_misfit_moves_is_what_a_fit_with_the_term_finds(fits):
     """The oracle: the same log fitted with the term."""
-    _, log = loaded
-    found = found_in(plain, [log], friction=PLAIN, estimator="wls")
-    better = found_in(plain, [log], friction={ELBOW: "load", "*": "none"}, estimator="wls")
+    found, better = fits("loaded", PLAIN), fits("loaded", {ELBOW: "load", "*": "none"})
     (misfit,) = found.misfits
     sample = take_sample(found)
     shift = sample.U.T @ misfit.shift  # base parameters
@@ -86,15 +101,11 @@ def test_what_a_misfit_moves_is_what_a_fit_with_the_term_finds(plain, loaded):
 
 @pytest.mark.parametrize(("robot", "family"), [("loaded", "load"), ("hooked", "stribeck")])
 def test_a_prediction_errs_by_what_a_missing_term_moves_and_by_its_torque(
-    plain, robot, family, request
+    plain, robot, family, fits
 ):
     """The oracle: how much the prediction changes once the term is in the model."""
-    (_, log), joint = request.getfixturevalue(robot), plain.joints.index(ELBOW)
-    slower = replace(log, t=1.4 * log.t, v=None, a=None)  # at other speeds, other loads
-    found, better = (
-        found_in(plain, [log], validation=[slower], friction=friction, estimator="wls")
-        for friction in (PLAIN, {ELBOW: family, "*": "none"})
-    )
+    joint = plain.joints.index(ELBOW)
+    found, better = (fits(robot, x) for x in (PLAIN, {ELBOW: family, "*": "none"}))
     (term,) = (term for term in found.open_terms if term.joint == ELBOW)
     pure = found.standard_covariance - sum(np.outer(x.moves, x.moves) for x in found.open_terms)
     assert np.linalg.eigvalsh(pure).min() > -1e-9 * np.linalg.eigvalsh(pure).max()
@@ -123,8 +134,8 @@ def test_a_prediction_errs_by_what_a_missing_term_moves_and_by_its_torque(
     np.testing.assert_allclose(curves[0].std, np.abs(changed), atol=0.3 * np.abs(changed).max())
 
 
-def test_without_rows_to_judge_by_errors_stay_as_they_are(plain, loaded):
-    found = found_in(plain, [loaded[1]], friction=PLAIN, estimator="wls")
+def test_without_rows_to_judge_by_errors_stay_as_they_are(fits):
+    found = fits("loaded", PLAIN)
     assert with_model_error(found, None, ()) == (found, ())
     assert found.mapping.names  # and with rows and no misfit they do, too
     same, on_misfit = with_model_error(found, take_sample(found), ())
@@ -132,10 +143,10 @@ def test_without_rows_to_judge_by_errors_stay_as_they_are(plain, loaded):
     assert on_misfit == ()
 
 
-def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked):
+def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked, fits):
     """The oracle: fits with the shape stated, larger and smaller by its standard error."""
     true, log = hooked
-    found = found_in(plain, [log], friction={ELBOW: "stribeck", "*": "none"}, estimator="wls")
+    found = fits("hooked", {ELBOW: "stribeck", "*": "none"})
     (choice,) = found.drives
     (shape,) = choice.shapes
     sure = {}

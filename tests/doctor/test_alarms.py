@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.corruptions import NOISE, clean_log, late, robot, table_of
+from helpers.corruptions import NOISE, clean_log, controlled_log, late, robot, table_of
 
 from robotid.doctor.diagnosis import diagnose
 from robotid.logs.data import Log
@@ -24,19 +24,18 @@ def simulated(file, seed):
     model = RobotModel.from_urdf(example_urdf(file))
     rng = np.random.default_rng(seed)
     pi = another_robot(model, rng)
-    motion = random_fourier(model, rng, period=10.0)
-    return model, simulate(model, pi, motion, rate=30.0, duration=20.0, rng=rng, noise=NOISE)
+    motion = random_fourier(model, rng, period=5.0)
+    return model, simulate(model, pi, motion, rate=30.0, duration=10.0, rng=rng, noise=NOISE)
 
 
 @pytest.mark.parametrize(("name", "duration"), [("ur5", 6.0), ("ur5", 8.0), ("panda", 6.0)])
 def test_a_short_clean_log_is_not_said_to_be_late(name, duration):
-    model = robot(name)
-    log = clean_log(model, 102 if name == "panda" else 100, duration=duration)
-    assert loud(diagnose(model, [log], [], SIGNALS)) == []
+    log = controlled_log(name, 100, duration=duration)
+    assert loud(diagnose(robot(name), [log], [], SIGNALS)) == []
 
 
 def test_a_late_torque_of_a_short_log_is_found_and_what_it_takes_away_is_said(ur5):
-    table = late("tau_", 0.03)(table_of(clean_log(ur5, 102, duration=8.0)))
+    table = late("tau_", 0.03)(table_of(controlled_log("ur5", 102, duration=8.0)))
     q, v, tau = (
         np.column_stack([table[f"{kind}_{joint}"] for joint in ur5.joints])
         for kind in ("q", "dq", "tau")

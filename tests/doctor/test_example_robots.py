@@ -3,12 +3,14 @@
 import json
 import os
 from collections import Counter
+from functools import lru_cache
 
 import pytest
 from helpers.paths import DOCS
 
 from robotid.doctor.urdf import inspect_urdf
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot import geometry
 from robotid.robot.examples import example_urdfs
 from robotid.robot.model import RobotModel
 
@@ -17,8 +19,10 @@ AUDIT, COUNTS = DOCS / "urdf_audit.md", DOCS / "base_counts.md"
 
 @pytest.fixture(scope="module")
 def inspections():
-    """The inspection of every example robot by its path."""
-    return {path: inspect_urdf(path) for path in example_urdfs()}
+    """The inspection of every example robot by its path; robots of a family share meshes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(geometry, "read_surfaces", lru_cache(128)(geometry.read_surfaces))
+        return {path: inspect_urdf(path) for path in example_urdfs()}
 
 
 def test_every_example_robot_can_be_inspected(inspections):

@@ -12,6 +12,7 @@ from robotid.commands.logs import examine
 from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import LogUnits
+from robotid.robot.drives import DRIVE_TERMS
 from robotid.robot.examples import example_urdf
 
 HELD = "wrist_3_joint"
@@ -33,6 +34,7 @@ def job(ur5, rng, tmp_path):
             joints=ur5.joints[:-1],
             locked={} if stated is None else {HELD: stated},
             identification=(LogEntry(tmp_path / "run.csv"),),
+            terms=DRIVE_TERMS,
             report=False,
             **options,
         )

@@ -13,9 +13,11 @@ JOBS = Path(__file__).parents[1] / "jobs"
 TRAPS = {
     "kinova_gen3/gen3_1.parquet": [
         ("gap", "longest", 0.9, 1.0),  # slow samples were removed
+        ("jitter", "relative_spread", 0.16, 0.17),
     ],
     "kinova_gen3/gen3_2.parquet": [("gap", "gaps", 2, 4)],
     "tx40/joint_side.parquet": [
+        ("rate", "rate", 4999, 5001),
         ("standstill", "after", 1.2, 1.6),  # motion 0-7.45 s of 9, cut and trimmed by the settings
     ],
     "ur10e/ident_20200212_50s12h.parquet": [
@@ -26,8 +28,9 @@ TRAPS = {
         ("velocity_delay", "delay", 0.13, 0.2),  # 140-190 ms, smoothed by the driver
         ("quantised", "steps_arm_5_joint", 20, 60),  # wrist currents of a few quanta
         ("quantised", "steps_arm_7_joint", 20, 60),
-        ("standstill", "before", 5.0, 10.0),  # about 9 s at rest, then slow
+        ("standstill", "before", 6.0, 10.0),  # about 9 s at rest, then slow
         ("standstill", "after", 11.0, 13.0),
+        ("unexplained_torque", "share", 0.7, 0.8),  # of the last joint
     ],
     "panda/panda_inria.parquet": [
         ("jitter", "longest", 0.0019, 0.009),  # 0.7-8.8 ms around 1 ms

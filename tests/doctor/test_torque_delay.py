@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.corruptions import clean_log, late, robot, table_of
+from helpers.corruptions import clean_log, controlled_log, late, robot, table_of
 from helpers.synthetic import exact_log, truth
 
 from robotid.doctor import torque_delay
@@ -27,8 +27,7 @@ def delayed(log, delay):
 
 @pytest.mark.parametrize(("name", "seed", "duration"), CLEAN)
 def test_a_short_clean_log_has_no_late_torque_but_a_delayed_one_has(name, seed, duration):
-    model = robot(name)
-    log = clean_log(model, seed, duration=duration)
+    model, log = robot(name), controlled_log(name, seed, duration=duration)
     (clean,) = found(model, log)
     assert clean.severity == "note"
     # without the filter on the regressor 6 to 9 ms and 11 to 15 %
@@ -43,7 +42,7 @@ def test_a_short_clean_log_has_no_late_torque_but_a_delayed_one_has(name, seed, 
 
 
 def test_a_stated_delay_is_no_longer_found(ur5):
-    log = delayed(clean_log(ur5, 100, duration=8.0), 0.03)
+    log = delayed(controlled_log("ur5", 100, duration=8.0), 0.03)
     (spoilt,) = found(ur5, log)
     delay = spoilt.evidence["delay"]
     (mended,) = found(ur5, log, replace(SIGNALS, torque_delay=delay))
@@ -122,7 +121,7 @@ def test_a_model_of_one_joint_is_not_judged():
 
 
 def test_one_joint_with_a_delay_of_its_own_is_named_and_does_not_count_for_the_others(ur5):
-    log = clean_log(ur5, 100, duration=8.0)
+    log = controlled_log("ur5", 100, duration=8.0)
     clean = found(ur5, log)
     assert [f.code for f in clean] == ["torque_delay"]
     tau = log.tau.copy()

@@ -69,7 +69,7 @@ def test_torques_of_a_course_are_those_of_the_bodies_and_the_friction_assumed(co
 def test_the_distance_of_a_course_is_that_of_all_pairs(course):
     *_, found = course
     around = found.clearance
-    poses = around.poses(found.values[0])
+    poses = around.placed(found.values[0])
     exact = around.near(poses, np.inf, around.everything).distance
     distance, pairs = found.nearness(around.everything)
     np.testing.assert_allclose(distance, exact.min(axis=0), atol=1e-9)

@@ -34,6 +34,16 @@ def test_baselines_are_the_urdf_with_and_without_motion(ur5, rng):
     assert measured.baselines["gravity_only"] > 10
 
 
+def test_without_parameters_there_are_recordings_but_no_predictions(ur5, rng):
+    own, other = (hold_log(ur5, exact_log(ur5, truth(ur5), rng), EXACT) for _ in range(2))
+    (fitted,), kept = evaluate_logs([own], [other, own], {}, None)
+    assert [e.is_refitted for e in kept] == [False, True]
+    for e in (fitted, *kept):
+        assert e.torques == e.sums == e.metrics == {}
+    # not copied: what was computed of the motion is there for all that follows
+    assert fitted.recording.trajectory is own.whole.trajectory
+
+
 def test_gravity_knows_no_offset(ur5, rng):
     pi = truth(ur5)
     found = evaluated(ur5, exact_log(ur5, pi, rng), {"truth": pi}, pi)

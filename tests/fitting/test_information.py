@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.fitting import identify
+from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.fitting.information import information
@@ -14,7 +14,7 @@ from robotid.robot.model import RobotModel
 def found(ur5):
     rng = np.random.default_rng(0)
     logs = [exact_log(ur5, truth(ur5), rng, samples=300, noise=0.1) for _ in range(2)]
-    return identify(ur5, logs, estimator="wls")
+    return fit(ur5, logs, estimator="wls")
 
 
 def dense(found):
@@ -65,7 +65,7 @@ def test_what_the_data_leave_open_has_no_share_and_no_correlation(ur5, rng):
     tau = (joint_torque_regressor(model, q, still, a) @ truth(ur5)).reshape(q.shape)
     one = type(log)(t=log.t, q=q, tau=tau + 0.1 * rng.standard_normal(q.shape), v=still, a=a,
                     joints=log.joints)  # fmt: skip
-    found = identify(model, [one])
+    found = fit(model, [one])
     said = information(found)
     open_ones = np.isin(found.mapping.base_names, found.wls.undetermined)
     assert open_ones.sum() > 20

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.fitting import identify
+from helpers.fitting import fit, identify
 from helpers.paths import ROOT
 from helpers.synthetic import truth
 
@@ -176,7 +176,7 @@ def test_repeated_rounding_errors_count_as_often_as_they_are_repeated(planar):
 
 def test_a_finding_names_joints_step_and_parameter(planar, motion):
     log = recorded(planar, motion)
-    found = identify(planar, [log], signals=SIGNALS, friction="viscous+coulomb")
+    found = identify(planar, [log], signals=SIGNALS)
     (finding,) = [f for f in found.findings if f.code == "encoder_noise"]
     assert finding.severity == "warning"
     assert "steps of up to 0.00307 rad (11.0 bits a turn)" in finding.message
@@ -193,7 +193,7 @@ def test_a_finding_names_joints_step_and_parameter(planar, motion):
 @pytest.mark.parametrize("step", [2 * np.pi / 2**18, 0.0])
 def test_fine_encoders_change_nothing_and_are_not_named(planar, motion, step):
     log = recorded(planar, motion, step=step)
-    found = identify(planar, [log], signals=SIGNALS, friction="viscous+coulomb")
+    found = identify(planar, [log], signals=SIGNALS)
     assert found.regressor_noise is None
     assert "encoder_noise" not in {f.code for f in found.findings}
 
@@ -213,10 +213,7 @@ def test_measured_velocities_have_no_noise_of_the_positions(planar, motion):
 
 def test_an_estimator_that_reads_samples_counts_the_shift_as_an_error(planar, motion):
     log = recorded(planar, motion)
-    wls, rls = (
-        identify(planar, [log], estimator=name, signals=SIGNALS, friction="viscous+coulomb")
-        for name in ("wls", "rls")
-    )
+    wls, rls = (identify(planar, [log], estimator=name, signals=SIGNALS) for name in ("wls", "rls"))
     noise = rls.regressor_noise
     assert not noise.is_corrected
     np.testing.assert_allclose(rls.base - noise.shift, wls.base, rtol=1e-3, atol=1e-4)
@@ -227,10 +224,7 @@ def test_an_estimator_that_reads_samples_counts_the_shift_as_an_error(planar, mo
 
 def test_corrected_factors_are_those_of_the_fit(planar, motion, runs):
     _, noises, known, _ = runs
-    found = identify(
-        planar, [recorded(planar, motion)], signals=SIGNALS, estimator="wls",
-        friction="viscous+coulomb",
-    )  # fmt: skip
+    found = fit(planar, [recorded(planar, motion)], signals=SIGNALS, estimator="wls")
     np.testing.assert_allclose(found.regressor_noise.shift, noises[0].shift, rtol=1e-6)
     np.testing.assert_allclose(found.base_error, known[0], rtol=1e-4)
     np.testing.assert_allclose(found.wls.theta, found.base, rtol=1e-6)
@@ -241,7 +235,7 @@ def test_corrected_factors_are_those_of_the_fit(planar, motion, runs):
 def test_ordinary_least_squares_are_corrected_by_their_own_weights(planar, motion):
     log = recorded(planar, motion)
     recordings, _, whole, _ = fitted(planar, log)
-    found = identify(planar, [log], estimator="ols", signals=SIGNALS, friction="viscous+coulomb")
+    found = fit(planar, [log], estimator="ols", signals=SIGNALS)
     plain = OLS(independent_share=recordings.share).fit(whole.factors)
     np.testing.assert_allclose(found.base, plain.theta - found.regressor_noise.shift, rtol=1e-6)
     np.testing.assert_allclose(found.regressor_noise.std_error, plain.std_error, rtol=0.05)
@@ -252,7 +246,7 @@ def test_ordinary_least_squares_are_corrected_by_their_own_weights(planar, motio
 
 def test_total_least_squares_have_a_correction_of_their_own(planar, motion):
     log = recorded(planar, motion)
-    found = identify(planar, [log], estimator="tls", signals=SIGNALS, friction="viscous+coulomb")
+    found = identify(planar, [log], estimator="tls", signals=SIGNALS)
     assert found.regressor_noise is None
 
 

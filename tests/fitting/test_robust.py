@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
-from helpers.fitting import identify
+from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.exceptions import SettingsError
@@ -55,11 +55,9 @@ def test_five_outliers_of_1000_newton_metres_move_it_by_less_than_its_standard_e
 ):
     clean, bad = logs
     tukey = EstimatorSettings(name, robust="tukey")
-    undisturbed, found = (
-        identify(ur5, [log], estimator=tukey, friction="none") for log in (clean, bad)
-    )
+    undisturbed, found = (fit(ur5, [log], estimator=tukey) for log in (clean, bad))
     assert np.max(np.abs(found.base - undisturbed.base) / undisturbed.base_error) < 0.8
-    plain, ruined = (identify(ur5, [log], estimator=name, friction="none") for log in (clean, bad))
+    plain, ruined = (fit(ur5, [log], estimator=name) for log in (clean, bad))
     assert np.max(np.abs(ruined.base - plain.base) / plain.base_error) > 5.0
     assert np.median(np.abs(undisturbed.base - plain.base) / plain.base_error) < 0.4
 
@@ -68,8 +66,8 @@ def test_huber_is_the_minimum_of_its_loss(ur5):
     pi = truth(ur5)
     log = exact_log(ur5, pi, np.random.default_rng(1), samples=300, noise=NOISE)
     rough = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-    found = identify(ur5, [log], signals=rough, estimator=EstimatorSettings("wls", robust="huber"))
-    plain = identify(ur5, [log], signals=rough, estimator="wls")
+    found = fit(ur5, [log], signals=rough, estimator=EstimatorSettings("wls", robust="huber"))
+    plain = fit(ur5, [log], signals=rough, estimator="wls")
     (evaluation,) = found.fitted
     residual = log.tau - evaluation.torques["estimate"]
     scale = 1.4826 * np.median(np.abs(residual), axis=0)
@@ -94,8 +92,8 @@ def test_huber_is_the_minimum_of_its_loss(ur5):
 
 def test_outliers_are_named_with_time_joint_and_torque(ur5, logs):
     clean, bad = logs
-    assert identify(ur5, [clean], estimator="wls").outliers == ()
-    found = identify(ur5, [bad], estimator=EstimatorSettings("wls", robust="tukey")).outliers
+    assert fit(ur5, [clean], estimator="wls").outliers == ()
+    found = fit(ur5, [bad], estimator=EstimatorSettings("wls", robust="tukey")).outliers
     named = {(o.joint, round(100 * o.t)) for o in found}
     assert named == {*((joint, row) for joint, row in ROWS.items()), ("shoulder_pan_joint", 300)}
     assert all(abs(o.torque - o.predicted) > 50 for o in found)
@@ -105,7 +103,7 @@ def test_outliers_are_named_with_time_joint_and_torque(ur5, logs):
 def test_friction_that_the_filter_smears_leaves_no_residual(ur5):
     quiet = exact_log(ur5, truth(ur5), np.random.default_rng(4), samples=2000, rate=100.0)
     noise = 1e-3 * np.random.default_rng(5).standard_normal(quiet.tau.shape)
-    found = identify(ur5, [replace(quiet, tau=quiet.tau + noise)], estimator="wls")
+    found = fit(ur5, [replace(quiet, tau=quiet.tau + noise)], estimator="wls")
     (evaluation,) = found.fitted
     residual = np.abs(evaluation.recording.trajectory.tau - evaluation.torques["estimate"])
     usual = np.median(residual, axis=0)
@@ -119,7 +117,7 @@ def test_friction_that_is_not_coulombs_near_a_reversal_is_no_outlier(ur5):
     step = pi[[name.endswith(".coulomb") for name in ur5.layout.names]]
     smooth = step * (np.tanh(quiet.v / 0.03) - np.sign(quiet.v))
     log = replace(quiet, tau=quiet.tau + noise + smooth)
-    found = identify(ur5, [log], estimator="wls", friction="none")
+    found = fit(ur5, [log], estimator="wls")
     (evaluation,) = found.fitted
     residual = np.abs(evaluation.recording.trajectory.tau - evaluation.torques["estimate"])
     usual = np.median(residual, axis=0)
@@ -130,7 +128,7 @@ def test_friction_that_is_not_coulombs_near_a_reversal_is_no_outlier(ur5):
 def test_exact_data_need_no_weights(ur5):
     log = exact_log(ur5, truth(ur5), np.random.default_rng(2), samples=300)
     exact = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-    found = identify(ur5, [log], signals=exact, estimator=EstimatorSettings("wls", robust="tukey"))
+    found = fit(ur5, [log], signals=exact, estimator=EstimatorSettings("wls", robust="tukey"))
     beta = found.mapping.to_base(truth(ur5))
     np.testing.assert_allclose(found.base, beta, rtol=1e-7, atol=1e-8)
     assert found.outliers == ()
@@ -143,7 +141,7 @@ def test_standard_errors_of_a_robust_fit_allow_for_its_loss_of_efficiency(ur5):
     for seed in range(12):
         log = exact_log(ur5, pi, np.random.default_rng([5, seed]), samples=400, noise=NOISE)
         estimator = EstimatorSettings("wls", robust="huber")
-        found = identify(ur5, [log], signals=signals, estimator=estimator)
+        found = fit(ur5, [log], signals=signals, estimator=estimator)
         errors.append(found.base - found.mapping.to_base(pi))
         reported.append(found.base_error)
     ratio = np.sqrt(np.mean(np.square(reported), axis=0) / np.mean(np.square(errors), axis=0))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
-from helpers.fitting import identify
+from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import OLS, WLS
@@ -83,7 +83,7 @@ def test_behind_the_filter_errors_are_the_scatter_and_those_of_independent_rows_
     found, stated, naive = [], [], []
     for _ in range(30):
         log = replace(clean, tau=clean.tau + level * rng.standard_normal(clean.tau.shape))
-        result = identify(model, [log], signals=filtered, estimator="ols")
+        result = fit(model, [log], signals=filtered, estimator="ols")
         assert basis in result.errors.method
         pair = (result.estimate, result.wls)
         found.append([estimate.theta for estimate in pair])

@@ -76,15 +76,16 @@ def assert_alike(model, path, signals, *, start=None, end=None, **reading):
     return found, whole
 
 
-@pytest.mark.parametrize("suffix", ["csv", "parquet", "npz"])
 @pytest.mark.parametrize(
-    "given",
+    ("suffix", "given"),
     [
-        {},
-        {"velocity": "differentiated", "cutoff": 12.0, "order": 2},
-        {"cutoff": None, "min_velocity": 0.0},
-        {"cutoff": None, "rate": 70.0},
-        {"rate": 50.0, "trim": 0.6, "torque_delay": 0.02},
+        ("csv", {}),
+        ("parquet", {"velocity": "differentiated", "cutoff": 12.0, "order": 2}),
+        ("csv", {"cutoff": None, "min_velocity": 0.0}),
+        ("parquet", {"cutoff": None, "rate": 70.0}),
+        ("csv", {"rate": 50.0, "trim": 0.6, "torque_delay": 0.02}),
+        ("npz", {}),
+        ("npz", {"rate": 50.0, "trim": 0.6, "torque_delay": 0.02}),
     ],
     ids=str,
 )

@@ -1,6 +1,7 @@
 """Ways to spoil a clean log, with the codes of the finding that must name each."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -19,6 +20,7 @@ ROBOTS = {
 }
 
 
+@cache
 def robot(name, **options):
     file, joints = ROBOTS[name]
     return RobotModel.from_urdf(example_urdf(file), joints=joints, **options)
@@ -39,6 +41,12 @@ def clean_log(
         model, truth, motion, rate=rate, duration=duration, rng=rng, noise=NOISE, settings=settings
     )
     return replace(log, path=path)
+
+
+@cache
+def controlled_log(name, seed, *, rate=100.0, duration=20.0):
+    """Return the clean log of a robot under a controller, as real logs are: made once a process."""
+    return clean_log(robot(name), seed, rate=rate, duration=duration, controller="feedforward")
 
 
 @dataclass(frozen=True)

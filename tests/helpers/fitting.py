@@ -1,7 +1,28 @@
-"""``identify`` for tests of fits: the doctor, whose findings they do not read, is not asked."""
+"""``identify`` for tests of fits: neither the doctor nor the choice of friction is asked.
 
+``fit`` is the fit alone, without what is concluded from it.
+"""
+
+from robotid.fitting.fit import fit_recordings
+from robotid.fitting.recordings import Recordings
+from robotid.fitting.settings import EstimatorSettings
+from robotid.fitting.survey import hold_log
 from robotid.identification import pipeline
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
+
+PLAIN = {"doctor": False, "friction": "viscous+coulomb"}  # what tests of fits do not read
 
 
 def identify(model, logs, **settings):
-    return pipeline.identify(model, logs, **{"doctor": False, **settings})
+    return pipeline.identify(model, logs, **{**PLAIN, **settings})
+
+
+def fit(model, logs, *, validation=(), signals=None, estimator="consistent"):
+    """Return the fit of a model as it is to logs in memory, before anything is judged."""
+    fitted, kept = (
+        [hold_log(model, log, signals or SignalSettings()) for log in some]
+        for some in (logs, validation)
+    )
+    choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
+    return fit_recordings(Recordings(model, structural_mapping(model), fitted, kept), choice)

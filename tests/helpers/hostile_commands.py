@@ -34,7 +34,7 @@ from helpers.recorders import write_lerobot
 from robotid.closed_loop.settings import LoopSettings
 from robotid.logs.data import Log
 from robotid.logs.read import write_log
-from robotid.robot.families import FAMILIES
+from robotid.robot.drives import FAMILIES
 from robotid.simulation.settings import Simulation
 
 __all__ = ["COMMAND_KINDS"]

@@ -1,5 +1,6 @@
 """Joints with servos of their own, simulated apart from the package: for logs of commands."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,21 +36,7 @@ def record(commands, servos, *, rate=200.0, duration=20.0, seed=0, couple=None, 
     told = hold / rate * np.floor(t / (hold / rate) + 1e-9)
     q_ref = commands(told)
     n = q_ref.shape[1]
-    late = np.array([round(s.delay / STEP) for s in servos])
-    k, d, c, top, play = (
-        np.array([getattr(s, name) for s in servos])
-        for name in ("stiffness", "damping", "coulomb", "top", "play")
-    )
-    q, v, joint = q_ref[0].copy(), np.zeros(n), q_ref[0].copy()
-    path, places = np.empty_like(q_ref), np.arange(n)
-    for i in range(len(t)):
-        path[i] = joint
-        wanted = q_ref[np.maximum(i - late, 0), places]
-        free = (v + STEP * k * (wanted - q)) / (1 + STEP * d + STEP**2 * k)
-        v = np.sign(free) * np.maximum(np.abs(free) - STEP * c / (1 + STEP * d), 0.0)
-        v = np.clip(v, -top, top)
-        q = q + STEP * v
-        joint = np.clip(joint, q - play / 2, q + play / 2)
+    path = np.column_stack([_follow(x, s) for x, s in zip(q_ref.T, servos, strict=True)])
     every = round(1 / (rate * STEP))
     rows = slice(None, None, every)
     seen = path[rows] + np.array([s.noise for s in servos]) * rng.standard_normal(path[rows].shape)
@@ -60,6 +47,23 @@ def record(commands, servos, *, rate=200.0, duration=20.0, seed=0, couple=None, 
     seen = np.where(quantum, coarse, seen)
     names = tuple(f"joint_{j}" for j in range(n))
     return Log(t[rows], seen, np.zeros_like(seen), names, q_ref=q_ref[rows], has_torque=False)
+
+
+def _follow(commands, servo):
+    """Return where one joint is at each step; plain numbers are faster than arrays."""
+    wanted, late = commands.tolist(), round(servo.delay / STEP)
+    k, top, half = servo.stiffness, servo.top, servo.play / 2
+    inertia = 1 + STEP * servo.damping + STEP**2 * k
+    held = STEP * servo.coulomb / (1 + STEP * servo.damping)
+    q, v, joint, path = wanted[0], 0.0, wanted[0], []
+    for i in range(len(wanted)):
+        path.append(joint)
+        free = (v + STEP * k * (wanted[max(i - late, 0)] - q)) / inertia
+        v = math.copysign(max(abs(free) - held, 0.0), free)
+        v = min(max(v, -top), top)
+        q += STEP * v
+        joint = min(max(joint, q - half), q + half)
+    return path
 
 
 def chirps(amplitudes, fastest, *, duration=20.0, slowest=0.1, shift=0.7):

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.fitting import identify
+from helpers.fitting import fit, identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import batch
@@ -14,7 +14,7 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import MassMatrixCheck
 from robotid.robot.model import RobotModel
 
-EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0, velocity="measured")
 
 
 @pytest.mark.parametrize("estimator", ["ols", "wls", "consistent"])
@@ -48,7 +48,7 @@ def test_the_consistent_result_is_possible_and_says_where_it_comes_from(ur5, rng
 
 def test_what_least_squares_leaves_open_is_as_wide_as_the_prior(ur5, rng):
     log = exact_log(ur5, truth(ur5), rng, noise=np.full(6, 0.1))
-    found = identify(ur5, [log], signals=EXACT, estimator="wls")
+    found = fit(ur5, [log], signals=EXACT, estimator="wls")
     i = ur5.layout.names.index("shoulder_link.m")
     assert found.standard_error[i] == pytest.approx(found.prior_std[i], rel=1e-6)
     np.testing.assert_allclose(found.base, found.wls.theta, rtol=1e-9, atol=1e-10)
@@ -56,12 +56,10 @@ def test_what_least_squares_leaves_open_is_as_wide_as_the_prior(ur5, rng):
 
 def test_a_filter_widens_the_standard_errors(ur5, rng):
     log = exact_log(ur5, truth(ur5), rng, rate=200.0, samples=2000, noise=np.full(6, 0.5))
-    filtered = identify(ur5, [log], signals=SignalSettings(cutoff=10.0), estimator="wls")
+    filtered = fit(ur5, [log], signals=SignalSettings(cutoff=10.0), estimator="wls")
     # white noise behind a 10 Hz filter at 200 Hz: a tenth of the rows are independent, and a
     # tenth of the variance is left, so the errors stay about what they were without the filter
-    plain = identify(
-        ur5, [log], signals=SignalSettings(cutoff=None, min_velocity=0.02), estimator="wls"
-    )
+    plain = fit(ur5, [log], signals=SignalSettings(cutoff=None, min_velocity=0.02), estimator="wls")
     ratio = np.median(filtered.base_error / plain.base_error)
     assert 0.8 < ratio < 1.4
 
@@ -82,14 +80,14 @@ def test_stand_still_rows_do_not_spoil_friction(ur5, rng):
         joints=ur5.joints,
     )
     settings = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.02)
-    found = identify(ur5, [log], signals=settings, estimator="wls")
+    found = fit(ur5, [log], signals=settings, estimator="wls")
     names = list(found.mapping.base_names)
     truth_base = found.mapping.to_base(pi)
     for joint in ur5.joints:
         i = names.index(f"{joint}.coulomb")
         assert found.base[i] == pytest.approx(truth_base[i], rel=1e-6)
     without = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-    spoiled = identify(ur5, [log], signals=without, estimator="wls")
+    spoiled = fit(ur5, [log], signals=without, estimator="wls")
     coulomb = [names.index(f"{joint}.coulomb") for joint in ur5.joints]
     # what leaving the rows in costs: Coulomb friction comes out low
     assert (spoiled.base[coulomb] < 0.8 * truth_base[coulomb]).any()
@@ -129,7 +127,7 @@ def test_an_unknown_estimator_is_refused():
 
 
 def test_parameters_with_an_indefinite_mass_matrix_are_not_consistent(ur5, rng):
-    found = identify(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT)
+    found = fit(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT)
     assert found.is_consistent
     check = replace(found.mass_matrix, positive_share=0.64)
     other = replace(found, _checked=[(found.standard, check)])  # as if it had been found so
@@ -140,12 +138,12 @@ def test_noise_levels_that_settle_slowly_on_few_rows_do_not_stop_it(ur5, monkeyp
     """Their change halves every two iterations: 3e-4 after 20, 2.5e-7 after 40, on any machine."""
     log = exact_log(ur5, truth(ur5), np.random.default_rng(0), samples=60, noise=0.5)
     monkeypatch.setattr(batch, "_MAX_ITERATIONS", 40)
-    found = identify(ur5, [log], estimator="wls")
+    found = fit(ur5, [log], estimator="wls")
     assert "after 40 iterations, where they still change by" in found.estimate.message
     assert found.errors.stretches < 12
     monkeypatch.setattr(batch, "_MAX_ITERATIONS", 20)
     with pytest.raises(NotConvergedError, match=r"still change by 3\.\de-04 after 20 iterations"):
-        identify(ur5, [log], estimator="wls")
+        fit(ur5, [log], estimator="wls")
 
 
 def test_the_mass_matrix_is_checked_once_and_again_for_other_parameters(ur5, rng, monkeypatch):
@@ -156,8 +154,8 @@ def test_the_mass_matrix_is_checked_once_and_again_for_other_parameters(ur5, rng
         return MassMatrixCheck(1, 1.0, 1.0)
 
     monkeypatch.setattr("robotid.fitting.result.check_mass_matrix", check)
-    found = identify(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT, estimator="wls")
-    assert found.mass_matrix is replace(found, alarms=("x",)).mass_matrix is found.mass_matrix
+    found = fit(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT, estimator="wls")
+    assert found.mass_matrix is replace(found, drives=()).mass_matrix is found.mass_matrix
     assert len(asked) == 1
     other = replace(found, standard=found.prior)
     assert other.mass_matrix.is_positive

@@ -1,11 +1,12 @@
-"""Standard errors where bounds bind: projections, closed forms, what identify makes of them."""
+"""Standard errors where bounds bind: projections, closed forms, what the fit makes of them."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.driven import arm
 from helpers.estimation import EXACT, NOISE
-from helpers.fitting import identify
+from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import Consistent
@@ -21,15 +22,17 @@ BOUND = {"prior": "euclidean", "prior_weight": 1.0}  # which leaves bodies on th
 
 
 @pytest.fixture
-def inside(ur5, rng):
+def inside(rng):
     """A fit whose prior is so narrow and so far inside that no bound binds."""
-    trajectory, mapping = process(exact_log(ur5, truth(ur5), rng), EXACT), structural_mapping(ur5)
+    model = arm()
+    trajectory = process(exact_log(model, truth(model), rng), EXACT)
     prior, spread = (
-        ur5.standard_parameters(),
-        1e-3 * prior_spread(ur5, trajectory.squares, len(trajectory.t)),
+        model.standard_parameters(),
+        1e-3 * prior_spread(model, trajectory.squares, len(trajectory.t)),
     )
-    prior[ur5.layout.n_inertial :] = 100.0 * spread[ur5.layout.n_inertial :]
-    return Consistent(ur5.layout, mapping.K, prior, spread, metric="euclidean", margin=1e-9)
+    prior[model.layout.n_inertial :] = 100.0 * spread[model.layout.n_inertial :]
+    K = structural_mapping(model).K
+    return Consistent(model.layout, K, prior, spread, metric="euclidean", margin=1e-9)
 
 
 def information(fit, rng, strength):
@@ -118,8 +121,8 @@ def test_on_a_bound_half_of_the_fits_stay_there(inside, rng):
 
 def test_bounds_make_intervals_narrower_and_are_named(ur5, rng):
     log = exact_log(ur5, truth(ur5), rng, samples=2000, noise=NOISE)
-    found = identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
-    free = identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(draws=0, **BOUND))
+    found = fit(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
+    free = fit(ur5, [log], signals=EXACT, estimator=EstimatorSettings(draws=0, **BOUND))
     assert found.estimate.details["active"]
     np.testing.assert_array_equal(found.standard, free.standard)
     assert "64 fits to redrawn data and prior" in found.errors.method
@@ -141,17 +144,17 @@ def test_fits_that_are_not_solved_are_counted_and_many_are_refused(ur5, rng, mon
 
     monkeypatch.setattr(Programme, "redrawn", some_fail)
     lost = 3
-    found = identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
+    found = fit(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
     assert "61 fits" in found.errors.method
     assert "(3 more not solved: InsufficientProgress)" in found.errors.method
     lost = 20
     with pytest.raises(NotConvergedError, match="solved 44 of 64 fits to redrawn data; set draws"):
-        identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
+        fit(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
 
 
 def test_a_log_of_few_stretches_is_redrawn_by_the_filters_share(ur5, rng):
     log = exact_log(ur5, truth(ur5), rng, samples=300, noise=NOISE)
-    found, again = (identify(ur5, [log], estimator=EstimatorSettings(**BOUND)) for _ in range(2))
+    found, again = (fit(ur5, [log], estimator=EstimatorSettings(**BOUND)) for _ in range(2))
     assert "only" in found.errors.method
     assert "fits to redrawn data" in found.errors.method
     np.testing.assert_array_equal(again.standard_error, found.standard_error)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
@@ -7,6 +9,8 @@ from robotid.commands.job import job_from_settings
 from robotid.commands.validate import validate_result
 from robotid.findings import Finding
 from robotid.fitting.metrics import JointMetrics, Metrics
+from robotid.fitting.settings import EstimatorSettings
+from robotid.identification.pipeline import identify
 from robotid.judgement.verdict import Doubt, doubts_of, is_outvoted, judge, refuted
 from robotid.judgement.witness import Witness
 from robotid.logs.read import write_log
@@ -252,23 +256,38 @@ def test_a_robust_loss_excuses_jumps_of_the_torque_and_what_they_cause():
     assert [doubt.joint for doubt in doubts_of(other, JOINTS, is_robust=True)] == ["b"]
 
 
+def spoilt_logs(model, spoil=None):
+    """Return two logs of the same arm, to fit and to validate with, as a test spoils them."""
+    logs = []
+    for name, rng in zip(("run.csv", "kept.csv"), np.random.default_rng(0).spawn(2), strict=True):
+        log = exact_log(model, truth(model), rng, samples=800, rate=100.0, noise=0.1 * NOISE)
+        log = replace(log, path=name)
+        logs.append(log if spoil is None else spoil(log))
+    return logs
+
+
+def found_of(model, spoil=None, ignore=(), **settings):
+    """Return what is found of such logs."""
+    log, kept = spoilt_logs(model, spoil)
+    settings = EstimatorSettings(prior_weight=1.0, draws=0, **settings)
+    return identify(
+        model, [log], validation=[kept], estimator=settings, friction="none", ignore=ignore
+    )
+
+
 @pytest.fixture
 def run(ur5, tmp_path):
-    """Run a job on two logs of the same arm, the fitted one as a test spoils it."""
+    """Run a job on such logs; return what is found, its result, and the verdict of its file."""
 
-    def runner(spoil=None, ignore=(), **settings):
-        names = ("run.csv", "kept.csv")
-        for name, rng in zip(names, np.random.default_rng(0).spawn(2), strict=True):
-            log = exact_log(ur5, truth(ur5), rng, samples=800, rate=100.0, noise=0.1 * NOISE)
-            if spoil is not None:
-                log = spoil(log, name)
-            write_log(log, tmp_path / name)
+    def runner(**settings):
+        for log in spoilt_logs(ur5):
+            write_log(log, tmp_path / log.path)
         table = {
             "urdf": str(example_urdf("ur5_robot.urdf")),
             "identification": [{"log": "run.csv"}],
             "validation": [{"log": "kept.csv"}],
+            "model": {"friction": "viscous+coulomb"},
             "estimator": {"prior_weight": 1.0, "draws": 0, **settings},
-            "doctor": {"ignore": list(ignore)},
             "output": {"report": False},
         }
         out = tmp_path / "out"
@@ -289,21 +308,22 @@ def test_a_stated_bound_that_binds_makes_it_usable(run):
     assert "the data push against them at shoulder_lift_joint," in finding["message"]
 
 
-def test_a_stated_bound_that_only_the_urdf_minds_is_a_note(run):
-    found, result, _ = run(constraints={"total_mass": [10.0, 17.0]})
-    (finding,) = [f for f in result["warnings"] if f["code"] == "bound_binds"]
+def test_a_stated_bound_that_only_the_urdf_minds_is_a_note(ur5):
+    found = found_of(ur5, constraints={"total_mass": [10.0, 17.0]})
+    (finding,) = [f for f in found.findings if f.code == "bound_binds"]
     assert found.doubts == ()
-    assert "the torque is explained as well as without" in finding["message"]
+    assert finding.severity == "note"
+    assert "the torque is explained as well as without" in finding.message
     assert found.verdict.status == "good"
 
 
-def test_a_mass_that_is_stated_does_not_come_from_the_data(run):
-    _, result, _ = run(constraints={"mass": {"forearm_link": 2.0}})
-    (mass,) = [p for p in result["standard_parameters"] if p["name"] == "forearm_link.m"]
-    assert (mass["value"], mass["source"]) == (pytest.approx(2.0), "prior")
+def test_a_mass_that_is_stated_does_not_come_from_the_data(ur5):
+    found = found_of(ur5, constraints={"mass": {"forearm_link": 2.0}})
+    k = ur5.layout.names.index("forearm_link.m")
+    assert (found.standard[k], found.sources[k]) == (pytest.approx(2.0), "prior")
 
 
-def test_a_wrong_total_mass_makes_the_joints_usable_that_it_costs(run):
+def test_a_wrong_total_mass_makes_the_joints_usable_that_it_costs(run, ur5):
     _, result, again = run(constraints={"total_mass": 5.0})
     assert result["verdict"]["status"] == again["status"] == "usable"
     lift = result["verdict"]["per_joint"]["shoulder_lift_joint"]
@@ -313,25 +333,23 @@ def test_a_wrong_total_mass_makes_the_joints_usable_that_it_costs(run):
     assert all("what [estimator] asks for ({'total_mass': 5.0})" in text for text in costs)
     assert "physics and data disagree" in lift["reasons"][-1]
     assert again["per_joint"]["shoulder_lift_joint"]["status"] == "usable"
-    found, *_ = run(constraints={"total_mass": 5.0}, ignore=["constraint_costs"])
+    found = found_of(ur5, constraints={"total_mass": 5.0}, ignore=["constraint_costs"])
     assert "constraint_costs" not in {doubt.code for doubt in found.doubts}
 
 
-def test_spikes_in_torques_do_not_condemn_a_robust_fit(run):
-    def spoil(log, name):
+def test_spikes_in_torques_do_not_condemn_a_robust_fit(ur5):
+    def spoil(log):
         tau = log.tau.copy()
-        if name == "run.csv":
+        if log.path == "run.csv":
             tau[[200, 400, 600], 2] += 1000.0
-        return type(log)(**{**vars(log), "tau": tau})
+        return replace(log, tau=tau)
 
-    plain, result, _ = run(spoil)
-    assert "jumps by up to" in result["verdict"]["reasons"][0]
+    plain = found_of(ur5, spoil)
+    assert "jumps by up to" in plain.verdict.reasons[0]
     assert plain.alarms
-    robust, result, again = run(spoil, robust="tukey")
-    verdict = result["verdict"]
-    assert verdict["status"] == again["status"] == "good", verdict["reasons"]
-    assert verdict["doubts"] == []
-    assert not robust.alarms
+    robust = found_of(ur5, spoil, robust="tukey")
+    assert robust.verdict.status == "good", robust.verdict.reasons
+    assert robust.doubts == robust.alarms == ()
 
 
 def test_what_noise_hides_of_a_rich_motion_is_said_and_does_not_condemn():

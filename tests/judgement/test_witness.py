@@ -2,15 +2,18 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from helpers.driven import arm
+from helpers.fitting import fit, identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.fitting.settings import EstimatorSettings
-from robotid.identification.pipeline import identify
-from robotid.judgement.witness import Witness
+from robotid.judgement.findings import fit_findings
+from robotid.judgement.witness import Witness, call_witness
 from robotid.logs.settings import SignalSettings
 
-EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0, velocity="measured")
 NOISE = 0.05 * np.array([4, 4, 2, 1, 1, 0.5])
 
 
@@ -20,15 +23,20 @@ def near_urdf(model, scale=1.0):
     return scale * pi
 
 
-def found_of(model, pi, estimator="consistent"):
+def found_of(model, pi, **constraints):
     logs = [exact_log(model, pi, r, noise=NOISE) for r in np.random.default_rng(0).spawn(2)]
-    return identify(
-        model, logs[:1], validation=logs[1:], signals=EXACT, doctor=False, estimator=estimator
-    )
+    settings = EstimatorSettings(draws=0, constraints=constraints)
+    return identify(model, logs[:1], validation=logs[1:], signals=EXACT, estimator=settings)
 
 
-def test_a_robot_like_its_urdf_is_good_and_its_urdf_bears_witness(ur5):
-    found = found_of(ur5, near_urdf(ur5))
+@pytest.fixture(scope="module")
+def alike(ur5):
+    """A robot whose bodies are those of its URDF."""
+    return found_of(ur5, near_urdf(ur5))
+
+
+def test_a_robot_like_its_urdf_is_good_and_its_urdf_bears_witness(alike):
+    found = alike
     assert found.witness.factor == pytest.approx(1.0, abs=0.01)
     for joint, ratio in found.witness.gravity.items():
         assert ratio == pytest.approx(1.0, abs=5 * found.witness.gravity_error[joint] + 1e-3)
@@ -44,8 +52,7 @@ def test_torques_of_another_gain_are_told_from_other_masses_and_never_good(ur5):
     assert found.verdict.status == "usable"
     (reason,) = [r for r in found.verdict.reasons if "could not be checked" in r]
     assert "All joints alike are off by 0.80" in reason
-    stated = EstimatorSettings("consistent", constraints={"total_mass": [10.0, 20.0]})
-    found = found_of(ur5, near_urdf(ur5, 0.8), stated)
+    found = found_of(ur5, near_urdf(ur5, 0.8), total_mass=[10.0, 20.0])
     assert found.verdict.status == "good"
     assert "rests on the mass that was stated" in found.verdict.reasons[-1]
 
@@ -78,8 +85,8 @@ def test_without_gravity_nothing_bears_witness(ur5):
     assert "gravity loads no joint" in found.verdict.reasons[-1]
 
 
-def test_friction_stands_beside_it_as_a_share_of_the_torque(ur5):
-    found = found_of(ur5, near_urdf(ur5))
+def test_friction_stands_beside_it_as_a_share_of_the_torque(ur5, alike):
+    found = alike
     layout, (e,) = ur5.layout, found.fitted
     viscous, coulomb = (
         found.standard[layout.names.index(f"wrist_3_joint.{term}")]
@@ -91,10 +98,10 @@ def test_friction_stands_beside_it_as_a_share_of_the_torque(ur5):
     json.dumps(found.witness.to_dict(), allow_nan=False)
 
 
-def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is_its_own(ur5):
-    from robotid.judgement.findings import fit_findings
-
-    found = found_of(ur5, near_urdf(ur5))
+def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is_its_own(
+    ur5, alike
+):
+    found = alike
     shapes = {f.code for f in fit_findings(found) if f.severity == "warning"}
     assert not shapes & {"com_outside", "gyration", "density"}
     i = ur5.layout.names.index("forearm_link.mcx")
@@ -113,10 +120,8 @@ def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is
     assert "so it is in the URDF already" in finding.message
 
 
-def test_a_needle_denser_than_any_material_is_named_unless_the_urdf_has_it(ur5):
-    from robotid.judgement.findings import fit_findings
-
-    found = found_of(ur5, near_urdf(ur5))
+def test_a_needle_denser_than_any_material_is_named_unless_the_urdf_has_it(ur5, alike):
+    found = alike
 
     def dense(found):
         return [f for f in fit_findings(found) if f.code == "dense_body"]
@@ -140,10 +145,58 @@ def test_a_result_that_its_prior_holds_back_bears_no_witness(ur5, rng):
     size = ur5.layout.n_inertial
     pi[:size] = 3.0 * ur5.standard_parameters()[:size]  # the sensors say three times the URDF
     log = exact_log(ur5, pi, rng, samples=1000, noise=0.5)
-    kept = EstimatorSettings(prior_weight=1e9)
-    held = identify(ur5, [log], estimator=kept, doctor=False)
+    kept = EstimatorSettings(prior_weight=1e9, draws=0)
+    held = identify(ur5, [log], estimator=kept)
     assert held.witness.factor == pytest.approx(1.0, abs=0.05)  # it stays at the URDF
     assert not held.witness.follows
     assert not held.witness.agrees
-    free = identify(ur5, [log], doctor=False)
+    free = identify(ur5, [log], estimator=EstimatorSettings(draws=0))
     assert free.witness.follows
+
+
+def test_its_figures_are_those_of_pinocchios_gravity_over_the_poses_of_all_logs():
+    model, rng = arm(), np.random.default_rng(3)
+    size, pi = model.layout.n_inertial, truth(model)
+    pi[:size].reshape(-1, 10)[-1] *= 1.3
+    logs = [exact_log(model, pi, rng, samples=n, noise=0.5) for n in (170, 130)]
+    found = fit(model, logs, signals=EXACT, estimator=EstimatorSettings(draws=0))
+    witness = call_witness(found)
+
+    def gravity(values):
+        bodies = model.with_parameters(values).pin_model
+        data = bodies.createData()
+        poses = model.configurations(np.vstack([log.q for log in logs]))
+        return np.array([pin.computeGeneralizedGravity(bodies, data, q) for q in poses])
+
+    def columns(of):
+        """Return the gravity torque of each of some parameters, by differences; it is linear."""
+        step = 1e-3 * np.eye(len(pi))[of]
+        return np.stack([(gravity(found.prior + d) - u) / 1e-3 for d in step], axis=-1)
+
+    u, g = gravity(found.prior), gravity(found.standard)
+    ratio = np.sum(u * g, axis=0) / np.sum(u * u, axis=0)
+    assert witness.factor == pytest.approx(np.sum(u * g) / np.sum(u * u), rel=1e-6)
+    rest = np.linalg.norm(g - witness.factor * u) / np.linalg.norm(g)
+    weights = np.einsum("nj,njk->jk", u, columns(slice(0, size))) / np.sum(u * u, axis=0)[:, None]
+    C = found.standard_covariance[:size, :size]
+    error = np.sqrt(np.einsum("jk,kl,jl->j", weights, C, weights))
+    known = {j: (x, e) for j, x, e in zip(model.joints, ratio, error, strict=True) if e < 0.1}
+    assert 0 < len(known) < 3
+    assert witness.gravity == {j: pytest.approx(x, rel=1e-6) for j, (x, _) in known.items()}
+    assert witness.gravity_error == {j: pytest.approx(e, rel=1e-4) for j, (_, e) in known.items()}
+    P = columns(slice(size - 10, size - 6)).reshape(-1, 4)
+    both = np.linalg.lstsq(np.column_stack([u.ravel(), P]), g.ravel())[0]
+    assert witness.scale == pytest.approx(both[0], rel=1e-6)
+    payload = np.linalg.lstsq(P, (g - u).ravel())[0]
+    left = np.linalg.norm((g - u).ravel() - P @ payload) / np.linalg.norm(g)
+    assert witness.unexplained == pytest.approx((rest, left), rel=1e-4)
+    masses = (found.prior[:size:10].sum(), found.standard[:size:10].sum(), max(both[1], 0.0))
+    assert witness.masses == pytest.approx(masses, rel=1e-5)
+    # friction of both logs
+    k = [
+        [model.layout.names.index(f"{j}.{t}") for j in model.joints] for t in ("viscous", "coulomb")
+    ]
+    v, tau = (np.vstack([getattr(log, x) for log in logs]) for x in ("v", "tau"))
+    torque = found.standard[k[0]] * v + found.standard[k[1]] * np.sign(v)
+    share = np.linalg.norm(torque, axis=0) / np.linalg.norm(tau, axis=0)
+    np.testing.assert_allclose(list(witness.friction.values()), share, rtol=1e-9)

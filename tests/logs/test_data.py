@@ -202,6 +202,25 @@ def test_trajectory_cannot_be_changed():
     assert make_trajectory(rate=None).rate is None
 
 
+def test_some_samples_of_a_trajectory_cannot_be_changed_either_and_keep_nothing_of_the_whole():
+    memory, direction = np.arange(1000.0).reshape(500, 2), np.ones((500, 3))
+    whole = make_trajectory(memory=memory, direction=direction)
+    whole.derived["inertial rows"] = "of all"
+    rows = {"part": slice(7, 20), "every": slice(None, None, 9), "at": np.array([3, 400])}
+    for some, own in zip(
+        [whole.part(7, 20), whole.every(9), whole.at(rows["at"])], rows.values(), strict=True
+    ):
+        assert some.derived == {}
+        for name in ("t", "q", "v", "a", "tau", "segment", "direction", "memory"):
+            found = getattr(some, name)
+            np.testing.assert_array_equal(found, getattr(whole, name)[own])
+            with pytest.raises(ValueError, match="read-only"):
+                found[0] = 1
+    assert (whole.part(7, 20).rate, whole.every(9).rate) == (100.0, None)
+    other = whole.with_memory(None)
+    assert (other.memory, other.derived, whole.memory is memory) == (None, whole.derived, True)
+
+
 @pytest.mark.parametrize("name", ["q", "v", "a", "tau"])
 def test_trajectory_refuses_wrong_shapes_and_nan(name):
     with pytest.raises(DataError, match=rf"trajectory: {name} has shape \(500, 1\), wanted"):

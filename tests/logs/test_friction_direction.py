@@ -4,22 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.fitting import identify
+from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 from scipy.signal import butter, sosfiltfilt
 
+from robotid.estimators import WLS
 from robotid.exceptions import DataError
 from robotid.fitting.bands import torque_band
 from robotid.fitting.recordings import Recordings
-from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
-from robotid.identification.pipeline import conclude
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.friction_direction import acting_directions
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_directions, friction_speeds
+from robotid.regressor.factors import join
 from robotid.regressor.torque import build_problem, joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -43,11 +43,11 @@ def filtered(x, cutoff, rate, order=4):
 def coulomb_errors(model, recordings, pi):
     """Return the errors of the Coulomb parameters of weighted least squares over their values."""
     mapping = structural_mapping(model)
-    found = conclude(Recordings(model, mapping, recordings), EstimatorSettings("wls"))
+    found = WLS().fit(join(Recordings(model, mapping, recordings).reduce()).factors)
     chosen = [k for k, name in enumerate(mapping.base_names) if name.endswith(".coulomb")]
     assert len(chosen) == len(friction_speeds(model.layout))
     true = mapping.to_base(pi)[chosen]
-    return np.abs(found.base[chosen] / true - 1.0)
+    return np.abs(found.theta[chosen] / true - 1.0)
 
 
 def test_coulomb_friction_is_found_again_behind_the_filter(robot):
@@ -249,7 +249,7 @@ def test_estimates_from_filtered_logs_scatter_as_their_standard_errors_say(ur5):
     for seed in range(4):
         log = exact_log(ur5, pi, np.random.default_rng(seed), samples=4000, rate=200.0)
         noise = 0.01 * np.random.default_rng(10 + seed).standard_normal(log.tau.shape)
-        found = identify(ur5, [replace(log, tau=log.tau + noise)], estimator="wls")
+        found = fit(ur5, [replace(log, tau=log.tau + noise)], estimator="wls")
         names = found.mapping.base_names
         drives = [name.endswith((".coulomb", ".viscous", ".armature")) for name in names]
         z = (found.base - found.mapping.to_base(pi)) / found.base_error

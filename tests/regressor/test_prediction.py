@@ -8,7 +8,6 @@ from robotid.exceptions import DataError
 from robotid.regressor import prediction
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_speeds
-from robotid.regressor.compiled import is_installed
 from robotid.regressor.prediction import predict, predict_instants
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.drives import Lag, LoadFriction, Presliding, Stribeck
@@ -47,8 +46,7 @@ def test_predicted_torque_is_the_regressor_times_the_parameters(case, rng):
     possible, heavier, base_only = vectors(model, rng)
     assert_is_regressor_times(model, [possible], trajectory, compiled=False)  # inverse dynamics
     assert_is_regressor_times(model, [possible, heavier, base_only], trajectory, compiled=False)
-    if is_installed():
-        assert_is_regressor_times(model, [possible, base_only], trajectory, compiled=True)
+    assert_is_regressor_times(model, [possible, base_only], trajectory, compiled=True)
 
 
 def test_inverse_dynamics_takes_few_possible_robots_and_rows_the_rest(panda, rng, monkeypatch):

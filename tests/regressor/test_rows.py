@@ -9,8 +9,8 @@ from helpers.robots import ROBOTS, motion, possible_parameters
 from robotid.regressor import rows
 from robotid.regressor.memory import remember
 from robotid.regressor.prediction import predict
-from robotid.regressor.rows import keep_inertial_rows, kept_rows
-from robotid.regressor.torque import build_problem
+from robotid.regressor.rows import keep_inertial_rows, kept_rows, thinned
+from robotid.regressor.torque import build_problem, trajectory_regressor
 from robotid.robot.drives import LoadFriction
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -39,10 +39,23 @@ def test_rows_and_predictions_are_those_without_what_is_kept(name, rng, monkeypa
     pairs = [blocks(model, m, weight, (100, 650)) for m in (fresh, kept)]
     for wanted, found in zip(*pairs, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
+    thin = thinned(model, kept, 3)
+    assert kept_rows(model, thin) is not None
+    pairs = [blocks(model, m, weight[::3], (20, 210)) for m in (fresh.every(3), thin)]
+    for wanted, found in zip(*pairs, strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
+    assert kept_rows(model, thinned(model, fresh, 3)) is None
     vectors = [possible_parameters(model, rng) for _ in range(2)]
     vectors[1][model.layout.n_inertial :] = 0.0
     for wanted, found in zip(*(predict(model, vectors, m) for m in (fresh, kept)), strict=True):
         np.testing.assert_allclose(found, wanted, atol=1e-9 * np.abs(wanted).max())
+    whole, every = (trajectory_regressor(model, m) for m in (fresh, kept))
+    np.testing.assert_allclose(every, whole, atol=1e-12 * np.abs(whole).max())
+    some = np.array([650, 3, 128])  # of samples that are taken out
+    wanted = whole.reshape(SAMPLES, model.n_rows, -1)[some].reshape(-1, whole.shape[1])
+    for m in (fresh, kept):
+        found = trajectory_regressor(model, m, some)
+        np.testing.assert_allclose(found, wanted, atol=1e-12 * np.abs(whole).max())
 
 
 def test_what_is_kept_is_of_one_robot_and_goes_with_its_motion_alone(ur5, rng, monkeypatch):

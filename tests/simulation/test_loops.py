@@ -10,19 +10,24 @@ from helpers.single_joint import slider
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from robotid.exceptions import MissingDependencyError, NotConvergedError, SettingsError
+from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.logs.data import Log
 from robotid.robot.drives import (
     Asymmetric,
     Coulomb,
+    Counterbalance,
     Cubic,
     Harmonic,
+    Hat,
     Lag,
     LoadFriction,
     LuGre,
     Offset,
     PositionCoulomb,
+    Power,
     Presliding,
+    Ramp,
+    Spring,
     Stribeck,
     Tanh,
     Viscous,
@@ -39,9 +44,13 @@ PLAIN = (Viscous(), Coulomb(), Offset())
 TERMS = (
     *PLAIN, PositionCoulomb(order=1, centre=0.1), PositionCoulomb(order=2, centre=0.1),
     Stribeck(speed=0.2), Asymmetric(), Cubic(), Tanh(speed=0.3), Harmonic(order=3),
-    Harmonic(order=2, is_sine=True), LoadFriction(),
+    Harmonic(order=2, is_sine=True), Power(exponent=1.3), Ramp(low=0.1, high=0.9), Spring(),
+    Hat(at=0.1, before=-0.3, after=0.4), Counterbalance(arm=0.5, base=1.2, angle=0.2, rest=0.3),
+    LoadFriction(),
 )  # fmt: skip
-VALUES = (0.1, 0.2, 0.05, 0.1, 0.15, 0.08, 0.03, 0.002, 0.1, 0.04, 0.03, 0.1)
+VALUES = (
+    0.1, 0.2, 0.05, 0.1, 0.15, 0.08, 0.03, 0.002, 0.1, 0.04, 0.03, 0.05, 0.1, 0.2, 0.1, 0.2, 0.1,
+)  # fmt: skip
 #: Terms with a memory, among others.
 LASTING = (
     Viscous(), Coulomb(), Presliding(displacement=0.01),
@@ -491,12 +500,6 @@ def test_lanes_know_nothing_of_each_other(legs):
             np.testing.assert_allclose(mine[2], other[2], atol=1e-12)
 
 
-def test_without_numba_the_extra_is_named(planar, monkeypatch):
-    monkeypatch.setattr("robotid.simulation.loops.is_installed", lambda: False)
-    with pytest.raises(MissingDependencyError, match=r"closed loops needs numba.*robotid\[fast\]"):
-        LoopedRobot(planar)
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -510,9 +513,10 @@ def test_robots_that_cannot_be_rolled_out_are_named(options):
         LoopedRobot(model)
 
 
-def test_a_term_without_a_place_is_named(planar):
+def test_a_late_torque_has_no_place_and_is_told_why(planar):
     loops = loops_of(planar, (*PLAIN, Lag()), (0.1, 0.1, 0.0, 0.01))
-    with pytest.raises(SettingsError, match=r"the term Lag has no place in roll-outs; they have V"):
+    words = r"the term Lag has no place in roll-outs: it delays the measured torque.*set delay in"
+    with pytest.raises(SettingsError, match=words):
         rolled(planar, loops, commanded(planar))
 
 

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 
 import numpy as np
 import pinocchio as pin
@@ -77,6 +78,31 @@ def still(opened):
     assert opened.errors == []
 
 
+@pytest.fixture(scope="module")
+def started(browser, page):
+    with visit(browser, page) as seen:
+        yield seen
+
+
+@pytest.fixture
+def playing(started):
+    """The page as it opens: its clock runs."""
+    started.page.evaluate("replay.seek(7); replay.play()")
+    yield started
+    assert started.errors == []
+
+
+@contextmanager
+def sized(seen, width, height):
+    """Show the page in a window of another size [px]."""
+    seen.page.set_viewport_size({"width": width, "height": height})
+    seen.page.wait_for_timeout(100)
+    yield seen
+    seen.page.set_viewport_size(dict(zip(("width", "height"), SMALL, strict=True)))
+    seen.page.evaluate("scrollTo(0, 0)")
+    seen.page.wait_for_timeout(100)
+
+
 def pixels(seen):
     """Return what the 3-D view shows, shape (height, width, 3)."""
     seen.page.wait_for_timeout(120)  # a frame is drawn
@@ -97,13 +123,13 @@ def cursors(seen):
     )
 
 
-def test_the_page_loads_without_an_error_or_a_request(browser, page):
-    with visit(browser, page) as seen:
-        seen.page.wait_for_timeout(300)
-        assert seen.errors == []
-        assert seen.requests == []
-        assert seen.page.locator("#marks li").inner_text() == "10.00 s: payload <b>2 kg</b>"
-        assert "ghost: designed </script>" in seen.page.locator("#switches").inner_text()
+def test_the_page_loads_without_an_error_or_a_request(playing):
+    seen = playing
+    seen.page.wait_for_timeout(300)
+    assert seen.errors == []
+    assert seen.requests == []
+    assert seen.page.locator("#marks li").inner_text() == "10.00 s: payload <b>2 kg</b>"
+    assert "ghost: designed </script>" in seen.page.locator("#switches").inner_text()
 
 
 def test_the_robot_is_drawn_where_pinocchio_says(still, ur5):
@@ -125,34 +151,37 @@ def test_the_robot_is_drawn_where_pinocchio_says(still, ur5):
     assert 0.01 < differs.mean() < 0.6
 
 
-def test_playback_moves_the_robot_at_true_time_and_stops(browser, page):
-    with visit(browser, page) as seen:
-        watch = "[replay.clock.time, replay.clock.at / 1000 * 0.25]"  # at: of the last frame
-        seen.page.select_option("#speed", "0.25")  # or screenshots take longer than the motion
-        seen.page.wait_for_timeout(100)
-        before, pose, first = seen.page.evaluate(watch), poses(seen), pixels(seen)
-        seen.page.wait_for_timeout(900)
-        after, second = seen.page.evaluate(watch), pixels(seen)
-        assert after[0] - before[0] == pytest.approx(after[1] - before[1], abs=1e-6)
-        assert after[0] - before[0] > 0.2
-        assert not np.allclose(pose, poses(seen), atol=0.02)
-        assert (np.abs(first - second).max(axis=2) > 30).mean() > 0.003
-        seen.page.locator("body").press("Space")
-        assert seen.page.locator("#play").inner_text() == "Play"
-        stopped = seen.page.evaluate("replay.clock.time")
-        seen.page.wait_for_timeout(200)
-        assert seen.page.evaluate("replay.clock.time") == stopped
+def test_playback_moves_the_robot_at_true_time_and_stops(playing):
+    seen = playing
+    watch = "[replay.clock.time, replay.clock.at / 1000 * 0.25]"  # at: of the last frame
+    seen.page.select_option("#speed", "0.25")  # or screenshots take longer than the motion
+    seen.page.wait_for_timeout(100)
+    before, pose, first = seen.page.evaluate(watch), poses(seen), pixels(seen)
+    seen.page.wait_for_timeout(900)
+    after, second = seen.page.evaluate(watch), pixels(seen)
+    assert after[0] - before[0] == pytest.approx(after[1] - before[1], abs=1e-6)
+    assert after[0] - before[0] > 0.2
+    assert not np.allclose(pose, poses(seen), atol=0.02)
+    assert (np.abs(first - second).max(axis=2) > 30).mean() > 0.003
+    seen.page.locator("body").press("Space")
+    assert seen.page.locator("#play").inner_text() == "Play"
+    stopped = seen.page.evaluate("replay.clock.time")
+    seen.page.wait_for_timeout(200)
+    assert seen.page.evaluate("replay.clock.time") == stopped
+    seen.page.select_option("#speed", "1")
 
 
-def test_speed_and_loop(browser, page):
-    with visit(browser, page, **OPEN) as seen:
-        seen.page.select_option("#speed", "10")
-        seen.page.click("#play")
-        seen.page.wait_for_timeout(1000)  # 10 s of a motion of 4 s
-        assert seen.page.evaluate("replay.clock.playing")
-        seen.page.uncheck("#loop")
-        until(seen, "!replay.clock.playing")
-        assert seen.page.evaluate("replay.clock.time") == pytest.approx(11.0, abs=1e-5)
+def test_speed_and_loop(still):
+    seen = still
+    seen.page.select_option("#speed", "10")
+    seen.page.click("#play")
+    seen.page.wait_for_timeout(1000)  # 10 s of a motion of 4 s
+    assert seen.page.evaluate("replay.clock.playing")
+    seen.page.uncheck("#loop")
+    until(seen, "!replay.clock.playing")
+    assert seen.page.evaluate("replay.clock.time") == pytest.approx(11.0, abs=1e-5)
+    seen.page.check("#loop")
+    seen.page.select_option("#speed", "1")
 
 
 def test_a_click_in_a_chart_moves_robot_slider_and_every_cursor(still):
@@ -199,8 +228,8 @@ def test_keys_move_the_clock_and_a_mark_is_a_button_that_picks_its_joint(still, 
     assert seen.page.evaluate("replay.picked") == ur5.joints[2]
 
 
-def test_play_is_the_first_tab_stop_and_every_target_is_large_enough(browser, page):
-    with visit(browser, page, size=(1280, 800), **OPEN) as seen:
+def test_play_is_the_first_tab_stop_and_every_target_is_large_enough(still):
+    with sized(still, 1280, 800) as seen:
         seen.page.locator("summary").click()
         seen.page.mouse.click(5, 5)
         seen.page.keyboard.press("Tab")
@@ -358,19 +387,19 @@ def test_axe_finds_no_fault(browser, page, scheme):
         assert seen.errors == []
 
 
-def test_the_address_keeps_time_joint_and_camera(browser, page, ur5):
-    with visit(browser, page, **OPEN) as seen:
-        seen.page.evaluate("replay.seek(9.25); replay.pick(3)")
-        box = seen.page.locator("#meshcat-pane").bounding_box()
-        x, y = box["x"] + 30, box["y"] + box["height"] - 30
-        seen.page.mouse.move(x, y)
-        seen.page.mouse.down()
-        seen.page.mouse.move(x + 90, y - 20, steps=4)
-        seen.page.mouse.up()
-        camera = "replay.viewer.camera.position.toArray()"
-        place, address = seen.page.evaluate(camera), seen.page.url
-        assert "t=9.250" in address
-        assert f"joint={ur5.joints[2]}" in address
+def test_the_address_keeps_time_joint_and_camera(browser, still, ur5):
+    seen = still
+    seen.page.evaluate("replay.seek(9.25); replay.pick(3)")
+    box = seen.page.locator("#meshcat-pane").bounding_box()
+    x, y = box["x"] + 30, box["y"] + box["height"] - 30
+    seen.page.mouse.move(x, y)
+    seen.page.mouse.down()
+    seen.page.mouse.move(x + 90, y - 20, steps=4)
+    seen.page.mouse.up()
+    camera = "replay.viewer.camera.position.toArray()"
+    place, address = seen.page.evaluate(camera), seen.page.url
+    assert "t=9.250" in address
+    assert f"joint={ur5.joints[2]}" in address
     with visit(browser, address, **OPEN) as seen:
         assert seen.page.evaluate("replay.clock.time") == pytest.approx(9.25)
         assert seen.page.evaluate("replay.picked") == ur5.joints[2]
@@ -378,47 +407,48 @@ def test_the_address_keeps_time_joint_and_camera(browser, page, ur5):
         assert seen.errors == []
 
 
-def test_a_picture_and_a_film_are_saved_and_not_blank(browser, page, tmp_path):
-    with visit(browser, page, **OPEN) as seen:
-        with seen.page.expect_download() as download:
-            seen.page.click("#picture")
-        download.value.save_as(tmp_path / "picture.png")
-        image = np.asarray(Image.open(tmp_path / "picture.png").convert("RGB")).astype(int)
-        assert download.value.suggested_filename == "ur5_7.00s.png"
-        assert np.ptp(image.reshape(-1, 3), axis=0).max() > 100
+def test_a_picture_and_a_film_are_saved_and_not_blank(still, tmp_path):
+    seen = still
+    with seen.page.expect_download() as download:
+        seen.page.click("#picture")
+    download.value.save_as(tmp_path / "picture.png")
+    image = np.asarray(Image.open(tmp_path / "picture.png").convert("RGB")).astype(int)
+    assert download.value.suggested_filename == "ur5_7.00s.png"
+    assert np.ptp(image.reshape(-1, 3), axis=0).max() > 100
+    seen.page.click("#film")
+    seen.page.wait_for_timeout(1200)
+    with seen.page.expect_download() as download:
         seen.page.click("#film")
-        seen.page.wait_for_timeout(1200)
-        with seen.page.expect_download() as download:
-            seen.page.click("#film")
-        download.value.save_as(tmp_path / "film.webm")
-        film = (tmp_path / "film.webm").read_bytes()
-        assert film[:4] == bytes.fromhex("1a45dfa3")  # Matroska
-        assert len(film) > 5000
-        assert seen.errors == []
+    download.value.save_as(tmp_path / "film.webm")
+    film = (tmp_path / "film.webm").read_bytes()
+    assert film[:4] == bytes.fromhex("1a45dfa3")  # Matroska
+    assert len(film) > 5000
+    assert seen.errors == []
 
 
-def test_what_stands_still_is_drawn_with_all_pixels(browser, page):
-    with visit(browser, page) as seen:
-        seen.page.evaluate("replay.draw(0.5)")
-        # drawn in the same task: a canvas of a new size is empty until then
-        width = seen.page.evaluate("document.querySelector('#meshcat-pane canvas').width")
-        assert np.ptp(pixels(seen).reshape(-1, 3), axis=0).max() > 60
-        seen.page.locator("body").press("Space")
-        whole = seen.page.evaluate("document.querySelector('#meshcat-pane canvas').width")
-        assert whole == pytest.approx(2 * width, abs=2)
-        assert seen.page.evaluate("replay.pace.pixels") == 1
+def test_what_stands_still_is_drawn_with_all_pixels(playing):
+    seen = playing
+    seen.page.evaluate("replay.draw(0.5)")
+    # drawn in the same task: a canvas of a new size is empty until then
+    width = seen.page.evaluate("document.querySelector('#meshcat-pane canvas').width")
+    assert np.ptp(pixels(seen).reshape(-1, 3), axis=0).max() > 60
+    seen.page.locator("body").press("Space")
+    whole = seen.page.evaluate("document.querySelector('#meshcat-pane canvas').width")
+    assert whole == pytest.approx(2 * width, abs=2)
+    assert seen.page.evaluate("replay.pace.pixels") == 1
 
 
-def test_colours_follow_the_scheme_of_an_open_page(browser, page):
-    with visit(browser, page, color_scheme="dark", **OPEN) as seen:
-        seen.page.locator(".plot").first.scroll_into_view_if_needed()
-        until(seen, "document.querySelector('.u-over') !== null")
-        axis = "charts.all.find(c => c.plot).plot.axes[0].stroke()"
-        corner, ink = pixels(seen)[5, 5], seen.page.evaluate(axis)
-        assert corner.max() < 90
-        seen.page.emulate_media(color_scheme="light")
-        assert pixels(seen)[5, 5].min() > 150
-        assert (ink, seen.page.evaluate(axis)) == ("#e3e7eb", "#1c2126")
+def test_colours_follow_the_scheme_of_an_open_page(still):
+    seen = still
+    seen.page.emulate_media(color_scheme="dark")
+    seen.page.locator(".plot").first.scroll_into_view_if_needed()
+    until(seen, "document.querySelector('.u-over') !== null")
+    axis = "charts.all.find(c => c.plot).plot.axes[0].stroke()"
+    corner, ink = pixels(seen)[5, 5], seen.page.evaluate(axis)
+    assert corner.max() < 90
+    seen.page.emulate_media(color_scheme="light")
+    assert pixels(seen)[5, 5].min() > 150
+    assert (ink, seen.page.evaluate(axis)) == ("#e3e7eb", "#1c2126")
 
 
 def test_the_camera_follows_a_floating_base(browser, tmp_path, ur5):
@@ -440,10 +470,10 @@ def test_the_camera_follows_a_floating_base(browser, tmp_path, ur5):
         assert seen.errors == []
 
 
-def test_a_page_at_twice_its_size_leaves_room_above_its_footer(browser, page):
-    with visit(browser, page, size=(640, 400), **OPEN) as seen:
+def test_a_page_at_twice_its_size_leaves_room_above_its_footer(still):
+    with sized(still, 640, 400) as seen:
         assert seen.page.locator("footer").bounding_box()["height"] < 100
-    with visit(browser, page, size=(800, 400), **OPEN) as seen:
+    with sized(still, 800, 400) as seen:
         assert seen.page.locator("footer").bounding_box()["height"] < 60
 
 
@@ -464,8 +494,8 @@ def test_arcs_take_the_colour_of_the_residual(browser, ur5, tmp_path):
             assert wanted != "grey" or count["blue"] + count["red"] < 20
 
 
-def test_a_phone_shows_everything_without_scrolling_sideways(browser, page):
-    with visit(browser, page, size=(390, 844), **OPEN) as seen:
+def test_a_phone_shows_everything_without_scrolling_sideways(still):
+    with sized(still, 390, 844) as seen:
         assert seen.page.evaluate("document.documentElement.scrollWidth") <= 390
         assert seen.page.locator("#play").is_visible()
         drawn = pixels(seen)

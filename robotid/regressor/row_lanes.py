@@ -1,0 +1,349 @@
+"""Rows of the regressor for many samples at once, and their gradient, compiled by Numba.
+
+Row j of body i is what the forces that its parameters make do along the axis (u, e) of joint j. In
+the frame of the body, with its velocity (v, w), its acceleration (a, dw), that of its origin
+d = a + w x v, gravity taken off, B = [dw]x + [w]x [w]x and N I = I dw + w x I w, it is
+
+    s_j . f_i = u . (m d + B mc) + e . (mc x d + N I).
+
+The gradient goes the same way back (reverse mode, by hand): ``pull``s are what a sum counts each
+motion, forces all of them, and are handed on as forces are.
+"""
+
+import numpy as np
+
+from robotid.regressor.lanes import (
+    add,
+    compiled,
+    cross,
+    dot,
+    get,
+    get3,
+    put,
+    put3,
+    scale,
+    times,
+    width,
+    work_space,
+)
+from robotid.regressor.tree_lanes import (
+    ACCELERATION,
+    FRAME,
+    VELOCITY,
+    along,
+    axis,
+    carry,
+    gather,
+    get6,
+    joined,
+    motion_cross,
+    move,
+    pass_up,
+    place,
+    placement,
+    put6,
+    times6,
+    turned,
+)
+
+__all__ = [
+    "finish_rows",
+    "inertial_rows",
+    "placements",
+    "pull_rows",
+    "rows_size",
+    "width",
+    "work_space",
+]
+
+# what of one body is at hand: q, v, a of its joint; what its rows share; ten columns. No int of
+# Python's, for which Numba would compile a function once more for each number that it is given.
+_MOTION, _D, _X, _Y, _Z, _DW, _WW, _COLUMNS, _WORLD = np.array([0, 3, 6, 9, 12, 15, 18, 21, 31])
+
+
+def rows_size(bodies: int, depth: int) -> int:
+    """Return the number of entries of the work space of rows, and of their gradient.
+
+    Args:
+        bodies: Number of bodies.
+        depth: Largest number of rows that one body loads.
+    """
+    return int(_WORLD) + (bodies + 1) * (FRAME + 12 * depth + 12)
+
+
+@compiled
+def _load(work, tree, i, motion, first, last):
+    """Write q, v, a of a joint that follows a coordinate; past the end, the last."""
+    q, v, a, _ = motion
+    leader, ratio, offset = tree.leaders[i], tree.joints[i, 39], tree.joints[i, 40]
+    for lane in range(width(work)):
+        k = min(first + lane, last)
+        put(work, _MOTION, lane, ratio * q[k, leader] + offset)
+        put(work, _MOTION + 1, lane, ratio * v[k, leader])
+        put(work, _MOTION + 2, lane, ratio * a[k, leader])
+
+
+@compiled
+def _above(tree, i):
+    """Return how many rows the parent of a body loads."""
+    return tree.depths[tree.parents[i]] if tree.parents[i] >= 0 else 0
+
+
+@compiled
+def _follow(work, tree, i, size, motion, first, last):
+    """Write placement, velocity, acceleration and axes of a body, where those of its parent are."""
+    own, up = _WORLD + (i + 1) * size, _WORLD + (tree.parents[i] + 1) * size
+    if tree.slots[i] < 0:  # the floating base: its state is given, its axes stand
+        for k in range(12):
+            for lane in range(width(work)):
+                put(work, own + VELOCITY + k, lane, motion[3][k, min(first + lane, last)])
+        for k in range(36):
+            for lane in range(width(work)):
+                put(work, own + FRAME + k, lane, 1.0 if k % 7 == 0 else 0.0)
+        return
+    joint, above = tree.joints[i], _above(tree, i)
+    _load(work, tree, i, motion, first, last)
+    place(work, own, joint, _MOTION, 0.0)
+    move(work, own, up, joint, _MOTION + 1, _MOTION + 2)
+    for row in range(above):
+        carry(work, own, up + FRAME + 6 * row, own + FRAME + 6 * row)
+    s, to = times6(joint[39], axis(joint)), own + FRAME + 6 * tree.slots[i]
+    if tree.slots[i] < above:  # a coordinate that moves the parent, too
+        for lane in range(width(work)):
+            gather(work, to, lane, s)
+    else:
+        for lane in range(width(work)):
+            put6(work, to, lane, s)
+
+
+@compiled
+def _share(work, own):
+    """Write d, B by columns, dw and the products of w, which all rows of a body share."""
+    for lane in range(width(work)):
+        v, w = get6(work, own + VELOCITY, lane)
+        a, dw = get6(work, own + ACCELERATION, lane)
+        xx, yy, zz = w[0] * w[0], w[1] * w[1], w[2] * w[2]
+        xy, xz, yz = w[0] * w[1], w[0] * w[2], w[1] * w[2]
+        put3(work, _D, lane, add(a, cross(w, v)))
+        put3(work, _X, lane, (-(yy + zz), xy + dw[2], xz - dw[1]))
+        put3(work, _Y, lane, (xy - dw[2], -(xx + zz), yz + dw[0]))
+        put3(work, _Z, lane, (xz + dw[1], yz - dw[0], -(xx + yy)))
+        put3(work, _DW, lane, dw)
+        put3(work, _WW, lane, (xy, xz, yz))
+
+
+@compiled
+def _row(work, at):
+    """Write the ten columns of one body in one row: m, mc, and I as xx xy yy xz yz zz."""
+    for lane in range(width(work)):
+        u, e = get6(work, at, lane)
+        d, dw = get3(work, _D, lane), get3(work, _DW, lane)
+        X, Y, Z = get3(work, _X, lane), get3(work, _Y, lane), get3(work, _Z, lane)
+        xy, xz, yz = get3(work, _WW, lane)
+        put(work, _COLUMNS, lane, dot(u, d))
+        put3(work, _COLUMNS + 1, lane, add((dot(X, u), dot(Y, u), dot(Z, u)), cross(d, e)))
+        put(work, _COLUMNS + 4, lane, e[0] * dw[0] + e[1] * xz - e[2] * xy)
+        put(work, _COLUMNS + 5, lane, -e[0] * X[2] + e[1] * Y[2] + e[2] * (X[0] - Y[1]))
+        put(work, _COLUMNS + 6, lane, -e[0] * yz + e[1] * dw[1] + e[2] * xy)
+        put(work, _COLUMNS + 7, lane, e[0] * X[1] + e[1] * (Z[2] - X[0]) - e[2] * Z[1])
+        put(work, _COLUMNS + 8, lane, e[0] * (Y[1] - Z[2]) - e[1] * Y[0] + e[2] * Z[0])
+        put(work, _COLUMNS + 9, lane, e[0] * yz - e[1] * xz + e[2] * dw[2])
+
+
+@compiled
+def _write(work, out, places, start, stride):
+    """Copy those of the ten columns that are wanted to their places in the block."""
+    for k in range(10):
+        if places[k] >= 0:
+            to = places[k] * stride + start
+            for lane in range(width(work)):
+                out[np.uintp(to + lane)] = get(work, _COLUMNS + k, lane)
+
+
+@compiled
+def _begin(work, tree):
+    """Write what accelerates the world: the negative of gravity."""
+    for k in range(3):
+        for lane in range(width(work)):
+            put(work, _WORLD + ACCELERATION + k, lane, -tree.gravity[k])
+
+
+@compiled
+def inertial_rows(tree, places, motion, work, out, span):
+    """Write the inertial columns of a block of samples, row by row.
+
+    Args:
+        tree: The robot.
+        places: Row of ``out`` for each body, row and parameter, shape (B, D, 10), int; -1: none.
+        motion: Coordinates, velocities and accelerations, shape (N, n_rows) each, and v, w, a, dw
+            of a floating base, gravity taken off, shape (12, N).
+        work: Work space of ``rows_size``.
+        out: The columns, shape (columns, k); k a multiple of the lanes; written.
+        span: First sample, and the one after the last.
+    """
+    size, stride = FRAME + 6 * places.shape[1], out.shape[1]
+    columns = out.reshape(out.size)
+    _begin(work, tree)
+    for start in range(span[0], span[1], width(work)):
+        for i in range(len(tree.parents)):
+            own = _WORLD + (i + 1) * size
+            _follow(work, tree, i, size, motion, start, span[1] - 1)
+            _share(work, own)
+            for row in range(tree.depths[i]):
+                _row(work, own + FRAME + 6 * row)
+                _write(work, columns, places[i, row], start - span[0], stride)
+
+
+@compiled
+def finish_rows(values, places, widths, weights, root, out, span):
+    """Write drive columns and torques of a block, and weigh its rows.
+
+    Args:
+        values: Drive columns and torques, shape (E, N).
+        places: Place of each, shape (E,), int.
+        widths: Number of columns that each row has in ``out``, shape (n_rows,), int.
+        weights: Weights, shape (N, n_rows), or (0, 0) if all are 1.
+        root: Work space, shape (k,).
+        out: The columns, shape (columns, k); written.
+        span: First sample, and the one after the last.
+    """
+    first, count = span[0], span[1] - span[0]
+    for e in range(len(places)):
+        for k in range(count):
+            out[places[e], k] = values[e, first + k]
+    end = 0
+    for j in range(len(widths) if len(weights) else 0):
+        begin, end = end, end + widths[j]
+        for k in range(count):
+            root[k] = np.sqrt(weights[first + k, j])
+        for column in range(begin, end):
+            for k in range(count):
+                out[column, k] *= root[k]
+
+
+@compiled
+def _weigh(work, weights, places, first, last):
+    """Write what the ten columns of one body in one row count."""
+    for k in range(10):
+        for lane in range(width(work)):
+            weight = weights[places[k], min(first + lane, last)] if places[k] >= 0 else 0.0
+            put(work, _COLUMNS + k, lane, weight)
+
+
+@compiled
+def _pull_row(work, own, at, pull, pulls):
+    """Add what the ten columns pull at an axis, and at velocity and acceleration of its body."""
+    for lane in range(width(work)):
+        u, e = get6(work, at, lane)
+        v, w = get6(work, own + VELOCITY, lane)
+        a, dw = get6(work, own + ACCELERATION, lane)
+        m, h = get(work, _COLUMNS, lane), get3(work, _COLUMNS + 1, lane)
+        one, other = get3(work, _COLUMNS + 4, lane), get3(work, _COLUMNS + 7, lane)
+        M = one[0], one[1], one[2], other[0], other[1], other[2]
+        d, wh, Mw = add(a, cross(w, v)), dot(w, h), times(M, w)
+        by_u = add(add(scale(m, d), cross(dw, h)), add(scale(wh, w), scale(-dot(w, w), h)))
+        by_e = add(add(cross(h, d), times(M, dw)), cross(w, Mw))
+        by_d, by_dw = add(scale(m, u), cross(e, h)), add(cross(h, u), times(M, e))
+        by_w = add(add(scale(dot(w, u), h), scale(wh, u)), scale(-2.0 * dot(h, u), w))
+        by_w = add(add(by_w, cross(v, by_d)), add(cross(Mw, e), times(M, cross(e, w))))
+        put6(work, pull, lane, joined(get6(work, pull, lane), (by_u, by_e)))
+        gather(work, pulls, lane, (cross(by_d, w), by_w))
+        gather(work, pulls + 6, lane, (by_d, by_dw))
+
+
+@compiled
+def _pull_joint(work, own, joint, axes, pull, pulls, above):
+    """Write what is pulled at q, v and a of a joint to where these are, and free its pulls of it.
+
+    What is left of them is pulled at the velocity and the acceleration that the parent hands on.
+    """
+    s = axis(joint)
+    for lane in range(width(work)):
+        V, A = get6(work, own + VELOCITY, lane), get6(work, own + ACCELERATION, lane)
+        by_V, by_A = get6(work, pulls, lane), get6(work, pulls + 6, lane)
+        bent, rate = motion_cross(V, s), get(work, _MOTION + 1, lane)
+        by_q = along(bent, by_V) + along(motion_cross(A, s), by_A)
+        put(work, _MOTION, lane, by_q)
+        put(work, _MOTION + 1, lane, along(s, by_V) + along(bent, by_A))
+        put(work, _MOTION + 2, lane, along(s, by_A))
+        back = cross(by_A[0], s[1]), add(cross(by_A[0], s[0]), cross(by_A[1], s[1]))
+        put6(work, pulls, lane, joined(by_V, times6(-rate, back)))
+    for row in range(above):
+        for lane in range(width(work)):
+            seen = motion_cross(get6(work, axes + 6 * row, lane), s)
+            by_q = along(seen, get6(work, pull + 6 * row, lane))
+            put(work, _MOTION, lane, get(work, _MOTION, lane) + by_q)
+
+
+@compiled
+def pull_rows(tree, places, motion, weights, work, out):
+    """Write the gradient of sum(weights * rows) by q, v and a of a robot with a fixed base.
+
+    Args:
+        tree: The robot.
+        places: Row of ``weights`` for each body, row and parameter, shape (B, D, 10); -1: none.
+        motion: As of ``inertial_rows``.
+        weights: What each column counts at each sample, shape (columns, N).
+        work: Work space of ``rows_size``.
+        out: The gradient, shape (3, N, n_rows), 0 at first; written.
+    """
+    bodies, depth, N = len(tree.parents), places.shape[1], weights.shape[1]
+    axes, pulls = FRAME + 6 * depth, FRAME + 12 * depth
+    size = pulls + 12
+    _begin(work, tree)
+    for start in range(0, N, width(work)):
+        for i in range(bodies):
+            own = _WORLD + (i + 1) * size
+            _follow(work, tree, i, size, motion, start, N - 1)
+            for k in range(axes, size):
+                for lane in range(width(work)):
+                    put(work, own + k, lane, 0.0)
+        for i in range(bodies - 1, -1, -1):
+            own, up = _WORLD + (i + 1) * size, _WORLD + (tree.parents[i] + 1) * size
+            above, ratio = _above(tree, i), tree.joints[i, 39]
+            for row in range(tree.depths[i]):
+                _weigh(work, weights, places[i, row], start, N - 1)
+                _pull_row(work, own, own + FRAME + 6 * row, own + axes + 6 * row, own + pulls)
+            _load(work, tree, i, motion, start, N - 1)
+            _pull_joint(work, own, tree.joints[i], own + FRAME, own + axes, own + pulls, above)
+            for k in range(3):
+                for lane in range(min(width(work), N - start)):
+                    out[k, start + lane, tree.leaders[i]] += ratio * get(work, _MOTION + k, lane)
+            for row in range(above):
+                pass_up(work, own, own + axes + 6 * row, up + axes + 6 * row)
+            pass_up(work, own, own + pulls, up + pulls)
+            pass_up(work, own, own + pulls + 6, up + pulls + 6)
+
+
+@compiled
+def placements(tree, q, work, R, p):
+    """Write where bodies are in the frame of the root link.
+
+    Args:
+        tree: The robot, with a fixed base.
+        q: Coordinates, shape (N, n_rows).
+        work: Work space of ``rows_size``.
+        R: Rotations, shape (3, 3, B, N); written.
+        p: Origins of the joints, shape (3, B, N); written.
+    """
+    N = len(q)
+    for start in range(0, N, width(work)):
+        for i in range(len(tree.parents)):
+            _load(work, tree, i, (q, q, q, q), start, N - 1)
+            place(work, _WORLD, tree.joints[i], _MOTION, 0.0)
+            up = tree.parents[i]
+            for lane in range(min(width(work), N - start)):
+                n = start + lane
+                X, Y, Z, at = placement(work, _WORLD, lane)
+                if up >= 0:
+                    T = _column(R, 0, up, n), _column(R, 1, up, n), _column(R, 2, up, n), at
+                    X, Y, Z = turned(T, X), turned(T, Y), turned(T, Z)
+                    at = add(turned(T, at), (p[0, up, n], p[1, up, n], p[2, up, n]))
+                for c in range(3):
+                    R[c, 0, i, n], R[c, 1, i, n], R[c, 2, i, n] = X[c], Y[c], Z[c]
+                    p[c, i, n] = at[c]
+
+
+@compiled
+def _column(R, c, i, n):
+    return R[0, c, i, n], R[1, c, i, n], R[2, c, i, n]
