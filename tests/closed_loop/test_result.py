@@ -85,6 +85,11 @@ def test_speeds_of_a_log_are_those_between_its_gaps():
     np.testing.assert_allclose(motion.v[inner, 1], -t[inner])
     np.testing.assert_allclose(motion.v[:, 1], -t, atol=0.0051)
     assert not motion.a.any()
-    windows = cut_windows(log, 0.2, 0.0)
-    rms = np.sqrt(np.mean(t**2))
-    np.testing.assert_allclose(_speed(windows), [2.0, rms], rtol=1e-2)
+
+
+def test_the_usual_speed_of_a_joint_is_the_root_of_its_mean_square():
+    t = 3.0 + np.arange(200) / 100.0
+    q = np.sin(20.0 * t)[:, None] * [1.0, 0.5]
+    windows = cut_windows(Log(t, q, 0 * q, ("a", "b"), q_ref=q, has_torque=False), 0.5, 0.0)
+    rms = np.sqrt(np.mean((20.0 * np.cos(20.0 * t)) ** 2))
+    np.testing.assert_allclose(_speed(windows), [rms, 0.5 * rms], rtol=0.02)

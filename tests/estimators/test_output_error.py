@@ -97,6 +97,15 @@ def test_no_more_correlation_is_taken_out_than_is_allowed(rng):
     assert found.details["correlation"] == [0.5]
 
 
+def test_the_condition_is_that_of_the_slopes_of_unit_columns(rng):
+    lag = lagging(rng)
+    found = OutputError(whitens=False).fit(lag, START)
+    A = np.concatenate([r.slopes[:, 0] for r in lag.residuals(found.theta, with_slopes=True)])
+    unit = A / np.linalg.norm(A, axis=0)
+    assert found.condition == pytest.approx(np.linalg.cond(unit), rel=1e-3)  # a last step apart
+    assert found.condition > 1.5
+
+
 def test_standard_errors_are_the_scatter_of_many_noises():
     rng = np.random.default_rng(5)
     draws = [OutputError().fit(lagging(rng), TRUTH) for _ in range(100)]
