@@ -1,6 +1,6 @@
 """Laws of drives for roll-outs, with their derivatives, in Numba: friction, and position control.
 
-Imported only where the extra ``fast`` is installed. ``drive_laws`` states the laws.
+Imported only where a loop is rolled out. ``drive_laws`` states the laws.
 """
 
 import math
