@@ -18,7 +18,8 @@ EXAMPLES = {
     "values, identified": 6,
     "excite": 10,
     "loop of a job": 3,
-    "report of result.json": 6,
+    "result.json": 25,
+    "report of result.json": 10,
     "Python arguments": 60,
 }  # others: 15
 

@@ -113,6 +113,27 @@ def test_the_written_urdf_predicts_what_the_fit_predicts(identified, logs, capsy
         assert after["urdf_relative_error_pct"] == pytest.approx(before["urdf_relative_error_pct"])
 
 
+@pytest.mark.parametrize(
+    ("place", "wrong", "said"),
+    [
+        (("base_parameters", 1, "value"), "x", "base_parameters[1].value is 'x', wanted"),
+        (("inputs", 2, "path"), 3, "inputs[2].path is 3, wanted"),
+        (("verdict", "reasons"), {}, "verdict.reasons is {}, wanted"),
+    ],
+)
+def test_a_result_that_was_changed_by_hand_is_refused_by_the_place(
+    identified, logs, tmp_path, capsys, place, wrong, said
+):
+    result = json.loads((identified / "result.json").read_text())
+    inside = result
+    for key in place[:-1]:
+        inside = inside[key]
+    inside[place[-1]] = wrong
+    (tmp_path / "result.json").write_text(json.dumps(result))
+    assert main(["validate", str(tmp_path / "result.json"), str(logs / "keep.csv")]) == 1
+    assert said in capsys.readouterr().err
+
+
 def test_the_written_urdf_holds_the_identified_masses(identified):
     result = json.loads((identified / "result.json").read_text())
     outputs = result["outputs"]
