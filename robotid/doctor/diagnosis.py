@@ -94,8 +94,6 @@ def diagnose(
     probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
     mapping = structural_mapping(model) if probes else None
     moving = [probe.motion for probe in probes]
-    names = ", ".join(log.name for log in fitted)
-    excitation = list(check_excitation(model, mapping, moving, signals, names)) if mapping else []
     segments = Segments(model, mapping, moving, signals.min_velocity) if mapping else None
     for log, (motion, probe) in zip(kept, motions[len(fitted) :], strict=True):
         if motion is not None:
@@ -104,7 +102,9 @@ def diagnose(
             own = replace(segments, motions=[probe.motion])
             findings += check_payload_change(segments, own, signals, log.name)
     if mapping is not None:
-        findings += [*excitation, *rounded_robot(model, mapping)]
+        names = ", ".join(log.name for log in fitted)
+        findings += check_excitation(model, mapping, moving, signals, names)
+        findings += rounded_robot(model, mapping)
     return by_severity(findings)
 
 

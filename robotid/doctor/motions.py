@@ -14,7 +14,6 @@ from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import compress, merge
-from robotid.regressor.rows import keep_inertial_rows
 from robotid.regressor.used_rows import base_problem, independent_share, row_mask
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
@@ -73,7 +72,7 @@ def check_excitation(
 ) -> Iterator[Finding]:
     """Yield which base parameters the fitted motions determine, by ``determine``.
 
-    Of long logs a share of the rows stands for all; of others, the inertial columns are kept.
+    Of long logs a share of the rows stands for all.
 
     Args:
         model: The robot.
@@ -88,8 +87,6 @@ def check_excitation(
     """
     prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
     thinned = [motion.every(step) for motion in motions]
-    for motion in motions if step == 1 else ():
-        keep_inertial_rows(model, motion)
     try:
         masks = [row_mask(model, m, signals.min_velocity) for m in thinned]
         problems = (

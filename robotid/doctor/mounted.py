@@ -16,7 +16,6 @@ from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import Reduction, compress_stretches, join
-from robotid.regressor.rows import thinned
 from robotid.regressor.used_rows import base_problem, row_mask
 from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel
@@ -101,7 +100,7 @@ class Segments:
         return tuple(part for motion in self.motions for part in self._of(motion))
 
     def _of(self, motion: Trajectory) -> Iterator[Reduction]:
-        thin = thinned(self.model, motion, max(1, len(motion.t) // _ROWS))
+        thin = motion.every(max(1, len(motion.t) // _ROWS))
         count = int(np.clip(np.ptp(thin.t) / _STRETCH, 1, _STRETCHES))
         length = -(-len(thin.t) // count)
         rows = row_mask(self.model, thin, self.min_velocity)

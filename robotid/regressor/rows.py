@@ -34,7 +34,6 @@ __all__ = [
     "choose_engine",
     "keep_inertial_rows",
     "kept_rows",
-    "thinned",
     "trajectory_rows",
 ]
 
@@ -158,20 +157,6 @@ def kept_rows(model: RobotModel, trajectory: Trajectory) -> InertialRows | None:
     """
     rows: InertialRows | None = trajectory.derived.get("inertial rows")
     return rows if rows is not None and rows.pin_model is model.pin_model else None
-
-
-def thinned(model: RobotModel, trajectory: Trajectory, step: int) -> Trajectory:
-    """Return every so many samples of a trajectory, with the inertial columns kept with it.
-
-    Args:
-        model: The robot.
-        trajectory: The trajectory.
-        step: How many samples one stands for.
-    """
-    thin, rows = trajectory.every(step), kept_rows(model, trajectory)
-    if rows is not None:
-        thin.derived["inertial rows"] = replace(rows, values=rows.values[:, ::step])
-    return thin
 
 
 @dataclass(frozen=True, eq=False)

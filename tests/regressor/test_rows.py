@@ -9,7 +9,7 @@ from helpers.robots import ROBOTS, motion, possible_parameters
 from robotid.regressor import rows
 from robotid.regressor.memory import remember
 from robotid.regressor.prediction import predict
-from robotid.regressor.rows import keep_inertial_rows, kept_rows, thinned
+from robotid.regressor.rows import keep_inertial_rows, kept_rows
 from robotid.regressor.torque import build_problem, trajectory_regressor
 from robotid.robot.drives import LoadFriction
 from robotid.robot.examples import example_urdf
@@ -39,12 +39,6 @@ def test_rows_and_predictions_are_those_without_what_is_kept(name, rng, monkeypa
     pairs = [blocks(model, m, weight, (100, 650)) for m in (fresh, kept)]
     for wanted, found in zip(*pairs, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
-    thin = thinned(model, kept, 3)
-    assert kept_rows(model, thin) is not None
-    pairs = [blocks(model, m, weight[::3], (20, 210)) for m in (fresh.every(3), thin)]
-    for wanted, found in zip(*pairs, strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
-    assert kept_rows(model, thinned(model, fresh, 3)) is None
     vectors = [possible_parameters(model, rng) for _ in range(2)]
     vectors[1][model.layout.n_inertial :] = 0.0
     for wanted, found in zip(*(predict(model, vectors, m) for m in (fresh, kept)), strict=True):
