@@ -1,13 +1,13 @@
 """Lower bounds of the distances between hulls along a motion, compiled by Numba.
 
-Imported only where a motion is designed. Along any direction two hulls are at least as far apart
-as the points of each that reach farthest towards the other. The sides of the boxes around them are tried first, then the direction that was best before, then
-those of Frank and Wolfe's way to the point of B - A that is nearest to 0. It ends where a bound
-suffices, or where that point shows that the hulls are nearer than asked for.
+Imported only where a motion is designed. Along any direction two hulls are at least as far apart as
+the points of each that reach farthest towards the other. The sides of the boxes around them are
+tried first, then the direction that was best before, then those of Frank and Wolfe's way to the
+point of B - A that is nearest to 0. It ends where a bound suffices, or where that point shows that
+the hulls are nearer than asked for.
 
-References:
-    Gilbert, Johnson, Keerthi (1988), A fast procedure for computing the distance between complex
-    objects in three-dimensional space.
+References: Gilbert, Johnson, Keerthi (1988), A fast procedure for computing the distance between
+complex objects in three-dimensional space.
 """
 
 import numpy as np
