@@ -78,12 +78,12 @@ def identify_loops(
         model, logs, loop, settings, signals=signals, chooses=chooses, progress=progress
     )
     report_stage(progress, "testing", STAGES)
-    sign = fitted.encoders.sign
+    sign, simulator = fitted.encoders.sign, fitted.simulator
+    robot = simulator.fine or simulator.robot  # with the steps of the fit
     runs = [
         [
             run_open_loop(
-                fitted.simulator.robot, fitted.loops, log.turned(sign),
-                _others(model, loop, fitted),
+                robot, fitted.loops, log.turned(sign), _others(model, loop, fitted)
             )
             for log in part
         ]

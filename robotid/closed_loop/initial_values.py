@@ -112,10 +112,14 @@ def _inertia(model: RobotModel, pi: Array, windows: Sequence[Window]) -> Array:
 
 def _speed(windows: Sequence[Window]) -> Array:
     """Return the usual speed of each joint, shape (n,)."""
-    steps = np.concatenate([np.diff(w.log.q[w.counted], axis=0) for w in windows])
-    dt = float(np.median(np.diff(windows[0].log.t)))
-    speed: Array = np.maximum(np.sqrt(np.mean(steps**2, axis=0)) / dt, 1e-6)
+    steps = [np.diff(w.log.q[w.counted], axis=0) / _period(w) for w in windows]
+    speed: Array = np.maximum(np.sqrt(np.mean(np.concatenate(steps) ** 2, axis=0)), 1e-6)
     return speed
+
+
+def _period(window: Window) -> float:
+    """Return the time between the rows of a window's log [s]."""
+    return float(np.median(np.diff(window.log.t)))
 
 
 def first_loops(

@@ -154,8 +154,8 @@ def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
     speed = np.abs(np.diff(log.q, axis=0)).max(axis=1) / step
     passing = np.zeros(len(same), dtype=bool)
     passing[1:-1] = (speed[:-2] > _STILL) | (speed[2:] > _STILL)
-    runs = runs_of(same)
-    stale = sum(stop - start for start, stop in runs if passing[start] or passing[stop - 1])
+    runs = [(a, b) for a, b in runs_of(same) if passing[a] or passing[b - 1]]
+    stale = sum(stop - start for start, stop in runs)
     if stale == 0:
         return
     share = stale / len(log.t)
@@ -164,7 +164,7 @@ def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
         "robot moves: the logger ran faster than the robot's state; log each state once, with its "
         "own time stamp"
     )
-    severity, longest = "warning" if share > _STALE else "note", max(e - s for s, e in runs)
+    severity, longest = "warning" if share > _STALE else "note", max(b - a for a, b in runs)
     yield log_finding(
         log.name, "stale_rows", severity, message, rows=stale, share=share, longest_run=longest
     )

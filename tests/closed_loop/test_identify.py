@@ -120,6 +120,11 @@ def test_the_drives_of_an_arm_are_recovered_with_steps_that_are_halved():
     assert fine.step == pytest.approx(estimate.details["step"])
     assert round(4e-3 / fine.step) in (8, 16)
     assert estimate.details["halving"] <= 0.2  # of a standard error, that another would move
+    again, coarse = (
+        run_open_loop(r, found.fit.loops, first) for r in (fine, found.fit.simulator.robot)
+    )
+    np.testing.assert_allclose(found.fitted[0].rmse, again.rmse, rtol=1e-12)
+    assert (found.fitted[0].rmse < coarse.rmse).all(), "errors of the steps of the fit"
 
 
 def test_the_standard_parameters_are_what_was_found(leg, found):

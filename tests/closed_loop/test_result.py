@@ -93,3 +93,6 @@ def test_the_usual_speed_of_a_joint_is_the_root_of_its_mean_square():
     windows = cut_windows(Log(t, q, 0 * q, ("a", "b"), q_ref=q, has_torque=False), 0.5, 0.0)
     rms = np.sqrt(np.mean((20.0 * np.cos(20.0 * t)) ** 2))
     np.testing.assert_allclose(_speed(windows), [rms, 0.5 * rms], rtol=0.02)
+    seldom = Log(t[::2], q[::2], 0 * q[::2], ("a", "b"), q_ref=q[::2], has_torque=False)
+    both = [*windows, *cut_windows(seldom, 0.5, 0.0)]  # each log has a rate of its own
+    np.testing.assert_allclose(_speed(both), [rms, 0.5 * rms], rtol=0.02)

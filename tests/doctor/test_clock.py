@@ -86,6 +86,17 @@ def test_rows_that_repeat_the_one_before_are_counted_where_the_robot_moves():
     assert stale(80).severity == "note"  # a twentieth is not more than a twentieth
 
 
+def test_the_longest_run_of_repeated_rows_is_one_in_motion():
+    log, rows = log_of(START + 0.01 * np.arange(79)), np.arange(79)
+    rows[5:15], rows[61:64] = 4, 60  # at rest before and after it, and in motion
+    held = {name: getattr(log, name)[rows].copy() for name in ("q", "v", "tau")}
+    for at in (slice(0, 5), slice(15, 20)):
+        held["q"][at] = held["q"][5]
+    held["tau"][[*range(5), *range(15, 20)]] += np.arange(10.0)[:, None]
+    found = said(check_clock(Log(log.t, joints=log.joints, **held)))["stale_rows"]
+    assert (found.evidence["rows"], found.evidence["longest_run"]) == (3, 3)
+
+
 @pytest.fixture(scope="module")
 def slider():
     """A joint that slides and one that turns."""
