@@ -189,6 +189,8 @@ def test_a_base_that_is_not_level_makes_no_counterbalance(model):
     assert [(m.joint, m.term.code) for m in alone] == [("shoulder_pan_joint", "position_periodic")]
     assert misfits == ()
     assert named(others) == [("gravity", "all joints"), ("position_offset", "shoulder_lift_joint")]
+    assert others[0].evidence["size"] == pytest.approx(np.tan(np.radians(6)), rel=0.15)
+    assert -0.2 < others[1].evidence["size"] < -0.08  # of the second to first order only
 
 
 def test_a_joint_that_lies_elsewhere_is_named(model, tmp_path):

@@ -232,6 +232,15 @@ def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
         wanted = np.sqrt((u @ after @ u) / (u @ before @ u))
         assert grown[name] == pytest.approx(wanted, rel=0.02), name
     assert grown[f"{ELBOW}.coulomb"] > 1.5
+    # rows that are weighed by what terms leave keep their residual's share of the torque
+    anew = drive_choice._weighed_anew(sample, drive, [(family, [speed])])
+    factor = anew.r[:rows, j] @ sample.r[:rows, j] / np.sum(sample.r[:rows, j] ** 2)
+    assert factor > 1.5
+    np.testing.assert_allclose(anew.weight[:, j], factor * sample.weight[:, j])
+    np.testing.assert_allclose(anew.W[:, j], factor * sample.W[:, j])
+    assert anew.torque[j] == pytest.approx(factor**2 * sample.torque[j])
+    others = np.arange(len(sample.joints)) != j
+    np.testing.assert_array_equal(anew.torque[others], sample.torque[others])
 
 
 def test_a_counterbalance_that_is_known_is_in_the_model_before_others_are_tried(plain, cases):

@@ -17,6 +17,7 @@ from robotid.commands.logs import survey_logs
 from robotid.diagnosis import misfit
 from robotid.diagnosis import sample as sample_module
 from robotid.diagnosis.candidates import CANDIDATES
+from robotid.diagnosis.candidates import couplings as couplings_of
 from robotid.diagnosis.misfit import find_misfits
 from robotid.diagnosis.misfit_findings import (
     counterbalanced,
@@ -28,6 +29,7 @@ from robotid.diagnosis.misfit_findings import (
 from robotid.diagnosis.sample import take_sample, trials
 from robotid.doctor.diagnosis import check_logs
 from robotid.findings import Finding
+from robotid.fitting.joint_motion import JointMotion
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
@@ -404,3 +406,15 @@ def test_real_drives_have_the_terms_that_others_measured_on_them(recordings, mon
     assert set(said["tx40"]) == {("joint_2", "friction_shape"), ("joint_3", "load_friction")}
     assert {("joint_5", "coupling"), ("joint_6", "coupling")} < set(said["tx40 uncoupled"])
     assert said["panda_inria"] == {}
+
+
+def test_a_coupled_drive_turns_by_the_ratio_of_the_other_joint(rng):
+    v, turned, a, still = rng.uniform(-1, 1, (4, 50))
+    other = JointMotion(still, turned, a, still, still, still, still)
+    motion = JointMotion(still, v, still, still, still, still, still, others={"b": other})
+    for candidate in couplings_of(motion):
+        w = v + candidate.ratio * turned
+        usual = np.sqrt(np.mean(w**2))
+        expected = np.column_stack([a, turned, np.tanh(w / (0.05 * usual))])
+        np.testing.assert_allclose(candidate.columns(motion), expected)
+    assert [(c.coupled, c.ratio) for c in couplings_of(motion)] == [("b", 1.0), ("b", -1.0)]

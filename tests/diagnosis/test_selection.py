@@ -79,3 +79,10 @@ def test_rounds_end_with_the_first_that_finds_nothing_or_the_most(rng):
     assert found == ["a", "b", None]
     shares = {"a": 0.5}
     assert [best for _, best in select(offered, RULE)] == ["a"] * 3
+
+
+def test_options_are_alike_within_a_share_of_the_residual_not_of_the_gain():
+    before = np.full(10, 2.0)
+    left = {name: before * (1.0 - share) for name, share in (("a", 0.3), ("b", 0.281), ("c", 0.27))}
+    this = Round(before, left, 10, 20.0)
+    assert this.alike(replace(RULE, chance=None)) == ["a", "b"]

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from helpers.corruptions import clean_log, robot
 
+from robotid.doctor import hypotheses
 from robotid.doctor.diagnosis import diagnose
-from robotid.doctor.hypotheses import explanations
+from robotid.doctor.hypotheses import explanations, own_share
 from robotid.doctor.loads import load_model
 from robotid.doctor.sample import smooth_motion, take_probe
 from robotid.logs.settings import SignalSettings
@@ -105,3 +106,26 @@ def test_the_fit_is_the_least_squares_of_all_joints_and_drives(ur5, ur5_log):
     assert chi == pytest.approx(np.sum((A / size @ found - b) ** 2), rel=1e-6)
     covariance = np.linalg.inv((A / size).T @ (A / size)) / np.outer(size, size)
     np.testing.assert_allclose(error, np.sqrt(np.diag(covariance))[:10], rtol=1e-4)
+
+
+def test_a_balanced_joint_may_follow_its_position_either_way_and_no_other(ur5, ur5_log):
+    probe = replace(take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS)), balanced=(1, 3))
+    drives, c, s = probe.drives, np.cos(probe.q), np.sin(probe.q)
+    assert drives.shape[2] == 5 + 4  # no coupled drives
+    for j in range(6):
+        wave = np.column_stack([c[:, j], s[:, j], -c[:, j], -s[:, j]])
+        np.testing.assert_allclose(drives[:, j, 5:], wave if j in (1, 3) else 0.0 * wave)
+    np.testing.assert_array_equal(drives[:, :, 0], probe.a)
+    np.testing.assert_array_equal(drives[:, :, 3:5], [[[1.0, -1.0]]] * np.ones((*c.shape, 1)))
+
+
+def test_exchanged_columns_keep_each_torque_s_own_share(ur5, ur5_log):
+    probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS))
+    order = [0, 4, 2, 3, 1, 5]
+    moved = probe.with_motion(tuple(x[:, order] for x in (probe.q, probe.v, probe.a)))
+    positions, columns = hypotheses._exchanged(probe, (1, 4))
+    np.testing.assert_allclose(positions.share, own_share(moved), rtol=1e-9)
+    # of a torque column, that of the joint whose position it has
+    whole = own_share(replace(moved, tau=probe.tau[:, order]))
+    np.testing.assert_allclose(columns.share, whole[order], rtol=1e-9)
+    assert abs(columns.share[1] - columns.share[4]) > 1e-3

@@ -8,7 +8,10 @@ from helpers.corruptions import NOISE, clean_log, robot
 from helpers.synthetic import perfect
 
 from robotid.doctor.diagnosis import diagnose
+from robotid.doctor.mounted import Segments
+from robotid.doctor.sample import smooth_motion
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.bodies import link_places
 from robotid.robot.drives import FAMILIES
 from robotid.simulation.closed_loop import another_robot
@@ -118,3 +121,16 @@ def test_a_load_is_named_beside_a_urdf_of_another_robot(arm_and_log):
     mass, error = change.evidence["mass"], change.evidence["std_error"]
     assert mass == pytest.approx(1.0, abs=4 * error)
     assert error < 0.05
+
+
+def test_segments_are_of_all_motions(ur5):
+    motions = [
+        smooth_motion(ur5, clean_log(ur5, seed, duration=duration), SignalSettings())
+        for seed, duration in ((0, 7.0), (1, 12.0))
+    ]
+    segments = Segments(ur5, structural_mapping(ur5), motions, 0.0)
+    assert segments.seconds == pytest.approx(sum(m.t[-1] - m.t[0] for m in motions))
+    alone = [replace(segments, motions=[motion]).reductions for motion in motions]
+    assert len(segments.reductions) == len(alone[0]) + len(alone[1])
+    rows = [sum(part.samples for part in parts) for parts in (segments.reductions, *alone)]
+    assert rows[0] == rows[1] + rows[2]

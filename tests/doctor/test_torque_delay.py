@@ -78,24 +78,27 @@ def test_joints_that_hardly_move_have_no_say(ur5):
 
 # gains in ms, s.e. 1 ms (its floor): misfits 1 - share (1 - x^2), x = 0 at the delay; what they
 # fall by is the share
+@pytest.mark.parametrize("stated", [0.0, 0.01])
 @pytest.mark.parametrize(
     ("delay", "share", "severity"),
     [(0.045, 0.05, "note"), (0.045, 0.5, "warning"), (0.005, 0.05, "warning"),
      (0.0025, 0.5, "note"), (-0.005, 0.05, "warning")],
 )  # fmt: skip
 def test_a_delay_is_said_at_three_sigma_if_it_helps_elsewhere(
-    ur5, monkeypatch, delay, share, severity
+    ur5, monkeypatch, delay, share, severity, stated
 ):
     parabola = ((torque_delay._GRID - delay) / delay) ** 2
     squares = np.tile(1 - share * (1 - parabola), (6, 8, 1))
     misfit = torque_delay._Misfit(squares, np.ones(6), ur5.joints)
     monkeypatch.setattr(torque_delay, "_misfit", lambda *_: misfit)
-    (finding,) = found(ur5, clean_log(ur5, 100, duration=2.0))
+    signals = replace(SIGNALS, torque_delay=stated)
+    (finding,) = found(ur5, clean_log(ur5, 100, duration=2.0), signals)
     assert finding.severity == severity
     assert finding.evidence["delay"] == pytest.approx(delay, abs=1e-9)
     assert finding.evidence["std_error"] == pytest.approx(1e-3)
     assert finding.evidence["gain"] == pytest.approx(share, rel=0.01)
-    told = f"set torque_delay = {delay:.4f} (--torque-delay {delay:.4f})" in finding.message
+    total = f"{delay + stated:.4f}"
+    told = f"set torque_delay = {total} (--torque-delay {total})" in finding.message
     assert told == (severity == "warning")
 
 

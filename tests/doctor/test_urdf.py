@@ -7,6 +7,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.doctor.diagnosis import check_logs
 from robotid.doctor.urdf import inspect_urdf
+from robotid.doctor.urdf_base import rounded_robot
 from robotid.exceptions import ModelError
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
@@ -190,6 +191,10 @@ def test_a_rounded_angle_of_a_frame_is_a_note(tmp_path):
     inspection = inspected(tmp_path, ("</robot>", frame), tilted)
     severity = {f["joint"]: f["severity"] for f in found(inspection, "rounded_rpy")}
     assert severity == {"hold": "note", "elbow": "note"}
+    model = RobotModel.from_urdf(tmp_path / "two.urdf")
+    (finding,) = rounded_robot(model, structural_mapping(model))  # of those that move or carry
+    assert finding.message.startswith("two.urdf rounds angles of the joints elbow: ")
+    assert finding.evidence == {"joints": 1.0}
 
 
 def test_rounded_angles_of_several_joints_are_one_note():

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from robotid.exceptions import DataError, SettingsError
-from robotid.excitation.clearance import Box, Clearance
+from robotid.excitation.clearance import _FIRST, Box, Clearance
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.motions import ProgramMotion, random_fourier
@@ -211,3 +211,54 @@ def test_directions_that_parted_hulls_before_spare_their_distances(scattered):
     wrong /= np.linalg.norm(wrong, axis=2, keepdims=True)
     found = clearance.near(poses, 0.05, clearance.everything, wrong)
     np.testing.assert_array_equal(found.distance[exact < 0.05], exact[exact < 0.05])
+
+
+# an arm that a turning base carries out, farther to one side than to the other
+TURRET = """
+<robot name="turret">
+  <link name="base"/>
+  <link name="arm"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial></link>
+  <link name="ball"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial>
+    <collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="2" effort="100"/></joint>
+  <joint name="reach" type="prismatic"><parent link="arm"/><child link="ball"/>
+    <origin xyz="0 0.3 0"/>
+    <axis xyz="1 0 0"/><limit lower="-1.5" upper="0.2" velocity="2" effort="100"/></joint>
+</robot>"""
+
+
+def test_a_joint_can_move_a_hull_as_far_as_what_slides_beyond_it_reaches(tmp_path):
+    (tmp_path / "turret.urdf").write_text(TURRET)
+    model = RobotModel.from_urdf(tmp_path / "turret.urdf")
+    clearance = Clearance(model, boxes=[Box("post", (2.0, 0.0, -0.2), (2.1, 0.2, 0.2))])
+    (levers,) = clearance._levers
+    # radius of the ball, its way to the joint, the joint's way
+    assert levers == pytest.approx([0.05 * np.sqrt(3) + 0.3 + 1.5, 1.0])
+    # a turn by 1e-3 rad moves the farthest corner by less than that, but hardly so
+    corner = np.hypot(1.5 + 0.05, 0.3 + 0.05)
+    assert 0.8 * levers[0] < corner < levers[0]
+
+
+def test_a_motion_that_swings_between_the_first_samples_is_followed_by_its_acceleration(slider):
+    clearance = Clearance(slider, boxes=[Box("post", (0.0, 0.4, -0.2), (0.1, 0.6, 0.2))])
+    h = 0.5 * _FIRST  # the first instants that are looked at are its odd multiples
+
+    class Swing:
+        """A motion that is at rest at these instants, 0.25 m from the post, and in it between."""
+
+        def evaluate(self, t):
+            w, none = np.pi / h, np.zeros_like(t)
+            x, v, a = (
+                -0.1 + 0.2 * np.cos(w * t),
+                -0.2 * w * np.sin(w * t),
+                -0.2 * w**2 * np.cos(w * t),
+            )
+            return tuple(np.column_stack([y, none]) for y in (x, v, a))
+
+    contact = clearance.nearest(Swing(), 20 * h)
+    assert {contact.first, contact.second} == {"ball", "post"}
+    assert contact.distance < 0.0
+    assert min(abs(contact.time - 2 * h * k) for k in range(11)) < 0.35 * h

@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -202,3 +203,18 @@ def test_distances_without_a_cost_are_not_looked_at_and_change_nothing(wrist, de
     np.testing.assert_allclose(some[1], every[1], atol=1e-12)
     looked_at = len(around.near(placed, held.reach(aim)).pairs)
     assert 0 < looked_at < len(around.near(placed, np.inf).pairs) / 2
+
+
+def test_a_posture_in_collision_counts_by_what_its_distances_are_short_of(wrist, designer):
+    inside = Clearance(wrist, least=0.01, boxes=[Box("room", (-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))])
+    near = replace(designer, clearance=inside).postures
+    q = near._drawn(np.random.default_rng(0), 20)
+    distance = inside.near(inside.placed(q), np.inf, inside.everything).distance
+    short = np.maximum(inside.kept[:, None] + inside.spare - distance, 0.0)
+    limits = replace(near, clearance=None)._broken_by_joint(q)
+    of_pairs = (near._broken_by_joint(q) - limits).sum(axis=1)
+    np.testing.assert_allclose(of_pairs, short.sum(axis=0) / 0.05, rtol=1e-6)
+    told = near._why_not(*near._at_rest(q))
+    found, wanted = re.search(r"room are (\S+) mm apart, wanted (\S+) mm", told).groups()
+    assert float(found) in [pytest.approx(1e3 * own.max(), abs=0.06) for own in distance]
+    assert float(wanted) == pytest.approx(1e3 * (0.01 + inside.spare.max()), abs=0.06)

@@ -7,6 +7,7 @@ import pinocchio as pin
 
 from robotid.logs.data import Trajectory
 from robotid.robot.bodies import held_parameters
+from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, inertial_from_pseudo_inertia, pseudo_inertia
 
 WRIST = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", -0.5)))
@@ -27,6 +28,28 @@ ROBOTS = {
     "humanoid": ("talos_reduced.urdf", {}),
     "humanoid, floating": ("talos_reduced.urdf", {"free_flyer": True}),
 }
+
+LINK = (
+    '<link name="{}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" '
+    'ixz="0" iyz="0"/></inertial></link>'
+)
+JOINT = (
+    '<joint name="j{i}" type="{kind}"><parent link="l{parent}"/><child link="l{i}"/>'
+    '<axis xyz="{axis}"/><origin xyz="{xyz}" rpy="{rpy}"/>'
+    '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+)
+
+
+def mimicking(folder, rng, **options):
+    """Return a robot whose second and third joint follow the first, which carries the second."""
+    mimic = '<mimic joint="j1" multiplier="-2.5" offset="0.3"/></joint>'
+    parts = [LINK.format("l0")]
+    for i, parent in ((1, 0), (2, 1), (3, 0), (4, 2)):
+        text = {k: " ".join(map(str, rng.standard_normal(3))) for k in ("axis", "xyz", "rpy")}
+        joint = JOINT.format(i=i, kind="revolute", parent=parent, **text)
+        parts += [LINK.format(f"l{i}"), joint.replace("</joint>", mimic) if i in (2, 3) else joint]
+    (folder / "tree.urdf").write_text(f'<robot name="tree">{"".join(parts)}</robot>')
+    return RobotModel.from_urdf(folder / "tree.urdf", mimic="coupled", **options)
 
 
 def motion(model, rng, samples, reach=3.0, direction=None):

@@ -2,7 +2,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.paths import URDF
-from helpers.robots import ROBOTS
+from helpers.robots import ROBOTS, mimicking
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.regressor import compiled
@@ -14,8 +14,10 @@ from robotid.robot.model import RobotModel
 FIXED = {name: spec for name, spec in ROBOTS.items() if not spec[1].get("free_flyer")}
 
 
-@pytest.fixture(params=FIXED)
-def model(request):
+@pytest.fixture(params=[*FIXED, "mimic joints at a ratio"])
+def model(request, tmp_path):
+    if request.param not in FIXED:
+        return mimicking(tmp_path, np.random.default_rng(4), terms=[])
     file, options = FIXED[request.param]
     return RobotModel.from_urdf(example_urdf(file), terms=[], **{**options, "couplings": ()})
 

@@ -2,7 +2,7 @@ import logging
 
 import numpy as np
 import pytest
-from helpers.robots import ROBOTS, motion
+from helpers.robots import JOINT, LINK, ROBOTS, mimicking, motion
 
 from robotid.estimators import WLS
 from robotid.exceptions import DataError
@@ -59,17 +59,6 @@ def test_compiled_rows_are_pinocchios(case, rng):
     assert_is_pinocchio(model, motion(model, rng, 150, direction=direction))
 
 
-LINK = (
-    '<link name="{}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" '
-    'ixz="0" iyz="0"/></inertial></link>'
-)
-JOINT = (
-    '<joint name="j{i}" type="{kind}"><parent link="l{parent}"/><child link="l{i}"/>'
-    '<axis xyz="{axis}"/><origin xyz="{xyz}" rpy="{rpy}"/>'
-    '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
-)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_compiled_rows_are_pinocchios_on_random_trees(seed, tmp_path):
     rng = np.random.default_rng(seed)
@@ -88,15 +77,7 @@ def test_compiled_rows_are_pinocchios_on_random_trees(seed, tmp_path):
 
 
 def test_a_mimic_joint_follows_at_its_ratio_above_and_beside_its_leader(tmp_path, rng):
-    mimic = '<mimic joint="j1" multiplier="-2.5" offset="0.3"/></joint>'
-    parts = [LINK.format("l0")]
-    for i, parent in ((1, 0), (2, 1), (3, 0), (4, 2)):  # 2 is carried by its leader 1, 3 is not
-        text = {k: " ".join(map(str, rng.standard_normal(3))) for k in ("axis", "xyz", "rpy")}
-        joint = JOINT.format(i=i, kind="revolute", parent=parent, **text)
-        parts += [LINK.format(f"l{i}"), joint.replace("</joint>", mimic) if i in (2, 3) else joint]
-    path = tmp_path / "tree.urdf"
-    path.write_text(f'<robot name="tree">{"".join(parts)}</robot>')
-    model = RobotModel.from_urdf(path, mimic="coupled")
+    model = mimicking(tmp_path, rng)
     assert model.joints == ("j1", "j4")
     assert_is_pinocchio(model, motion(model, rng, 64))
 

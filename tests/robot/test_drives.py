@@ -458,3 +458,26 @@ def test_what_drives_remember_is_of_the_model_not_of_what_was_remembered_before(
 def test_a_shape_that_divides_by_zero_is_refused(make, words):
     with pytest.raises(SettingsError, match=words):
         make()
+
+
+def test_bounds_of_a_shape_are_shares_of_the_largest_speed_or_of_the_range_of_positions():
+    seen = {"v": (0.1, 2.0), "q": (-1.0, 3.5)}
+    speed, way, exponent = (
+        FAMILIES[name].shapes[0] for name in ("stribeck", "presliding", "power")
+    )
+    assert speed.within(seen) == pytest.approx((0.005 * 2.0, 0.5 * 2.0))
+    assert way.within(seen) == pytest.approx((0.0005 * 4.5, 0.015 * 4.5))
+    assert exponent.within(seen) == (0.1, 0.9)
+
+
+def test_knots_and_centres_of_families_lie_in_the_range_seen():
+    seen = {"v": (0.1, 3.2), "q": (-1.0, 3.0)}
+    rises = [(term.low, term.high) for term in FAMILIES["curve"].make(seen)]
+    np.testing.assert_allclose(rises, [(0.0, 0.2), (0.2, 0.8), (0.8, 1.8), (1.8, 3.2)])
+    table = {term.number: (term.before, term.at, term.after)
+             for term in FAMILIES["spring_table"].make(seen)}  # fmt: skip
+    wanted = {k: np.array([-1.5, -1.0, -0.5]) + 0.5 * (k - 1) for k in (1, 2, 3, 4, 6, 7, 8, 9)}
+    assert list(table) == list(wanted)  # the middle one is the offset's
+    np.testing.assert_allclose(list(table.values()), list(wanted.values()), atol=1e-12)
+    by_position = FAMILIES["position"].make(seen)
+    assert [(term.order, term.centre) for term in by_position] == [(1, 1.0), (2, 1.0)]

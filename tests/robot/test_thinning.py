@@ -115,3 +115,13 @@ def test_edges_stay_sharp_when_few_triangles_are_left():
     mesh = trimesh.Trimesh(thinned.vertices, thinned.faces)
     assert mesh.volume == pytest.approx(6.0, rel=1e-3)
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [1, 2, 3], atol=1e-3)
+
+
+def test_patches_of_a_closed_solid_are_closed_beside_an_open_one():
+    box = trimesh.creation.box((1, 1, 1))
+    halves = [Surface(np.asarray(box.vertices), box.faces[part], None)
+              for part in (slice(5), slice(5, None))]  # fmt: skip
+    sheet = Surface(np.asarray(box.vertices) + 3.0, box.faces[:4], None)
+    closed, (opened,) = thin([halves, [sheet]], 100)
+    assert [s.is_closed for s in closed] == [True, True]
+    assert not opened.is_closed

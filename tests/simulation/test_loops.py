@@ -35,6 +35,7 @@ from robotid.robot.drives import (
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
+from robotid.simulation.course_lanes import divide_rows
 from robotid.simulation.loops import LoopedRobot, Loops, Window, cut_windows
 
 RATE = 500.0  # [Hz]
@@ -333,7 +334,7 @@ def held_slider(t, start, told, rate, begin, *, mass, kp, kd, viscous):
 @pytest.mark.parametrize("begin", [0, 52])
 def test_a_held_loop_has_the_closed_form_of_its_ticks(tmp_path, rate, begin):
     body = {"mass": 2.0, "kp": 300.0, "kd": 40.0}
-    model, t = slider(tmp_path), np.arange(150) / RATE
+    model, t = slider(tmp_path), 7.3 + np.arange(150) / RATE
     rail = loops_of(
         model, (Viscous(),), (0.0,), kp=300.0, kd=np.array([40.0]), armature=np.array([0.5]),
         zero=np.zeros(1), rate=rate,
@@ -407,6 +408,9 @@ def test_a_controller_too_slow_for_its_gains_is_told_the_rate_it_needs(tmp_path)
         q_ref=np.full((500, 1), 0.3),
     )  # fmt: skip
     rail = {"kp": 300.0, "kd": np.array([400.0]), "armature": np.array([0.5])}  # 400 / (2 2.5)
+    stiff = rail | {"kp": 3e4, "kd": np.array([100.0])}  # 3e4 / (2 100)
+    with pytest.raises(NotConvergedError, match=r"kp 3e\+04 and kd 100 need some 150 Hz"):
+        rolled(model, loops_of(model, (Viscous(),), zero=np.zeros(1), rate=40.0, **stiff), log)
     with pytest.raises(
         NotConvergedError,
         match=r"roll-out of j runs away: a controller of 40 Hz holds.*kd 400 need some 80 Hz",
@@ -524,3 +528,13 @@ def test_friction_below_0_has_no_solution(legs):
     loops = loops_of(legs, PLAIN, (0.1, -5.0, 0.0))
     with pytest.raises(NotConvergedError, match=r"FL_hip_joint.*no solution: friction below 0"):
         rolled(legs, loops, commanded(legs))
+
+
+def test_the_longest_steps_of_a_row_are_divided_further():
+    ticks, every = np.array([6.0, 6.9, 8.0]), 5
+    times, is_tick = np.empty(11), np.empty(10, dtype=bool)
+    divide_rows(np.array([5.0, 6.0, 7.5]), ticks, times, is_tick)
+    first = 5.0 + np.arange(5) / 5  # no tick: five alike
+    second = [6.0, 6.3, 6.6, 6.9, 7.2, 7.5]  # three of 0.9 s, two of 0.6 s
+    np.testing.assert_allclose(times, [*first, *second])
+    assert np.flatnonzero(is_tick).tolist() == [0, every, 8]
