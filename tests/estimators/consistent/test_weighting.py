@@ -12,6 +12,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.estimators import Consistent
 from robotid.estimators.consistent.weighting import (
     Segments,
+    _is_as_good,
     choose_weight,
     held_out_errors,
     log_evidence,
@@ -268,6 +269,17 @@ def test_the_noise_level_of_few_rows_is_right_on_average(ur5, rng):
     # 15 runs of 30 degrees of freedom know it to 3 %; what the prior misses adds to it
     assert (ratio > 0.85).all()
     assert (ratio < 1.2).all()
+
+
+def test_a_sum_of_errors_is_as_good_within_two_standard_errors_of_pairs(rng):
+    best, chance = rng.uniform(1.0, 9.0, 16), rng.standard_normal(16)
+    chance *= 0.3 / chance.std(ddof=1)
+    chance -= chance.mean()
+    for times, is_as_good in ((-5.0, True), (1.95, True), (2.05, False)):
+        # a sum of 16 differences scatters by 4 times what each does
+        parts = best + chance + times * 4.0 * 0.3 / 16
+        assert _is_as_good(parts, best) is is_as_good
+    assert not _is_as_good(best[:0], best[:0])
 
 
 def test_extents_that_the_data_contradict_are_named_and_no_others(rng):
