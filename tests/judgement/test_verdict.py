@@ -388,6 +388,7 @@ def test_a_prediction_of_unseen_motion_refutes_hypotheses_on_masses_and_units():
     assert refuted_code("clipped", 1.0) == "warning"
     assert refuted_code("current_for_torque", 1.0, {"a": 1.3}) == "note"
     assert refuted_code("current_for_torque", 1.0, {"a": 0.1}) == "warning"  # 1 % of what unit?
+    assert refuted_code("current_for_torque", 1.0, {"a": 1.3, "b": 2.1}) == "warning"
     assert refuted_code("unexplained_torque", 9.0, where="run.csv: b") == "note"
     assert refuted_code("unexplained_torque", 9.0, where="run.csv: a") == "warning"
     assert refuted_code("gravity", 1.0) == "note"

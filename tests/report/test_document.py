@@ -187,6 +187,10 @@ def test_samples_and_rows_are_those_of_the_fitted_logs_together(report, identifi
         f"({samples} samples after filtering, {rows} torque rows used) by " in said
     )
     assert f"Kept apart for validation: {kept.recording.name}. " in said
+    counts = [identified.sources.count(source) for source in ("data", "mixed")]
+    assert min(counts) > 0
+    every = len(identified.sources)
+    assert f"{sum(counts)} of {every} determined by motion, in part or whole" in said
 
 
 def test_every_joint_has_its_error_its_parameters_and_its_plot(html, found):
