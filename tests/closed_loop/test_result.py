@@ -1,14 +1,18 @@
 """Figures that are derived of a fit of loops, with errors that are given."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scipy.stats
 from helpers.crane import identified_crane
 
+from robotid.closed_loop import result
+from robotid.closed_loop.findings import loop_findings
 from robotid.closed_loop.initial_values import _speed
-from robotid.closed_loop.result import logged_motion
+from robotid.closed_loop.result import LoopIdentification, logged_motion
+from robotid.closed_loop.zeros import Encoders
 from robotid.fitting.bands import REACH
 from robotid.logs.data import Log
 from robotid.simulation.loops import cut_windows
@@ -54,9 +58,10 @@ def test_errors_of_sums_are_those_of_their_parameters(found):
         assert error == (pytest.approx(size) if size > 0 else np.inf)
 
 
-def test_unknowns_whose_errors_go_together_are_sets(found):
+@pytest.mark.parametrize("pairs", [[(0, 3), (3, 4)], [(0, 4), (3, 4)], [(0, 3), (0, 4)]])
+def test_unknowns_whose_errors_go_together_are_sets(found, pairs):
     R = np.eye(5)
-    for a, b, rho in ((0, 3, 0.99), (3, 4, -0.985), (1, 2, 0.97)):
+    for (a, b), rho in zip([*pairs, (1, 2)], (0.99, -0.985, 0.97), strict=True):
         R[a, b] = R[b, a] = rho
     std = np.array([1e-3, 10.0, 0.1, 2.0, 5e-2])
     other = of(found, covariance=R * np.outer(std, std))
@@ -71,6 +76,61 @@ def test_what_the_data_hardly_shrink_is_undetermined(found):
     other = of(found, covariance=np.diag((share * spread) ** 2))
     np.testing.assert_allclose(other.shrunk, share)
     assert other.undetermined == ("turn.armature", "rail.viscous")
+
+
+def test_two_sets_that_a_third_pair_joins_are_one(found):
+    R = np.eye(5)
+    for a, b in ((0, 3), (1, 2), (2, 3)):
+        R[a, b] = R[b, a] = 0.99
+    [names] = of(found, covariance=R).told_together
+    assert names == ("rail.armature", "turn.armature", "robot.delay", "rail.viscous")
+
+
+def test_friction_is_projected_where_a_joint_moves_by_its_own_largest_speed(monkeypatch):
+    seen = []
+    monkeypatch.setattr(result, "drive_moments", lambda _, motions: seen.extend(motions))
+    t = 2.0 + np.arange(200) / 100.0
+    logs = [
+        Log(t, q, 0 * q, ("a", "b"), q_ref=q, has_torque=False)
+        for q in (np.sin(6.0 * t)[:, None] * size for size in ([1.0, 0.01], [0.02, 3.0]))
+    ]
+    model = SimpleNamespace(layout=SimpleNamespace(own={"a": ()}))
+    model.with_reference = lambda standard: model
+    runs = [SimpleNamespace(log=log) for log in logs]
+    stub = SimpleNamespace(model=model, standard=None, fitted=runs)
+    LoopIdentification.moments.fget(stub)
+    assert len(seen) == 2
+    for motion, moving in seen:
+        speed = np.abs(motion.v)
+        np.testing.assert_array_equal(moving, speed > 0.05 * speed.max(axis=0))
+        assert moving.mean(axis=0) == pytest.approx(0.97, abs=0.01)  # |cos| > 0.05
+
+
+def test_encoders_are_told_with_the_figures_of_their_own_joint(found):
+    def told(**changes):
+        both = dict.fromkeys(Encoders.__dataclass_fields__, np.zeros(2))
+        both |= {"sign": np.ones(2), "next_sign": np.ones(2)}
+        encoders = Encoders(**{key: np.array(x) for key, x in (both | changes).items()})
+        fit = replace(found.fit, encoders=encoders)
+        loop = replace(found.loop, zeros="find")
+        said = loop_findings(replace(found, fit=fit, loop=loop), ())
+        return {f.code: f for f in said if f.code.startswith("encoder")}
+
+    [open_] = told(margin=[0.05, 0.13]).values()
+    assert (open_.where, open_.evidence) == ("rail, turn", {"margin": 0.13})
+    assert "leave 13 % more of the squared error of the loops at most" in open_.message
+    turned = {"gain": [0.0, 0.31], "sign": [1.0, -1.0], "next_zero": [0.4, -0.25]}
+    every = told(**turned, margin=[0.5, 2.1], explained=[0.62, 0.9])
+    assert {code: f.where for code, f in every.items()} == {
+        "encoder": "turn", "encoder_kept": "rail",
+    }  # fmt: skip
+    said = every["encoder"].message
+    assert "turn: its encoder counts the other way, and reads 0" in said
+    assert "explains 31 % of what holds" in said
+    assert "the next best, -0.25 rad, counted the other way, leaves 210 % more" in said
+    kept = every["encoder_kept"].message
+    assert "explains 62 % of what slowly holds" in kept
+    assert "the next best, +0.4 rad leaves 50 % more" in kept
 
 
 def test_speeds_of_a_log_are_those_between_its_gaps():

@@ -223,6 +223,11 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
         "note: noise: run.csv: 1 % of arm_1's torque is odd",
         "6 findings, 4 causes; worst: arm_1",
     ]
+    wrong = [finding("arm_6", code, 1, "error") for code in ("one", "two")]
+    wrong += [finding("arm_7", code, 9) for code in ("three", "four")]
+    wrong.append(finding("arm_7", "five", 9, "error"))
+    doctor.show({"findings": wrong, "joints": joints}, is_verbose=False)
+    assert capsys.readouterr().out.splitlines()[-1].endswith("worst: arm_6"), "two errors"
     doctor.show({"findings": [], "joints": joints}, is_verbose=False)
     assert capsys.readouterr().out == "nothing was found\n"
 

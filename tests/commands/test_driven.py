@@ -1,5 +1,6 @@
 import json
 from contextlib import redirect_stdout
+from dataclasses import replace
 from io import StringIO
 
 import numpy as np
@@ -7,7 +8,10 @@ import pytest
 from helpers.mujoco_plant import plant, torque_log
 
 from robotid.cli import main
+from robotid.commands import identify
+from robotid.commands.job import read_job
 from robotid.logs.read import write_log
+from robotid.robot.families import AUTO
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +101,34 @@ def test_its_result_is_validated_on_another_log(folder, job, result, capsys):
     [run], [before] = again["validation"], result["simulation"]["validation"]
     for joint, own in run["per_joint"].items():
         assert own["rmse"] == pytest.approx(before["per_joint"][joint]["rmse"], rel=1e-6)
+    assert again["verdict"]["status"] != "not evaluated"
+    logs = [str(job.parent / f"{name}.csv") for name in ("second", "first")]
+    assert main(["validate", str(folder), *logs, "--json"]) == 0
+    both = json.loads(capsys.readouterr().out)
+    assert both["verdict"]["status"] == "not evaluated", "one of the two was fitted"
+    assert both["validation"][0] == run
+
+
+@pytest.mark.parametrize("is_auto", [False, True])
+def test_what_a_job_says_reaches_the_fit_of_roll_outs(job, monkeypatch, is_auto):
+    class Told(Exception):
+        pass
+
+    def told(*stated, **options):
+        raise Told(stated, options)
+
+    monkeypatch.setattr(identify, "identify_loops", told)
+    asked = replace(read_job(job), ignore=("spikes",))
+    asked = replace(asked, terms=(*asked.terms, *([AUTO] if is_auto else [])))
+    with pytest.raises(Told) as error:
+        identify._identify_loops(asked, asked.model(), None)
+    (_, fitted, kept, loop, estimator), options = error.value.args
+    for logs, name in ((fitted, "first.csv"), (kept, "second.csv")):
+        assert [log.name for log in logs] == [name]
+    assert (loop, estimator) == (asked.controller, asked.estimator)
+    assert options["signals"].cutoff == 30.0
+    assert options["ignore"] == ("spikes",)
+    assert options["chooses"] is is_auto
 
 
 def test_its_report_is_made_anew_and_its_replay_shows_torques(folder, job, tmp_path):

@@ -196,6 +196,21 @@ def test_a_result_with_a_clock_follows_by_it_and_its_export_says_so(result, tmp_
         assert ("reads its joints 100 times a second and holds its torque" in out) is says
 
 
+def test_encoders_that_count_the_other_way_are_heard_and_answered_in_their_sense(result):
+    folder, leg = result
+    log, _ = recorded(leg, np.random.default_rng(5), duration=0.3, noise=0.0)
+    plain = load_result(folder)
+    loop = {**plain.content["simulation"], "signs": {LEG[1]: -1.0}}  # one that is not named: 1
+    turned = replace(plain, content={**plain.content, "simulation": loop})
+    sign = np.array([1.0, -1.0, 1.0])
+    other = log.turned(sign)
+    np.testing.assert_array_equal(turned.follow_commands(other), sign * plain.follow_commands(log))
+    one, two = (found.open_loop(x) for found, x in ((plain, log), (turned, other)))
+    np.testing.assert_array_equal(two.q, one.q)
+    np.testing.assert_array_equal(two.rmse, one.rmse)
+    assert one.rmse.max() < 0.1
+
+
 def test_impossible_drives_are_refused(result, tmp_path):
     content = json.loads((result[0] / "result.json").read_text())
     for name in ("robot.urdf", "robot.drive.json"):

@@ -1,5 +1,7 @@
 """What result.json holds of loops, figure by figure, for two joints of two kinds and three logs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.crane import RATES, STARTS, identified_crane
@@ -39,6 +41,18 @@ def test_what_was_stated_has_no_error_and_what_was_found_has_its_own(found, entr
     assert entries["simulation"]["controller"] == {
         "kind": "pd", "effort_limit": {"rail": 80.0}, "rate": None,
     }  # fmt: skip
+
+
+def test_sums_of_bodies_that_were_not_fitted_are_named(found):
+    n, names = found.model.layout.n_inertial, np.array(found.mapping.base_names)
+    is_body = np.array(found.mapping.independent) < n
+    assert is_body.sum() > 1
+    assert (~is_body).sum() > 1
+    error = np.ones(len(names))
+    last, drive = np.flatnonzero(is_body)[-1], np.flatnonzero(~is_body)[0]
+    error[[last, drive]] = np.inf
+    other = loop_entries(replace(found, base_error=error))
+    assert other["ranges"]["undetermined"] == [names[last]]
 
 
 def test_each_log_has_its_times_rate_and_role(found):

@@ -11,7 +11,7 @@ from helpers.figures import figures
 
 from robotid import __version__
 from robotid.exceptions import DataError, ModelError
-from robotid.export.entries import build_result, recording_metrics
+from robotid.export.entries import _curve, build_result, recording_metrics
 from robotid.export.result import read_result, stated_parameters
 from robotid.findings import Finding
 from robotid.robot.parameters import INERTIAL_TERMS
@@ -261,3 +261,21 @@ def test_results_that_are_not_whole_are_refused(result, identified, tmp_path):
     short = {**result, "drive_parameters": result["drive_parameters"][1:]}
     with pytest.raises(ModelError, match=r"^the result has no value of shoulder_pan_joint\.arm"):
         stated_parameters(short, identified.model)
+
+
+def test_a_friction_curve_is_of_the_logs_in_which_its_joint_moves(identified):
+    first, second = identified.fitted
+    row = identified.model.row_names.index("elbow_joint")
+
+    def still(e):
+        motion, mask = e.recording.trajectory, e.recording.mask.copy()
+        mask[:, row] &= False
+        return replace(e, recording=replace(e.recording, trajectory=motion, mask=mask))
+
+    one = replace(identified, fitted=(still(first), second))
+    speed = np.abs(second.recording.trajectory.v[second.recording.mask[:, row], row])
+    curve = _curve(one, "elbow_joint")["curve"]
+    np.testing.assert_allclose(
+        [np.abs(curve["v"]).min(), np.abs(curve["v"]).max()], [speed.min(), speed.max()]
+    )
+    assert _curve(replace(identified, fitted=(still(first), still(second))), "elbow_joint") == {}

@@ -1,8 +1,17 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.fitting.evaluation import evaluate_logs, pool, predict, shares_rows
+from robotid.fitting.evaluation import (
+    evaluate_logs,
+    hidden_joints,
+    pool,
+    predict,
+    shares_rows,
+)
+from robotid.fitting.metrics import TorqueSums
 from robotid.fitting.survey import hold_log
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
@@ -44,6 +53,13 @@ def test_without_parameters_there_are_recordings_but_no_predictions(ur5, rng):
     assert fitted.recording.trajectory is own.whole.trajectory
 
 
+def test_each_kept_log_is_looked_for_in_each_fitted_one(ur5, rng):
+    a, b, new = (hold_log(ur5, exact_log(ur5, truth(ur5), rng), EXACT) for _ in range(3))
+    for fitted in ([a, b], [b, a]):
+        _, kept = evaluate_logs(fitted, [b, new, a], {}, None)
+        assert [e.is_refitted for e in kept] == [True, False, True]
+
+
 def test_gravity_knows_no_offset(ur5, rng):
     pi = truth(ur5)
     found = evaluated(ur5, exact_log(ur5, pi, rng), {"truth": pi}, pi)
@@ -56,6 +72,29 @@ def test_pooled_metrics_are_those_of_all_rows(ur5, rng):
     found = [evaluated(ur5, log, {"x": pi}, pi) for log in logs]
     squares = [f.metrics["x"].pooled_rmse ** 2 for f in found]
     np.testing.assert_allclose(pool(ur5, found, "x").pooled_rmse, np.sqrt(np.mean(squares)))
+
+
+def test_joints_are_hidden_whose_torque_changes_less_over_the_rows_used_than_is_left():
+    model = SimpleNamespace(is_static=True, row_names=tuple("abcd"), row_units=("N m",) * 4)
+    k = np.arange(40)
+    way = (-1.0) ** k[:, None]  # of a mean of 0, and of size 1
+
+    def evaluation(mean, used):
+        torque = mean + way * [1.0, 1.0, 2.1, 1.0]
+        torque[k % 4 > 1, 0] += 90.0  # where no row is used
+        mask = np.column_stack([used, used | True, used | True, used & False])
+        left = 2.0 * (-1.0) ** (k[:, None] // 2)
+        sums = TorqueSums.of(torque + left, torque, mask, {})
+        return SimpleNamespace(
+            torques={"estimate": torque}, sums={"estimate": sums},
+            recording=SimpleNamespace(mask=mask),
+        )  # fmt: skip
+
+    logs = [evaluation(np.array([0.0, mean, 0.0, 0.0]), k % 4 <= 1) for mean in (-1.8, 1.8)]
+    assert hidden_joints(model, logs) == ("a",), "the second's stands differ from log to log"
+    assert hidden_joints(model, logs[:1]) == ("a", "b"), "the fourth has no row"
+    full = SimpleNamespace(is_static=False, row_names=model.row_names, row_units=model.row_units)
+    assert hidden_joints(full, logs) == ()
 
 
 def test_rows_of_slow_joints_and_slow_coupled_drives_are_left_out(ur5, rng):

@@ -6,6 +6,7 @@ from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.fitting.information import information
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
 
@@ -51,6 +52,18 @@ def test_the_share_of_the_data_is_that_of_a_bayesian_update(found):
         data = found.wls.covariance[b, b]
         posterior = 1.0 / (1.0 / prior + 1.0 / data)
         assert said[b] == pytest.approx(1.0 - posterior / prior, rel=1e-9)
+
+
+def test_directions_shrink_by_the_rows_that_are_independent_behind_the_filter(ur5):
+    rng = np.random.default_rng(1)
+    logs = [
+        exact_log(ur5, truth(ur5), rng, samples=300, rate=rate, noise=0.1) for rate in (40.0, 50.0)
+    ]
+    found = fit(ur5, logs, signals=SignalSettings(cutoff=5.0), estimator="wls")
+    share = 2 * 5.0 / 50.0  # the filter's band over that of the rows, of the log with most of them
+    spread = np.sqrt(found.mapping.K**2 @ found.prior_std**2)
+    size = np.linalg.svd(np.sqrt(share) * dense(found) * spread, compute_uv=False)
+    np.testing.assert_allclose(found.determination.shrinkage, 1 / np.hypot(1, size), rtol=1e-6)
 
 
 def test_what_the_data_leave_open_has_no_share_and_no_correlation(ur5, rng):

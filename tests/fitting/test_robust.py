@@ -144,6 +144,7 @@ def test_standard_errors_of_a_robust_fit_allow_for_its_loss_of_efficiency(ur5):
         found = fit(ur5, [log], signals=signals, estimator=estimator)
         errors.append(found.base - found.mapping.to_base(pi))
         reported.append(found.base_error)
+        np.testing.assert_allclose(found.wls.std_error, found.base_error, rtol=1e-9)
     ratio = np.sqrt(np.mean(np.square(reported), axis=0) / np.mean(np.square(errors), axis=0))
     assert 0.85 < np.median(ratio) < 1.2, np.median(ratio)
 

@@ -11,6 +11,7 @@ from helpers.synthetic import truth
 
 from robotid.estimators.batch import solve_factor
 from robotid.exceptions import DataError, SettingsError
+from robotid.export.entries import build_preview
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.assumptions import TorqueNoise, assumed_noise
@@ -148,6 +149,27 @@ def test_the_prior_only_helps_and_bands_are_of_the_motion(ur5, motion):
     W = joint_torque_regressor(ur5, one.q, one.v, one.a, one.direction)[:, mapping.independent]
     std = np.sqrt(np.diag(W @ covariance @ W.T))
     np.testing.assert_allclose(band.parameters[123], std, rtol=1e-8)
+
+
+def test_bands_of_torques_are_root_mean_squares_over_all_motions(ur5):
+    logs = [moved(ur5, np.random.default_rng(seed))[0] for seed in (4, 5)]
+    logs[1] = logs[1].window(end=3.0)  # 12 s and 3 s
+    found = preview(ur5, logs, noise=white(), estimator="wls")
+    mapping, covariance = found.expected.mapping, found.expected.wls.covariance
+    variance, torque = [], []
+    for e, band in zip(found.expected.fitted, found.bands, strict=True):
+        one = e.recording.trajectory.at(band.samples)
+        W = joint_torque_regressor(ur5, one.q, one.v, one.a, one.direction)
+        W = W[:, mapping.independent]
+        variance.append(np.sum(W @ covariance * W, axis=1).reshape(-1, 6))
+        torque.append(e.recording.trajectory.tau)
+    size = np.sqrt(np.mean(np.concatenate(variance), axis=0))
+    rms = np.sqrt(np.mean(np.concatenate(torque) ** 2, axis=0))
+    whole = np.hypot(size, found.expected.estimate.sigma)
+    for j, told in enumerate(build_preview(found)["torque"].values()):
+        assert told["of_parameters"] == pytest.approx(1.96 * size[j], rel=1e-4)
+        assert told["half_width"] == pytest.approx(1.96 * whole[j], rel=1e-4)
+        assert told["rms"] == pytest.approx(rms[j])
 
 
 def test_a_joint_that_stands_still_is_named(ur5, motion):

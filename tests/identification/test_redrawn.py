@@ -76,14 +76,16 @@ def test_the_nearest_matrix_has_the_positive_eigenvalues(rng):
     np.testing.assert_allclose(unsvec(found.reshape(-1)), clipped, atol=5e-3)
 
 
-@pytest.mark.parametrize(("meat_over_bread", "pull"), [(1.0, 1.0), (9.0, 0.25)])
-def test_where_no_bound_binds_it_is_the_covariance(inside, rng, meat_over_bread, pull):
+@pytest.mark.parametrize(
+    ("meat_over_bread", "pull", "weight"), [(1.0, 1.0, 1.0), (9.0, 0.25, 1.0), (2.0, 3.0, 16.0)]
+)
+def test_where_no_bound_binds_it_is_the_covariance(inside, rng, meat_over_bread, pull, weight):
     rows = information(inside, rng, 1.0)
     R = rows[:, :-1]
     meat = meat_over_bread * R.T @ R
-    found, failures = inside.programme.redrawn(rows, 1.0, inside.prior, meat, pull, 3000, rng)
+    found, failures = inside.programme.redrawn(rows, weight, inside.prior, meat, pull, 3000, rng)
     assert failures == []
-    L = np.diag(inside.prior_std**-2)
+    L = weight * np.diag(inside.prior_std**-2)
     B = np.linalg.inv(inside.K.T @ R.T @ R @ inside.K + L)
     expected = B @ (inside.K.T @ meat @ inside.K + pull * L) @ B
     scale = np.sqrt(np.diag(expected))

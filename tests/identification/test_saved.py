@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from helpers.synthetic import exact_log, truth
 
 import robotid
 from robotid.cli import main
-from robotid.commands.job import job_from_settings
+from robotid.commands.identify import _entries
+from robotid.commands.job import LogEntry, job_from_settings
 from robotid.exceptions import SettingsError
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
@@ -115,3 +117,13 @@ def test_a_result_is_written_whole_or_not_at_all(found, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="JSON"):
         robotid.save_result(found, tmp_path / "out", report=False)
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_the_windows_of_logs_in_files_are_those_of_the_job():
+    def evaluation(path, start, end):
+        log, extent = SimpleNamespace(path=path), SimpleNamespace(start=start, end=end)
+        return SimpleNamespace(recording=SimpleNamespace(log=log, extent=extent))
+
+    logs = [("a/one.csv", 1.5, 4.0), ("", 0.0, 9.0), ("b/two.csv", -2.0, 3.25)]
+    found = _entries([evaluation(*log) for log in logs])
+    assert found == (LogEntry(Path("a/one.csv"), 1.5, 4.0), LogEntry(Path("b/two.csv"), -2.0, 3.25))

@@ -388,6 +388,7 @@ def test_a_prediction_of_unseen_motion_refutes_hypotheses_on_masses_and_units():
     assert refuted_code("clipped", 1.0) == "warning"
     assert refuted_code("current_for_torque", 1.0, {"a": 1.3}) == "note"
     assert refuted_code("current_for_torque", 1.0, {"a": 0.1}) == "warning"  # 1 % of what unit?
+    assert refuted_code("current_for_torque", 1.0, {"a": 1.3, "b": 2.1}) == "warning"
     assert refuted_code("unexplained_torque", 9.0, where="run.csv: b") == "note"
     assert refuted_code("unexplained_torque", 9.0, where="run.csv: a") == "warning"
     assert refuted_code("gravity", 1.0) == "note"
@@ -399,6 +400,16 @@ def test_a_prediction_of_unseen_motion_refutes_hypotheses_on_masses_and_units():
         assert refuted([no_gravity], kept, witness)[0].severity == severity
     seen = [finding("repeated_motion", "val.csv")]
     assert refuted_code("urdf_mismatch", 1.0, more=seen) == "warning"
+
+
+@pytest.mark.parametrize("errors", [(9.0, 1.0), (1.0, 9.0)])
+def test_the_worst_of_several_recordings_refutes_no_hypothesis(errors):
+    kept = {f"{k}.csv": Metrics({"a": joint(x)}, 1.0) for k, x in enumerate(errors)}
+    mismatch, witness = finding("urdf_mismatch", "run.csv"), Witness(gravity={}, gravity_error={})
+    assert refuted([mismatch], kept, witness)[0].severity == "warning"
+    few = {name: Metrics({"a": joint(x / 2)}, 1.0) for name, x in zip(kept, errors, strict=True)}
+    [note] = refuted([mismatch], few, witness)
+    assert note.message.endswith("but the result predicts unseen motion within 4.5 %")
 
 
 @pytest.mark.parametrize(

@@ -177,6 +177,22 @@ def test_verdict_comes_first_then_how_it_was_made(html, found):
         places.append(text.index(words, places[-1]))
 
 
+def test_samples_and_rows_are_those_of_the_fitted_logs_together(report, identified):
+    fitted, (kept,) = [e.recording for e in identified.fitted], identified.validation
+    samples, rows = sum(len(r.mask) for r in fitted), sum(r.mask.sum() for r in fitted)
+    first, second = (recording.name for recording in fitted)
+    said = " ".join(Reader(report).text.split())
+    assert (
+        f"{len(identified.base)} base parameters of 6 joints were fitted to {first}, {second} "
+        f"({samples} samples after filtering, {rows} torque rows used) by " in said
+    )
+    assert f"Kept apart for validation: {kept.recording.name}. " in said
+    counts = [identified.sources.count(source) for source in ("data", "mixed")]
+    assert min(counts) > 0
+    every = len(identified.sources)
+    assert f"{sum(counts)} of {every} determined by motion, in part or whole" in said
+
+
 def test_every_joint_has_its_error_its_parameters_and_its_plot(html, found):
     text = Reader(html).text
     for joint in found.model.joints:

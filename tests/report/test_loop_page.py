@@ -138,9 +138,9 @@ def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content
     assert rows[LEG[0]]["coulomb_q1 [N m]"] == "–"
     assert "±" not in rows[LEG[0]]["kp [N m/rad]"]
     late = next(e for e in content["drive_parameters"] if e["name"] == f"{LEG[0]}.delay")
-    assert float(rows[LEG[0]]["delay [ms]"].split()[0]) == pytest.approx(
-        1e3 * late["value"], rel=0.01
-    )
+    value, _, error = rows[LEG[0]]["delay [ms]"].split()
+    assert float(value) == pytest.approx(1e3 * late["value"], rel=0.01)
+    assert float(error) == pytest.approx(1e3 * late["std_error"], rel=0.05)
     every = tables(page)["All drive parameters with their 95 % intervals"].by_name()
     assert every[f"{LEG[1]}.kp"]["from"] == "stated"
     assert every[f"{LEG[1]}.coulomb"]["low"] == "0.201"

@@ -1,6 +1,7 @@
 """The weight of the prior chosen from the data: brute force, closed form, what it is good for."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from helpers.synthetic import exact_log, truth
 from robotid.estimators import Consistent
 from robotid.estimators.consistent.weighting import (
     Segments,
+    _is_as_good,
     choose_weight,
+    contradicted_extents,
     held_out_errors,
     log_evidence,
 )
@@ -268,6 +271,59 @@ def test_the_noise_level_of_few_rows_is_right_on_average(ur5, rng):
     # 15 runs of 30 degrees of freedom know it to 3 %; what the prior misses adds to it
     assert (ratio > 0.85).all()
     assert (ratio < 1.2).all()
+
+
+def test_a_sum_of_errors_is_as_good_within_two_standard_errors_of_pairs(rng):
+    best, chance = rng.uniform(1.0, 9.0, 16), rng.standard_normal(16)
+    chance *= 0.3 / chance.std(ddof=1)
+    chance -= chance.mean()
+    for times, is_as_good in ((-5.0, True), (1.95, True), (2.05, False)):
+        # a sum of 16 differences scatters by 4 times what each does
+        parts = best + chance + times * 4.0 * 0.3 / 16
+        assert _is_as_good(parts, best) is is_as_good
+    assert not _is_as_good(best[:0], best[:0])
+
+
+@dataclass(frozen=True)
+class Boxed:
+    """A fit of three bodies whose slacks of their boxes, by a fit without them, are given."""
+
+    constraints: str
+    slack: np.ndarray
+    layout = SimpleNamespace(bodies=("a", "b", "c"))
+    prior_std = np.array([2.0, 1.0, 1.0])  # in which the cone has its coefficients
+
+    @property
+    def programme(self):
+        linear = SimpleNamespace(
+            G=np.diag(self.prior_std), h=np.full(3, 0.5), labels=[f"extent {x}" for x in "abc"]
+        )
+        x = self.slack - 0.5
+        return SimpleNamespace(
+            cone=SimpleNamespace(linear=linear),
+            minimise=lambda rows, weight, is_exact: SimpleNamespace(x=x),
+            covariance=lambda weight, rows, x: np.diag([4.0, 4.0, 0.25]),
+        )
+
+
+@pytest.mark.parametrize(
+    ("ratio", "chance", "named"),
+    [(1.015, 0.0, ()), (1.025, 0.0, ("a", "c")), (1.025, 0.2, ()), (0.9, 0.0, ())],
+)
+def test_an_extent_is_contradicted_by_four_errors_two_percent_and_two_errors_of_pairs(
+    monkeypatch, ratio, chance, named
+):
+    constraints = SimpleNamespace(extent=("a", "b", "c"), without_extent=lambda _: "free")
+    fit = Boxed(constraints, np.array([-8.1, -7.9, -2.1]))  # four times 2, 2 and 0.5
+    swing = chance * np.tile([1.0, -1.0], 4)
+
+    def held_out(fit, segments, weight, starts):
+        left = np.ones((8, 1)) if fit.constraints == "free" else ratio + swing[:, None]
+        return left, []
+
+    monkeypatch.setattr("robotid.estimators.consistent.weighting._held_out", held_out)
+    segments = SimpleNamespace(rows=None, kept=[None] * 8)
+    assert contradicted_extents(fit, segments) == named
 
 
 def test_extents_that_the_data_contradict_are_named_and_no_others(rng):

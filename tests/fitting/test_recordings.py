@@ -1,0 +1,34 @@
+"""Stretches that logs in memory are cut into."""
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.fitting.recordings import Recordings
+from robotid.fitting.survey import hold_log
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
+
+
+@pytest.mark.parametrize(
+    ("cutoff", "sizes", "stretches"),
+    [
+        (None, (1200,), [25] * 48),
+        (None, (1200, 600), [50] * 24 + [25] * 24),  # 48 of both logs together
+        (5.0, (1200, 600), [50] * 24 + [50] * 12),  # ten times the filter's five rows at least
+    ],
+)
+def test_all_logs_together_have_48_stretches_of_ten_correlation_times_or_more(
+    ur5, rng, cutoff, sizes, stretches
+):
+    signals = SignalSettings(cutoff=cutoff, trim=0.0, min_velocity=0.0)
+    logs = [hold_log(ur5, exact_log(ur5, truth(ur5), rng, samples=n), signals) for n in sizes]
+    recordings = Recordings(ur5, structural_mapping(ur5), logs)
+    found = recordings.reduce()
+    assert [reduction.samples for reduction in found] == stretches
+    whole = recordings.reduce(is_cut=False)
+    assert [reduction.samples for reduction in whole] == list(sizes)
+    squares = sum(reduction.factors.torque_squares() for reduction in found)
+    np.testing.assert_allclose(
+        squares, sum(np.sum(log.whole.trajectory.tau**2, axis=0) for log in logs)
+    )

@@ -1,0 +1,29 @@
+"""What a fit says of its parameters, by figures that are given."""
+
+from dataclasses import replace
+
+import numpy as np
+
+
+def test_a_bound_is_the_source_of_what_it_moved_and_the_data_do_not_show(identified):
+    names = np.array(identified.model.layout.names)
+    spread, body = identified.prior_std, "forearm_link"
+    share = np.full(len(names), 0.5)
+    moved = np.zeros(len(names))
+    own = np.flatnonzero([name.startswith(f"{body}.") for name in names])
+    # 0 data and moved, 1 in part and moved, 2 nothing and moved, 3 in part, 4 nothing, 5 data
+    share[own[:6]] = 0.29, 0.31, 0.95, 0.5, 0.95, 0.1
+    moved[own[:6]] = 0.4, -0.4, 0.31, 0.29, -0.29, 0.0
+    details = {**identified.estimate.details, "active": (f"extent {body}",), "pinned": ()}
+    found = replace(
+        identified,
+        standard=identified.prior + moved * spread,
+        errors=replace(identified.errors, unbounded=share * spread),
+        estimate=replace(identified.estimate, details=details | {"constraints": False}),
+    )
+    wanted = np.full(len(names), "mixed", dtype=object)
+    wanted[own[:6]] = "data", "bound", "bound", "mixed", "prior", "data"
+    assert found.sources == tuple(wanted)
+    pinned = details | {"constraints": False, "pinned": (body,)}
+    held = replace(found, estimate=replace(found.estimate, details=pinned))
+    assert {held.sources[i] for i in own} == {"prior"}
