@@ -66,7 +66,7 @@ class LoopIdentification(Identified):
     asked: Asked = field(default_factory=Asked)
 
     def __repr__(self) -> str:
-        return identification_line(self)
+        return identification_line(self, self.estimator.name, self.verdict.status)
 
     @property
     def estimate(self) -> Estimate:

@@ -70,7 +70,7 @@ class Identification(Fit):
     asked: Asked = field(default_factory=Asked)
 
     def __repr__(self) -> str:
-        return identification_line(self)
+        return identification_line(self, self.estimator.name, self.verdict.status)
 
     def _repr_html_(self) -> str:
         return identification_html(self)

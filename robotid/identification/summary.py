@@ -10,7 +10,7 @@ from robotid._text import columns
 from robotid.pages.html import code, number, percent, table, text
 
 if TYPE_CHECKING:
-    from robotid.closed_loop.result import LoopIdentification
+    from robotid.fitting.identified import Identified
     from robotid.fitting.metrics import Metrics
     from robotid.identification.result import Identification
 
@@ -39,15 +39,17 @@ _BESIDE = {
 _NO_REPORT = "robotid.write_report(found, 'report.html') writes the whole report"
 
 
-def identification_line(found: Identification | LoopIdentification) -> str:
+def identification_line(found: Identified, estimator: str, status: str) -> str:
     """Return an identification in one line.
 
     Args:
         found: The identification.
+        estimator: Name of its estimator.
+        status: Its verdict, in a word.
     """
     return (
         f"<Identification of {found.model.name}: {len(found.base)} base parameters by "
-        f"{found.estimator.name}, verdict {found.verdict.status}>"
+        f"{estimator}, verdict {status}>"
     )
 
 
@@ -57,7 +59,8 @@ def identification_text(found: Identification) -> str:
     Args:
         found: The identification.
     """
-    lines = [identification_line(found)[1:-1], *verdict_lines(found.verdict.to_dict())[1:]]
+    line = identification_line(found, found.estimator.name, found.verdict.status)
+    lines = [line[1:-1], *verdict_lines(found.verdict.to_dict())[1:]]
     for caption, ours, wls in _tables(found):
         lines += [caption, *error_lines(ours.to_dict(), wls.to_dict())]
     lines += friction_lines({drive.joint: drive.to_dict() for drive in found.drives})
