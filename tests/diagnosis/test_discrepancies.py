@@ -103,6 +103,9 @@ def test_what_is_stated_wrongly_is_named_with_its_size(model, change, code, wher
     assert (first.code, first.where, first.severity) == (code, where, "warning")
     assert first.evidence["size"] == pytest.approx(size, rel=0.25)
     assert words in first.message
+    if code == "time_scale":
+        faster = np.sqrt(1.0 + first.evidence["size"])  # inertial torques go with its square
+        assert f"the time stamps run {faster:.3f} times as fast" in first.message
 
 
 @pytest.mark.parametrize(

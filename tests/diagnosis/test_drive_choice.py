@@ -136,7 +136,8 @@ def test_the_family_is_chosen_on_its_joint_and_nothing_on_others(plain, cases, n
     plain_error, error = (x.held_out_error_pct for x in taken)
     assert error < 0.7 * plain_error
     assert taken[1].chance < 0.015
-    # noise is 1 % of the torque
+    # noise is 1 % of the torque; shapes of the grid leave more than those of the fit
+    assert error == pytest.approx(1.0, abs=0.5)
     assert found.metrics().per_joint[ELBOW].relative_error_pct == pytest.approx(1.0, rel=0.15)
 
 

@@ -418,3 +418,18 @@ def test_a_coupled_drive_turns_by_the_ratio_of_the_other_joint(rng):
         expected = np.column_stack([a, turned, np.tanh(w / (0.05 * usual))])
         np.testing.assert_allclose(candidate.columns(motion), expected)
     assert [(c.coupled, c.ratio) for c in couplings_of(motion)] == [("b", 1.0), ("b", -1.0)]
+
+
+def test_a_misfit_matters_by_its_part_of_the_torque_if_nothing_denies_it():
+    (load, tanh) = (c for c in CANDIDATES if c.name in ("load", "tanh"))
+    still = np.zeros(3)
+    motion = JointMotion(*7 * [still])
+    usual = misfit.Misfit(
+        LIFT, load, 0.36, 1e-9, 0.2, 0.1, 0.01, "N m per N m", 0.04, still, still, motion
+    )
+    assert usual.matters  # 2.4 % of the torque
+    assert not replace(usual, error=0.03).matters  # 1.8 %
+    assert not replace(usual, share=0.24, error=0.9).matters
+    assert replace(usual, confirmed=None).matters
+    assert not replace(usual, confirmed=0.08).matters  # less than a quarter of the share
+    assert not replace(usual, term=tanh).matters

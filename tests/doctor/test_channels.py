@@ -108,3 +108,13 @@ def test_the_delay_of_a_velocity_is_told_beyond_what_is_stated(stated):
     assert found.evidence["delay"] == pytest.approx(0.03 - stated, abs=1e-3)
     assert "state [signals] velocity_delay = 0.0300" in found.message
     assert found_of(log, "velocity_delay") == []
+
+
+def test_the_delay_of_a_velocity_is_as_sure_as_joints_agree():
+    log = log_of_two()
+    late = [np.interp(log.t - x, log.t, v) for x, v in zip((0.03, 0.033), log.v.T, strict=True)]
+    log = replace(log, v=np.column_stack(late))
+    (found,) = found_of(log, "velocity_delay", velocity_delay=0.0)
+    off = np.array([0.03, 0.033]) - found.evidence["delay"]
+    expected = 1.48 * np.median(np.abs(off)) / np.sqrt(2)
+    assert found.evidence["std_error"] == pytest.approx(expected, rel=0.05)

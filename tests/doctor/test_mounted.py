@@ -64,8 +64,10 @@ def test_a_load_in_the_validation_log_only_is_weighed(name):
     assert change.where == f"run.csv: {model.layout.bodies[-1]}"
     assert change.evidence["mass"] == pytest.approx(1.0, abs=3 * change.evidence["std_error"])
     assert change.evidence["std_error"] < 0.05
+    assert " kg more than in the fitted logs" in change.message
     (change,) = [f for f in loud(model, kept, [fitted]) if f.code == "payload_change"]
     assert change.evidence["mass"] == pytest.approx(-1.0, abs=3 * change.evidence["std_error"])
+    assert " kg less than in the fitted logs" in change.message
 
 
 @pytest.mark.parametrize(

@@ -150,3 +150,12 @@ def test_one_joint_with_a_delay_of_its_own_is_named_and_does_not_count_for_the_o
     own, _ = found(ur5, replace(log, tau=tau))
     assert own.where == "run.csv: elbow_joint"
     assert "100 ms or more early" in own.message
+
+
+def test_the_error_of_a_delay_counts_friction_beside_the_scatter(ur5, monkeypatch):
+    squares = np.tile(1 - 0.5 * (1 - (torque_delay._GRID / 0.03 - 1) ** 2), (6, 8, 1))
+    misfit = torque_delay._Misfit(squares, np.ones(6), ur5.joints)
+    monkeypatch.setattr(torque_delay, "_misfit", lambda *_: misfit)
+    monkeypatch.setattr(torque_delay._Misfit, "error", lambda self: 2e-3)
+    (finding,) = found(ur5, clean_log(ur5, 100, duration=2.0))
+    assert finding.evidence["std_error"] == pytest.approx(np.hypot(2e-3, 1e-3))

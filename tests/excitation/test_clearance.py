@@ -262,3 +262,12 @@ def test_a_motion_that_swings_between_the_first_samples_is_followed_by_its_accel
     assert {contact.first, contact.second} == {"ball", "post"}
     assert contact.distance < 0.0
     assert min(abs(contact.time - 2 * h * k) for k in range(11)) < 0.35 * h
+
+
+def test_links_of_several_pairs_are_told_with_the_least_of_their_distances(slider):
+    clearance = Clearance(slider, boxes=[Box("post", (0.3, 0.4, -0.2), (0.4, 0.6, 0.2))])
+    clearance.pairs = np.repeat(clearance.pairs[:1], 3, axis=0)
+    (told,) = clearance._listed(np.array([True, True, False]), np.array([0.009, 0.016, 0.001]))
+    assert told.endswith("(9 mm)")
+    (told,) = clearance._listed(np.array([True, True, True]), np.array([0.009, -0.004, 0.001]))
+    assert told.endswith("(overlap by 4 mm)")

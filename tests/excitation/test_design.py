@@ -218,3 +218,23 @@ def test_a_posture_in_collision_counts_by_what_its_distances_are_short_of(wrist,
     found, wanted = re.search(r"room are (\S+) mm apart, wanted (\S+) mm", told).groups()
     assert float(found) in [pytest.approx(1e3 * own.max(), abs=0.06) for own in distance]
     assert float(wanted) == pytest.approx(1e3 * (0.01 + inside.spare.max()), abs=0.06)
+
+
+def test_what_a_joint_needs_to_rest_is_the_least_of_what_postures_need(wrist, designer):
+    q = designer.postures._drawn(np.random.default_rng(3), 10)
+    none, pi = np.zeros_like(q), wrist.standard_parameters()
+    tau = np.abs((joint_torque_regressor(wrist, q, none, none) @ pi).reshape(10, 3)[:, 0])
+    assert tau.max() > 1.5 * tau.min() > 0.0
+    weak = designer.limits.sizes.copy()
+    weak[4, 0] = tau.min() / 3
+    postures = replace(designer.postures, limits=replace(designer.limits, sizes=weak))
+    words = postures._why_not(*postures._at_rest(q))
+    assert "wrist_1_joint needs 300 % of its torque limit at the least" in words
+
+
+def test_postures_are_drawn_from_the_middle_of_wide_ranges(designer):
+    sizes = designer.limits.sizes.copy()
+    sizes[0], sizes[1] = (1.0, 3.0, 3.0), (3.0, 1.0, 1.0)
+    postures = replace(designer.postures, limits=replace(designer.limits, sizes=sizes))
+    q = postures._drawn(np.random.default_rng(0), 4000) - designer.limits.middle
+    np.testing.assert_allclose(np.abs(q).max(axis=0), [0.8, 1.44, 1.44], rtol=0.01)

@@ -125,3 +125,11 @@ def test_patches_of_a_closed_solid_are_closed_beside_an_open_one():
     closed, (opened,) = thin([halves, [sheet]], 100)
     assert [s.is_closed for s in closed] == [True, True]
     assert not opened.is_closed
+
+
+def test_a_robot_of_any_size_keeps_its_corners():
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    for size in (1e-6, 1e5):
+        ((same,),) = thin([[Surface(size * ball.vertices, ball.faces, None)]], 10_000)
+        assert len(same.faces) == len(ball.faces)
+        assert len(same.vertices) == len(ball.vertices)

@@ -538,3 +538,23 @@ def test_the_longest_steps_of_a_row_are_divided_further():
     second = [6.0, 6.3, 6.6, 6.9, 7.2, 7.5]  # three of 0.9 s, two of 0.6 s
     np.testing.assert_allclose(times, [*first, *second])
     assert np.flatnonzero(is_tick).tolist() == [0, every, 8]
+
+
+def test_ticks_between_rows_take_the_commands_of_their_own_half_row(planar):
+    """Two ticks a row, a quarter of a row late: beside a log that has a row for each tick."""
+    log = commanded(planar, 0.2)
+    loops = loops_of(planar, kp=60.0, rate=2 * RATE, delay=np.full(2, 0.25 / RATE))
+    [late] = LoopedRobot(planar, step=1e-3).roll_out(loops, cut_windows(log, np.inf, 0.0))
+    N = len(log.t)
+
+    def told(x):  # of a tick at a row, the half row about it; of one between rows, the last row
+        before = np.vstack([x[:1], x[:-1]])
+        return np.stack([0.5 * (before + x), x], axis=1).reshape(2 * N, -1)[:-1]
+
+    names = {name: told(getattr(log, name)) for name in ("q_ref", "v_ref", "tau_ref")}
+    q = np.tile(log.q[:1], (2 * N - 1, 1))
+    fine = Log(np.arange(2 * N - 1) / (2 * RATE), q, 0 * q, log.joints, has_torque=False, **names)
+    [same] = LoopedRobot(planar, step=1e-3).roll_out(
+        replace(loops, delay=np.zeros(2)), cut_windows(fine, np.inf, 0.0)
+    )
+    np.testing.assert_allclose(late.q, same.q[::2], atol=1e-12)
