@@ -65,7 +65,9 @@ def test_a_drive_at_its_limit_has_it_found(limited):
     np.testing.assert_array_equal(found.fit.loops.delay, values["robot.delay"])
     [said] = [f for f in found.findings if f.code == "limit"]
     assert said.where == calf
-    assert said.evidence["limit"] == values[f"{calf}.limit"]
+    error = dict(zip(estimate.names, estimate.std_error, strict=True))[f"{calf}.limit"]
+    assert said.evidence == {"limit": values[f"{calf}.limit"], "std_error": error}
+    assert f"at most {values[f'{calf}.limit']:.3g} +- {error:.2g} N m, beyond" in said.message
 
 
 def test_a_limit_that_is_stated_is_taken(limited):

@@ -76,6 +76,11 @@ def test_what_the_data_hardly_shrink_is_undetermined(found):
     other = of(found, covariance=np.diag((share * spread) ** 2))
     np.testing.assert_allclose(other.shrunk, share)
     assert other.undetermined == ("turn.armature", "rail.viscous")
+    simulator = found.fit.simulator
+    body = replace(simulator.unknowns[1], what="body")
+    unknowns = (simulator.unknowns[0], body, *simulator.unknowns[2:])
+    fit = replace(other.fit, simulator=replace(simulator, unknowns=unknowns))
+    assert replace(other, fit=fit).undetermined == ("rail.viscous",), "bodies have a prior"
 
 
 def test_two_sets_that_a_third_pair_joins_are_one(found):

@@ -1,11 +1,13 @@
-"""What a term gains in windows that it was not fitted to, beside fits by least squares."""
+"""Terms that are offered, and what they gain in windows that they were not fitted to."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.crane import identified_crane
 
 from robotid.closed_loop import term_choice
-from robotid.closed_loop.term_choice import _Fold, _folds, _gains
+from robotid.closed_loop.term_choice import _Fold, _folds, _gains, candidates
 from robotid.estimators.output_error import OutputError, linearised
 
 
@@ -45,3 +47,36 @@ def test_folds_share_windows_in_turn_and_count_the_prior_once(tmp_path, monkeypa
         np.testing.assert_allclose(fold.H, H, rtol=1e-9, atol=1e-9 * np.abs(H).max())
         np.testing.assert_allclose(fold.g, g, rtol=1e-9, atol=1e-9 * np.abs(g).max())
         assert fold.rows == rows // 2  # of one joint of two
+
+
+def test_terms_are_offered_in_the_size_of_motion_and_torque():
+    t = 7.0 + np.arange(400) / 200.0  # two windows of a second, one of them in the log's middle
+    q = np.column_stack(
+        [0.2 + 0.5 * np.sin(2 * np.pi * t), 0.02 * np.sin(4 * np.pi * t), 0.0 * t + 1.0]
+    )
+    windows = [
+        SimpleNamespace(log=SimpleNamespace(t=t, q=q), counted=part)
+        for part in (slice(0, 200), slice(200, 400))
+    ]
+    model = SimpleNamespace(joints=("wide", "narrow", "still"))
+    simulator = SimpleNamespace(robot=SimpleNamespace(model=model), windows=windows)
+    offered = candidates(simulator, np.array([8.0, 3.0, 1.0]))
+    assert [[u.name for u in unknowns] for unknowns in offered] == [
+        ["wide.stribeck"], ["wide.load"], ["wide.coulomb_q1", "wide.coulomb_q2"],
+        ["narrow.stribeck"], ["narrow.load"],
+    ]  # fmt: skip
+    found = {u.name: u for unknowns in offered for u in unknowns}
+    for name, amplitude, rate in (("wide", 0.5, 1.0), ("narrow", 0.02, 2.0)):
+        rms = amplitude * 2 * np.pi * rate / np.sqrt(2)
+        assert found[f"{name}.stribeck"].term.speed == pytest.approx(0.3 * rms, rel=0.01)
+    spread = {name: u.spread for name, u in found.items()}
+    assert spread == pytest.approx({
+        "wide.stribeck": 8.0, "wide.load": 1.0, "wide.coulomb_q1": 8.0 / 0.5,
+        "wide.coulomb_q2": 8.0 / 0.5**2, "narrow.stribeck": 3.0, "narrow.load": 1.0,
+    }, rel=1e-3)  # fmt: skip
+    for order in (1, 2):
+        term = found[f"wide.coulomb_q{order}"].term
+        assert (term.order, term.centre) == (order, pytest.approx(0.2, abs=1e-3))
+        assert term.seen == pytest.approx((-0.3, 0.7), abs=1e-3)
+    lowest = {name: u.lowest for name, u in found.items()}
+    assert lowest == {n: 0.0 if n.endswith("load") else -np.inf for n in found}

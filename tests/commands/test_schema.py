@@ -43,6 +43,7 @@ def test_the_example_of_the_docs_is_valid(check):
         {"joint": ["a"]},
         {"joints": "a"},
         {"gravity": [0.0, -9.81]},
+        {"gravity": [0.0, 0.0, -9.81, 0.0]},
         {"locked": {"a": "here"}},
         {"signals": {"velocity": "guessed"}},
         {"signals": {"rate": "fast"}},

@@ -61,6 +61,19 @@ def test_another_motion_is_a_prediction(here):
     assert found["status"] == "good", found["reasons"]
 
 
+def test_figures_of_the_fitted_log_are_those_of_the_result(here):
+    path = here[0] / "out" / "result.json"
+    [found] = validate_result(path, [here[0] / "run.csv"])["validation"]
+    stated = json.loads(path.read_text())["identification"]["per_joint"]
+    assert found["per_joint"].keys() == stated.keys()
+    for joint, own in stated.items():
+        assert own["urdf_with_drives_relative_error_pct"] > 0
+        assert own.keys() == found["per_joint"][joint].keys()
+        for key, value in own.items():
+            told = found["per_joint"][joint][key]
+            assert told == (value if isinstance(value, str) else pytest.approx(value, rel=1e-4))
+
+
 @pytest.mark.parametrize(
     "part", [slice(None), slice(None, None, 2), slice(0, 700)], ids=["all", "thinned", "cut"]
 )

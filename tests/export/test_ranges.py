@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from robotid.export.entries import build_result
 from robotid.export.ranges import (
+    body_ranges,
     parameter_ranges,
     projected_ranges,
     ranges_text,
@@ -92,6 +93,22 @@ def test_widths_are_those_of_draws_from_the_covariance(identified):
             assert figure["nominal"] == pytest.approx(
                 (figure["high"] + figure["low"]) / 2, rel=1e-3
             )
+
+
+def test_a_link_of_which_something_was_identified_has_ends_and_another_none(identified):
+    """Of a link whose mass alone is uncertain, and of one of which nothing was fitted."""
+    C = np.zeros_like(identified.standard_covariance)
+    C[10, 10] = 0.01**2
+    found = body_ranges(
+        identified.model, identified.standard, C, identified.sources, np.full(len(C), 2.0)
+    )
+    first, second, *_ = found.values()
+    m = identified.standard[10]
+    assert second["mass"]["high"] == pytest.approx(m + 0.02)
+    assert second["mass"]["low"] == pytest.approx(m * np.exp(-0.02 / m))
+    x = second["com"]["x"]
+    assert x["high"] - x["nominal"] == pytest.approx(0.02 * abs(x["nominal"]) / m)
+    assert first["mass"].keys() == {"nominal", "source"}
 
 
 def test_what_is_drawn_is_possible_however_wide_the_intervals(identified):

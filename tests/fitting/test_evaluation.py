@@ -5,6 +5,7 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.fitting.evaluation import (
+    _parts,
     evaluate_logs,
     hidden_joints,
     pool,
@@ -139,6 +140,18 @@ def test_rows_recorded_twice_are_found_whatever_the_clock_says(ur5, rng):
     assert not shares_rows(after, before)
     jittered = Log(t=log.t, q=log.q, tau=log.tau * (1 + 1e-12), joints=log.joints)
     assert not shares_rows(jittered, log)
+
+
+def test_two_hundred_rows_of_a_window_are_looked_for_whatever_its_pieces():
+    first, stop = 5003, 7003  # of a long file
+    ends = [first, 5600, 6205, stop]
+    pieces = [SimpleNamespace(first=row) for row in ends[:-1]]
+    log = SimpleNamespace(pieces=pieces, first=first, stop=stop, is_held=False)
+    rows = [
+        np.arange(piece.first, end)[part.sampled]
+        for piece, part, end in zip(pieces, _parts(log), ends[1:], strict=True)
+    ]
+    np.testing.assert_array_equal(np.concatenate(rows), np.arange(first, stop, 10))
 
 
 def test_a_recording_is_named_by_its_file_and_stretch(ur5, rng):

@@ -8,6 +8,7 @@ from helpers.synthetic import truth
 
 from robotid.estimators import OLS, WLS
 from robotid.fitting import survey
+from robotid.fitting.fit import solve_recordings
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.regressor_noise import (
     acceleration_noise,
@@ -16,6 +17,7 @@ from robotid.fitting.regressor_noise import (
     smoothed,
     without_noise,
 )
+from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.standard_errors import measured_errors
 from robotid.fitting.survey import hold_log, survey_log
 from robotid.logs.data import Log
@@ -230,6 +232,23 @@ def test_corrected_factors_are_those_of_the_fit(planar, motion, runs):
     np.testing.assert_allclose(found.wls.theta, found.base, rtol=1e-6)
     beta = found.mapping.to_base(truth(planar))
     assert (np.abs(found.base - beta) < 3.0 * known[0]).all()
+
+
+def test_what_is_held_out_is_corrected_as_the_whole_is(planar, motion):
+    recordings, parts, whole, wls = fitted(planar, recorded(planar, motion))
+    ground = solve_recordings(recordings, EstimatorSettings("wls")).ground
+    theta, shift = wls.theta * 1.01, ground.noise.shift
+    assert len(ground.before.held_out) == len(ground.segments) == len(parts)
+    for own in (ground.before.held_out, ground.segments):
+        for part, corrected in zip(parts, own, strict=True):
+            np.testing.assert_allclose(
+                corrected.residual_squares(theta), part.factors.residual_squares(theta + shift),
+                rtol=1e-6,
+            )  # fmt: skip
+    np.testing.assert_allclose(
+        ground.factors.residual_squares(theta), whole.factors.residual_squares(theta + shift)
+    )
+    np.testing.assert_allclose(ground.rough.theta, wls.theta - shift)
 
 
 def test_ordinary_least_squares_are_corrected_by_their_own_weights(planar, motion):

@@ -11,7 +11,7 @@ from robotid.findings import Finding
 from robotid.fitting.metrics import JointMetrics, Metrics
 from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
-from robotid.judgement.verdict import Doubt, doubts_of, is_outvoted, judge, refuted
+from robotid.judgement.verdict import Doubt, doubts_of, is_beaten, is_outvoted, judge, refuted
 from robotid.judgement.witness import Witness
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
@@ -105,6 +105,18 @@ def test_the_worst_of_several_recordings_decides_on_a_joint():
     assert found.to_dict()["per_joint"]["a"]["reasons"] == [
         "a: predicted to 60.0 % only on two.csv"
     ]
+
+
+def test_what_is_good_is_said_with_the_worst_of_all_joints_and_recordings():
+    logs = {"one": {"a": joint(3.0), "b": joint(2.0)}, "two": {"a": joint(4.5), "b": joint(1.0)}}
+    kept = {name: Metrics(own, 1.0) for name, own in logs.items()}
+    fit = Metrics({"a": joint(3.0), "b": joint(2.0)}, 1.0)
+    found = judge(fit, kept, undetermined=(), is_consistent=True)
+    assert found.status == "good"
+    assert found.reasons[0].startswith("every joint is predicted within 4.5 % on recordings")
+    for name, worst in (("a", 4.5), ("b", 2.0)):
+        [reason] = found.joints[name].reasons
+        assert reason.startswith(f"predicted within {worst} %, better than")
 
 
 def test_without_a_kept_recording_no_joint_is_evaluated():
@@ -374,6 +386,14 @@ def test_the_urdf_with_fitted_drives_is_to_be_beaten():
     assert "predicts a better than the identified bodies" in found.reasons[1]
     tie = verdict({"a": joint(8.0, urdf_with_drives=7.8)}, fitted={"a": joint(7.0)})
     assert tie.status == "good"
+
+
+@pytest.mark.parametrize(
+    ("error", "driven", "is_worse"),
+    [(1.2, 1.0, False), (1.35, 1.0, True), (12.5, 12.0, False), (12.7, 12.0, True)],
+)
+def test_a_twentieth_and_a_third_of_a_percent_must_be_missed_more(error, driven, is_worse):
+    assert is_beaten(joint(error, urdf_with_drives=driven)) is is_worse
 
 
 def refuted_code(code, error, gravity=None, where="run.csv", more=()):

@@ -141,6 +141,10 @@ def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content
     value, _, error = rows[LEG[0]]["delay [ms]"].split()
     assert float(value) == pytest.approx(1e3 * late["value"], rel=0.01)
     assert float(error) == pytest.approx(1e3 * late["std_error"], rel=0.05)
+    has_error = [e["std_error"] is not None for e in content["drive_parameters"]]
+    assert 0 < has_error.count(True) != has_error.count(False) > 0
+    assert f"{has_error.count(True)} found, {has_error.count(False)} stated or held" in page
+    assert f"{has_error.count(True)} of {len(has_error)} found" in page
     every = tables(page)["All drive parameters with their 95 % intervals"].by_name()
     assert every[f"{LEG[1]}.kp"]["from"] == "stated"
     assert every[f"{LEG[1]}.coulomb"]["low"] == "0.201"

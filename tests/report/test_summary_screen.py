@@ -70,6 +70,17 @@ def test_every_joint_has_its_verdict_and_its_reason(screen, identified):
     assert shown == wanted
 
 
+def test_a_recording_is_named_in_reasons_unless_it_is_the_only_one(screen, identified):
+    (kept,) = identified.validation
+    named = f" on {kept.recording.name}"
+    assert any(named in reason for v in identified.verdict.joints.values() for reason in v.reasons)
+    assert named not in screen[screen.index('id="worst"') :]
+    log = replace(kept.recording.log, path="other.csv")
+    second = replace(kept, recording=replace(kept.recording, log=log))
+    both = summary_screen(replace(identified, validation=(kept, second)), ORIGIN, {})
+    assert named in both[both.index('id="worst"') :]
+
+
 def test_masses_and_sources_are_those_of_the_result(screen, identified):
     before, after = (pi[:60:10].sum() for pi in (identified.prior, identified.standard))
     assert f"{before:.2f} → {after:.2f} kg" in screen
