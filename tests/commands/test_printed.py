@@ -288,9 +288,9 @@ def test_identify(shown):
         "  * worse than a constant",
         "",
         "not fitted: y/keep.csv 2-5 s",
-        "  joint  error  rmse       URDF +   WLS   URDF  gravity",
-        "             %           drives %     %      %   only %",
-        "  one *  150.0  12.0  N         -  99.0  210.0     98.0",
+        "  joint  error  rmse      WLS   URDF  gravity",
+        "             %              %      %   only %",
+        "  one *  150.0  12.0  N  99.0  210.0     98.0",
         "  * worse than a constant",
         "",
         "friction beside viscous and Coulomb's:",
@@ -307,16 +307,24 @@ def test_identify(shown):
 
 
 def test_validate(shown):
+    of_one = {"relative_error_pct": 0.41, "second_order_relative_error_pct": 5.5}
+    of_slide = {"relative_error_pct": 20.0, "second_order_relative_error_pct": None}
     rolled = {
-        "log": "x/roll.csv", "start": 1.0, "end": 3.5, "horizons": {},
+        "name": "roll.csv, 1 to 3.5 s",
         "per_joint": {
-            "one": {"rmse": 0.00123, "unit": "rad", "urdf_rmse": 0.02, "command_rmse": 0.3},
-            "slide": {"rmse": 0.0045, "unit": "m", "urdf_rmse": None, "command_rmse": 0.06},
+            "one": {**of_one, "rmse": 0.00123, "unit": "rad", "urdf_relative_error_pct": 6.7,
+                    "command_relative_error_pct": 100.5, "better_than_constant": True},
+            "slide": {**of_slide, "rmse": 0.0045, "unit": "m", "urdf_relative_error_pct": None,
+                      "command_relative_error_pct": 60.0, "better_than_constant": True},
         },
     }  # fmt: skip
     driven = {
-        "log": "x/driven.csv", "start": 0.0, "end": 2.0, "horizons": {},
-        "per_joint": {"one": {"rmse": 0.5, "unit": "rad", "rows_rmse": 0.6, "steady_rmse": 0.7}},
+        "name": "driven.csv, 0 to 2 s",
+        "per_joint": {
+            "one": {"relative_error_pct": 50.0, "rmse": 0.5, "unit": "rad",
+                    "rows_relative_error_pct": 60.0, "steady_relative_error_pct": 70.0,
+                    "better_than_constant": False},
+        },
     }  # fmt: skip
     content = {
         "predicted_with": "arm.urdf",
@@ -333,14 +341,17 @@ def test_validate(shown):
         "  slide *  101.0   12.0  N           -  210.0     98.0",
         "  * worse than a constant",
         "",
-        "roll.csv 1-3.5 s, position missed",
-        "  joint  open loop   URDF  command",
-        "  one         1.23  20.00   300.00  mrad",
-        "  slide       4.50      -    60.00    mm",
+        "roll.csv, 1 to 3.5 s",
+        "  joint  error     rmse           2nd  URDF  command",
+        "             %                order %     %        %",
+        "  one      0.4  0.00123  rad      5.5   6.7    100.5",
+        "  slide   20.0  0.00450  m          -     -     60.0",
         "",
-        "driven.csv 0-2 s, position missed over 0.5 s",
-        "  joint  open loop  torques alone  same speed",
-        "  one       500.00         600.00      700.00  mrad",
+        "driven.csv, 0 to 2 s",
+        "  joint  error   rmse       torques     same",
+        "             %              alone %  speed %",
+        "  one *   50.0  0.500  rad     60.0     70.0",
+        "  * worse than a constant",
         "",
         "verdict: poor",
         "  one: good",
