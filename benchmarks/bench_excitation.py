@@ -147,7 +147,8 @@ def slsqp(task, start, seconds):
                 known.clear()
             used, _, rows = free._kept(x.reshape(start.shape) * unit)
             objective = free.judged(free.matrix(rows))[0]
-            near = task.clearance.near(rows.state, least + 0.03).distance[:, ::EVERY]
+            placed = task.clearance.placed(rows.motion[0])
+            near = task.clearance.near(placed, least + 0.03).distance[:, ::EVERY]
             finite = used[np.isfinite(task.limits.sizes).any(axis=1), ::EVERY]
             distance = np.minimum(near.min(axis=0), least + 0.03)
             known[key] = objective, np.r_[1.0 - finite.ravel() ** 2, (distance - least) / 0.05]
