@@ -3,6 +3,7 @@
 ``drives`` has the terms and the families.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
@@ -59,7 +60,7 @@ class DriveMotion:
 
 
 @dataclass(frozen=True)
-class DriveTerm:
+class DriveTerm(ABC):
     """One term of a drive's torque, linear in its parameter.
 
     Attributes:
@@ -123,13 +124,13 @@ class DriveTerm:
         """Its name in parameters, as ``"elbow.viscous"``."""
         return self.label
 
+    @abstractmethod
     def column(self, motion: DriveMotion) -> Array:
         """Return what the parameter multiplies, element by element, within the range seen.
 
         Args:
             motion: How a drive moves.
         """
-        raise NotImplementedError
 
     def to_dict(self) -> dict[str, Any]:
         """Return the term as plain values, which ``term_from_dict`` reads."""
