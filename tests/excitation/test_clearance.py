@@ -188,6 +188,19 @@ def scattered(request):
     return model, clearance, poses, clearance.near(poses, np.inf, clearance.everything).distance
 
 
+@pytest.mark.parametrize("spare", [0.0, 1.0, 2.0])
+def test_margins_leave_what_is_kept_and_spared(scattered, spare):
+    _, clearance, placed, _ = scattered
+    wanted = np.minimum(0.002, clearance.room / 4)[:, None]  # 2 mm, or a quarter of the room
+    likely = clearance.near(placed, np.inf).distance
+    exactly = likely - clearance.kept[:, None] - spare * wanted
+    found = clearance.margins(placed, spare)
+    near = exactly < np.minimum(0.01, clearance.room / 4)[:, None]
+    assert near.any()
+    np.testing.assert_allclose(found[near], exactly[near], atol=1e-9)
+    assert (found <= exactly + 1e-9).all()  # farther ones have a lower bound
+
+
 def test_hulls_that_are_far_apart_are_left_out(scattered):
     _, clearance, placed, exact = scattered
     found = clearance.near(placed, 0.05, clearance.everything)
