@@ -30,6 +30,11 @@ __all__ = ["Backend", "ProcessBackend", "SerialBackend", "named", "require_worke
 
 _log = logging.getLogger(__name__)
 
+# The pool's thread that feeds its workers may be the last to hold a semaphore. Where the process
+# ends between its two calls, remove and unregister, the tracker of resources tells of a leak.
+_FEEDER = "QueueFeederThread"
+_PATIENCE = 5.0  # [s] that it is waited for
+
 
 class Backend(ABC):
     """Where pieces are worked on; a context manager, which lets its workers go at its end."""
@@ -98,6 +103,7 @@ class ProcessBackend(Backend):
     def __init__(self, workers: int) -> None:
         self.workers = require_workers(workers)
         self._pool: ProcessPoolExecutor | None = None
+        self._other_threads: set[threading.Thread] = set()
 
     @property
     def description(self) -> str:
@@ -116,6 +122,7 @@ class ProcessBackend(Backend):
     def _start(self) -> "ProcessPoolExecutor":
         from loky import ProcessPoolExecutor
 
+        self._other_threads = set(threading.enumerate())
         self._pool = ProcessPoolExecutor(
             self.workers,
             initializer=_start_worker,
@@ -128,6 +135,9 @@ class ProcessBackend(Backend):
         pool, self._pool = self._pool, None
         if pool is not None:
             pool.shutdown(wait=True, kill_workers=kill_workers)
+            for thread in set(threading.enumerate()) - self._other_threads:
+                if thread.name == _FEEDER:
+                    thread.join(_PATIENCE)
 
     def _collect(
         self, work: Work, pieces: Iterable[tuple[int, Workload]]

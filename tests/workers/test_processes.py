@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -142,6 +143,23 @@ def test_what_stops_the_caller_ends_the_workers(tmp_path):
     done = len(marks(tmp_path / "marks"))
     assert done < 10
     assert not any(map(is_running, workers_of(tmp_path / "marks")))
+
+
+def test_no_thread_of_the_pool_outlives_it(tmp_path, monkeypatch):
+    def feeders():
+        return [thread for thread in threading.enumerate() if thread.name == "QueueFeederThread"]
+
+    class Slow(threading.Thread):  # its end takes longer than what is left of the process
+        def run(self):
+            super().run()
+            if self.name == "QueueFeederThread":
+                time.sleep(0.2)
+
+    monkeypatch.setattr("threading.Thread", Slow)
+    with ProcessBackend(1) as backend:
+        reduce_all(pieces_in(tmp_path / "marks", 2), backend=backend)
+        assert len(feeders()) == 1
+    assert not feeders()
 
 
 @pytest.mark.parametrize(("number", "workers"), [(signal.SIGKILL, 2), (signal.SIGINT, 1)])
