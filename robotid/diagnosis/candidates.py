@@ -84,15 +84,15 @@ def _of_family(family: Family) -> Candidate:
 
 def _ripple(m: JointMotion, count: int) -> Array:
     """Return cosine and sine of many times the position, as the filter of torques passes them."""
-    passed = _passed(m, np.array([count]))
-    columns: Array = passed * np.column_stack([np.cos(count * m.q), np.sin(count * m.q)])
+    waves = np.array([np.cos(count * m.q), np.sin(count * m.q)])
+    columns: Array = (_passed(m, np.array([count])) * waves).T
     return columns
 
 
 def _passed(m: JointMotion, counts: Array) -> Array:
-    """Return what the filter leaves of torques that repeat so often a turn, shape (N, k)."""
-    hertz = np.abs(np.outer(m.v, counts)) / (2 * np.pi)
-    passed: Array = 1.0 / (1.0 + (hertz / m.passes) ** _STEEP)
+    """Return what the filter leaves of torques that repeat so often a turn, shape (k, N)."""
+    turns = np.abs(m.v) / (2 * np.pi * m.passes)  # a second, over the filter's cut-off
+    passed: Array = 1.0 / (1.0 + np.outer(counts.astype(float) ** _STEEP, turns**_STEEP))
     return passed
 
 
@@ -104,9 +104,13 @@ def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
         weight: What torques of the rows are multiplied by, 0 where they are not used, shape (N,).
         r: The residual, likewise multiplied, shape (N,).
     """
-    X = weight[:, None] * _passed(m, _RIPPLES) * np.exp(1j * np.outer(m.q, _RIPPLES))
-    power = np.sum(np.abs(X) ** 2, axis=0)
-    explained = np.abs(r @ X) ** 2 / np.where(power > 0, power, np.inf)
+    turn = np.exp(1j * m.q)
+    turned = turn ** _RIPPLES[0]  # e^(i count q)
+    explained = np.zeros(len(_RIPPLES))
+    for k, size in enumerate(weight * _passed(m, _RIPPLES)):
+        if power := size @ size:
+            explained[k] = np.abs((r * size) @ turned) ** 2 / power
+        turned *= turn
     counts = _RIPPLES[np.sort(np.argsort(-explained)[:_PEAKS])]
     return tuple(
         Candidate(

@@ -27,7 +27,7 @@ from robotid.diagnosis.decisions import (
     SURE,
 )
 from robotid.diagnosis.misfit import Misfit, find_misfits
-from robotid.diagnosis.sample import Sample, along, trials
+from robotid.diagnosis.sample import Sample, Trials, along
 from robotid.diagnosis.selection import Round, select
 from robotid.findings import Finding, listed
 from robotid.fitting.result import Fit
@@ -122,8 +122,8 @@ def _columns(misfits: Sequence[Misfit], sample: Sample) -> Array:
 
 def _left(sample: Sample, Z: Array) -> float:
     """Return the squared residual that columns leave of stretches they were not fitted to."""
-    apart, _ = trials(sample, slice(None), Z)
-    return float(apart.left(list(range(Z.shape[2])))[: sample.fitted].sum())
+    left = Trials(sample, Z).apart.left(list(range(Z.shape[2])))
+    return float(left[: sample.fitted].sum())
 
 
 def _refined(applied: _Applied, x: Array, pi: Array, sample: Sample) -> tuple[Array, Array, Sample]:
@@ -146,7 +146,7 @@ def _refined(applied: _Applied, x: Array, pi: Array, sample: Sample) -> tuple[Ar
         beyond = [applied(x + _STEP * axis) for axis in np.eye(len(x))]
         moved = [_torques(model, pi, at) for model, at in beyond]
         Z = (np.stack(moved, axis=-1) - tau[..., None]) / _STEP
-        step, covariance = trials(sample, slice(None), Z)[1].estimate(every, sample.fitted)
+        step, covariance = Trials(sample, Z).whole.estimate(every, sample.fitted)
         x, error = x + step, np.sqrt(np.diag(covariance))
         if np.linalg.norm(step) < 0.1 * np.linalg.norm(error):
             break
@@ -241,14 +241,15 @@ def _found(fit: Fit, sample: Sample, own: Sequence[_Alteration]) -> Iterator[_Fo
     Z = np.concatenate([alteration.Z for alteration in own], axis=2)
     ends = np.cumsum([alteration.Z.shape[2] for alteration in own]).tolist()
     place = [list(range(end - a.Z.shape[2], end)) for a, end in zip(own, ends, strict=True)]
-    apart, whole = trials(sample, slice(None), Z)
+    trials = Trials(sample, Z)
+    apart, whole = trials.apart, trials.whole
     chosen: list[int] = []
     total = before = apart.left([])
     of_fitted, of_kept = (float(part.sum()) for part in np.split(total, [sample.fitted]))
     untried = dict(zip(own, place, strict=True))
 
     def offered() -> Round[_Alteration]:
-        left = {one: apart.left([*chosen, *which]) for one, which in untried.items()}
+        left = apart.left_each({one: [*chosen, *which] for one, which in untried.items()})
         return Round(before, left, sample.fitted, of_fitted)
 
     for this, best in select(offered, ALTERATION, _complexity):

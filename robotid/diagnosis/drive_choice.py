@@ -9,14 +9,14 @@ with the linear parameters refitted each time (Golub, Pereyra 2003, variable pro
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.diagnosis.decisions import AT_BOUND, DOUBTED, FAMILY, FAMILY_SEEN, TENFOLD
-from robotid.diagnosis.sample import Sample, Trial, take_sample, trials
+from robotid.diagnosis.sample import RIDGE, Sample, Trial, Trials, take_sample
 from robotid.diagnosis.selection import Round, select
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
@@ -42,20 +42,23 @@ _NOTHING = 1e-300
 class _Drive:
     """A joint's drive along the sampled rows."""
 
-    j: int
     slides: bool
     motions: tuple[DriveMotion, ...]  # of each recording, all its rows
     taken: tuple[Array, ...]  # rows of each recording in the sample
     seen: Seen
+    largest: float  # of its torques there, by their size [N m or N]
     plain: Mapping[str, Array]  # what of x is each of its plain parameters, U^T x, by name
+    known: dict[DriveTerm, Array] = field(default_factory=dict)  # columns of terms, (N,)
 
     def columns(self, terms: Sequence[DriveTerm]) -> Array:
         """Return what terms multiply in the sampled rows, shape (N, c)."""
-        parts = [
-            np.column_stack([term.column(motion)[rows] for term in terms])
-            for motion, rows in zip(self.motions, self.taken, strict=True)
-        ]
-        return np.concatenate(parts)
+        Z = np.empty((sum(map(len, self.taken)), len(terms)))
+        for k, term in enumerate(terms):
+            if term not in self.known:
+                along = zip(self.motions, self.taken, strict=True)
+                self.known[term] = np.concatenate([term.column(m)[rows] for m, rows in along])
+            Z[:, k] = self.known[term]
+        return Z
 
 
 def choose_drives(
@@ -74,14 +77,13 @@ def choose_drives(
     Returns:
         A choice per joint; none where a joint hardly moved, or the logs are too short to judge.
     """
-    sample = take_sample(fit, is_steady=False)
+    sample = take_sample(fit, for_drives=True)
     if sample is None or fit.model.free_flyer:
         return ()
     model = fit.model.with_reference(fit.standard)
-    kept = [e for e in fit.validation if not e.is_refitted]
-    recordings = [e.recording for e in (*fit.fitted, *kept)]
-    motions = [drive_motion_along(model, recording.trajectory) for recording in recordings]
-    used = sample.weight[: sample.rows] > 0
+    motions = [drive_motion_along(model, x.trajectory) for x in sample.recordings]
+    torques = np.concatenate([motion.tau for motion in sample.at])
+    used = sample.weight > 0
     choices = []
     for j, joint in enumerate(sample.joints):
         names = wanted[joint]
@@ -94,17 +96,19 @@ def choose_drives(
             for k, name in enumerate(fit.mapping.base_names)
             if name.startswith(f"{joint}.")
         }
-        drive = _Drive(j, bool(sample.slides[j]), own, sample.taken, seen, plain)
+        largest = float(np.abs(torques[:, j]).max())
+        drive = _Drive(bool(sample.slides[j]), own, sample.taken, seen, largest, plain)
         first = [own for own in [(balanced or {}).get(joint)] if own is not None]
-        chosen = _auto(sample, drive, first) if names is None else _fixed(sample, drive, names)
+        alone = sample.of_joint(j)
+        chosen = _auto(alone, drive, first) if names is None else _fixed(alone, drive, names)
         choices.append(chosen)
     return tuple(choices)
 
 
 def _seen(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Array) -> Seen:
-    """Return the ranges of position and of the size of speed in the fitted rows that count."""
-    fitted = [(m.q[rows], m.v[rows]) for m, rows in zip(motions, taken, strict=True)]
-    q, v = (np.concatenate(x)[: len(used)][used] for x in zip(*fitted, strict=True))
+    """Return the ranges of position and of the size of speed in the rows that count."""
+    own = [(m.q[rows], m.v[rows]) for m, rows in zip(motions, taken, strict=True)]
+    q, v = (np.concatenate(x)[used] for x in zip(*own, strict=True))
     speed = np.abs(v)
     return {
         "q": (float(q.min()), float(q.max())),
@@ -132,47 +136,54 @@ def _sizes(low: float, high: float) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Trials:
-    """Candidates of a joint, and what they leave."""
+class _Options:
+    """Candidates of a joint, with every shape on the grid, and what they leave."""
 
     own: list[tuple[Family, list[float]]]
     place: list[list[int]]  # columns of each
     is_positive: Array  # which columns multiply what cannot be negative, bool
     highest: Array  # what their parameters are at most
-    apart: Trial
-    whole: Trial
-    fitted: int
+    trials: Trials
 
     @classmethod
-    def of(cls, sample: Sample, drive: _Drive, own: list[tuple[Family, list[float]]]) -> "_Trials":
+    def of(cls, sample: Sample, drive: _Drive, own: list[tuple[Family, list[float]]]) -> "_Options":
         terms = [family.make(drive.seen, *sizes) for family, sizes in own]
-        columns = [drive.columns(those) for those in terms]
-        ends = np.cumsum([x.shape[1] for x in columns]).tolist()
-        place = [list(range(e - x.shape[1], e)) for x, e in zip(columns, ends, strict=True)]
-        Z = np.hstack(columns) if columns else np.empty((len(sample.r), 0))
+        ends = np.cumsum([len(those) for those in terms]).tolist()
+        place = [list(range(e - len(those), e)) for those, e in zip(terms, ends, strict=True)]
         flat = [term for those in terms for term in those]
         positive = np.array([term.is_nonnegative for term in flat], dtype=bool)
-        largest = max(float(np.abs(motion.tau[:, drive.j]).max()) for motion in sample.at)
-        highest = np.array([min(term.highest, largest / _reach(drive, term)) for term in flat])
-        apart, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
-        return cls(own, place, positive, highest, apart, whole, sample.fitted)
+        highest = np.array([min(x.highest, drive.largest / _reach(drive, x)) for x in flat])
+        return cls(own, place, positive, highest, _trials(sample, drive, flat))
 
     def left(self, chosen: Sequence[int]) -> Array:
-        """Return the squared residual of each fitted stretch with some candidates."""
-        return self.apart.left(self._columns(chosen))[: self.fitted]
+        """Return the squared residual of each stretch with some candidates."""
+        return self.trials.apart.left(self._columns(chosen))
 
-    def is_possible(self, chosen: Sequence[int]) -> bool:
-        """Return whether no parameter of some candidates has a size that physics forbids.
+    def left_each(self, beside: Mapping[int, Sequence[int]]) -> dict[int, Array]:
+        """Return the squared residual of each stretch with each candidate beside some others.
 
-        Friction is of one sign, and below the largest torque of the joint.
+        Only of those whose parameters have no size that physics forbids: friction is of one sign,
+        and below the largest torque of the joint.
         """
-        columns = self._columns(chosen)
-        theta = self.whole.parameters(columns)
-        is_signed = (theta[self.is_positive[columns]] >= 0).all()
-        return bool(is_signed and (np.abs(theta) <= self.highest[columns]).all())
+        columns = {i: self._columns([*others, i]) for i, others in beside.items()}
+        theta = self.trials.whole.parameters_each(columns)
+        possible = {
+            i: which
+            for i, which in columns.items()
+            if (theta[i][self.is_positive[which]] >= 0).all()
+            and (np.abs(theta[i]) <= self.highest[which]).all()
+        }
+        return self.trials.apart.left_each(possible)
 
     def _columns(self, chosen: Sequence[int]) -> list[int]:
         return [k for i in chosen for k in self.place[i]]
+
+
+def _trials(
+    sample: Sample, drive: _Drive, terms: Sequence[DriveTerm], ridge: float = RIDGE
+) -> Trials:
+    """Return the trials of terms of a drive."""
+    return Trials(sample, drive.columns(terms)[:, None], ridge)
 
 
 def _reach(drive: _Drive, term: DriveTerm) -> float:
@@ -191,8 +202,8 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
     grid = list(_candidates(drive, [f for f in FAMILIES.values() if f.is_automatic]))
     known = list(_candidates(drive, [FAMILIES[name] for name in first]))
     start = _weighed_anew(sample, drive, known)
-    every = _Trials.of(start, drive, [*known, *grid])
-    torque = float(start.torque[drive.j])
+    every = _Options.of(start, drive, [*known, *grid])
+    torque = float(start.torque[0])
     chosen = list(range(len(known)))
     doubted: list[tuple[Family, list[float]]] = []
     before = every.left(chosen)
@@ -203,11 +214,7 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
     def offered() -> Round[int]:
         nonlocal beside
         beside = _beside(every, chosen, len(known))
-        left = {
-            i: every.left([*others, i])
-            for i, others in beside.items()
-            if every.is_possible([*others, i])
-        }
+        left = every.left_each(beside)
         whole = float(before.sum())
         return Round(before, left, len(before), whole, FAMILY_SEEN**2 * torque)
 
@@ -228,14 +235,14 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
         own = found.own
         known = known if set(chosen) <= set(beside[best]) else []
         anew = _weighed_anew(sample, drive, own)
-        every, torque = _Trials.of(anew, drive, [*own, *grid]), float(anew.torque[drive.j])
+        every, torque = _Options.of(anew, drive, [*own, *grid]), float(anew.torque[0])
         chosen = list(range(len(own)))
         before = every.left(chosen)
     choice = _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
     return replace(choice, doubted=_terms(drive, doubted))
 
 
-def _beside(every: _Trials, chosen: Sequence[int], known: int) -> dict[int, list[int]]:
+def _beside(every: _Options, chosen: Sequence[int], known: int) -> dict[int, list[int]]:
     """Return what stays of the chosen candidates beside each other one that may join them.
 
     A joint has one family of each kind; only those it was given before the choice are replaced.
@@ -253,7 +260,7 @@ def _group(family: Family) -> str:
     return family.name.rstrip("0123456789")
 
 
-def _simplicity(every: _Trials, i: int) -> tuple[int, int]:
+def _simplicity(every: _Options, i: int) -> tuple[int, int]:
     """Return how many columns a candidate has, and where its family is in the order of them."""
     return len(every.place[i]), list(FAMILIES).index(every.own[i][0].name)
 
@@ -270,7 +277,7 @@ class _Refined:
 def _conditioned(
     sample: Sample,
     drive: _Drive,
-    every: _Trials,
+    every: _Options,
     this: Round[int],
     beside: Mapping[int, Sequence[int]],
     best: int,
@@ -289,7 +296,7 @@ def _conditioned(
         return _Refined(i, own, (bool(_at_bound(drive, own).any()), is_grown))
 
     def left_of(other: _Refined) -> Array:
-        return _Trials.of(sample, drive, other.own).left(range(len(other.own)))
+        return _Options.of(sample, drive, other.own).left(range(len(other.own)))
 
     first = refined(best)
     if not any(first.faults):
@@ -314,7 +321,7 @@ def _is_alike(best: Array, other: Array, slack: float) -> bool:
 
 
 def _told(
-    every: _Trials,
+    every: _Options,
     this: Round[int],
     torque: float,
     beside: Mapping[int, Sequence[int]],
@@ -341,12 +348,12 @@ def _percent(left: Array, torque: float) -> float:
 def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
     """Return the families asked for, with the shapes that fit best."""
     families = [FAMILIES[name] for name in names]
-    every = _Trials.of(sample, drive, list(_candidates(drive, families)))
+    every = _Options.of(sample, drive, list(_candidates(drive, families)))
     groups = [[i for i, (f, _) in enumerate(every.own) if f.name == name] for name in names]
     missing = [name for name, group in zip(names, groups, strict=True) if not group]
     if missing:
         raise SettingsError(
-            f"friction of {sample.joints[drive.j]} has {listed(missing)}, but the joint slides, or "
+            f"friction of {sample.joints[0]} has {listed(missing)}, but the joint slides, or "
             "turned less than half a turn in the fitted logs; leave it out, or record more"
         )
     chosen = [group[len(group) // 2] for group in groups]
@@ -354,7 +361,7 @@ def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
         for at, group in enumerate(groups):
             rest = [*chosen[:at], *chosen[at + 1 :]]
             chosen[at] = min(group, key=lambda i: float(every.left([*rest, i]).sum()))
-    torque = float(sample.torque[drive.j])
+    torque = float(sample.torque[0])
     tried = (
         Tried((), _percent(every.left([]), torque), 1.0, False),
         Tried(tuple(names), _percent(every.left(chosen), torque), 1.0, True),
@@ -377,7 +384,7 @@ def _found(
     anew = _weighed_anew(sample, drive, refined)
     covariance = _shape_covariance(anew, drive, families, flat)
     return DriveChoice(
-        joint=sample.joints[drive.j],
+        joint=sample.joints[0],
         families=tuple(family.name for family in families),
         terms=_terms(drive, refined),
         tried=tried,
@@ -426,7 +433,7 @@ def _grown(
         return {}
     _, trial = _with_slopes(sample, drive, families, _flat(chosen))
     T, S = trial.T[:, :-1], trial.S[:-1, :-1]
-    _, before = sample.whole
+    _, before = sample.normal.whole
     grown = {}
     for name, u in drive.plain.items():
         more = u @ T @ np.linalg.solve(S, T.T @ u)
@@ -444,24 +451,10 @@ def _weighed_anew(
     """
     if not chosen:
         return sample
-    Z = drive.columns(_terms(drive, chosen))
-    _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
-    left = [
-        float(whole.left(which)[: sample.fitted].sum()) for which in ([], list(range(Z.shape[1])))
-    ]
-    factor = np.ones(len(sample.joints))
-    factor[drive.j] = np.sqrt(left[0] / max(left[1], _SHARPEST * left[0], _NOTHING))
-    W, r = sample.W * factor[:, None], sample.r * factor
-    by_stretch = [(W[k].reshape(-1, W.shape[2]), r[k].ravel()) for k in sample.stretches]
-    return replace(
-        sample,
-        weight=sample.weight * factor,
-        torque=sample.torque * factor**2,
-        W=W,
-        r=r,
-        A=np.array([W_k.T @ W_k for W_k, _ in by_stretch]),
-        B=np.array([W_k.T @ r_k for W_k, r_k in by_stretch]),
-    )
+    terms = _terms(drive, chosen)
+    whole = _trials(sample, drive, terms).whole
+    before, after = (float(whole.left(which).sum()) for which in ([], list(range(len(terms)))))
+    return sample.weighed(np.sqrt(before / max(after, _SHARPEST * before, _NOTHING)))
 
 
 def _terms(
@@ -488,13 +481,13 @@ def _refined(
     start = np.log(_flat(chosen))
 
     def left(log_sizes: Array) -> float:
-        Z = drive.columns(_terms(drive, with_shapes(families, np.exp(log_sizes))))
-        _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None], _ROUNDING)
-        return float(np.log(whole.left(list(range(Z.shape[1])))[: sample.fitted].sum() + _NOTHING))
+        terms = _terms(drive, with_shapes(families, np.exp(log_sizes)))
+        (squares,) = _trials(sample, drive, terms, _ROUNDING).whole.left(list(range(len(terms))))
+        return float(np.log(squares + _NOTHING))
 
     best = start
     if len(start):
-        sample = _weighed_anew(sample, drive, chosen)
+        sample = _weighed_anew(sample, drive, chosen).joined()
         bounds, options = _log_bounds(drive, families), {"eps": _STEP, "maxiter": _STEPS}
         found = minimize(left, start, method="L-BFGS-B", bounds=bounds, options=options)
         best = found.x if found.fun <= left(start) else start
@@ -518,13 +511,10 @@ def _with_slopes(
 ) -> tuple[int, Trial]:
     """Return the number c of columns of terms, and a trial of them and of d(torque)/d(shape)."""
     Z = drive.columns(_terms(drive, with_shapes(families, flat)))
-    _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None], _ROUNDING)
-    theta = whole.parameters(list(range(Z.shape[1])))
+    theta = Trials(sample, Z[:, None], _ROUNDING).whole.parameters(list(range(Z.shape[1])))
     slopes = np.empty((len(Z), len(flat)))
     for k, h in enumerate(_STEP * flat):
         larger = flat + h * (np.arange(len(flat)) == k)
         moved = drive.columns(_terms(drive, with_shapes(families, larger)))
         slopes[:, k] = (moved - Z) @ theta / h
-    columns = np.hstack([Z, slopes])[:, None]
-    _, beside = trials(sample, slice(drive.j, drive.j + 1), columns, _ROUNDING)
-    return Z.shape[1], beside
+    return Z.shape[1], Trials(sample, np.hstack([Z, slopes])[:, None], _ROUNDING).whole

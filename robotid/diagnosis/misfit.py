@@ -16,7 +16,7 @@ from robotid.diagnosis.decisions import (
     MISFIT_WARNS,
     ONE_SIDED,
 )
-from robotid.diagnosis.sample import Sample, Trial, trials
+from robotid.diagnosis.sample import Sample, Trial, Trials
 from robotid.diagnosis.selection import Round, select
 from robotid.fitting.joint_motion import JointMotion
 from robotid.robot.drives import DriveTerm
@@ -110,14 +110,15 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
         candidate: list(range(end - x.shape[1], end))
         for candidate, x, end in zip(own, columns, ends, strict=True)
     }
-    apart, whole = trials(sample, slice(j, j + 1), np.hstack(columns)[:, None])
+    trials = Trials(sample.of_joint(j), np.hstack(columns)[:, None])
+    apart, whole = trials.apart, trials.whole
     chosen: list[int] = []
     total = before = apart.left([])
     squares = float(total[: sample.fitted].sum())
     error = float(np.sqrt(squares / sample.torque[j]))
 
     def offered() -> Round[Candidate]:
-        left = {c: apart.left([*chosen, *place[c]]) for c in own}
+        left = apart.left_each({c: [*chosen, *place[c]] for c in own})
         return Round(before, left, sample.fitted, squares)
 
     found = select(offered, MISFIT, lambda c: len(place[c]), attrgetter("tried"))

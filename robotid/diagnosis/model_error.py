@@ -21,7 +21,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.diagnosis.decisions import GROWN
 from robotid.diagnosis.misfit import Misfit
-from robotid.diagnosis.sample import Sample, Trial, take_sample, trials
+from robotid.diagnosis.sample import Sample, Trial, Trials, take_sample
 from robotid.fitting.joint_motion import JointMotion
 from robotid.fitting.open_terms import OpenTerm
 from robotid.fitting.result import Fit, Solution
@@ -54,7 +54,7 @@ def with_model_error(
     """
     if sample is None:
         return found, ()
-    motions = _motions(found) if found.drives else []
+    motions = _motions(found, sample) if found.drives else []
     found = _wider(found, sample, list(_of_shapes(found, sample, motions)))
     found = _wider(found, sample, list(_of_doubts(found, sample, motions)))
     wider = _wider(found, sample, [_of_misfit(misfit) for misfit in misfits])
@@ -143,8 +143,7 @@ def _shape_trial(
         )[rows]
         for motion, rows in zip(motions, sample.taken, strict=True)
     ]
-    _, whole = trials(sample, slice(j, j + 1), np.concatenate(slopes)[:, None], _ROUNDING)
-    return whole
+    return Trials(sample.of_joint(j), np.concatenate(slopes)[:, None], _ROUNDING).whole
 
 
 def settled_shapes(found: Solution) -> "tuple[DriveChoice, ...] | None":
@@ -158,10 +157,10 @@ def settled_shapes(found: Solution) -> "tuple[DriveChoice, ...] | None":
     Returns:
         The choices; None if no shape moves by more than a part of its standard error.
     """
-    sample = take_sample(found, is_steady=False)
+    sample = take_sample(found, for_drives=True)
     if sample is None or not any(choice.shapes for choice in found.drives):
         return None
-    motions, drives, farthest = _motions(found), [], 0.0
+    motions, drives, farthest = _motions(found, sample), [], 0.0
     for choice in found.drives:
         if choice.shapes:
             whole = _shape_trial(found, choice, sample, motions)
@@ -186,7 +185,7 @@ def _of_doubts(found: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> It
             for motion, rows in zip(motions, sample.taken, strict=True)
         ]
         Z = np.concatenate(columns)
-        _, whole = trials(sample, slice(j, j + 1), Z[:, None])
+        whole = Trials(sample.of_joint(j), Z[:, None]).whole
         theta = whole.parameters(list(range(len(choice.doubted))))
 
         torque = partial(_of_terms, choice.doubted, theta)
@@ -200,12 +199,10 @@ def _of_terms(
     return np.asarray(np.column_stack([term.column(motion) for term in terms]) @ theta)
 
 
-def _motions(found: Solution) -> list[DriveMotion]:
+def _motions(found: Solution, sample: Sample) -> list[DriveMotion]:
     """Return how the drives move along each recording, as ``Sample.taken`` counts them."""
-    kept = [e for e in found.validation if not e.is_refitted]
-    recordings = [e.recording for e in (*found.fitted, *kept)]
     model = found.model.with_reference(found.standard)
-    return [drive_motion_along(model, x.trajectory) for x in recordings]
+    return [drive_motion_along(model, x.trajectory) for x in sample.recordings]
 
 
 def shape_slope(found: Solution, choice: "DriveChoice", which: int, motion: DriveMotion) -> Array:

@@ -9,10 +9,11 @@ so that what base parameters can explain does not count (Frisch, Waugh 1933); C 
 before the data. What a term explains of the stretches left out, it explains beyond chance.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,8 +26,10 @@ from robotid.regressor.torque import trajectory_regressor
 from robotid.regressor.used_rows import independent_share
 from robotid.robot.model import RobotModel
 
-__all__ = ["Sample", "Trial", "along", "take_sample", "trials"]
+__all__ = ["RIDGE", "Normal", "Sample", "Trial", "Trials", "along", "take_sample"]
 
+#: Share of a column that the regressor must leave of it.
+RIDGE = 1e-4
 _ROWS = 3000  # of all fitted logs, and of all kept ones, that are read
 _NUMBERS = 2**24  # of the regressor in them
 _PER_INDEPENDENT = 2.0  # rows for each that is independent behind the filter
@@ -35,74 +38,51 @@ _SHORTEST = 10  # independent rows in a stretch
 _FEWEST = 6  # stretches to judge by
 _NEAR = 0.5  # periods of the filter's cut-off
 _OUTLIER = 12.0  # usual residuals from which a row is left out
-_RIDGE = 1e-4  # share of a column that the regressor must leave of it
 _FREE = 1e3  # residuals that a column beside the base parameters may explain before the data
+
+OptionT = TypeVar("OptionT", bound=Hashable)
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
-    """Rows of the recordings, each joint's over its usual residual, 0 where they are not used.
+class Normal:
+    """Normal equations of the base parameters in K stretches of the rows, all joints together.
 
     Attributes:
-        joints: Names of the n joints.
-        slides: Which of them slide, shape (n,), bool.
-        motions: How each joint moves in the N rows.
-        at: The motions of the recordings, those rows alone.
-        taken: Which rows of the recordings these are, of fitted ones and then of those kept.
-        weight: What torques of the rows are multiplied by, shape (N, n) [1/(N m), 1/N].
-        torque: Sum of the squared torques of fitted rows, likewise weighted, shape (n,).
-        stretches: Which rows each of the K stretches has, those of the logs kept apart last.
-        fitted: How many of the stretches are of fitted logs.
-        rows: How many of the rows are.
-        W: Regressor of the base parameters over their spread before the data, shape (N, n, b), and
-            columns that are refitted beside them.
-        r: Residual of the estimate, shape (N, n).
-        independent: Which columns of the regressor are those of base parameters, shape (b,), int.
-        U: Factor of the covariance of base parameters before the data, C = U^T U, shape (b, b).
-        A: W^T W of each stretch, all joints together, shape (K, b, b).
+        A: W^T W of each stretch, shape (K, b, b).
         B: W^T r likewise, shape (K, b).
+        fitted: How many of the stretches are of fitted logs, the first ones.
     """
 
-    joints: tuple[str, ...]
-    slides: Array
-    motions: tuple[JointMotion, ...]
-    at: tuple[Trajectory, ...]
-    taken: tuple[Array, ...]
-    weight: Array
-    torque: Array
-    stretches: tuple[slice, ...]
-    fitted: int
-    rows: int
-    W: Array
-    r: Array
-    independent: Array
-    U: Array
     A: Array
     B: Array
+    fitted: int
 
-    def beside(self, Z: Array) -> "Sample":
-        """Return the same rows with more columns that are refitted as base parameters are.
+    @classmethod
+    def of(cls, W: Array, r: Array, stretches: Sequence[slice], fitted: int) -> "Normal":
+        """Return those of rows.
 
         Args:
-            Z: What sizes of 1 add to the torques, shape (N, n, c) [N m or N].
+            W: Regressor, shape (N, n, b).
+            r: Residual, shape (N, n).
+            stretches: Which of the N rows each has.
+            fitted: How many of them are of fitted logs.
         """
-        columns = self.weight[:, :, None] * Z
-        size = np.linalg.norm(columns, axis=(0, 1))
-        spread = _FREE * np.linalg.norm(self.r) / np.where(size > 0, size, np.inf)
-        W = np.concatenate([self.W, columns * spread], axis=2)
-        A, B = _products(W, self.r, self.stretches)
-        return replace(self, W=W, A=A, B=B)
+        rows = [(W[k].reshape(-1, W.shape[2]), r[k].ravel()) for k in stretches]
+        A, B = (np.array(x) for x in zip(*[(w.T @ w, w.T @ e) for w, e in rows], strict=True))
+        return cls(A, B, fitted)
 
     @cached_property
     def is_fitted(self) -> Array:
         """Which of the stretches are of fitted logs, shape (K,), bool."""
-        return np.arange(len(self.stretches)) < self.fitted
+        return np.arange(len(self.A)) < self.fitted
 
     @cached_property
     def apart(self) -> tuple[Array, Array]:
         """What row k of stretches is fitted to that judges it not, (K, K), and its inverses."""
-        used = (self.is_fitted & ~np.eye(len(self.stretches), dtype=bool)).astype(float)
-        return used, self._inverse(used)
+        K, fitted = len(self.A), self.fitted
+        used = (self.is_fitted & ~np.eye(K, dtype=bool)).astype(float)
+        own, whole = self._inverse(used[:fitted]), self.whole[1]
+        return used, np.concatenate([own, np.broadcast_to(whole, (K - fitted, *whole.shape))])
 
     @cached_property
     def whole(self) -> tuple[Array, Array]:
@@ -115,30 +95,143 @@ class Sample:
         return np.asarray(np.linalg.inv(A + np.eye(A.shape[-1])))
 
 
-def take_sample(fit: Solution, *, is_steady: bool = True) -> Sample | None:
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Rows of the recordings, each joint's over its usual residual, 0 where they are not used.
+
+    Attributes:
+        joints: Names of the n joints.
+        slides: Which of them slide, shape (n,), bool.
+        motions: How each joint moves in the N rows.
+        recordings: The recordings, fitted ones and then those kept apart, if they are read.
+        at: Their motions, those rows alone.
+        taken: Which of their rows these are.
+        weight: What torques of the rows are multiplied by, shape (N, n) [1/(N m), 1/N].
+        torque: Sum of the squared torques of fitted rows, likewise weighted, shape (n,).
+        stretches: Which rows each of the K stretches has, those of the logs kept apart last.
+        rows: How many of the rows are of fitted logs.
+        W: Regressor of the base parameters over their spread before the data, shape (N, n, b), and
+            columns that are refitted beside them.
+        r: Residual of the estimate, shape (N, n).
+        independent: Which columns of the regressor are those of base parameters, shape (b,), int.
+        U: Factor of the covariance of base parameters before the data, C = U^T U, shape (b, b).
+        normal: Normal equations of the stretches, of all joints of the robot.
+    """
+
+    joints: tuple[str, ...]
+    slides: Array
+    motions: tuple[JointMotion, ...]
+    recordings: tuple[Recording, ...]
+    at: tuple[Trajectory, ...]
+    taken: tuple[Array, ...]
+    weight: Array
+    torque: Array
+    stretches: tuple[slice, ...]
+    rows: int
+    W: Array
+    r: Array
+    independent: Array
+    U: Array
+    normal: Normal
+
+    @property
+    def fitted(self) -> int:
+        """How many of the stretches are of fitted logs."""
+        return self.normal.fitted
+
+    def beside(self, Z: Array) -> "Sample":
+        """Return the same rows with more columns that are refitted as base parameters are.
+
+        Args:
+            Z: What sizes of 1 add to the torques, shape (N, n, c) [N m or N].
+        """
+        columns = self.weight[:, :, None] * Z
+        size = np.linalg.norm(columns, axis=(0, 1))
+        spread = _FREE * np.linalg.norm(self.r) / np.where(size > 0, size, np.inf)
+        W = np.concatenate([self.W, columns * spread], axis=2)
+        return replace(self, W=W, normal=Normal.of(W, self.r, self.stretches, self.fitted))
+
+    def of_joint(self, j: int) -> "Sample":
+        """Return the rows of one joint; the others count by the normal equations alone.
+
+        Args:
+            j: Which joint.
+        """
+        own = slice(j, j + 1)
+        return replace(
+            self,
+            joints=self.joints[own],
+            slides=self.slides[own],
+            motions=self.motions[own],
+            weight=self.weight[:, own],
+            torque=self.torque[own],
+            W=np.ascontiguousarray(self.W[:, own]),
+            r=self.r[:, own],
+        )
+
+    @cached_property
+    def own(self) -> Normal:
+        """Normal equations of its own rows, those of one joint."""
+        return Normal.of(self.W, self.r, self.stretches, self.fitted)
+
+    def weighed(self, factor: float) -> "Sample":
+        """Return the rows of one joint weighed anew.
+
+        Args:
+            factor: What their weights are multiplied by.
+        """
+        normal, more = self.normal, factor**2 - 1.0
+        return replace(
+            self,
+            weight=factor * self.weight,
+            torque=factor**2 * self.torque,
+            W=factor * self.W,
+            r=factor * self.r,
+            normal=replace(normal, A=normal.A + more * self.own.A, B=normal.B + more * self.own.B),
+        )
+
+    def joined(self) -> "Sample":
+        """Return the rows of fitted logs as one stretch, for what is fitted to all of them."""
+        normal, rows = self.normal, slice(self.rows)
+        A, B = (x[: self.fitted].sum(axis=0, keepdims=True) for x in (normal.A, normal.B))
+        return replace(
+            self,
+            weight=self.weight[rows],
+            stretches=(rows,),
+            W=self.W[rows],
+            r=self.r[rows],
+            normal=Normal(A, B, 1),
+        )
+
+
+def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
     """Return rows spread over the recordings; None if there are too few, or static ones.
 
     Args:
         fit: What was found.
-        is_steady: Whether rows near reversals are left out, where a drive that sticks is smeared.
+        for_drives: Whether terms of drives are chosen by them: rows of fitted logs alone, among
+            them those near reversals, where a drive that sticks is smeared.
     """
     model, mapping = fit.model, fit.mapping
     if model.is_static:
         return None
     kept = [e for e in fit.validation if not e.is_refitted]
     rows, independent = _spread_rows(model, fit.fitted, kept)
+    parts = list(zip([*fit.fitted, *kept], rows, strict=True))
+    if for_drives:
+        del parts[len(fit.fitted) :]
+    rows = [k for _, k in parts]
     own = sum(map(len, rows[: len(fit.fitted)]))
     stretches = _stretches(own, sum(map(len, rows)) - own, independent)
     number = sum(part.stop <= own for part in stretches)
     if model.free_flyer or number < _FEWEST:
         return None
-    parts = list(zip([*fit.fitted, *kept], rows, strict=True))
     motion = [e.recording.trajectory.at(k) for e, k in parts]
     Y = np.concatenate([_regressor(model, e.recording.trajectory, k) for e, k in parts])
     tau = np.concatenate([m.tau for m in motion])
     r = tau - Y @ fit.standard
     used = np.concatenate([e.recording.mask[k] for e, k in parts])
-    if is_steady:
+    if not for_drives:
         used &= np.concatenate([_is_steady(e.recording)[k] for e, k in parts])
     used = used & (np.abs(r) <= _OUTLIER * _usual_size(r[:own], used[:own]))
     squares = np.sum(r[:own] ** 2, axis=0, where=used[:own])
@@ -150,24 +243,22 @@ def take_sample(fit: Solution, *, is_steady: bool = True) -> Sample | None:
     U = np.asarray(np.linalg.qr((mapping.K * fit.prior_std).T, mode="r"))
     W = weight[:, :, None] * (Y[:, :, mapping.independent] @ U.T)
     r = weight * r
-    A, B = _products(W, r, stretches)
     return Sample(
         joints=model.joints,
         slides=np.isin(model.joints, list(model.layout.prismatic)),
         motions=joint_motions([e.recording for e, _ in parts], rows, load, model),
+        recordings=tuple(e.recording for e, _ in parts),
         at=tuple(motion),
         taken=tuple(rows),
         weight=weight,
         torque=np.sum((weight * tau)[:own] ** 2, axis=0),
         stretches=stretches,
-        fitted=number,
         rows=own,
         W=W,
         r=r,
         independent=mapping.independent,
         U=U,
-        A=A,
-        B=B,
+        normal=Normal.of(W, r, stretches, number),
     )
 
 
@@ -185,16 +276,8 @@ def along(sample: Sample, model: RobotModel, at: Sequence[Trajectory], tau: Arra
     W = sample.weight[:, :, None] * (Y @ sample.U.T)
     W = np.concatenate([W, sample.W[:, :, W.shape[2] :]], axis=2)
     r = sample.weight * (np.concatenate([motion.tau for motion in at]) - tau)
-    A, B = _products(W, r, sample.stretches)
-    return replace(sample, at=tuple(at), W=W, r=r, A=A, B=B)
-
-
-def _products(W: Array, r: Array, stretches: Sequence[slice]) -> tuple[Array, Array]:
-    """Return W^T W and W^T r of each stretch, all joints together."""
-    pairs = [(W[k].reshape(-1, W.shape[2]), r[k].ravel()) for k in stretches]
-    return np.array([W_k.T @ W_k for W_k, _ in pairs]), np.array(
-        [W_k.T @ r_k for W_k, r_k in pairs]
-    )
+    normal = Normal.of(W, r, sample.stretches, sample.fitted)
+    return replace(sample, at=tuple(at), W=W, r=r, normal=normal)
 
 
 def _spread_rows(
@@ -255,27 +338,36 @@ def _is_steady(recording: Recording) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """What columns Z of a joint, beside the base parameters, leave of its residual.
+    """What columns Z of joints, beside the base parameters, leave of their residual.
 
     Attributes:
         S: [Z r]^T M [Z r] of the rows fitted, shape (..., c + 1, c + 1).
-        H: What [Z r] leaves of each stretch after the regressor's fit, shape (K, c + 1, c + 1).
         T: What of the columns of W imitates [Z r], shape (..., b, c + 1).
+        rows: W and [Z r] of each of K stretches, shapes (N_k, b) and (N_k, c + 1).
     """
 
     S: Array
-    H: Array
     T: Array
+    rows: Sequence[tuple[Array, Array]]
 
-    def parameters(self, which: Sequence[int]) -> Array:
+    @cached_property
+    def H(self) -> Array:
+        """What [Z r] leaves of each stretch after the regressor's fit, (K, c + 1, c + 1)."""
+        every_T = np.broadcast_to(self.T, (len(self.rows), *self.T.shape[-2:]))
+        left = [X - W @ T for (W, X), T in zip(self.rows, every_T, strict=True)]
+        return np.array([E.T @ E for E in left])
+
+    def parameters(self, which: Sequence[int] | Array) -> Array:
         """Return the parameters of some columns, shape (..., k).
 
         Args:
-            which: The k columns.
+            which: The k columns; or m choices of k, shape (m, k), for parameters (..., m, k).
         """
-        square = self.S[..., which, :][..., which]
-        theta: Array = np.linalg.solve(square, self.S[..., which, -1:])[..., 0]
-        return theta
+        S, k = self.S, np.asarray(which, dtype=int)
+        theta: Array = np.linalg.solve(
+            S[..., k[..., :, None], k[..., None, :]], S[..., k, -1][..., None]
+        )
+        return theta[..., 0]
 
     def estimate(self, which: Sequence[int], fitted: int) -> tuple[Array, Array]:
         """Return the parameters of some columns and their covariance, shapes (k,) and (k, k).
@@ -294,52 +386,98 @@ class Trial:
         covariance: Array = few * (inverse @ (scores.T @ scores) @ inverse)
         return theta, covariance
 
-    def left(self, which: Sequence[int]) -> Array:
+    def left(self, which: Sequence[int] | Array) -> Array:
         """Return the squared residual of each stretch with some columns fitted, shape (K,).
 
         Args:
-            which: The columns.
+            which: The k columns; or m choices of k, shape (m, k), for residuals (K, m).
         """
-        if not which:
-            alone: Array = self.H[:, -1, -1]
-            return alone
-        theta = np.broadcast_to(self.parameters(which), (len(self.H), len(which)))
-        x = np.hstack([-theta, np.ones((len(theta), 1))])
-        square = self.H[:, [*which, -1], :][:, :, [*which, -1]]
-        left: Array = np.einsum("ki,kij,kj->k", x, square, x)
+        k = np.asarray(which, dtype=int)
+        theta = self.parameters(k)
+        with_r = np.concatenate([k, np.full((*k.shape[:-1], 1), -1)], axis=-1)
+        x = np.concatenate([-theta, np.ones((*theta.shape[:-1], 1))], axis=-1)
+        square = self.H[:, with_r[..., :, None], with_r[..., None, :]]
+        left: Array = (x[..., None, :] @ square @ x[..., :, None])[..., 0, 0]
         return left
 
+    def left_each(self, choices: Mapping[OptionT, Sequence[int]]) -> dict[OptionT, Array]:
+        """Return the squared residual of each stretch with columns of each option, shapes (K,).
 
-def trials(sample: Sample, joints: slice, Z: Array, ridge: float = _RIDGE) -> tuple[Trial, Trial]:
-    """Return trials of columns: fitted without the stretch that judges, and to all.
+        Args:
+            choices: Columns of each option.
+        """
+        return _each(choices, lambda which: self.left(which).T)
+
+    def parameters_each(self, choices: Mapping[OptionT, Sequence[int]]) -> dict[OptionT, Array]:
+        """Return the parameters of columns of each option, shapes (k,), of a fit to all rows.
+
+        Args:
+            choices: Columns of each option.
+        """
+        return _each(choices, self.parameters)
+
+
+def _each(
+    choices: Mapping[OptionT, Sequence[int]], of: Callable[[Array], Array]
+) -> dict[OptionT, Array]:
+    """Return what a function gives of the columns of each option, all of one number at once.
 
     Args:
+        choices: Columns of each option.
+        of: Returns one entry for each of m choices of k columns, shape (m, k).
+    """
+    found: dict[OptionT, Array] = {}
+    for size in {len(which) for which in choices.values()}:
+        alike = {x: which for x, which in choices.items() if len(which) == size}
+        found.update(zip(alike, of(np.array([*alike.values()])), strict=True))
+    return {x: found[x] for x in choices}
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """Trials of columns.
+
+    Attributes:
         sample: The rows.
-        joints: Which m joints are looked at.
-        Z: What sizes of 1 add to their torques, shape (N, m, c).
+        Z: What sizes of 1 add to their torques, shape (N, n, c).
         ridge: Share of a column that the regressor must leave of it.
     """
-    X = np.concatenate([sample.weight[:, joints, None] * Z, sample.r[:, joints, None]], axis=2)
-    every_X = [X[k].reshape(-1, X.shape[2]) for k in sample.stretches]
-    every_W = [
-        sample.W[k, joints].reshape(len(x), -1)
-        for k, x in zip(sample.stretches, every_X, strict=True)
-    ]
-    D = np.array([x.T @ x for x in every_X])  # (K, c + 1, c + 1)
-    B = np.array([w.T @ x for w, x in zip(every_W, every_X, strict=True)])  # (K, b, c + 1)
-    B[:, :, -1] = sample.B  # other joints know of the base parameters, too
 
-    def trial(used: Array, inverse: Array) -> Trial:
-        D_fit, B_fit = (np.tensordot(used, x, axes=1) for x in (D, B))
-        T = inverse @ B_fit  # (..., b, c + 1)
-        S = D_fit - B_fit.swapaxes(-1, -2) @ T
+    sample: Sample
+    Z: Array
+    ridge: float = RIDGE
+
+    @cached_property
+    def apart(self) -> Trial:
+        """Fitted without the stretch that judges."""
+        return self._trial(*self.sample.normal.apart)
+
+    @cached_property
+    def whole(self) -> Trial:
+        """Fitted to all stretches of fitted logs."""
+        return self._trial(*self.sample.normal.whole)
+
+    @cached_property
+    def _rows(self) -> list[tuple[Array, Array]]:
+        """W and X = [Z r] of each stretch."""
+        W, r, weight = self.sample.W, self.sample.r, self.sample.weight
+        X = np.concatenate([weight[..., None] * self.Z, r[..., None]], axis=2)
+        return [(W[k].reshape(-1, W.shape[2]), X[k].reshape(-1, X.shape[2]))
+                for k in self.sample.stretches]  # fmt: skip
+
+    @cached_property
+    def _products(self) -> tuple[Array, Array]:
+        """X^T X and W^T X of each stretch, shapes (K, c + 1, c + 1) and (K, b, c + 1)."""
+        D = np.array([X.T @ X for _, X in self._rows])
+        B = np.array([W.T @ X for W, X in self._rows])
+        B[:, :, -1] = self.sample.normal.B  # other joints know of the base parameters, too
+        return D, B
+
+    def _trial(self, used: Array, inverse: Array) -> Trial:
+        D, B = (np.tensordot(used, x, axes=1) for x in self._products)
+        T = inverse @ B  # (..., b, c + 1)
+        S = D - B.swapaxes(-1, -2) @ T
         c = np.arange(S.shape[-1] - 1)
-        still = D_fit[..., c, c] == 0  # a column of a joint that does not move
-        S[..., c, c] += np.where(still, 1.0, ridge * D_fit[..., c, c])
-        E = [
-            x - w @ T_k
-            for x, w, T_k in zip(every_X, every_W, np.broadcast_to(T, B.shape), strict=True)
-        ]
-        return Trial(S, np.array([E_k.T @ E_k for E_k in E]), T)
-
-    return trial(*sample.apart), trial(*sample.whole)
+        still = D[..., c, c] == 0  # a column of a joint that does not move
+        S[..., c, c] += np.where(still, 1.0, self.ridge * D[..., c, c])
+        return Trial(S, T, self._rows)

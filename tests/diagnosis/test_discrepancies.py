@@ -12,7 +12,7 @@ from helpers.paths import ROOT
 
 from robotid.diagnosis.discrepancies import explain_residual
 from robotid.diagnosis.misfit import find_misfits
-from robotid.diagnosis.sample import along, take_sample, trials
+from robotid.diagnosis.sample import Trials, along, take_sample
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
@@ -174,9 +174,9 @@ def test_columns_beside_the_base_parameters_are_refitted_with_them(model, rng):
     )
     sample = take_sample(found)
     Z = rng.standard_normal((*sample.r.shape, 2)) + sample.r[..., None]
-    together, _ = trials(sample, slice(None), Z)[1].estimate([0, 1], sample.fitted)
+    together, _ = Trials(sample, Z).whole.estimate([0, 1], sample.fitted)
     beside = sample.beside(Z[..., :1])
-    alone, _ = trials(beside, slice(None), Z[..., 1:])[1].estimate([0], sample.fitted)
+    alone, _ = Trials(beside, Z[..., 1:]).whole.estimate([0], sample.fitted)
     assert alone[0] == pytest.approx(together[1], rel=2e-3)
     tau = np.concatenate([m.tau for m in sample.at])
     there = along(beside, found.model, sample.at, tau)

@@ -22,7 +22,7 @@ from robotid.commands.job import job_from_settings
 from robotid.commands.logs import survey_logs
 from robotid.diagnosis import drive_choice
 from robotid.diagnosis.drive_choice import choose_drives
-from robotid.diagnosis.sample import take_sample
+from robotid.diagnosis.sample import Normal, take_sample
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.export.urdf import load_identified, write_urdf
 from robotid.fitting.bands import friction_curve
@@ -207,7 +207,7 @@ def rising_logs(found):
 def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
     """Beside the columns of a term, and of its shape's derivative."""
     found = fitted_in(plain, [cases("stribeck")[2]], friction="none")
-    sample = take_sample(found, is_steady=False)
+    sample = take_sample(found, for_drives=True)
     j, speed = sample.joints.index(ELBOW), 0.1
     own = [drive_motion_along(found.model, found.fitted[0].recording.trajectory).of(j)]
     plain_parts = {
@@ -215,16 +215,17 @@ def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
         for k, name in enumerate(found.mapping.base_names)
         if name.startswith(ELBOW)
     }
-    drive = drive_choice._Drive(j, False, tuple(own), sample.taken, SEEN, plain_parts)
+    drive = drive_choice._Drive(False, tuple(own), sample.taken, SEEN, 1.0, plain_parts)
+    alone = sample.of_joint(j)
     family = FAMILIES["stribeck"]
-    grown = drive_choice._grown(sample, drive, [(family, [speed])])
+    grown = drive_choice._grown(alone, drive, [(family, [speed])])
     Z = [drive.columns([Stribeck(speed=speed * x, seen=SEEN["v"])]) for x in (1.0, 1.001)]
     theta = 3.0  # about: it scales the derivative's column only
-    rows, b = sample.rows, sample.W.shape[-1]
+    b = sample.W.shape[-1]
     columns = np.zeros((*sample.r.shape, 2))
     columns[:, j] = sample.weight[:, [j]] * np.hstack([Z[0], theta * (Z[1] - Z[0])])
-    W = sample.W[:rows].reshape(-1, b)
-    X = np.hstack([W, columns[:rows].reshape(-1, 2)])
+    W = sample.W.reshape(-1, b)
+    X = np.hstack([W, columns.reshape(-1, 2)])
     before = np.linalg.inv(W.T @ W + np.eye(b))
     prior = np.diag(np.append(np.ones(b), np.zeros(2)))
     after = np.linalg.inv(X.T @ X + prior)[:b, :b]
@@ -234,14 +235,17 @@ def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
         assert grown[name] == pytest.approx(wanted, rel=0.02), name
     assert grown[f"{ELBOW}.coulomb"] > 1.5
     # rows that are weighed by what terms leave keep their residual's share of the torque
-    anew = drive_choice._weighed_anew(sample, drive, [(family, [speed])])
-    factor = anew.r[:rows, j] @ sample.r[:rows, j] / np.sum(sample.r[:rows, j] ** 2)
+    anew = drive_choice._weighed_anew(alone, drive, [(family, [speed])])
+    factor = anew.r[:, 0] @ alone.r[:, 0] / np.sum(alone.r[:, 0] ** 2)
     assert factor > 1.5
-    np.testing.assert_allclose(anew.weight[:, j], factor * sample.weight[:, j])
-    np.testing.assert_allclose(anew.W[:, j], factor * sample.W[:, j])
-    assert anew.torque[j] == pytest.approx(factor**2 * sample.torque[j])
-    others = np.arange(len(sample.joints)) != j
-    np.testing.assert_array_equal(anew.torque[others], sample.torque[others])
+    np.testing.assert_allclose(anew.weight, factor * alone.weight)
+    np.testing.assert_allclose(anew.W, factor * alone.W)
+    assert anew.torque == pytest.approx(factor**2 * alone.torque)
+    weighed = np.where(np.arange(len(sample.joints)) == j, factor, 1.0)
+    W, r = sample.W * weighed[:, None], sample.r * weighed
+    wanted = Normal.of(W, r, sample.stretches, sample.fitted)
+    np.testing.assert_allclose(anew.normal.A, wanted.A, atol=1e-9 * np.abs(wanted.A).max())
+    np.testing.assert_allclose(anew.normal.B, wanted.B, atol=1e-9 * np.abs(wanted.B).max())
 
 
 def test_a_counterbalance_that_is_known_is_in_the_model_before_others_are_tried(plain, cases):

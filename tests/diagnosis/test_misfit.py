@@ -15,7 +15,6 @@ from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings, read_job
 from robotid.commands.logs import survey_logs
 from robotid.diagnosis import misfit
-from robotid.diagnosis import sample as sample_module
 from robotid.diagnosis.candidates import CANDIDATES
 from robotid.diagnosis.candidates import couplings as couplings_of
 from robotid.diagnosis.misfit import find_misfits
@@ -26,7 +25,7 @@ from robotid.diagnosis.misfit_findings import (
     settled,
     with_entries,
 )
-from robotid.diagnosis.sample import take_sample, trials
+from robotid.diagnosis.sample import RIDGE, Trials, take_sample
 from robotid.doctor.diagnosis import check_logs
 from robotid.findings import Finding
 from robotid.fitting.joint_motion import JointMotion
@@ -258,8 +257,8 @@ def test_columns_join_the_regressor_and_base_parameters_are_refitted(ur5):
     sample = take_sample(identified(ur5, 1, "load", 1, duration=12.0))
     j, b = 2, sample.W.shape[-1]
     Z = np.column_stack([sample.motions[j].q, sample.motions[j].v ** 3])
-    apart, whole = trials(sample, slice(j, j + 1), Z[:, None])
-    for trial, left_out in ((whole, None), (apart, 3)):
+    trials = Trials(sample.of_joint(j), Z[:, None])
+    for trial, left_out in ((trials.whole, None), (trials.apart, 3)):
         rows = np.arange(len(sample.r)) < sample.rows
         if left_out is not None:
             rows[sample.stretches[left_out]] = False
@@ -267,7 +266,7 @@ def test_columns_join_the_regressor_and_base_parameters_are_refitted(ur5):
         columns[:, j] = sample.weight[:, [j]] * Z
         X = np.concatenate([sample.W, columns], axis=2)
         # the prior of base parameters, and the ridge of the columns
-        size = np.sqrt(sample_module._RIDGE * np.sum(columns[rows] ** 2, axis=(0, 1)))
+        size = np.sqrt(RIDGE * np.sum(columns[rows] ** 2, axis=(0, 1)))
         prior = np.diag(np.concatenate([np.ones(b), size]))
         stacked = np.vstack([X[rows].reshape(-1, b + 2), prior])
         r = np.append(sample.r[rows].ravel(), np.zeros(b + 2))
