@@ -1,6 +1,7 @@
 """The command line: flags to arguments, results to text; nothing is computed here."""
 
 import argparse
+import gc
 import io
 import os
 import sys
@@ -20,6 +21,8 @@ from robotid.versions import __version__
 
 __all__ = ["COMMANDS", "main"]
 
+_OBJECTS = 50_000  # made between two collections: a command makes many, and hardly a cycle of them
+
 #: The commands in the order of the help; each is a module: SUMMARY, add_flags and run.
 COMMANDS = (
     "demo", "paper", "inspect", "identify", "track", "excite", "preview", "replay", "doctor",
@@ -38,6 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         that is not ignored, 2 wrong usage, 129 SIGHUP, 130 Ctrl-C, 143 SIGTERM.
     """
     code = 0
+    gc.set_threshold(_OBJECTS)
     open_closed_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):  # whose encoding may lack what a name has
         sys.stdout.reconfigure(errors="backslashreplace")
