@@ -89,7 +89,7 @@ def _complete() -> None:
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
-    """Return the parser of a command line, with the flags of its own command alone."""
+    """Return the parser of a command line, for its own command alone if it begins with one."""
     parser = argparse.ArgumentParser(
         prog="robotid",
         description="Identify a robot's inertial and drive parameters from its URDF and motion "
@@ -97,8 +97,9 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"robotid {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    first = [word for word in words[:1] if word in COMMANDS]
     chosen = next((word for word in words if not word.startswith("-")), None)
-    for name in COMMANDS:
+    for name in first or COMMANDS:
         module = import_module(f"robotid.cli.{name}")
         command = commands.add_parser(name, help=module.SUMMARY)
         command.set_defaults(run=module.run)
