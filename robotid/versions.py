@@ -1,6 +1,7 @@
 """What runs: the versions that a result depends on."""
 
 import platform
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 
 __all__ = ["__version__", "code_versions", "versions"]
@@ -23,15 +24,18 @@ def code_versions() -> dict[str, str]:
         Versions of this package, of what it computes with and of Python, by name; "not installed
         by pip" where no package of that name is recorded.
     """
-    found = {"robotid": __version__}
-    for name, package in _PACKAGES.items():
-        try:
-            found[name] = version(package)
-        except PackageNotFoundError:
-            found[name] = "not installed by pip"
-    return found | {"python": platform.python_version()}
+    found = {name: _installed(package) for name, package in _PACKAGES.items()}
+    return {"robotid": __version__, **found, "python": platform.python_version()}
 
 
 def versions() -> dict[str, str]:
     """Return the versions of what runs: ``code_versions`` and the platform."""
     return code_versions() | {"platform": platform.platform()}
+
+
+@cache  # each reads all that its package says of itself
+def _installed(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed by pip"

@@ -140,6 +140,16 @@ def test_importing_the_package_is_light(statement):
     assert json.loads(run.stdout) == []
 
 
+def test_logs_and_results_are_handled_without_the_simulator():
+    code = (
+        "import sys, robotid.commands.logs, robotid.export.entries, robotid.fitting.survey\n"
+        "slow = ('robotid.closed_loop.fit', 'robotid.simulation.loops', 'scipy.interpolate')\n"
+        "print([m for m in slow if m in sys.modules])"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
 def test_help_needs_neither_numpy_nor_pinocchio():
     code = (
         "import sys\nfrom robotid.cli import main\n"

@@ -1,6 +1,7 @@
 """The command line: flags to arguments, results to text; nothing is computed here."""
 
 import argparse
+import gc
 import io
 import os
 import sys
@@ -20,6 +21,8 @@ from robotid.versions import __version__
 
 __all__ = ["COMMANDS", "main"]
 
+_OBJECTS = 50_000  # made between two collections: a command makes many, and hardly a cycle of them
+
 #: The commands in the order of the help; each is a module: SUMMARY, add_flags and run.
 COMMANDS = (
     "demo", "paper", "inspect", "identify", "track", "excite", "preview", "replay", "doctor",
@@ -38,6 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         that is not ignored, 2 wrong usage, 129 SIGHUP, 130 Ctrl-C, 143 SIGTERM.
     """
     code = 0
+    gc.set_threshold(_OBJECTS)
     open_closed_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):  # whose encoding may lack what a name has
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -85,7 +89,7 @@ def _complete() -> None:
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
-    """Return the parser of a command line, with the flags of its own command alone."""
+    """Return the parser of a command line, for its own command alone if it begins with one."""
     parser = argparse.ArgumentParser(
         prog="robotid",
         description="Identify a robot's inertial and drive parameters from its URDF and motion "
@@ -93,8 +97,9 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"robotid {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    first = [word for word in words[:1] if word in COMMANDS]
     chosen = next((word for word in words if not word.startswith("-")), None)
-    for name in COMMANDS:
+    for name in first or COMMANDS:
         module = import_module(f"robotid.cli.{name}")
         command = commands.add_parser(name, help=module.SUMMARY)
         command.set_defaults(run=module.run)

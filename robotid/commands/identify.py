@@ -4,14 +4,11 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from robotid._files import check_folder, folder_beside, write_json
 from robotid._settings import require_kind
 from robotid._typing import STAGES, ProgressCallback, ignore_progress, report_stage
-from robotid.closed_loop.fit import STAGES as LOOP_STAGES
-from robotid.closed_loop.identify import identify_loops
-from robotid.closed_loop.result import LoopIdentification
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import (
     checkpoint_inputs,
@@ -42,6 +39,9 @@ from robotid.robot.tree import read_tree
 from robotid.workers.checkpoint import Checkpoint, released_on_error
 from robotid.workers.plan import WorkPlan
 
+if TYPE_CHECKING:
+    from robotid.closed_loop.result import LoopIdentification
+
 __all__ = ["identify_job", "run_job", "save_result"]
 
 _log = logging.getLogger(__name__)
@@ -54,7 +54,7 @@ def run_job(
     plan: WorkPlan | None = None,
     source: Sequence[str] = (),
     beside: Mapping[str, str] | None = None,
-) -> tuple[Identification | LoopIdentification, dict[str, Any]]:
+) -> tuple["Identification | LoopIdentification", dict[str, Any]]:
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
     A job may want no report, and an impossible result has no URDF. Every file is made in a folder
@@ -83,7 +83,7 @@ def run_job(
     require_kind(folder, (str, Path), "folder", "the path of a folder")
     chosen = plan or WorkPlan(job.workers or 1)
     is_simulated = isinstance(job.estimator, SimulationSettings)
-    stages = LOOP_STAGES if is_simulated else STAGES
+    stages = _loop_stages() if is_simulated else STAGES
     report_stage(chosen.progress, "reading logs", stages)
     model, target = job.model(), Path(folder)
     check_folder(target, ["result.json", *_names(model)])
@@ -136,13 +136,13 @@ def _names(model: RobotModel) -> tuple[str, str, str]:
 
 
 def _write(
-    found: Identification | LoopIdentification,
+    found: "Identification | LoopIdentification",
     job: Job,
     target: Path,
     *,
     source: Sequence[str] = (),
     beside: Mapping[str, str] | None = None,
-) -> tuple[Identification | LoopIdentification, dict[str, Any]]:
+) -> tuple["Identification | LoopIdentification", dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
     report, name, sidecar = _names(found.model)
     target.mkdir(parents=True, exist_ok=True)
@@ -275,10 +275,19 @@ def identify_job(
     return replace(concluded, asked=asked, findings=(*there.notes, *concluded.findings)), checkpoint
 
 
+def _loop_stages() -> Sequence[str]:
+    """Return the stages of a simulation, whose modules other jobs do not wait for."""
+    from robotid.closed_loop.fit import STAGES as stages
+
+    return stages
+
+
 def _identify_loops(
     job: Job, model: RobotModel, progress: ProgressCallback | None
-) -> LoopIdentification:
+) -> "LoopIdentification":
     """Identify by simulation, from commands or logged torques, and write nothing."""
+    from robotid.closed_loop.identify import identify_loops
+
     assert isinstance(job.estimator, SimulationSettings)
     check_ignored(job.ignore)
     logs, kept = (

@@ -4,14 +4,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from robotid._files import file_sha256
 from robotid._typing import STAGES, ProgressCallback, report_stage
-from robotid.closed_loop.driven import driven_log
-from robotid.closed_loop.identify import with_gravity
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.locked_joints import STILL, check_locked
@@ -20,7 +18,6 @@ from robotid.export.result import Result, load_result, stated_model, stated_para
 from robotid.findings import Finding, by_severity
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import SurveyedLog, survey_log
-from robotid.identification.previews import Run
 from robotid.judgement.verdict import check_ignored
 from robotid.logs.columns import Needs
 from robotid.logs.data import Log
@@ -29,6 +26,9 @@ from robotid.logs.table import Table
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.versions import code_versions
+
+if TYPE_CHECKING:
+    from robotid.identification.previews import Run
 
 __all__ = [
     "LockedLogs",
@@ -228,7 +228,7 @@ def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[Lo
     return wanted, list(stated.identification)
 
 
-def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotModel, Run]:
+def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotModel, "Run"]:
     """Return what the logs of a result have said.
 
     Args:
@@ -243,6 +243,8 @@ def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotMo
         DataError: If a log that was fitted is gone or was changed.
         SettingsError: If the settings in the result are not usable.
     """
+    from robotid.identification.previews import Run
+
     job, fitted = job_of_result(job, path, "give a result whose logs are there")
     result = load_result(path).content
     model = stated_model(result, job.model())
@@ -315,8 +317,14 @@ def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
     """
     log = job.read(entry, result.robot, needs=needed_of(job))
     if job.controller.kind == "torque":
+        from robotid.closed_loop.driven import driven_log
+
         return driven_log(result.robot, log, job.signals)
-    return with_gravity(job.model(), log) if job.controller.gravity_compensation else log
+    if not job.controller.gravity_compensation:
+        return log
+    from robotid.closed_loop.identify import with_gravity
+
+    return with_gravity(job.model(), log)
 
 
 def needed_of(job: Job) -> Needs:

@@ -16,6 +16,7 @@ from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import Reduction, compress_stretches, join
+from robotid.regressor.rows import keep_inertial_rows
 from robotid.regressor.used_rows import base_problem, row_mask
 from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel
@@ -101,6 +102,7 @@ class Segments:
 
     def _of(self, motion: Trajectory) -> Iterator[Reduction]:
         thin = motion.every(max(1, len(motion.t) // _ROWS))
+        keep_inertial_rows(self.model, thin)  # whose excitation is looked at, too
         count = int(np.clip(np.ptp(thin.t) / _STRETCH, 1, _STRETCHES))
         length = -(-len(thin.t) // count)
         rows = row_mask(self.model, thin, self.min_velocity)

@@ -16,6 +16,7 @@ from robotid.findings import Finding, log_finding
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
+from robotid.logs.splines import cubic_spline
 from robotid.regressor.torque import carried_columns, joint_torque_regressor
 from robotid.robot.model import RobotModel
 
@@ -327,11 +328,9 @@ def _coupled(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
 
 def _interpolated(t: Array, values: Array, times: Array) -> Array:
     """Return values, shape (N, n), at times of any shape, shape (..., n)."""
-    from scipy.interpolate import CubicSpline
-
     if len(t) < 2:
         return np.empty((*times.shape, values.shape[1]))
-    return np.asarray(CubicSpline(t, values, axis=0)(times))
+    return cubic_spline(t, values, times)
 
 
 def _distance(at: Array, turns: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,7 +11,9 @@ from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
-from robotid.simulation.loops import Loops, open_loops
+
+if TYPE_CHECKING:
+    from robotid.simulation.loops import Loops
 
 __all__ = [
     "CommandedDrive",
@@ -107,7 +109,7 @@ def commanded_drives(
 
 def loops_of(
     model: RobotModel, pi: Array, drives: Sequence[CommandedDrive], rate: float | None = None
-) -> Loops:
+) -> "Loops":
     """Return bodies, drives and loops as roll-outs take them.
 
     Args:
@@ -116,6 +118,8 @@ def loops_of(
         drives: Its drives; armature, friction and offset are those of pi.
         rate: Ticks per second of a controller with a clock [Hz]; None: it has none.
     """
+    from robotid.simulation.loops import open_loops
+
     kp, kd, delay, zero, limit = (
         np.array([getattr(drive, key) for drive in drives])
         for key in ("kp", "kd", "delay", "zero", "effort_limit")

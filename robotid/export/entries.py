@@ -2,26 +2,27 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from robotid._files import finite, source_entry
-from robotid.closed_loop.result import LoopIdentification
-from robotid.export.loops import loop_entries, loop_inputs
 from robotid.export.ranges import parameter_ranges
 from robotid.fitting.bands import REACH, usual_friction
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.identified import SOURCES, Identified
 from robotid.fitting.parameter_table import parameter_entries
-from robotid.identification.previews import Preview
 from robotid.identification.result import Identification
 from robotid.logs.transmission import Transmission
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.drives import TERMS
 from robotid.robot.parameters import pseudo_inertia
 from robotid.versions import __version__, versions
+
+if TYPE_CHECKING:
+    from robotid.closed_loop.result import LoopIdentification
+    from robotid.identification.previews import Preview
 
 __all__ = [
     "SCHEMA_VERSION",
@@ -37,7 +38,7 @@ _EXTENT = ("samples", "rate", "start", "end", "rows_used", "segments")
 
 
 def build_result(
-    found: Identification | LoopIdentification,
+    found: "Identification | LoopIdentification",
     settings: Mapping[str, Any],
     outputs: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
@@ -49,12 +50,14 @@ def build_result(
         outputs: Files written beside it, by kind.
     """
     model, (bodies, drives) = found.model, parameter_entries(found)
-    if isinstance(found, LoopIdentification):
-        own = loop_entries(found)
-    else:
+    if isinstance(found, Identification):
         own = _torque_entries(found, settings)
         beside = found.urdf_with_drives[len(bodies) :].tolist()
         drives = [x | {"with_urdf": value} for x, value in zip(drives, beside, strict=True)]
+    else:
+        from robotid.export.loops import loop_entries
+
+        own = loop_entries(found)
     common = {
         "schema_version": SCHEMA_VERSION,
         "robotid": __version__,
@@ -112,7 +115,7 @@ def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[
     }
 
 
-def build_preview(preview: Preview) -> dict[str, Any]:
+def build_preview(preview: "Preview") -> dict[str, Any]:
     """Return what a preview tells, plain values only and all of them finite.
 
     Args:
@@ -211,7 +214,7 @@ def _without_value(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {key: x for key, x in entry.items() if key not in ("value", "at_bound")}
 
 
-def _expected_torque(preview: Preview) -> dict[str, dict[str, Any]]:
+def _expected_torque(preview: "Preview") -> dict[str, dict[str, Any]]:
     """Return size and 95 % band of each joint's torque on the motions, root mean squares."""
     found, bands = preview.expected, preview.bands
     torque = np.vstack([e.recording.trajectory.tau for e in found.fitted])
@@ -230,14 +233,16 @@ def _expected_torque(preview: Preview) -> dict[str, dict[str, Any]]:
     }
 
 
-def input_entries(found: Identification | LoopIdentification) -> list[dict[str, Any]]:
+def input_entries(found: "Identification | LoopIdentification") -> list[dict[str, Any]]:
     """Return the files that were read, as result.json has them, the URDF first.
 
     Args:
         found: What was identified.
     """
     inputs = [{"role": "urdf", **source_entry(found.model.tree.path)}]
-    if isinstance(found, LoopIdentification):
+    if not isinstance(found, Identification):
+        from robotid.export.loops import loop_inputs
+
         return [*inputs, *loop_inputs(found)]
     for role, evaluations in (
         ("identification", found.fitted),

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from robotid._files import check_path, read_json
 from robotid._settings import Range, require_kind
 from robotid._typing import Array
-from robotid.closed_loop.evaluation import HORIZONS, OpenLoop, run_open_loop
 from robotid.exceptions import DataError, ModelError
 from robotid.export.commanded import (
     CommandedDrive,
@@ -35,7 +34,9 @@ from robotid.regressor.friction_projection import (
 )
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot, open_loops
+
+if TYPE_CHECKING:
+    from robotid.closed_loop.evaluation import OpenLoop
 
 __all__ = [
     "Result",
@@ -171,23 +172,27 @@ class Result:
             raise DataError(f"{log.name} has no commands, columns qref_ of each joint")
         return self._signs * self.open_loop(log, horizons=()).q
 
-    def open_loop(self, log: Log, *, horizons: Sequence[float] = HORIZONS) -> OpenLoop:
+    def open_loop(self, log: Log, *, horizons: Sequence[float] | None = None) -> "OpenLoop":
         """Return a log beside the positions simulated for it, in the URDF's sense of the joints.
 
         Its commands move the robot; of a result without gains, its fed-forward torque.
 
         Args:
             log: The log, of its joints in its order, with commands.
-            horizons: Horizons of errors [s].
+            horizons: Horizons of errors [s]; those of result.json if None.
 
         Raises:
             MissingDependencyError: If Numba is not installed.
             NotConvergedError: If a step has no solution.
             SettingsError: If a term of the drives cannot be rolled out.
         """
+        from robotid.closed_loop.evaluation import HORIZONS, run_open_loop
+        from robotid.simulation.loops import LoopedRobot, open_loops
+
         (model, pi), drives = self.identified, self.commanded
         loops = loops_of(model, pi, drives, self.rate) if drives else open_loops(model, pi)
-        return run_open_loop(LoopedRobot(model), loops, log.turned(self._signs), horizons=horizons)
+        far = HORIZONS if horizons is None else horizons
+        return run_open_loop(LoopedRobot(model), loops, log.turned(self._signs), horizons=far)
 
     @property
     def _signs(self) -> Array:

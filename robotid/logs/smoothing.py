@@ -14,6 +14,7 @@ from robotid.logs.data import Log, Trajectory
 from robotid.logs.filters import butterworth_poles, zero_phase
 from robotid.logs.friction_direction import acting_directions
 from robotid.logs.settings import SignalSettings
+from robotid.logs.splines import cubic_spline
 
 __all__ = ["SPLINE", "Stretch", "filter_reach", "low_pass", "process_stretches", "too_short"]
 
@@ -252,8 +253,5 @@ def _resample(t: Array, values: Array, grid: Array) -> Array:
     """Return the values on the grid, by cubic splines through the true time stamps."""
     if len(grid) == len(t) and np.array_equal(grid, t):
         return values
-    from scipy.interpolate import CubicSpline
-
     # of a channel moved in time nothing is known beyond its own ends
-    resampled: Array = CubicSpline(t, values, axis=0)(np.clip(grid, t[0], t[-1]))
-    return resampled
+    return cubic_spline(t, values, np.clip(grid, t[0], t[-1]))

@@ -162,17 +162,16 @@ def thin(y: Array, points: int) -> NDArray[np.int_]:
         return np.arange(count)
     width = -(-2 * count // points)
     finite = np.isfinite(y)
-    first = width * np.arange(-(-count // width))
-    below, above = (
-        np.pad(np.where(finite, y, no), (0, -count % width), constant_values=no).reshape(-1, width)
-        for no in (np.inf, -np.inf)
-    )
-    extremes = np.r_[first + below.argmin(axis=1), first + above.argmax(axis=1)]
+    first = np.arange(0, count, width)
+    below, above = np.full((2, len(first) * width), [[np.inf], [-np.inf]])
+    below[:count][finite] = above[:count][finite] = y[finite]
+    extremes = np.concatenate(
+        [first + below.reshape(-1, width).argmin(axis=1),
+         first + above.reshape(-1, width).argmax(axis=1)]
+    )  # fmt: skip
+    extremes = extremes[finite[extremes]]
     breaks = np.flatnonzero(finite[1:] != finite[:-1])
-    kept = np.r_[
-        0, extremes[finite[np.minimum(extremes, count - 1)]], breaks, breaks + 1, count - 1
-    ]
-    return np.unique(np.minimum(kept, count - 1))
+    return np.unique(np.concatenate([[0], extremes, breaks, breaks + 1, [count - 1]]))
 
 
 def broken(segment: Array, x: Array, *lines: Array) -> tuple[Array, ...]:
@@ -254,8 +253,9 @@ class _Axis:
             decades = range(int(np.floor(self.low)), int(np.ceil(self.high)) + 1)
             every = [s * 10.0**d for d in decades for s in ((1, 2, 5) if few else (1,))]
             return [v for v in every if self.low <= np.log10(v) <= self.high]
-        first, last = np.ceil(self.low / self.step), np.floor(self.high / self.step)
-        return [float(k * self.step) for k in np.arange(first, last + 1)]
+        step = self.step
+        first, last = np.ceil(self.low / step), np.floor(self.high / step)
+        return [float(k * step) for k in np.arange(first, last + 1)]
 
     @property
     def step(self) -> float:
@@ -437,15 +437,18 @@ def _band(
     """Return what lies between edges, as a path."""
     breaks = np.flatnonzero(np.diff(np.isfinite(y)))
     step = max(1, len(x) // points)
-    rows = np.unique(np.r_[np.arange(0, len(x), step), breaks, breaks + 1, len(x) - 1])
+    every = np.arange(0, len(x), step)
+    rows = np.unique(np.concatenate([every, breaks, breaks + 1, [len(x) - 1]]))
     at = across(x[rows])
     path = ""
     for low, high in cover:
         lower, upper = up(low[rows]), up(high[rows])
         is_wide = np.abs(upper - lower) > _THIN
-        is_seen = is_wide | np.r_[is_wide[1:], False] | np.r_[False, is_wide[:-1]]
+        is_seen = is_wide.copy()  # ... and what is beside what is wide
+        is_seen[:-1] |= is_wide[1:]
+        is_seen[1:] |= is_wide[:-1]
         path += "".join(
-            _path(np.r_[at[r], at[r][::-1]], np.r_[upper[r], lower[r][::-1]]) + "z"
+            _path(np.append(at[r], at[r][::-1]), np.append(upper[r], lower[r][::-1])) + "z"
             for r in _runs(np.where(is_seen, lower + upper + y[rows], np.nan))
         )
     return f'<path d="{path}" {style}/>'
@@ -465,12 +468,15 @@ def _whiskers(x: Array, y: Array, half: Array | None, across: _Axis, up: _Axis, 
 
 def _runs(y: Array) -> list[slice]:
     """Return the stretches of finite numbers."""
-    edges = np.flatnonzero(np.diff(np.r_[False, np.isfinite(y), False].astype(int)))
-    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    is_inside = np.zeros(len(y) + 2, dtype=bool)
+    is_inside[1:-1] = np.isfinite(y)
+    edges = np.flatnonzero(is_inside[1:] != is_inside[:-1])
+    return [slice(a, b) for a, b in edges.reshape(-1, 2).tolist()]
 
 
 def _path(x: Array, y: Array) -> str:
-    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
+    places = np.column_stack([x, y]).ravel().tolist()
+    return "M" + "L".join(["%.1f %.1f"] * len(x)) % tuple(places)
 
 
 def _finite(x: Array, y: Array) -> Iterator[tuple[float, float]]:
