@@ -1,15 +1,17 @@
 """robotid export: write a result in the formats that other programs read."""
 
 import argparse
+from collections.abc import Mapping
 from typing import Any
 
 from robotid.cli.flags import add_json
 from robotid.cli.printing import say
 from robotid.cli.running import show_found
+from robotid.export.formats import FORMATS, options_of
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "write a result as URDF, MJCF, SDF, Isaac Lab's actuators or ranges for randomisation"
+SUMMARY = f"write a result for other programs: {', '.join(FORMATS)}"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -20,17 +22,24 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     """
     add = parser.add_argument
     add("result", metavar="RESULT", help="result.json or its folder")
-    kinds = ("urdf", "mjcf", "sdf", "isaac", "ranges")
-    words = "isaac: YAML of Isaac Lab's actuators; ranges: YAML of 95 %% intervals"
-    add("--format", required=True, choices=kinds, help=words)
+    words = {kind: form.words for kind, form in FORMATS.items()}
+    add("--format", required=True, choices=[*FORMATS], help=_by_format(words))
     add("--out", required=True, metavar="FILE", help="file to write")
-    words = "time step of the simulator; default: 0.001 of mjcf, 0.005 of isaac"
-    add("--step", type=float, metavar="S", help=words)
-    words = "how mjcf delays commands; default: history, which needs MuJoCo 3.5"
-    add("--delay", choices=("history", "filter"), help=words)
-    words = "deprecated, without effect: friction that a format lacks is always projected"
-    add("--mean-friction", action="store_true", help=words)
+    for name, having in options_of(FORMATS).items():
+        words = {kind: option.words for kind, option in having.items()}
+        first = next(iter(having.values()))
+        about: dict[str, Any] = {"type": first.kind, "metavar": first.metavar}
+        if first.among:
+            about = {"choices": first.among}
+        add(f"--{name.replace('_', '-')}", help=_by_format(words), **about)
+    without = "deprecated, without effect: friction that a format lacks is always projected"
+    add("--mean-friction", action="store_true", help=without)
     add_json(parser)
+
+
+def _by_format(words: Mapping[str, str]) -> str:
+    """Return words of formats as the help shows them."""
+    return "; ".join(f"{kind}: {said}" for kind, said in words.items()).replace("%", "%%")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -41,7 +50,7 @@ def run(options: argparse.Namespace) -> None:
     """
     from robotid.commands.export import export_result
 
-    chosen = {key: getattr(options, key) for key in ("step", "delay")}
+    chosen = {name: getattr(options, name) for name in options_of(FORMATS)}
     done = export_result(options.result, options.format, options.out, **chosen)
     show_found(done, options, _show)
 

@@ -11,17 +11,18 @@ from robotid._files import write_text
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.commanded import CommandedDrive, limit_of
-from robotid.export.links import unstated_terms
+from robotid.export.exported import Exported, Written, unstated_terms
+from robotid.export.result import Result
 from robotid.export.yaml_text import yaml_text
 from robotid.findings import listed
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 from robotid.versions import __version__
 
-__all__ = ["ISAAC_TERMS", "isaac_actuators", "write_isaac"]
+__all__ = ["export", "isaac_actuators", "write_isaac"]
 
-#: The drive terms that Isaac Lab's actuators have, the offset by a sentence of its own.
-ISAAC_TERMS = ("armature", "viscous", "coulomb", "offset")
+# the drive terms that Isaac Lab's actuators have, the offset by a sentence of its own.
+_TERMS = ("armature", "viscous", "coulomb", "offset")
 _STEP = 0.005  # [s]
 _HEAD = """\
 Actuators of {robot} for Isaac Lab 2.2 or later (Isaac Sim 5, where friction is a torque), by
@@ -36,6 +37,22 @@ Delays are the nearest steps of physics_dt, which sim.dt must be; where min_dela
 max_delay, Isaac Lab draws one for each robot at each reset. Friction is Coulomb's, at rest and
 moving.
 """
+
+
+def export(result: Result, target: Path, *, step: float = _STEP) -> Written:
+    """Write the drives of a result as the YAML of Isaac Lab's actuators.
+
+    Args:
+        result: The result.
+        target: The file to write.
+        step: As of ``write_isaac``.
+
+    Raises:
+        DataError, SettingsError: As of ``write_isaac``; also if it has no URDF.
+    """
+    of = Exported.of(result, _TERMS)
+    notes = write_isaac(of.model, of.pi, of.commanded, target, step=step, notes=of.notes)
+    return of.written(target, notes=notes)
 
 
 def isaac_actuators(
@@ -103,7 +120,7 @@ def write_isaac(
         SettingsError: If step is not positive, or the target is a folder.
     """
     content = isaac_actuators(model, commanded, step)
-    said = [*notes, *unstated_terms(model, pi, "Isaac Lab", ISAAC_TERMS)]
+    said = [*notes, *unstated_terms(model, pi, "Isaac Lab", _TERMS)]
     for key, words in (
         ("offset", "the offset, which may be subtracted from the effort target"),
         ("zero", "the encoder's zero, which the simulator's position and command have more"),

@@ -12,6 +12,7 @@ from robotid._files import write_text
 from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.exceptions import ModelError
+from robotid.export.exported import unstated_terms
 from robotid.export.urdf import link_parameters
 from robotid.findings import listed
 from robotid.robot.bodies import inertial_parameters, link_places
@@ -21,7 +22,7 @@ from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.tree import Joint
 from robotid.versions import __version__
 
-__all__ = ["WORLD", "Format", "SimulatedLink", "own_drives", "unstated_terms", "write_model"]
+__all__ = ["WORLD", "SimulatedLink", "XmlFormat", "own_drives", "write_model"]
 
 #: What simulators call the frame that does not move.
 WORLD = "world"
@@ -30,7 +31,7 @@ _ROUNDING = 1e-12  # of the largest eigenvalue of a pseudo-inertia: a smaller on
 
 
 @dataclass(frozen=True)
-class Format:
+class XmlFormat:
     """What a simulator's format can state.
 
     Attributes:
@@ -80,7 +81,7 @@ def write_model(
     pi: Array,
     target: str | Path,
     original: str | Path | None,
-    to: Format,
+    to: XmlFormat,
     build: Callable[[Sequence[SimulatedLink], dict[str, float]], ET.Element],
     notes: Sequence[str] = (),
 ) -> tuple[str, ...]:
@@ -134,30 +135,6 @@ def own_drives(model: RobotModel, values: Mapping[str, float]) -> dict[str, floa
     """
     shared = {coupling.name for coupling in model.layout.couplings}
     return {name: x for name, x in values.items() if name.rpartition(".")[0] not in shared}
-
-
-def unstated_terms(
-    model: RobotModel, pi: Array, name: str, terms: Collection[str], *, has_couplings: bool = False
-) -> list[str]:
-    """Return a sentence on the drive parameters that a format has no place for, if any.
-
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        name: The format.
-        terms: The drive terms that it states.
-        has_couplings: Whether it states drives that turn with several joints.
-    """
-    layout = model.layout
-    drives = zip(layout.drive_parameters, layout.drive_names, pi[layout.n_inertial :], strict=True)
-    missing = [
-        drive
-        for (d, term), drive, value in drives
-        if value != 0.0
-        and not (term.name in terms and (has_couplings or layout.drives[d] not in layout.couplings))
-    ]
-    sentence = f"{name} has no place for {listed(missing)}; the sidecar of the URDF has them"
-    return [sentence] if missing else []
 
 
 def _links(
@@ -225,7 +202,7 @@ def _inertials(model: RobotModel, pi: Array) -> dict[str, Array]:
 
 
 def _shapes(
-    model: RobotModel, to: Format, urdfs: Sequence[str | Path], left_out: set[str]
+    model: RobotModel, to: XmlFormat, urdfs: Sequence[str | Path], left_out: set[str]
 ) -> dict[str, list[tuple[str, Shape, Array, Path | None]]]:
     """Return the shapes of each link, and put what the URDF calls meshes left out into a set."""
     found: dict[str, list[tuple[str, Shape, Array, Path | None]]] = {}

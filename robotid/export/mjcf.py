@@ -14,14 +14,17 @@ from robotid._settings import require_each, require_kind
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
 from robotid.export.commanded import CommandedDrive, limit_of
-from robotid.export.links import WORLD, Format, SimulatedLink, own_drives, write_model
+from robotid.export.exported import Exported, Written
+from robotid.export.formats import DELAYS
+from robotid.export.links import WORLD, SimulatedLink, XmlFormat, own_drives, write_model
+from robotid.export.result import Result
 from robotid.export.urdf import numbers_text
 from robotid.findings import listed
 from robotid.robot.bodies import principal_moments
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 
-__all__ = ["DELAYS", "MJCF_TERMS", "write_mjcf"]
+__all__ = ["export", "write_mjcf"]
 
 #: Attribute of a joint, or of a tendon over several, that states a term of a drive.
 _ATTRIBUTES = {
@@ -31,8 +34,7 @@ _ATTRIBUTES = {
     "spring": "stiffness",
 }
 _OFFSET = "offset"  # stated by the actuator's bias
-#: The drive terms that MJCF has.
-MJCF_TERMS = (*_ATTRIBUTES, _OFFSET)
+_TERMS = (*_ATTRIBUTES, _OFFSET)
 #: Sizes of a geom over those of a shape in a URDF: MuJoCo states half lengths.
 _SIZES = {"box": (0.5,), "sphere": (1.0,), "cylinder": (1.0, 0.5)}
 _SEEN = {"group": "2"}  # what the viewer shows by default
@@ -49,11 +51,29 @@ _COMPILER = {
     "boundmass": "0", "boundinertia": "0",
 }  # fmt: skip
 _MOST_FACES = 200_000  # of a mesh that MuJoCo reads
-#: How the delay of a command may be stated.
-DELAYS = ("history", "filter")
 _STEP = 0.001  # [s]
 _EXACT = 1e-9  # of a step: a delay that is so close to whole steps has that many
 _STL_HEAD, _STL_FACE = 84, 50  # bytes; MuJoCo reads no STL written as text
+
+
+def export(result: Result, target: Path, *, step: float = _STEP, delay: str = "history") -> Written:
+    """Write a result as MJCF.
+
+    Args:
+        result: The result.
+        target: The file to write.
+        step: As of ``write_mjcf``.
+        delay: As of ``write_mjcf``.
+
+    Raises:
+        DataError, ModelError, SettingsError: As of ``write_mjcf``; also if it has no URDF.
+    """
+    of = Exported.of(result, _TERMS)
+    notes = write_mjcf(
+        of.model, of.pi, target, original=of.original, commanded=of.commanded, step=step,
+        delay=delay, notes=of.notes,
+    )  # fmt: skip
+    return of.written(target, notes=notes)
 
 
 @dataclass(frozen=True)
@@ -161,7 +181,7 @@ def write_mjcf(
     if delay not in DELAYS:
         raise SettingsError(f"delay is {delay!r}, wanted one of {listed(DELAYS)}")
     to, servos = (
-        Format("MJCF", MJCF_TERMS, True, _is_readable),
+        XmlFormat("MJCF", _TERMS, True, _is_readable),
         _Servos({drive.joint: drive for drive in commanded}, step, delay),
     )
     build = partial(_mjcf, model, servos)

@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,6 +16,9 @@ from scipy.spatial.transform import Rotation
 from robotid._files import write_text
 from robotid._settings import require_kind
 from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.export.commanded import commanded_drives
+from robotid.export.exported import Written
 from robotid.export.urdf import link_parameters
 from robotid.export.yaml_text import yaml_text
 from robotid.fitting.bands import REACH
@@ -28,8 +31,12 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia_basis
 from robotid.versions import __version__
 
+if TYPE_CHECKING:
+    from robotid.export.result import Result
+
 __all__ = [
     "body_ranges",
+    "export",
     "parameter_ranges",
     "projected_ranges",
     "ranges_text",
@@ -64,6 +71,27 @@ and Coulomb friction and an offset, nearest to it over the fitted rows. Drive pa
 of the joint, gear included: gains kp and kd, delay of commands and zero of the encoder, too, if
 commands were identified.
 """
+
+
+def export(result: "Result", target: Path) -> Written:
+    """Write the ranges that a result states, as YAML.
+
+    Args:
+        result: The result.
+        target: The file to write.
+
+    Raises:
+        DataError: If the result has no URDF, since it is wrong, or no ranges.
+        SettingsError: If the target is a folder.
+    """
+    model, pi = result.identified  # of a result that may be used
+    has_gains = bool(commanded_drives(model, pi, result.content, result.path.name))
+    if "ranges" not in result.content and not has_gains:
+        raise DataError(
+            f"{result.path.name} has no ranges: an earlier version wrote it; identify again"
+        )
+    write_text(ranges_text(stated_ranges(result.content)), target)
+    return Written((target,), (), {})
 
 
 def parameter_ranges(found: Identified) -> dict[str, Any]:

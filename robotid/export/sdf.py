@@ -9,23 +9,39 @@ import numpy as np
 
 from robotid._settings import require_kind
 from robotid._typing import Array
-from robotid.export.links import WORLD, Format, SimulatedLink, write_model
+from robotid.export.exported import Exported, Written
+from robotid.export.links import WORLD, SimulatedLink, XmlFormat, write_model
+from robotid.export.result import Result
 from robotid.export.urdf import numbers_text
 from robotid.robot.bodies import central_inertial
 from robotid.robot.meshes import Shape
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import MOMENTS, Joint
 
-__all__ = ["SDF_TERMS", "write_sdf"]
+__all__ = ["export", "write_sdf"]
 
 _VERSION, _VERSION_OF_MIMIC = "1.9", "1.11"
 #: Element of a joint's ``<dynamics>`` that states a term of its drive.
 _DYNAMICS = {"viscous": "damping", "coulomb": "friction"}
 _ROTOR = "armature"  # stated by an element of Drake's own
-#: The drive terms that SDF has.
-SDF_TERMS = (*_DYNAMICS, _ROTOR)
+_TERMS = (*_DYNAMICS, _ROTOR)
 _MESHES = (".dae", ".stl", ".obj", ".glb", ".gltf")
 _SIZES = {"sphere": ("radius",), "cylinder": ("radius", "length")}
+
+
+def export(result: Result, target: Path) -> Written:
+    """Write a result as SDF.
+
+    Args:
+        result: The result.
+        target: The file to write.
+
+    Raises:
+        DataError, ModelError, SettingsError: As of ``write_sdf``; also if it has no URDF.
+    """
+    of = Exported.of(result, _TERMS)
+    notes = write_sdf(of.model, of.pi, target, original=of.original, notes=of.notes)
+    return of.written(target, notes=notes)
 
 
 def write_sdf(
@@ -65,7 +81,7 @@ def write_sdf(
         "Drake reads armature (drake:rotor_inertia), not friction; Gazebo the reverse",
         f"gravity is the world's to state: <gravity>{gravity}</gravity> was identified with",
     ]
-    to = Format("SDF", SDF_TERMS, False, lambda mesh: mesh.suffix.lower() in _MESHES)
+    to = XmlFormat("SDF", _TERMS, False, lambda mesh: mesh.suffix.lower() in _MESHES)
     return write_model(model, pi, target, original, to, partial(_sdf, model.name), said)
 
 

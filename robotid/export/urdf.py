@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
 from robotid.export import xml_splice
+from robotid.export.exported import Exported, Written, unstated_terms
 from robotid.export.shape import FLAG, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.xml_splice import Document, Edit
 from robotid.regressor.friction_projection import Projection
@@ -38,8 +39,12 @@ from robotid.robot.parameters import Coupling, pseudo_inertia
 from robotid.robot.tree import MOMENTS, Inertial
 from robotid.versions import __version__
 
+if TYPE_CHECKING:
+    from robotid.export.result import Result
+
 __all__ = [
     "DYNAMICS_TERMS",
+    "export",
     "link_parameters",
     "load_identified",
     "numbers_text",
@@ -123,6 +128,22 @@ def write_urdf(
         (partial / sidecar.name).write_text(text + "\n", encoding="utf-8")
         _check_torque(model, pi, partial / goal.name, partial / sidecar.name)
     return sidecar
+
+
+def export(result: "Result", target: Path) -> Written:
+    """Write the URDF of a result with ``<dynamics>``, and its sidecar.
+
+    Args:
+        result: The result.
+        target: The URDF to write.
+
+    Raises:
+        DataError, ModelError: As of ``write_urdf``; also if the result has no URDF.
+    """
+    of = Exported.of(result, DYNAMICS_TERMS)
+    sidecar = write_urdf(*result.identified, target, dynamics=of.projection)
+    unstated = unstated_terms(of.model, of.pi, "URDF", DYNAMICS_TERMS)
+    return of.written(target, sidecar, notes=[*of.notes, *unstated])
 
 
 def urdf_changes(model: RobotModel, pi: Array, *, dynamics: Projection | bool = False) -> list[str]:

@@ -11,7 +11,7 @@ from robotid.estimators.determination import Determination, base_spread, determi
 from robotid.estimators.estimator import Weighing
 from robotid.exceptions import NotConvergedError, RankDeficientError, SettingsError
 from robotid.fitting.baselines import urdf_with_drives
-from robotid.fitting.estimators import Known, consistent_fit, make_estimator
+from robotid.fitting.estimators import Known, consistent_fit
 from robotid.fitting.evaluation import evaluate_logs
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.regressor_noise import RegressorNoise, find_regressor_noise
@@ -20,9 +20,7 @@ from robotid.fitting.robust import reweigh
 from robotid.fitting.settings import (
     BoundedSettings,
     EstimatorSettings,
-    OLSSettings,
     RecursiveSettings,
-    TLSSettings,
 )
 from robotid.fitting.standard_errors import (
     Redraws,
@@ -213,7 +211,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
             standard = standard - 0.5 * moved
         loads = [_size_of(ground, x) for x in (moved, standard)]
         if (loads[0] <= _SETTLED * loads[1]).all():
-            estimator = make_estimator(choice, model, mapping, before)
+            estimator = choice.make(before)
             if estimator.reads == "factors":
                 estimate = estimator.fit(ground.factors)
                 standard, _ = standard_of(estimate, mapping, before.pi, before.spread)
@@ -266,7 +264,8 @@ def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool)
     factors, share = reduction.factors, recordings.share
     spread = prior_spread(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
-    before = Known(prior, spread, share, rough.sigma, segments or (factors,))
+    held_out = segments or (factors,)
+    before = Known(model, mapping, prior, spread, share, rough.sigma, held_out)
     known = model.layout.owned_by(choice.bounds.pinned)
     rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
     determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
@@ -280,10 +279,10 @@ def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Gro
     factors finds as much less. Estimators that read samples keep the bias as an error. Total least
     squares have a correction of their own.
     """
-    if isinstance(choice, TLSSettings):
+    if choice.allows_for_noise:
         return ground
     level, theta = ground.rough.sigma, ground.rough.theta
-    sigma = np.ones_like(level) if isinstance(choice, OLSSettings) else level
+    sigma = np.ones_like(level) if choice.weighs_alike else level
     noise = find_regressor_noise(ground.recordings, ground.whole, theta, sigma, level)
     if noise is None:
         return ground
@@ -306,9 +305,8 @@ def _run(
 ) -> tuple[Estimate, Consistent | None, Weighing]:
     """Return the estimate, what made it physically consistent if it is, and how rows weighed."""
     recordings, before = ground.recordings, ground.before
-    model, mapping = recordings.model, recordings.mapping
-    estimator = make_estimator(choice, model, mapping, before)
-    if model.is_static and estimator.needs_mass:
+    estimator = choice.make(before)
+    if recordings.model.is_static and estimator.needs_mass:
         raise SettingsError(
             f"the estimator {choice.name!r} needs the mass matrix, which dynamics = 'static' does "
             "not identify; choose another one, or dynamics = 'full'"
@@ -320,5 +318,5 @@ def _run(
         return estimate, None, estimator.weighing
     if estimator.weighing == "by step":
         estimate = with_wls_errors(estimate, ground.rough)
-    fit = consistent_fit(choice, model, mapping, before)
+    fit = consistent_fit(choice, before)
     return fit.project(estimate), fit, estimator.weighing

@@ -3,11 +3,17 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
 
 from robotid._settings import Range, Settings, require_kind, setting
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
+
+if TYPE_CHECKING:
+    from robotid.estimators import BatchEstimator, RecursiveEstimator
+    from robotid.fitting.estimators import Known
 
 __all__ = [
     "ESTIMATORS",
@@ -131,7 +137,14 @@ class EstimatorSettings(Settings):
     """Which estimator, and its own settings, as ``EstimatorSettings("wls", robust="huber")``.
 
     It makes the settings of that estimator; a setting of another one is refused.
+
+    Attributes:
+        weighs_alike: Whether rows weigh alike, whatever the noise of their joints is.
+        allows_for_noise: Whether it allows for the noise of the regressor by itself.
     """
+
+    weighs_alike: ClassVar[bool] = False
+    allows_for_noise: ClassVar[bool] = False
 
     name: str = setting("consistent", "which estimator")
 
@@ -159,6 +172,18 @@ class EstimatorSettings(Settings):
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
         return cls(**table)
+
+    def make(self, known: "Known") -> "BatchEstimator | RecursiveEstimator[Any]":
+        """Return the estimator that reads rows or samples.
+
+        Args:
+            known: The robot, and what is known of it before the data.
+
+        Raises:
+            SettingsError: If constraints contradict each other or do not fit the robot, or the
+                estimator reads a simulator.
+        """
+        raise SettingsError(f"{self!r} describes no estimator; take EstimatorSettings(name)")
 
     @property
     def words(self) -> str:
@@ -251,12 +276,25 @@ class DescentSettings(RecursiveSettings):
     passes: int = setting(4, "largest number of passes over the logs", within=_COUNT)
     seed: int = setting(0, "seed of the order of the samples; negative: that of time")
 
+    @property
+    def _common(self) -> dict[str, Any]:
+        """Return the arguments that these estimators share."""
+        rng = np.random.default_rng(self.seed) if self.seed >= 0 else None
+        return {"average": self.average, "passes": self.passes, "rng": rng}
+
 
 @dataclass(frozen=True)
 class OLSSettings(EstimatorSettings):
     """Nothing but least squares."""
 
+    weighs_alike: ClassVar[bool] = True
+
     name: str = _called("ols", "ordinary least squares")
+
+    def make(self, known: "Known") -> "BatchEstimator":
+        from robotid.estimators import OLS
+
+        return OLS(independent_share=known.share)
 
 
 @dataclass(frozen=True)
@@ -265,10 +303,17 @@ class WLSSettings(RobustSettings):
 
     name: str = _called("wls", "weighted least squares, rows weighted by the noise of their joint")
 
+    def make(self, known: "Known") -> "BatchEstimator":
+        from robotid.estimators import WLS
+
+        return WLS(independent_share=known.share)
+
 
 @dataclass(frozen=True)
 class TLSSettings(EstimatorSettings):
     """Settings of total least squares."""
+
+    allows_for_noise: ClassVar[bool] = True
 
     name: str = _called("tls", "total least squares, which allows for noise of the regressor, too")
     regressor_noise: float = setting(
@@ -276,6 +321,11 @@ class TLSSettings(EstimatorSettings):
         "noise of the regressor's columns over their root mean square [-]",
         within=Range("x > 0", lambda x: x > 0),
     )
+
+    def make(self, known: "Known") -> "BatchEstimator":
+        from robotid.estimators import TLS
+
+        return TLS(self.regressor_noise, independent_share=known.share)
 
 
 @dataclass(frozen=True)
@@ -287,6 +337,11 @@ class ConsistentSettings(RobustSettings, BoundedSettings):
         "weighted least squares that keeps every body physically possible and leaves the URDF's "
         "value where the data say nothing",
     )
+
+    def make(self, known: "Known") -> "BatchEstimator":
+        from robotid.fitting.estimators import consistent_fit
+
+        return consistent_fit(self, known)
 
 
 @dataclass(frozen=True)
@@ -303,6 +358,13 @@ class LogCholeskySettings(ConsistentSettings):
     )
     seed: int = setting(0, "seed of the random starts", within=_NOT_NEGATIVE)
 
+    def make(self, known: "Known") -> "BatchEstimator":
+        from robotid.estimators import LogCholesky
+        from robotid.fitting.estimators import consistent_fit
+
+        rng = np.random.default_rng(self.seed)
+        return LogCholesky(consistent_fit(self, known), starts=self.starts, rng=rng)
+
 
 @dataclass(frozen=True)
 class RLSSettings(RecursiveSettings):
@@ -314,6 +376,13 @@ class RLSSettings(RecursiveSettings):
         "weight of a sample relative to the next one [-]",
         within=Range("0 < x <= 1", lambda x: 0 < x <= 1),
     )
+
+    def make(self, known: "Known") -> "RecursiveEstimator[Any]":
+        from robotid.estimators import RLS
+
+        # without forgetting nothing of the prior enters: batch least squares
+        std = np.sqrt(np.diag(known.covariance)) if self.forgetting < 1 else None
+        return RLS(known.sigma, self.forgetting, known.beta, std, known.share)
 
 
 @dataclass(frozen=True)
@@ -332,6 +401,12 @@ class KalmanSettings(RecursiveSettings):
         ),
     )
 
+    def make(self, known: "Known") -> "RecursiveEstimator[Any]":
+        from robotid.estimators import Kalman
+
+        gate = None if self.gate is False else float(self.gate)
+        return Kalman(known.sigma, known.beta, known.covariance, self.walk, gate, known.share)
+
 
 @dataclass(frozen=True)
 class PRXSettings(DescentSettings):
@@ -343,6 +418,12 @@ class PRXSettings(DescentSettings):
         "noise", "what measures the residual of the exact step", among=("noise", "mass", "rows")
     )
 
+    def make(self, known: "Known") -> "RecursiveEstimator[Any]":
+        from robotid.estimators import PRX
+
+        own = {"step": self.step, "metric": self.metric, **self._common}
+        return PRX(known.sigma, known.beta, **own)
+
 
 @dataclass(frozen=True)
 class GradientSettings(DescentSettings):
@@ -352,6 +433,12 @@ class GradientSettings(DescentSettings):
     step_size: float = setting(
         1.0, "relaxation [-]", within=Range("0 < x < 2", lambda x: 0 < x < 2)
     )
+
+    def make(self, known: "Known") -> "RecursiveEstimator[Any]":
+        from robotid.estimators import NormalisedGradient
+
+        own = {"step_size": self.step_size, **self._common}
+        return NormalisedGradient(known.sigma, known.beta, **own)
 
 
 @dataclass(frozen=True)

@@ -304,13 +304,13 @@ def preview_logs(
     said = _Information.of(model, mapping, motions, noise)
     said = said if run is None else said.beside(run)
     prior, spread = model.standard_parameters(), prior_spread(model, said.squares, said.samples)
-    ground = Known(prior, spread, said.share, said.sigma)
+    ground = Known(model, mapping, prior, spread, said.share, said.sigma)
     weight = _WEIGHT if known is None or known.weight is None else known.weight
-    estimate, wls = _errors(model, mapping, said, ground, choice, weight)
-    expected = _expected(mapping, motions, pi, said, ground, choice, estimate, wls)
+    estimate, wls = _errors(said, ground, choice, weight)
+    expected = _expected(motions, pi, said, ground, choice, estimate, wls)
     before = None
     if run is not None:
-        alone, _ = _errors(model, mapping, said.without_motions(), ground, choice, weight)
+        alone, _ = _errors(said.without_motions(), ground, choice, weight)
         before = _base_error(alone, mapping, prior, spread)
     return Preview(expected, noise, before)
 
@@ -420,54 +420,44 @@ def _expect(log: SurveyedLog, pi: Array) -> None:
 
 
 def _errors(
-    model: RobotModel,
-    mapping: BaseMapping,
-    said: _Information,
-    known: Known,
-    choice: EstimatorSettings,
-    usual: tuple[float, float],
+    said: _Information, known: Known, choice: EstimatorSettings, usual: tuple[float, float]
 ) -> tuple[Estimate, Estimate]:
     """Return the estimate and that of WLS to be expected, both at the prior.
 
     The bounds of a consistent fit are left out, for which of them bind is not known before the
     data; nor is the weight of its prior, and the plausible one, unless it is stated: the usual.
     """
-    factors, K = said.factors, mapping.K
+    factors, K = said.factors, known.mapping.K
     plain, alike = (
-        _least_squares(said, mapping, known, sigma)
-        for sigma in (said.sigma, np.ones_like(said.sigma))
+        _least_squares(said, known, sigma) for sigma in (said.sigma, np.ones_like(said.sigma))
     )
     if not isinstance(choice, ConsistentSettings):
-        return (alike if choice.name == "ols" else plain), plain
+        return (alike if choice.weighs_alike else plain), plain
     stated = choice.prior_weight
     weight, plausible = usual if isinstance(stated, str) else (stated, 1.0)
     bounds = {**choice.constraints, "extent": "none"}
     settings = replace(choice, prior_weight=weight, constraints=bounds)
-    fit = replace(consistent_fit(settings, model, mapping, known), plausible_weight=plausible)
+    fit = replace(consistent_fit(settings, known), plausible_weight=plausible)
     C = fit.programme.covariance(weight, fit.rows(factors, said.sigma))
     R, meat = factors.weighted(said.sigma)[:-1, :-1], said.meat(K, said.sigma)
     covariance = about_prior(C, K, said.share**2 * meat, R, said.share, fit.pull)
     estimate = replace(
-        plain, theta=known.pi, covariance=covariance, names=mapping.names,
+        plain, theta=known.pi, covariance=covariance, names=known.mapping.names,
         prior_std=fit.spread_before,
     )  # fmt: skip
     return estimate, plain
 
 
-def _least_squares(
-    said: _Information, mapping: BaseMapping, known: Known, sigma: Array
-) -> Estimate:
+def _least_squares(said: _Information, known: Known, sigma: Array) -> Estimate:
     """Return least squares of rows weighted by sigma^-2, at the prior."""
-    beta = mapping.to_base(known.pi)
-    solution = solve_factor(said.factors, sigma, beta)
+    solution = solve_factor(said.factors, sigma, known.beta)
     bread = solution.covariance
-    covariance = bread @ said.meat(mapping.K, sigma) @ bread
+    covariance = bread @ said.meat(known.mapping.K, sigma) @ bread
     found = solution.estimate(said.factors.names, covariance, said.sigma, 0, "expected")
-    return replace(found, theta=beta)
+    return replace(found, theta=known.beta)
 
 
 def _expected(
-    mapping: BaseMapping,
     motions: Sequence[SurveyedLog],
     pi: Array,
     said: _Information,
@@ -477,13 +467,13 @@ def _expected(
     wls: Estimate,
 ) -> Identification:
     """Return the identification to be expected."""
-    model, K = motions[0].model, mapping.K
+    model, mapping = known.model, known.mapping
     standard = known.pi if said.run is None else pi
     rows = said.factors.weighted(said.sigma / np.sqrt(said.share))[:, :-1]
-    before = base_spread(K, known.spread, model.layout.owned_by(choice.bounds.pinned))
+    before = base_spread(mapping.K, known.spread, model.layout.owned_by(choice.bounds.pinned))
     fitted, _ = evaluate_logs(motions, (), {"estimate": pi, "wls": pi}, known.pi)
     inflation = np.mean([level / said.sigma**2 for _, level in said.levels])
-    errors = StandardErrors("noise expected", 0, float(inflation), np.full(len(K), np.inf))
+    errors = StandardErrors("noise expected", 0, float(inflation), np.full(len(mapping.K), np.inf))
     return Identification(
         model=model,
         mapping=mapping,

@@ -10,6 +10,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from robotid.diagnosis.misfit_findings import setting_of, with_entries
+from robotid.export.formats import FORMATS
 from robotid.findings import Cause, grouped, listed, toml_key
 from robotid.judgement.verdict import GOOD, is_beaten
 from robotid.robot.drives import COUNTERBALANCE, DriveTerm
@@ -23,7 +24,6 @@ __all__ = ["Origin", "Step", "loop_steps", "next_steps"]
 _MOST = 3  # steps
 _NAMED = 4  # joints that a step names
 _NEW = "NEW.csv"
-_EXPORTED = {"mjcf": ".xml", "isaac": "_actuators.yaml", "ranges": "_ranges.yaml"}  # ends of files
 _PLAIN = "viscous+coulomb"
 _APPENDED = ("--validate",)  # flags that add to what was stated before
 
@@ -150,23 +150,24 @@ def loop_steps(content: Mapping[str, Any], origin: Origin) -> tuple[Step, ...]:
         next((x["path"] for x in content["inputs"] if x["role"] == role), "")
         for role in ("urdf", "identification")
     )
-    result, robot = f"{origin.folder}/result.json", content["robot"] or "robot"
-    if content["simulation"]["controller"]["kind"] == "torque":  # which has no gains
-        seen, exports = "See measured and predicted torque.", {"mjcf": "Simulate it in MuJoCo."}
-    else:
-        seen, exports = (
-            "See commanded, measured and simulated robot.",
-            {
-                "mjcf": "Simulate it in MuJoCo, gains and delays included.",
-                "isaac": "Train with it in Isaac Lab.",
-                "ranges": "Draw its drives at random, within their intervals.",
-            },
-        )
-    steps = [Step(seen, origin.using("replay", urdf, log, result))]
-    for form, words in exports.items():
-        target = f"{robot}{_EXPORTED[form]}"
-        steps.append(Step(words, origin.using("export", result, "--format", form, "--out", target)))
-    return tuple(steps) if origin.folder else ()
+    has_gains = content["simulation"]["controller"]["kind"] != "torque"
+    seen = "See measured and predicted torque."
+    if has_gains:
+        seen = "See commanded, measured and simulated robot."
+    watched = Step(seen, origin.using("replay", urdf, log, f"{origin.folder}/result.json"))
+    exports = _exports(content["robot"], origin, has_gains=has_gains)
+    return (watched, *exports) if origin.folder else ()
+
+
+def _exports(robot: str, origin: Origin, *, has_gains: bool = False) -> list[Step]:
+    """Return what writes a result in the formats that are of use to it."""
+    steps = []
+    for name, form in FORMATS.items():
+        if words := form.use_of_gains if has_gains else form.use:
+            target = f"{robot or 'robot'}{form.suffix}"
+            stated = (f"{origin.folder}/result.json", "--format", name, "--out", target)
+            steps.append(Step(words, origin.using("export", *stated)))
+    return steps
 
 
 def _once(steps: Sequence[Step]) -> tuple[Step, ...]:
@@ -408,7 +409,6 @@ def _doctor(found: Identification, origin: Origin, causes: Sequence[Cause]) -> S
 def _uses(found: Identification, origin: Origin, asked: Sequence[Step]) -> list[Step]:
     """Return what may be done with a result, but for what is asked for already."""
     result = f"{origin.folder}/result.json"
-    target = ["--format", "mjcf", "--out", f"{found.model.name or 'robot'}.xml"]
     steps = [
         Step("Play a recording and see where the prediction misses.", _replay(found, origin)),
         Step(
@@ -417,8 +417,7 @@ def _uses(found: Identification, origin: Origin, asked: Sequence[Step]) -> list[
         ),
     ]
     if found.has_urdf:
-        words = "Use it: the identified URDF is written; this makes a model for MuJoCo of it."
-        steps.insert(0, Step(words, origin.using("export", result, *target)))
+        steps = [*_exports(found.model.name, origin), *steps]
     if not found.witness.agrees:
         steps.insert(0, _weigh(found, origin, ()))
     typed = {block for step in asked for block in step.blocks}

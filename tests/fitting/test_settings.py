@@ -1,6 +1,6 @@
 import json
 import pickle
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +8,12 @@ import pytest
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
+from robotid._settings import setting
+from robotid.cli import main
 from robotid.commands.identify import run_job
 from robotid.commands.job import LogEntry, job_from_settings, read_job
+from robotid.commands.schema import job_schema
+from robotid.estimators import WLS, BatchEstimator
 from robotid.estimators.consistent.cones import SOLVERS
 from robotid.estimators.consistent.penalties import METRICS
 from robotid.exceptions import SettingsError
@@ -144,3 +148,42 @@ def test_settings_of_each_estimator_survive_a_round_trip(name):
     assert EstimatorSettings(**settings.to_dict()) == settings
     assert replace(settings) == settings
     assert pickle.loads(pickle.dumps(settings)) == settings
+
+
+@dataclass(frozen=True)
+class Shrunk(BatchEstimator):
+    """Least squares, times a factor."""
+
+    factor: float
+
+    def _fit(self, factors):
+        found = WLS().fit(factors)
+        return replace(found, theta=self.factor * found.theta)
+
+
+@dataclass(frozen=True)
+class ShrunkSettings(EstimatorSettings):
+    name: str = setting("shrunk", "a toy", among=("shrunk",))
+    factor: float = setting(0.5, "what parameters are shrunk to [-]")
+
+    def make(self, known):
+        assert known.pi.shape == known.spread.shape
+        return Shrunk(self.factor)
+
+
+def test_a_new_estimator_is_a_module_and_its_settings(ur5, rng, monkeypatch, capsys):
+    monkeypatch.setitem(ESTIMATORS, "shrunk", ShrunkSettings)
+    log = exact_log(ur5, truth(ur5), rng)
+    wls, found = (
+        fit(ur5, [log], signals=EXACT, estimator=EstimatorSettings(name, **own))
+        for name, own in (("wls", {}), ("shrunk", {"factor": 0.25}))
+    )
+    np.testing.assert_allclose(found.base, 0.25 * wls.base, rtol=1e-9, atol=1e-12)
+    with pytest.raises(SettingsError, match="estimator 'shrunk' has no setting 'starts'"):
+        EstimatorSettings("shrunk", starts=3)
+    with pytest.raises(SystemExit):
+        main(["identify", "--help"])
+    assert "gradient, simulation, shrunk" in " ".join(capsys.readouterr().out.split())
+    keys = job_schema()["properties"]["estimator"]["properties"]
+    assert keys["factor"]["description"] == "what parameters are shrunk to [-]"
+    assert keys["name"]["enum"][-1] == "shrunk"
