@@ -1,0 +1,6 @@
+import pytest
+
+
+@pytest.mark.parametrize("name", "estimators choice payload".split())
+def test_all_figures_are_those_that_are_stored(same, name):
+    same(name)
