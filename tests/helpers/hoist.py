@@ -4,7 +4,7 @@ Nothing of the package is used: what a scenario is compared with is known from h
 """
 
 import csv
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import pinocchio as pin
@@ -89,6 +89,7 @@ class Drive:
     load: float = 0.0  # [-] of the rigid torque
     stribeck: float = 0.0  # beside Coulomb's, gone at a speed of some WIDTH
     spring: float = 0.0
+    ripple: float = 0.0  # times cos(2 q + 0.4)
 
 
 WIDTH = 0.25  # [rad/s or m/s] of every Stribeck hook
@@ -112,10 +113,11 @@ class Hoist:
     coupling: tuple = ()  # ratios by joint of one more drive
     coupled: Drive = Drive()
     load: tuple = ()  # mass and centre in the tool's frame
+    text: str = ""  # of a URDF in the place of that of the bodies
 
     def model(self):
         """Return Pinocchio's model of the joints that move, in their order."""
-        full = pin.buildModelFromXML(urdf(self.bodies))
+        full = pin.buildModelFromXML(self.text or urdf(self.bodies))
         q = pin.neutral(full)
         still = []
         for name, where in self.locked.items():
@@ -146,7 +148,8 @@ class Hoist:
             tau[:, j] += own(self.drives[name], q[:, j], v[:, j], a[:, j], rigid[:, j])
         if self.coupling:
             r = np.array(self.coupling)
-            tau += r * own(self.coupled, q @ r, v @ r, a @ r, 0.0)[:, None]
+            load = rigid @ r / (r @ r)
+            tau += r * own(self.coupled, q @ r, v @ r, a @ r, load)[:, None]
         return tau
 
 
@@ -154,7 +157,14 @@ def own(drive, q, v, a, rigid):
     """Return the torque of a drive at some speeds."""
     hook = drive.stribeck * np.exp(-np.abs(v) / WIDTH)
     friction = (drive.coulomb + drive.load * np.abs(rigid) + hook) * np.sign(v)
-    return drive.armature * a + drive.viscous * v + friction + drive.offset + drive.spring * q
+    return (
+        drive.armature * a
+        + drive.viscous * v
+        + friction
+        + drive.offset
+        + drive.spring * q
+        + (drive.ripple * np.cos(2 * q + 0.4))
+    )
 
 
 def _configuration(model, q):
@@ -234,6 +244,63 @@ def write_table(path, table, scale=None):
         writer = csv.writer(file)
         writer.writerow(table)
         writer.writerows([[f"{x:.9g}" for x in row] for row in zip(*table.values(), strict=True)])
+
+
+INERTIAL = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+_LINK = {child: joint for joint, _, _, child, *_ in _JOINTS}
+
+
+def parameters(hoist):
+    """Return the true standard parameters by name, as "boom.mcx" and "lift.viscous"."""
+    model, found = hoist.model(), {}
+    for link, joint in _LINK.items():
+        if joint in hoist.joints:
+            values = model.inertias[model.getJointId(joint)].toDynamicParameters()
+            found |= {f"{link}.{k}": float(x) for k, x in zip(INERTIAL, values, strict=True)}
+    for name in hoist.joints:
+        found |= {f"{name}.{k}": x for k, x in asdict(hoist.drives[name]).items()}
+    return found
+
+
+def base_value(expression, values):
+    """Return a base parameter, a sum as "slide.m + 0.98 hand.m", of standard ones by name."""
+    words = expression.replace(" - ", " + -1 ").split(" + ")
+    total = 0.0
+    for word in words:
+        *factors, name = word.split()
+        total += np.prod([float(x) for x in factors]) * values[name]
+    return total
+
+
+def standardised(result, values):
+    """Return the errors of base parameters over their standard errors, where these are known."""
+    return np.array([
+        (entry["value"] - base_value(entry["expression"], values)) / entry["std_error"]
+        for entry in result["base_parameters"]
+        if entry["std_error"] is not None
+    ])  # fmt: skip
+
+
+def regressor_torque(hoist, values, q, v, a):
+    """Return the torque of standard parameters by name, by Pinocchio's regressor, shape (N, n)."""
+    model = hoist.model()
+    data = model.createData()
+    pi = np.concatenate([
+        [values[f"{link}.{k}"] for k in INERTIAL]
+        for name in hoist.joints
+        for link, joint in _LINK.items()
+        if joint == name
+    ])  # fmt: skip
+    tau = np.stack([
+        pin.computeJointTorqueRegressor(model, data, _configuration(model, q[i]), v[i], a[i]) @ pi
+        for i in range(len(q))
+    ])  # fmt: skip
+    rigid = tau.copy()
+    for j, name in enumerate(hoist.joints):
+        keys = [k for k in asdict(Drive()) if f"{name}.{k}" in values]
+        drive = Drive(**{k: values[f"{name}.{k}"] for k in keys})
+        tau[:, j] += own(drive, q[:, j], v[:, j], a[:, j], rigid[:, j])
+    return tau
 
 
 # ---- a closed loop ---------------------------------------------------------------------------

@@ -28,7 +28,10 @@ _OF_CHART = 5  # digits: of numbers of 16 bits, or of pixels
 _LONG = 24  # numbers of a list that is told by a few of its own
 _LEFT_OUT = {"versions", "sha256", "seconds", "robotid", "urdf_sha256", "log_sha256", "platform"}
 _NUMBER = re.compile(r"(?<![\w.])[-−+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w]|\.\d)")
-_VARIES = re.compile(r"\b\d+(?:\.\d+)? (?:ms|s|min) of (?:processor|wall)|\d+\.\d+\.\d+|\bin \d+\.\d s\b")
+_VARIES = re.compile(
+    r"\b\d+(?:\.\d+)? (?:ms|s|min) of (?:processor|wall)|\d+\.\d+\.\d+|\bin \d+\.\d s\b"
+    r"|\b\d+\.\d s(?=, \d+ start)"
+)
 
 
 # ---- running ---------------------------------------------------------------------------------
@@ -59,7 +62,9 @@ class Runs:
                 ended = f"{end}: {err.getvalue()}"
         if code is None:
             self.documents[f"{name}, exit code"] = ended
-        assert code in (None, ended), f"robotid {' '.join(words)} ended with {ended}: {err.getvalue()}"
+        assert code in (None, ended), (
+            f"robotid {' '.join(words)} ended with {ended}: {err.getvalue()}"
+        )
         text = out.getvalue()
         if "--json" in words or words[0] == "schema":
             content = json.loads(text)
@@ -236,7 +241,9 @@ def page_content(html):
             charts.append(unpacked(json.loads(text)))
         except ValueError:
             continue
-    drawn = [summary(x, _OF_CHART) for x in page.drawn if len(x) > _LONG]
+    # how long a design took is drawn, too
+    drawn = [] if "design time [s]" in html else page.drawn
+    drawn = [summary(x, _OF_CHART) for x in drawn if len(x) > _LONG]
     return {"texts": page.texts, "charts": charts, "drawings": drawn}
 
 
@@ -244,11 +251,15 @@ def unpacked(value):
     """Return the data of a chart with its packed numbers told by a few figures."""
     if isinstance(value, dict):
         if {"data", "low", "high"} <= value.keys():
-            return summary(numbers_of(value), _OF_CHART) | ({"is_log": True} if value["log"] else {})
+            return summary(numbers_of(value), _OF_CHART) | (
+                {"is_log": True} if value["log"] else {}
+            )
         if {"data", "kind", "shape"} <= value.keys():
             return told_columns(value)
         usual = {"faint": False, "hidden": False, "half": None, "marks": [], "logarithmic": "",
                  "x_names": [], "spans": []}  # fmt: skip
+        if value.get("x_label") == "design time [s]":
+            value = {key: x for key, x in value.items() if key != "x"}
         return {k: unpacked(x) for k, x in value.items() if k not in usual or x != usual[k]}
     return [unpacked(x) for x in value] if isinstance(value, list) else value
 
@@ -352,7 +363,9 @@ def write(name, documents):
 def _dumped(value, indent=""):
     """Return JSON in lines of up to 150 letters where that is possible."""
     whole = json.dumps(value, ensure_ascii=False, sort_keys=True)
-    is_deep = isinstance(value, dict | list) and any(isinstance(x, dict | list | str) for x in value)
+    is_deep = isinstance(value, dict | list) and any(
+        isinstance(x, dict | list | str) for x in value
+    )
     if not is_deep or len(whole) + len(indent) < (150 if isinstance(value, dict) else 100):
         return whole
     more = indent + " "
