@@ -1,0 +1,390 @@
+"""Everything that leaves a command, made comparable with what a file holds of it.
+
+Numbers are compared as numbers, those inside sentences and pages, too; texts exactly. What changes
+from run to run is left out: times taken, versions, hashes, the folder.
+"""
+
+import base64
+import io
+import json
+import math
+import os
+import re
+from contextlib import redirect_stderr, redirect_stdout
+from html.parser import HTMLParser
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+from robotid.cli import main
+
+HERE = Path(__file__).resolve().parents[1] / "figures"
+RELATIVE = 2e-5  # of a figure
+OF_ERROR = 1e-3  # of the standard error that stands beside it
+FLOOR = 1e-6  # of the largest of a list
+_DIGITS = 7
+_OF_CHART = 5  # digits: of numbers of 16 bits, or of pixels
+_LONG = 24  # numbers of a list that is told by a few of its own
+_LEFT_OUT = {"versions", "sha256", "seconds", "robotid", "urdf_sha256", "log_sha256", "platform"}
+_NUMBER = re.compile(r"(?<![\w.])[-−+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w]|\.\d)")
+_VARIES = re.compile(
+    r"\b\d+(?:\.\d+)? (?:ms|s|min) of (?:processor|wall)|\d+\.\d+\.\d+|\bin \d+\.\d s\b"
+    r"|\b\d+\.\d s(?=, \d+ start)"
+)
+
+
+# ---- running ---------------------------------------------------------------------------------
+
+
+class Runs:
+    """Commands in a folder, and what they printed and wrote, by name."""
+
+    def __init__(self, folder):
+        self.folder = Path(folder)
+        self.documents = {}
+
+    def run(self, name, *words, code=0):
+        """Run a command line, keep what it prints under a name, and return it.
+
+        Args:
+            name: The name.
+            words: What follows ``robotid``.
+            code: Exit code that is wanted; None: it is kept, too.
+        """
+        words = [str(word) for word in words]
+        out, err = io.StringIO(), io.StringIO()
+        surroundings = {"COLUMNS": "100", "NO_COLOR": "1"}
+        with mock.patch.dict(os.environ, surroundings), redirect_stdout(out), redirect_stderr(err):
+            try:
+                ended = main(words)
+            except SystemExit as end:  # of words that argparse refuses
+                ended = f"{end}: {err.getvalue()}"
+        if code is None:
+            self.documents[f"{name}, exit code"] = ended
+        assert code in (None, ended), (
+            f"robotid {' '.join(words)} ended with {ended}: {err.getvalue()}"
+        )
+        text = out.getvalue()
+        if "--json" in words or words[0] == "schema":
+            content = json.loads(text)
+            self.documents[name] = self.scrubbed(content)
+        else:
+            content = text
+            self.documents[name] = self.lines(text)
+        if err.getvalue():
+            self.documents[f"{name}, stderr"] = self.lines(err.getvalue())
+        return content
+
+    def keep(self, name, path, part=lambda content: content):
+        """Keep a file that was written, of JSON a part of it, and return its content."""
+        path = self.folder / path
+        text = path.read_text()
+        if path.suffix == ".json":
+            content = json.loads(text)
+            self.documents[name] = self.scrubbed(part(content))
+            return content
+        if path.suffix == ".html":
+            self.documents[name] = self.scrubbed(page_content(text))
+        elif path.suffix == ".csv":
+            self.documents[name] = self.scrubbed(table_content(path))
+        else:
+            self.documents[name] = self.lines(text)
+        return text
+
+    def lines(self, text):
+        """Return the lines of a text, blanks inside them counting as one."""
+        return [line for line in map(self.line, text.split("\n")) if line.strip()]
+
+    def line(self, text):
+        text = text.replace(str(self.folder), "FOLDER")
+        indent = text[: len(text) - len(text.lstrip())]
+        return _shortened(indent + " ".join(_VARIES.sub("...", text).split()))
+
+    def scrubbed(self, value, key=""):
+        """Return a JSON value without what changes from run to run, figures rounded."""
+        if isinstance(value, dict):
+            return {k: self.scrubbed(x, k) for k, x in value.items() if k not in _LEFT_OUT}
+        if isinstance(value, list):
+            if key == "history" and all(isinstance(x, list) for x in value):  # when, how good
+                value = [row[1:] for row in value]
+            if len(value) > _LONG and all(isinstance(x, int | float) for x in value):
+                return summary(value)
+            return [self.scrubbed(x, key) for x in value]
+        if isinstance(value, str):
+            return self.line(value)
+        return rounded(value)
+
+
+def rounded(value, digits=_DIGITS):
+    """Return a number to a few digits; whole numbers and what is none as they are."""
+    if isinstance(value, float) and math.isfinite(value):
+        return float(f"{value:.{digits}g}")
+    return value if not isinstance(value, float) else str(value)
+
+
+def _shortened(text):
+    """Return a text whose numbers of many digits have fewer."""
+
+    def shorter(found):
+        word = found.group()
+        return f"{float(word):.{_DIGITS}g}" if len(re.sub(r"[eE].*|\D", "", word)) > 9 else word
+
+    return _NUMBER.sub(shorter, text)
+
+
+def summary(values, digits=_DIGITS):
+    """Return a few figures that tell an array: sizes, ends, weighted means."""
+    x = np.array([math.nan if v is None else v for v in values], dtype=float)
+    finite = np.isfinite(x)
+    told = {"of": [int(finite.sum()), len(x)]}
+    if not finite.any():
+        return told
+    ramp, y = np.linspace(0, 1, len(x))[finite], x[finite]
+    size = float(np.sqrt(np.mean(y**2)))
+    # first, last, least, most, root mean square, mean, mean along a ramp
+    figures = [y[0], y[-1], y.min(), y.max(), size, y.mean(), np.mean(ramp * y)]
+    return told | {"are": [rounded(float(f), digits) for f in figures]}
+
+
+# ---- files -----------------------------------------------------------------------------------
+
+
+def table_content(path):
+    """Return the columns of a CSV, each told by a few figures."""
+    head, *rows = path.read_text().splitlines()
+    columns = zip(*(row.split(",") for row in rows), strict=True)
+    return {
+        name: summary([float(x) if x else None for x in column])
+        for name, column in zip(head.split(","), columns, strict=True)
+    }
+
+
+class _Page(HTMLParser):
+    """Texts, links and charts of a page."""
+
+    _BLOCKS = {"p", "li", "tr", "h1", "h2", "h3", "h4", "figcaption", "summary", "pre", "dd", "dt",
+               "figure", "div", "section", "header", "caption", "table", "svg", "ol", "ul", "dl"}  # fmt: skip
+
+    def __init__(self):
+        super().__init__()
+        self.texts, self.charts, self.drawn = [], [], []
+        self._line, self._script, self._skips, self._depth = [], None, False, 0
+        self._is_title = False  # of a drawing; its other texts are those of its chart's data
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        if tag in ("script", "style"):
+            self._skips = True
+            is_data = attrs.get("type") == "application/json" or "id" in attrs
+            self._script = [] if tag == "script" and is_data else None
+            return
+        self._is_title = tag == "title"
+        if tag == "svg":
+            self._depth += 1
+            if self._depth == 1:
+                self.drawn.append([])
+        if self._depth:
+            for key, value in attrs.items():
+                if key not in ("id", "href", "viewbox", "aria-labelledby", "class", "role"):
+                    self.drawn[-1] += [float(x) for x in _COORDINATE.findall(value or "")]
+        if tag in self._BLOCKS:
+            self._end_line()
+        elif tag != "wbr":  # which breaks words
+            self._line.append(" ")
+        for key in ("aria-label", "title", "href", "style"):
+            if attrs.get(key) and not (key == "href" and attrs[key].startswith("#")):
+                self._line.append(f"[{attrs[key]}] ")
+        if tag in ("td", "th"):
+            self._line.append("| ")
+        if tag in ("tr", "div", "td") and attrs.get("class"):
+            self._line.append(f"({attrs['class']}) ")
+
+    def handle_endtag(self, tag):
+        self._is_title = False
+        if tag in ("script", "style"):
+            if self._script:
+                self.charts.append("".join(self._script))
+            self._skips, self._script = False, None
+        if tag == "svg":
+            self._depth -= 1
+        if tag in self._BLOCKS:
+            self._end_line()
+        else:
+            self._line.append(" ")
+
+    def handle_data(self, data):
+        if self._script is not None:
+            self._script.append(data)
+        elif not self._skips and (not self._depth or self._is_title):
+            self._line.append(data)
+
+    def _end_line(self):
+        line = " ".join("".join(self._line).split())
+        if line:
+            self.texts.append(line)
+        self._line = []
+
+
+_COORDINATE = re.compile(r"-?\d+\.?\d*")
+
+
+def page_content(html):
+    """Return what a page shows: texts, charts' data, and a few figures of each drawing."""
+    page = _Page()
+    page.feed(html)
+    page.close()
+    page._end_line()
+    charts = []
+    for text in page.charts:
+        try:
+            charts.append(unpacked(json.loads(text)))
+        except ValueError:
+            continue
+    # how long a design took is drawn, too
+    drawn = [] if "design time [s]" in html else page.drawn
+    drawn = [summary(x, _OF_CHART) for x in drawn if len(x) > _LONG]
+    return {"texts": page.texts, "charts": charts, "drawings": drawn}
+
+
+def unpacked(value):
+    """Return the data of a chart with its packed numbers told by a few figures."""
+    if isinstance(value, dict):
+        if {"data", "low", "high"} <= value.keys():
+            return summary(numbers_of(value), _OF_CHART) | (
+                {"is_log": True} if value["log"] else {}
+            )
+        if {"data", "kind", "shape"} <= value.keys():
+            return told_columns(value)
+        usual = {"faint": False, "hidden": False, "half": None, "marks": [], "logarithmic": "",
+                 "x_names": [], "spans": []}  # fmt: skip
+        if value.get("x_label") == "design time [s]":
+            value = {key: x for key, x in value.items() if key != "x"}
+        return {k: unpacked(x) for k, x in value.items() if k not in usual or x != usual[k]}
+    return [unpacked(x) for x in value] if isinstance(value, list) else value
+
+
+def told_columns(packed):
+    """Return a few figures of each column of an array of a replay, at most eight of them."""
+    data = np.frombuffer(base64.b64decode(packed["data"]), dtype=packed["kind"]).astype(float)
+    columns = data.reshape(packed["shape"][0], -1).T
+    told = [summary(column, _OF_CHART) for column in columns[:8]]
+    return {"shape": packed["shape"], "columns": told}
+
+
+def numbers_of(packed):
+    """Return the numbers that a page packs, NaN for none."""
+    bits = packed["bits"]
+    codes = np.frombuffer(base64.b64decode(packed["data"]), dtype=f"<u{bits // 8}").astype(float)
+    last = 2**bits - 1
+    values = packed["low"] + codes / (last - 1) * (packed["high"] - packed["low"])
+    values[codes == last] = np.nan
+    return 10**values if packed["log"] else values
+
+
+# ---- comparing -------------------------------------------------------------------------------
+
+
+def differences(stored, found, at="", scale=0.0, error=0.0):
+    """Yield where two values differ, and how."""
+    if isinstance(stored, dict) and isinstance(found, dict):
+        for key in sorted(stored.keys() | found.keys()):
+            if key not in found or key not in stored:
+                yield f"{at}/{key}: {'gone' if key in stored else 'new'}"
+                continue
+            beside = stored.get("std_error")
+            beside = OF_ERROR * beside if isinstance(beside, int | float) else error
+            yield from differences(stored[key], found[key], f"{at}/{key}", 0.0, beside)
+    elif isinstance(stored, list) and isinstance(found, list):
+        if len(stored) != len(found):
+            yield f"{at}: {len(stored)} entries stored, {len(found)} found"
+        largest = max((abs(x) for x in stored if _is_number(x)), default=0.0)
+        for i, (x, y) in enumerate(zip(stored, found, strict=False)):
+            yield from differences(x, y, f"{at}/{i}", largest, error)
+    elif _is_number(stored) and _is_number(found):
+        if isinstance(stored, int) and isinstance(found, int):
+            is_same = stored == found
+        else:
+            room = RELATIVE * max(abs(stored), abs(found)) + FLOOR * scale + error + 1e-12
+            is_same = abs(stored - found) <= room
+        if not is_same:
+            yield f"{at}: {stored} stored, {found} found"
+    elif isinstance(stored, str) and isinstance(found, str):
+        if not same_text(stored, found):
+            yield f"{at}: stored, found\n    {stored}\n    {found}"
+    elif stored != found or type(stored) is not type(found):
+        yield f"{at}: {stored!r} stored, {found!r} found"
+
+
+def _is_number(x):
+    return isinstance(x, int | float) and not isinstance(x, bool)
+
+
+def same_text(stored, found):
+    """Return whether two texts are the same but for the last digit of a number that has decimals."""
+    if stored == found:
+        return True
+    if _NUMBER.sub("#", stored) != _NUMBER.sub("#", found):
+        return False
+    pairs = zip(_NUMBER.finditer(stored), _NUMBER.finditer(found), strict=True)
+    return all(_same_number(x, y) for x, y in pairs)
+
+
+def _same_number(stored, found):
+    a, b = (x.group().replace("−", "-") for x in (stored, found))
+    if a == b:
+        return True
+    if re.fullmatch(r"[-+]?\d+", a) and re.fullmatch(r"[-+]?\d+", b):  # a count, or of few digits
+        behind = stored.string[stored.end() : stored.end() + 2]
+        return behind.strip()[:1] in ("%", "°") and abs(int(a) - int(b)) <= 1
+    unit = max(_last_digit(a), _last_digit(b))
+    return abs(float(a) - float(b)) <= 1.01 * unit + RELATIVE * abs(float(a)) + 1e-9
+
+
+def _last_digit(word):
+    """Return what one of the last digit of a printed number is worth."""
+    mantissa, _, power = word.lower().partition("e")
+    decimals = len(mantissa.partition(".")[2])
+    return 10.0 ** (int(power or 0) - decimals)
+
+
+# ---- storing ---------------------------------------------------------------------------------
+
+
+def path_of(name):
+    return HERE / f"{name}.json"
+
+
+def write(name, documents):
+    """Write the documents of a scenario, keys sorted, a list of numbers on one line."""
+    path_of(name).write_text(_dumped(documents) + "\n")
+
+
+def _dumped(value, indent=""):
+    """Return JSON in lines of up to 150 letters where that is possible."""
+    whole = json.dumps(value, ensure_ascii=False, sort_keys=True)
+    is_deep = isinstance(value, dict | list) and any(
+        isinstance(x, dict | list | str) for x in value
+    )
+    if not is_deep or len(whole) + len(indent) < (150 if isinstance(value, dict) else 100):
+        return whole
+    more = indent + " "
+    if isinstance(value, dict):
+        items = [f"{more}{json.dumps(k)}: {_dumped(value[k], more)}" for k in sorted(value)]
+        return "{\n" + ",\n".join(items) + "\n" + indent + "}"
+    return "[\n" + ",\n".join(more + _dumped(x, more) for x in value) + "\n" + indent + "]"
+
+
+def check(name, documents):
+    """Fail with all that differs from what is stored of a scenario."""
+    stored = json.loads(path_of(name).read_text())
+    # as a file has them: keys are texts, tuples are lists
+    found = json.loads(json.dumps(documents))
+    odd = list(differences(stored, found))
+    more = f"\n... and {len(odd) - 30} more" if len(odd) > 30 else ""
+    assert not odd, (
+        f"figures of {name} differ from tests/figures/{name}.json; if the change is meant, run "
+        f"`python tests/figures/write.py {name}` and look at the diff:\n"
+        + "\n".join(odd[:30])
+        + more
+    )
