@@ -7,7 +7,7 @@ from helpers.mujoco_plant import held, multisine, plant, recorded
 from helpers.single_joint import slider
 
 from robotid.closed_loop.evaluation import position_metrics, run_open_loop
-from robotid.closed_loop.fit import stated_loops
+from robotid.closed_loop.fit import fit_loops, stated_loops
 from robotid.closed_loop.gain_check import gain_scale
 from robotid.closed_loop.identify import identify_loops, with_gravity
 from robotid.closed_loop.second_order import SecondOrder
@@ -260,7 +260,7 @@ def test_of_many_scales_that_suit_the_positions_the_urdfs_is_taken():
     robot = plant("planar", rng)
     log, truth = recorded(robot, rng, duration=3.0, rate=250.0, step=2e-4)
     settings, loop = replace(COARSE, bodies=0.1), LoopSettings(delays="group")
-    fitted = identify_loops(robot.model, [log], [], loop, settings, chooses=False).fit
+    fitted = fit_loops(robot.model, [log], loop, settings, chooses=False)
     gains = [unknown.what == "kp" for unknown in fitted.simulator.unknowns]
     exact = np.array([truth[name] for name in np.array(fitted.estimate.names)[gains]])
     np.testing.assert_allclose(fitted.estimate.theta[gains], exact, rtol=0.02)

@@ -22,8 +22,8 @@ HELD = "wrist_3_joint"
 def job(ur5, rng, tmp_path):
     """Hold the last joint, which the log says to be at 0.7 rad; or to move, if not still."""
 
-    def make(stated, *, still=True, **options):
-        log = exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0, noise=0.1)
+    def make(stated, *, still=True, samples=600, **options):
+        log = exact_log(ur5, truth(ur5), rng, samples=samples, rate=100.0, noise=0.1)
         if still:
             q, v = log.q.copy(), log.v.copy()
             q[:, -1], v[:, -1] = 0.7, 0.0
@@ -69,8 +69,6 @@ def test_a_joint_that_nobody_placed_is_locked_where_the_logs_have_it(job, tmp_pa
     assert (note.severity, note.where) == ("note", HELD)
     assert "wrist_3_joint = 0.7" in note.message
     assert "locked_at_zero" not in {f.code for f in identification.findings}
-    stated, _ = run_job(replace(unplaced, locked={HELD: 0.7}), tmp_path / "stated")
-    np.testing.assert_array_equal(identification.standard, stated.standard)
 
 
 def test_a_mimic_joint_is_placed_with_its_leader(job):
@@ -104,11 +102,10 @@ def test_a_joint_that_stands_where_it_is_said_to_is_not_named(job):
     assert found(job(0.7)) == []
 
 
-@pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_held_joints_are_checked_in_logs_read_in_pieces_too(job, tmp_path, suffix, monkeypatch):
+def test_held_joints_are_checked_in_logs_read_in_pieces_too(job, tmp_path, monkeypatch):
     monkeypatch.setattr("robotid.fitting.survey._WINDOW", 300)
-    short = job(0.5)
-    path = tmp_path / f"run.{suffix}"
+    short = job(0.5, samples=1000)
+    path = tmp_path / "run.parquet"
     write_log(read_log(tmp_path / "run.csv", (*short.model().joints, HELD)), path)
     short = replace(short, identification=(LogEntry(path),))
     long = replace(short, rows_in_memory=512)

@@ -50,11 +50,9 @@ def test_a_hand_that_was_not_mounted_is_named():
     assert loud(panda, recorded(panda, 0)) == []
 
 
-@pytest.mark.parametrize("name", ["ur5", "tiago"])
-def test_a_load_in_the_validation_log_only_is_weighed(name):
-    model, size = robot(name), robot(name).layout.n_inertial
-    pi = another_robot(model, np.random.default_rng(0))
-    fitted, other = (clean_log(model, seed, pi=pi, duration=10.0) for seed in (0, 1))
+def test_a_load_in_the_validation_log_only_is_weighed(arm_and_log):
+    model, fitted, other = arm_and_log
+    size, pi = model.layout.n_inertial, another_robot(model, np.random.default_rng(0))
     assert loud(model, fitted, [other]) == []
     loaded = pi.copy()
     last = loaded[:size].reshape(-1, 10)[-1]

@@ -175,10 +175,10 @@ def test_logs_are_given_one_or_several_of_every_kind(ur5, tmp_path, rng):
 
 def test_identify_takes_paths_and_frames_and_finds_what_it_finds_in_logs(ur5, tmp_path, rng):
     first, second = (
-        exact_log(ur5, truth(ur5), rng, samples=700, rate=100.0, noise=0.1) for _ in range(2)
+        exact_log(ur5, truth(ur5), rng, samples=200, rate=50.0, noise=0.1) for _ in range(2)
     )
     write_log(first, tmp_path / "first.csv")
-    settings = robotid.EstimatorSettings(draws=0)
+    settings = robotid.EstimatorSettings("wls")
     one = robotid.identify(ur5, [first], validation=[second], estimator=settings)
     other = robotid.identify(
         ur5.tree.path, tmp_path / "first.csv", validation=frame_of(second), estimator=settings

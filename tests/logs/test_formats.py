@@ -7,7 +7,6 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from helpers.fitting import identify
 from helpers.recorders import (
     StoragePlugin,
     messages_of,
@@ -18,7 +17,6 @@ from helpers.recorders import (
     write_mat73,
     write_mcap,
 )
-from helpers.synthetic import exact_log, truth
 from mcap.writer import Writer as McapLibraryWriter
 
 from robotid.exceptions import DataError, MissingDependencyError, SettingsError
@@ -126,23 +124,6 @@ def test_what_the_library_wrote_is_read_unchanged(tmp_path, write):
     assert_same(back, log)
     assert (back.joints, back.path, back.notes) == (JOINTS, str(path), ())
     assert_same(read_log(path, JOINTS[::-1]), log.select(JOINTS[::-1]))
-
-
-@pytest.fixture(scope="module")
-def reference(ur5, tmp_path_factory):
-    """A log of the UR5 and what is identified from its CSV file."""
-    log = replace(exact_log(ur5, truth(ur5), np.random.default_rng(0), noise=0.1), a=None)
-    path = tmp_path_factory.mktemp("csv") / "run.csv"
-    write_log(log, path)
-    return log, identify(ur5, [read_log(path, ur5.joints)]).standard
-
-
-@pytest.mark.parametrize("name", ["mcap", "ros2 folder", "ros1", "npz", "hdf5", "mat struct",
-                                  "mat 7.3"])  # fmt: skip
-def test_the_estimate_is_that_of_the_csv_file(tmp_path, ur5, reference, name):
-    log, pi = reference
-    back = read_log(FORMATS[name](tmp_path, log), ur5.joints)
-    np.testing.assert_array_equal(identify(ur5, [back]).standard, pi)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".h5", ".hdf5", ".mat"])

@@ -246,8 +246,8 @@ def test_a_robot_that_sticks_is_predicted_as_well_as_its_noise_allows(ur5):
 def test_estimates_from_filtered_logs_scatter_as_their_standard_errors_say(ur5):
     """Coulomb, viscous and armature of clean logs were off by 1.5 to 2.5 standard errors."""
     pi, deviations = truth(ur5), []
-    for seed in range(4):
-        log = exact_log(ur5, pi, np.random.default_rng(seed), samples=4000, rate=200.0)
+    for seed in range(3):
+        log = exact_log(ur5, pi, np.random.default_rng(seed), samples=3000, rate=200.0)
         noise = 0.01 * np.random.default_rng(10 + seed).standard_normal(log.tau.shape)
         found = fit(ur5, [replace(log, tau=log.tau + noise)], estimator="wls")
         names = found.mapping.base_names

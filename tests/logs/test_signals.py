@@ -205,3 +205,20 @@ def test_a_log_without_velocity_cannot_use_it():
 def test_a_log_too_short_for_its_trim_is_refused():
     with pytest.raises(DataError, match="none of its 1 uninterrupted stretches is long enough"):
         process(sine_log(np.arange(0, 0.3, 0.01)), SignalSettings(trim=0.2))
+
+
+@pytest.mark.parametrize(
+    ("step", "cutoff", "gap"),
+    [
+        (0.01, 5.0, 0.05),  # a quarter of the filter's period
+        (0.01, 20.0, 0.025),  # two and a half steps
+        (0.04, 5.0, 0.1),
+        (0.04, None, 0.1),
+    ],
+)
+def test_a_gap_is_longer_than_steps_and_than_a_share_of_the_filters_period(step, cutoff, gap):
+    log = sine_log(np.arange(0.0, 20.0, step) + 3.0)
+    found = resolve(log, SignalSettings(cutoff=cutoff))
+    assert found.max_gap == pytest.approx(gap)
+    assert found.rate == (None if cutoff is None else pytest.approx(1.0 / step))
+    assert resolve(log, SignalSettings(cutoff=cutoff, max_gap=0.7)).max_gap == 0.7

@@ -4,11 +4,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.signal import butter
 
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process, resolve
-from robotid.logs.smoothing import SPLINE, Stretch, filter_reach, process_stretches
+from robotid.logs.smoothing import SPLINE, Stretch, _Grid, filter_reach, process_stretches
 
 RATE = 200.0  # [Hz]
 PART = 700  # rows
@@ -110,3 +111,41 @@ def test_rows_that_a_part_does_not_own_are_cut_off_behind_the_filter(rng):
     assert filter_reach(resolve(log, SignalSettings(torque_delay=-0.4))) == pytest.approx(
         reach + 0.4
     )
+
+
+@pytest.mark.parametrize(
+    ("order", "cutoff", "rate"), [(1, 3.0, 50.0), (4, 40.0, 100.0), (5, 8.0, 300.0)]
+)
+def test_a_filter_reaches_until_nothing_is_left_of_its_slowest_pole(order, cutoff, rate):
+    """At the rate of the log and on a grid as fine as may be, whichever is slower."""
+
+    def slowest(rate):
+        poles = butter(order, cutoff, fs=rate, output="zpk")[1]
+        return -1.0 / (np.log(np.abs(poles)).max() * rate)
+
+    settings = SignalSettings(
+        order=order, cutoff=cutoff, rate=rate, torque_delay=-0.03, velocity_delay=0.02
+    )
+    wanted = 0.03 + 2 * 42.0 * max(slowest(rate), slowest(1e3 * rate)) + 8.0 / cutoff
+    assert filter_reach(settings) == pytest.approx(wanted, rel=1e-5)
+
+
+def test_points_of_a_grid_are_numbered_from_its_start():
+    stretch = Stretch(first=3, stop=904, start=1234.5, end=1243.5, number=2)
+    grid = _Grid.of(stretch, SignalSettings(rate=30.0, cutoff=5.0))
+    # 100 rows a second are decimated after the filter: every third of 90 points a second
+    assert (grid.keep_every, grid.count) == (3, 811)
+    assert grid.rate == pytest.approx(90.0)
+    assert (grid.start, grid.last) == (1234.5, pytest.approx(1243.5))
+    for k in (0, 1, 7, 400, 810):
+        t = float(grid.at(np.array(k)))
+        assert t == pytest.approx(1234.5 + k / 90.0)
+        assert [grid.number_of(t - 1e-3), grid.number_of(t), grid.number_of(t + 1e-3)] == [
+            k,
+            k,
+            k + 1,
+        ]
+    coarse = _Grid.of(stretch, SignalSettings(rate=30.0, cutoff=None))
+    assert (coarse.keep_every, coarse.count, coarse.rate) == (1, 271, pytest.approx(30.0))
+    rows = _Grid.of(stretch, SignalSettings(rate=None, cutoff=None))
+    assert (rows.step, rows.count, rows.start, rows.last) == (None, 901, 1234.5, 1243.5)

@@ -64,3 +64,29 @@ def test_fast_moves_between_poses_are_left_out_with_what_is_beside_them():
     np.testing.assert_allclose(motion.q, [[0, 0], [1, -0.8], [0, 0]], atol=1e-12)
     fast, _ = means(log_of(np.arange(400) / 100, np.linspace(0, 4, 400)[:, None] * [1, 1]))
     assert fast.t.size == 0
+
+
+def test_speeds_are_0_on_both_sides_of_where_a_joint_turns_round_or_sets_out():
+    row = np.arange(200)  # eight stretches of 25 rows
+    turning = 0.03 * 0.01 * np.minimum(row, 199 - row)  # between the fourth and the fifth
+    leaving = 0.04 * 0.01 * np.maximum(row - 49, 0)  # between the second and the third
+    for sign in (1.0, -1.0):
+        q = sign * np.column_stack([turning, leaving])
+        motion, stands = means(log_of(3.7 + row / 100, q))
+        assert not stands.any()
+        v = [[0.03] * 3 + [0, 0] + [-0.03] * 3, [0, 0, 0] + [0.04] * 5]
+        np.testing.assert_allclose(sign * motion.v, np.transpose(v), atol=1e-12)
+        np.testing.assert_allclose(motion.t, 3.7 + 0.12 + 0.25 * np.arange(8))
+        np.testing.assert_allclose(motion.q, q.reshape(8, 25, 2).mean(axis=1))
+        assert not motion.a.any()
+        assert motion.rate is None
+
+
+def test_the_slope_of_a_short_stretch_counts_as_far_as_it_goes():
+    """Half of a quarter of a second is enough; of less, the speed counts by its share of that."""
+    for rows, share in ((3, 0.02 / 0.125), (10, 0.09 / 0.125), (14, 1.0), (25, 1.0)):
+        t = 5.0 + np.concatenate([np.arange(rows), 100 + np.arange(25)]) / 100
+        motion, _ = means(log_of(t, np.outer(t, [0.05, -0.08])))
+        wanted = np.outer([share, 1.0], [0.05, -0.08])
+        np.testing.assert_allclose(motion.v, wanted, rtol=1e-9)
+        assert motion.segment.tolist() == [0, 1]

@@ -43,7 +43,7 @@ def test_its_gradient_is_that_of_differences_by_each_joint(model):
     found = regressor.pull(*x, weights)
     h = 1e-6
     for kind in range(3):
-        for joint in range(len(model.joints)):
+        for joint in rng.permutation(len(model.joints))[:8]:
             up, down = x.copy(), x.copy()
             up[kind, :, joint] += h
             down[kind, :, joint] -= h

@@ -7,7 +7,7 @@ from helpers.robots import JOINT, LINK, ROBOTS, mimicking, motion
 from robotid.estimators import WLS
 from robotid.exceptions import DataError
 from robotid.logs.data import Trajectory
-from robotid.regressor import compiled, rows
+from robotid.regressor import compiled, factors, rows
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_speeds
 from robotid.regressor.factors import compress
@@ -96,11 +96,12 @@ def test_quarter_turns_keep_their_digits(ur5, rng):
     assert_is_pinocchio(ur5, trajectory)
 
 
-@pytest.fixture(scope="module")
-def long_log(panda):
+@pytest.fixture
+def long_log(panda, monkeypatch):
     """Three parts, the last one short, weights of a mask."""
+    monkeypatch.setattr(factors, "_PART", 2048)
     rng = np.random.default_rng(1)
-    trajectory = motion(panda, rng, 2 * 16384 + 777)
+    trajectory = motion(panda, rng, 2 * 2048 + 777)
     return trajectory, rng.choice([0.0, 1.0, 4.0], trajectory.v.shape)
 
 

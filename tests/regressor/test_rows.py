@@ -15,7 +15,7 @@ from robotid.robot.drives import LoadFriction
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
-SAMPLES = 700  # more than a block
+SAMPLES = 300  # more than two blocks
 
 
 def blocks(model, trajectory, weight, part):
@@ -36,7 +36,7 @@ def test_rows_and_predictions_are_those_without_what_is_kept(name, rng, monkeypa
     assert kept_rows(model, fresh) is None
     assert kept_rows(model, kept) is not None
     weight = rng.uniform(0.5, 2.0, (SAMPLES, model.n_rows))
-    pairs = [blocks(model, m, weight, (100, 650)) for m in (fresh, kept)]
+    pairs = [blocks(model, m, weight, (100, 280)) for m in (fresh, kept)]
     for wanted, found in zip(*pairs, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
     vectors = [possible_parameters(model, rng) for _ in range(2)]
@@ -45,7 +45,7 @@ def test_rows_and_predictions_are_those_without_what_is_kept(name, rng, monkeypa
         np.testing.assert_allclose(found, wanted, atol=1e-9 * np.abs(wanted).max())
     whole, every = (trajectory_regressor(model, m) for m in (fresh, kept))
     np.testing.assert_allclose(every, whole, atol=1e-12 * np.abs(whole).max())
-    some = np.array([650, 3, 128])  # of samples that are taken out
+    some = np.array([280, 3, 128])  # of samples that are taken out
     wanted = whole.reshape(SAMPLES, model.n_rows, -1)[some].reshape(-1, whole.shape[1])
     for m in (fresh, kept):
         found = trajectory_regressor(model, m, some)

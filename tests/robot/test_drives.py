@@ -101,7 +101,7 @@ def drive_part(model):
 
 def log_of(model, pi, rng):
     """Return a log of exact torques, those of what drives remember among them."""
-    log = exact_log(model, pi, rng)
+    log = exact_log(model, pi, rng, samples=200)
     motion = remember(model, process(log, EXACT))
     return Log(t=log.t, q=log.q, v=log.v, a=log.a, joints=log.joints,
                tau=predict(model, [pi], motion)[0])  # fmt: skip
@@ -204,8 +204,9 @@ def test_friction_that_holds_any_load_is_refused_by_the_plant():
                          ids=lambda term: term.name)  # fmt: skip
 def test_a_simulated_robot_is_identified(model, rng):
     pi = truth(model)
-    log = simulate(model, pi, random_fourier(model, rng), rate=250.0, duration=4.0, rng=rng)
-    found = identify(model, [log], signals=SignalSettings(cutoff=20.0), estimator="wls")
+    log = simulate(model, pi, random_fourier(model, rng), rate=200.0, duration=3.0, rng=rng)
+    signals = SignalSettings(cutoff=20.0)
+    found = identify(model, [log], signals=signals, estimator="wls", doctor=False)
     beta = found.mapping.to_base(pi)
     assert np.linalg.norm(found.base - beta) < 0.02 * np.linalg.norm(beta)
 

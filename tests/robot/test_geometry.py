@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
+from helpers.fitting import fit
 from helpers.hostile_urdfs import FILES
 from helpers.synthetic import exact_log, truth
 
 from robotid.doctor.urdf import inspect_urdf
 from robotid.exceptions import SettingsError
 from robotid.fitting.settings import EstimatorSettings
-from robotid.identification.pipeline import identify
 from robotid.logs.settings import SignalSettings
 from robotid.robot.geometry import (
     body_boxes,
@@ -121,11 +121,11 @@ def test_half_spaces_hold_every_point_and_touch_the_hull(rng):
 
 def test_the_centres_of_mass_of_a_real_arm_stay_in_its_meshes(ur5, rng):
     noise = 20 * np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])
-    log = exact_log(ur5, truth(ur5), rng, noise=noise)
+    log = exact_log(ur5, truth(ur5), rng, samples=200, noise=noise)
     settings = EstimatorSettings(prior_weight=0.01, constraints={"com_within": "hull"})
     exact = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-    found = identify(ur5, [log], signals=exact, estimator=settings)
-    free = identify(ur5, [log], signals=exact, estimator=EstimatorSettings(prior_weight=0.01))
+    found = fit(ur5, [log], signals=exact, estimator=settings)
+    free = fit(ur5, [log], signals=exact, estimator=EstimatorSettings(prior_weight=0.01))
     spaces = geometry_half_spaces(ur5, "hull")
     assert set(spaces) == set(ur5.layout.bodies)
 

@@ -243,7 +243,7 @@ def differences(model, loops, log, change, h):
 )
 def test_sensitivities_are_those_of_differences(request, name, rate, terms):
     model = request.getfixturevalue(name)
-    robot, log = LoopedRobot(model), commanded(model, 0.3 if terms is TERMS else 0.12)
+    robot, log = LoopedRobot(model), commanded(model, 0.12)
     size = 1.0 if name == "legs" else 30.0
     n, kinds = len(model.joints), LoopedRobot(model).kinds
     values = VALUES if terms is TERMS else (0.1, 0.05, 0.1, 0.15, 0.1)

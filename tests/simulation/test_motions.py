@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from robotid.exceptions import DataError, SettingsError
-from robotid.simulation.motions import ProgramMotion, SampledMotion
+from robotid.robot.model import RobotModel
+from robotid.simulation.motions import ProgramMotion, SampledMotion, random_fourier
 
 
 def test_a_motion_of_seven_joints_has_the_coefficients_of_equation_28():
@@ -64,3 +65,38 @@ def test_what_cannot_be_a_motion_is_named(message):
     error, arguments = ERRORS[message]
     with pytest.raises(error, match=f"^{re.escape(message)}$"):
         ProgramMotion(*arguments)
+
+
+LIMITS = """<robot name="three"><link name="base"/>{bodies}
+<joint name="near" type="revolute"><parent link="base"/><child link="a"/><axis xyz="0 1 0"/>
+<limit lower="-0.5" upper="2.0" effort="1" velocity="0.7"/></joint>
+<joint name="free" type="continuous"><parent link="a"/><child link="b"/><axis xyz="1 0 0"/></joint>
+<joint name="rail" type="prismatic"><parent link="b"/><child link="c"/><axis xyz="0 0 1"/>
+<limit lower="-0.2" upper="1.0" effort="1" velocity="{fast}"/></joint></robot>"""
+BODY = """<link name="{}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0"
+ixz="0" iyz="0"/></inertial></link>"""
+
+
+@pytest.mark.parametrize(
+    ("period", "fast", "centre", "bounds"),
+    [
+        # long: positions reach nine tenths of the nearer limit, at most 1.2 rad or 0.15 m
+        (500.0, 2.0, None, [0.9 * 1.25, 1.2, 0.15]),
+        (500.0, 2.0, [1.5, 7.0, -0.1], [0.9 * 0.5, 1.2, 0.9 * 0.1]),
+        (500.0, 2.0, [-0.1, 7.0, 0.95], [0.9 * 0.4, 1.2, 0.9 * 0.05]),
+        # short: speeds are nine tenths of the limit, at most 1.5 rad/s or 0.3 m/s
+        (0.01, 2.0, None, [0.9 * 0.7, 1.5, 0.3]),
+        (0.01, 0.2, None, [0.9 * 0.7, 1.5, 0.9 * 0.2]),
+    ],
+)
+def test_a_random_motion_is_as_large_as_it_may(tmp_path, rng, period, fast, centre, bounds):
+    path = tmp_path / "three.urdf"
+    path.write_text(LIMITS.format(bodies="".join(map(BODY.format, "abc")), fast=fast))
+    given = None if centre is None else np.array(centre)
+    motion = random_fourier(RobotModel.from_urdf(path), rng, period=period, centre=given)
+    mean = np.array([0.75, 0.0, 0.4] if centre is None else centre)
+    np.testing.assert_allclose(motion.q0, mean)
+    assert (motion.period, motion.sine.shape) == (period, (5, 3))
+    q, v, _ = motion.evaluate(np.linspace(0.0, period, 1000))
+    found = np.abs(q - mean if period > 1 else v).max(axis=0)
+    np.testing.assert_allclose(found, bounds, rtol=1e-9)
