@@ -2,9 +2,11 @@
 
 import pickle
 import re
+from functools import partial
 
 import numpy as np
 import pytest
+from helpers import driven as helper
 from helpers.driven import (
     ELBOW,
     EXACT,
@@ -14,8 +16,6 @@ from helpers.driven import (
     arm,
     driven,
     driven_log,
-    fitted_in,
-    found_in,
 )
 
 from robotid.commands.job import job_from_settings
@@ -38,6 +38,7 @@ from robotid.regressor.prediction import predict
 from robotid.robot.drives import FAMILIES, DriveMotion, Harmonic, LoadFriction, Stribeck, Tanh
 from robotid.robot.families import AUTO, wanted_families
 
+found_in, fitted_in = (partial(f, estimator="wls") for f in (helper.found_in, helper.fitted_in))
 SEED, REACH = 3, 1.5  # of the motion: the elbow turns more than half a turn
 SURE = 2.6  # standard errors, of a few hundred figures that are looked at
 SEEN = {"q": (-1.58, 1.80), "v": (0.03, 1.53)}  # of the elbow in this motion
@@ -101,7 +102,9 @@ def friction(true, pi, v, load):
 @pytest.mark.parametrize("name", CASES)
 def test_a_family_that_is_stated_is_found_within_its_intervals(plain, cases, name):
     true, pi, log = cases(name)
-    found = found_in(plain, [log], friction={ELBOW: name, "*": "none"})
+    # least squares alone does not tell the parts of a curve from viscous friction
+    finds = helper.found_in if name == "curve" else found_in
+    found = finds(plain, [log], friction={ELBOW: name, "*": "none"})
     (choice,) = found.drives
     assert (choice.joint, choice.families) == (ELBOW, (name,))
     for shape, size in zip(choice.shapes, CASES[name][0], strict=True):
@@ -164,7 +167,7 @@ def rising(plain):
     """Friction that sets in over most of the speeds: a hook of Stribeck's fits nearly as well."""
     terms = [Tanh(speed=0.6 * SEEN["v"][1])]
     true, pi = driven(plain, {ELBOW: terms}, {f"{ELBOW}.tanh": 14.0})
-    return found_in(plain, [driven_log(true, pi, SEED, reach=REACH, noise=0.03)])
+    return helper.found_in(plain, [driven_log(true, pi, SEED, reach=REACH, noise=0.03)])
 
 
 def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
@@ -179,7 +182,7 @@ def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
     assert abs(shares[0] - shares[1]) < 0.02
     assert last["stribeck"].chance < 0.015
     assert not any(shape.is_at_bound for shape in choice.shapes)
-    stated = found_in(plain, rising_logs(rising), friction={ELBOW: "stribeck", "*": "none"})
+    stated = helper.found_in(plain, rising_logs(rising), friction={ELBOW: "stribeck", "*": "none"})
     (other,) = (c for c in stated.drives if c.families)
     assert other.shapes[0].is_at_bound
     assert other.grown[f"{ELBOW}.coulomb"] > 10.0 > choice.grown[f"{ELBOW}.coulomb"]
@@ -334,13 +337,13 @@ def test_a_joint_that_moves_in_one_of_several_logs_is_judged_by_that(plain, case
     true, pi, _ = cases("stribeck")
     logs = [driven_log(true, pi, seed, reach=REACH, still=still)
             for seed, still in ((4, (1,)), (SEED, (0,)), (5, (1,)))]  # fmt: skip
-    found = found_in(plain, logs)
+    found = helper.found_in(plain, logs)
     assert chosen(found) == {ELBOW: ("stribeck",)}
     k = list(found.model.layout.names).index(f"{ELBOW}.stribeck")
     assert abs(found.standard[k] - 3.0) < 3.0 * found.standard_error[k]
     assert found.standard_error[k] < 0.3
     still = [driven_log(true, pi, seed, reach=REACH, still=(1,)) for seed in (4, 5)]
-    found = found_in(plain, still)
+    found = helper.found_in(plain, still)
     assert ELBOW not in {choice.joint for choice in found.drives}
     assert chosen(found) == {}
 

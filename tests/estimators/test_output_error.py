@@ -108,11 +108,11 @@ def test_the_condition_is_that_of_the_slopes_of_unit_columns(rng):
 
 def test_standard_errors_are_the_scatter_of_many_noises():
     rng = np.random.default_rng(5)
-    draws = [OutputError().fit(lagging(rng), TRUTH) for _ in range(100)]
+    draws = [OutputError().fit(lagging(rng, windows=12), TRUTH) for _ in range(60)]
     theta = np.array([d.theta for d in draws])
     ratio = np.mean([d.std_error for d in draws], axis=0) / theta.std(axis=0)
     assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
-    bias = (theta.mean(axis=0) - TRUTH) / (theta.std(axis=0) / np.sqrt(100))
+    bias = (theta.mean(axis=0) - TRUTH) / (theta.std(axis=0) / np.sqrt(60))
     assert np.abs(bias).max() < 4
 
 
@@ -340,8 +340,8 @@ def test_standard_errors_of_what_drifts_are_the_scatter_of_many_drifts():
     """What an input's noise adds up to: whitening leaves much of it, as long as a window goes."""
     rng = np.random.default_rng(9)
     draws = []
-    for _ in range(100):
-        lag = lagging(rng, windows=20, samples=240)
+    for _ in range(60):
+        lag = lagging(rng, windows=20, samples=160)
         drift = 0.002 * np.cumsum(rng.standard_normal(lag.told.shape), axis=1)
         own = {**vars(lag), "measured": lag.simulated(TRUTH) + drift}
         draws.append(OutputError(frees=True, rounds=2).fit(Started(**own), TRUTH))

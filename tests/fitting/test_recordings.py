@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
 
 from robotid.fitting.recordings import Recordings
@@ -19,11 +20,11 @@ from robotid.regressor.base_parameters import structural_mapping
     ],
 )
 def test_all_logs_together_have_48_stretches_of_ten_correlation_times_or_more(
-    ur5, rng, cutoff, sizes, stretches
+    rng, cutoff, sizes, stretches
 ):
-    signals = SignalSettings(cutoff=cutoff, trim=0.0, min_velocity=0.0)
-    logs = [hold_log(ur5, exact_log(ur5, truth(ur5), rng, samples=n), signals) for n in sizes]
-    recordings = Recordings(ur5, structural_mapping(ur5), logs)
+    model, signals = arm(), SignalSettings(cutoff=cutoff, trim=0.0, min_velocity=0.0)
+    logs = [hold_log(model, exact_log(model, truth(model), rng, samples=n), signals) for n in sizes]
+    recordings = Recordings(model, structural_mapping(model), logs)
     found = recordings.reduce()
     assert [reduction.samples for reduction in found] == stretches
     whole = recordings.reduce(is_cut=False)

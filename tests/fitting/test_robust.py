@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
+from helpers.driven import arm
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
@@ -17,20 +18,29 @@ from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.used_rows import base_problem
 
-NOISE = np.array([6.0, 6.0, 3.0, 0.9, 0.9, 0.3])
-ROWS = {"wrist_2_joint": 584, "elbow_joint": 1148, "shoulder_pan_joint": 1287, "wrist_1_joint": 900}
+NOISE = np.array([6.0, 3.0, 0.9])
+OUTLIERS = {  # [N m] by joint and row
+    ("shoulder_lift_joint", 300): -1000.0,
+    ("wrist_1_joint", 584): 1000.0,
+    ("wrist_1_joint", 900): 1000.0,
+    ("elbow_joint", 1148): 1000.0,
+    ("shoulder_lift_joint", 1287): 1000.0,
+}
 
 
 @pytest.fixture(scope="module")
-def logs(ur5):
+def model():
+    return arm()
+
+
+@pytest.fixture(scope="module")
+def logs(model):
     """A log, and the same with five outliers of 1000 N m."""
-    clean = exact_log(
-        ur5, truth(ur5), np.random.default_rng(0), samples=1500, rate=100.0, noise=NOISE
-    )
+    rng = np.random.default_rng(0)
+    clean = exact_log(model, truth(model), rng, samples=1500, rate=100.0, noise=NOISE)
     tau = clean.tau.copy()
-    for joint, row in ROWS.items():
-        tau[row, ur5.joints.index(joint)] += 1000.0
-    tau[300, 0] -= 1000.0
+    for (joint, row), torque in OUTLIERS.items():
+        tau[row, model.joints.index(joint)] += torque
     return clean, replace(clean, tau=tau)
 
 
@@ -51,20 +61,21 @@ def test_losses_have_the_derivatives_and_efficiency_they_claim(loss):
 
 @pytest.mark.parametrize("name", ["wls", "consistent"])
 def test_five_outliers_of_1000_newton_metres_move_it_by_less_than_its_standard_error(
-    ur5, logs, name
+    model, logs, name
 ):
     clean, bad = logs
     tukey = EstimatorSettings(name, robust="tukey")
-    undisturbed, found = (fit(ur5, [log], estimator=tukey) for log in (clean, bad))
+    undisturbed, found = (fit(model, [log], estimator=tukey) for log in (clean, bad))
     assert np.max(np.abs(found.base - undisturbed.base) / undisturbed.base_error) < 0.8
-    plain, ruined = (fit(ur5, [log], estimator=name) for log in (clean, bad))
+    plain, ruined = (fit(model, [log], estimator=name) for log in (clean, bad))
     assert np.max(np.abs(ruined.base - plain.base) / plain.base_error) > 5.0
     assert np.median(np.abs(undisturbed.base - plain.base) / plain.base_error) < 0.4
 
 
 def test_huber_is_the_minimum_of_its_loss(ur5):
+    six = np.array([6.0, 6.0, 3.0, 0.9, 0.9, 0.3])
     pi = truth(ur5)
-    log = exact_log(ur5, pi, np.random.default_rng(1), samples=300, noise=NOISE)
+    log = exact_log(ur5, pi, np.random.default_rng(1), samples=300, noise=six)
     rough = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
     found = fit(ur5, [log], signals=rough, estimator=EstimatorSettings("wls", robust="huber"))
     plain = fit(ur5, [log], signals=rough, estimator="wls")
@@ -90,34 +101,34 @@ def test_huber_is_the_minimum_of_its_loss(ur5):
     assert np.max(np.abs(gradient(plain.base)) / size) > 0.5
 
 
-def test_outliers_are_named_with_time_joint_and_torque(ur5, logs):
+def test_outliers_are_named_with_time_joint_and_torque(model, logs):
     clean, bad = logs
-    assert fit(ur5, [clean], estimator="wls").outliers == ()
-    found = fit(ur5, [bad], estimator=EstimatorSettings("wls", robust="tukey")).outliers
+    assert fit(model, [clean], estimator="wls").outliers == ()
+    found = fit(model, [bad], estimator=EstimatorSettings("wls", robust="tukey")).outliers
     named = {(o.joint, round(100 * o.t)) for o in found}
-    assert named == {*((joint, row) for joint, row in ROWS.items()), ("shoulder_pan_joint", 300)}
+    assert named == set(OUTLIERS)
     assert all(abs(o.torque - o.predicted) > 50 for o in found)
     assert [o.size for o in found] == sorted((o.size for o in found), reverse=True)
 
 
-def test_friction_that_the_filter_smears_leaves_no_residual(ur5):
-    quiet = exact_log(ur5, truth(ur5), np.random.default_rng(4), samples=2000, rate=100.0)
+def test_friction_that_the_filter_smears_leaves_no_residual(model):
+    quiet = exact_log(model, truth(model), np.random.default_rng(4), samples=2000, rate=100.0)
     noise = 1e-3 * np.random.default_rng(5).standard_normal(quiet.tau.shape)
-    found = fit(ur5, [replace(quiet, tau=quiet.tau + noise)], estimator="wls")
+    found = fit(model, [replace(quiet, tau=quiet.tau + noise)], estimator="wls")
     (evaluation,) = found.fitted
     residual = np.abs(evaluation.recording.trajectory.tau - evaluation.torques["estimate"])
     usual = np.median(residual, axis=0)
     assert (np.where(evaluation.recording.mask, residual, 0.0) < 10 * usual).all()
 
 
-def test_friction_that_is_not_coulombs_near_a_reversal_is_no_outlier(ur5):
-    pi = truth(ur5)
-    quiet = exact_log(ur5, pi, np.random.default_rng(4), samples=2000, rate=100.0)
+def test_friction_that_is_not_coulombs_near_a_reversal_is_no_outlier(model):
+    pi = truth(model)
+    quiet = exact_log(model, pi, np.random.default_rng(4), samples=2000, rate=100.0)
     noise = 1e-3 * np.random.default_rng(5).standard_normal(quiet.tau.shape)
-    step = pi[[name.endswith(".coulomb") for name in ur5.layout.names]]
+    step = pi[[name.endswith(".coulomb") for name in model.layout.names]]
     smooth = step * (np.tanh(quiet.v / 0.03) - np.sign(quiet.v))
     log = replace(quiet, tau=quiet.tau + noise + smooth)
-    found = fit(ur5, [log], estimator="wls")
+    found = fit(model, [log], estimator="wls")
     (evaluation,) = found.fitted
     residual = np.abs(evaluation.recording.trajectory.tau - evaluation.torques["estimate"])
     usual = np.median(residual, axis=0)
@@ -125,23 +136,23 @@ def test_friction_that_is_not_coulombs_near_a_reversal_is_no_outlier(ur5):
     assert found.outliers == ()
 
 
-def test_exact_data_need_no_weights(ur5):
-    log = exact_log(ur5, truth(ur5), np.random.default_rng(2), samples=300)
+def test_exact_data_need_no_weights(model):
+    log = exact_log(model, truth(model), np.random.default_rng(2), samples=300)
     exact = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-    found = fit(ur5, [log], signals=exact, estimator=EstimatorSettings("wls", robust="tukey"))
-    beta = found.mapping.to_base(truth(ur5))
+    found = fit(model, [log], signals=exact, estimator=EstimatorSettings("wls", robust="tukey"))
+    beta = found.mapping.to_base(truth(model))
     np.testing.assert_allclose(found.base, beta, rtol=1e-7, atol=1e-8)
     assert found.outliers == ()
 
 
-def test_standard_errors_of_a_robust_fit_allow_for_its_loss_of_efficiency(ur5):
-    pi = truth(ur5)
+def test_standard_errors_of_a_robust_fit_allow_for_its_loss_of_efficiency(model):
+    pi = truth(model)
     signals = SignalSettings(cutoff=None, trim=0.0)
     errors, reported = [], []
     for seed in range(12):
-        log = exact_log(ur5, pi, np.random.default_rng([5, seed]), samples=400, noise=NOISE)
+        log = exact_log(model, pi, np.random.default_rng([5, seed]), samples=400, noise=NOISE)
         estimator = EstimatorSettings("wls", robust="huber")
-        found = fit(ur5, [log], signals=signals, estimator=estimator)
+        found = fit(model, [log], signals=signals, estimator=estimator)
         errors.append(found.base - found.mapping.to_base(pi))
         reported.append(found.base_error)
         np.testing.assert_allclose(found.wls.std_error, found.base_error, rtol=1e-9)
@@ -149,11 +160,11 @@ def test_standard_errors_of_a_robust_fit_allow_for_its_loss_of_efficiency(ur5):
     assert 0.85 < np.median(ratio) < 1.2, np.median(ratio)
 
 
-def test_logs_larger_than_memory_are_refused_by_name(ur5, tmp_path):
+def test_logs_larger_than_memory_are_refused_by_name(model, tmp_path):
     path = tmp_path / "run.parquet"
-    write_log(exact_log(ur5, truth(ur5), np.random.default_rng(0), samples=300), path)
-    log = survey_log(*lay_out(path, ur5.joints), ur5, SignalSettings(cutoff=None), length=256)
-    recordings = Recordings(ur5, structural_mapping(ur5), [log])
+    write_log(exact_log(model, truth(model), np.random.default_rng(0), samples=300), path)
+    log = survey_log(*lay_out(path, model.joints), model, SignalSettings(cutoff=None), length=256)
+    recordings = Recordings(model, structural_mapping(model), [log])
     with pytest.raises(SettingsError, match="rows_in_memory"):
         conclude(recordings, EstimatorSettings("wls", robust="huber"))
 

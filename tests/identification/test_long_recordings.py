@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
 
 from robotid.commands.identify import run_job
@@ -25,15 +26,16 @@ HELD = 1024  # rows in memory, so that pieces have 256
 
 
 @pytest.fixture(scope="module")
-def noisy_job(ur5, tmp_path_factory):
+def noisy_job(tmp_path_factory):
     """Return a job with a log to fit in CSV, and one kept apart in Parquet."""
-    rng, folder = np.random.default_rng(0), tmp_path_factory.mktemp("job")
-    logs = [exact_log(ur5, truth(ur5), rng, samples=n, noise=0.3) for n in (1500, 700)]
+    model, rng, folder = arm(), np.random.default_rng(0), tmp_path_factory.mktemp("job")
+    logs = [exact_log(model, truth(model), rng, samples=n, noise=0.3) for n in (1500, 700)]
     paths = [folder / "fit.csv", folder / "kept.parquet"]
     for log, path in zip(logs, paths, strict=True):
         write_log(log, path)
     return Job(
-        urdf=Path(ur5.tree.path),
+        urdf=Path(model.tree.path),
+        joints=model.joints,
         signals=SignalSettings(cutoff=10.0),
         terms=DRIVE_TERMS,  # of a log in pieces, what else there is is judged by three stretches
         identification=(LogEntry(paths[0]),),
@@ -153,11 +155,9 @@ def test_recursive_estimators_read_pieces_in_the_order_of_time(
     np.testing.assert_allclose(other.estimate.theta, one.estimate.theta, rtol=0, atol=1e-8 * size)
 
 
-def test_a_fitted_recording_is_no_validation_in_pieces_either(
-    noisy_job, ur5, tmp_path, without_doctor
-):
+def test_a_fitted_recording_is_no_validation_in_pieces_either(noisy_job, tmp_path, without_doctor):
     """The rows are found whatever the file is called, where it starts and what its clock says."""
-    log = read_log(noisy_job.identification[0].path, ur5.joints)
+    log = read_log(noisy_job.identification[0].path, noisy_job.joints)
     part = Log(t=log.t + 7.0, q=log.q, tau=log.tau, joints=log.joints).window(20.0, 30.0)
     write_log(part, tmp_path / "other_name.parquet")
     again, apart = LogEntry(tmp_path / "other_name.parquet"), noisy_job.validation[0]
@@ -178,7 +178,7 @@ def test_only_stretches_of_a_long_log_are_drawn_and_examined(noisy_job, tmp_path
     assert recording.trajectory.t[0] == pytest.approx(0.22)
     assert recording.trajectory.t[-1] == pytest.approx(29.98 - 0.22)
     assert recording.trajectory.segment.tolist() == [0] * 100 + [1] * 100 + [2] * 100
-    assert recording.trajectory.direction.shape == (300, 6)
+    assert recording.trajectory.direction.shape == (300, 3)
     rows = evaluation.metrics["estimate"].per_joint["elbow_joint"].rows
     assert 1000 < rows <= recording.extent.smooth == 1478
     page = (tmp_path / "report.html").read_text()
@@ -193,15 +193,17 @@ def test_only_stretches_of_a_long_log_are_drawn_and_examined(noisy_job, tmp_path
     ]
 
 
-def test_a_log_with_samples_in_no_usual_piece_is_drawn_all_the_same(ur5, rng, tmp_path):
-    path, pi = tmp_path / "run.parquet", truth(ur5)
-    write_log(exact_log(ur5, pi, rng, samples=1010), path)
+def test_a_log_with_samples_in_no_usual_piece_is_drawn_all_the_same(rng, tmp_path):
+    model = arm()
+    path, pi = tmp_path / "run.parquet", truth(model)
+    write_log(exact_log(model, pi, rng, samples=1010), path)
     job = Job(
-        urdf=Path(ur5.tree.path),
+        urdf=Path(model.tree.path),
+        joints=model.joints,
         signals=SignalSettings(cutoff=10.0, trim=10.0),
         rows_in_memory=HELD,
     )
-    (log,) = survey_logs(replace(job, rows_in_memory=1009), ur5, [LogEntry(path)])[0]
+    (log,) = survey_logs(replace(job, rows_in_memory=1009), model, [LogEntry(path)])[0]
     assert [len(piece.read().trajectory.t) for piece in log.pieces] == [0, 8, 0, 0]
     ((evaluation,), ()) = evaluate_logs([log], (), {"estimate": pi}, pi)
     assert len(evaluation.recording.trajectory.t) == evaluation.recording.extent.smooth == 8

@@ -121,10 +121,11 @@ def test_on_a_bound_half_of_the_fits_stay_there(inside, rng):
     assert np.mean(away**2) == pytest.approx(0.5, abs=0.06)  # E max(0, z)^2
 
 
-def test_bounds_make_intervals_narrower_and_are_named(ur5, rng):
-    log = exact_log(ur5, truth(ur5), rng, samples=2000, noise=NOISE)
-    found = fit(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
-    free = fit(ur5, [log], signals=EXACT, estimator=EstimatorSettings(draws=0, **BOUND))
+def test_bounds_make_intervals_narrower_and_are_named(rng):
+    model = arm()
+    log = exact_log(model, truth(model), rng, samples=2000, noise=NOISE[1:4])
+    found = fit(model, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
+    free = fit(model, [log], signals=EXACT, estimator=EstimatorSettings(draws=0, **BOUND))
     assert found.estimate.details["active"]
     np.testing.assert_array_equal(found.standard, free.standard)
     assert "64 fits to redrawn data and prior" in found.errors.method
@@ -136,8 +137,9 @@ def test_bounds_make_intervals_narrower_and_are_named(ur5, rng):
     assert found.errors.freedom.max() < 64
 
 
-def test_fits_that_are_not_solved_are_counted_and_many_are_refused(ur5, rng, monkeypatch):
-    log = exact_log(ur5, truth(ur5), rng, samples=1000, noise=NOISE)
+def test_fits_that_are_not_solved_are_counted_and_many_are_refused(rng, monkeypatch):
+    model = arm()
+    log = exact_log(model, truth(model), rng, samples=1000, noise=NOISE[1:4])
     solve = Programme.redrawn
 
     def some_fail(self, *arguments):
@@ -146,17 +148,18 @@ def test_fits_that_are_not_solved_are_counted_and_many_are_refused(ur5, rng, mon
 
     monkeypatch.setattr(Programme, "redrawn", some_fail)
     lost = 3
-    found = fit(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
+    found = fit(model, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
     assert "61 fits" in found.errors.method
     assert "(3 more not solved: InsufficientProgress)" in found.errors.method
     lost = 20
     with pytest.raises(NotConvergedError, match="solved 44 of 64 fits to redrawn data; set draws"):
-        fit(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
+        fit(model, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
 
 
-def test_a_log_of_few_stretches_is_redrawn_by_the_filters_share(ur5, rng):
-    log = exact_log(ur5, truth(ur5), rng, samples=300, noise=NOISE)
-    found, again = (fit(ur5, [log], estimator=EstimatorSettings(**BOUND)) for _ in range(2))
+def test_a_log_of_few_stretches_is_redrawn_by_the_filters_share(rng):
+    model = arm()
+    log = exact_log(model, truth(model), rng, samples=300, noise=NOISE[1:4])
+    found, again = (fit(model, [log], estimator=EstimatorSettings(**BOUND)) for _ in range(2))
     assert "only" in found.errors.method
     assert "fits to redrawn data" in found.errors.method
     np.testing.assert_array_equal(again.standard_error, found.standard_error)
