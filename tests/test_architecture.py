@@ -78,21 +78,19 @@ def imports(path):
 
 
 def _imports(tree):
-    parents = {child: node for node in ast.walk(tree) for child in ast.iter_child_nodes(node)}
-    for node in ast.walk(tree):
+    waiting = [(tree, True, False)]
+    while waiting:
+        node, at_top, typing_only = waiting.pop()
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            yield from ((alias.name, at_top, typing_only) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            names = [node.module]
-        else:
-            continue
-        above, at_top, typing_only = parents[node], True, False
-        while above is not tree:
-            at_top &= not isinstance(above, ast.FunctionDef | ast.AsyncFunctionDef)
-            typing_only |= isinstance(above, ast.If) and "TYPE_CHECKING" in ast.dump(above.test)
-            above = parents[above]
-        for name in names:
-            yield name, at_top, typing_only
+            yield node.module, at_top, typing_only
+        at_top &= not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        typing_only |= isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+        for part in ("body", "orelse", "finalbody", "handlers", "cases"):  # imports are statements
+            inside = getattr(node, part, [])  # of a lambda or a conditional expression: no list
+            if isinstance(inside, list):
+                waiting += [(child, at_top, typing_only) for child in inside]
 
 
 def test_a_room_imports_only_rooms_of_the_lines_above():

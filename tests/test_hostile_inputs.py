@@ -15,13 +15,13 @@ from hypothesis import HealthCheck, Phase, given, settings
 
 KINDS = INPUT_KINDS | COMMAND_KINDS | ARGUMENT_KINDS
 EXAMPLES = {
-    "values, identified": 6,
-    "excite": 10,
+    "values, identified": 4,
+    "excite": 6,
     "loop of a job": 3,
-    "result.json": 25,
-    "report of result.json": 10,
-    "Python arguments": 60,
-}  # others: 15
+    "result.json": 15,
+    "report of result.json": 5,
+    "Python arguments": 40,
+}  # others: 8
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -29,7 +29,7 @@ def test_no_input_gives_a_traceback(kind):
     make, arguments, run = KINDS[kind]
 
     @settings(
-        max_examples=EXAMPLES.get(kind, 15),
+        max_examples=EXAMPLES.get(kind, 8),
         derandomize=True,
         database=None,
         deadline=None,

@@ -2,20 +2,22 @@ import argparse
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from robotid.cli import excite, main
-from robotid.commands.excite import _designer
+from robotid.commands.excite import _designer, _expected
 from robotid.commands.job import Job
 from robotid.excitation.clearance import Box
 from robotid.excitation.design import Designer
 from robotid.excitation.settings import MotionSettings
 from robotid.logs.formats import open_table
-from robotid.logs.settings import LogSource
+from robotid.logs.settings import LogSource, SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+from robotid.simulation.motions import random_fourier
 from robotid.simulation.settings import Payload
 
 WRIST = ["wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
@@ -301,6 +303,23 @@ def test_every_setting_reaches_what_designs(pan_tilt):
     )
     assert (basis[0].basis.duration, basis[0].basis.harmonics) == (4.0, 3)
     assert (basis[0].name, basis[0].clearance) == ("D", None)
+
+
+def test_what_is_expected_of_a_motion_rests_on_the_noise_that_is_stated(pan_tilt, rng):
+    model = RobotModel.from_urdf(pan_tilt)
+    motion = random_fourier(model, rng, period=4.0)
+    settings = MotionSettings(points=50.0, noise={"a": 0.2, "b": 0.6})
+    job = Job(pan_tilt, signals=SignalSettings(cutoff=None, trim=0.0))
+    design = SimpleNamespace(motion=motion, duration=4.0)
+    found = _expected(job, model, design, settings, None, "m.csv")
+    assert found.noise.std.tolist() == [0.2, 0.6]
+    (evaluation,) = found.expected.fitted
+    trajectory = evaluation.recording.trajectory
+    np.testing.assert_allclose(trajectory.t, np.arange(201) / 50.0)
+    for name, values in zip("qva", motion.evaluate(trajectory.t), strict=True):
+        np.testing.assert_allclose(getattr(trajectory, name), values, atol=1e-12)
+    assert evaluation.recording.log.path == "m.csv"
+    assert found.before is None
 
 
 def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt, capsys):

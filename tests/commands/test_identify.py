@@ -2,8 +2,10 @@
 
 import hashlib
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,12 +13,18 @@ from helpers.synthetic import exact_log, truth
 
 from robotid._files import file_sha256
 from robotid.cli import main
-from robotid.commands.identify import run_job
+from robotid.commands.identify import _job_of, run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.exceptions import DataError, SettingsError
+from robotid.export.urdf import DYNAMICS_TERMS
 from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
 from robotid.logs.read import write_log
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.friction_projection import project_friction
+from robotid.robot.drives import Stribeck
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
 
 PLAIN = ("--friction", "viscous+coulomb", "--no-report")
 
@@ -203,3 +211,58 @@ def test_python_says_what_the_command_line_says(arm, logs, tmp_path, delay):
     assert known.findings != blind.findings
     with pytest.raises(SettingsError, match="ignore names 'late'"):
         identify(arm, named[:1], ignore=["late"])
+
+
+def test_the_robot_of_a_result_is_that_of_the_job_that_is_saved_with_it(arm):
+    """Of an identification made in Python, whose job is made up afterwards."""
+    model = RobotModel.from_urdf(
+        arm.tree,
+        joints=["joint_2", "joint_1"],
+        gravity=(1.0, -2.0, 3.0),
+        terms=("viscous", "offset"),
+        couplings=(Coupling("motor", (("joint_1", 2.0), ("joint_2", -3.0))),),
+        own_terms={"joint_1": [Stribeck(speed=0.3)]},
+    )
+    asked = SimpleNamespace(
+        job=None, friction={"*": ""}, signals=SignalSettings(cutoff=5.0), ignore=("late",)
+    )
+    estimator = EstimatorSettings(draws=17)
+    found = SimpleNamespace(
+        model=model, asked=asked, drives=(), estimator=estimator, fitted=(), validation=()
+    )
+    job = _job_of(found)
+    again = job.model()
+    assert again.joints == model.joints
+    assert again.options == model.options
+    assert again.options["gravity"] == [1.0, -2.0, 3.0]
+    assert again.layout.names == model.layout.names
+    assert again.layout.couplings == model.layout.couplings
+    assert again.layout.own == model.layout.own
+    assert (job.signals.cutoff, job.ignore, job.estimator) == (5.0, ("late",), estimator)
+
+
+def test_dynamics_of_the_urdf_are_the_nearest_to_friction_of_more_terms(arm, arm_logs, tmp_path):
+    job = Job(
+        Path(arm.tree.path),
+        identification=(LogEntry(arm_logs / "fit.csv"),),
+        terms=("armature", "viscous", "coulomb", "offset"),
+        drives={"joint_2": (Stribeck(speed=0.3),)},
+        estimator=EstimatorSettings(draws=0, prior_weight=1.0),
+        report=False,
+        dynamics=True,
+    )
+    found, result = run_job(job, tmp_path)
+    nearest = project_friction(found.model, found.standard, found.moments, DYNAMICS_TERMS)
+    (drive,) = nearest.drives
+    assert drive.name == "joint_2"
+    value = dict(zip(found.model.layout.names, found.standard, strict=True))
+    text = (tmp_path / result["outputs"]["urdf"]).read_text()
+    for joint, own in (
+        ("joint_1", {term: value[f"joint_1.{term}"] for term in DYNAMICS_TERMS}),
+        ("joint_2", drive.values),
+    ):
+        (stated,) = re.findall(rf'<joint name="{joint}".*?<dynamics (.*?)/>', text, re.DOTALL)
+        figures = dict(re.findall(r'(\w+)="([^"]*)"', stated))
+        assert float(figures["damping"]) == pytest.approx(own["viscous"], rel=1e-9)
+        assert float(figures["friction"]) == pytest.approx(own["coulomb"], rel=1e-9)
+    assert abs(drive.values["viscous"] - value["joint_2.viscous"]) > 1e-4

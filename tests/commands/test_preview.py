@@ -9,6 +9,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.cli import main
 from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings
+from robotid.commands.preview import _motions
 from robotid.logs.formats import write_columns
 from robotid.logs.read import read_log, write_log
 from robotid.robot.examples import example_urdf
@@ -104,6 +105,25 @@ def test_what_was_achieved_stands_beside_what_was_expected(files, capsys):
         assert noise["achieved"] == result["identification"]["per_joint"][joint]["rmse"]
         assert noise["achieved"] == pytest.approx(noise["std"], rel=0.1)
     assert "times what was expected" in " ".join(asked(capsys, *words).split())
+
+
+def test_of_each_motion_its_window_is_previewed(files):
+    job = job_from_settings(
+        {
+            "urdf": ARM,
+            "identification": [
+                {"log": "log_motion.csv", "start": 2.0, "end": 7.0},
+                {"log": "other_motion.csv", "start": 1.0, "end": 4.5},
+            ],
+            "signals": {"trim": 0.0},
+        },
+        "job.toml",
+        files,
+    )
+    first, second = _motions(job, job.model(), job.identification)
+    for motion, start, end in ((first, 2.0, 7.0), (second, 1.0, 4.5)):
+        (look,) = motion.looks
+        assert (look.t[0], look.t[-1]) == pytest.approx((start, end), abs=0.0101)
 
 
 def test_the_text_says_what_it_rests_on(files, capsys):

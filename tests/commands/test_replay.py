@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from helpers.replay_data import shown
 from helpers.synthetic import exact_log, payload_log, truth
 
 from robotid.cli import main
-from robotid.commands.replay import read_findings
+from robotid.commands.job import Job, LogEntry
+from robotid.commands.replay import _base_poses, read_findings
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.logs.formats import write_columns
@@ -247,6 +249,25 @@ def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):
     assert "log.csv: base_qx to base_qw must be the four numbers" in capsys.readouterr().err
 
 
+def test_between_the_poses_of_a_base_it_turns_the_short_way(tmp_path):
+    """Poses at 10 Hz, whose quaternions change their signs at will, asked for at other times."""
+    t = 4.0 + np.arange(21) / 10.0
+    half, sign = 0.4 * (t - 4.0), np.where(np.isin(np.arange(21), [3, 4, 9, 15, 16, 17]), -1.0, 1.0)
+    turn = sign[:, None] * np.column_stack([0 * t, np.sin(half), 0 * t, np.cos(half)])
+    table = np.column_stack([t, 2.0 * t, -t, 0.5 * t, 1.004 * turn])
+    table[7, 5] = np.nan
+    header = "time,base_x,base_y,base_z,base_qx,base_qy,base_qz,base_qw"
+    path = tmp_path / "log.csv"
+    np.savetxt(path, table, delimiter=",", header=header, comments="")
+    at = np.array([4.0, 4.25, 4.35, 4.45, 4.7, 4.85, 5.55, 6.0])
+    job = Job(Path(URDF))
+    found = _base_poses(job, LogEntry(path), SimpleNamespace(t=at))
+    np.testing.assert_allclose(found[:, :3], at[:, None] * [2.0, -1.0, 0.5])
+    wanted = np.column_stack([0 * at, np.sin(0.4 * (at - 4)), 0 * at, np.cos(0.4 * (at - 4))])
+    np.testing.assert_allclose(found[:, 3:], wanted, atol=1e-12)  # half-way, where it is exact
+    assert _base_poses(job, LogEntry(path), SimpleNamespace(t=at[:1])).shape == (1, 7)
+
+
 def test_a_motion_without_torques_plays_and_marks_where_it_uses_the_most_of_limits(folder):
     model = RobotModel.from_urdf(URDF)
     t = np.arange(401) / 100.0
@@ -304,8 +325,12 @@ def test_drives_that_follow_commands_are_played_with_their_ghosts(tmp_path):
         settings={"urdf": urdf, "estimator": {"name": "wls"}, "identification": [{"log": "l"}]},
     )  # fmt: skip
     words = ["replay", urdf, str(tmp_path / "log.csv"), str(out), "--html"]
-    assert main([*words, str(tmp_path / "page.html")]) == 0
+    ghost = ["--ghost", str(tmp_path / "log.csv")]
+    assert main([*words, str(tmp_path / "page.html"), *ghost]) == 0
     data = shown((tmp_path / "page.html").read_text(encoding="utf-8"))
+    again = data["ghosts"].pop()
+    assert again["label"] == "log.csv"
+    np.testing.assert_allclose(again["q"], data["motion"]["q"], atol=1e-6)
     assert data["torques"]["quantity"] == "position"
     assert data["torques"]["labels"] == ["measured", "simulated", "commanded"]
     assert [joint["unit"] for joint in data["torques"]["joints"]] == ["rad", "rad"]

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import re
 
 import numpy as np
 import pytest
@@ -93,6 +94,11 @@ def test_identify_finds_the_truth_that_stands_beside_the_log(folder, ur5, capsys
     values = by_name(truth["standard_parameters"] + truth["drive_parameters"])
     assert list(values) == list(model.layout.names)
     np.testing.assert_allclose(pi, list(values.values()), rtol=1e-9, atol=1e-12)
+    text = (folder / "true.urdf").read_text()
+    for joint in ur5.joints:
+        (own,) = re.findall(rf'<joint name="{joint}".*?<dynamics (.*?)/>', text, re.DOTALL)
+        viscous, coulomb = (values[f"{joint}.{term}"] for term in ("viscous", "coulomb"))
+        assert own == f'damping="{viscous!r}" friction="{coulomb!r}"'
     assert truth["log_sha256"] == file_sha256(folder / "log.parquet")
     assert truth["motion"]["sha256"] == file_sha256(folder / "design.parquet")
     shipped = ur5.standard_parameters()[:60]

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
+from robotid.commands import track as module
 from robotid.commands.job import Job, LogEntry
-from robotid.commands.track import run_track
+from robotid.commands.track import run_track, serve_track
 from robotid.logs.formats import open_table
-from robotid.logs.read import write_log
+from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import LogSource, SignalSettings
 from robotid.online.settings import OnlineSettings
+from robotid.viewer.scene import coordinates
 
 
 def tracked(arm, log, folder=None, **signals):
@@ -55,3 +57,75 @@ def test_what_is_told_is_what_the_history_ends_with(arm, rng, tmp_path):
         assert entry["std_error"] == columns[f"{entry['name']}.std_error"][-1]
     assert list(content["sigma"]) == list(arm.joints)
     assert list(content["sigma"].values()) == identifier.reading.sigma.tolist()
+
+
+class Clock:
+    """A clock that only waiting moves on."""
+
+    now = 50.0
+
+    @classmethod
+    def monotonic(cls):
+        return cls.now
+
+    @classmethod
+    def sleep(cls, seconds):
+        assert seconds >= 0.0
+        cls.now += seconds
+
+
+def test_a_live_page_is_told_what_is_known_at_each_moment_in_the_time_of_the_log(
+    arm, arm_logs, monkeypatch
+):
+    heard = []
+
+    class Page:
+        url = "here"
+
+        def __init__(self, html, port):
+            assert port == 7
+
+        __enter__ = lambda self: self  # noqa: E731
+        __exit__ = lambda self, *_: None  # noqa: E731
+        finish = lambda self: None  # noqa: E731
+
+        def send(self, message):
+            heard.append((Clock.now - 50.0, message))
+
+    known = {}
+    monkeypatch.setattr(module, "time", Clock)
+    monkeypatch.setattr(module, "LivePage", Page)
+    told = module._Teller.__call__
+
+    def noted(self, k, identifier):
+        if identifier.is_ready:
+            known[k] = identifier.reading, *identifier.compared
+        told(self, k, identifier)
+
+    monkeypatch.setattr(module._Teller, "__call__", noted)
+    job = Job(Path(arm.tree.path), identification=(LogEntry(arm_logs / "fit.csv"),))
+    stated = {"port": 7, "speed": 4.0, "linger": False}
+    content = serve_track(job, None, announce=heard.append, **stated)
+    address, *messages = heard
+    assert address == "here"
+    log = read_log(arm_logs / "fit.csv", arm.joints)
+    times = np.array([message["t"] for _, message in messages])
+    assert set(times) <= set(log.t)
+    assert (times[0], times[-1]) == (log.t[0], log.t[-1])
+    steps = np.diff(times)[:-1]  # 25 in a second, of samples that are 10 ms apart
+    assert steps.min() > 0.04 - 1e-9
+    assert steps.max() < 0.05 + 1e-9
+    np.testing.assert_allclose([at for at, _ in messages], (times - log.t[0]) / 4.0, atol=1e-9)
+    ready = 0
+    for _, message in messages:
+        k = int(np.argmin(np.abs(log.t - message["t"])))
+        assert message["q"] == coordinates(arm, log.q[k : k + 1])[0].tolist()
+        if k in known:
+            reading, tau, predicted = known[k]
+            assert message["theta"] == reading.theta.tolist()
+            assert message["std_error"] == reading.std_error.tolist()
+            assert (message["at"], message["tau"]) == (reading.t, tau.tolist())
+            np.testing.assert_array_equal(np.array(message["predicted"], float), predicted)
+            ready += 1
+    assert ready > 100
+    assert message["theta"] == [entry["value"] for entry in content["base_parameters"]]

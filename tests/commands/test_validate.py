@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
+from robotid.commands import validate
 from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings
 from robotid.commands.validate import validate_result
+from robotid.logs.data import Log
 from robotid.logs.read import write_log
 
 NOISE = np.array([0.2, 0.05])  # [N m]
@@ -176,3 +178,51 @@ def test_what_the_result_ignores_is_no_doubt(here, rng):
     path.write_text(json.dumps(result))
     tau = first.tau + 0.01 * NOISE * rng.standard_normal(first.tau.shape)
     assert verdict(folder, replace(first, tau=tau))["doubts"] == []
+
+
+def test_a_fault_of_the_second_of_two_new_logs_is_one_of_the_verdict(here, monkeypatch):
+    folder, _, other = here
+    v = other.v[500:].copy()
+    v[:, 1] *= 0.5
+    halves = {"sound": rows(other, slice(0, 500)), "spoilt": rows(other, slice(500, None))}
+    halves["spoilt"] = replace(halves["spoilt"], v=v)
+    for name, log in halves.items():
+        write_log(log, folder / f"{name}.csv")
+    judged = {}
+
+    def noted(fitted, kept, **stated):
+        judged.update(stated, kept=kept)
+        return judge(fitted, kept, **stated)
+
+    judge = validate.judge
+    monkeypatch.setattr(validate, "judge", noted)
+    monkeypatch.setattr(
+        validate, "hidden_joints", lambda model, some: tuple(e.recording.name for e in some)
+    )
+    logs = [folder / f"{name}.csv" for name in halves]
+    found = validate_result(folder / "out" / "result.json", logs)
+    assert found["verdict"]["status"] == "poor"
+    assert any("dq_joint_2 is 0.5 times d(q)/dt" in words for words in found["verdict"]["alarms"])
+    names = ["sound.csv 0-4.99 s", "spoilt.csv 5-9.99 s"]
+    assert list(judged["kept"]) == list(judged["hidden"]) == names
+    stated = json.loads((folder / "out" / "result.json").read_text())
+    assert judged["undetermined"] == stated["structure"]["undetermined"]
+    assert judged["is_poorly_excited"] is stated["structure"]["poorly_excited"]
+    assert judged["witness"].to_dict() == stated["witness"]
+    assert judged["refitted"] == []
+    assert judged["joints"] == ("joint_1", "joint_2")
+
+
+def test_few_fitted_rows_in_a_long_log_and_a_few_of_it_in_a_long_fitted_one_are_shared(rng):
+    def log(count):
+        q, tau = rng.standard_normal((2, count, 2))
+        return Log(np.arange(count) / 100.0, q, tau, ("a", "b"))
+
+    short, long = log(30), log(9000)
+    q, tau = long.q.copy(), long.tau.copy()
+    q[4321:4351], tau[4321:4351] = short.q, short.tau
+    assert not validate._share(short, long)
+    assert not validate._share(long, short)
+    holder = replace(long, q=q, tau=tau)
+    assert validate._share(short, holder)
+    assert validate._share(holder, short)

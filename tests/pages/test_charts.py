@@ -150,6 +150,23 @@ def test_the_still_picture_shows_the_line_in_the_units_of_its_ticks(torque, line
     }
 
 
+@pytest.fixture(scope="module")
+def opened(browser, demo):
+    with visit(browser, demo) as seen:
+        yield seen
+
+
+@pytest.fixture
+def seen(opened):
+    """The page with its first charts drawn, all of each shown, the cursor beside them."""
+    until(opened, "charts.all[1].plot !== null")
+    opened.page.mouse.move(5, 5)
+    opened.page.evaluate("scrollTo(0, 0)")
+    yield opened
+    assert opened.errors == []
+    assert opened.requests == []
+
+
 VALUES = "charts.all.map((c) => c.values.map((v) => v.textContent))"
 
 
@@ -158,82 +175,72 @@ def shown(value):
     return float(value.replace("−", "-"))
 
 
-def test_values_under_the_cursor_are_the_data_in_all_linked_charts(browser, demo, torque, lines):
-    with visit(browser, demo) as seen:
-        until(seen, "charts.all[1].plot !== null")
-        box = seen.page.locator(".u-over").first.bounding_box()
-        seen.page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 40)
-        until(seen, "charts.all[0].index > 0")
-        at = seen.page.evaluate("charts.all[0].x[charts.all[0].index]")
-        assert at == pytest.approx(1003.0, abs=0.02)
-        row = round((at - 1000) * 500)
-        said = seen.page.evaluate(VALUES)
-        assert shown(said[0][0]) == pytest.approx(lines[0][row], rel=2e-3, abs=2e-3)
-        identified, half = said[0][1].split(" ± ")
-        assert shown(identified) == pytest.approx(lines[1][row], rel=2e-3, abs=2e-3)
-        assert half == "4"
-        # the linked chart has points of its own: the nearest of them
-        near = seen.page.evaluate("charts.all[1].x[charts.all[1].index]")
-        assert near == pytest.approx(at, abs=0.02)
-        other = round((near - 1000) * 500)
-        assert shown(said[1][0]) == pytest.approx(lines[0][other] - lines[1][other], abs=2e-3)
-        assert said[2] == ["", "", ""]  # a chart of no link
-        seen.page.mouse.move(box["x"] + 0.45 * box["width"], box["y"] + 40)  # rows not used
-        until(seen, "charts.all[0].x[charts.all[0].index] > 1004")
-        assert seen.page.evaluate(VALUES)[0][1] == "–"
-        seen.page.mouse.move(5, 5)
-        until(seen, "charts.all[0].index === -1")
-        assert seen.errors == []
-        assert seen.requests == []
+def test_values_under_the_cursor_are_the_data_in_all_linked_charts(seen, lines):
+    box = seen.page.locator(".u-over").first.bounding_box()
+    seen.page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 40)
+    until(seen, "charts.all[0].index > 0")
+    at = seen.page.evaluate("charts.all[0].x[charts.all[0].index]")
+    assert at == pytest.approx(1003.0, abs=0.02)
+    row = round((at - 1000) * 500)
+    said = seen.page.evaluate(VALUES)
+    assert shown(said[0][0]) == pytest.approx(lines[0][row], rel=2e-3, abs=2e-3)
+    identified, half = said[0][1].split(" ± ")
+    assert shown(identified) == pytest.approx(lines[1][row], rel=2e-3, abs=2e-3)
+    assert half == "4"
+    # the linked chart has points of its own: the nearest of them
+    near = seen.page.evaluate("charts.all[1].x[charts.all[1].index]")
+    assert near == pytest.approx(at, abs=0.02)
+    other = round((near - 1000) * 500)
+    assert shown(said[1][0]) == pytest.approx(lines[0][other] - lines[1][other], abs=2e-3)
+    assert said[2] == ["", "", ""]  # a chart of no link
+    seen.page.mouse.move(box["x"] + 0.45 * box["width"], box["y"] + 40)  # rows not used
+    until(seen, "charts.all[0].x[charts.all[0].index] > 1004")
+    assert seen.page.evaluate(VALUES)[0][1] == "–"
+    seen.page.mouse.move(5, 5)
+    until(seen, "charts.all[0].index === -1")
 
 
-def test_dragging_zooms_linked_charts_and_keys_lead_back(browser, demo):
-    with visit(browser, demo) as seen:
-        until(seen, "charts.all[1].plot !== null")
-        box = seen.page.locator(".u-over").first.bounding_box()
-        middle = box["y"] + 40
-        seen.page.mouse.move(box["x"] + 0.2 * box["width"], middle)
-        seen.page.mouse.down()
-        seen.page.mouse.move(box["x"] + 0.4 * box["width"], middle, steps=4)
-        seen.page.mouse.up()
-        window = "charts.all.map((c) => c.plot ? [c.plot.scales.x.min, c.plot.scales.x.max] : null)"
-        until(seen, "charts.all[0].plot.scales.x.max < 1005")
-        first, second, *_ = seen.page.evaluate(window)
-        assert first == second == pytest.approx([1002.0, 1004.0], abs=0.03)
-        assert seen.page.get_by_role("button", name="Show all").count() == 2
-        seen.page.locator(".place").first.focus()
-        seen.page.keyboard.press("Escape")
-        until(seen, "charts.all[1].plot.scales.x.max > 1009")
-        assert seen.page.evaluate(window)[0] == pytest.approx([1000.0, 1009.998], abs=0.001)
-        for key in ("ArrowRight", "ArrowRight", "+"):
-            seen.page.keyboard.press(key)
-        low, high = seen.page.evaluate(window)[1]
-        assert high - low == pytest.approx(5.0, abs=0.01)
-        said = seen.page.locator(".place").first.get_attribute("aria-valuetext")
-        assert re.match(r"1005\.00\d+ s: measured −?[\d.]+, identified", said)
-        seen.page.keyboard.press("1")  # hides the measured torque
-        assert seen.page.evaluate("charts.all[0].plot.series.map((s) => s.show)") == [
-            True,
-            False,
-            True,
-        ]
-        assert seen.errors == []
+def test_dragging_zooms_linked_charts_and_keys_lead_back(seen):
+    box = seen.page.locator(".u-over").first.bounding_box()
+    middle = box["y"] + 40
+    seen.page.mouse.move(box["x"] + 0.2 * box["width"], middle)
+    seen.page.mouse.down()
+    seen.page.mouse.move(box["x"] + 0.4 * box["width"], middle, steps=4)
+    seen.page.mouse.up()
+    window = "charts.all.map((c) => c.plot ? [c.plot.scales.x.min, c.plot.scales.x.max] : null)"
+    until(seen, "charts.all[0].plot.scales.x.max < 1005")
+    first, second, *_ = seen.page.evaluate(window)
+    assert first == second == pytest.approx([1002.0, 1004.0], abs=0.03)
+    assert seen.page.get_by_role("button", name="Show all").count() == 2
+    seen.page.locator(".place").first.focus()
+    seen.page.keyboard.press("Escape")
+    until(seen, "charts.all[1].plot.scales.x.max > 1009")
+    assert seen.page.evaluate(window)[0] == pytest.approx([1000.0, 1009.998], abs=0.001)
+    for key in ("ArrowRight", "ArrowRight", "+"):
+        seen.page.keyboard.press(key)
+    low, high = seen.page.evaluate(window)[1]
+    assert high - low == pytest.approx(5.0, abs=0.01)
+    said = seen.page.locator(".place").first.get_attribute("aria-valuetext")
+    assert re.match(r"1005\.00\d+ s: measured −?[\d.]+, identified", said)
+    seen.page.keyboard.press("1")  # hides the measured torque
+    shown = "charts.all[0].plot.series.map((s) => s.show)"
+    assert seen.page.evaluate(shown) == [True, False, True]
+    seen.page.keyboard.press("1")
+    assert seen.page.evaluate(shown) == [True, True, True]
+    seen.page.keyboard.press("Escape")
 
 
-def test_charts_are_drawn_when_they_come_into_sight_and_areas_are_stacked(browser, demo):
-    with visit(browser, demo) as seen:
-        until(seen, "charts.all[0].plot !== null")
-        assert seen.page.evaluate("charts.all.slice(2).every((c) => c.plot === null)")
-        seen.page.locator("summary").click()
-        until(seen, "charts.all[2].plot !== null")
-        low, high = seen.page.evaluate("charts.all[2].extent()")
-        parts = np.array([np.sin(T[::10]), -np.cos(2 * T[::10]), np.sin(3 * T[::10])])
-        top, bottom = np.maximum(parts, 0).sum(axis=0).max(), np.minimum(parts, 0).sum(axis=0).min()
-        room = 0.04 * (top - bottom)
-        assert [low, high] == pytest.approx([bottom - room, top + room], abs=1e-3)
-        seen.page.evaluate("charts.link('time').set(1007)")  # as the clock of a replay does
-        assert seen.page.evaluate("charts.all[1].index") > 0
-        assert seen.errors == []
+def test_charts_are_drawn_when_they_come_into_sight_and_areas_are_stacked(seen):
+    assert seen.page.evaluate("charts.all.slice(2).every((c) => c.plot === null)")
+    seen.page.locator("summary").click()
+    until(seen, "charts.all[2].plot !== null")
+    low, high = seen.page.evaluate("charts.all[2].extent()")
+    parts = np.array([np.sin(T[::10]), -np.cos(2 * T[::10]), np.sin(3 * T[::10])])
+    top, bottom = np.maximum(parts, 0).sum(axis=0).max(), np.minimum(parts, 0).sum(axis=0).min()
+    room = 0.04 * (top - bottom)
+    assert [low, high] == pytest.approx([bottom - room, top + room], abs=1e-3)
+    seen.page.evaluate("charts.link('time').set(1007)")  # as the clock of a replay does
+    assert seen.page.evaluate("charts.all[1].index") > 0
 
 
 def colours(seen):
@@ -255,22 +262,20 @@ def colours(seen):
     })()""")
 
 
-def test_an_open_page_follows_from_dark_to_light_and_prints_light(browser, demo):
-    with visit(browser, demo, color_scheme="dark") as seen:
-        until(seen, "charts.all[0].plot !== null")
-        until(seen, "document.querySelector('canvas').width > 300")
-        light, dark = colours(seen)
-        assert light > 10 * dark
-        seen.page.emulate_media(color_scheme="light")
-        seen.page.wait_for_timeout(200)
-        light, dark = colours(seen)
-        assert dark > 10 * light
-        seen.page.emulate_media(color_scheme="dark", media="print")
-        assert seen.page.locator("figure.chart svg").first.is_visible()
-        assert not seen.page.locator(".explore").first.is_visible()
-        ink = "getComputedStyle(document.documentElement).getPropertyValue('--predicted').trim()"
-        assert seen.page.evaluate(ink) == "#0b63c5"
-        assert seen.errors == []
+def test_an_open_page_follows_from_dark_to_light_and_prints_light(seen):
+    seen.page.emulate_media(color_scheme="dark")
+    seen.page.wait_for_timeout(200)
+    light, dark = colours(seen)
+    assert light > 10 * dark
+    seen.page.emulate_media(color_scheme="light")
+    seen.page.wait_for_timeout(200)
+    light, dark = colours(seen)
+    assert dark > 10 * light
+    seen.page.emulate_media(color_scheme="dark", media="print")
+    assert seen.page.locator("figure.chart svg").first.is_visible()
+    assert not seen.page.locator(".explore").first.is_visible()
+    ink = "getComputedStyle(document.documentElement).getPropertyValue('--predicted').trim()"
+    assert seen.page.evaluate(ink) == "#0b63c5"
 
 
 def test_without_scripts_the_still_pictures_stand_in_the_page(browser, demo):

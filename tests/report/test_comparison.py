@@ -121,6 +121,51 @@ def test_other_fitted_recordings_and_versions_are_said(changed):
     assert [row["name"] for row in found["versions"]] == ["numpy"]
 
 
+def test_a_third_result_is_compared_with_the_first_and_with_what_all_have(folder, tmp_path):
+    paths = [folder / "a.json", folder / "b.json", tmp_path / "c.json"]
+
+    def compared(change):
+        result = read_result(folder / "b.json")
+        change(result)
+        write_json(result, paths[2])
+        return compare_results(paths)
+
+    def farther(result):
+        for entry in result["base_parameters"]:
+            entry["value"], entry["std_error"] = entry["value"] + 0.5, 3.0 * entry["std_error"]
+        result["settings"]["signals"] = {"order": 6}
+        result["inputs"][-1]["rows_used"] = 77
+
+    found, a = compared(farther), read_result(folder / "a.json")
+    first = {entry["name"]: entry for entry in a["base_parameters"]}
+    c = {entry["name"]: entry for entry in read_result(paths[2])["base_parameters"]}
+    for entry in found["base_parameters"]:
+        one, other = first[entry["name"]], c[entry["name"]]
+        s = math.hypot(one["std_error"], other["std_error"])
+        assert entry["differences"][1] == pytest.approx((other["value"] - one["value"]) / s)
+        assert entry["values"][2] == other["value"]
+    assert [result["label"] for result in found["results"]] == ["A", "B", "C"]
+    (order,) = [row for row in found["settings"] if row["name"] == "signals.order"]
+    assert (order["values"][2], order["values"][0]) == ("6", order["values"][1])
+    assert found["fitted_alike"]
+    (entry,) = found["validation"]
+    assert all(len(joint["rmse"]) == 3 for joint in entry["per_joint"])
+    (remark,) = found["remarks"]
+    rows = a["inputs"][-1]["rows_used"]
+    assert f"second.csv was prepared in other ways (rows {rows} | {rows} | 77)" in remark
+
+    found = compared(lambda result: result["inputs"][1].update(sha256="1" * 64))
+    assert not found["fitted_alike"]
+    assert [row["in"] for row in found["inputs"] if not all(row["in"])] == [
+        [True, True, False], [False, False, True],
+    ]  # fmt: skip
+    found = compared(lambda result: result["inputs"][-1].update(sha256="0" * 64))
+    assert found["validation"] == []
+    assert [remark[:15] for remark in found["remarks"]] == [
+        *(f"{label} was validated"[:15] for label in "ABC"), "no validation r",
+    ]  # fmt: skip
+
+
 def test_other_base_parameters_are_refused_by_name(changed):
     with pytest.raises(DataError, match=r"a\.json has 1 base parameters that .*b\.json has not: "):
         changed(lambda result: result["base_parameters"].pop())
@@ -358,13 +403,14 @@ def test_bars_are_as_long_as_what_they_show(folder, tmp_path):
     assert float(reach) == pytest.approx(d * 45 / 6, abs=0.06)
 
 
-@pytest.mark.parametrize("size", [(1280, 800), (360, 800)])
-def test_the_page_in_the_browser(folder, tmp_path, browser, size):
+def test_the_page_in_the_browser(folder, tmp_path, browser):
     write_comparison([folder / "a.json", folder / "b.json"], tmp_path / "c.html")
-    with visit(browser, tmp_path / "c.html", size=size, color_scheme="dark") as seen:
+    with visit(browser, tmp_path / "c.html", color_scheme="dark") as seen:
         seen.page.locator("#friction").scroll_into_view_if_needed()
         until(seen, "charts.all.some((c) => c.plot)")
-        assert seen.page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        for width in (1280, 360):
+            seen.page.set_viewport_size({"width": width, "height": 800})
+            assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
         head = seen.page.get_by_role("button", name="(B − A) / s")
         head.click()
         head.click()

@@ -294,18 +294,21 @@ def test_without_a_validation_log_the_fitted_rows_are_drawn(model, tmp_path):
     assert "fitted rows, for no recording was kept apart" in text
 
 
-def test_long_recordings_stay_small(model, tmp_path):
-    log = make_log(model, 1)
+def test_long_recordings_stay_small(model, html, tmp_path):
+    """Lines are thinned: of 24 times as many samples the page is hardly larger."""
+    log, many = make_log(model, 1), 12
     repeated = Log(
-        t=np.arange(40 * 800) / 100.0,
-        q=np.tile(log.q, (40, 1)),
-        v=np.tile(log.v, (40, 1)),
-        tau=np.tile(log.tau, (40, 1)),
+        t=np.arange(many * 800) / 100.0,
+        **{key: np.tile(getattr(log, key), (many, 1)) for key in ("q", "v", "tau")},
         joints=model.joints,
     )
     signals = SignalSettings(cutoff=None, trim=0.0)
-    found = identify(model, [log], validation=[repeated] * 3, signals=signals)
-    assert write_report(found, tmp_path / "r.html").stat().st_size < 3_000_000
+    found = identify(
+        model, [log], validation=[repeated] * 2, signals=signals, estimator="wls", doctor=False,
+        friction="viscous+coulomb",
+    )  # fmt: skip
+    size = write_report(found, tmp_path / "r.html").stat().st_size
+    assert size < len(html) + 400_000
 
 
 def test_the_same_result_gives_the_same_file(found, tmp_path):

@@ -14,7 +14,14 @@ from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.logs.data import Log
 from robotid.report.advice import Origin
-from robotid.report.loop_page import _undetermined, write_loop_report
+from robotid.report.loop_page import (
+    _bars,
+    _charts,
+    _facts,
+    _horizon_chart,
+    _undetermined,
+    write_loop_report,
+)
 
 ERRORS = {"rmse": (2e-3, 4e-3, 8e-3), "command_rmse": (0.02, 0.05, 0.08), "urdf_rmse": (0.01,) * 3}
 REASON = "the calf is <i>off</i>"
@@ -127,6 +134,55 @@ def test_charts_show_commanded_measured_and_simulated_and_the_worst_joint_first(
     left = {series["label"]: series["y"] for series in error["series"]}
     np.testing.assert_allclose(left["measured − simulated"], 6.0, atol=1e-3)  # [mrad]
     assert "kept.csv, 1 to 5 s, kept apart: RMSE 6 mrad" in page
+
+
+def test_of_two_logs_each_joint_shows_its_worse_error_and_each_log_its_own(content, followed):
+    first = content["validation"][0]
+    better = {
+        joint: {**own, "relative_error_pct": own["relative_error_pct"] * (0.5, 0.5, 3.0)[j]}
+        for j, (joint, own) in enumerate(first["per_joint"].items())
+    }
+    del better[LEG[1]]
+    for both in ([first, {"per_joint": better}], [{"per_joint": better}, first]):
+        found = _bars({**content, "validation": both})
+        assert [bar.joint for bar in found] == [LEG[2], LEG[1], LEG[0]]
+        assert [bar.error for bar in found] == pytest.approx([18.0, 4.0, 2.0])
+        assert [bar.others["command"] for bar in found] == [40.0] * 3
+    facts = _facts(content)
+    entries = content["drive_parameters"]
+    found = [entry for entry in entries if entry["std_error"] is not None]
+    assert 0 < len(found) < len(entries)
+    assert facts["Drive parameters"] == (
+        f"{len(found)} found, {len(entries) - len(found)} stated or held"
+    )
+    # a log whose error is not the same all the time
+    q = followed.q + 0.004 * np.sin(np.arange(400.0))[:, None] * [1.0, 2.0, 3.0]
+    q[:50] = np.nan
+    run = replace(followed, q=q)
+    html = _charts(run, "fitted", 1, LEG[1], "rad", link="log 0", points=500)
+    rmse = 1e3 * np.sqrt(np.mean((run.log.q - q)[50:, 1] ** 2))
+    assert f"kept.csv, 1 to 5 s, fitted: RMSE {rmse:.3g} mrad" in html
+
+
+def test_the_mean_over_the_horizon_is_of_all_joints_and_the_lines_of_the_worst():
+    names = [f"j{k}" for k in range(9)]
+    size = dict(zip(names, np.arange(9.0, 0.0, -1.0), strict=True))  # [mrad]
+    rows = {
+        "per_joint": {name: {"rmse": 2e-3 * x, "unit": "rad"} for name, x in size.items()},
+        "horizons": {"0.5": {name: 1e-3 * x for name, x in size.items()}},
+        "start": 3.0,
+        "end": 10.0,
+    }
+    html = _horizon_chart(rows, "said")
+    found = chart(html, "position error over the horizon")
+    np.testing.assert_allclose(found["x"], [0.5, 7.0], rtol=1e-6)
+    *lines, mean = found["series"]
+    assert [line["label"] for line in lines] == names[:7]
+    for line, x in zip(lines, size.values(), strict=False):
+        np.testing.assert_allclose(line["y"], [x, 2 * x], rtol=1e-3)
+    both = np.exp(np.mean(np.log([*size.values()])))
+    np.testing.assert_allclose(mean["y"], [both, 2 * both], rtol=1e-3)
+    assert "Error over horizon, the worst 7 joints, the whole stretch last: said" in html
 
 
 def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content):

@@ -10,11 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.figures import torques
-from helpers.pages import chart
+from helpers.pages import chart, percent
 
 from robotid.fitting.information import information
 from robotid.fitting.residuals import autocorrelation, spectrum
-from robotid.identification.pictures import torque_charts
+from robotid.identification.pictures import REACH, torque_charts
+from robotid.report import torques as torques_module
+from robotid.report.torques import torques_section
 from robotid.robot.parameters import INERTIAL_TERMS
 
 JOINTS = range(6)
@@ -224,3 +226,35 @@ def test_captions_say_error_and_how_much_the_band_holds(identified, report):
         )
     assert all(words in report for words in said), said
     assert len(set(said)) == len(said)
+
+
+def test_each_recording_has_its_own_band_error_and_share_of_the_points(identified, monkeypatch):
+    drawn = []
+
+    def noted(chart, caption, points):
+        drawn.append((chart, caption, points))
+        return ""
+
+    monkeypatch.setattr(torques_module, "chart_html", noted)
+    monkeypatch.setattr(torques_module, "_ROWS", 9600)
+    torques_section(replace(identified, validation=()))
+    fitted, joints = identified.fitted, identified.model.joints
+    assert {points for *_, points in drawn} == {9600 // (2 * 6 * 2)}
+    above, below = drawn[::2], drawn[1::2]
+    assert [caption for _, caption, _ in below] == [""] * 12
+    pairs = [(j, k) for j in range(6) for k in range(2)]
+    for (j, k), (upper, caption, _) in zip(pairs, above, strict=True):
+        evaluation, name = fitted[k], joints[j]
+        band, motion = identified.band(evaluation), evaluation.recording.trajectory
+        used = evaluation.recording.mask[:, j].astype(bool)
+        half = REACH * np.interp(np.arange(len(motion.t)), band.samples, band.total[:, j])
+        (series,) = [series for series in upper.series if series.half is not None]
+        np.testing.assert_allclose(series.half[np.isfinite(series.half)], half)
+        residual = motion.tau[used, j] - evaluation.torques["estimate"][used, j]
+        rmse, size = np.sqrt(np.mean(residual**2)), np.sqrt(np.mean(motion.tau[used, j] ** 2))
+        held = np.mean(np.abs(residual) <= half[used])
+        assert upper.link == f"recording {k}"
+        assert caption == (
+            f"{evaluation.recording.name}, fitted: error {percent(100 * rmse / size)} %, RMSE "
+            f"{rmse:.3g} N m; 95 % band holds {100 * held:.0f} %"
+        ), name
