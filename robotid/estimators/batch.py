@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
@@ -78,7 +79,8 @@ class WLS(BatchEstimator):
     independent_share: float = 1.0
 
     def _fit(self, factors: Factors) -> Estimate:
-        sigma = OLS(prior=self.prior).fit(factors).sigma
+        start = solve_factor(factors, np.ones(len(factors.rows)), self.prior)
+        sigma = _noise(factors, start.theta, factors.leverages(start.covariance))
         for iteration in range(1, _MAX_ITERATIONS + 1):
             solution = solve_factor(factors, sigma, self.prior)
             spent = factors.leverages(solution.covariance) / sigma**2
@@ -169,7 +171,7 @@ class TLS(BatchEstimator):
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solution:
     """The minimiser of a weighted problem, and what its factor says of it.
 
@@ -177,15 +179,21 @@ class Solution:
         theta: Parameters, shape (c,).
         covariance: (W^T S^-1 W)^+, shape (c, c).
         rank: Number of directions that the data determine.
-        condition: Condition number over them, columns scaled to unit norm.
+        columns: Factor of the columns scaled to unit norm, shape (c + 1, c).
         undetermined: Names of the parameters that the data leave open.
     """
 
     theta: Array
     covariance: Array
     rank: int
-    condition: float
+    columns: Array
     undetermined: tuple[str, ...]
+
+    @cached_property
+    def condition(self) -> float:
+        """Condition number over the determined directions, columns scaled to unit norm."""
+        s = np.linalg.svd(self.columns, compute_uv=False)
+        return float(s[0] / s[self.rank - 1]) if self.rank else float("inf")
 
     def estimate(
         self, names: tuple[str, ...], covariance: Array, sigma: Array, n_iter: int, message: str
@@ -234,12 +242,12 @@ def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solutio
     heard = norms > _SILENT * norms.max()
     scale = np.where(heard, norms, 1.0)
     X = np.where(heard, A / scale, 0.0)
-    s = np.linalg.svd(X, compute_uv=False)
-    rank = int(np.sum(s > _RANK * s[0])) if s[0] > 0 else 0
-    if rank == c:  # the directions are not needed: they take most of the time
-        inverse = scipy.linalg.solve_triangular(A[:c], np.eye(c))
-        return Solution(inverse @ d[:c], inverse @ inverse.T, rank, float(s[0] / s[-1]), ())
+    inverse, is_singular = scipy.linalg.lapack.dtrtri(A[:c])
+    # the product of Frobenius' norms of X, c^(1/2), and of its inverse bounds its condition
+    if heard.all() and not is_singular and _RANK * np.linalg.norm(scale * inverse.T) < c**-0.5:
+        return Solution(inverse @ d[:c], inverse @ inverse.T, c, X, ())
     U, s, Vt = np.linalg.svd(X)
+    rank = int(np.sum(s > _RANK * s[0])) if s[0] > 0 else 0
     V, V0 = Vt[:rank].T, Vt[rank:].T
     share = np.linalg.norm(V0, axis=1)
     undetermined = tuple(np.array(factors.names)[share > _OPEN].tolist())
@@ -248,8 +256,7 @@ def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solutio
     start = np.zeros(c) if prior is None else prior
     step = V @ ((U[:, :rank].T @ (d - A @ start)) / s[:rank])
     basis = V / s[:rank] / scale[:, None]
-    condition = float(s[0] / s[rank - 1]) if rank else float("inf")
-    return Solution(start + step / scale, basis @ basis.T, rank, condition, undetermined)
+    return Solution(start + step / scale, basis @ basis.T, rank, X, undetermined)
 
 
 def _noise(factors: Factors, theta: Array, spent: Array) -> Array:

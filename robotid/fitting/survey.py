@@ -29,7 +29,7 @@ from robotid.logs.units import check_reach, check_units
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import friction_speeds
 from robotid.regressor.factors import Reduction
-from robotid.regressor.memory import remember
+from robotid.regressor.memory import bears_load, remember
 from robotid.regressor.rows import COMPILED, choose_engine
 from robotid.regressor.used_rows import base_problem, row_mask, static_rows
 from robotid.robot.model import RobotModel
@@ -116,14 +116,16 @@ class LogPiece:
         """
         return self._kept if isinstance(self.header.source, Log) else self._read()
 
-    def take(self, rows: Rows) -> None:
-        """Keep rows that were smoothed before, of a robot with the same friction speeds.
+    def take(self, rows: Rows, before: RobotModel) -> None:
+        """Keep rows that were smoothed before.
 
         Args:
             rows: The rows.
+            before: The robot that they are of, with the same friction speeds.
         """
-        model, mask = self.header.model, rows.mask
-        motion = remember(model, rows.trajectory.with_memory(None))
+        model, motion, mask = self.header.model, rows.trajectory, rows.mask
+        if model.layout != before.layout or bears_load(model):
+            motion = remember(model, motion.with_memory(None))
         if not model.is_static:  # whose stands were chosen with their speeds
             mask = row_mask(model, motion, self.header.signals.min_velocity)
         vars(self)["_kept"] = replace(rows, trajectory=motion, mask=mask)
@@ -292,7 +294,7 @@ class SurveyedLog:
             friction_speeds(model.layout), friction_speeds(self.model.layout)
         ):
             for piece, own in zip(other.pieces, self.pieces, strict=True):
-                piece.take(own.read())
+                piece.take(own.read(), self.model)
         return other
 
     @property

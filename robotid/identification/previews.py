@@ -416,7 +416,7 @@ def _expect(log: SurveyedLog, pi: Array) -> None:
     rows = log.whole
     (torque,) = predict(log.model, [pi], rows.trajectory)
     (piece,) = log.pieces
-    piece.take(replace(rows, trajectory=replace(rows.trajectory, tau=torque)))
+    piece.take(replace(rows, trajectory=replace(rows.trajectory, tau=torque)), log.model)
 
 
 def _errors(

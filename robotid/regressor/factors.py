@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -265,10 +265,9 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
         rows = _fold_sources(triangles, columns, problem.sources, threads)
     else:
         rows = _fold_blocks(triangles, columns, problem)
-    # what is not finite in a row is not finite in R
-    if not all(np.isfinite(triangle.R).all() for triangle in triangles):
-        raise DataError("the problem holds a row that is not finite; check the trajectory")
-    return Factors(tuple(triangle.R for triangle in triangles), tuple(columns), rows, problem.names)
+    found = tuple(triangle.R for triangle in triangles)
+    _require_finite(found)
+    return Factors(found, tuple(columns), rows, problem.names)
 
 
 def compress_stretches(
@@ -286,13 +285,21 @@ def compress_stretches(
     """
     if not problem.sources:
         raise DataError("the problem comes in blocks only; it cannot be cut into stretches")
-    parts = [
-        replace(problem, sources=(source.part(start, min(start + length, source.samples)),))
-        for source in problem.sources
-        for start in range(0, source.samples, length)
-    ]
-    is_parallel = all(source.is_parallel for source in problem.sources)
-    return tuple(_in_order(partial(compress, threads=1), parts, is_parallel, threads))
+    columns = tuple(np.flatnonzero(row) for row in problem.support)
+    part = -(-_PART // length) * length  # whole stretches
+    found = []
+    for source in problem.sources:
+        places = _places(source, columns)
+        starts = range(0, source.samples, part)
+        fold = partial(_fold_part, source, part, length)
+        folded = chain.from_iterable(_in_order(fold, starts, source.is_parallel, threads))
+        for start, triangles in zip(range(0, source.samples, length), folded, strict=True):
+            _require_finite(triangles)
+            rows = source.rows(start, min(start + length, source.samples))
+            placed = zip(triangles, places, columns, strict=True)
+            own = tuple(_placed(R, place, len(wanted) + 1) for R, place, wanted in placed)
+            found.append(Factors(own, columns, rows, problem.names))
+    return tuple(found)
 
 
 def merge(factors: Sequence[Factors]) -> Factors:
@@ -425,17 +432,37 @@ def _fold_sources(
 ) -> Array:
     """Fold each source into the factors, part by part; return the number of rows per joint."""
     for source in sources:
-        places = [
-            np.append(np.searchsorted(wanted, own), len(wanted))
-            for wanted, own in zip(columns, source.columns, strict=True)
-        ]
+        places = _places(source, columns)
         starts = range(0, source.samples, _PART)
-        parts = _in_order(partial(_fold_part, source), starts, source.is_parallel, threads)
-        for part in parts:
+        fold = partial(_fold_part, source, _PART, _PART)
+        for part in chain.from_iterable(_in_order(fold, starts, source.is_parallel, threads)):
             for triangle, place, R_j in zip(triangles, places, part, strict=True):
                 triangle.fold_triangle(R_j, place)
-    rows: Array = np.sum([source.rows for source in sources], axis=0)
+    rows: Array = np.sum([source.rows(0, source.samples) for source in sources], axis=0)
     return rows
+
+
+def _places(source: RowSource, columns: Sequence[Array]) -> list[Array]:
+    """Return where the columns of each row of a source, and its torque, are among those wanted."""
+    return [
+        np.append(np.searchsorted(wanted, own), len(wanted))
+        for wanted, own in zip(columns, source.columns, strict=True)
+    ]
+
+
+def _placed(R: Array, places: Array, size: int) -> Array:
+    """Return the factor of the same rows with more columns, shape (size, size)."""
+    if len(places) == size:
+        return R
+    total = Triangle(size)
+    total.fold_triangle(R, places)
+    return total.R
+
+
+def _require_finite(triangles: Sequence[Array]) -> None:
+    """Refuse factors of rows that are not finite: what is not finite in a row is not in R."""
+    if not all(np.isfinite(R).all() for R in triangles):
+        raise DataError("the problem holds a row that is not finite; check the trajectory")
 
 
 def _in_order(
@@ -450,12 +477,17 @@ def _in_order(
         yield from pool.map(work, items)
 
 
-def _fold_part(source: RowSource, start: int) -> list[Array]:
-    triangles = [Triangle(len(own) + 1) for own in source.columns]
-    for block in source.blocks(start, min(start + _PART, source.samples)):
-        for triangle, rows in zip(triangles, block, strict=True):
+def _fold_part(source: RowSource, length: int, stretch: int, start: int) -> list[list[Array]]:
+    """Return the factors of each stretch of a part of so many samples, joint by joint."""
+    folded: list[list[Triangle]] = []
+    done = 0
+    for block in source.blocks(start, min(start + length, source.samples), stretch):
+        if done % stretch == 0:
+            folded.append([Triangle(len(own) + 1) for own in source.columns])
+        done += len(block[0])
+        for triangle, rows in zip(folded[-1], block, strict=True):
             triangle.fold(rows)
-    return [triangle.R for triangle in triangles]
+    return [[triangle.R for triangle in triangles] for triangles in folded]
 
 
 def triangle_of(rows: Array) -> Array:

@@ -11,10 +11,22 @@ from robotid.regressor.columns import (
     trajectory_values,
 )
 from robotid.regressor.prediction import predict
-from robotid.robot.drives import DriveMotion
+from robotid.robot.drives import Bristles, DriveMotion
 from robotid.robot.model import RobotModel
 
-__all__ = ["drive_motion_along", "remember"]
+__all__ = ["bears_load", "drive_motion_along", "remember"]
+
+
+def bears_load(model: RobotModel) -> bool:
+    """Return whether what the drives of a robot remember changes with the torque of its reference.
+
+    That of bristles does not: it is their way alone.
+
+    Args:
+        model: The robot.
+    """
+    terms = (model.layout.drive_parameters[k][1] for k in model.layout.remembering)
+    return any(not isinstance(term, Bristles) for term in terms)
 
 
 def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:

@@ -49,10 +49,14 @@ class RowSource(ABC):
     def columns(self) -> tuple[Array, ...]:
         """The columns that row j has here, n arrays of shape (c_j,), ascending."""
 
-    @property
     @abstractmethod
-    def rows(self) -> Array:
-        """Number of rows with a positive weight per joint, shape (n,), int."""
+    def rows(self, start: int, stop: int) -> Array:
+        """Return the number of rows with a positive weight per joint, shape (n,), int.
+
+        Args:
+            start: First sample that counts.
+            stop: Sample after the last one.
+        """
 
     @property
     @abstractmethod
@@ -60,25 +64,17 @@ class RowSource(ABC):
         """Whether several threads read it faster than one."""
 
     @abstractmethod
-    def blocks(self, start: int, stop: int) -> Iterator[list[Array]]:
+    def blocks(self, start: int, stop: int, stretch: int | None = None) -> Iterator[list[Array]]:
         """Yield the rows of samples start to stop, a few hundred samples at a time.
 
         Args:
             start: First sample.
             stop: Sample after the last one.
+            stretch: After so many samples each a block ends; None: wherever it does.
 
         Yields:
             Per joint j the rows sqrt(weight) [W_j tau_j], shape (k, c_j + 1), column-major. They
             belong to the caller until the next ones are asked for.
-        """
-
-    @abstractmethod
-    def part(self, start: int, stop: int) -> "RowSource":
-        """Return the rows of samples start to stop only.
-
-        Args:
-            start: First sample.
-            stop: Sample after the last one.
         """
 
     @abstractmethod

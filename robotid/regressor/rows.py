@@ -91,15 +91,6 @@ class InertialRows:
         """Place at which each row begins, and the end, shape (n_rows + 1,), int."""
         return np.concatenate([[0], np.cumsum([len(own) for own in self.columns])])
 
-    def part(self, start: int, stop: int) -> "InertialRows":
-        """Return those of some samples.
-
-        Args:
-            start: First sample.
-            stop: Sample after the last one.
-        """
-        return replace(self, values=self.values[:, start:stop])
-
     def write(self, samples: Array | slice, Y: Array) -> None:
         """Write those of N samples into regressors, shape (N, n_rows, p).
 
@@ -193,21 +184,15 @@ class TrajectoryRows(RowSource):
     def columns(self) -> tuple[Array, ...]:
         return tuple(np.flatnonzero(row) for row in self.support[:, self.kept])
 
-    @cached_property
-    def rows(self) -> Array:
-        used: Array = np.count_nonzero(self.weights > 0, axis=0)
+    def rows(self, start: int, stop: int) -> Array:
+        used: Array = np.count_nonzero(self.weights[start:stop] > 0, axis=0)
         return used
-
-    def part(self, start: int, stop: int) -> "TrajectoryRows":
-        motion = self.trajectory.part(start, stop)
-        inertial = None if self.inertial is None else self.inertial.part(start, stop)
-        return replace(self, trajectory=motion, weights=self.weights[start:stop], inertial=inertial)
 
     def select(self, columns: Array) -> "TrajectoryRows":
         return replace(self, kept=self.kept[columns])
 
-    def blocks(self, start: int, stop: int) -> Iterator[list[Array]]:
-        plan = self._plan
+    def blocks(self, start: int, stop: int, stretch: int | None = None) -> Iterator[list[Array]]:
+        plan, stretch = self._plan, stretch or stop - start
         length = _block_length(int(plan.first[-1]))
         out = np.empty((plan.first[-1], length))
         motion = self.trajectory
@@ -222,8 +207,9 @@ class TrajectoryRows(RowSource):
             weights = self.weights[part] if self._is_weighted else None
             values = trajectory_values(self.model.layout, motion, part)
             writer.load(motion, part, values, weights)
-            for k in range(0, last - first, length):
-                end = min(k + length, last - first)
+            ends = range(start + stretch, last, stretch)  # of stretches
+            edges = {*range(first, last, length), *(end for end in ends if end > first), last}
+            for k, end in pairwise(sorted(edge - first for edge in edges)):
                 writer.write(k, end)
                 yield [out[i:j, : end - k].T for i, j in pairwise(plan.first)]
 

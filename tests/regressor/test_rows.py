@@ -18,11 +18,13 @@ from robotid.robot.model import RobotModel
 SAMPLES = 300  # more than two blocks
 
 
-def blocks(model, trajectory, weight, part):
+def blocks(model, trajectory, weight, part, stretch=90):
     """Return the rows of some samples, row of the robot by row, of every block."""
     (source,) = build_problem(model, trajectory, weight, compiled=False).sources
-    found = list(source.part(*part).blocks(0, part[1] - part[0]))
-    return [np.concatenate(own) for own in zip(*(map(np.copy, b) for b in found), strict=True)]
+    found = [list(map(np.copy, block)) for block in source.blocks(*part, stretch)]
+    ends = np.cumsum([len(block[0]) for block in found]).tolist()
+    assert {*range(stretch, part[1] - part[0], stretch)} < {*ends}  # no block has two stretches
+    return [np.concatenate(own) for own in zip(*found, strict=True)]
 
 
 @pytest.mark.parametrize("name", ["mimic joint coupled", "torso that slides", "humanoid"])

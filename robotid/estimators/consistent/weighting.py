@@ -12,6 +12,7 @@ from robotid.estimators.consistent.fit import Consistent
 from robotid.estimators.consistent.penalties import WeightChoice
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, merge
+from robotid.regressor.lapack import Triangle
 
 __all__ = ["Segments", "choose_weight", "contradicted_extents", "held_out_errors", "log_evidence"]
 
@@ -60,9 +61,12 @@ class Segments:
     @cached_property
     def others(self) -> Array:
         """Information of all segments but one, shape (K, b + 1, b + 1)."""
-        level = self.sigma / np.sqrt(self.share)
-        rest = [merge([*self.kept[:k], *self.kept[k + 1 :]]) for k in range(len(self.kept))]
-        return np.array([factors.weighted(level) for factors in rest])
+        own = [factors.weighted(self.sigma / np.sqrt(self.share)) for factors in self.kept]
+        rest = [Triangle(len(self.rows)) for _ in own]
+        for k, total in enumerate(rest):
+            for R in (*own[:k], *own[k + 1 :]):
+                total.fold_triangle(R, np.arange(len(R)))
+        return np.array([total.R for total in rest])
 
 
 def choose_weight(fit: Consistent, segments: Segments, how: str) -> WeightChoice:
