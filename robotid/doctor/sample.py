@@ -9,11 +9,11 @@ from robotid._typing import Array
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process, resolve, unwrap
-from robotid.regressor.columns import friction_speeds
-from robotid.regressor.torque import carried_columns, joint_torque_regressor
+from robotid.regressor.columns import drive_values, friction_directions, friction_speeds
+from robotid.regressor.torque import carried_columns
 from robotid.robot.model import RobotModel
 
-__all__ = ["Probe", "smooth_motion", "take_probe"]
+__all__ = ["Probe", "coupled_columns", "smooth_motion", "take_probe"]
 
 _MARGIN = 0.15  # [s] rows nearer to the end of a stretch are left out: the filter has not settled
 _STILL = 0.02  # [rad/s] slower than this the sign of a friction torque is not known
@@ -46,13 +46,7 @@ class _Loads:
     @cached_property
     def coupled(self) -> Array:
         """Columns of the coupled drives, shape (N, n, k)."""
-        layout = self.model.layout
-        chosen = layout.n_inertial + np.flatnonzero(layout.is_coupled)
-        if not len(chosen):
-            return np.empty((*self.v.shape, 0))
-        Y = joint_torque_regressor(self.model, self.q, self.v, self.a)
-        columns: Array = Y.reshape(*self.v.shape, -1)[:, :, chosen]
-        return columns
+        return coupled_columns(self.model, self.q, self.v, self.a)
 
     @cached_property
     def pulls(self) -> Array:
@@ -173,6 +167,23 @@ class Probe:
         """
         moved = _probe(self.model, self.motion, self.rows, state)
         return replace(moved, balanced=self.balanced)
+
+
+def coupled_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
+    """Return the regressor's columns of coupled drives, shape (N, n, k).
+
+    Args:
+        model: The robot, with a fixed base and no drive that remembers.
+        q: Joint positions, shape (N, n) [rad or m].
+        v: Velocities, shape (N, n).
+        a: Accelerations, shape (N, n).
+    """
+    layout, coupled = model.layout, np.flatnonzero(model.layout.is_coupled)
+    if not len(coupled):
+        return np.empty((*v.shape, 0))
+    values = drive_values(layout, q, v, a, friction_directions(layout, v, None))
+    columns: Array = layout.drive_loads[:, coupled] * values[coupled].T[:, None]
+    return columns
 
 
 def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Trajectory:

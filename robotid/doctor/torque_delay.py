@@ -11,13 +11,13 @@ from itertools import pairwise
 import numpy as np
 
 from robotid._typing import Array
-from robotid.doctor.sample import smooth_motion
+from robotid.doctor.sample import coupled_columns, smooth_motion
 from robotid.findings import Finding, log_finding
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
 from robotid.logs.splines import cubic_spline
-from robotid.regressor.torque import carried_columns, joint_torque_regressor
+from robotid.regressor.torque import carried_columns
 from robotid.robot.model import RobotModel
 
 __all__ = ["check_torque_delay"]
@@ -304,7 +304,7 @@ def _window(
     state = motion.q[coarse], motion.v[coarse], motion.a[coarse]
     inertial, coupled = (
         low_pass(columns(model, *state), 1 / (step * every), signals)[inner]
-        for columns in (carried_columns, _coupled)
+        for columns in (carried_columns, coupled_columns)
     )
     at = motion.t[coarse[inner]]
     turns = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
@@ -314,16 +314,6 @@ def _window(
     late = _interpolated(t, tau, at + _GRID[:, None])
     drive = np.concatenate([own, coupled], axis=2)
     return _Window(inertial, drive, np.column_stack(steady), late)
-
-
-def _coupled(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
-    """Return the regressor's columns of coupled drives, shape (N, n, k)."""
-    coupled = model.layout.n_inertial + np.flatnonzero(model.layout.is_coupled)
-    if not len(coupled):
-        return np.empty((*q.shape, 0))
-    W = joint_torque_regressor(model, q, v, a)
-    columns: Array = W.reshape(*q.shape, -1)[:, :, coupled]
-    return columns
 
 
 def _interpolated(t: Array, values: Array, times: Array) -> Array:

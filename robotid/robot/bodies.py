@@ -1,5 +1,6 @@
 """Which link's mass is in which body: links joined by fixed or locked joints are one body."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,19 +60,21 @@ def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
         model: The robot.
     """
     arriving = {joint.child: joint for joint in model.tree.joints}
+    frames = {link: _frame(model, link) for link in model.tree.links}
+    heavy = model.tree.inertials
+    transfers = _transfers([frames[link] for link in heavy])
+    parameters = {
+        link: transfer @ inertial_parameters(inertial)
+        for (link, inertial), transfer in zip(heavy.items(), transfers, strict=True)
+    }
     places = []
-    for link in model.tree.links:
-        body, transfer = link_transfer(model, link)
-        role, at = "moved", link
+    for link, frame in frames.items():
+        body, role, at = frame.parentJoint - 1, "moved", link
         while at in arriving and (body < 0 or at != model.layout.bodies[body]):
             joint = arriving[at]
             role = "held" if joint.is_movable or role == "held" else "fixed"
             at = joint.parent
-        inertial = model.tree.inertials.get(link)
-        parameters = np.zeros(10)
-        if inertial is not None:
-            parameters = transfer @ inertial_parameters(inertial)
-        places.append(LinkPlace(link, body, role, parameters))
+        places.append(LinkPlace(link, body, role, parameters.get(link, np.zeros(10))))
     return tuple(places)
 
 
@@ -94,10 +97,21 @@ def link_transfer(model: RobotModel, link: str) -> tuple[int, Array]:
             f"link {link!r} is not in {Path(model.tree.path).name}; links: "
             f"{listed(model.tree.links, 30)}"
         )
-    frame = model.pin_model.frames[model.pin_model.getFrameId(link, pin.FrameType.BODY)]
+    frame = _frame(model, link)
+    return frame.parentJoint - 1, _transfers([frame])[0]
+
+
+def _frame(model: RobotModel, link: str) -> pin.Frame:
+    frame: pin.Frame = model.pin_model.frames[model.pin_model.getFrameId(link, pin.FrameType.BODY)]
+    return frame
+
+
+def _transfers(frames: Sequence[pin.Frame]) -> Array:
+    """Return the map of ``link_transfer`` of k frames, shape (k, 10, 10)."""
     # a pseudo-inertia moves with a homogeneous matrix H as H J H^T, massless links too
-    H = frame.placement.homogeneous
-    return frame.parentJoint - 1, inertial_from_pseudo_inertia(H @ pseudo_inertia_basis() @ H.T).T
+    H = np.array([frame.placement.homogeneous for frame in frames]).reshape(-1, 1, 4, 4)
+    moved: Array = H @ pseudo_inertia_basis() @ H.swapaxes(-1, -2)
+    return inertial_from_pseudo_inertia(moved).swapaxes(-1, -2)
 
 
 def held_parameters(model: RobotModel) -> Array:

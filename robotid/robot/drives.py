@@ -293,15 +293,16 @@ class Bristles(DriveTerm):
         """
         if motion.begins is None:
             return motion.direction * self.level(motion.v)
+        from scipy.linalg.lapack import dtbtrs
+
         way = np.diff(motion.q, prepend=motion.q[:1])
         level, _, kept = laws.bristles(self.numbers, way, motion.v)
-        ends, start = np.sign(way) * level, motion.direction * level
-        z, state = np.empty(len(way)), 0.0
-        steps = zip(*(x.tolist() for x in (ends, kept, start, motion.begins)), strict=True)
-        for k, (end, share, first, is_first) in enumerate(steps):
-            state = first if is_first else end + (state - end) * share if share < 1.0 else state
-            z[k] = state
-        return z
+        # z_k = kept_k z_k-1 + (1 - kept_k) sign(way_k) g_k: a triangle of two diagonals
+        kept = np.where(motion.begins, 0.0, kept)
+        ends = np.where(motion.begins, motion.direction, np.sign(way)) * level
+        band = np.stack([np.ones_like(way), -np.roll(kept, -1)])
+        z, _ = dtbtrs(band, ((1.0 - kept) * ends)[:, None], uplo="L", diag="U", overwrite_b=1)
+        return np.asarray(z[:, 0])
 
 
 @dataclass(frozen=True)

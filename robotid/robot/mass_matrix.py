@@ -58,11 +58,29 @@ def check_mass_matrix(
     q = rng.uniform(lower, upper, (poses, len(free)))
     if model.free_flyer:  # where the base is changes nothing
         q = np.hstack([np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (poses, 1)), q])
-    parts = (q[first : first + _BLOCK] for first in range(0, poses, _BLOCK))
-    smallest = np.concatenate(
-        [np.linalg.eigvalsh(joint_mass_matrices(model, pi, part))[:, 0] for part in parts]
-    )
-    return MassMatrixCheck(poses, float(smallest.min()), float((smallest > 0).mean()))
+    bodies, smallest, positive = model.with_parameters(pi), np.inf, 0
+    for first in range(0, poses, _BLOCK):
+        M = _mass_matrices(bodies, pi, q[first : first + _BLOCK])
+        if first and _are_above(M, max(smallest, 0.0)):
+            positive += len(M)
+            continue
+        least = np.linalg.eigvalsh(M)[:, 0]
+        smallest, positive = min(smallest, float(least.min())), positive + int((least > 0).sum())
+    return MassMatrixCheck(poses, smallest, positive / poses)
+
+
+def _are_above(M: Array, least: float) -> bool:
+    """Return whether all eigenvalues of all matrices are larger: it takes less than to find them.
+
+    Args:
+        M: Symmetric matrices, shape (N, n, n).
+        least: What they are compared with.
+    """
+    try:
+        np.linalg.cholesky(M - least * np.eye(M.shape[-1]))
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def joint_mass_matrices(model: RobotModel, pi: Array, q: Array) -> Array:
@@ -73,10 +91,14 @@ def joint_mass_matrices(model: RobotModel, pi: Array, q: Array) -> Array:
         pi: Standard parameters, shape (p,).
         q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
     """
-    bodies = model.with_parameters(pi)
+    return _mass_matrices(model.with_parameters(pi), pi, q)
+
+
+def _mass_matrices(bodies: RobotModel, pi: Array, q: Array) -> Array:
+    """Return ``joint_mass_matrices`` of a robot that has the parameters."""
     M = rigid_mass_matrices(bodies, bodies.configurations(q))
-    first = model.n_rows - len(model.joints)
-    M[:, first:, first:] += drive_inertia(model.layout, pi)
+    first = bodies.n_rows - len(bodies.joints)
+    M[:, first:, first:] += drive_inertia(bodies.layout, pi)
     return M
 
 

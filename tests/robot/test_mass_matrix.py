@@ -63,6 +63,21 @@ def test_poses_stay_within_the_limits_and_the_share_is_counted(ur5):
     assert not bad.is_positive
 
 
+@pytest.mark.parametrize("upper_arm", [None, 1.0, -5.0])
+def test_the_least_and_the_share_are_those_of_every_block_of_poses(ur5, upper_arm):
+    pi = ur5.standard_parameters()
+    if upper_arm is not None:
+        pi[10], pi[14:20] = upper_arm, 0.0  # its mass, without inertia
+    found = check_mass_matrix(ur5, pi, poses=1500)
+    low, high = (np.array([getattr(j, side) for j in ur5.limits]) for side in ("lower", "upper"))
+    q = np.random.default_rng(0).uniform(low, high, (1500, 6))
+    least = np.linalg.eigvalsh(joint_mass_matrices(ur5, pi, q))[:, 0]
+    assert found.smallest_eigenvalue == pytest.approx(least.min(), rel=1e-9)
+    assert found.positive_share == np.mean(least > 0)
+    if upper_arm is None:
+        assert least.argmin() > 400, "it is not in the first blocks"
+
+
 def test_a_floating_base_has_one_too():
     model = RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True)
     assert check_mass_matrix(model, model.standard_parameters(), poses=20).is_positive
