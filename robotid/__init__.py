@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from robotid.commands.identify import run_job, save_result
+    from robotid.commands.in_memory import identify
     from robotid.commands.job import read_job
     from robotid.doctor.diagnosis import check_logs
     from robotid.doctor.urdf import inspect_urdf
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from robotid.export.urdf import write_urdf
     from robotid.fitting.settings import EstimatorSettings
     from robotid.identification.payload_fit import identify_payload
-    from robotid.identification.pipeline import identify
     from robotid.identification.previews import preview
     from robotid.identification.result import Identification
     from robotid.logs.data import Log, Trajectory
@@ -63,6 +63,7 @@ __all__ = [
 
 _HOMES = {
     "commands.identify": ["run_job", "save_result"],
+    "commands.in_memory": ["identify"],
     "commands.job": ["read_job"],
     "doctor.diagnosis": ["check_logs"],
     "doctor.urdf": ["inspect_urdf"],
@@ -74,7 +75,6 @@ _HOMES = {
     "export.urdf": ["write_urdf"],
     "fitting.settings": ["EstimatorSettings"],
     "identification.payload_fit": ["identify_payload"],
-    "identification.pipeline": ["identify"],
     "identification.previews": ["preview"],
     "identification.result": ["Identification"],
     "logs.data": ["Log", "Trajectory"],

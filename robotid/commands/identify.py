@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from robotid._files import check_folder, folder_beside, write_json
 from robotid._settings import require_kind
 from robotid._typing import STAGES, ProgressCallback, ignore_progress, report_stage
+from robotid.closed_loop.settings import LoopSettings
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import (
     checkpoint_inputs,
@@ -40,6 +41,7 @@ from robotid.workers.checkpoint import Checkpoint, released_on_error
 from robotid.workers.plan import WorkPlan
 
 if TYPE_CHECKING:
+    from robotid.closed_loop.evaluation import OpenLoop
     from robotid.closed_loop.result import LoopIdentification
 
 __all__ = ["identify_job", "run_job", "save_result"]
@@ -101,7 +103,12 @@ def run_job(
     return saved
 
 
-def save_result(identification: Identification, folder: str | Path, *, report: bool = True) -> Path:
+def save_result(
+    identification: "Identification | LoopIdentification",
+    folder: str | Path,
+    *,
+    report: bool = True,
+) -> Path:
     """Write what ``robotid identify`` writes: result.json, report, URDF with its sidecar.
 
     ``robotid.load_result(folder)``, ``robotid validate`` and ``robotid replay`` read it. Every file
@@ -168,7 +175,7 @@ def _write(
     return found, result
 
 
-def _job_of(identification: Identification) -> Job:
+def _job_of(identification: "Identification | LoopIdentification") -> Job:
     """Return the job that an identification comes from, made in Python as far as it is known.
 
     Logs in memory have no file, and gains, units and names of columns are not in a ``Log``.
@@ -176,7 +183,10 @@ def _job_of(identification: Identification) -> Job:
     model, asked = identification.model, identification.asked
     if isinstance(asked.job, Job):
         return asked.job
-    chosen = {drive.joint: drive for drive in identification.drives}
+    if isinstance(identification, Identification):
+        chosen, loop = {drive.joint: drive for drive in identification.drives}, LoopSettings()
+    else:
+        chosen, loop = {}, identification.loop
     wanted = wanted_families(asked.friction, model.joints)
     is_auto = all(names is None for names in wanted.values())
     drives: dict[str, tuple[str | DriveTerm, ...]] = {}
@@ -205,15 +215,19 @@ def _job_of(identification: Identification) -> Job:
         identification=_entries(identification.fitted),
         validation=_entries(identification.validation),
         ignore=asked.ignore,
+        controller=loop,
     )
 
 
-def _entries(evaluations: Sequence[Evaluation]) -> tuple[LogEntry, ...]:
+def _entries(runs: "Sequence[Evaluation | OpenLoop]") -> tuple[LogEntry, ...]:
     """Return the windows of the logs that are in files."""
-    recordings = [evaluation.recording for evaluation in evaluations]
-    return tuple(
-        LogEntry(Path(r.log.path), r.extent.start, r.extent.end) for r in recordings if r.log.path
-    )
+    windows = [
+        (run.recording.log.path, run.recording.extent.start, run.recording.extent.end)
+        if isinstance(run, Evaluation)
+        else (run.log.path, float(run.log.t[0]), float(run.log.t[-1]))
+        for run in runs
+    ]
+    return tuple(LogEntry(Path(path), start, end) for path, start, end in windows if path)
 
 
 def _remove_stale(files: Iterable[Path]) -> None:

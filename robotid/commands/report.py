@@ -5,7 +5,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from robotid._files import check_file, file_sha256
+from robotid._files import check_file, file_sha256, write_text
 from robotid._typing import ProgressCallback, report_stage
 from robotid.commands.identify import identify_job
 from robotid.commands.job import Job, job_from_settings
@@ -16,7 +16,8 @@ from robotid.findings import listed
 from robotid.identification.result import Identification
 from robotid.report.advice import Origin
 from robotid.report.document import write_report
-from robotid.report.loop_page import write_loop_report
+from robotid.report.positions import shown_positions
+from robotid.report.shown import page_of
 from robotid.versions import versions
 from robotid.workers.plan import WorkPlan
 
@@ -74,7 +75,11 @@ def rewrite_report(
             [loaded.open_loop(log_of_commands(job, entry, loaded)) for entry in entries]
             for entries in (job.validation, job.identification)
         )
-        write_loop_report(content, fitted, kept, goal, files=files, origin=origin)
+        model = job.model()
+        pi, bodies = model.standard_parameters(), slice(model.layout.n_inertial)
+        pi[bodies] = loaded.parameters[bodies]
+        shown = shown_positions(content, fitted, kept, origin, (model, pi))
+        write_text(page_of(shown, files), goal)
     else:
         write_report(found, goal, files=files, origin=origin)
     return {"result": str(loaded.path), "report": str(goal)}

@@ -91,11 +91,15 @@ def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dic
             "prior": float(found.prior[i]),
             "source": sources[i],
             "at_bound": bool(at_bound[i]),
-            **({"correlated_with": layout.names[pairs[i][0]]} if i in pairs else {}),
+            **(_partner(layout.names[pairs[i][0]], pairs[i][1]) if i in pairs else {}),
         }
         for i, name in enumerate(layout.names)
     ]
     return entries[: layout.n_inertial], entries[layout.n_inertial :]
+
+
+def _partner(name: str, correlation: float) -> dict[str, Any]:
+    return {"correlated_with": name, "correlation": correlation}
 
 
 def parameter_table(

@@ -1,27 +1,45 @@
 """The report's tables as HTML: parameters, changes, consistency, what is open, settings, inputs."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from html import escape
 from typing import Any
 
 import numpy as np
 
-from robotid.export.entries import input_entries
+from robotid._typing import Array
 from robotid.export.urdf import urdf_changes
 from robotid.findings import listed
 from robotid.fitting.evaluation import Recording
 from robotid.fitting.identified import SOURCES
-from robotid.fitting.parameter_table import correlated_parameters
 from robotid.identification.result import Identification
-from robotid.pages.html import Cell, code, number, percent, table, text, with_error
-from robotid.report.summary_screen import DETERMINED
-from robotid.robot.parameters import pseudo_inertia
-from robotid.versions import versions
+from robotid.pages.html import Cell, code, folded, number, percent, table, text, with_error
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import INERTIAL_TERMS, pseudo_inertia
 
-__all__ = ["input_table", "tables", "version_table"]
+__all__ = [
+    "base_table",
+    "consistency_section",
+    "input_table",
+    "open_section",
+    "parameter_section",
+    "settings_tables",
+    "sources_fact",
+    "version_table",
+]
 
+#: In words, what determined a parameter.
+_DETERMINED = {
+    "data": "motion",
+    "mixed": "motion and prior",
+    "prior": "prior",
+    "bound": "at its bound",
+    "stated": "stated",
+}
+
+_FIRST_TERMS = ("kp", "kd", "delay", "limit", "zero")  # of a drive, before all others
+_MILLI = {"s": "ms"}  # units that drives are shown in
 _METRICS = {
     "euclidean": "each parameter over its own spread (euclidean)",
     "riemannian": "the pull-back metric at the URDF's pseudo-inertias (riemannian)",
@@ -34,67 +52,129 @@ _CHOSEN = {
 }
 
 
-def tables(found: Identification) -> dict[str, str]:
-    """Return the tables by the section that they stand in.
+def parameter_section(
+    model: RobotModel | None,
+    standard: Array | None,
+    entries: Sequence[Mapping[str, Any]],
+    words: str,
+    on_misfit: Collection[str] = (),
+) -> str:
+    """Return every parameter of the links and drives, and how the URDF changes.
 
     Args:
-        found: The identification.
+        model: The robot; None if its URDF is not at hand.
+        standard: Its identified standard parameters, shape (p,), SI units; None without a URDF.
+        entries: The parameters, as in result.json.
+        words: What they are, HTML.
+        on_misfit: Names of those that stand on a misfit.
     """
-    return {
-        "parameters": _parameter_table(found),
-        "changes": _change_section(found),
-        "base": _base_table(found),
-        "consistency": _consistency_section(found),
-        "open": _open_section(found),
-        "settings": _settings_tables(found),
-        "inputs": input_table(input_entries(found)),
-        "versions": version_table(versions()),
-    }
+    return (
+        f"<p>{words} ±: one standard error; low and high: the 95 % interval. Determined by motion, "
+        "where it is below 30 % of the spread assumed before the fit; by the prior, above 90 %, "
+        "which is the URDF; at its bound, where physics allows no more; with another (r), where "
+        "the errors of both cancel: the effect of the two together is known far better than "
+        "each.</p>\n"
+        + _drive_table(entries)
+        + _parameter_table(entries, on_misfit)
+        + folded("changes", "Changes of the URDF", _change_section(model, standard))
+    )
 
 
-def _parameter_table(found: Identification) -> str:
-    """Return every parameter of the links and drives: before, after, and what determined it."""
-    layout, prior, error = found.model.layout, found.prior, found.standard_error
-    rows, pairs = [], correlated_parameters(found)
-    for i, (name, source) in enumerate(zip(layout.names, found.sources, strict=True)):
-        owner, term = name.rsplit(".", 1)
-        value, uncertain = with_error(found.standard[i], error[i])
-        change, _ = with_error(found.standard[i] - prior[i], error[i], sign="+")
-        if not set("123456789") & set(change.html):
-            change = replace(change, html="0")
-        words = DETERMINED[source] + (", on a misfit" if name in found.on_misfit else "")
-        if i in pairs:
-            other, r = pairs[i]
-            words += f", with {layout.names[other].rpartition('.')[2]} (r = {r:.3f})"
+def _parameter_table(entries: Sequence[Mapping[str, Any]], on_misfit: Collection[str]) -> str:
+    """Return every parameter: before, after, and what determined it."""
+    rows = []
+    for entry in entries:
+        owner, _, term = entry["name"].rpartition(".")
+        error, prior = _error(entry), entry.get("prior")
+        value, uncertain = with_error(entry["value"], error)
+        change = number(None)
+        if prior is not None:
+            change, _ = with_error(entry["value"] - prior, error, sign="+")
+            if not set("123456789") & set(change.html):
+                change = replace(change, html="0")
+        words = _DETERMINED[entry["source"]]
+        words += ", on a misfit" if entry["name"] in on_misfit else ""
+        if other := entry.get("correlated_with"):
+            words += f", with {other.rpartition('.')[2]} (r = {entry['correlation']:.3f})"
+        low, high = entry.get("interval_95") or (None, None)
         rows.append(
             [
                 code(owner),
                 text(term),
-                number(prior[i]),
+                number(prior),
                 value,
                 uncertain,
+                number(low),
+                number(high),
                 change,
                 text(words),
-                text(layout.units[i]),
+                text(entry["unit"]),
             ]
         )
-    headers = ["link or drive", "parameter", "URDF", "identified", "± error", "change"]
-    headers += ["determined by", "unit"]
-    return (
-        "<p>One of many sets with the same torque: the data fix the base parameters only, the "
-        "rest follows the URDF. ±: one standard error. Determined by motion, where it is below "
-        "30 % of the spread assumed before the fit; by the prior, above 90 %, which is the URDF; "
-        "at its bound, where physics allows no more; with another (r), where the errors of "
-        "both cancel: the torque of the two together is known far better than each.</p>\n"
-        + table("Parameters of links and drives", headers, rows, is_data=True)
+    headers = ["link or drive", "parameter", "URDF", "identified", "± error", "low", "high"]
+    headers += ["change", "determined by", "unit"]
+    return table("Parameters of links and drives", headers, rows, is_data=True)
+
+
+def _drive_table(entries: Sequence[Mapping[str, Any]]) -> str:
+    """Return the terms of drives side by side, joint by joint."""
+    drives: dict[str, dict[str, Mapping[str, Any]]] = {}
+    for entry in entries:
+        owner, _, term = entry["name"].rpartition(".")
+        if term not in INERTIAL_TERMS:
+            drives.setdefault(owner, {})[term] = entry
+    told = {
+        term: entry
+        for own in drives.values()
+        for term, entry in own.items()
+        if entry["value"] or entry.get("std_error") is not None
+    }  # of the others all are 0 and fixed
+    terms = sorted(told, key=lambda term: (*_FIRST_TERMS, term).index(term))
+    units = [_MILLI.get(told[term]["unit"], told[term]["unit"]) for term in terms]
+    headers = ["joint", *(f"{term} [{unit}]" for term, unit in zip(terms, units, strict=True))]
+    rows = [
+        [code(joint), *(_short(own.get(term)) for term in terms)] for joint, own in drives.items()
+    ]
+    return table("Drives, joint by joint", headers, rows, is_data=True) if terms else ""
+
+
+def _error(entry: Mapping[str, Any]) -> float:
+    error = entry.get("std_error")
+    return math.inf if error is None else float(error)
+
+
+def _short(entry: Mapping[str, Any] | None) -> Cell:
+    """Return a parameter with its standard error in one cell; times in ms."""
+    if entry is None:
+        return number(None)
+    scale = 1e3 if entry["unit"] in _MILLI else 1.0
+    value, error = with_error(scale * entry["value"], scale * _error(entry))
+    if error.value is None:
+        return value
+    return Cell(f"{value.html} ± {error.html}", "number", value.value)
+
+
+def sources_fact(entries: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Return how many parameters were determined by what, in figures, HTML by its name.
+
+    Args:
+        entries: The parameters, as in result.json.
+    """
+    counts = {kind: sum(entry["source"] == kind for entry in entries) for kind in _DETERMINED}
+    there = {kind: count for kind, count in counts.items() if count}
+    shares = "".join(
+        f'<i class="{kind}" style="flex: {count}"></i>' for kind, count in there.items()
     )
+    words = ", ".join(f"{count} {_DETERMINED[kind]}" for kind, count in there.items())
+    name = f"{len(entries)} parameters, determined by"
+    return {name: f'<span class="shares">{shares}</span>{words}'}
 
 
-def _change_section(found: Identification) -> str:
+def _change_section(model: RobotModel | None, standard: Array | None) -> str:
     """Return the lines of the URDF that change, with the name of the link before each."""
-    if not found.has_urdf:
+    if standard is None:
         return "<p>No URDF was written.</p>\n"
-    lines = urdf_changes(found.model, found.standard)
+    lines = [] if model is None else urdf_changes(model, standard)
     if not lines:
         return "<p>The URDF is no longer where it was read.</p>\n"
     kinds, html, link = {"-": "del", "+": "ins"}, "", ""
@@ -110,8 +190,12 @@ def _change_section(found: Identification) -> str:
     )
 
 
-def _base_table(found: Identification) -> str:
-    """Return the table of the base parameters."""
+def base_table(found: Identification) -> str:
+    """Return the table of the base parameters.
+
+    Args:
+        found: The identification.
+    """
     mapping, units = found.mapping, found.model.layout.units
     open_ = set(found.determination.undetermined)
     rows = []
@@ -131,8 +215,12 @@ def _base_table(found: Identification) -> str:
     )
 
 
-def _consistency_section(found: Identification) -> str:
-    """Return masses and pseudo-inertias, before and after; then prior, bounds and mass matrix."""
+def consistency_section(found: Identification) -> str:
+    """Return masses and pseudo-inertias, before and after; then prior, bounds and mass matrix.
+
+    Args:
+        found: The identification.
+    """
     layout = found.model.layout
     before, after = (
         pseudo_inertia(pi[: layout.n_inertial]) for pi in (found.prior, found.standard)
@@ -162,8 +250,12 @@ def _consistency_section(found: Identification) -> str:
     )
 
 
-def _open_section(found: Identification) -> str:
-    """Return what the data do not determine."""
+def open_section(found: Identification) -> str:
+    """Return what the data do not determine.
+
+    Args:
+        found: The identification.
+    """
     wls, layout = found.wls, found.model.layout
     kept = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
     return (
@@ -215,8 +307,12 @@ def _combinations(found: Identification) -> str:
     )
 
 
-def _settings_tables(found: Identification) -> str:
-    """Return the tables of the settings, as used."""
+def settings_tables(found: Identification) -> str:
+    """Return the tables of the settings, as used.
+
+    Args:
+        found: The identification.
+    """
     model = found.model
     settings = found.estimator.to_dict()
     pairs = {

@@ -1,48 +1,191 @@
-"""The report's section of torques over time: each joint's, in every recording that is shown."""
+"""What the report shows of an identification from torques."""
 
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from html import escape
+from typing import Any
 
+from robotid.export.entries import input_entries
+from robotid.findings import listed
 from robotid.fitting.bands import TorqueBand
 from robotid.fitting.evaluation import Evaluation
+from robotid.fitting.metrics import Metrics
+from robotid.fitting.parameter_table import parameter_entries
 from robotid.identification.pictures import torque_charts
 from robotid.identification.result import Identification
-from robotid.identification.summary import verdict_cell
+from robotid.logs.settings import SignalSettings
 from robotid.pages.charts import chart_html
-from robotid.pages.html import code, folded, percent
-from robotid.report.summary_screen import joint_errors
+from robotid.pages.html import percent
+from robotid.report.advice import Origin, next_steps
+from robotid.report.curves import curves_section, drawn
+from robotid.report.diagnosis import (
+    body_figures,
+    drive_figures,
+    information_section,
+    residual_section,
+)
+from robotid.report.errors import TORQUE, Errors, worst_errors
+from robotid.report.shown import Shown
+from robotid.report.tables import (
+    base_table,
+    consistency_section,
+    input_table,
+    open_section,
+    parameter_section,
+    settings_tables,
+    version_table,
+)
+from robotid.report.why import why_section
+from robotid.versions import versions
 
-__all__ = ["torques_section"]
+__all__ = ["shown_torques", "torques_section"]
 
-_ROWS = 24_000  # of all charts together: about half a MB
-_LONGEST = 2000  # rows of one chart
-_OPEN = 6  # joints that are open at most
-_MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
+_ERRORS = (
+    "<p>error = 100 |τ − prediction| / |τ| over the rows used. For comparison, the error of "
+    "unconstrained weighted least squares (WLS) on the same rows, of the URDF as shipped "
+    "without drive parameters, of the URDF's bodies with drive terms fitted to the same rows, "
+    "and of the URDF's gravity torque alone; predicting zero scores 100.</p>\n"
+)
+_PARAMETERS = (
+    "One of many sets with the same torque: the data fix the base parameters only, the rest "
+    "follows the URDF."
+)
 
 
-def torques_section(found: Identification) -> str:
-    """Return torques and residuals over time; joints that are not good are open, the worst few.
+def shown_torques(found: Identification, origin: Origin) -> Shown:
+    """Return what a report shows of an identification.
 
     Args:
         found: The identification.
+        origin: Where it came from, for commands.
     """
-    model, evaluations = found.model, found.validation or found.fitted
-    shown = evaluations[: max(1, _MOST_PLOTS // model.n_rows)]
-    points = min(_LONGEST, max(200, _ROWS // (2 * model.n_rows * len(shown))))
-    bands = [found.band(evaluation) for evaluation in shown]
-    parts, worst = [_said(found, shown, evaluations[len(shown) :])], [*joint_errors(found)][:_OPEN]
-    for row, name in enumerate(model.row_names):
-        verdict = found.verdict.joints.get(name)
-        said = "" if verdict is None else verdict_cell(name, asdict(verdict))
-        charts = "".join(
-            _charts(found, evaluation, band, row, link=f"recording {k}", points=points)
-            for k, (evaluation, band) in enumerate(zip(shown, bands, strict=True))
+    count = len(found.fitted)
+    fitted = Errors(
+        "" if count > 1 else _names(found.fitted),
+        _joints(found.metrics(), found.metrics("wls")),
+        is_fitted=True,
+    )
+    kept = [
+        Errors(e.recording.name, _joints(e.metrics["estimate"], e.metrics["wls"]))
+        for e in found.validation
+    ]
+    counted = [errors for errors, e in zip(kept, found.validation, strict=True)
+               if not e.is_refitted] or [fitted]  # fmt: skip
+    entries = [entry for part in parameter_entries(found) for entry in part]
+    verdict = found.verdict.to_dict()
+    return Shown(
+        title=f"{found.model.name}: identified parameters",
+        robot=found.model.name,
+        rows=found.model.row_names,
+        verdict=verdict,
+        findings=found.findings,
+        quantity=TORQUE,
+        counted=counted,
+        recordings=[*kept, fitted],
+        facts=_facts(found),
+        steps=next_steps(found, origin),
+        made="".join(f"<p>{escape(text)}</p>\n" for text in (_made(found), _beside(found))),
+        errors=(_ERRORS, ""),
+        curves=("Torques", torques_section(found, verdict["per_joint"], [*worst_errors(counted)])),
+        why=why_section(found),
+        parameters=parameter_section(found.model, found.standard if found.has_urdf else None,
+                                     entries, _PARAMETERS, found.on_misfit),
+        entries=entries,
+        appendix={
+            "residuals": ("What the residuals hold", residual_section(found)),
+            "drives": ("Friction and drives", drive_figures(found)),
+            "bodies": ("Bodies beside the URDF's", body_figures(found)),
+            "base": ("Base parameters", base_table(found)),
+            "consistency": ("Physical consistency", consistency_section(found)),
+            "information": ("Excitation and correlation", information_section(found)),
+            "open": ("What the data do not determine", open_section(found)),
+            "settings": ("Settings", settings_tables(found)),
+            "inputs": ("Inputs", input_table(input_entries(found))),
+            "versions": ("Versions", version_table(versions())),
+        },
+    )  # fmt: skip
+
+
+def _joints(metrics: Metrics, wls: Metrics) -> dict[str, dict[str, Any]]:
+    """Return the metrics of joints as in result.json, the error of WLS as that of a baseline."""
+    joints: dict[str, dict[str, Any]] = metrics.to_dict()["per_joint"]
+    for joint, measured in joints.items():
+        measured["wls_relative_error_pct"] = wls.per_joint[joint].relative_error_pct
+    return joints
+
+
+def _names(evaluations: Sequence[Evaluation]) -> str:
+    return ", ".join(e.recording.name for e in evaluations)
+
+
+def _facts(found: Identification) -> dict[str, str]:
+    before, after, _ = found.witness.masses
+    change = f" ({100 * (after / before - 1):+.0f} %)".replace("-", "−") if before > 0 else ""
+    return {
+        "Total mass": f"<strong>{before:.2f} → {after:.2f} kg</strong>{change}",
+        "Base parameters determined": (
+            f"<strong>{found.determination.rank} of {len(found.base)}</strong>, condition number "
+            f"{found.wls.condition:.3g}"
+        ),
+    }
+
+
+def _made(found: Identification) -> str:
+    """Return what was fitted to what."""
+    fitted, kept = found.fitted, found.validation
+    samples = sum(e.recording.extent.smooth for e in fitted)
+    rows = sum(e.recording.extent.rows_used for e in fitted)
+    chains = sorted({_chain(e.recording.signals) for e in (*fitted, *kept)})
+    return (
+        f"{len(found.base)} base parameters of {len(found.model.joints)} joints were fitted to "
+        f"{_names(fitted)} ({samples} samples after filtering, {rows} torque rows used) by "
+        f"{found.estimator.words} ({found.estimator.name}). "
+        + (f"Kept apart for validation: {_names(kept)}. " if kept else "No log was kept apart. ")
+        + f"Signals: {'; or '.join(chains)}."
+    )
+
+
+def _beside(found: Identification) -> str:
+    """Return masses, gravity and friction in a sentence, beside which a verdict is read."""
+    witness = found.witness
+    shares = [f"{joint} {100 * share:.0f} %" for joint, share in witness.friction.items()]
+    before, after, _ = witness.masses
+    gravity = [f"{joint} {ratio:.2f}" for joint, ratio in witness.gravity.items()]
+    return (
+        f"Total mass {before:.2f} -> {after:.2f} kg. Gravity torque over the URDF's: "
+        f"{listed(gravity)}. Friction as a share of the torque: {listed(shares)}."
+    )
+
+
+def _chain(signals: SignalSettings) -> str:
+    cutoff = "no filter"
+    if signals.cutoff is not None:
+        cutoff = (
+            f"zero-phase Butterworth low-pass, cut-off {signals.cutoff:g} Hz, order "
+            f"{signals.order} run forward and backward"
         )
-        summary = f"<strong>{code(name).html}</strong> {escape(said)}"
-        is_bad = said.startswith(("poor", "usable")) and name in worst
-        parts.append(folded(f"torque-{row}", summary, charts, is_open=is_bad))
-    return "".join(parts)
+    rate = f"grid of {signals.rate:.6g} Hz" if signals.rate else "rows as they were recorded"
+    return f"{cutoff}, {rate}, velocity {signals.velocity}"
+
+
+def torques_section(
+    found: Identification, verdicts: Mapping[str, Mapping[str, Any]], worst: Sequence[str]
+) -> str:
+    """Return torques and residuals over time.
+
+    Args:
+        found: The identification.
+        verdicts: The verdict on each joint, as in result.json.
+        worst: Joints that have errors, the worst first.
+    """
+    evaluations, rows = found.validation or found.fitted, found.model.row_names
+    shown = drawn(evaluations, rows)
+    runs = {f"recording {k}": (e, found.band(e)) for k, e in enumerate(shown)}
+
+    def charts(run: tuple[Evaluation, TorqueBand], row: int, link: str, points: int) -> str:
+        return _charts(found, *run, row, link=link, points=points)
+
+    said = _said(found, shown, evaluations[len(shown) :])
+    return curves_section(said, runs, rows, verdicts, worst, charts)
 
 
 def _said(found: Identification, shown: Sequence[Evaluation], left: Sequence[Evaluation]) -> str:

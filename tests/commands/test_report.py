@@ -186,7 +186,7 @@ def test_the_report_of_drives_that_follow_commands_rolls_the_result_out(tmp_path
     shown = chart(page, f"position of {log.joints[0]}")
     lines = {series["label"]: series["y"] for series in shown["series"]}
     np.testing.assert_allclose(lines["simulated"], lines["measured"], atol=2e-3)
-    assert "log.csv, 0 to 2.995 s, fitted: RMSE" in page
+    assert "log.csv 0-2.995 s, fitted: RMSE" in page
     (tmp_path / "log.csv").write_text("time\n")
     assert main(["report", str(out), "--out", str(tmp_path / "page.html")]) == 1
 

@@ -17,7 +17,7 @@ from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process, resolve
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
-from robotid.report.tables import tables
+from robotid.report.tables import open_section
 
 EXACT = SignalSettings(cutoff=None, trim=0.0)
 NOISE = 0.1  # [N m]
@@ -165,7 +165,7 @@ def test_doctor_result_report_and_refusal_say_the_same(ur5, case, request):
     assert structure["rank"] == known.rank
     assert structure["undetermined"] == list(known.undetermined)
     sums = [entry for group in structure["not_told_apart"] for entry in group["determined"]]
-    html = tables(found)["open"].replace("<wbr>", "")
+    html = open_section(found).replace("<wbr>", "")
     assert f"The data determine {known.rank} of 58 base parameters" in html
     for entry in sums:
         assert entry["text"] in html

@@ -102,7 +102,8 @@ CALLS = {
     "identify": (
         robotid.identify,
         lambda c, _: {"model": c.model, "logs": c.log, "validation": (), "signals": None,
-                      "estimator": "ols", "friction": "none", "doctor": False, "ignore": ()},
+                      "estimator": "ols", "controller": None, "friction": "none", "doctor": False,
+                      "ignore": ()},
     ),
     "identify_payload": (
         robotid.identify_payload,

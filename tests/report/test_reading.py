@@ -77,15 +77,15 @@ def test_csv_holds_every_number_in_full_with_ascii_minus_signs(seen, identified)
     assert "\u2212" not in text
     head, *rows = csv.reader(io.StringIO(text))
     assert head == [
-        "link or drive", "parameter", "URDF", "identified", "± error", "change", "determined by",
-        "unit",
+        "link or drive", "parameter", "URDF", "identified", "± error", "low", "high", "change",
+        "determined by", "unit",
     ]  # fmt: skip
     assert [".".join(row[:2]) for row in rows] == list(identified.model.layout.names)
     for row, prior, value, error in zip(
         rows, identified.prior, identified.standard, identified.standard_error, strict=True
     ):
         assert [float(x) for x in row[2:4]] == pytest.approx([prior, value], rel=1e-9)
-        assert float(row[5]) == pytest.approx(value - prior, rel=1e-9)
+        assert float(row[7]) == pytest.approx(value - prior, rel=1e-9)
         assert float(row[4] or "inf") == pytest.approx(error, rel=1e-9)
     assert any(row[3].startswith("-") for row in rows)
 

@@ -17,7 +17,9 @@ from robotid.estimators.determination import Group
 from robotid.fitting.information import information
 from robotid.identification.summary import verdict_cell
 from robotid.pages import html
-from robotid.report import tables as report_tables
+from robotid.report.advice import Origin
+from robotid.report.tables import _consistency_notes, _reach, base_table
+from robotid.report.torques import shown_torques
 from robotid.robot.parameters import INERTIAL_TERMS
 from robotid.versions import versions
 
@@ -125,8 +127,10 @@ def test_every_parameter_stands_beside_that_of_the_urdf(shown, identified):
             change = ("+" if value > urdf[i] else "−") + change
         else:
             change = "0"
-        assert row[2:] == [number(urdf[i]), said, uncertain, change, words[source], units[row[1]]]
-    held = [".".join(row[:2]) for row in rows if row[6] == "at its bound" and row[4] == "–"]
+        ends = [number(x) for x in identified.standard_interval[i]]
+        assert row[2:5] == [number(urdf[i]), said, uncertain]
+        assert row[5:] == [*ends, change, words[source], units[row[1]]]
+    held = [".".join(row[:2]) for row in rows if row[8] == "at its bound" and row[4] == "–"]
     assert held == ["elbow_joint.viscous"]
     columns = shown["Parameters of links and drives"]
     assert columns.column("URDF") != columns.column("identified")
@@ -168,13 +172,13 @@ def test_a_base_parameter_that_is_not_determined_has_no_error(identified):
     names = identified.mapping.base_names
     group = replace(Group((names[3],), ()))
     known = replace(identified.determination, groups=(group,))
-    rows = tables(report_tables.tables(replace(identified, determination=known))["base"])
+    rows = tables(base_table(replace(identified, determination=known)))
     dashed = [row[0] for row in rows["Base parameters"].rows if row[2:4] == ["–", "–"]]
     assert dashed == [names[3], "elbow_joint.viscous"]
 
 
 def test_the_lines_of_the_urdf_that_change_stand_under_the_name_of_their_link(identified):
-    diff = report_tables.tables(identified)["changes"]
+    diff = shown_torques(identified, Origin()).parameters
     links = re.findall(r"<strong>(.*?)</strong>", diff)
     held = ["ee_link", "tool0"]  # fixed to the last link, whose inertial has theirs
     assert links == [*identified.model.layout.bodies, *held]
@@ -235,7 +239,7 @@ def test_the_notes_on_consistency_state_every_figure_with_its_unit(identified):
     found = SimpleNamespace(
         estimate=estimate, mass_matrix=check, model=identified.model, sources=identified.sources
     )
-    said = text_of(report_tables._consistency_notes(found)).split(" The mass matrix")[1]
+    said = text_of(_consistency_notes(found)).split(" The mass matrix")[1]
     assert said == (
         ", armatures included, is positive definite at 97.3 % of 321 random poses (smallest "
         "eigenvalue -0.0123). The distance from the URDF's values is measured by the divergence of "
@@ -246,7 +250,7 @@ def test_the_notes_on_consistency_state_every_figure_with_its_unit(identified):
     )
     sources = ["prior"] * len(identified.sources)
     sources[:3], sources[60:] = ["data", "mixed", "bound"], ["data"] * (len(sources) - 60)
-    said = report_tables._reach(SimpleNamespace(model=identified.model, sources=tuple(sources)))
+    said = _reach(SimpleNamespace(model=identified.model, sources=tuple(sources)))
     bodies = identified.model.layout.bodies
     assert said == (
         f"How far the data carry: of {len(sources)} parameters {len(sources) - 59} come from the "
@@ -336,6 +340,6 @@ def test_versions_are_listed(shown):
 
 def test_a_drive_parameter_that_stands_on_a_misfit_says_so(identified):
     found = replace(identified, on_misfit=("elbow_joint.coulomb",))
-    rows = tables(report_tables.tables(found)["parameters"])["Parameters of links and drives"].rows
-    marked = [row[:2] for row in rows if row[6].endswith(", on a misfit")]
+    rows = tables(shown_torques(found, Origin()).parameters)["Parameters of links and drives"].rows
+    marked = [row[:2] for row in rows if row[8].endswith(", on a misfit")]
     assert marked == [["elbow_joint", "coulomb"]]

@@ -24,7 +24,8 @@ from robotid.regressor.torque import (
     joint_torque_regressor,
     trajectory_regressor,
 )
-from robotid.report.tables import tables
+from robotid.report.advice import Origin
+from robotid.report.torques import shown_torques
 from robotid.robot.drives import (
     DRIVE_TERMS,
     FAMILIES,
@@ -218,7 +219,7 @@ def test_identification_recovers_it_and_the_table_shows_it(model, term, rng):
     drives = drive_part(model)
     if not (term.is_inertia or term.name.startswith("sin")):  # those may come in a group
         np.testing.assert_allclose(found.standard[drives], pi[drives], atol=1e-6)
-    html = tables(found)["parameters"].replace("<wbr>", "").replace("−", "-")
+    html = shown_torques(found, Origin()).parameters.replace("<wbr>", "").replace("−", "-")
     lines = [re.sub(r"<[^>]*>", " ", row).split() for row in html.split("</tr>")[1:]]
     known = zip(
         model.layout.drive_names, found.standard[drives], found.standard_error[drives], strict=True

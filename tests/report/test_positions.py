@@ -14,14 +14,9 @@ from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.logs.data import Log
 from robotid.report.advice import Origin
-from robotid.report.loop_page import (
-    _bars,
-    _charts,
-    _facts,
-    _horizon_chart,
-    _undetermined,
-    write_loop_report,
-)
+from robotid.report.errors import worst_errors
+from robotid.report.positions import _charts, _horizons, _undetermined, shown_positions
+from robotid.report.shown import page_of
 
 ERRORS = {"rmse": (2e-3, 4e-3, 8e-3), "command_rmse": (0.02, 0.05, 0.08), "urdf_rmse": (0.01,) * 3}
 REASON = "the calf is <i>off</i>"
@@ -77,38 +72,51 @@ def content(tmp_path_factory):
     per_joint = {
         joint: {
             "relative_error_pct": 2.0 * (j + 1), "rmse": ERRORS["rmse"][j], "unit": "rad",
-            "command_relative_error_pct": 40.0, "urdf_relative_error_pct": 10.0,
+            "command_relative_error_pct": 40.0, "urdf_relative_error_pct": 10.0, "r2": 0.99,
+            "rows": 400, "better_than_constant": True,
         }
         for j, joint in enumerate(LEG)
     }  # fmt: skip
     kept = {"log": "logs/kept.csv", "per_joint": per_joint}
-    return {**load_result(folder).content, "validation": [kept]}
+    fitted = {
+        joint: {**own, "rmse": 0.5 * own["rmse"], "rows": 800} for joint, own in per_joint.items()
+    }
+    whole = {"per_joint": fitted}
+    return {**load_result(folder).content, "validation": [kept], "identification": whole}
+
+
+def page_with(content, fitted, kept, robot=None):
+    shown = shown_positions(content, fitted, kept, Origin((), "out"), robot)
+    return page_of(shown, {"URDF": "a.urdf"})
 
 
 @pytest.fixture(scope="module")
-def page(content, followed, tmp_path_factory):
-    target = tmp_path_factory.mktemp("pages") / "report.html"
-    page = write_loop_report(
-        content, [], [followed], target, files={"URDF": "a.urdf"}, origin=Origin((), "out")
-    )
-    return page.read_text()
+def page(content, followed):
+    return page_with(content, [], [followed])
 
 
-def test_errors_are_those_of_the_result_in_mrad(page):
-    kept = tables(page)["kept.csv, 1 to 5 s, kept apart: errors in mrad"]
-    head = ["joint", "RMSE", "% of command's", "URDF", "command", "over 0.1 s", "over 0.5 s"]
+def test_errors_are_those_of_the_result(page):
+    kept = tables(page)["kept.csv: not fitted"]
+    head = ["joint", "error %", "verdict", "RMSE", "unit", "R²", "rows", "URDF %", "command %"]
     assert kept.headers == head
-    assert kept.rows[1] == [LEG[1], "4.00", "8.0", "10.0", "50.0", "1.00", "2.00"]
-    assert kept.foot[:2] == ["geometric mean", "4.00"]  # of 2, 4 and 8
-    fitted = tables(page)["fitted.csv, 1 to 5 s, fitted: errors in mrad"]
-    assert fitted.column("RMSE") == ["1.00", "2.00", "4.00"]
+    assert kept.rows[1] == [LEG[1], "4.0", "–", "4", "mrad", "0.990", "400", "10.0", "40.0"]
+    assert kept.column("verdict") == ["–", "–", "usable: it is soft"]
+    fitted = tables(page)["fitted.csv 1-5 s: fitted"]
+    assert fitted.column("RMSE") == ["1", "2", "4"]
     assert "<strong>4 mrad</strong>, geometric mean of 3 joints" in page
     assert "URDF 2.5 ×, command 11 ×" in page  # (20 50 80)^(1/3) / 4
     assert REASON not in page
     assert "&lt;i&gt;off" in page
 
 
-def test_charts_show_commanded_measured_and_simulated_and_the_worst_joint_first(page, followed):
+def test_errors_over_horizons_are_those_of_the_result_in_mrad(page):
+    kept = tables(page)["kept.csv 1-5 s, not fitted: error over the horizon, mrad"]
+    assert kept.headers == ["joint", "0.1 s", "0.5 s", "4 s"]
+    assert kept.rows[1] == [LEG[1], "1.00", "2.00", "4.00"]
+    assert kept.foot == ["geometric mean", "1.00", "2.00", "4.00"]  # of 2, 4 and 8
+
+
+def test_charts_show_commanded_measured_and_simulated(page, followed):
     found = bars(page)
     assert list(found) == [*LEG[::-1]]
     for width, (joint, (end, marks)) in zip((6.0, 4.0, 2.0), found.items(), strict=True):
@@ -123,8 +131,8 @@ def test_charts_show_commanded_measured_and_simulated_and_the_worst_joint_first(
     assert mean["label"] == "geometric mean of all"
     np.testing.assert_allclose(mean["y"], [1.0, 2.0, 4.0], rtol=1e-4)
     shown = [c for c in charts(page) if c["title"].startswith("position of")]
-    assert [c["title"] for c in shown] == [f"position of {joint}" for joint in LEG[::-1]]
-    lines = {series["label"]: series["y"] for series in shown[0]["series"]}
+    assert [c["title"] for c in shown] == [f"position of {joint}" for joint in LEG]
+    lines = {series["label"]: series["y"] for series in shown[2]["series"]}
     for label, values in (
         ("commanded", followed.log.q_ref), ("measured", followed.log.q),
         ("simulated", followed.q),
@@ -133,7 +141,7 @@ def test_charts_show_commanded_measured_and_simulated_and_the_worst_joint_first(
     error = chart(page, f"position error of {LEG[2]}")
     left = {series["label"]: series["y"] for series in error["series"]}
     np.testing.assert_allclose(left["measured − simulated"], 6.0, atol=1e-3)  # [mrad]
-    assert "kept.csv, 1 to 5 s, kept apart: RMSE 6 mrad" in page
+    assert "kept.csv 1-5 s, not fitted: RMSE 6 mrad" in page
 
 
 def test_of_two_logs_each_joint_shows_its_worse_error_and_each_log_its_own(content, followed):
@@ -144,36 +152,34 @@ def test_of_two_logs_each_joint_shows_its_worse_error_and_each_log_its_own(conte
     }
     del better[LEG[1]]
     for both in ([first, {"per_joint": better}], [{"per_joint": better}, first]):
-        found = _bars({**content, "validation": both})
-        assert [bar.joint for bar in found] == [LEG[2], LEG[1], LEG[0]]
-        assert [bar.error for bar in found] == pytest.approx([18.0, 4.0, 2.0])
-        assert [bar.others["command"] for bar in found] == [40.0] * 3
-    facts = _facts(content)
-    entries = content["drive_parameters"]
-    found = [entry for entry in entries if entry["std_error"] is not None]
-    assert 0 < len(found) < len(entries)
-    assert facts["Drive parameters"] == (
-        f"{len(found)} found, {len(entries) - len(found)} stated or held"
-    )
+        runs = [{"log": f"logs/{k}.csv", **run} for k, run in enumerate(both)]
+        shown = shown_positions({**content, "validation": runs}, [], [], Origin((), "out"))
+        found = worst_errors(shown.counted)
+        assert list(found) == [LEG[2], LEG[1], LEG[0]]
+        errors = [own["relative_error_pct"] for own in found.values()]
+        assert errors == pytest.approx([18.0, 4.0, 2.0])
+        assert [own["command_relative_error_pct"] for own in found.values()] == [40.0] * 3
     # a log whose error is not the same all the time
     q = followed.q + 0.004 * np.sin(np.arange(400.0))[:, None] * [1.0, 2.0, 3.0]
     q[:50] = np.nan
     run = replace(followed, q=q)
     html = _charts(run, "fitted", 1, LEG[1], "rad", link="log 0", points=500)
     rmse = 1e3 * np.sqrt(np.mean((run.log.q - q)[50:, 1] ** 2))
-    assert f"kept.csv, 1 to 5 s, fitted: RMSE {rmse:.3g} mrad" in html
+    assert f"kept.csv 1-5 s, fitted: RMSE {rmse:.3g} mrad" in html
 
 
-def test_the_mean_over_the_horizon_is_of_all_joints_and_the_lines_of_the_worst():
+def test_the_mean_over_the_horizon_is_of_all_joints_and_the_lines_of_the_worst(content):
     names = [f"j{k}" for k in range(9)]
     size = dict(zip(names, np.arange(9.0, 0.0, -1.0), strict=True))  # [mrad]
     rows = {
         "per_joint": {name: {"rmse": 2e-3 * x, "unit": "rad"} for name, x in size.items()},
         "horizons": {"0.5": {name: 1e-3 * x for name, x in size.items()}},
+        "log": "logs/kept.csv",
         "start": 3.0,
         "end": 10.0,
     }
-    html = _horizon_chart(rows, "said")
+    simulation = {**content["simulation"], "validation": [rows]}
+    html = _horizons({**content, "simulation": simulation})
     found = chart(html, "position error over the horizon")
     np.testing.assert_allclose(found["x"], [0.5, 7.0], rtol=1e-6)
     *lines, mean = found["series"]
@@ -182,7 +188,8 @@ def test_the_mean_over_the_horizon_is_of_all_joints_and_the_lines_of_the_worst()
         np.testing.assert_allclose(line["y"], [x, 2 * x], rtol=1e-3)
     both = np.exp(np.mean(np.log([*size.values()])))
     np.testing.assert_allclose(mean["y"], [both, 2 * both], rtol=1e-3)
-    assert "Error over horizon, the worst 7 joints, the whole stretch last: said" in html
+    said = "the worst 7 joints, the whole recording last: kept.csv 3-10 s, not fitted"
+    assert f"Error over horizon, {said}" in html
 
 
 def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content):
@@ -199,11 +206,14 @@ def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content
     assert float(error) == pytest.approx(1e3 * late["std_error"], rel=0.05)
     has_error = [e["std_error"] is not None for e in content["drive_parameters"]]
     assert 0 < has_error.count(True) != has_error.count(False) > 0
-    assert f"{has_error.count(True)} found, {has_error.count(False)} stated or held" in page
-    assert f"{has_error.count(True)} of {len(has_error)} found" in page
-    every = tables(page)["All drive parameters with their 95 % intervals"].by_name()
-    assert every[f"{LEG[1]}.kp"]["from"] == "stated"
-    assert every[f"{LEG[1]}.coulomb"]["low"] == "0.201"
+    count, every = has_error.count(True), len(has_error)
+    assert f"{every} parameters, determined by" in page
+    assert f"{count} motion, {every - count} stated</dd>" in page
+    assert f"{count} of {every} determined by motion, in part or whole" in page
+    rows = tables(page)["Parameters of links and drives"].rows
+    own = {f"{row[0]}.{row[1]}": row for row in rows}
+    assert own[f"{LEG[1]}.kp"][8] == "stated"
+    assert own[f"{LEG[1]}.coulomb"][8] == "motion"
     said = page[page.index("The logs leave these open") :]
     assert "FL_calf.Ixx" in said
     assert "kp of every joint, kd of every joint, masses of the URDF" in said
@@ -232,17 +242,25 @@ def test_findings_and_commands_are_shown(page):
     assert [words.split()[1] for words in commands] == ["replay", "export", "export", "export"]
 
 
-def test_logs_that_do_not_fit_are_refused(content, followed, tmp_path):
+def test_logs_that_do_not_fit_are_refused(content, followed):
     other = replace(followed, q=followed.q[:, :2])
     with pytest.raises(DataError, match=r"kept.csv has 2 joints, the result 3"):
-        write_loop_report(content, [other], [], tmp_path / "a.html")
-    write_loop_report(content, [], [], tmp_path / "a.html")
-    assert "No log is at hand" in (tmp_path / "a.html").read_text()
-    write_loop_report(content, [followed], [], tmp_path / "a.html")
-    page = (tmp_path / "a.html").read_text()
-    assert "kept.csv, 1 to 5 s, fitted: RMSE 6 mrad" in page
+        page_with(content, [other], [])
+    assert "No log is at hand" in page_with(content, [], [])
+    assert "kept.csv 1-5 s, fitted: RMSE 6 mrad" in page_with(content, [followed], [])
     driven = replace(followed, baselines={"steady": np.zeros(3)})
-    write_loop_report(content, [], [driven], tmp_path / "a.html")
-    shown = chart((tmp_path / "a.html").read_text(), f"position of {LEG[0]}")
+    shown = chart(page_with(content, [], [driven]), f"position of {LEG[0]}")
     labels = [line["label"] for line in shown["series"]]
     assert labels == ["measured", "simulated"], "the torque drives it, no command"
+
+
+def test_the_lines_of_the_urdf_that_change_are_shown(content, followed):
+    model = plant("leg", np.random.default_rng(0)).model
+    pi = model.standard_parameters()
+    pi[0] *= 2.0
+    page = page_with(content, [], [followed], (model, pi))
+    assert (
+        f"<ins>+      &lt;mass value=&quot;{pi[0]}" in page or f"mass value=&quot;{pi[0]}" in page
+    )
+    assert "every other byte is the same" in page
+    assert "no longer where it was read" in page_with(content, [], [followed])

@@ -11,14 +11,20 @@ from helpers.pages import bars
 from robotid.judgement.verdict import GOOD, POOR
 from robotid.report import bars as errors
 from robotid.report.advice import Origin, next_steps
-from robotid.report.summary_screen import joint_errors, summary_screen
+from robotid.report.errors import worst_errors
+from robotid.report.shown import first_screen
+from robotid.report.torques import shown_torques
 
 ORIGIN = Origin(("arm.toml",), "out")
 
 
+def screen_of(found, files=None):
+    return first_screen(shown_torques(found, ORIGIN), files or {})
+
+
 @pytest.fixture(scope="module")
 def screen(identified):
-    return summary_screen(identified, ORIGIN, {"urdf": "arm identified.urdf"})
+    return screen_of(identified, {"urdf": "arm identified.urdf"})
 
 
 def test_each_joint_has_a_bar_of_its_error_the_worst_first(screen, identified):
@@ -45,11 +51,12 @@ def test_of_several_recordings_the_worst_counts(identified):
     better = {j: replace(m, relative_error_pct=0.1) for j, m in metrics.per_joint.items()}
     other = replace(metrics, per_joint=better | {joint: worse})
     second = replace(kept, metrics={**kept.metrics, "estimate": other})
-    errors = joint_errors(replace(identified, validation=(kept, second)))
+    shown = shown_torques(replace(identified, validation=(kept, second)), ORIGIN)
+    errors = worst_errors(shown.counted)
     assert next(iter(errors)) == joint
-    for name, (measured, _) in errors.items():
+    for name, measured in errors.items():
         wanted = worse if name == joint else metrics.per_joint[name]
-        assert measured == wanted
+        assert measured["relative_error_pct"] == wanted.relative_error_pct
 
 
 def test_every_joint_has_its_verdict_and_its_reason(screen, identified):
@@ -77,7 +84,7 @@ def test_a_recording_is_named_in_reasons_unless_it_is_the_only_one(screen, ident
     assert named not in screen[screen.index('id="worst"') :]
     log = replace(kept.recording.log, path="other.csv")
     second = replace(kept, recording=replace(kept.recording, log=log))
-    both = summary_screen(replace(identified, validation=(kept, second)), ORIGIN, {})
+    both = screen_of(replace(identified, validation=(kept, second)))
     assert named in both[both.index('id="worst"') :]
 
 
@@ -101,7 +108,7 @@ def test_the_steps_stand_in_order_with_what_to_copy(screen, identified):
 
 def test_the_best_of_many_joints_are_folded_away(identified, screen, monkeypatch):
     monkeypatch.setattr(errors, "_ROWS", 4)
-    html = summary_screen(identified, ORIGIN, {})
+    html = screen_of(identified)
     shown, folded = html.split("2 more joints, which are predicted better")
     assert [*bars(shown), *bars(folded)] == list(bars(screen))
     assert len(bars(shown)) == 4

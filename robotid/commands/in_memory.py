@@ -1,0 +1,143 @@
+"""identify() of Python: from torques, or by simulation."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, overload
+
+from robotid._settings import require_flag, require_kind
+from robotid._typing import ProgressCallback, ignore_progress, report_stage
+from robotid.doctor.diagnosis import diagnose
+from robotid.exceptions import SettingsError
+from robotid.fitting.settings import EstimatorSettings, SimulationSettings
+from robotid.identification import pipeline
+from robotid.identification.pipeline import robot_of
+from robotid.identification.result import Identification
+from robotid.judgement.verdict import check_ignored
+from robotid.logs.read import Readable, read_logs
+from robotid.logs.settings import SignalSettings
+from robotid.robot.families import AUTO, wanted_families
+from robotid.robot.model import RobotModel
+
+if TYPE_CHECKING:
+    from robotid.closed_loop.result import LoopIdentification
+
+__all__ = ["identify"]
+
+
+@overload
+def identify(  # type: ignore[overload-overlap]
+    model: RobotModel | str | Path,
+    logs: Readable | Sequence[Readable],
+    *,
+    estimator: Literal["simulation"] | SimulationSettings,
+    validation: Readable | Sequence[Readable] = ...,
+    signals: SignalSettings | None = ...,
+    controller: Mapping[str, Any] | None = ...,
+    friction: str | Mapping[str, str] = ...,
+    doctor: bool = ...,
+    ignore: Sequence[str] = ...,
+    progress: ProgressCallback | None = ...,
+) -> "LoopIdentification": ...
+
+
+@overload
+def identify(
+    model: RobotModel | str | Path,
+    logs: Readable | Sequence[Readable],
+    *,
+    estimator: str | EstimatorSettings = ...,
+    validation: Readable | Sequence[Readable] = ...,
+    signals: SignalSettings | None = ...,
+    controller: Mapping[str, Any] | None = ...,
+    friction: str | Mapping[str, str] = ...,
+    doctor: bool = ...,
+    ignore: Sequence[str] = ...,
+    progress: ProgressCallback | None = ...,
+) -> Identification: ...
+
+
+def identify(
+    model: RobotModel | str | Path,
+    logs: Readable | Sequence[Readable],
+    *,
+    validation: Readable | Sequence[Readable] = (),
+    signals: SignalSettings | None = None,
+    estimator: EstimatorSettings | str = "consistent",
+    controller: Mapping[str, Any] | None = None,
+    friction: str | Mapping[str, str] = AUTO,
+    doctor: bool = True,
+    ignore: Sequence[str] = (),
+    progress: ProgressCallback | None = None,
+) -> "Identification | LoopIdentification":
+    """Identify a robot's parameters from motion logs, as the command line does.
+
+    Args:
+        model: The robot; or the path of its URDF, all of whose joints move.
+        logs: Recordings to fit: a ``Log`` that has the model's joints, the path of a file, a
+            DataFrame with the columns of such a file, or several of these. Files are read whole,
+            as by ``read_log``; ``robotid.run_job`` reads long ones in pieces.
+        validation: Recordings kept apart to measure the prediction with, likewise.
+        signals: How logs become trajectories; the defaults if None.
+        estimator: Name or settings of the estimator. With "simulation" the robot is simulated on
+            the commands of the logs, or on their torques.
+        controller: What is known of the loops that follow the commands, the keys of the job file's
+            table ``[controller]``; of the estimator "simulation" alone.
+        friction: What friction joints have beside viscous and Coulomb's, as of
+            ``wanted_families``: "auto" has it chosen. Simulation chooses that of all joints, or
+            of none.
+        doctor: Whether the doctor looks at the logs first; the verdict counts what it finds.
+        ignore: Codes of errors and doubts that you know better.
+        progress: Called as each stage begins: its name, stages done, in all, "stages"; and in
+            between with the name of a work, units done, in all, and what they are.
+
+    Returns:
+        What was found; of the estimator "simulation" a ``LoopIdentification``.
+
+    Raises:
+        DataError: If a log cannot be read, does not fit the model or is too short.
+        ModelError: If the model is no model, nor the path of a URDF that can be used.
+        RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
+        NotConvergedError: If a solver fails, or loops cannot be simulated.
+        SettingsError: If a setting is out of range, or a code to ignore is unknown.
+    """
+    require_kind(
+        estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
+    )
+    choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
+    if not isinstance(choice, SimulationSettings):
+        if controller is not None:
+            raise SettingsError(
+                f"controller is of the estimator 'simulation', but the estimator is "
+                f"{choice.name!r}; leave controller out, or set estimator='simulation'"
+            )
+        return pipeline.identify(
+            model, logs, validation=validation, signals=signals, estimator=choice,
+            friction=friction, doctor=doctor, ignore=ignore, progress=progress,
+        )  # fmt: skip
+    from robotid.closed_loop.fit import STAGES
+    from robotid.closed_loop.identify import identify_loops
+    from robotid.closed_loop.settings import LoopSettings
+
+    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
+    require_kind(controller, (Mapping, type(None)), "controller", "a table of its settings")
+    require_flag(doctor, "doctor")
+    check_ignored(ignore)
+    loop, settings = LoopSettings.from_dict(controller or {}), signals or SignalSettings()
+    report_stage(progress, "reading logs", STAGES)
+    model = robot_of(model, logs)
+    wanted = wanted_families(friction, model.joints).values()
+    if any(wanted) or len({names is None for names in wanted}) > 1:
+        raise SettingsError(
+            "friction is stated joint by joint or by families, but simulation chooses that of all "
+            "joints, or of none: take 'auto' or 'viscous+coulomb', and state terms in the model"
+        )
+    needs: Literal["torque", "commands"] = "torque" if loop.kind == "torque" else "commands"
+    fitted, kept = (
+        read_logs(some, model.joints, prismatic=model.layout.prismatic, needs=needs)
+        for some in (logs, validation)
+    )
+    return identify_loops(
+        model, fitted, kept, loop, choice, signals=settings, chooses=None in wanted,
+        examined=diagnose(model, fitted, kept, settings) if doctor else (), ignore=ignore,
+        progress=progress or ignore_progress,
+    )  # fmt: skip

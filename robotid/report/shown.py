@@ -1,0 +1,129 @@
+"""What a report shows of a result, of torques or of positions, and the page that it makes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from robotid.findings import Finding
+from robotid.pages.html import Section, facts_html, folded, page, steps_html, verdict_html
+from robotid.report.advice import Step
+from robotid.report.causes import findings_line, findings_section
+from robotid.report.errors import Errors, Quantity, error_bars, error_table, worst_errors
+from robotid.report.tables import sources_fact
+from robotid.versions import __version__
+
+__all__ = ["Shown", "first_screen", "page_of"]
+
+_WRITTEN = (
+    f"Written by robotid {__version__}. SI units throughout; inertial parameters in Pinocchio's "
+    "order, inertias about the joint frame."
+)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a report shows. Texts are HTML.
+
+    Attributes:
+        title: Title of the page, not escaped.
+        robot: Name of the robot, not escaped.
+        rows: Names of its joints.
+        verdict: The verdict, as in result.json.
+        findings: What was found.
+        quantity: What is predicted.
+        counted: The recordings whose errors count.
+        recordings: All of them.
+        facts: Figures by their names.
+        steps: What to do next.
+        made: How it was made.
+        errors: What errors are, and what is beside their tables.
+        curves: Title and content of the section of charts over time.
+        why: Why each joint is predicted as it is; "" if that is not known.
+        parameters: Content of the section of parameters.
+        entries: The parameters, as in result.json.
+        appendix: Title and content of what stands last, by its key.
+    """
+
+    title: str
+    robot: str
+    rows: Sequence[str]
+    verdict: Mapping[str, Any]
+    findings: Sequence[Finding]
+    quantity: Quantity
+    counted: Sequence[Errors]
+    recordings: Sequence[Errors]
+    facts: Mapping[str, str]
+    steps: Sequence[Step]
+    made: str
+    errors: tuple[str, str]
+    curves: tuple[str, str]
+    why: str
+    parameters: str
+    entries: Sequence[Mapping[str, Any]]
+    appendix: Mapping[str, tuple[str, str]]
+
+    @property
+    def verdicts(self) -> Mapping[str, Mapping[str, Any]]:
+        """The verdict on each joint."""
+        verdicts: Mapping[str, Mapping[str, Any]] = self.verdict.get("per_joint", {})
+        return verdicts
+
+
+def first_screen(shown: Shown, files: Mapping[str, str]) -> str:
+    """Return the HTML of the first screen: verdict, figures, errors of joints, what to do next.
+
+    Args:
+        shown: What is shown.
+        files: Files beside the report, by what they are.
+    """
+    facts = {**shown.facts, **sources_fact(shown.entries)}
+    bars = error_bars(
+        shown.quantity, shown.counted, shown.rows, shown.verdicts, has_why=bool(shown.why)
+    )
+    steps = steps_html((step.words, step.blocks) for step in shown.steps)
+    return (
+        f"{verdict_html(shown.robot, shown.verdict['status'], shown.verdict['reasons'])}"
+        f"{facts_html(facts, files)}"
+        f'<div class="halves">\n<div>{bars}</div>\n<div>{steps}</div>\n</div>\n'
+    )
+
+
+def page_of(shown: Shown, files: Mapping[str, str]) -> str:
+    """Return the HTML of the report.
+
+    Args:
+        shown: What is shown.
+        files: Files beside it to link to, by what they are.
+    """
+    worst = list(worst_errors(shown.counted))
+    words, beside = shown.errors
+    tables = "".join(
+        error_table(shown.quantity, errors, shown.rows, shown.verdicts)
+        for errors in shown.recordings
+    )
+    found = sum(entry["source"] in ("data", "mixed") for entry in shown.entries)
+    appendix = "".join(
+        folded(key, title, html) for key, (title, html) in shown.appendix.items() if html
+    )
+    line = findings_line(shown.findings, shown.rows, next(iter(worst), ""))
+    sections = {
+        "errors": Section(
+            "Errors", f"{words}{tables}{beside}", f"{len(shown.verdicts)} joints, by recording",
+            False,
+        ),
+        "findings": Section(
+            "Findings", findings_section(shown.findings, shown.rows, worst), line, False
+        ),
+        "curves": Section(*shown.curves),
+        "why": Section("Why each joint", shown.why, "what its torque is made of", False),
+        "parameters": Section(
+            "Parameters",
+            shown.parameters,
+            f"{found} of {len(shown.entries)} determined by motion, in part or whole",
+            False,
+        ),
+        "appendix": Section("Appendix", appendix),
+    }  # fmt: skip
+    made = folded("made", "How it was made", f'{shown.made}<p class="note">{_WRITTEN}</p>\n')
+    there = {key: section for key, section in sections.items() if section.html}
+    return page(shown.title, first_screen(shown, files) + made, there)

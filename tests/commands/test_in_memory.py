@@ -1,0 +1,66 @@
+"""robotid.identify by simulation: what run_job finds of the same logs, without files."""
+
+import numpy as np
+import pytest
+from helpers.mujoco_plant import plant, torque_log
+
+import robotid
+from robotid.closed_loop.result import LoopIdentification
+from robotid.exceptions import DataError, SettingsError
+
+SETTINGS = {"bodies": 0.0, "step": 4e-3, "torques": False}
+
+
+@pytest.fixture(scope="module")
+def arm():
+    rng = np.random.default_rng(5)
+    robot = plant("planar", rng, delay=0.0)
+    logs = [torque_log(robot, rng, duration=d, noise=2e-5, torque=0.05) for d in (3.0, 2.0)]
+    return robot.model, *logs
+
+
+@pytest.fixture(scope="module")
+def found(arm):
+    model, log, kept = arm
+    return robotid.identify(
+        model, log, validation=kept, controller={"kind": "torque"}, doctor=False,
+        friction="viscous+coulomb",
+        estimator=robotid.EstimatorSettings("simulation", **SETTINGS),
+    )  # fmt: skip
+
+
+def test_it_finds_what_a_job_finds_of_the_same_logs(arm, found, tmp_path):
+    model, *logs = arm
+    for name, log in zip(("log", "kept"), logs, strict=True):
+        robotid.write_log(log, tmp_path / f"{name}.csv")
+    (tmp_path / "job.toml").write_text(
+        f"urdf = '{model.tree.path}'\n[model]\nfriction = 'viscous+coulomb'\n"
+        "[estimator]\nname = 'simulation'\nbodies = 0.0\nstep = 4e-3\ntorques = false\n"
+        "[controller]\nkind = 'torque'\n[[identification]]\nlog = 'log.csv'\n"
+        "[[validation]]\nlog = 'kept.csv'\n[output]\nreport = false\n"
+    )
+    again, _ = robotid.run_job(robotid.read_job(tmp_path / "job.toml"), tmp_path / "out")
+    assert isinstance(found, LoopIdentification)
+    np.testing.assert_allclose(found.standard, again.standard, rtol=1e-6, atol=1e-9)
+    assert len(found.validation) == 1
+    assert found.verdict.status == again.verdict.status
+
+
+def test_it_is_saved_and_loaded(found, tmp_path):
+    path = robotid.save_result(found, tmp_path / "out", report=False)
+    loaded = robotid.load_result(path)
+    np.testing.assert_allclose(loaded.parameters, found.standard, rtol=1e-9, atol=1e-12)
+    assert loaded.content["settings"]["controller"]["kind"] == "torque"
+    assert loaded.content["settings"]["estimator"]["step"] == 4e-3
+
+
+def test_what_does_not_fit_it_is_refused(arm):
+    model, log, _ = arm
+    with pytest.raises(SettingsError, match="controller is of the estimator 'simulation', but"):
+        robotid.identify(model, log, controller={"kp": 20.0})
+    with pytest.raises(SettingsError, match="simulation chooses that of all joints, or of none"):
+        robotid.identify(model, log, estimator="simulation", friction="stribeck")
+    with pytest.raises(SettingsError, match="controller: kind"):
+        robotid.identify(model, log, estimator="simulation", controller={"kind": "none"})
+    with pytest.raises(DataError, match="has no commanded positions"):
+        robotid.identify(model, log, estimator="simulation", doctor=False)
