@@ -32,7 +32,7 @@ def test_stands_are_rows_of_joints_that_move_in_no_more_samples_than_there_are_s
         pose.append(np.tile([0.1 * k, -0.2 * k, 0.3], (25, 1)))
     way = 0.02 * np.arange(700)[:, None] / 100
     late = 0.02 * np.maximum(np.arange(700)[:, None] - 625, 0) / 100
-    moving = np.hstack([way, late, 0 * way]) + [0.5, 0.4, 0.3]
+    moving = np.array([0.5, 0.4, 0.3]) + np.hstack([way, late, 0 * way])
     q = np.concatenate([*pose, moving])
     stands = np.arange(100) / 100 + np.repeat(np.arange(4), 25)
     t = 5.0 + np.concatenate([stands, 9 + np.arange(700) / 100])
