@@ -13,6 +13,7 @@ from robotid.regressor.factors import (
     Reduction,
     compress,
     compress_stretches,
+    gather,
     join,
     join_stretches,
     merge,
@@ -377,3 +378,20 @@ def test_pieces_are_joined_to_stretches_of_one_length(rng, count, most, lengths)
         np.testing.assert_array_equal(own.squares, sum(10.0**k for k in range(i, j)))
         total = sum(gram(piece.factors.R[1]) for piece in pieces[i:j])
         np.testing.assert_allclose(gram(own.factors.R[1]), total, atol=1e-10)
+
+
+def test_stretches_are_gathered_to_as_many_as_wanted_or_as_there_are(rng):
+    pieces = [compress(make(rng, samples=10 + k)[0]) for k in range(5)]
+    for count, edges in (
+        (2, [0, 2, 5]),
+        (3, [0, 2, 3, 5]),
+        (5, range(6)),
+        (9, range(6)),
+        (1, [0, 5]),
+    ):
+        found = gather(pieces, count)
+        assert len(found) == len(edges) - 1
+        for own, i, j in zip(found, edges[:-1], edges[1:], strict=True):
+            np.testing.assert_array_equal(own.rows, sum(piece.rows for piece in pieces[i:j]))
+            total = sum(gram(piece.R[0]) for piece in pieces[i:j])
+            np.testing.assert_allclose(gram(own.R[0]), total, atol=1e-10)

@@ -49,3 +49,19 @@ def test_stands_are_rows_of_joints_that_move_in_no_more_samples_than_there_are_s
     np.testing.assert_array_equal(used, wanted)
     np.testing.assert_array_equal(motion.direction[moves], 1.0)
     np.testing.assert_allclose(motion.tau, 10.0 * motion.q, atol=1e-9)
+
+
+@pytest.mark.parametrize("gravity", [9.81, 3.7])
+def test_a_stretch_is_slow_whose_inertia_is_two_hundredths_of_gravity(gravity):
+    model = RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"), joints=["elbow_joint", "wrist_1_joint"],
+        terms=("coulomb", "offset"), gravity=(0.0, 0.0, -gravity),
+    )  # fmt: skip
+    fastest = np.sqrt(0.02 * gravity / model.length)  # v^2 l / g
+    t = 5.0 + np.arange(300) / 100
+    for share, count in ((0.98, 12), (1.02, 0)):
+        q = np.outer(t, [share * fastest, 0.1])
+        log = Log(t, q, q, tuple(model.joints), v=np.zeros_like(q))
+        motion, used = static_rows(model, log, resolve(log, SignalSettings(cutoff=None)))
+        assert len(motion.t) == count
+        assert used.all()
