@@ -59,9 +59,10 @@ def test_the_least_density_of_a_body_is_that_of_its_ellipsoid():
 
 
 def test_principal_moments_are_those_of_a_turned_body():
-    turned = pin.rpy.rpyToMatrix(0.4, -1.1, 0.7)
     moments = np.array([0.02, 0.05, 0.11])  # second moments of mass along its axes
-    for order in ([0, 1, 2], [2, 0, 1], [1, 0, 2]):
+    turns = np.random.default_rng(0).uniform(-3.0, 3.0, (12, 3))  # axes as found are of either hand
+    for order, turn in zip(4 * ([0, 1, 2], [2, 0, 1], [1, 0, 2]), turns, strict=True):
+        turned = pin.rpy.rpyToMatrix(*turn)
         own = moments[order]
         I = turned @ np.diag(own.sum() - own) @ turned.T  # noqa: E741
         c, m = np.array([0.2, -0.3, 0.1]), 2.5
