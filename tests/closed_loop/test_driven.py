@@ -1,4 +1,5 @@
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -151,3 +152,17 @@ def test_a_log_without_torque_drives_nothing(arm):
     bare = Log(log.t, log.q, np.zeros_like(log.q), log.joints, has_torque=False)
     with pytest.raises(DataError, match=r"has no torque, which drives the robot"):
         identify_loops(robot.model, [bare], [], DRIVEN, SimulationSettings())
+
+
+@pytest.mark.parametrize(("scatter", "counted", "variance"), [(4.0, 2.0, 8.0), (0.3, 2.0, 2.0)])
+def test_rows_of_torque_weigh_as_independent_as_their_scatter_shows(scatter, counted, variance):
+    found = SimpleNamespace(
+        model="the model", mapping=SimpleNamespace(K=np.eye(2)),
+        wls=SimpleNamespace(sigma=np.array([0.5, 2.0])),
+        errors=SimpleNamespace(inflation=scatter),
+        factors=SimpleNamespace(weighted=lambda sigma: np.diag(1.0 / sigma)),
+    )  # fmt: skip
+    rows = torque_rows(found, counted)
+    np.testing.assert_allclose(np.diag(rows.R), np.array([2.0, 0.5]) / np.sqrt(variance))
+    np.testing.assert_array_equal(rows.K, np.eye(2))
+    assert rows.model == "the model"

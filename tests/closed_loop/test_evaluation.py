@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from helpers.single_joint import slider
 
-from robotid.closed_loop.evaluation import OpenLoop, position_metrics
+from robotid.closed_loop.evaluation import OpenLoop, position_metrics, run_open_loop
+from robotid.closed_loop.fit import stated_loops
+from robotid.closed_loop.settings import LoopSettings
 from robotid.logs.data import Log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+from robotid.simulation.loops import LoopedRobot, cut_windows
 
 
 def run(joints, rmse, spread, moves, n=50, **baselines):
@@ -59,3 +62,35 @@ def test_a_motion_of_no_size_has_no_share_and_a_rail_has_metres(tmp_path):
     assert found.unit == "m"
     assert found.relative_error_pct is None
     assert not found.better_than_constant
+
+
+def test_errors_are_of_samples_in_windows_and_the_spread_is_about_the_mean(tmp_path):
+    """A body that follows a command about 3 m, its log with a gap and a sample by itself."""
+    rail, rng = slider(tmp_path), np.random.default_rng(1)
+    t = 5.0 + np.concatenate([np.arange(120), [150], 190 + np.arange(60)]) / 100
+    q_ref = 3.0 + 0.2 * np.sin(5 * t)[:, None]
+    q = q_ref + 0.02 * rng.standard_normal(q_ref.shape)
+    log = Log(t, q, 0 * q, ("j",), q_ref=q_ref, has_torque=False)
+    robot = LoopedRobot(rail, step=2e-3)
+    loops = stated_loops(rail, LoopSettings(kp=300.0, kd=40.0))
+    soft = replace(loops, kp=np.array([50.0]))
+    found = run_open_loop(robot, loops, log, {"urdf": soft}, horizons=(0.1, 0.5, 9.0))
+    assert np.isnan(found.q[120])
+
+    def rms(loops, length):
+        outs = robot.roll_out(loops, cut_windows(log, length, 0.0))
+        missed = np.concatenate([log.q[o.window.counted] - o.q for o in outs])
+        return np.sqrt(np.mean(missed**2, axis=0))
+
+    np.testing.assert_allclose(found.rmse, rms(loops, np.inf))
+    assert list(found.horizons) == [0.1, 0.5]
+    for length, error in found.horizons.items():
+        np.testing.assert_allclose(error, rms(loops, length))
+    np.testing.assert_allclose(found.spread, np.sqrt(np.mean((q - q.mean()) ** 2)))
+    assert list(found.baselines) == ["command", "urdf", "second_order"]
+    np.testing.assert_allclose(found.baselines["command"], np.sqrt(np.mean((q_ref - q) ** 2)))
+    np.testing.assert_allclose(found.baselines["urdf"], rms(soft, np.inf))
+    assert found.baselines["second_order"] is None
+    assert found.name == "log 5-7.49 s"
+    assert found.moves.tolist() == [True]
+    assert not found.is_driven

@@ -14,7 +14,7 @@ from robotid.export.commanded import loops_of
 from robotid.logs.data import Log
 from robotid.robot.drives import Coulomb, Viscous
 from robotid.robot.parameters import pseudo_inertia
-from robotid.simulation.loops import LoopedRobot, cut_windows
+from robotid.simulation.loops import LoopedRobot, RollOut, Window, cut_windows
 
 
 @pytest.fixture(scope="module")
@@ -279,3 +279,48 @@ def test_torques_tell_gains_before_anything_is_fitted(told):
     )
     np.testing.assert_array_equal(found.kp, open_.kp)  # no gain that would drive it away
     np.testing.assert_array_equal(found.kd, open_.kd)
+
+
+def test_torques_are_missed_over_all_windows_by_the_larger_of_logged_and_given(simulator):
+    behind = np.array([3.0, 2.0, 2.5])
+    theta = simulator.prior.copy()
+    for share in ([0.5, 1.0, 4.0], [4.0, 0.2, 1.0]):
+        windows = [
+            replace(w, log=replace(w.log, tau=w.log.tau * own)) for w, own in zip(
+                simulator.windows, (1.0, np.array(share)), strict=True
+            )
+        ]  # fmt: skip
+        sim = replace(simulator, windows=tuple(windows), behind=behind)
+        outs, loops = sim.roll_out(theta), sim.loops(theta)
+        given = np.concatenate([drive_torques(out, loops, behind).given for out in outs])
+        logged = np.concatenate([w.log.tau[w.counted] for w in windows])
+        rms = [np.sqrt(np.mean(x**2, axis=0)) for x in (logged - given, logged, given)]
+        np.testing.assert_allclose(sim.missed_torque(theta), rms[0] / np.maximum(*rms[1:]))
+
+
+def test_what_drives_give_follows_commands_whole_or_broken_rows_late():
+    """Kinds, limits and delays of two joints, beside the equation row by row."""
+    rng = np.random.default_rng(2)
+    q, v, q_ref, v_ref, tau_ref = rng.standard_normal((5, 9, 2))
+    log = Log(5.0 + np.arange(9) / 100, q, 0 * q, ("a", "b"), q_ref=q_ref, v_ref=v_ref,
+              tau_ref=tau_ref, has_torque=False)  # fmt: skip
+    window = Window(log, 0, 2, 8)
+    out = RollOut(window, q[2:8], v[2:8])
+    kp, kd, limit = np.array([3.0, 5.0]), np.array([0.7, 0.2]), np.array([2.0, np.inf])
+    loops = replace(
+        stated_loops(plant("planar", rng).model, LoopSettings()), kp=kp, kd=kd, limit=limit
+    )
+    for behind in ([0.0, 1.0], [2.25, 0.5], [4.0, 1.75]):
+        found = drive_torques(out, loops, np.array(behind))
+        for j, late in enumerate(behind):
+            at = np.arange(2, 8) - late  # between two rows their mean, by how near they are
+
+            def told(x, j=j, at=at):
+                return np.interp(at, np.arange(9), x[:, j])
+
+            reach, rate = told(q_ref) - q[2:8, j], told(v_ref) - v[2:8, j]
+            asked = kp[j] * reach + kd[j] * rate + told(tau_ref)
+            np.testing.assert_allclose(found.reach[:, j], reach)
+            np.testing.assert_allclose(found.rate[:, j], rate)
+            np.testing.assert_allclose(found.asked[:, j], asked)
+            np.testing.assert_allclose(found.given[:, j], np.clip(asked, -limit[j], limit[j]))

@@ -8,6 +8,7 @@ from helpers.corruptions import clean_log, controlled_log, late, robot, table_of
 from helpers.synthetic import exact_log, truth
 
 from robotid.doctor import torque_delay
+from robotid.doctor.torque_delay import _EXACT, _GRID, _Misfit
 from robotid.logs.settings import SignalSettings
 from robotid.robot.model import RobotModel
 
@@ -159,3 +160,71 @@ def test_the_error_of_a_delay_counts_friction_beside_the_scatter(ur5, monkeypatc
     monkeypatch.setattr(torque_delay._Misfit, "error", lambda self: 2e-3)
     (finding,) = found(ur5, clean_log(ur5, 100, duration=2.0))
     assert finding.evidence["std_error"] == pytest.approx(np.hypot(2e-3, 1e-3))
+
+
+def parabolas(rng, joints=3, blocks=4):
+    """Return a misfit whose joints leave parabolas of the delay in each block, and these."""
+    bottom, bend = rng.uniform(2.0, 5.0, (2, joints, blocks))
+    bend *= 1e4  # per s^2
+    at = rng.uniform(-0.02, 0.03, (joints, blocks))
+    squares = bottom[..., None] + bend[..., None] * (_GRID - at[..., None]) ** 2
+    rows = np.array([900, 400, 100])[:joints]
+    return _Misfit(squares, rows, ("a", "b", "c")[:joints]), bottom, bend, at
+
+
+def lowest(misfit, bend, at, kept=slice(None), out=()):
+    """Return the delay of the lowest sum of parabolas, each joint's by its own lowest."""
+    blocks = [b for b in range(bend.shape[1]) if b not in out]
+    squares = misfit.squares[kept][:, blocks].sum(axis=1) + _EXACT
+    weight = (misfit.rows[kept] / squares.min(axis=1))[:, None] * bend[kept][:, blocks]
+    return float(np.sum(weight * at[kept][:, blocks]) / np.sum(weight))
+
+
+def test_a_delay_its_error_and_its_gain_are_those_of_jackknifed_parabolas(rng):
+    misfit, bottom, bend, at = parabolas(rng)
+    assert misfit.delay() == pytest.approx(lowest(misfit, bend, at), abs=1e-9)
+    joints = [lowest(misfit, bend, at, [k for k in range(3) if k != j]) for j in range(3)]
+    assert misfit.delays_without(0) == pytest.approx(joints, abs=1e-9)
+    assert misfit.without({1}).joints == ("a", "c")
+    blocks = [lowest(misfit, bend, at, out=(b,)) for b in range(4)]
+    assert misfit.delays_without(1) == pytest.approx(blocks, abs=1e-9)
+    variance = sum((len(x) - 1) / len(x) * np.sum((x - np.mean(x)) ** 2) for x in (joints, blocks))
+    assert misfit.error() == pytest.approx(np.sqrt(variance), rel=1e-6)
+
+    def left(delays):
+        below = np.floor(np.asarray(delays) / step) * step  # straight between points of the grid
+        share = (np.asarray(delays) - below) / step
+        ends = [bottom + bend * (x - at) ** 2 for x in (below, below + step)]
+        return np.sum((1 - share) * ends[0] + share * ends[1], axis=1) + _EXACT
+
+    step = _GRID[1] - _GRID[0]
+    share = np.mean(left(blocks) / left(np.zeros(4)))
+    assert misfit.gain() == pytest.approx(1 - share, rel=1e-6)
+    late = replace(misfit, squares=misfit.squares[..., ::-1])
+    assert late.delay() == pytest.approx(-misfit.delay(), abs=1e-9)
+
+
+def test_a_delay_of_one_joint_is_beside_that_of_the_others(rng):
+    misfit, bottom, bend, at = parabolas(rng)
+    shift = np.array([0.0, 0.04, 0.0])[:, None]
+    squares = bottom[..., None] + bend[..., None] * (_GRID - (0.1 * at + shift)[..., None]) ** 2
+    own = replace(misfit, squares=squares).own_delay(1)
+    whole = np.sum(bend[1] * (0.1 * at[1] + 0.04)) / bend[1].sum()
+    step = _GRID[1] - _GRID[0]
+    assert own.delay == pytest.approx(whole, abs=0.51 * step)
+    common = lowest(replace(misfit, squares=squares), bend, 0.1 * at, [0, 2])
+    assert own.common == pytest.approx(common, abs=1e-9)
+    without = []
+    for b in range(4):
+        rest = np.delete(np.arange(4), b)
+        best = np.sum((bend[1] * (0.1 * at[1] + 0.04))[rest]) / bend[1][rest].sum()
+        without.append(_GRID[np.argmin(np.abs(_GRID - best))])
+    spread = np.sqrt(3 / 4 * np.sum((without - np.mean(without)) ** 2))
+    assert own.error == pytest.approx(np.hypot(step, spread), rel=1e-6)
+    now, then = (
+        np.sum(bottom[1] + bend[1] * (np.asarray(x) - 0.1 * at[1] - 0.04) ** 2)
+        for x in (common, without)
+    )
+    assert own.explained == pytest.approx(1 - then / now, abs=2e-3)
+    assert own.is_sure
+    assert not misfit.own_delay(0).is_sure

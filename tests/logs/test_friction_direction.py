@@ -266,3 +266,25 @@ def test_the_band_of_a_prediction_follows_the_filtered_sign(ur5):
     expected = np.abs(motion.direction[band.samples])
     np.testing.assert_allclose(band.parameters[:, 2], expected[:, 2], atol=1e-12)
     assert np.abs(expected[:, 2] - 1.0).max() > 0.2
+
+
+@pytest.mark.parametrize(("before", "after", "factor"), [(1, -1, 2.0), (-1, 1, 2.0), (1, 1, 4.0)])
+@pytest.mark.parametrize(("enters", "leaves"), [(4.0, 0.5), (0.5, 4.0)])  # [rad/s^2]
+def test_a_drive_sticks_that_is_slow_for_longer_than_its_slopes_say(
+    before, after, factor, enters, leaves
+):
+    least, dt = factor * BAND * (1 / enters + 1 / leaves), 1e-4
+    for share, sticks in ((1.03, True), (0.97, False)):
+        slow = share * least
+        t = 7.0 + np.arange(0.0, slow + 0.2, dt)
+        in_, out = 7.1, 7.1 + slow
+        way_in = before * np.maximum(BAND - enters * (t - in_), BAND - 3 * enters * dt)
+        way_out = after * np.maximum(BAND + leaves * (t - out), BAND - 3 * leaves * dt)
+        w = np.where(t < in_ + slow / 2, way_in, way_out)
+        found = acting_directions(t, w[:, None], BAND, longest=2.0)[:, 0]
+        stuck = np.interp(t, [in_, out], [before, after])
+        np.testing.assert_allclose(
+            found, stuck if sticks else np.sign(w), atol=1e-6 if share < 1 else 2e-3
+        )
+        sharp = acting_directions(t, w[:, None], BAND, longest=0.99 * slow)[:, 0]
+        np.testing.assert_array_equal(sharp, np.sign(w))

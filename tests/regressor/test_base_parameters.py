@@ -207,3 +207,20 @@ def test_arms_on_one_base_share_no_base_parameter(ur5, rng):
     np.testing.assert_allclose(found.K[b:, p:], alone.K, atol=1e-9)
     assert not found.K[:b, p:].any()
     assert not found.K[b:, :p].any()
+
+
+def test_pivots_are_shares_of_the_largest_whatever_the_unit(rng):
+    W = rng.standard_normal((60, 4)) * [100.0, 1.0, 10.0, 0.5]
+    W = np.column_stack([W, W[:, 1] - 2.0 * W[:, 2]])
+    names = tuple("abcde")
+    for size in (1.0, 7e3):
+        found = base_mapping(size * W, names)
+        assert found.pivots[0] == 1.0
+        assert (np.diff(found.pivots) <= 0).all()
+        assert found.pivots[4] < 1e-12
+        assert found.K.shape == (4, 5)
+        pi = rng.standard_normal(5)
+        np.testing.assert_allclose(W[:, found.independent] @ (found.K @ pi), W @ pi, atol=1e-9)
+        spread = np.array([2.0, 0.5, 1.0, 3.0, 0.1])
+        G = np.diag(spread**2) @ found.K.T @ np.linalg.inv(found.K @ np.diag(spread**2) @ found.K.T)
+        np.testing.assert_allclose(found.gain(spread), G, atol=1e-9)

@@ -13,6 +13,7 @@ from robotid.regressor.factors import (
     Reduction,
     compress,
     compress_stretches,
+    gather,
     join,
     join_stretches,
     merge,
@@ -308,3 +309,89 @@ def test_a_reduction_survives_its_arrays_to_the_last_bit(ur5, rng, tmp_path):
     np.testing.assert_array_equal(again.factors.R, found.factors.R)
     np.testing.assert_array_equal(again.factors.rows, found.factors.rows)
     np.testing.assert_array_equal(again.squares, found.squares)
+
+
+def unlike(rng):
+    """Two logs of three joints with columns of their own and rows left out, and their rows."""
+    support = np.array([[1, 1, 1, 0, 1], [0, 1, 0, 1, 1], [0, 0, 0, 1, 1]], dtype=bool)
+    parts = []
+    for samples, own in ((40, support), (23, support & ~np.eye(3, 5, dtype=bool))):
+        weight = rng.choice([0.0, 0.5, 4.0], samples * 3)
+        parts.append((*make(rng, samples=samples, weight=weight, support=own, block=16), weight))
+    return parts
+
+
+def test_what_is_asked_of_factors_is_what_their_dense_rows_say(rng):
+    parts = unlike(rng)
+    factors = compress(concatenate([problem for problem, *_ in parts]))
+    rows = []
+    for j in range(3):
+        W, tau, weight = (np.concatenate([part[k][j::3] for part in parts]) for k in (1, 2, 3))
+        rows.append((W * np.sqrt(weight)[:, None], tau * np.sqrt(weight), weight))
+    theta, each = rng.standard_normal(5), np.array([0.7, 3.0, 0.2])
+    A = rng.standard_normal((5, 5))
+    covariance = A @ A.T
+    np.testing.assert_array_equal(factors.rows, [np.sum(w > 0) for *_, w in rows])
+    left = [np.sum((tau - W @ theta) ** 2) for W, tau, _ in rows]
+    np.testing.assert_allclose(factors.residual_squares(theta), left)
+    np.testing.assert_allclose(factors.torque_squares(), [np.sum(tau**2) for _, tau, _ in rows])
+    spread = [np.trace(W @ covariance @ W.T) for W, *_ in rows]
+    np.testing.assert_allclose(factors.leverages(covariance), spread)
+    known = sum(x * W.T @ W for x, (W, *_) in zip(each, rows, strict=True))
+    np.testing.assert_allclose(factors.information(each), known, atol=1e-12)
+    score = sum(x * W.T @ (tau - W @ theta) for x, (W, tau, _) in zip(each, rows, strict=True))
+    np.testing.assert_allclose(factors.score(theta, each), score, atol=1e-12)
+    np.testing.assert_allclose(factors.without(theta).torque_squares(), left)
+    sigma = np.array([0.5, 2.0, 0.1])
+    whole = sum(
+        gram(np.column_stack([W, tau]) / level)
+        for level, (W, tau, _) in zip(sigma, rows, strict=True)
+    )
+    np.testing.assert_allclose(gram(factors.weighted(sigma)), whole, atol=1e-9)
+
+
+def test_a_problem_of_two_logs_has_the_columns_of_both(rng):
+    parts = unlike(rng)
+    problems = [problem for problem, *_ in parts]
+    for order in (problems, problems[::-1]):
+        both = concatenate(order)
+        np.testing.assert_array_equal(both.support, problems[0].support)
+        assert both.names == problems[0].names
+    W, tau, weight = (np.concatenate(x) for x in zip(*concatenate(problems).blocks(), strict=True))
+    for k, found in enumerate((W, tau, weight), start=1):
+        np.testing.assert_array_equal(found, np.concatenate([part[k] for part in parts]))
+
+
+@pytest.mark.parametrize(
+    ("count", "most", "lengths"),
+    [(7, 3, [3, 3, 1]), (6, 3, [2, 2, 2]), (5, 4, [2, 2, 1]), (3, 8, [1, 1, 1]), (4, 1, [4])],
+)
+def test_pieces_are_joined_to_stretches_of_one_length(rng, count, most, lengths):
+    pieces = []
+    for k in range(count):
+        problem, *_ = make(rng, samples=10 + k)
+        pieces.append(Reduction(compress(problem), np.full((3, 3), 10.0**k), 10 + k))
+    found = join_stretches(iter(pieces), count, most)
+    edges = np.cumsum([0, *lengths])
+    for own, i, j in zip(found, edges[:-1], edges[1:], strict=True):
+        assert own.samples == sum(10 + k for k in range(i, j))
+        np.testing.assert_array_equal(own.squares, sum(10.0**k for k in range(i, j)))
+        total = sum(gram(piece.factors.R[1]) for piece in pieces[i:j])
+        np.testing.assert_allclose(gram(own.factors.R[1]), total, atol=1e-10)
+
+
+def test_stretches_are_gathered_to_as_many_as_wanted_or_as_there_are(rng):
+    pieces = [compress(make(rng, samples=10 + k)[0]) for k in range(5)]
+    for count, edges in (
+        (2, [0, 2, 5]),
+        (3, [0, 2, 3, 5]),
+        (5, range(6)),
+        (9, range(6)),
+        (1, [0, 5]),
+    ):
+        found = gather(pieces, count)
+        assert len(found) == len(edges) - 1
+        for own, i, j in zip(found, edges[:-1], edges[1:], strict=True):
+            np.testing.assert_array_equal(own.rows, sum(piece.rows for piece in pieces[i:j]))
+            total = sum(gram(piece.R[0]) for piece in pieces[i:j])
+            np.testing.assert_allclose(gram(own.R[0]), total, atol=1e-10)

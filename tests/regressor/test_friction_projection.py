@@ -19,6 +19,9 @@ from robotid.robot.drives import (
     Spring,
     Stribeck,
 )
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
 
 LIFT, ELBOW, WRIST = "shoulder_lift_joint", "elbow_joint", "wrist_1_joint"
 OWN = {
@@ -176,3 +179,36 @@ def test_a_delay_stays_by_itself_and_presliding_is_that_of_long_motion(case, ur5
     left = dict(zip(found.model.layout.names, found.pi, strict=True))
     assert left[f"{ELBOW}.lag"] == 0.01
     assert f"{ELBOW}.presliding" not in left
+
+
+def test_moments_of_a_drive_of_several_joints_are_of_rows_that_all_of_them_use():
+    ratios = (("elbow_joint", 2.0), ("wrist_1_joint", -0.5))
+    joints = ["shoulder_lift_joint", "elbow_joint", "wrist_1_joint"]
+    model = RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"), joints=joints, couplings=(Coupling("motor", ratios),),
+        own_terms={"motor": (Harmonic(seen=(-9.0, 9.0), order=2.0),)},
+    )  # fmt: skip
+    rng, recordings, rows = np.random.default_rng(3), [], []
+    for count in (90, 31):
+        m = motion(model, rng, count)
+        mask = rng.random((count, 3)) < 0.6
+        recordings.append((m, mask))
+        both = mask[:, 1] & mask[:, 2]
+        assert 0 < both.sum() < (mask[:, 1] | mask[:, 2]).sum()
+        w, z = (2.0 * x[both, 1] - 0.5 * x[both, 2] for x in (m.v, m.q))
+        rows.append((np.column_stack([w, np.sign(w), np.cos(2 * z), np.ones_like(w), z]),
+                     m.tau[both, 1:]))  # fmt: skip
+    [(name, found)] = drive_moments(model, recordings).items()
+    assert name == "motor"
+    X, tau = (np.concatenate(x) for x in zip(*rows, strict=True))
+    order = [found.terms.index(t) for t in ("viscous", "coulomb", "cos2", "offset", "spring")]
+    assert len(found.terms) == 5
+    np.testing.assert_allclose(found.products[np.ix_(order, order)], X.T @ X / len(X), atol=1e-12)
+    assert found.torque == pytest.approx(np.sqrt(np.sum(tau**2) / len(X)))
+    x = {"viscous": 0.7, "cos2": -1.3, "spring": 0.2}
+    torque = X @ [0.7, 0.0, -1.3, 0.0, 0.2]
+    assert found.rms(x) == pytest.approx(np.sqrt(np.mean(torque**2)))
+    wanted = np.linalg.lstsq(X[:, [0, 3]], X[:, [2, 4]], rcond=None)[0]
+    np.testing.assert_allclose(
+        found.transfer(("cos2", "spring"), ("viscous", "offset")), wanted, atol=1e-9
+    )

@@ -221,6 +221,9 @@ def test_samples_are_shuffled_without_loss(rng):
     found = [int(s.tau[0]) for s in shuffled(samples, rng)]
     assert sorted(found) == list(range(20_000))
     assert np.mean(np.abs(np.array(found) - np.arange(20_000))) > 1000
+    # one of 8193 is drawn at a time: k draws leave each of the first as likely (1 - 1/8193)^k
+    left = np.mean(np.array(found[4000:]) < 8192) * 16_000 / 8192
+    assert left == pytest.approx((1 - 1 / 8193) ** 4000, abs=0.02)
 
 
 @pytest.mark.parametrize("name", ["ur5", "coupled"])

@@ -1,7 +1,14 @@
 import numpy as np
+import pinocchio as pin
 import pytest
 
-from robotid.robot.bodies import held_parameters, least_density, link_places
+from robotid.robot.bodies import (
+    central_inertial,
+    held_parameters,
+    least_density,
+    link_places,
+    principal_moments,
+)
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -49,3 +56,23 @@ def test_the_least_density_of_a_body_is_that_of_its_ellipsoid():
     assert least_density(pi) == pytest.approx(m / (4.0 / 3.0 * np.pi * a.prod()))
     assert least_density(np.zeros(10)) == 0.0
     assert least_density(np.array([1.0, *np.zeros(9)])) == np.inf
+
+
+def test_principal_moments_are_those_of_a_turned_body():
+    moments = np.array([0.02, 0.05, 0.11])  # second moments of mass along its axes
+    turns = np.random.default_rng(0).uniform(-3.0, 3.0, (12, 3))  # axes as found are of either hand
+    for order, turn in zip(4 * ([0, 1, 2], [2, 0, 1], [1, 0, 2]), turns, strict=True):
+        turned = pin.rpy.rpyToMatrix(*turn)
+        own = moments[order]
+        I = turned @ np.diag(own.sum() - own) @ turned.T  # noqa: E741
+        c, m = np.array([0.2, -0.3, 0.1]), 2.5
+        found, axes = principal_moments(pin.Inertia(m, c, I).toDynamicParameters())
+        np.testing.assert_allclose(found, moments, atol=1e-12)
+        assert np.linalg.det(axes) == pytest.approx(1.0)
+        np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
+        S = turned @ np.diag(own) @ turned.T
+        np.testing.assert_allclose(axes @ np.diag(found) @ axes.T, S, atol=1e-12)
+        stated = central_inertial(pin.Inertia(m, c, I).toDynamicParameters())
+        assert (stated.mass, stated.rpy) == (pytest.approx(m), (0.0, 0.0, 0.0))
+        np.testing.assert_allclose(stated.com, c)
+        np.testing.assert_allclose(stated.inertia, I[np.triu_indices(3)], atol=1e-12)

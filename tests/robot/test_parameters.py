@@ -86,3 +86,32 @@ def test_a_coupling_of_an_unknown_joint_is_refused():
 def test_an_unknown_drive_term_is_refused():
     with pytest.raises(SettingsError, match="unknown drive terms stiction; known: armature"):
         ParameterLayout(("a",), ("elbow",), terms=("stiction",))
+
+
+def test_a_slider_counts_by_its_stroke_and_a_coupling_by_the_mean_of_its_joints():
+    ratios = (("a", 2.0), ("c", -0.5))
+    options = {
+        "bodies": ("x",),
+        "couplings": (Coupling("motor", ratios),),
+        "joints": ("a", "b", "c"),
+    }
+    layout = ParameterLayout(prismatic=frozenset("bc"), strokes={"c": 0.8}, **options)
+    b, c = 1.0 / (2 * np.pi), 0.8 / (2 * np.pi)  # [m/s] that count as 1 rad/s; b states no stroke
+    motor = (2.0 + 0.5 * c) / 2.5
+    np.testing.assert_allclose(layout.drive_speeds, [1.0, b, c, motor])
+    R = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, -0.5]])
+    np.testing.assert_array_equal(layout.drive_ratios, R)
+    owner = [name.split(".")[0] for name in layout.drive_names]
+    places = [("a", "b", "c", "motor").index(name) for name in owner]
+    np.testing.assert_array_equal(layout.drive_loads, R[places].T)
+    shared = [name.startswith("motor.") for name in layout.drive_names]
+    np.testing.assert_array_equal(layout.is_coupled, shared)
+    assert "motor.offset" not in layout.drive_names
+    own = [
+        name for name, mine in zip(layout.names, layout.owned_by(["b", "x"]), strict=True) if mine
+    ]
+    assert own == [*layout.inertial_names, *(n for n in layout.drive_names if n.startswith("b."))]
+    length = 0.4
+    wanted = [1.0, *[0.4] * 3, *[0.16] * 6]
+    wanted += [0.16 if n in ("a.armature", "motor.armature") else 1.0 for n in layout.drive_names]
+    np.testing.assert_allclose(layout.scales(length), wanted)  # an armature of a slider is a mass

@@ -5,8 +5,9 @@ from helpers.synthetic import exact_log, truth
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.robot.mass_matrix import carried_inertia
-from robotid.robot.parameters import pseudo_inertia
-from robotid.robot.prior import prior_spread
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling, pseudo_inertia
+from robotid.robot.prior import payload_spread, prior_spread
 
 
 def test_the_spread_has_the_size_of_the_robot(ur5, rng):
@@ -58,3 +59,25 @@ def test_a_light_link_may_be_wrong_by_a_tenth_of_the_mean_mass(ur5):
     squares = np.ones((3, 6))
     spread = prior_spread(ur5.with_parameters(pi), squares, 1)
     assert spread[20] == pytest.approx(0.1 * pi[:60:10].mean(), rel=1e-6)
+
+
+def test_the_spread_of_a_payload_is_the_robots_mass_at_its_length(ur5):
+    mass, length = ur5.standard_parameters()[:60:10].sum(), ur5.length
+    wanted = mass * np.array([1.0, *[length] * 3, *[length**2] * 6])
+    assert abs(length - 1.0) > 0.05, "else its square is no other"
+    np.testing.assert_allclose(payload_spread(ur5), wanted)
+    light = ur5.with_parameters(0 * ur5.standard_parameters())
+    np.testing.assert_allclose(payload_spread(light), 1e-3 * wanted / mass)
+
+
+def test_the_spread_of_a_drive_of_several_joints_is_the_mean_of_theirs(ur5):
+    ratios = (("wrist_2_joint", 1.0), ("elbow_joint", -2.0))
+    model = RobotModel.from_urdf(ur5.tree.path, couplings=(Coupling("motor", ratios),))
+    tau, v = np.arange(1.0, 7.0), 0.5 * np.arange(2.0, 8.0)
+    squares = 9 * np.stack([tau, v, np.full(6, 3.0)]) ** 2
+    spread = dict(zip(model.layout.names, prior_spread(model, squares, 9), strict=True))
+    each = dict(zip(model.joints, tau / v, strict=True))
+    assert spread["elbow_joint.viscous"] == pytest.approx(each["elbow_joint"])
+    both = (each["elbow_joint"] + each["wrist_2_joint"]) / 2
+    assert spread["motor.viscous"] == pytest.approx(both)
+    assert spread["motor.coulomb"] == pytest.approx((3.0 + 5.0) / 2)

@@ -1,0 +1,220 @@
+"""Where a fit begins: usual sizes, first loops and unknowns, by their equations."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.paths import URDF
+
+from robotid.closed_loop.fit import stated_loops
+from robotid.closed_loop.initial_values import (
+    drive_unknowns,
+    first_loops,
+    is_stated,
+    likeness,
+    usual_sizes,
+    usual_sizes_of_torques,
+)
+from robotid.closed_loop.second_order import SecondOrder
+from robotid.closed_loop.settings import LoopSettings
+from robotid.closed_loop.zeros import _Motion
+from robotid.logs.data import Log
+from robotid.regressor.prediction import predict_instants
+from robotid.robot.model import RobotModel
+from robotid.simulation.loops import cut_windows
+
+T = 3.0 + np.arange(400) / 200.0
+
+
+@pytest.fixture(scope="module")
+def planar():
+    return RobotModel.from_urdf(URDF / "planar_2r.urdf")
+
+
+def plain_model(model, armature, kp, kd=(1.0, 1.0), values=(0.4, 0.3, 0.1, 0.8, 0.6, -0.2)):
+    """Return plain loops of two joints: viscous, Coulomb friction and offset of each."""
+    loops = replace(
+        stated_loops(model, LoopSettings()), armature=np.array(armature), kp=np.array(kp),
+        kd=np.array(kd), values=np.array(values), delay=np.array([0.01, 0.02]),
+    )  # fmt: skip
+    return SecondOrder(None, np.zeros(0), loops, np.array([3.0, 5.0]))
+
+
+@pytest.fixture(scope="module")
+def logged(planar):
+    """Two windows of a motion whose speeds are known, the errors largest in the second."""
+    q = np.column_stack([0.5 * np.sin(6 * T), 0.7 * np.cos(4 * T)])
+    q_ref = q + np.column_stack([0.02 * np.sin(T), -0.05 * (T - 3.0)])
+    return cut_windows(Log(T, q, 7.0 * q, planar.joints, q_ref=q_ref), 1.0, 0.0)
+
+
+def inertia_of(model, windows):
+    """Return the median of the diagonal of Pinocchio's mass matrices, of every eighth pose."""
+    q, data = np.concatenate([w.log.q[w.counted] for w in windows]), model.pin_model.createData()
+    return np.median([np.diag(pin.crba(model.pin_model, data, x)) for x in q[::8]], axis=0)
+
+
+def test_usual_sizes_are_measured_by_known_gains_or_by_the_bodies(planar, logged):
+    bodies = inertia_of(planar, logged)
+    plain = plain_model(planar, [3 * bodies[0], 0.4], [60.0, 1.0])
+    found = usual_sizes(
+        SimpleNamespace(model=planar), plain, logged, np.array([True, False]), np.array([2.0, 0.0])
+    )
+    np.testing.assert_allclose(found.bodies, bodies)
+    # of the second no gain is known: twice its bodies' inertia, or 0.3 of the first's, measures
+    scale = np.array([1.0, 2 * max(bodies[1], 0.3 * bodies[0]) / 0.4])
+    np.testing.assert_allclose(found.scale, scale)
+    np.testing.assert_allclose(found.inertia, np.maximum([3 * bodies[0], 0.4 * scale[1]], bodies))
+    np.testing.assert_allclose(found.torque, scale * [3.0, 5.0])
+    error = np.abs(np.concatenate([w.log.q_ref[w.counted] - w.log.q[w.counted] for w in logged]))
+    asked = 0.8 * np.array([60.0, 1.0]) * error.max(axis=0)
+    taken = 0.4 * 2.0 + 0.3  # by friction at the largest speed of the first
+    assert asked[0] < taken
+    np.testing.assert_allclose(found.largest, scale * asked)
+    quick = replace(plain, loops=replace(plain.loops, kp=np.array([600.0, 1.0])))
+    own = usual_sizes(
+        SimpleNamespace(model=planar), quick, logged, np.array([True, False]), np.array([2.0, 0.0])
+    )
+    np.testing.assert_allclose(own.largest, scale * [taken, asked[1]])
+    v = np.column_stack([3.0 * np.cos(6 * T), -2.8 * np.sin(4 * T)])
+    np.testing.assert_allclose(found.speed, np.sqrt(np.mean(v**2, axis=0)), rtol=2e-3)
+
+
+def test_usual_sizes_of_torques_are_those_of_rows_and_motors(planar, logged):
+    pi = planar.standard_parameters()
+    names = planar.layout.names
+    armature = np.array([0.3, 0.7])
+    for joint, x in zip(planar.joints, armature, strict=True):
+        pi[names.index(f"{joint}.armature")] = x
+    found = usual_sizes_of_torques(planar, pi, armature, logged)
+    bodies = inertia_of(planar, logged)
+    np.testing.assert_allclose(found.bodies, bodies)
+    np.testing.assert_allclose(found.inertia, bodies + armature)
+    q = np.concatenate([w.log.q[w.counted] for w in logged])
+    np.testing.assert_allclose(found.torque, 7.0 * np.sqrt(np.mean(q**2, axis=0)))
+    np.testing.assert_array_equal(found.largest, np.inf)
+    np.testing.assert_array_equal(found.scale, 1.0)
+
+
+def test_first_loops_and_unknowns_begin_with_usual_sizes(planar, logged):
+    bodies = inertia_of(planar, logged)
+    plain = plain_model(planar, [3 * bodies[0], 0.4], [60.0, 1.0])
+    usual = usual_sizes(
+        SimpleNamespace(model=planar), plain, logged, np.array([True, False]), np.zeros(2)
+    )
+    loop = LoopSettings(kp={planar.joints[0]: 60.0}, delays="one")
+    stated = stated_loops(planar, loop)
+    first = first_loops(planar, stated, plain, usual, np.array([False, True]))
+    s = usual.scale[1]
+    np.testing.assert_allclose(first.kp, [60.0, s])
+    wanted = np.maximum(usual.inertia - bodies, 0.05 * usual.inertia)
+    np.testing.assert_allclose(first.armature, wanted)
+    np.testing.assert_array_equal(first.delay, [0.01, 0.02])
+    np.testing.assert_array_equal(first.limit, [np.inf, usual.largest[1]])
+    by_name = [
+        {t.name: first.values[first.place(j, t)] for t in own} for j, own in enumerate(first.terms)
+    ]
+    assert by_name == [
+        {"viscous": 0.4, "coulomb": 0.3, "offset": 0.0},
+        {"viscous": pytest.approx(0.8 * s), "coulomb": pytest.approx(0.6 * s), "offset": 0.0},
+    ]
+    found = drive_unknowns(
+        planar, loop, ["both", "both"], first, usual, tells_kd=True,
+        finds_limit=np.array([False, True]),
+    )  # fmt: skip
+    a, b = planar.joints
+    table = {u.name: (u.joints, u.prior, u.spread, u.lowest) for u in found}
+    torque, speed = usual.torque, usual.speed
+    wanted = {
+        "both.armature": ((0, 1), np.median(first.armature), 10 * np.median(usual.inertia), 0.0),
+        "both.kp": ((1,), s, s, 0.05 * s),
+        "both.kd": ((0, 1), 0.0, 10 * np.median(torque / speed), 0.0),
+        f"{b}.limit": ((1,), usual.largest[1], 10 * torque[1], 0.05 * usual.largest[1]),
+        "robot.delay": ((0, 1), 0.015, 0.1, 0.0),
+        "both.viscous": ((0, 1), np.median([0.4, 0.8 * s]), 10 * np.median(torque / speed), 0.0),
+        f"{a}.coulomb": ((0,), 0.3, 10 * torque[0], 0.0),
+        f"{b}.coulomb": ((1,), 0.6 * s, 10 * torque[1], 0.0),
+        f"{a}.offset": ((0,), 0.0, 10 * torque[0], -np.inf),
+        f"{b}.offset": ((1,), 0.0, 10 * torque[1], -np.inf),
+    }
+    assert set(table) == set(wanted)
+    for name, (joints, *figures) in wanted.items():
+        assert table[name][0] == joints, name
+        assert table[name][1:] == pytest.approx(tuple(figures)), name
+    bare = drive_unknowns(
+        planar, LoopSettings(kp=1.0, kd=1.0, delay=0.0), ["a", "b"], first, usual, tells_kd=False,
+        finds_limit=np.zeros(2, dtype=bool),
+    )  # fmt: skip
+    kinds = {u.what for u in bare}
+    assert kinds == {"armature", "term"}
+
+
+def test_a_joint_follows_as_slowly_as_its_damping_or_its_swing(planar):
+    plain = plain_model(planar, [0.5, 8.0], [50.0, 2.0], kd=(4.6, 0.2))
+    # (4.6 + 0.4) / 50 = 0.1 and sqrt(0.5 / 50) = 0.1; (0.2 + 0.8) / 2 and sqrt(8 / 2)
+    np.testing.assert_allclose(plain.time_constant, [0.1, 2.0])
+    damped = plain_model(planar, [0.125, 0.02], [50.0, 2.0], kd=(4.6, 0.2))
+    np.testing.assert_allclose(damped.time_constant, [0.1, 0.5])
+
+
+def test_joints_are_alike_whose_limits_mass_and_moments_are():
+    base = np.array([2.0, 0.1, 0.2, 0.3, 0.5, 0.01, 0.6, 0.02, 0.03, 0.7])
+
+    def of(body=None, **limit):
+        own = {"type": "revolute", "effort": 5.0, "velocity": 2.0} | limit
+        return (base if body is None else body), SimpleNamespace(**own)
+
+    def changed(k, factor):
+        body = base.copy()
+        body[k] *= factor
+        return of(body)
+
+    same = [
+        of(),
+        *(changed(k, 3.0) for k in (1, 2, 3, 5, 7, 8)),
+        changed(0, 1.01),
+        of(effort=5.0001),
+    ]
+    others = [changed(k, 1.3) for k in (0, 4, 6, 9)]
+    others += [of(type="prismatic"), of(effort=6.0), of(velocity=2.1)]
+    every = [*same, *others]
+    model = SimpleNamespace(
+        standard_parameters=lambda: np.concatenate([body for body, _ in every]),
+        layout=SimpleNamespace(n_inertial=10 * len(every)),
+        limits=[limit for _, limit in every],
+    )
+    found = likeness(model)
+    assert set(found[: len(same)]) == {found[0]}
+    assert len(set(found)) == 1 + len(others)
+
+
+def test_a_number_states_all_joints_and_a_table_those_it_names(planar):
+    a, b = planar.joints
+    for value, wanted in ((3.0, [1, 1]), (None, [0, 0]), ({b: 1.0}, [0, 1]), ({a: 0.0}, [1, 0])):
+        assert is_stated(value, planar).tolist() == [bool(x) for x in wanted]
+
+
+def test_a_load_that_would_push_a_loop_the_wrong_way_does_not_count(rng):
+    model = RobotModel.from_urdf(URDF / "planar_2r.urdf", gravity=(0.0, -9.81, 0.0))
+    q, v, a = rng.uniform(-1.0, 1.0, (3, 60, 2))
+    sign, zero = np.array([-1.0, 1.0]), np.array([0.3, -0.4])
+    torque = predict_instants(
+        model, model.standard_parameters(), sign * q + zero, sign * v, sign * a
+    )
+    sense, noise = np.tanh(v), 1e-3 * rng.standard_normal((60, 2))
+    gives = sign * torque * [0.02, 0.05] + 0.1 * v - 0.2 * a + 0.3 * sense + 0.7 + noise
+    for way, counts in (([1.0, 1.0], [1, 1]), ([1.0, -1.0], [1, 0]), ([-1.0, 1.0], [0, 1])):
+        error = gives - (1.0 - np.array(way)) * sign * torque * [0.02, 0.05]
+        left, without = _Motion(q, v, a, error, sense).left(model, sign, zero)
+        for j in range(2):
+            X = np.column_stack([np.ones(60), v[:, j], sense[:, j], a[:, j]])
+            bare = np.linalg.lstsq(X, error[:, j], rcond=None)[1][0]
+            X = np.column_stack([X, torque[:, j]])
+            best = np.linalg.lstsq(X, error[:, j], rcond=None)[1][0]
+            assert without[j] == pytest.approx(bare)
+            assert left[j] == pytest.approx(best if counts[j] else bare)
+            assert best < 0.5 * bare
+        cost = _Motion(q, v, a, error, sense).cost(model, sign, zero)
+        assert cost == pytest.approx(60 * np.log(left).sum())

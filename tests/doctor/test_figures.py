@@ -1,0 +1,205 @@
+"""The figures of findings, by an independent computation: evidence and sentences alike."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.paths import ROOT
+from helpers.synthetic import exact_log, truth
+
+from robotid.doctor import hypotheses
+from robotid.doctor.channels import check_channels
+from robotid.doctor.clock import check_clock
+from robotid.doctor.command_channels import _held, _Loop
+from robotid.doctor.hypotheses import Explanation, _refined
+from robotid.doctor.loads import _payload
+from robotid.doctor.motions import check_excitation
+from robotid.doctor.torque_channels import check_torque_channels
+from robotid.doctor.urdf_geometry import _copies
+from robotid.doctor.urdf_inertials import impossible_inertial
+from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.model import RobotModel
+from robotid.robot.tree import Inertial
+
+T = 3.0 + np.arange(2000) / 100
+
+
+def log_of(t=T, tau=None, **changes):
+    q = np.column_stack([np.sin(2 * (t - 3.0)), 0.4 * np.cos(3 * (t - 3.0))])
+    tau = 5.0 * q if tau is None else tau
+    return replace(Log(t, q, tau, ("a", "b"), path="run.csv"), **changes)
+
+
+def one(findings, code):
+    [found] = [f for f in findings if f.code == code]
+    return found
+
+
+def test_spikes_are_counted_by_their_share_of_what_varies():
+    rng = np.random.default_rng(0)
+    tau = 40.0 + 5.0 * log_of().q + 0.01 * rng.standard_normal((2000, 2))
+    tau[[310, 700, 1500], 1] += [120.0, -70.0, 90.0]
+    found = one(check_channels(log_of(tau=tau), SignalSettings()), "spikes")
+    x = tau[:, 1]
+    height = np.array([120.0, -70.0, 90.0])
+    share = np.sum(height**2) / np.sum((x - np.median(x)) ** 2)
+    assert (found.where, found.severity) == ("run.csv: tau_b", "error")
+    assert found.evidence == {
+        "rows": 3.0, "largest": pytest.approx(120.0, abs=0.2), "first": pytest.approx(6.1),
+        "energy_share": pytest.approx(share, rel=0.01),
+    }  # fmt: skip
+    assert "tau of b jumps by up to 120 for 3 rows, the first at t = 6.1 s" in found.message
+
+
+@pytest.mark.parametrize("rows", [3, 5, 6])
+def test_a_held_torque_is_late_by_half_of_what_it_is_held_less_a_row(rows):
+    held = np.arange(2000) // rows * rows
+    tau = 5.0 * log_of().q
+    tau[:, 1] = tau[held, 1]
+    found = one(check_torque_channels(log_of(tau=tau)), "held_torque")
+    own = (np.arange(2000) - held)[: 2000 // rows * rows]  # rows since each was new
+    late = own.mean() * 0.01
+    assert found.where == "run.csv: b"
+    assert found.evidence == {"rows": rows, "delay": pytest.approx(late)}
+    told = f"held for {rows} rows: it is updated at {100 / rows:.3g} Hz and logged at 100 Hz"
+    assert told in found.message
+    assert f"{1e3 * late:.2g} ms late on average" in found.message
+    assert f"torque_delay = {late:.4f} (--torque-delay {late:.4f})" in found.message
+    assert f"a cutoff below {25 / rows:.2g} Hz" in found.message
+
+
+def test_clocks_that_were_set_are_told_from_gaps():
+    set_ = np.where(np.arange(2000) > 500, 7.0, 0.0) + np.where(np.arange(2000) > 900, 3.0, 0.0)
+    log = log_of(t=T + set_, q=log_of().q)
+    kept = np.delete(np.arange(2000), np.r_[1200:1260, 1700:1740])
+    log = replace(log, t=log.t[kept], q=log.q[kept], tau=log.tau[kept])
+    found = list(check_clock(log))
+    step = one(found, "clock_step")
+    assert step.evidence == {"jump": pytest.approx(7.0), "at": pytest.approx(8.0), "steps": 2.0}
+    assert "the clock jumps by 7 s at t = 8 s" in step.message
+    gap = one(found, "gap")
+    assert gap.evidence == {
+        "gaps": 2.0, "longest": pytest.approx(0.61), "at": pytest.approx(14.99 + 10.0)
+    }  # fmt: skip
+    assert "2 gaps, the longest of 0.61 s at t = 24.99 s" in gap.message
+    rate = one(found, "rate")
+    assert rate.evidence["samples"] == 1900
+    assert rate.evidence["rate"] == pytest.approx(100.0)
+    assert rate.evidence["duration"] == pytest.approx(19.99 + 10.0)
+
+
+def test_impossible_inertias_are_told_with_their_moments():
+    def found(*inertia, mass=2.0):
+        return list(impossible_inertial("arm", Inertial(mass, (0, 0, 0), (0, 0, 0), inertia), True))
+
+    [broken] = found(4.0, 0.0, 0.0, 1.0, 0.0, 2.5)
+    assert broken.severity == "error"
+    assert broken.evidence == pytest.approx(
+        {"smallest": 1.0, "middle": 2.5, "largest": 4.0, "triangle": -0.5}
+    )
+    assert "the two smaller ones add up to 3.5, wanted more than 4" in broken.message
+    [negative] = found(1.0, 2.0, 0.0, 1.0, 0.0, 2.5)  # -1, 2.5, 3
+    assert "moments of inertia -1, 2.5, 3 kg m^2 are not all positive" in negative.message
+    assert "(-1 is not)" in negative.message
+    assert negative.evidence["triangle"] == pytest.approx(-1.5)
+    [flat] = found(3.0, 0.0, 0.0, 1.0, 0.0, 2.0)
+    assert flat.severity == "note"
+    assert found(3.0, 0.0, 0.0, 1.5, 0.0, 2.0) == []
+    zero, _ = found(4.0, 0.0, 0.0, 1.0, 0.0, 2.5, mass=0.0)
+    assert (zero.code, zero.severity) == ("zero_mass", "warning")
+    assert found(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, mass=0.0)[1:] == []
+
+
+@pytest.mark.parametrize(("mass", "severity"), [(2.0, "warning"), (-2.0, "warning"), (0.4, "note")])
+def test_a_payload_is_told_with_its_moments(mass, severity):
+    pi = np.repeat([5.0, 3.0], 10)
+    model = SimpleNamespace(
+        standard_parameters=lambda: pi, layout=SimpleNamespace(n_inertial=20, bodies=("up", "low"))
+    )
+    [found] = _payload(
+        SimpleNamespace(model=model), np.array([mass, 0.1, -0.2, 0.3]), 0.05, "run.csv"
+    )
+    assert found.evidence == {
+        "mass": mass, "std_error": 0.05, "mcx": 0.1, "mcy": -0.2, "mcz": 0.3
+    }  # fmt: skip
+    assert (found.where, found.severity) == ("run.csv: low", severity)
+    sign = "more" if mass > 0 else "less"
+    assert f"low carries about {abs(mass):.2g} +- 0.05 kg {sign} than the URDF" in found.message
+    assert list(_payload(SimpleNamespace(model=model), np.array([0.14, 0, 0, 0]), 0.05, "x")) == []
+
+
+def test_copies_differ_by_the_largest_of_all_their_sides():
+    inertial = Inertial(2.0, (0.1, 0, 0), (0, 0, 0), (1.0, 0, 0, 1.0, 0, 1.5))
+    other = Inertial(2.1, (0.1, 0, 0), (0, 0, 0), (1.0, 0, 0, 1.0, 0, 1.5))
+    sides = {"a": (0.2, 0.3, 0.4), "b": (0.3, 0.4, 0.2), "c": (0.2, 0.5, 0.3), "d": (1, 1, 1)}
+    points = {name: np.array([[0, 0, 0], own]) for name, own in sides.items()}
+    inertials = dict.fromkeys("abc", inertial) | {"d": other}
+    model = SimpleNamespace(
+        layout=SimpleNamespace(bodies=tuple("abcd")), tree=SimpleNamespace(inertials=inertials)
+    )
+    [found] = _copies(model, points)
+    # of c the longest side is 0.1 m longer, of 0.5 m
+    assert found.evidence == {"links": 3.0, "difference": pytest.approx(0.2)}
+    assert "the links a, b, c have the same mass" in found.message
+    del points["c"]
+    assert list(_copies(model, points)) == [], "b has the same sides in another order"
+
+
+@pytest.mark.parametrize("off", [0.31, -0.27, 0.02])
+def test_an_offset_is_refined_to_either_side(monkeypatch, off):
+    def offset(_probe, j, x):
+        return Explanation("position_offset", np.array([0.1 + (x - 1.5 - off) ** 2]), (j,), (x,))
+
+    monkeypatch.setattr(hypotheses, "_offset", offset)
+    found = _refined(None, offset(None, 2, 1.5))
+    assert found.joints == (2,)
+    assert found.values[0] == pytest.approx(1.5 + off, abs=0.01)
+    assert found.misfit <= offset(None, 2, 1.5).misfit
+
+
+def test_held_commands_are_told_with_their_period():
+    held = np.arange(2000) // 5 * 5
+    log = log_of(q_ref=log_of().q[held])
+    [found] = _held(log, [_Loop(log, j) for j in range(2)])
+    assert found.evidence == {"rows": 5.0, "period": pytest.approx(0.05)}
+    assert "of a, b is renewed every 5 rows, 20 times a second in the mean" in found.message
+    assert "held for 50 ms" in found.message
+    assert "or 25 ms are taken for the drive's own delay" in found.message
+
+
+def test_a_lag_is_the_slope_of_the_phase_with_the_error_of_a_weighted_mean():
+    rng = np.random.default_rng(3)
+    ref = np.convolve(rng.standard_normal(2010), np.ones(11) / 11, "valid")
+    q_ref = np.column_stack([ref, ref])
+    log = log_of(q=np.roll(q_ref, 7, axis=0), q_ref=q_ref)
+    loop = _Loop(log, 0)
+    f = np.linspace(0.5, 6.0, 23)
+    phase, weight = 0.3 * rng.standard_normal(23), rng.uniform(5.0, 400.0, 23)
+    H = np.exp(-2j * np.pi * f * 0.074 + 1j * phase)
+    loop.__dict__.update(response=(f, H, weight), bandwidth=5.1)
+    lag, error = loop.lag
+    used = f < 5.1
+    w, y, weight = 2 * np.pi * f[used], (2 * np.pi * f * 0.074 - phase)[used], weight[used]
+    slope = np.sum(weight * w * y) / np.sum(weight * w**2)
+    assert lag == pytest.approx(slope, rel=1e-9)
+    share = weight * w**2 / np.sum(weight * w**2)
+    scatter = np.sqrt(np.sum(share * (y / w - slope) ** 2) / (len(w) - 1))
+    assert error == pytest.approx(max(scatter, np.sum(weight * w**2) ** -0.5), rel=1e-9)
+    assert scatter > np.sum(weight * w**2) ** -0.5, "the scatter counts"
+
+
+def test_what_a_motion_determines_is_the_same_of_its_halves():
+    model = RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
+    rng = np.random.default_rng(1)
+    log = exact_log(model, truth(model), rng, samples=900, rate=100.0, noise=[0.2, 0.05])
+    signals = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+    motion, mapping = process(log, signals), structural_mapping(model)
+    parts = [motion.part(0, 300), motion.part(300, 900)]
+    [whole], [cut] = (check_excitation(model, mapping, m, signals, "x") for m in ([motion], parts))
+    assert cut.evidence == pytest.approx(whole.evidence, rel=1e-9)
+    assert cut.message == whole.message
+    assert 0 < whole.evidence["weakest"] < 1
