@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from robotid.exceptions import SettingsError
+from robotid.excitation.course import Course
 from robotid.excitation.limits import MotionLimits
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -43,3 +44,22 @@ def test_bad_numbers_are_refused(panda):
         MotionLimits.of_model(panda, jerk={"panda_joint1": -1})
     with pytest.raises(SettingsError, match="power is stated of 'x', which is no joint that moves"):
         MotionLimits.of_model(panda, power={"x": 1})
+
+
+def test_a_course_peaks_where_most_of_a_limit_is_used_either_way():
+    limits = MotionLimits(np.array([1.0, 0.0]), np.full((6, 2), 2.0))
+    t = np.linspace(0.0, 3.0, 1501)
+    q = np.column_stack([1.0 + np.where(t > 1.0, -1.5, 1.0) * np.sin(np.pi * t), 0.2 * t])
+    v, a = (np.column_stack([x, -3.0 * x]) for x in (np.cos(t), np.exp(-t)))
+    torque = np.column_stack([4.0 + t, -t])
+    course = Course.of_motion(t, (q, v, a, torque), limits)
+    used = [q - [1.0, 0.0], v, a, np.gradient(a, t, axis=0), torque, torque * v]
+    np.testing.assert_allclose(course.used, np.array(used) / 2.0)
+    np.testing.assert_allclose(course.largest, np.abs(used).max(axis=1) / 2.0)
+    assert course.peak("position", 0) == pytest.approx(1.5)
+    assert course.peak("torque", 1) == pytest.approx(3.0)
+    few = course.thinned
+    np.testing.assert_array_equal(few.t, t[::2])
+    np.testing.assert_array_equal(few.values, course.values[:, ::2])
+    whole = Course.of_motion(t[:1000], tuple(x[:1000] for x in (q, v, a, torque)), limits)
+    assert len(whole.thinned.t) == 1000
