@@ -9,14 +9,15 @@ from robotid.robot.model import RobotModel
 
 
 def test_limits_are_those_of_the_urdf_and_those_stated(panda):
-    limits = MotionLimits.of_model(panda, share=0.5, jerk=7.0, acceleration={"panda_joint2": 3.0})
-    joint = panda.limits[1]
-    assert limits.middle[1] == pytest.approx((joint.lower + joint.upper) / 2)
-    np.testing.assert_allclose(
-        limits.sizes[:, 1],
-        [(joint.upper - joint.lower) / 4, joint.velocity / 2, 3.0, 7.0, joint.effort / 2, np.inf],
-    )
-    assert limits.sizes[2, 0] == np.inf
+    limits = MotionLimits.of_model(panda, share=0.5, jerk=7.0, acceleration={"panda_joint4": 3.0})
+    for j, joint in enumerate(panda.limits):
+        assert limits.middle[j] == pytest.approx((joint.lower + joint.upper) / 2)
+        half, stated = (joint.upper - joint.lower) / 2, 3.0 if j == 3 else np.inf
+        np.testing.assert_allclose(
+            limits.sizes[:, j],
+            [half / 2, joint.velocity / 2, stated, 7.0, joint.effort / 2, np.inf],
+        )
+    assert abs(limits.middle[3]) > 1.0  # its range is not even
 
 
 def test_shares_are_signed_and_power_is_torque_times_speed(panda):
