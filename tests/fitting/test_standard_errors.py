@@ -131,6 +131,42 @@ def test_one_parameter_is_the_closed_form_of_cr2(rng):
     assert found.freedom()[0] == pytest.approx(freedom, rel=1e-9)
 
 
+def test_scores_scatter_as_the_matrices_of_their_rows_say(W):
+    """Of two joints and four columns, one of which a single stretch has nearly alone."""
+    W = W.copy()
+    W[:60, :, 2] *= 30.0
+    tau = W @ TRUTH + 2.0 * noise(np.random.default_rng(8), 0.9)
+    sigma = np.array([1.5, 0.2])
+    rows, y = (x / sigma[:, None] for x in (W, tau[:, :, None]))
+    X, b = rows.reshape(STRETCHES, -1, 4), y.reshape(STRETCHES, -1)
+    B = np.linalg.inv(np.einsum("sia,sib->ab", X, X))
+    theta = B @ np.einsum("sia,si->a", X, b)
+    meat, alone, left, expected, a = np.zeros((4, 4)), np.zeros((4, 4)), 0.0, 0.0, []
+    for R, z in zip(X, b - X @ theta, strict=True):
+        H = R @ B @ R.T
+        leverage, V = np.linalg.eigh(H)
+        gain = np.maximum(1.0 - leverage, 0.05) ** -0.5  # of no more leverage than 0.95
+        A = (V * gain) @ V.T
+        score = R.T @ A @ z
+        meat += np.outer(score, score)
+        left += (A @ z) @ H @ (A @ z)
+        shown = A @ (np.eye(len(H)) - H) @ A  # of its own noise
+        expected += np.trace(H @ shown)
+        alone += R.T @ (np.eye(len(H)) - shown) @ R
+        a.append(A @ R @ B)
+    found = scatter(stretches(W, tau), theta, sigma, B)
+    assert found.inflation == pytest.approx(left / expected)
+    assert found.inflation > 3.0
+    np.testing.assert_allclose(found.meat, meat + left / expected * alone, rtol=1e-6)
+    assert alone[2, 2] > 0.3 / B[2, 2]
+    np.testing.assert_allclose(found.covariance, B @ found.meat @ B, rtol=1e-6)
+    for k in range(4):
+        back = np.array([R.T @ x[:, k] for R, x in zip(X, a, strict=True)])
+        gram = np.diag([x[:, k] @ x[:, k] for x in a]) - back @ B @ back.T
+        wanted = np.trace(gram) ** 2 / np.sum(gram**2)
+        assert found.freedom()[k] == pytest.approx(max(wanted, 1.0), rel=1e-6)
+
+
 def test_a_direction_of_one_stretch_alone_gets_the_scatter_of_the_others(W):
     alone = W.copy()
     alone[:, :, 1] = 0.0
