@@ -148,7 +148,7 @@ def test_rows_near_a_reversal_or_a_stop_are_not_steady():
     near = 0.5 / 4.9  # half a period of the cut-off
     start = np.abs(t) <= near  # a segment begins
     np.testing.assert_array_equal(steady[:, 0], ~(start | (np.abs(t - 1.0) <= near)))
-    np.testing.assert_array_equal(steady[:, 1], ~(start | (t <= 0.5 + near)))
+    np.testing.assert_array_equal(steady[:, 1], ~(start | (t <= 0.49 + near)))
     unfiltered = SignalSettings(cutoff=None)
     assert _is_steady(SimpleNamespace(trajectory=motion, signals=unfiltered)).all()
 
