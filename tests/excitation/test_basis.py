@@ -29,3 +29,8 @@ def test_a_basis_that_cannot_rest_is_refused():
         FourierBasis(5.0, 1)
     with pytest.raises(SettingsError, match="pieces is 2, wanted 3 or more"):
         BSplineBasis(5.0, 2)
+
+
+def test_the_shortest_wave_is_that_of_the_last_harmonic_or_of_two_pieces():
+    assert FourierBasis(7.0, 4).shortest == pytest.approx(1.75)
+    assert BSplineBasis(7.0, 9).shortest == pytest.approx(14.0 / 9.0)

@@ -2,20 +2,22 @@ import numpy as np
 import pytest
 
 from robotid.exceptions import SettingsError
+from robotid.excitation.course import Course
 from robotid.excitation.limits import MotionLimits
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 
 def test_limits_are_those_of_the_urdf_and_those_stated(panda):
-    limits = MotionLimits.of_model(panda, share=0.5, jerk=7.0, acceleration={"panda_joint2": 3.0})
-    joint = panda.limits[1]
-    assert limits.middle[1] == pytest.approx((joint.lower + joint.upper) / 2)
-    np.testing.assert_allclose(
-        limits.sizes[:, 1],
-        [(joint.upper - joint.lower) / 4, joint.velocity / 2, 3.0, 7.0, joint.effort / 2, np.inf],
-    )
-    assert limits.sizes[2, 0] == np.inf
+    limits = MotionLimits.of_model(panda, share=0.5, jerk=7.0, acceleration={"panda_joint4": 3.0})
+    for j, joint in enumerate(panda.limits):
+        assert limits.middle[j] == pytest.approx((joint.lower + joint.upper) / 2)
+        half, stated = (joint.upper - joint.lower) / 2, 3.0 if j == 3 else np.inf
+        np.testing.assert_allclose(
+            limits.sizes[:, j],
+            [half / 2, joint.velocity / 2, stated, 7.0, joint.effort / 2, np.inf],
+        )
+    assert abs(limits.middle[3]) > 1.0  # its range is not even
 
 
 def test_shares_are_signed_and_power_is_torque_times_speed(panda):
@@ -43,3 +45,22 @@ def test_bad_numbers_are_refused(panda):
         MotionLimits.of_model(panda, jerk={"panda_joint1": -1})
     with pytest.raises(SettingsError, match="power is stated of 'x', which is no joint that moves"):
         MotionLimits.of_model(panda, power={"x": 1})
+
+
+def test_a_course_peaks_where_most_of_a_limit_is_used_either_way():
+    limits = MotionLimits(np.array([1.0, 0.0]), np.full((6, 2), 2.0))
+    t = np.linspace(0.0, 3.0, 1501)
+    q = np.column_stack([1.0 + np.where(t > 1.0, -1.5, 1.0) * np.sin(np.pi * t), 0.2 * t])
+    v, a = (np.column_stack([x, -3.0 * x]) for x in (np.cos(t), np.exp(-t)))
+    torque = np.column_stack([4.0 + t, -t])
+    course = Course.of_motion(t, (q, v, a, torque), limits)
+    used = [q - [1.0, 0.0], v, a, np.gradient(a, t, axis=0), torque, torque * v]
+    np.testing.assert_allclose(course.used, np.array(used) / 2.0)
+    np.testing.assert_allclose(course.largest, np.abs(used).max(axis=1) / 2.0)
+    assert course.peak("position", 0) == pytest.approx(1.5)
+    assert course.peak("torque", 1) == pytest.approx(3.0)
+    few = course.thinned
+    np.testing.assert_array_equal(few.t, t[::2])
+    np.testing.assert_array_equal(few.values, course.values[:, ::2])
+    whole = Course.of_motion(t[:1000], tuple(x[:1000] for x in (q, v, a, torque)), limits)
+    assert len(whole.thinned.t) == 1000

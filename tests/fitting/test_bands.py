@@ -6,7 +6,7 @@ from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.export.entries import build_result
-from robotid.fitting.bands import TorqueBand, expected_band, torque_band
+from robotid.fitting.bands import TorqueBand, expected_band, recording_bands, torque_band
 from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
@@ -69,6 +69,25 @@ def test_the_noise_of_a_band_is_what_recordings_of_its_kind_leave(ur5):
         share = found.band(e).held(recording.trajectory.tau, e.torques["estimate"], recording.mask)
         assert ((share > 0.93) & (share < 0.97)).all(), share
     np.testing.assert_array_equal(expected_band(found, found.fitted[0]).noise, found.estimate.sigma)
+
+
+def test_a_validation_log_that_was_fitted_has_the_noise_of_the_fitted_ones(found):
+    identification, _ = found
+    (kept,) = identification.validation
+    again = replace(identification, validation=(replace(kept, is_refitted=True),))
+    bands = recording_bands(again)
+    np.testing.assert_array_equal(bands[0].noise, bands[1].noise)
+    for j in range(6):  # the least that holds 95 % of the rows of both
+        needed = []
+        for band, e in zip(bands, (*again.fitted, kept), strict=True):
+            k = band.samples
+            residual = (e.recording.trajectory.tau - e.torques["estimate"])[k, j]
+            used = e.recording.mask[k, j].astype(bool)
+            needed.append(((residual / 1.96) ** 2 - band.parameters[:, j] ** 2)[used])
+        wanted = np.sqrt(np.quantile(np.concatenate(needed), 0.95))
+        assert bands[0].noise[j] == pytest.approx(wanted)
+    apart = recording_bands(identification)
+    assert (apart[0].noise != apart[1].noise).all()
 
 
 def test_intervals_hold_the_truth(found):

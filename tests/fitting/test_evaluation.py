@@ -1,3 +1,4 @@
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.fitting.evaluation import (
+    _joined,
     _parts,
     evaluate_logs,
     hidden_joints,
@@ -158,6 +160,26 @@ def test_a_recording_is_named_by_its_file_and_stretch(ur5, rng):
     pi = truth(ur5)
     found = evaluated(ur5, exact_log(ur5, pi, rng), {"x": pi}, pi)
     assert found.recording.name == "log 0-11.98 s"
+    log = replace(exact_log(ur5, pi, rng), path="some/run.csv").window(2.0, 7.5)
+    later = replace(log, t=log.t + 3.0)
+    extent = evaluated(ur5, later, {"x": pi}, pi).recording.extent
+    assert (extent.start, extent.end) == pytest.approx((5.0, 10.5))
+    assert (extent.samples, extent.rate) == (len(log.t), pytest.approx(50.0))
+    assert (extent.smooth, extent.rows_used, extent.segments) == (len(log.t), 6 * len(log.t), 1)
+    assert evaluated(ur5, later, {"x": pi}, pi).recording.name == "run.csv 5-10.5 s"
+
+
+def test_parts_of_a_log_keep_the_gaps_between_them(rng):
+    q = rng.standard_normal((3, 5, 2))
+    segments = ([0, 0, 1, 1, 3], [3, 3, 4, 4, 4], [9, 9, 9, 9, 9])
+    motions = [
+        Trajectory(k + np.arange(5) / 10.0, x, x, x, x, ("a", "b"), 10.0, np.array(segment))
+        for k, (x, segment) in enumerate(zip(q, segments, strict=True))
+    ]
+    whole = _joined(motions)
+    assert whole.segment.tolist() == [0, 0, 1, 1, 2, 3, 3, 4, 4, 4, 5, 5, 5, 5, 5]
+    np.testing.assert_array_equal(whole.q, np.concatenate(q))
+    np.testing.assert_array_equal(whole.t, np.concatenate([m.t for m in motions]))
 
 
 @pytest.mark.parametrize(

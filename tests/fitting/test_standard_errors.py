@@ -10,8 +10,14 @@ from helpers.synthetic import exact_log, truth
 from robotid.estimators import OLS, WLS
 from robotid.estimators.stretches import quantile, scatter
 from robotid.exceptions import DataError
-from robotid.fitting.standard_errors import measured_errors, with_wls_errors
+from robotid.fitting.standard_errors import (
+    about_prior,
+    measured_errors,
+    standard_of,
+    with_wls_errors,
+)
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import Factors, compress, merge
 from robotid.regressor.problem import Problem
 from robotid.robot.examples import example_urdf
@@ -125,6 +131,42 @@ def test_one_parameter_is_the_closed_form_of_cr2(rng):
     assert found.freedom()[0] == pytest.approx(freedom, rel=1e-9)
 
 
+def test_scores_scatter_as_the_matrices_of_their_rows_say(W):
+    """Of two joints and four columns, one of which a single stretch has nearly alone."""
+    W = W.copy()
+    W[:60, :, 2] *= 30.0
+    tau = W @ TRUTH + 2.0 * noise(np.random.default_rng(8), 0.9)
+    sigma = np.array([1.5, 0.2])
+    rows, y = (x / sigma[:, None] for x in (W, tau[:, :, None]))
+    X, b = rows.reshape(STRETCHES, -1, 4), y.reshape(STRETCHES, -1)
+    B = np.linalg.inv(np.einsum("sia,sib->ab", X, X))
+    theta = B @ np.einsum("sia,si->a", X, b)
+    meat, alone, left, expected, a = np.zeros((4, 4)), np.zeros((4, 4)), 0.0, 0.0, []
+    for R, z in zip(X, b - X @ theta, strict=True):
+        H = R @ B @ R.T
+        leverage, V = np.linalg.eigh(H)
+        gain = np.maximum(1.0 - leverage, 0.05) ** -0.5  # of no more leverage than 0.95
+        A = (V * gain) @ V.T
+        score = R.T @ A @ z
+        meat += np.outer(score, score)
+        left += (A @ z) @ H @ (A @ z)
+        shown = A @ (np.eye(len(H)) - H) @ A  # of its own noise
+        expected += np.trace(H @ shown)
+        alone += R.T @ (np.eye(len(H)) - shown) @ R
+        a.append(A @ R @ B)
+    found = scatter(stretches(W, tau), theta, sigma, B)
+    assert found.inflation == pytest.approx(left / expected)
+    assert found.inflation > 3.0
+    np.testing.assert_allclose(found.meat, meat + left / expected * alone, rtol=1e-6)
+    assert alone[2, 2] > 0.3 / B[2, 2]
+    np.testing.assert_allclose(found.covariance, B @ found.meat @ B, rtol=1e-6)
+    for k in range(4):
+        back = np.array([R.T @ x[:, k] for R, x in zip(X, a, strict=True)])
+        gram = np.diag([x[:, k] @ x[:, k] for x in a]) - back @ B @ back.T
+        wanted = np.trace(gram) ** 2 / np.sum(gram**2)
+        assert found.freedom()[k] == pytest.approx(max(wanted, 1.0), rel=1e-6)
+
+
 def test_a_direction_of_one_stretch_alone_gets_the_scatter_of_the_others(W):
     alone = W.copy()
     alone[:, :, 1] = 0.0
@@ -195,3 +237,59 @@ def test_the_prior_makes_the_sandwich_of_its_formula(W):
     np.testing.assert_allclose(
         found.covariance, B @ (share**2 * K.T @ meat @ K + L) @ B, rtol=1e-6, atol=1e-12
     )
+
+
+@pytest.mark.parametrize("pull", [1.0, 2.5])
+def test_a_prior_that_pulls_more_than_it_is_sure_widens_by_its_own_part(rng, pull):
+    K, R, share = rng.standard_normal((4, 6)), np.triu(rng.standard_normal((4, 4))), 0.3
+    L, root = np.diag(np.arange(1.0, 7.0)), rng.standard_normal((4, 4))
+    meat = root @ root.T
+    C = np.linalg.inv(share * K.T @ R.T @ R @ K + L)
+    found = about_prior(C, K, meat, R, share, pull)
+    np.testing.assert_allclose(found, C @ (K.T @ meat @ K + pull * L) @ C, atol=1e-12)
+    np.testing.assert_array_equal(found, found.T)
+
+
+def test_what_is_scattered_beside_the_rows_adds_to_the_meat(W):
+    """Of a filter, of least squares and of a fit with a prior."""
+    parts = stretches(W, W @ TRUTH + noise(np.random.default_rng(7), 0.0))
+    whole, share, more = merge(parts), 0.25, np.diag([3.0, 1.0, 0.0, 2.0])
+    wls = WLS(independent_share=share).fit(whole)
+    for is_filter, bread in ((True, share * wls.covariance), (False, share * wls.covariance)):
+        plain, wide = (
+            measured_errors(
+                wls, parts, whole, share, np.eye(4), wls.sigma, is_filter=is_filter, more=x
+            )[0].covariance
+            for x in (None, more)
+        )
+        np.testing.assert_allclose(wide - plain, bread @ more @ bread, atol=1e-9 * wide.max())
+    K = np.hstack([np.eye(4), np.ones((4, 1))])
+    L = np.eye(5)
+    R = whole.weighted(wls.sigma)[:4, :4]
+    B = np.linalg.inv(share * K.T @ R.T @ R @ K + L)
+    fit = replace(wls, theta=np.append(wls.theta, 0.0), covariance=B, names=tuple("abcde"))
+    plain, wide = (
+        measured_errors(fit, parts, whole, share, K, wls.sigma, more=x)[0].covariance
+        for x in (None, more)
+    )
+    BK = B @ K.T
+    np.testing.assert_allclose(wide - plain, share**2 * BK @ more @ BK.T, atol=1e-9 * wide.max())
+
+
+def test_standard_parameters_are_the_prior_moved_by_the_least_to_the_base_parameters(W, rng):
+    wls = WLS().fit(merge(stretches(W, W @ TRUTH + noise(rng, 0.0))))
+    K, spread = np.hstack([np.eye(4), rng.standard_normal((4, 2))]), np.arange(1.0, 7.0)
+    mapping = BaseMapping(K, np.arange(4), tuple("abcdef"), np.ones(6))
+    prior, before = rng.standard_normal(6), np.diag(spread**2)
+    pi, C = standard_of(wls, mapping, prior, spread)
+    G = before @ K.T @ np.linalg.inv(K @ before @ K.T)
+    np.testing.assert_allclose(pi, prior + G @ (wls.theta - K @ prior))
+    np.testing.assert_allclose(K @ C @ K.T, wls.covariance, atol=1e-12)
+    left = before - G @ K @ before
+    np.testing.assert_allclose(C, left + G @ wls.covariance @ G.T, atol=1e-12)
+    # a base parameter that the data leave open is as wide as the prior has it
+    variance = np.diag(np.where(np.arange(4) == 1, np.inf, np.diag(wls.covariance)))
+    _, C = standard_of(replace(wls, covariance=variance), mapping, prior, spread)
+    after = np.diag(K @ C @ K.T)
+    assert after[1] == pytest.approx((K @ before @ K.T)[1, 1])
+    assert after[0] == pytest.approx(wls.covariance[0, 0])

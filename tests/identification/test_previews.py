@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.signal
+from helpers.driven import arm
 from helpers.fitting import identify
 from helpers.synthetic import truth
 
@@ -15,11 +16,13 @@ from robotid.export.entries import build_preview
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.assumptions import TorqueNoise, assumed_noise
-from robotid.identification.previews import preview
+from robotid.identification.previews import Run, _band, _Information, _seen, preview
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.prediction import predict
+from robotid.regressor.torque import joint_torque_regressor, trajectory_regressor
 from robotid.regressor.used_rows import base_problem
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -90,6 +93,58 @@ def test_what_is_expected_is_what_identify_then_reports(ur5, motion, found):
     # behind the filter the noise leaves what the fit leaves
     np.testing.assert_allclose(ahead.expected.estimate.sigma, found.wls.sigma, rtol=0.15)
     assert ahead.expected.determination.rank == found.determination.rank
+
+
+def test_motions_of_two_lengths_and_filters_tell_as_much_as_their_rows(rng):
+    model = arm()
+    mapping = structural_mapping(model)
+    logs = [moved(model, rng, period=period)[0] for period in (12.0, 7.0)]
+    settings = SignalSettings(cutoff=5.0), SignalSettings(cutoff=20.0)
+    held = [hold_log(model, log, s) for log, s in zip(logs, settings, strict=True)]
+    held[1] = hold_log(model, logs[1].window(0.0, 4.0), settings[1])
+    noise = TorqueNoise(STD[:3], np.array([0.0, 0.02, 0.5]), ("stated",) * 3)
+    said = _Information.of(model, mapping, held, noise)
+    density = STD[:3] ** 2 * np.maximum(noise.correlation, 1 / RATE)
+    residuals, rows, meat = [], [], np.zeros((len(mapping.K), len(mapping.K)))
+    for log in held:
+        part = compress(base_problem(model, mapping, log.whole.trajectory, log.whole.mask))
+        residuals.append(np.minimum(STD[:3] ** 2, density * _band(log)))
+        rows.append(part.rows)
+    sigma = np.sqrt(np.average(residuals, axis=0, weights=rows))
+    np.testing.assert_allclose(said.sigma, sigma, rtol=1e-9)
+    assert residuals[0][0] < residuals[1][0]  # a lower cut-off leaves less of white noise
+    assert _band(held[1]) == pytest.approx(4 * _band(held[0]), rel=0.02)
+    for log in held:
+        t = log.whole.trajectory
+        X = trajectory_regressor(model, t)[:, mapping.independent].reshape(len(t.t), 3, -1)
+        weight = log.whole.mask * density * RATE / sigma**4
+        meat += np.einsum("nj,nja,njb->ab", weight, X, X)
+    np.testing.assert_allclose(said.meat(mapping.K, sigma), meat, rtol=1e-7, atol=1e-9)
+    assert said.samples == sum(len(log.whole.trajectory.t) for log in held)
+    assert said.share == pytest.approx(2 * 5.0 / RATE)
+    np.testing.assert_allclose(said.squares, sum(log.whole.trajectory.squares for log in held))
+    run = Run((said.factors,), np.zeros(len(mapping.names)), 2 * said.squares, 7, 0.01, 0.01)
+    both = said.beside(run)
+    assert (both.samples, both.share) == (said.samples + 7, 0.01)
+    np.testing.assert_allclose(both.squares, 3 * said.squares)
+    np.testing.assert_array_equal(both.factors.rows, 2 * said.factors.rows)
+    alone = replace(both, share=1.0).without_motions()
+    assert (alone.share, alone.levels) == (0.01, ())
+    np.testing.assert_array_equal(alone.factors.rows, said.factors.rows)
+
+
+def test_the_largest_of_several_motions_is_seen(rng):
+    model = arm()
+    logs = [moved(model, rng)[0] for _ in range(2)]
+    fast = replace(logs[0], t=0.5 * logs[0].t)
+    held = [hold_log(model, log, SignalSettings()) for log in (logs[1], fast, logs[1])]
+    bodies = model.standard_parameters()
+    peak, fastest = _seen(model, held)
+    for j in range(3):
+        v = max(np.abs(log.whole.trajectory.v[:, j]).max() for log in held)
+        torques = [predict(model, [bodies], log.whole.trajectory)[0] for log in held]
+        assert fastest[j] == v
+        assert peak[j] == pytest.approx(max(np.abs(tau[:, j]).max() for tau in torques))
 
 
 def test_torques_that_a_log_has_are_ignored(ur5, motion, recorded):

@@ -11,6 +11,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.identification.pipeline import identify
+from robotid.identification.summary import cell, friction_lines
 from robotid.logs.read import write_log
 from robotid.robot.model import RobotModel
 
@@ -65,6 +66,61 @@ def test_its_text_has_verdict_reasons_and_every_joint(found):
         (first, _) = [line.split() for line in text.splitlines() if line.split()[0] == joint]
         assert first[1] == f"{error:.1f}"
         assert text.count(f"  {joint} ") == 2  # kept and fitted rows
+
+
+def test_its_tables_have_the_errors_of_plainer_predictions(found):
+    """Those of weighted least squares made worse than they are, to be another figure."""
+    (kept,), (fitted,) = found.validation, found.fitted
+    metrics = kept.metrics["wls"].per_joint.items()
+    others = {
+        joint: replace(m, relative_error_pct=3.0 * m.relative_error_pct) for joint, m in metrics
+    }
+    worse = {**kept.metrics, "wls": replace(kept.metrics["wls"], per_joint=others)}
+    sums = fitted.sums["wls"]
+    sums = {**fitted.sums, "wls": replace(sums, residual=4.0 * sums.residual)}
+    found = replace(
+        found, validation=(replace(kept, metrics=worse),), fitted=(replace(fitted, sums=sums),)
+    )
+    lines = [line.split() for line in str(found).splitlines()]
+    tables = (
+        (found.validation[0].metrics["estimate"], found.validation[0].metrics["wls"]),
+        (
+            found.metrics(),
+            found.metrics("wls"),
+        ),
+    )
+    for place, (ours, wls) in enumerate(tables):
+        for joint, m in ours.per_joint.items():
+            own = [words for words in lines if words and words[0] == joint][place]
+            others = [
+                m.baselines["urdf_with_drives"], wls.per_joint[joint].relative_error_pct,
+                m.baselines["urdf"], m.baselines["gravity_only"],
+            ]  # fmt: skip
+            assert own[1:] == [
+                f"{m.relative_error_pct:.1f}", f"{m.rmse:#.3g}", "N", "m", *map(cell, others),
+            ]  # fmt: skip
+
+
+def test_figures_above_a_thousand_have_no_decimals():
+    assert [cell(x) for x in (None, 0.04, 99.96, 123.45, 999.94, 1234.5)] == [
+        "-", "0.0", "100.0", "123.5", "999.9", "1234",
+    ]  # fmt: skip
+
+
+def test_friction_is_said_from_the_first_step_to_the_last_that_was_taken():
+    steps = [(20.0, True), (9.0, False), (8.04, True), (5.06, True), (3.0, False)]
+    tried = [{"held_out_error_pct": error, "is_taken": is_taken} for error, is_taken in steps]
+    joints = {
+        "a": {"families": ["tanh", "load"], "tried": tried},
+        "b": {"families": [], "tried": tried[:2]},
+        "c": {"families": ["lag"], "tried": tried[:3]},
+    }
+    assert friction_lines(joints) == [
+        "friction beside viscous and Coulomb's:",
+        "  a: tanh + load (held-out error 20.0 -> 5.1 %)",
+        "  c: lag (held-out error 20.0 -> 8.0 %)",
+    ]
+    assert friction_lines({"b": joints["b"]}) == []
 
 
 def test_its_html_has_verdict_and_tables_and_nothing_that_runs(found):

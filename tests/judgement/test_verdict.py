@@ -11,7 +11,15 @@ from robotid.findings import Finding
 from robotid.fitting.metrics import JointMetrics, Metrics
 from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
-from robotid.judgement.verdict import Doubt, doubts_of, is_beaten, is_outvoted, judge, refuted
+from robotid.judgement.verdict import (
+    Doubt,
+    alarming,
+    doubts_of,
+    is_beaten,
+    is_outvoted,
+    judge,
+    refuted,
+)
 from robotid.judgement.witness import Witness
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
@@ -266,6 +274,70 @@ def test_a_robust_loss_excuses_jumps_of_the_torque_and_what_they_cause():
     assert [doubt.joint for doubt in doubts_of(found, JOINTS)] == ["a"]
     other = [jump, finding("unexplained_torque", "run.csv: b")]
     assert [doubt.joint for doubt in doubts_of(other, JOINTS, is_robust=True)] == ["b"]
+
+
+def test_only_a_robust_loss_outvotes_jumps_and_ignored_errors_are_no_alarm():
+    jump, other = finding("spikes", "run.csv: tau_a", "error"), finding("late", "x", "error")
+    found = [jump, other, finding("clipped", "x")]
+    assert alarming(found, ()) == (jump, other)
+    assert alarming(found, (), is_robust=True) == (other,)
+    assert alarming(found, ["late"]) == (jump,)
+
+
+def test_many_open_parameters_are_counted_and_the_first_eight_named():
+    kept = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
+    names = [f"x{k}.m" for k in range(11)]
+    for is_poor in (True, False):
+        found = judge(
+            Metrics({"a": joint(3.0)}, 1.0), kept, undetermined=names, is_consistent=True,
+            is_poorly_excited=is_poor,
+        )  # fmt: skip
+        said = found.reasons[-1]
+        assert ("determine 11 base" in said, said.startswith("11 base")) == (is_poor, not is_poor)
+        assert all(name in said for name in names[:8])
+        assert "x8.m" not in said
+        assert "3 more" in said
+        assert found.status == ("usable" if is_poor else "good")
+
+
+def kept_logs(**errors):
+    """Return metrics of logs by name, of joints a and b."""
+    return {name: Metrics({"a": joint(a), "b": joint(b)}, 1.0) for name, (a, b) in errors.items()}
+
+
+def test_a_hypothesis_is_refuted_by_the_worst_of_all_logs_of_its_joints():
+    logs = kept_logs(one=(6.0, 2.0), two=(1.0, 3.0))
+    guesses = [finding("unexplained_torque", f"run.csv: {where}") for where in ("a", "b", "a, b")]
+    found = refuted([*guesses, finding("urdf_mismatch", "run.csv")], logs, Witness())
+    assert [f.severity for f in found] == ["warning", "note", "warning", "warning"]
+    assert found[1].message == (
+        "what was found; but the result predicts unseen motion within 3.0 %"
+    )
+    repeated = finding("repeated_motion", "one")
+    assert refuted([repeated, guesses[1]], logs, Witness())[1].severity == "warning"
+    alike = finding("unexplained_torque", "all joints")
+    assert refuted([alike], kept_logs(one=(1.0, 1.0)), Witness())[0].severity == "warning"
+
+
+@pytest.mark.parametrize(
+    ("gravity", "severity"),
+    [((1.9, 0.6), "note"), ((1.0, 2.1), "warning"), ((0.4, 1.0), "warning")],
+)
+def test_a_current_is_refuted_by_the_gravity_of_every_joint(gravity, severity):
+    logs, witness = kept_logs(one=(1.0, 1.0)), Witness(dict(zip("ab", gravity, strict=True)))
+    for kind in ("warning", "error"):
+        (found,) = refuted([finding("current_for_torque", "run.csv: a, b", kind)], logs, witness)
+        assert found.severity == (severity if severity == "note" else kind)
+
+
+@pytest.mark.parametrize(
+    ("scale", "factor", "severity"),
+    [(1.0, 1.9, "note"), (1.0, 2.1, "warning"), (1.0, 0.4, "warning"), (None, 1.0, "warning")],
+)
+def test_gravity_that_was_compensated_is_refuted_by_gravity(scale, factor, severity):
+    guess = finding("gravity_compensated", "run.csv")
+    (found,) = refuted([guess], kept_logs(one=(1.0, 1.0)), Witness(scale=scale, factor=factor))
+    assert found.severity == severity
 
 
 def spoilt_logs(model, spoil=None):

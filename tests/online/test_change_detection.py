@@ -98,3 +98,46 @@ def test_a_load_may_be_as_heavy_as_a_mean_link():
     found = load_spread(spread)
     assert found[0] == 2.5
     np.testing.assert_allclose(found[1:4], 0.5)
+
+
+def test_the_noise_and_what_the_parameters_leave_open_are_their_recursions(rng):
+    rms, dt, memory, model_error = np.array([10.0, 3.0]), 0.05, 1.5, 0.2
+    detector = ChangeDetector(2, 1e9, 4.0)
+    monitor = Innovations(rms, dt, memory, model_error, detector)
+    variance, torque, seen = 0.01 * rms**2, rms**2, np.full(2, 20.0)
+    open_, evidence = np.full(2, np.inf), np.zeros(2)
+    for k in range(80):
+        used = rng.uniform(size=2) < 0.8
+        tau, e, residual = rng.standard_normal((3, 2)) * [[8.0, 2.0]]
+        doubt = rng.uniform(0.0, 0.2, 2) * variance
+        for j in range(2):
+            expected = doubt[j] + variance[j] + model_error**2 * torque[j]
+            if used[j] and open_[j] < 0.25:
+                more = 0.3 * (min(e[j] ** 2 / expected, 25.0) - 4.0)
+                evidence[j] = max(evidence[j] + more, 0.0)
+        monitor.push(dt * k, tau, e, residual, doubt, used, 0.3)
+        for j in np.flatnonzero(used):
+            product = np.clip(e[j] * residual[j], 0.0, 9.0 * (doubt[j] + variance[j]))
+            ratio = doubt[j] / variance[j]
+            seen[j] = min(seen[j] + 1.0, memory / dt)
+            torque[j] += (tau[j] ** 2 - torque[j]) / seen[j]
+            variance[j] += (product - variance[j]) / seen[j]
+            open_[j] = ratio if np.isinf(open_[j]) else open_[j] + dt * (ratio - open_[j])
+        np.testing.assert_allclose(monitor.variance, variance)
+        np.testing.assert_allclose(monitor.doubt, open_)
+        np.testing.assert_allclose(detector.evidence, evidence)
+    assert evidence.max() > 0.0
+    assert monitor.is_converged
+    monitor.forget_convergence()
+    assert not monitor.is_converged
+
+
+def test_a_load_is_the_generalised_least_squares_of_its_change_about_none(rng):
+    columns, root = rng.standard_normal((30, 10)), rng.standard_normal((30, 30))
+    C, spread = 0.1 * root @ root.T, np.linspace(0.5, 3.0, 10)
+    change = rng.standard_normal(30)
+    found = payload_of(change, C, columns, spread)
+    H = np.diag(spread**-2.0) + columns.T @ np.linalg.solve(C, columns)
+    wanted = np.linalg.solve(H, columns.T @ np.linalg.solve(C, change))
+    np.testing.assert_allclose(found.parameters, wanted)
+    np.testing.assert_allclose(found.std_error, np.sqrt(np.diag(np.linalg.inv(H))))

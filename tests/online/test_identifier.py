@@ -33,6 +33,32 @@ def test_a_load_picked_up_at_ten_seconds_is_flagged_and_weighed(picked_up):
         identifier.payload(1)
 
 
+def test_a_load_is_as_sure_as_the_parameters_before_and_after_it(picked_up):
+    _, identifier = picked_up
+    (change,), estimate, model = identifier.changes, identifier.estimate, identifier.model
+    size = model.layout.n_inertial
+    columns = identifier.mapping.K[:, size - 10 : size]
+    load = identifier.payload(0)
+    C = estimate.covariance + change.covariance
+    spread = identifier._load_spread
+    H = np.diag(spread**-2.0) + columns.T @ np.linalg.solve(C, columns)
+    np.testing.assert_allclose(load.std_error, np.sqrt(np.diag(np.linalg.inv(H))), rtol=1e-3)
+    pull = columns.T @ np.linalg.solve(C, estimate.theta - change.theta)
+    miss = np.abs(load.parameters - np.linalg.solve(H, pull)) / load.std_error
+    assert miss.max() < 1e-3
+
+
+def test_what_the_data_leave_of_the_prior_is_the_mean_share_of_variances(picked_up):
+    _, identifier = picked_up
+    reading = identifier.reading
+    share = reading.std_error**2 / identifier._prior_variance
+    assert reading.excitation == pytest.approx(1.0 - np.minimum(share, 1.0).mean())
+    # behind the filter two rows per period of the cut-off are independent
+    s = identifier.settings
+    step = max(1, int(s.rate / (12.0 * s.cutoff))) / s.rate
+    assert identifier._share == pytest.approx(min(1.0, 2.0 * s.cutoff * step))
+
+
 def test_a_change_starts_from_what_was_known_before_it(panda, picked_up):
     log, identifier = picked_up
     (change,) = identifier.changes

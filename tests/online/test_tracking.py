@@ -72,6 +72,26 @@ def test_without_pyarrow_the_history_is_csv(panda, log_file, tmp_path, monkeypat
     assert len(lines) > 20
 
 
+def test_a_history_has_twenty_rows_a_second_and_the_last_sample(panda):
+    log = payload_log(panda, np.random.default_rng(0), duration=1.83, at=99.0)
+    seen = []
+    found = track(panda, log, OnlineSettings(), observer=lambda k, of: seen.append((k, of)))
+    assert [k for k, _ in seen] == list(range(len(log.t)))
+    assert {of for _, of in seen} == {found.identifier}
+    assert found.t[-1] == log.t[-1]
+    np.testing.assert_allclose(np.diff(found.t[:-1]), 0.05, atol=1e-9)
+    assert 0 < found.t[-1] - found.t[-2] < 0.045
+    last, columns = found.identifier.reading, found.columns()
+    for k, name in enumerate(found.identifier.names):
+        assert columns[name][-1] == last.theta[k]
+        assert columns[f"{name}.std_error"][-1] == last.std_error[k]
+    np.testing.assert_array_equal(columns["time"], found.t)
+    np.testing.assert_array_equal(columns["excitation"], found.excitation)
+    assert (np.diff(found.excitation) >= -1e-9).all()
+    assert found.excitation[-1] == last.excitation
+    np.testing.assert_array_equal(columns["converged"], found.converged)
+
+
 def test_a_log_without_motion_is_refused(panda, tmp_path):
     log = payload_log(panda, np.random.default_rng(0), duration=3.0, at=99.0)
     still = replace(log, q=np.zeros(log.q.shape))

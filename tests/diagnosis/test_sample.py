@@ -1,0 +1,159 @@
+"""Rows that terms are tried on, and what columns beside the base parameters leave of them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from robotid.diagnosis.sample import (
+    Sample,
+    _is_steady,
+    _products,
+    _spread_rows,
+    _stretches,
+    _usual_size,
+    trials,
+)
+from robotid.logs.data import Trajectory
+from robotid.logs.settings import SignalSettings
+
+N, JOINTS, BASE, FITTED, STRETCHES = 90, 2, 3, 7, 9
+
+
+@pytest.fixture
+def sample(rng):
+    """Seven stretches of fitted logs and two of validation, each of ten samples."""
+    weight = rng.uniform(0.5, 2.0, (N, JOINTS))
+    weight[3] = 0.0  # a row that is left out
+    W = weight[:, :, None] * rng.standard_normal((N, JOINTS, BASE))
+    r = weight * rng.standard_normal((N, JOINTS))
+    stretches = tuple(slice(k, k + 10) for k in range(0, N, 10))
+    A, B = _products(W, r, stretches)
+    return Sample(
+        joints=("a", "b"), slides=np.zeros(2, dtype=bool), motions=(), at=(), taken=(),
+        weight=weight, torque=np.ones(2), stretches=stretches, fitted=FITTED, rows=10 * FITTED,
+        W=W, r=r, independent=np.arange(BASE), U=np.eye(BASE), A=A, B=B,
+    )  # fmt: skip
+
+
+def solved(X, r, prior):
+    """Return the least squares of rows with a prior of so many about 0."""
+    return np.linalg.solve(X.T @ X + np.diag(prior), X.T @ r)
+
+
+@pytest.mark.parametrize("which", [[0], [1], [0, 1]])
+def test_columns_on_all_joints_have_the_scatter_of_the_scores_of_stretches(sample, rng, which):
+    Z = rng.standard_normal((N, JOINTS, 2)) + 0.4 * sample.r[:, :, None]
+    apart, whole = trials(sample, slice(None), Z)
+    columns = (sample.weight[:, :, None] * Z)[..., which]
+    k, own = len(which), slice(0, 10 * FITTED)
+    C, R = columns[own].reshape(-1, k), sample.r[own].ravel()
+    X = np.hstack([sample.W[own].reshape(-1, BASE), C])
+    ridge = 1e-4 * np.sum(C**2, axis=0)
+    prior = np.append(np.ones(BASE), ridge)
+    theta = solved(X, R, prior)
+    found, covariance = whole.estimate(which, FITTED)
+    np.testing.assert_allclose(found, theta[BASE:], rtol=1e-9)
+    np.testing.assert_allclose(whole.parameters(which), theta[BASE:], rtol=1e-9)
+    # of columns beside the base parameters: what these leave of them
+    H = X.T @ X + np.diag(prior)
+    inverse = np.linalg.inv(H)[BASE:, BASE:]
+    T = np.linalg.solve(X[:, :BASE].T @ X[:, :BASE] + np.eye(BASE), X[:, :BASE].T @ C)
+    E, e = C - X[:, :BASE] @ T, R - X @ theta
+    scores = np.array([E[20 * s : 20 * s + 20].T @ e[20 * s : 20 * s + 20] for s in range(FITTED)])
+    wanted = FITTED / (FITTED - 1) * inverse @ scores.T @ scores @ inverse
+    np.testing.assert_allclose(covariance, wanted, rtol=1e-7)
+    # each stretch of fitted logs is left out in turn, those of validation always
+    left, none = apart.left(which), apart.left([])
+    for s, rows in enumerate(sample.stretches):
+        used = np.ones(N, dtype=bool)
+        used[10 * FITTED :] = False
+        used[rows] = False
+        C_s, W_s = columns[used].reshape(-1, k), sample.W[used].reshape(-1, BASE)
+        prior = np.append(np.ones(BASE), 1e-4 * np.sum(C_s**2, axis=0))
+        theta = solved(np.hstack([W_s, C_s]), sample.r[used].ravel(), prior)
+        plain = solved(W_s, sample.r[used].ravel(), np.ones(BASE))
+        X_s = np.concatenate([sample.W[rows], columns[rows]], axis=2)
+        assert left[s] == pytest.approx(np.sum((sample.r[rows] - X_s @ theta) ** 2), rel=1e-9)
+        alone = np.sum((sample.r[rows] - sample.W[rows] @ plain) ** 2)
+        assert none[s] == pytest.approx(alone, rel=1e-9)
+
+
+def test_a_column_of_a_joint_at_rest_takes_nothing(sample, rng):
+    Z = rng.standard_normal((N, 1, 2))
+    Z[:, 0, 1] = 0.0
+    apart, whole = trials(sample, slice(1, 2), Z)
+    assert whole.parameters([0, 1])[1] == 0.0
+    np.testing.assert_allclose(apart.left([0, 1]), apart.left([0]))
+
+
+def test_columns_beside_are_as_free_as_what_is_left(sample, rng):
+    Z = rng.standard_normal((N, JOINTS, 1))
+    beside = sample.beside(Z)
+    columns = sample.weight[:, :, None] * Z
+    spread = 1e3 * np.linalg.norm(sample.r) / np.linalg.norm(columns)
+    np.testing.assert_allclose(beside.W, np.concatenate([sample.W, spread * columns], axis=2))
+    for k, rows in enumerate(sample.stretches):
+        W = beside.W[rows].reshape(-1, BASE + 1)
+        np.testing.assert_allclose(beside.A[k], W.T @ W)
+        np.testing.assert_allclose(beside.B[k], W.T @ sample.r[rows].ravel())
+
+
+@pytest.mark.parametrize(
+    ("fitted", "kept", "independent", "counts"),
+    [(3000, 0, 0.5, (16, 0)), (100, 90, 0.7, (7, 6)), (100, 9, 1.0, (10, 1))],
+)
+def test_stretches_have_ten_independent_rows_and_are_sixteen_of_each_kind_at_most(
+    fitted, kept, independent, counts
+):
+    found = _stretches(fitted, kept, independent)
+    assert len(found) == sum(counts)
+    assert [part.start for part in found[1:]] == [part.stop for part in found[:-1]]
+    assert (found[0].start, found[-1].stop) == (0, fitted + kept)
+    assert found[counts[0] - 1].stop == fitted
+    for kind in (found[: counts[0]], found[counts[0] :]):
+        sizes = [part.stop - part.start for part in kind]
+        assert not sizes or max(sizes) - min(sizes) <= 1
+
+
+def recording(count, cutoff):
+    q = np.zeros((count, 1))
+    motion = Trajectory(
+        np.arange(count) / 100.0, q, q, q, q, ("a",), 100.0, np.zeros(count, dtype=int)
+    )
+    signals = SignalSettings(cutoff=cutoff, rate=100.0)
+    return SimpleNamespace(recording=SimpleNamespace(trajectory=motion, signals=signals))
+
+
+def test_rows_are_two_for_each_that_is_independent_and_three_thousand_at_most():
+    model = SimpleNamespace(n_rows=1, layout=SimpleNamespace(names=("x",) * 10))
+    fitted, kept = [recording(400, 5.0), recording(7000, 20.0)], [recording(500, 10.0)]
+    rows, independent = _spread_rows(model, fitted, kept)
+    # 10, 40 and 20 of 100 rows are independent; of 7400 rows every third is read
+    for own, step, count in zip(rows, (5, 3, 2), (400, 7000, 500), strict=True):
+        np.testing.assert_array_equal(own, np.arange(0, count, step))
+    assert independent == pytest.approx(0.4)  # of each row that is read, in the kept one
+    _, alone = _spread_rows(model, fitted[1:], [])
+    assert alone == 1.0
+
+
+def test_rows_near_a_reversal_or_a_stop_are_not_steady():
+    t = np.arange(200) / 100.0
+    v = np.column_stack([np.where(t < 0.995, 1.0, -1.0), np.where(t < 0.5, 0.01, 1.0)])
+    q = np.cumsum(v, axis=0) / 100.0
+    segment = np.zeros(200, dtype=int)
+    motion = Trajectory(t, q, v, v, v, ("a", "b"), 100.0, segment)
+    signals = SignalSettings(cutoff=4.9, min_velocity=0.05)
+    steady = _is_steady(SimpleNamespace(trajectory=motion, signals=signals))
+    near = 0.5 / 4.9  # half a period of the cut-off
+    start = np.abs(t) <= near  # a segment begins
+    np.testing.assert_array_equal(steady[:, 0], ~(start | (np.abs(t - 1.0) <= near)))
+    np.testing.assert_array_equal(steady[:, 1], ~(start | (t <= 0.49 + near)))
+    unfiltered = SignalSettings(cutoff=None)
+    assert _is_steady(SimpleNamespace(trajectory=motion, signals=unfiltered)).all()
+
+
+def test_the_usual_size_is_the_median_of_the_rows_used():
+    r = np.array([[1.0, -5.0], [-2.0, 1.0], [9.0, 1.0], [4.0, 2.0]])
+    used = np.array([[True, False], [True, False], [False, False], [True, False]])
+    assert _usual_size(r, used).tolist() == [2.0, np.inf]
