@@ -92,3 +92,19 @@ def test_of_a_push_the_largest_mean_is_told_and_a_spike_is_none():
     assert size[2] > 1.0
     assert (found.joint, found.start, found.end) == ("c", T[rows[0]], T[rows[-1]])
     assert found.residual == pytest.approx(level[:, 2].max())
+
+
+@pytest.mark.parametrize(("seconds", "count"), [(0.04, 0), (0.06, 1), (0.3, 1)])
+def test_what_lasts_less_than_50_ms_is_a_spike(seconds, count):
+    """Samples so far apart that each is its own mean, but for some about 9 s."""
+    t = np.sort(np.r_[0.35 * np.arange(100), 9.0 + 0.0101 * np.arange(31)])
+    tau = np.sin(t)[:, None] * [1.0, 3.0]
+    pushed = (t >= 9.0) & (t <= 9.0 + 1.02 * seconds)
+    predicted = tau - 0.01
+    predicted[pushed, 1] -= 2.5
+    found = find_unexplained(t, tau, predicted, ("a", "b"))
+    assert len(found) == count
+    for one in found:
+        assert (one.joint, one.start) == ("b", pytest.approx(9.0))
+        assert one.end == t[pushed][-1]
+        assert one.residual == pytest.approx(2.51)
