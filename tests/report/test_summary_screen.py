@@ -52,6 +52,21 @@ def test_of_several_recordings_the_worst_counts(identified):
         assert measured == wanted
 
 
+def test_a_recording_that_was_fitted_is_none_that_was_predicted(identified):
+    (kept,) = identified.validation
+    metrics = kept.metrics["estimate"]
+    worse = {j: replace(m, relative_error_pct=99.0) for j, m in metrics.per_joint.items()}
+    changed = {**kept.metrics, "estimate": replace(metrics, per_joint=worse)}
+    again = replace(kept, metrics=changed, is_refitted=True)
+    for both in ((kept, again), (again, kept)):
+        assert joint_errors(replace(identified, validation=both)) == joint_errors(identified)
+    alone = joint_errors(replace(identified, validation=(again,)))
+    fitted, wls = identified.metrics(), identified.metrics("wls")
+    assert {joint: own for joint, (own, _) in alone.items()} == fitted.per_joint
+    for joint, (_, other) in alone.items():
+        assert other == wls.per_joint[joint].relative_error_pct
+
+
 def test_every_joint_has_its_verdict_and_its_reason(screen, identified):
     said = re.findall(
         r'<li class="([\w-]*)"><a [^>]*>(.*?)</a>.*?<span class="why">(.*?)</span>', screen
