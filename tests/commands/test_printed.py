@@ -86,6 +86,9 @@ def test_simulate(shown):
         "one                    0.012, 0.046 rad; at its effort limit for 12 % of the time",
         "slide                  0.0002, 0.003 m",
     ]
+    for kind in ("tau", "torque"):
+        noisy = content | {"settings": {"seed": 7, "sensors": {"noise": {kind: 0.02}}}}
+        assert shown(simulate._show, noisy)[1:3] == ["", "error of the position  rms, largest"]
 
 
 def test_payload(shown):

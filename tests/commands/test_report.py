@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,11 +18,14 @@ from robotid.closed_loop.settings import LoopSettings
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import log_of_commands
+from robotid.commands.report import _require_same
+from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.fitting.settings import SimulationSettings
 from robotid.logs.read import write_log
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
+from robotid.versions import versions
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
 
@@ -207,3 +211,32 @@ def test_a_controller_that_carries_the_weight_does_so_in_the_report_too(tmp_path
     np.testing.assert_allclose(heard.tau_ref, weight, atol=1e-4)
     plain = log_of_commands(Job(job.urdf), entry, result)
     assert plain.tau_ref is None
+
+
+def test_the_fit_is_the_same_within_a_hundredth_of_each_error_or_a_millionth():
+    values = {"a": 2.0, "b": 300.0, "c": -4.0}
+    errors = {"a": 0.5, "b": None, "c": 1e-9}
+    content = {
+        "robotid": versions()["robotid"],
+        "versions": versions(),
+        "base_parameters": [
+            {"name": name, "value": x, "std_error": errors[name]} for name, x in values.items()
+        ],
+    }
+
+    def fitted(**changes):
+        now = values | changes
+        base = np.array([*now.values()])
+        mapping = SimpleNamespace(base_names=tuple(now))
+        _require_same(SimpleNamespace(mapping=mapping, base=base), content, "result.json")
+
+    fitted()
+    fitted(a=2.0049, b=300.00029, c=-4.0000039)
+    for name, x in (("a", 2.0051), ("b", 300.00031), ("c", -4.0000041)):
+        with pytest.raises(DataError, match=f"1 of 3 base parameters differ: {name} is "):
+            fitted(**{name: x})
+    with pytest.raises(DataError, match="the parameters d are in one of them only"):
+        fitted(d=1.0)
+    del content["base_parameters"][1]
+    with pytest.raises(DataError, match="the parameters b are in one of them only"):
+        fitted()

@@ -1,12 +1,13 @@
 """What result.json holds of loops, figure by figure, for two joints of two kinds and three logs."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.crane import RATES, STARTS, identified_crane
 
-from robotid.export.loops import loop_entries, loop_inputs
+from robotid.export.loops import _loop_parameters, loop_entries, loop_inputs
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +42,47 @@ def test_what_was_stated_has_no_error_and_what_was_found_has_its_own(found, entr
     assert entries["simulation"]["controller"] == {
         "kind": "pd", "effort_limit": {"rail": 80.0}, "rate": None,
     }  # fmt: skip
+
+
+def test_each_joint_has_the_error_of_its_own_unknown():
+    names = [("a", "revolute"), ("b", "prismatic"), ("c", "revolute")]
+    unknowns = [("kp", (1,)), ("kp", (2,)), ("delay", (0, 2)), ("zero", (1,))]
+    estimate = SimpleNamespace(
+        std_error=np.array([1.0, 2.0, 3.0, 4.0]), reach=np.array([2.1, 2.2, 2.3, 2.4])
+    )
+    values = {
+        "kp": [10.0, 20.0, 30.0], "kd": [1.0, 2.0, 3.0], "delay": [0.1, 0.2, 0.3],
+        "limit": [np.inf, 9.0, np.inf], "zero": [0.01, 0.02, 0.03],
+    }  # fmt: skip
+    fit = SimpleNamespace(
+        loops=SimpleNamespace(**{what: np.array(x) for what, x in values.items()}),
+        estimate=estimate,
+        simulator=SimpleNamespace(
+            unknowns=[SimpleNamespace(what=what, joints=joints) for what, joints in unknowns]
+        ),
+    )
+    joints = [SimpleNamespace(name=name, type=kind) for name, kind in names]
+    loop = SimpleNamespace(kind="pd")
+    found = SimpleNamespace(loop=loop, fit=fit, model=SimpleNamespace(limits=joints))
+    shown = {entry["name"]: entry for entry in _loop_parameters(found)}
+    errors = {"b.kp": (1.0, 2.1), "c.kp": (2.0, 2.2), "a.delay": (3.0, 2.3), "c.delay": (3.0, 2.3),
+              "b.zero": (4.0, 2.4)}  # fmt: skip
+    assert len(shown) == 13
+    for j, (joint, kind) in enumerate(names):
+        force, way = ("N", "m") if kind == "prismatic" else ("N m", "rad")
+        units = {"kp": f"{force}/{way}", "kd": f"{force} s/{way}", "delay": "s", "limit": force,
+                 "zero": way}  # fmt: skip
+        for what, unit in units.items():
+            name = f"{joint}.{what}"
+            if what == "limit" and joint != "b":
+                assert name not in shown
+                continue
+            error, reach = errors.get(name, (None, None))
+            assert shown[name] == {
+                "name": name, "value": values[what][j], "std_error": error, "reach": reach,
+                "unit": unit, "source": "data" if name in errors else "stated",
+            }  # fmt: skip
+    assert _loop_parameters(SimpleNamespace(loop=SimpleNamespace(kind="torque"))) == []
 
 
 def test_sums_of_bodies_that_were_not_fitted_are_named(found):

@@ -15,6 +15,7 @@ from robotid.export.ranges import (
     parameter_ranges,
     projected_ranges,
     ranges_text,
+    stated_ranges,
     write_ranges,
 )
 from robotid.export.yaml_text import yaml_text
@@ -167,6 +168,49 @@ def test_names_of_any_characters_are_read_back_from_yaml(name):
     text = yaml_text(table, "# head")
     assert yaml.safe_load(text) == table
     assert len(text.splitlines()) == text.count("\n")
+
+
+def test_ends_of_loop_parameters_are_as_far_as_each_reaches():
+    entries = [
+        ("a.kp", 20.0, 2.0, 2.5, {}), ("a.kd", 0.5, 0.4, None, {}),
+        ("a.delay", 0.01, 0.002, 3.0, {}),
+        ("b.kp", 30.0, None, None, {}), ("b.offset", -0.2, 0.3, 2.0, {"source": "mixed"}),
+        ("b.coulomb", 0.0, 0.1, 2.0, {"at_bound": True}), ("b.zero", 0.1, 0.05, 2.0, {}),
+    ]  # fmt: skip
+    content = {
+        "robot": "arm",
+        "structure": {"undetermined": ["x"]},
+        "drive_parameters": [
+            {"name": name, "value": value, "std_error": error, "reach": reach, "unit": name[-3:]}
+            | others
+            for name, value, error, reach, others in entries
+        ],
+    }
+    found = stated_ranges(content)
+    assert (found["robot"], found["confidence"], found["undetermined"]) == ("arm", 0.95, ["x"])
+    low, high = 20.0 * np.exp(-2.5 * 2.0 / 20.0), 20.0 + 2.5 * 2.0
+    wanted = {
+        "a": {
+            "kp": (20.0, low, high, "data"), "kd": (0.5, 0.0, 0.5 + 1.96 * 0.4, "data"),
+            "delay": (0.01, 0.004, 0.016, "data"),
+        },
+        "b": {
+            "kp": (30.0, None, None, "stated"), "offset": (-0.2, -0.8, 0.4, "mixed"),
+            "coulomb": (0.0, 0.0, 0.2, "bound"), "zero": (0.1, 0.0, 0.2, "data"),
+        },
+    }  # fmt: skip
+    assert {drive: list(terms) for drive, terms in found["drives"].items()} == {
+        drive: list(terms) for drive, terms in wanted.items()
+    }
+    for drive, terms in wanted.items():
+        for term, (nominal, low, high, source) in terms.items():
+            own = found["drives"][drive][term]
+            assert (own["nominal"], own["source"]) == (nominal, source)
+            assert own["unit"] == f"{drive}.{term}"[-3:]
+            if low is None:
+                assert not {"low", "high"} & set(own)
+            else:
+                assert (own["low"], own["high"]) == pytest.approx((low, high), abs=1e-12)
 
 
 def test_projected_friction_is_as_wide_as_draws_of_what_it_replaces(ur5):

@@ -4,6 +4,7 @@ import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from helpers.figures import figures
 
 from robotid import __version__
 from robotid.exceptions import DataError, ModelError
-from robotid.export.entries import _curve, build_result, recording_metrics
+from robotid.export.entries import _curve, _expected_torque, build_result, recording_metrics
 from robotid.export.result import read_result, stated_parameters
 from robotid.findings import Finding
 from robotid.robot.parameters import INERTIAL_TERMS
@@ -279,3 +280,25 @@ def test_a_friction_curve_is_of_the_logs_in_which_its_joint_moves(identified):
         [np.abs(curve["v"]).min(), np.abs(curve["v"]).max()], [speed.min(), speed.max()]
     )
     assert _curve(replace(identified, fitted=(still(first), still(second))), "elbow_joint") == {}
+
+
+def test_the_torque_to_be_expected_is_that_of_all_motions_with_its_95_percent(rng):
+    counts = (30, 50)
+    tau, parameters, total = ([rng.normal(size=(n, 2)) for n in counts] for _ in range(3))
+    fitted = [
+        SimpleNamespace(recording=SimpleNamespace(trajectory=SimpleNamespace(tau=x))) for x in tau
+    ]
+    bands = [SimpleNamespace(parameters=a, total=b) for a, b in zip(parameters, total, strict=True)]
+    model = SimpleNamespace(row_names=("one", "two"), row_units=("N m", "N"))
+    preview = SimpleNamespace(expected=SimpleNamespace(fitted=fitted, model=model), bands=bands)
+    found = _expected_torque(preview)
+    assert list(found) == ["one", "two"]
+    for j, (own, unit) in enumerate(zip(found.values(), ("N m", "N"), strict=True)):
+        rms, band, part = (
+            np.sqrt(np.mean(np.concatenate([x[:, j] for x in each]) ** 2))
+            for each in (tau, total, parameters)
+        )
+        assert own == {
+            "rms": pytest.approx(rms), "half_width": pytest.approx(1.96 * band),
+            "of_parameters": pytest.approx(1.96 * part), "unit": unit,
+        }  # fmt: skip

@@ -15,6 +15,7 @@ from robotid.cli import main
 from robotid.commands.identify import _entries
 from robotid.commands.job import LogEntry, job_from_settings
 from robotid.exceptions import SettingsError
+from robotid.fitting.evaluation import Evaluation
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
 
@@ -122,7 +123,7 @@ def test_a_result_is_written_whole_or_not_at_all(found, tmp_path, monkeypatch):
 def test_the_windows_of_logs_in_files_are_those_of_the_job():
     def evaluation(path, start, end):
         log, extent = SimpleNamespace(path=path), SimpleNamespace(start=start, end=end)
-        return SimpleNamespace(recording=SimpleNamespace(log=log, extent=extent))
+        return Evaluation(SimpleNamespace(log=log, extent=extent), {}, {}, {})
 
     logs = [("a/one.csv", 1.5, 4.0), ("", 0.0, 9.0), ("b/two.csv", -2.0, 3.25)]
     found = _entries([evaluation(*log) for log in logs])

@@ -1,5 +1,6 @@
 import re
 import xml.etree.ElementTree as ET
+from html import unescape
 
 import numpy as np
 import pytest
@@ -7,8 +8,18 @@ from helpers.browsing import until, visit
 from helpers.pages import charts
 
 from robotid.exceptions import DataError
-from robotid.pages.charts import Chart, Series, broken, chart_html, thin
+from robotid.pages.charts import (
+    Chart,
+    Series,
+    _Axis,
+    _covers,
+    _drawn,
+    broken,
+    chart_html,
+    thin,
+)
 from robotid.pages.html import page
+from robotid.pages.plots import Plot
 
 T = 1000.0 + np.arange(5000) / 500  # [s], the log's own time
 
@@ -148,6 +159,82 @@ def test_the_still_picture_shows_the_line_in_the_units_of_its_ticks(torque, line
     assert {"torque [N m]", "time [s]", "measured", "identified"} <= {
         t.text for t in root.iter("text")
     }
+
+
+ACROSS = _Axis(0.0, 10.0, 0.0, 1000.0, False)  # 100 px each
+UP = _Axis(-5.0, 5.0, 200.0, 0.0, False)  # 20 px each, 0 at 100 px
+
+
+def drawn_of(series, k, x):
+    """Return the numbers of the paths of series k, drawn on axes whose pixels are known."""
+    chart = Chart("c", x, series, "x", "y")
+    items = [(s, s.y, s.half) for s in series]
+    html = _drawn(chart, x, items[k], _covers(items)[k], ACROSS, UP, 200)
+    paths = re.findall(r'd="([^"]*)"', html)
+    return [[float(n) for n in re.findall(r"-?[\d.]+", path)] for path in paths]
+
+
+def test_bars_stand_beside_each_other_on_zero_with_whiskers_both_ways():
+    x = np.array([1.0, 3.0, 5.0])
+    first = Series("a", np.array([1.0, -2.0, np.nan]), "text", "bars")
+    second = Series("b", np.array([3.0, 2.0, 1.0]), "text", "bars", half=np.array([0.5, 1.0, 0.1]))
+    line = Series("c", np.zeros(3), "text")
+    (bars,) = drawn_of((first, line, second), 0, x)
+    # slots of 0.8 / 2 of 2 between neighbours; bars fill nine tenths of theirs
+    assert bars == pytest.approx([60 - 36, 100, 72, 80, -72, 260 - 36, 100, 72, 140, -72])
+    bars, whiskers = drawn_of((first, line, second), 2, x)
+    left = [140 - 36, 340 - 36, 540 - 36]
+    wanted = [[a, 100, 72, y, -72] for a, y in zip(left, (40, 60, 80), strict=True)]
+    assert bars == pytest.approx([n for bar in wanted for n in bar])
+    ends = [[140, 50, 30], [340, 80, 40], [540, 82, 78]]
+    assert whiskers == pytest.approx([n for whisker in ends for n in whisker])
+
+
+def test_a_line_is_where_its_numbers_are_and_its_band_half_a_width_to_each_side():
+    x = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
+    y = np.array([0.0, 1.0, np.nan, 2.0, -1.0])
+    line = Series("a", y, "text", half=np.full(5, 0.5))
+    band, path = drawn_of((line,), 0, x)
+    assert path == pytest.approx([0, 100, 100, 80, 300, 60, 400, 120])
+    assert band == pytest.approx(
+        [0, 90, 100, 70, 100, 90, 0, 110, 300, 50, 400, 110, 400, 130, 300, 70]
+    )
+
+
+def test_ticks_are_round_and_apart_and_their_words_as_long_as_need_be():
+    axis = _Axis(-1.2, 2.6, 300.0, 0.0, False)  # 22 px at least: 0.279, so 0.5
+    assert axis.step == pytest.approx(0.5)
+    assert axis.ticks == pytest.approx([-1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0, 2.5])
+    assert axis.words == ["−1.0", "−0.5", "0.0", "0.5", "1.0", "1.5", "2.0", "2.5"]
+    wide = _Axis(0.0, 1000.0, 50.0, 800.0, False)  # 80 px at least: 107, so 200
+    assert wide.ticks == [0.0, 200.0, 400.0, 600.0, 800.0, 1000.0]
+    decades = _Axis(-1.0, 2.2, 0.0, 300.0, True)
+    assert decades.ticks == pytest.approx([0.1, 1.0, 10.0, 100.0])
+    assert float(decades(10.0)) == pytest.approx(300.0 * 2.0 / 3.2)
+    few = _Axis(0.2, 1.1, 0.0, 300.0, True)
+    assert few.ticks == pytest.approx([2.0, 5.0, 10.0])
+    assert np.isnan(few(0.0))
+
+
+def test_areas_are_stacked_up_and_down_from_zero():
+    x = np.arange(3.0)
+    areas = [np.array([1.0, -1.0, 2.0]), np.array([2.0, -3.0, np.nan]), np.array([-4.0, 5.0, 1.0])]
+    items = [(Series(str(k), y, "text", "area"), y, None) for k, y in enumerate(areas)]
+    found = [np.array(cover) for cover in _covers(items)]  # (2, 2, 3): up and down, low and high
+    up = np.cumsum([np.fmax(np.nan_to_num(y), 0) for y in areas], axis=0)
+    down = np.cumsum([np.fmin(np.nan_to_num(y), 0) for y in areas], axis=0)
+    for k, cover in enumerate(found):
+        np.testing.assert_allclose(cover[0], [up[k - 1] if k else 0 * x, up[k]])
+        np.testing.assert_allclose(cover[1], [down[k], down[k - 1] if k else 0 * x])
+
+
+def test_a_plot_in_a_notebook_is_as_high_as_its_charts():
+    one, two = (Chart("c", np.arange(2.0), (), "x", "y", height=h) for h in (90, 180))
+    for charts_of, height in (((one,), 262), ((one, two), 554), ((one,) * 9, 900)):
+        cell = Plot("a & b", tuple((chart, "x < y") for chart in charts_of))._repr_html_()
+        assert f"height:{height}px" in cell
+        assert 'title="a &amp; b"' in cell
+        assert unescape(re.search(r'srcdoc="([^"]*)"', cell)[1]).count("x &lt; y") == len(charts_of)
 
 
 @pytest.fixture(scope="module")

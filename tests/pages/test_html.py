@@ -1,6 +1,11 @@
 """Blocks that several pages share: the verdict, figures beside their names, commands to copy."""
 
-from robotid.pages.html import facts_html, steps_html, verdict_html
+from decimal import Decimal
+
+import numpy as np
+import pytest
+
+from robotid.pages.html import facts_html, steps_html, verdict_html, with_error
 
 
 def test_a_verdict_shows_three_reasons_and_folds_all_others():
@@ -34,3 +39,19 @@ def test_a_step_has_each_of_its_blocks_to_copy():
         "<li><p>Read.</p></li>\n</ol>\n"
     )
     assert steps_html([]) == ""
+
+
+def test_a_number_ends_at_the_second_digit_of_its_error(rng):
+    sizes = zip(rng.uniform(-6, 6, 300), rng.uniform(-7, 5, 300), strict=True)
+    for value, error in ((rng.choice([-1, 1]) * 10.0**a, 10.0**b) for a, b in sizes):
+        cells = with_error(value, error)
+        shown, half = (Decimal(cell.html.replace("−", "-")) for cell in cells)
+        assert [cell.value for cell in cells] == [value, error]
+        ends, digits = half.as_tuple().exponent, len(half.as_tuple().digits)
+        if error < 99.5:
+            assert digits == 2 or half == 0
+        assert float(half) == pytest.approx(error, rel=0.051)
+        assert shown.as_tuple().exponent == ends or abs(value) < error
+        assert abs(float(shown) - value) <= 0.5001 * 10.0 ** shown.as_tuple().exponent
+    assert [cell.html for cell in with_error(1.234, np.inf)] == ["1.234", "–"]
+    assert with_error(0.5, 0.25, sign="+")[0].html == "+0.50"

@@ -301,3 +301,44 @@ def test_the_source_of_a_command_line_is_what_is_identified():
     assert source_words(line.split()) == wanted
     assert source_words(["identify", "job.toml", "--out=x", "--resume"]) == ("job.toml",)
     assert (Origin(wanted).job, JOB.job) == ("", "my job.toml")
+
+
+def test_figures_in_steps_are_those_of_all_findings_and_of_the_result(identified):
+    late = (warning("torque_delay", "a.csv", delay=0.004), warning("torque_delay", delay=0.008))
+    step = next_steps(told(identified, *late), FLAGS)[0]
+    assert "state that it is 0.0060 s late" in step.words
+    assert step.blocks[0].endswith("--torque-delay 0.0060 --out out")
+    zeros = (
+        warning("position_offset", "elbow_joint", size=0.0123),
+        warning("position_offset", "wrist_1_joint", size=-0.5),
+    )
+    step = next_steps(told(identified, *zeros), FLAGS)[0]
+    assert step.words.endswith("; of elbow_joint by -0.0123; of wrist_1_joint by 0.5.")
+    before, after = (pi[:60:10].sum() for pi in (identified.prior, identified.standard))
+    step = next_steps(told(identified, warning("total_mass", "robot")), JOB)[0]
+    assert f"{after:.4g} kg as identified, {before:.4g} kg in the URDF." in step.words
+    assert f"{after:.4g}" != f"{before:.4g}"
+    assert step.blocks[0] == "[estimator.constraints]\ntotal_mass = KG"
+
+
+def test_joints_that_any_recording_misses_are_looked_at_and_the_first_is_played(identified):
+    (kept,) = identified.validation
+    metrics = kept.metrics["estimate"]
+    names = list(metrics.per_joint)
+
+    def other(path, errors):
+        per_joint = {
+            joint: replace(m, relative_error_pct=x, baselines={k: 99.0 for k in m.baselines})
+            for (joint, m), x in zip(metrics.per_joint.items(), errors, strict=True)
+        }
+        log = replace(kept.recording.log, path=path)
+        recording = replace(kept.recording, log=log)
+        changed = {**kept.metrics, "estimate": replace(metrics, per_joint=per_joint)}
+        return replace(kept, recording=recording, metrics=changed)
+
+    runs = (other("x.csv", [35.0, 1, 1, 1, 1, 1]), other("y.csv", [1, 1, 1, 1, 35.0, 1]))
+    steps = next_steps(told(identified, validation=runs), JOB)
+    (look,) = [step for step in steps if step.words.startswith("Look at what the torque of")]
+    assert f"the torque of {names[0]}, {names[4]} does" in look.words
+    (played,) = [b for step in steps for b in step.blocks if b.startswith("robotid replay")]
+    assert " x.csv out" in played

@@ -21,6 +21,7 @@ from robotid.export.entries import build_result
 from robotid.export.result import read_result
 from robotid.logs.read import write_log
 from robotid.pages.html import code
+from robotid.report import comparison_page
 from robotid.report.comparison import _friction_curves, compare_results, write_comparison
 from robotid.robot.drives import LoadFriction, Stribeck
 from robotid.robot.model import RobotModel
@@ -410,7 +411,7 @@ def test_the_page_in_the_browser(folder, tmp_path, browser):
         until(seen, "charts.all.some((c) => c.plot)")
         for width in (1280, 360):
             seen.page.set_viewport_size({"width": width, "height": 800})
-            assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
+            until(seen, f"document.documentElement.scrollWidth <= {width}")
         head = seen.page.get_by_role("button", name="(B − A) / s")
         head.click()
         head.click()
@@ -421,6 +422,37 @@ def test_the_page_in_the_browser(folder, tmp_path, browser):
         assert shown == sorted(shown, reverse=shown[0] > shown[-1])
         assert not seen.errors
         assert not seen.requests
+
+
+def test_a_difference_is_far_if_that_to_any_result_is_and_ends_in_a_point_beyond_six():
+    entries = [
+        ("a", [4.0, 1.0]), ("b", [-0.5, -7.25]), ("c", [2.9, -2.9]), ("d", [None, 0.0]),
+        ("e", [None, None]),
+    ]  # fmt: skip
+    content = {
+        "results": [{"label": label, "name": label} for label in "ABC"],
+        "base_parameters": [
+            {"name": name, "unit": "kg", "values": [1.0, None, 2.0],
+             "std_errors": [0.1, None, 0.02], "differences": differences}
+            for name, differences in entries
+        ],
+    }  # fmt: skip
+    html = comparison_page._base_section(content)
+    assert "<p>2 of 5 differ from A by more than 3 combined standard errors" in html
+    rows = tables(html)["Base parameters with standard errors"].by_name()
+    assert rows["b"]["(C − A) / s"] == "−7.2"
+    assert rows["d"]["(C − A) / s"] == "0.0"
+    assert rows["e"]["(B − A) / s"] == "–"
+    assert rows["a"]["B"] == rows["a"]["± B"] == "–"
+    assert (rows["a"]["C"], rows["a"]["± C"]) == ("2.000", "0.020")
+    half, widest = comparison_page._HALF, comparison_page._WIDEST
+    for difference, end, tip in ((2.0, 2.0, 0), (-5.0, -5.0, 0), (9.0, 6.0, 4), (-7.25, -6.0, -4)):
+        cell = comparison_page._difference(difference, 1)
+        assert f'd="M{half} 3h{end * half / widest - tip:.1f}l{tip} 4l{-tip} 4H{half}z"' in (
+            cell.html
+        )
+        assert ("<strong>" in cell.html) == (abs(difference) > 3)
+        assert cell.value == difference
 
 
 def test_friction_is_compared_up_to_the_fastest_speed_of_any_result():

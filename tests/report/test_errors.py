@@ -59,6 +59,24 @@ def test_of_several_recordings_the_worst_counts(identified):
         assert measured["relative_error_pct"] == wanted.relative_error_pct
 
 
+def test_a_recording_that_was_fitted_is_none_that_was_predicted(identified):
+    (kept,) = identified.validation
+    metrics = kept.metrics["estimate"]
+    worse = {j: replace(m, relative_error_pct=99.0) for j, m in metrics.per_joint.items()}
+    changed = {**kept.metrics, "estimate": replace(metrics, per_joint=worse)}
+    again = replace(kept, metrics=changed, is_refitted=True)
+
+    def counted(**changes):
+        return worst_errors(shown_torques(replace(identified, **changes), ORIGIN).counted)
+
+    for both in ((kept, again), (again, kept)):
+        assert counted(validation=both) == counted()
+    fitted, wls = identified.metrics(), identified.metrics("wls")
+    for joint, own in counted(validation=(again,)).items():
+        assert own["relative_error_pct"] == fitted.per_joint[joint].relative_error_pct
+        assert own["wls_relative_error_pct"] == wls.per_joint[joint].relative_error_pct
+
+
 def test_every_joint_has_its_verdict_and_its_reason(screen, identified):
     said = re.findall(
         r'<li class="([\w-]*)"><a [^>]*>(.*?)</a>.*?<span class="why">(.*?)</span>', screen

@@ -8,7 +8,8 @@ from helpers.replay_data import shown
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.robot.model import RobotModel
-from robotid.viewer.replays import Bands, Mark, Torques, replay
+from robotid.viewer.replays import Bands, Mark, Torques, _moved, _plotted, _view, replay
+from robotid.viewer.scene import robot_scene
 
 URDF = """<robot name="&lt;b&gt;x&lt;/b&gt;">
   <link name="base"/><link name="turner"/><link name="slider"/><link name="tip"/>
@@ -192,6 +193,78 @@ def test_bands_are_those_of_their_parameter(arm, motion):
     rows = np.abs(data["t"][:, None] + 5.0 - t).argmin(axis=1)
     np.testing.assert_allclose(data["values"][:, :3], theta[rows], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(data["values"][:, 3:], error[rows], rtol=1e-5, atol=1e-6)
+
+
+def test_what_begins_later_than_the_motion_is_shown_later(arm, motion):
+    t, q = motion
+    bands = Bands(t[40:], ["a.m"], ["kg"], q[40:, :1], 0.1 * q[40:, :1])
+    torques = Torques(t[70:], q[70:])
+    data = shown(replay(arm, t, q, bands=bands, torques=torques).html)
+    for name, row in (("bands", 40), ("torques", 70)):
+        assert data[name]["t"][0] == pytest.approx(t[row] - t[0], abs=1e-6)
+        assert data[name]["t"][-1] == pytest.approx(t[-1] - t[0], abs=1e-6)
+
+
+def test_in_the_middle_of_a_gap_a_plot_has_a_row_of_nothing():
+    t = np.r_[0.0:1.0:0.01, 3.0:3.5:0.01, 9.0:9.2:0.01]
+    values = np.column_stack([t, -t])
+    times, shown_as = _plotted(t, values)
+    (holes,) = np.nonzero(np.isnan(shown_as).all(axis=1))
+    np.testing.assert_allclose(times[holes], [(0.99 + 3.0) / 2, (3.49 + 9.0) / 2])
+    np.testing.assert_allclose(shown_as[holes - 1, 0], [0.99, 3.49])
+    np.testing.assert_allclose(shown_as[holes + 1, 0], [3.0, 9.0])
+    kept = np.delete(times, holes)
+    np.testing.assert_array_equal(np.delete(shown_as, holes, axis=0)[:, 1], -kept)
+    assert np.diff(times).min() > 0
+
+
+def test_the_strip_is_of_the_first_prediction_over_what_it_is_compared_to(arm, motion):
+    t, q = motion
+    rng = np.random.default_rng(5)
+    first, other = (q + scale * rng.normal(size=q.shape) for scale in (0.3, 2.0))
+    first[:50, 1] = np.nan
+    ours = {"first": first, "other": other}
+    noise = np.array([0.2, 0.5])
+    for quantity, stated, of, full in (
+        ("torque", noise, noise, 6.0),
+        ("torque", None, np.sqrt(np.mean(q**2, axis=0)), 0.5),
+        ("position", noise, noise, 0.25),
+    ):
+        data = shown(replay(arm, t, q, torques=Torques(t, q, ours, stated, quantity)).html)
+        scale, strip = data["torques"]["scale"], data["torques"]["strip"]
+        np.testing.assert_allclose(scale["of"], of)
+        assert scale["full"] == full
+        edges = np.linspace(t[0], t[-1], len(strip) + 1)
+        which = np.minimum(np.searchsorted(edges, t, side="right") - 1, len(strip) - 1)
+        assert len(strip) == 201 // 4
+        for b in range(0, len(strip), 7):
+            left = ((q - first) / of)[which == b]
+            for j in range(2):
+                known = left[np.isfinite(left[:, j]), j]
+                wanted = 100 * np.sqrt(np.mean(known**2)) if len(known) else 65_534
+                assert strip[b, j] == pytest.approx(wanted, abs=0.51)
+
+
+def test_the_camera_sees_the_outermost_points_about_the_base_and_the_ground(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(URDF)
+    model = RobotModel.from_urdf(path, free_flyer=True)
+    q = np.zeros((11, 9))
+    q[:, 0], q[:, 2], q[:, 6] = np.linspace(0.0, 50.0, 11), -2.0, 1.0
+    still = _view(model, robot_scene(model).corners, [q[:1] * [0, 1, 1, 1, 1, 1, 1, 1, 1]])
+    moved = _view(model, robot_scene(model).corners, [q])
+    for end in (np.min, np.max):
+        ends = [end(np.array(view["points"]), axis=0) for view in (still, moved)]
+        np.testing.assert_allclose(*ends, atol=1e-9)
+    size = np.linalg.norm(np.ptp(np.array(still["points"]), axis=0))
+    assert moved["radius"] == pytest.approx(size / 2, rel=1e-6)
+    points = np.array(still["points"])
+    assert moved["ground"] == pytest.approx(points[:, 2].min() - 2.0)
+    assert 20 * moved["cell"] <= 2.5 * moved["radius"]
+    # a turn of either sign, at any time, is one and the same
+    q[[2, 5, 6], 3:7] *= -1.0
+    _, coordinates = _moved(model, np.arange(11) / 30.0, q, 1000.0)
+    np.testing.assert_allclose(coordinates[:, 6], 1.0)
 
 
 def test_the_ghost_is_the_second_motion(arm, motion):

@@ -2,7 +2,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.viewer.scene import ellipsoids
+from robotid.robot.model import RobotModel
+from robotid.viewer.scene import _corners, _ends, _reach, ellipsoids
 
 
 def test_the_ellipsoid_of_a_solid_ellipsoid_is_itself(rng):
@@ -34,3 +35,48 @@ def test_what_no_solid_can_be_has_no_ellipsoid_and_says_why():
     assert impossible.fault == "no solid has this inertia"
     assert impossible.semi_axes is None
     np.testing.assert_allclose(impossible.com, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "half"),
+    [
+        ("box", [0.2, 0.4, 0.6], [0.1, 0.2, 0.3]),
+        ("sphere", [0.3], [0.3, 0.3, 0.3]),
+        ("cylinder", [0.1, 0.8], [0.1, 0.4, 0.1]),  # along y, as the viewer has them
+        ("mesh", [1], None),
+    ],
+)
+def test_the_box_about_a_part_is_where_the_part_is(shape, size, half):
+    M = pin.SE3.Random().homogeneous
+    boxes = [np.zeros((2, 3)), np.array([[-0.1, 0.2, 0.3], [0.4, 0.5, 0.9]])]
+    part = {"shape": shape, "size": size, "matrix": M.T.ravel().tolist()}
+    found = _corners(part, boxes)
+    own = (found - M[:3, 3]) @ M[:3, :3]  # in the part's own frame
+    low, high = boxes[1] if half is None else (-np.array(half), np.array(half))
+    np.testing.assert_allclose(own.min(axis=0), low, atol=1e-12)
+    np.testing.assert_allclose(own.max(axis=0), high, atol=1e-12)
+    assert len(np.unique(own.round(9), axis=0)) == 8
+
+
+BRANCHED = """<robot name="tree"><link name="base"/><link name="a"/><link name="b"/><link name="c"/>
+<link name="near"/><link name="far"/>
+<joint name="ja" type="revolute"><parent link="base"/><child link="a"/><origin xyz="0 0 0.5"/>
+<axis xyz="0 0 1"/><limit effort="1" velocity="1"/></joint>
+<joint name="jb" type="revolute"><parent link="base"/><child link="b"/><origin xyz="0.3 0 0"/>
+<axis xyz="0 0 1"/><limit effort="1" velocity="1"/></joint>
+<joint name="jc" type="revolute"><parent link="b"/><child link="c"/><origin xyz="0 0.4 0"/>
+<axis xyz="0 0 1"/><limit effort="1" velocity="1"/></joint>
+<joint name="f1" type="fixed"><parent link="c"/><child link="near"/><origin xyz="0 0 0.1"/></joint>
+<joint name="f2" type="fixed"><parent link="c"/><child link="far"/><origin xyz="0.2 0 0"/></joint>
+</robot>"""
+
+
+def test_a_skeleton_reaches_to_each_child_and_to_the_farthest_frame(tmp_path):
+    (tmp_path / "tree.urdf").write_text(BRANCHED)
+    model = RobotModel.from_urdf(tmp_path / "tree.urdf")
+    tree = model.pin_model
+    assert _reach(model) == pytest.approx(0.7)  # 0.3 + 0.4 along one branch, 0.5 along the other
+    number = {name: tree.getJointId(name) for name in ("ja", "jb", "jc")}
+    np.testing.assert_allclose(sorted(map(tuple, _ends(model, 0))), [(0, 0, 0.5), (0.3, 0, 0)])
+    np.testing.assert_allclose(_ends(model, number["jb"]), [[0, 0.4, 0]])
+    np.testing.assert_allclose(_ends(model, number["jc"]), [[0.2, 0, 0]])

@@ -1,0 +1,105 @@
+"""What the report's appendix says in figures beside its charts."""
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.pages import charts, tables
+
+from robotid.fitting.information import information
+from robotid.report.diagnosis import _choice, _correlations, _residual_figures, information_section
+from robotid.report.errors import _remarks
+from robotid.report.torques import _beside
+
+
+def test_shares_of_the_data_are_those_of_all_and_of_the_weakest(identified):
+    share = information(identified).data_share
+    said = information_section(identified)
+    assert (
+        f"the data give {np.mean(np.round(100 * share)):.0f} % in the mean and "
+        f"{round(100 * share.min())} % of the weakest"
+    ) in said
+    assert share.min() < 0.9 * share.mean()
+
+
+@pytest.mark.parametrize("row", [0, 3, 5])
+def test_a_correlation_falls_where_its_chart_first_does(identified, row):
+    html = _residual_figures(identified, row)
+    _, correlation = charts(html)
+    (series,) = [s for s in correlation["series"][:1]]
+    first = correlation["x"][np.flatnonzero(np.abs(series["y"]) < 0.2)[0]]
+    said = re.search(r"correlation falls below 0.2 after ([\d.e-]+) s", html)[1]
+    assert float(said) == pytest.approx(first, rel=0.06)
+
+
+def test_what_was_tried_of_a_joint_stands_with_error_chance_and_shape():
+    tried = [
+        SimpleNamespace(families=(), held_out_error_pct=4.5678, chance=None, is_taken=False),
+        SimpleNamespace(families=("tanh",), held_out_error_pct=3.4, chance=2e-4, is_taken=False),
+        SimpleNamespace(
+            families=("tanh", "load"), held_out_error_pct=2.25, chance=0.031, is_taken=True
+        ),
+    ]
+    shapes = [
+        SimpleNamespace(name="speed", value=0.12345, std_error=0.0067, unit="rad/s",
+                        is_at_bound=False),
+        SimpleNamespace(name="order", value=2.0, std_error=0.5, unit="", is_at_bound=True),
+    ]  # fmt: skip
+    drive = SimpleNamespace(joint="one", families=("tanh", "load"), shapes=shapes, tried=tried)
+    html = _choice(None, drive)
+    said = "one: tanh + load; speed = 0.123 ± 0.0067 rad/s, order = 2 ± 0.5  (at its bound)"
+    ((caption, table),) = tables(html).items()
+    assert caption == said
+    assert f"<summary>{said}</summary>" in html
+    assert table.headers == ["terms", "held-out error %", "chance", ""]
+    assert table.rows == [
+        ["viscous and Coulomb", "4.57", "", ""], ["tanh", "3.40", "2.0e−04", ""],
+        ["tanh + load", "2.25", "3.1e−02", "taken"],
+    ]  # fmt: skip
+    none = SimpleNamespace(joint="two", families=(), shapes=(), tried=tried[:1])
+    assert "<summary>two: nothing more</summary>" in _choice(None, none)
+
+
+def test_all_strong_correlations_are_counted_and_the_strongest_listed():
+    size = 8
+    r = np.eye(size)
+    pairs = [(i, j) for i in range(size) for j in range(i)]
+    for k, (i, j) in enumerate(pairs):
+        r[i, j] = r[j, i] = (-1) ** k * (0.995 - 0.01 * k)
+    names = [f"p{k}" for k in range(size)]
+    html = _correlations(SimpleNamespace(correlation=r), names)
+    strong = sum(0.995 - 0.01 * k >= 0.8 for k in range(len(pairs)))
+    assert strong == 20
+    table = tables(html)["The strongest of 20 correlations of 0.8 and more"]
+    assert table.rows == [
+        [names[i], names[j], f"{r[i, j]:.3f}".replace("-", "−")] for i, j in pairs[:15]
+    ]
+    assert "Correlation of the errors of 8 base parameters; 20 pairs above 0.8" in html
+    weak = _correlations(SimpleNamespace(correlation=0.5 * r), names)
+    assert "No two errors are correlated by 0.8 or more." in weak
+
+
+def test_what_a_verdict_is_read_beside_is_in_percent_and_times():
+    witness = SimpleNamespace(
+        friction={"one": 0.256, "two": 0.044}, masses=(10.126, 12.374, 0.1),
+        gravity={"one": 1.049, "two": 0.951},
+    )  # fmt: skip
+    assert _beside(SimpleNamespace(witness=witness)) == (
+        "Total mass 10.13 -> 12.37 kg. Gravity torque over the URDF's: one 1.05, two 0.95. "
+        "Friction as a share of the torque: one 26 %, two 4 %."
+    )
+
+
+@pytest.mark.parametrize(
+    ("error", "urdf", "better", "wanted"),
+    [
+        (5.0, 6.0, True, []), (6.0, 5.0, True, ["worse than the URDF"]),
+        (5.0, 6.0, False, ["worse than a constant"]), (None, 5.0, True, []), (5.0, None, True, []),
+        (9.0, 5.0, False, ["worse than a constant", "worse than the URDF"]),
+    ],
+)  # fmt: skip
+def test_a_joint_is_remarked_where_a_simpler_prediction_is_better(error, urdf, better, wanted):
+    own = {"better_than_constant": better, "relative_error_pct": error}
+    own["urdf_relative_error_pct"] = urdf
+    assert _remarks(own) == wanted
