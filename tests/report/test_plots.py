@@ -12,8 +12,8 @@ import pytest
 from helpers.figures import torques
 from helpers.pages import chart
 
+from robotid.diagnosis.residuals import autocorrelation, spectrum
 from robotid.fitting.information import information
-from robotid.fitting.residuals import autocorrelation, spectrum
 from robotid.identification.pictures import torque_charts
 from robotid.robot.parameters import INERTIAL_TERMS
 
