@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotid._typing import Array
+from robotid.diagnosis.residuals import autocorrelation, friction_split, spectrum
 from robotid.fitting.bands import REACH, TorqueBand, friction_curve
 from robotid.fitting.evaluation import Evaluation
-from robotid.fitting.residuals import autocorrelation, friction_split, spectrum
 from robotid.pages.charts import Chart, Series, broken
 from robotid.regressor.memory import drive_motion_along
 

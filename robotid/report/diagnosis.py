@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotid._typing import Array
+from robotid.diagnosis.residuals import friction_split
 from robotid.findings import listed
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.information import Information, information
-from robotid.fitting.residuals import friction_split
 from robotid.identification.pictures import (
     friction_chart,
     parameter_charts,

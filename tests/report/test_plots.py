@@ -12,8 +12,8 @@ import pytest
 from helpers.figures import torques
 from helpers.pages import chart, percent
 
+from robotid.diagnosis.residuals import autocorrelation, spectrum
 from robotid.fitting.information import information
-from robotid.fitting.residuals import autocorrelation, spectrum
 from robotid.identification.pictures import REACH, torque_charts
 from robotid.report import torques as torques_module
 from robotid.report.torques import torques_section

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
+from robotid.diagnosis.residuals import autocorrelation, friction_split, spectrum
 from robotid.fitting.evaluation import evaluate_logs
-from robotid.fitting.residuals import autocorrelation, friction_split, spectrum
 from robotid.fitting.survey import hold_log
 from robotid.logs.settings import SignalSettings
 
