@@ -117,7 +117,7 @@ def test_what_a_job_says_reaches_the_fit_of_roll_outs(job, monkeypatch, is_auto)
     def told(*stated, **options):
         raise Told(stated, options)
 
-    monkeypatch.setattr(identify, "identify_loops", told)
+    monkeypatch.setattr("robotid.closed_loop.identify.identify_loops", told)
     asked = replace(read_job(job), ignore=("spikes",))
     asked = replace(asked, terms=(*asked.terms, *([AUTO] if is_auto else [])))
     with pytest.raises(Told) as error:
