@@ -42,7 +42,7 @@ INSIDE_FUNCTIONS = {
     "yourdfpy": {"robot"},
     "meshcat": {"viewer"},
     "trimesh": {"robot"},
-    "pandas": {"fitting"},
+    "pandas": {"judgement"},
     "pyarrow": {"logs"},
     "rosbags": {"logs"},
     "h5py": {"logs"},

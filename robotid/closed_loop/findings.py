@@ -56,14 +56,10 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
     yield from _gains_contradicted(found)
     yield from _coarse_steps(estimate.details)
     yield from _at_bound(estimate.details["at_bound"])
-    for told_names in found.told_together:
-        told = listed(told_names, _NAMED)
-        yield Finding(
-            "told_together",
-            "note",
-            told,
-            f"{told} are told together only: their ratios are known better than they are",
-        )
+    for together in found.correlated:
+        names = listed(together, _NAMED)
+        message = f"{names} are strongly correlated: their ratios are known better than they are"
+        yield Finding("correlated_terms", "note", names, message)
     if found.undetermined:
         names = listed(found.undetermined, _NAMED)
         yield Finding(

@@ -18,6 +18,7 @@ from robotid.fitting.metrics import Metrics
 from robotid.fitting.settings import SimulationSettings
 from robotid.identification.result import Asked
 from robotid.identification.summary import identification_line
+from robotid.judgement.correlation import correlated_sets
 from robotid.judgement.positions import judge_positions
 from robotid.judgement.verdict import Verdict
 from robotid.logs.data import Log, Trajectory
@@ -33,7 +34,6 @@ STATED_SCALE = (
     "positions do not show the scale: all drive and inertial parameters scale with kp as stated "
     "(kp stated 20 % too large makes all 20 % too large); log a torque to test it"
 )
-_TOGETHER = 0.98  # correlation from which two parameters are told together only
 _CAUTIONS = ("at_bound", "coarse_steps", "gains_contradicted")  # keep a result from being good
 _GAP = 3.0  # median steps: across a longer one no speed is computed
 _MOVING = 0.05  # of a joint's largest speed, below which differences of positions are noise
@@ -127,17 +127,11 @@ class LoopIdentification(Identified):
         )
 
     @property
-    def told_together(self) -> tuple[tuple[str, ...], ...]:
-        """Unknowns of loops whose errors go together, so that their ratios alone are known."""
-        unknowns, errors = self.fit.simulator.unknowns, self.estimate.std_error
-        own = [k for k, u in enumerate(unknowns) if u.what != "body" and errors[k] > 0]
-        covariance = self.estimate.covariance[np.ix_(own, own)]
-        correlation = covariance / np.outer(errors[own], errors[own])
-        sets: list[set[int]] = []
-        for a, b in np.argwhere(np.triu(np.abs(correlation) > _TOGETHER, 1)):
-            joined = [s for s in sets if s & {int(a), int(b)}]
-            sets = [s for s in sets if s not in joined] + [set().union({int(a), int(b)}, *joined)]
-        return tuple(tuple(unknowns[own[k]].name for k in sorted(s)) for s in sets)
+    def correlated(self) -> tuple[tuple[str, ...], ...]:
+        """Sets of unknowns of loops that are strongly correlated: their ratios are known."""
+        unknowns, C = self.fit.simulator.unknowns, self.estimate.covariance
+        own = [k for k, u in enumerate(unknowns) if u.what != "body" and C[k, k] > 0]
+        return tuple(tuple(unknowns[k].name for k in each) for each in correlated_sets(C, own))
 
     @property
     def moments(self) -> dict[str, DriveMoments]:

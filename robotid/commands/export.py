@@ -34,8 +34,10 @@ def export_result(
         DataError: If the result has no URDF, or no ranges or gains that the format needs, or the
             folder does not exist.
         ModelError: If the URDF was changed, or a link of it is impossible.
-        SettingsError: If the target is a folder, or an option is not of the format.
+        SettingsError: If the target is a folder, or there is no such format, or option of it.
     """
+    if kind not in FORMATS:
+        raise SettingsError(f"format is {kind!r}, wanted one of {listed(FORMATS)}")
     stated = {name: value for name, value in options.items() if value is not None}
     having = options_of(FORMATS)
     for name in stated:

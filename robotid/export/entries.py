@@ -12,8 +12,8 @@ from robotid.fitting.bands import REACH, usual_friction
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.identified import SOURCES, Identified
-from robotid.fitting.parameter_table import parameter_entries
 from robotid.identification.result import Identification
+from robotid.judgement.parameter_table import parameter_entries
 from robotid.logs.transmission import Transmission
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.drives import TERMS

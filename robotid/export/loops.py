@@ -30,7 +30,7 @@ def loop_entries(found: LoopIdentification) -> dict[str, Any]:
         "structure": {
             "rank": estimate.rank,
             "condition": finite(estimate.condition),
-            "not_told_apart": [{"names": list(names)} for names in found.told_together],
+            "not_told_apart": [{"names": list(names)} for names in found.correlated],
         },
         "uncertainty": {
             "method": "scatter of the scores of stretches of the whitened residual",

@@ -24,7 +24,7 @@ from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_s
 from robotid.export.urdf import load_identified, terms_from_facts
 from robotid.findings import listed
 from robotid.fitting.bands import FrictionCurve
-from robotid.fitting.parameter_table import parameter_table
+from robotid.judgement.parameter_table import parameter_table
 from robotid.judgement.verdict import Doubt
 from robotid.judgement.witness import Witness
 from robotid.logs.data import Log, suggestion

@@ -11,7 +11,6 @@ from robotid.diagnosis.torque_split import joint_torques
 from robotid.exceptions import DataError
 from robotid.findings import Finding, listed
 from robotid.fitting.evaluation import Evaluation, hidden_joints
-from robotid.fitting.parameter_table import parameter_entries, parameter_table
 from robotid.fitting.result import Fit
 from robotid.identification.pictures import friction_chart, shown_evaluation, torque_charts
 from robotid.identification.summary import (
@@ -20,6 +19,7 @@ from robotid.identification.summary import (
     identification_text,
 )
 from robotid.identification.why_pictures import why_charts
+from robotid.judgement.parameter_table import parameter_entries, parameter_table
 from robotid.judgement.verdict import Doubt, Verdict, judge
 from robotid.judgement.witness import Witness, call_witness
 from robotid.logs.data import suggestion

@@ -15,10 +15,10 @@ from robotid.diagnosis.misfit_findings import misfit_findings
 from robotid.doctor.urdf_geometry import audit_bodies
 from robotid.estimators.consistent.constraints import slabs
 from robotid.findings import Finding, listed
-from robotid.fitting.parameter_table import correlated_parameters
 from robotid.fitting.regressor_noise import encoder_findings
 from robotid.fitting.result import Fit
 from robotid.fitting.settings import BoundedSettings, ConsistentSettings
+from robotid.judgement.correlation import correlated_parameters
 from robotid.logs.data import Log
 from robotid.robot.bodies import held_parameters, least_density
 from robotid.robot.geometry import body_boxes, body_points

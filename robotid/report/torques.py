@@ -9,9 +9,9 @@ from robotid.findings import listed
 from robotid.fitting.bands import TorqueBand
 from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.metrics import Metrics
-from robotid.fitting.parameter_table import parameter_entries
 from robotid.identification.pictures import torque_charts
 from robotid.identification.result import Identification
+from robotid.judgement.parameter_table import parameter_entries
 from robotid.logs.settings import SignalSettings
 from robotid.pages.charts import chart_html
 from robotid.pages.html import percent

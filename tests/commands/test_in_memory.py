@@ -1,5 +1,7 @@
 """robotid.identify by simulation: what run_job finds of the same logs, without files."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, torque_log
@@ -44,6 +46,11 @@ def test_it_finds_what_a_job_finds_of_the_same_logs(arm, found, tmp_path):
     np.testing.assert_allclose(found.standard, again.standard, rtol=1e-6, atol=1e-9)
     assert len(found.validation) == 1
     assert found.verdict.status == again.verdict.status
+    alone = replace(again, asked=replace(again.asked, job=None))  # as if it came of these files
+    saved = robotid.load_result(robotid.save_result(alone, tmp_path / "alone", report=False))
+    for role, log in zip(("identification", "validation"), logs, strict=True):
+        (entry,) = saved.content["settings"][role]
+        assert (entry["start"], entry["end"]) == pytest.approx((log.t[0], log.t[-1]), abs=1e-6)
 
 
 def test_it_is_saved_and_loaded(found, tmp_path):

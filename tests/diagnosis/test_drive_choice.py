@@ -26,10 +26,10 @@ from robotid.diagnosis.sample import Normal, take_sample
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.export.urdf import load_identified, write_urdf
 from robotid.fitting.bands import friction_curve
-from robotid.fitting.parameter_table import parameter_entries
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify, with_drives
+from robotid.judgement.parameter_table import parameter_entries
 from robotid.logs.read import write_log
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping

@@ -83,6 +83,8 @@ def test_each_option_goes_to_the_formats_that_have_it_alone(result, tmp_path):
     for kind, name in refused:
         with pytest.raises(SettingsError, match=rf"--{name} is for the formats .*mjcf.* not for"):
             export_result(result, kind, tmp_path / "a", **{name: 1})
+    with pytest.raises(SettingsError, match="format is 'obj', wanted one of urdf, mjcf"):
+        export_result(result, "obj", tmp_path / "a")
     assert not list(tmp_path.iterdir())
 
 

@@ -5,21 +5,17 @@ from collections.abc import Iterable, Mapping
 from importlib.util import find_spec
 from typing import Any
 
-import numpy as np
-
 from robotid._files import finite
 from robotid.fitting.identified import Identified
+from robotid.judgement.correlation import correlated_parameters
 from robotid.pages.html import code, number, table, text
 
 __all__ = [
     "HEADERS",
     "ParameterRows",
-    "correlated_parameters",
     "parameter_entries",
     "parameter_table",
 ]
-
-_CORRELATED = 0.95  # from which two parameters of a drive are known as their sum alone
 
 #: What a row says: link or drive, parameter, the URDF's value, the identified one, its standard
 #: error, its 95 % interval, what determined it, unit.
@@ -42,33 +38,6 @@ class ParameterRows(list[dict[str, Any]]):
             for row in self
         ]
         return table("Parameters", HEADERS, cells)
-
-
-def correlated_parameters(found: Identified) -> dict[int, tuple[int, float]]:
-    """Return drive parameters whose errors are strongly correlated with another's of the drive.
-
-    Args:
-        found: What was identified.
-
-    Returns:
-        By number of the standard parameter, that of the other one and their correlation, of which
-        the size is above 0.95.
-    """
-    layout, C, at_bound = found.model.layout, found.standard_covariance, found.at_bound
-    pairs = {}
-    for drive in range(len(layout.drives)):
-        own = [
-            k
-            for k, (d, _) in enumerate(layout.drive_parameters, start=layout.n_inertial)
-            if d == drive and C[k, k] > 0 and not at_bound[k]
-        ]
-        error = np.sqrt(np.diag(C)[own])
-        R = C[np.ix_(own, own)] / np.outer(error, error) - np.eye(len(own))
-        for i, row in zip(own, R, strict=True):
-            k = int(np.argmax(np.abs(row)))
-            if abs(row[k]) > _CORRELATED:
-                pairs[i] = own[k], float(row[k])
-    return pairs
 
 
 def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:

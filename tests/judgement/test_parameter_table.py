@@ -9,7 +9,7 @@ import pytest
 
 from robotid.export.entries import build_result
 from robotid.export.result import Result
-from robotid.fitting import parameter_table
+from robotid.judgement import parameter_table
 
 
 @pytest.fixture
