@@ -21,8 +21,8 @@ def table(path):
 
 def test_a_design_uses_of_each_limit_what_its_file_shows(ran):
     runs, found = ran("design")
-    margins = found["fourier"]["limits"]
-    motion = table(runs.folder / "fourier.csv")
+    margins = found["searched"]["limits"]
+    motion = table(runs.folder / "searched.csv")
     np.testing.assert_allclose(motion["time"], np.arange(201) / 50, atol=1e-12)
     speed = {j: np.abs(motion[f"dq_{j}"]).max() / (0.7 * most)
              for j, most in (("lift", 2.5), ("reach", 0.8), ("roll", 4.0))}  # fmt: skip

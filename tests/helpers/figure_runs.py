@@ -444,7 +444,7 @@ def commands(folder):
         chirp = np.sin(2 * np.pi * (0.5 * told + 0.9 * told**2)[:, None] + [seed, 2 * seed])
         wanted = motion(joints, seed, told, 1.4)[0] + np.array([0.03, 0.006]) * chirp
         wanted = np.repeat(wanted, every, axis=0)[: len(t)]
-        q, v, tau = follow(hoist, replace(LOOP, limit={"reach": 80.0}), wanted, step=step)
+        q, _, _ = follow(hoist, replace(LOOP, limit={"reach": 80.0}), wanted, step=step)
         rng, rows = np.random.default_rng(seed), slice(None, None, every)
         table = {"time": start + t[rows]}
         for j, joint in enumerate(joints):
@@ -550,26 +550,33 @@ def design(folder):
               "--box", "post=-0.9,-0.5,0.2,-0.6,0.5,1.2"]  # fmt: skip
     around = ["--share", "0.6", "--clearance", "0.01", "--box", "post=-0.9,-0.5,0.2,-0.6,0.5,1.2"]
     found = {}
+    # the first motion of the search is taken: where it ends is a matter of rounding
+    first = ["--seconds", "0.001"]
+    loaded = ["--link", "tool", "--mass", "1.5", "--com", "0.02,0,0.1", "--moving", "lift,roll"]
     for name, kind, *words in (
-        ("fourier", "fourier", "--duration", "4", "--harmonics", "2", "--points", "50",
-         "--criterion", "A"),
+        ("fourier", "fourier", "--duration", "5", "--harmonics", "3", "--points", "50",
+         "--criterion", "A", *limits, *first, "--report", folder / "fourier.html"),
         ("bspline", "bspline", "--duration", "4", "--harmonics", "2", "--points", "40",
-         "--criterion", "D"),
-        ("sweeps", "sweeps", "--points", "20"),
-        ("stands", "stands", "--points", "20"),
-        ("payload", "payload", "--duration", "5", "--link", "tool", "--mass", "1.5",
-         "--com", "0.02,0,0.1", "--moving", "lift,roll", "--harmonics", "2"),
+         "--criterion", "E", *limits, *first),
+        ("sweeps", "sweeps", "--points", "20", *around),
+        ("stands", "stands", "--points", "20", *around),
+        ("payload", "payload", "--duration", "5", "--harmonics", "2", *loaded, *limits, *first),
     ):  # fmt: skip
-        file, page = folder / f"{name}.csv", folder / f"{name}.html"
-        more = ["--report", page] if name == "fourier" else []
-        of = around if kind in ("sweeps", "stands") else limits
-        found[name] = runs.run(f"excite {name}", *excite, *noise, *of, "--kind", kind, "--out", file,
-                               *words, *more, "--json")  # fmt: skip
+        file = folder / f"{name}.csv"
+        line = [*excite, *noise, "--kind", kind, "--out", file, *words, "--json"]
+        found[name] = runs.run(f"excite {name}", *line)
         runs.keep(f"{name}.csv", f"{name}.csv")
+    searched = ["--duration", "4", "--harmonics", "2", "--points", "50", *limits, *noise, "--json"]
+    found["searched"] = runs.run("searched", *excite, "--out", folder / "searched.csv", *searched)
+    del runs.documents["searched"]
     runs.keep("fourier.html", "fourier.html")
     runs.run("excite again", *excite, "--kind", "sweeps", "--out", folder / "motion.yaml",
              "--share", "0.5", "--clearance", "none")  # fmt: skip
-    motion_file = folder / "fourier.csv"
+    t, joints = np.arange(301) / 50, ("lift", "reach", "roll")
+    motion_file, table = folder / "motion.csv", {"time": t}
+    for key, values in zip(("q", "dq", "ddq"), motion(joints, 91, t), strict=True):
+        table |= {f"{key}_{joint}": values[:, j] for j, joint in enumerate(joints)}
+    write_table(motion_file, table)
     ahead = ["preview", folder / "hoist.urdf", motion_file, *robot, *noise, "--correlation", "0.07",
              "--friction", "viscous+coulomb+load", "--cutoff", "6"]  # fmt: skip
     runs.run("preview", *ahead)
