@@ -97,11 +97,13 @@ def arm(folder):
     }
     for path in folder.glob("*.csv"):
         path.write_text(path.read_text().replace("tau_swing", "M1", 1))
+    runs = Runs(folder)
     turned = (folder / "faulty.csv").read_text().replace("tau_lift", "tau_", 1)
     turned = turned.replace("tau_roll", "tau_lift", 1).replace("tau_,", "tau_roll,", 1)
     (folder / "faulty.csv").write_text(turned)  # two torques exchanged
     (folder / "job.toml").write_text(ARM_JOB)
-    runs, out = Runs(folder), folder / "out"
+    out = folder / "out"
+    runs.run("doctor", "doctor", folder / "job.toml", "--verbose")
     runs.run("identify", "identify", folder / "job.toml", "--out", out, "--verbose")
     found = runs.keep("result.json", "out/result.json")
     runs.keep("report.html", "out/report.html")
@@ -201,7 +203,7 @@ name = "ols"
 [[transmission]]
 joints = ["swing", "lift"]
 motors = ["m1", "m2"]
-matrix = [[81.0, 0.0], [40.0, 60.0]]
+matrix = [[81.0, 0.0], [-40.0, 60.0]]
 efficiency = [0.85, 0.75]
 offset = [0.1, -0.2]
 [[identification]]
@@ -212,7 +214,7 @@ end = 26.0
 [[validation]]
 log = "three.csv"
 """
-MATRIX, EFFICIENCY, ZEROS = np.array([[81.0, 0.0], [40.0, 60.0]]), (0.85, 0.75), (0.1, -0.2)
+MATRIX, EFFICIENCY, ZEROS = np.array([[81.0, 0.0], [-40.0, 60.0]]), (0.85, 0.75), (0.1, -0.2)
 MOTOR_GAINS = (0.11, 0.13)  # [N m/A]
 
 
@@ -237,7 +239,7 @@ def motors(folder):
             own = drive.armature * dw + drive.viscous * w + drive.coulomb * np.sign(w)
             tau += own[:, None] * row
         tau += np.array([NOISE[j] for j in joints]) * rng.standard_normal(tau.shape)
-        turned = (q - ZEROS) @ MATRIX.T
+        turned = np.round((q - ZEROS) @ MATRIX.T / 0.15) * 0.15  # steps of the encoders
         amperes = np.linalg.solve(MATRIX.T, tau.T).T / EFFICIENCY / MOTOR_GAINS
         table = {"time": start + t}
         for k, motor in enumerate(("m1", "m2")):
@@ -589,9 +591,9 @@ def design(folder):
     runs.keep("log.csv", "log.csv")
     runs.keep("true.urdf", "true.urdf")
     runs.run("simulate by flags", "simulate", folder / "hoist.urdf", motion_file, "--out",
-             folder / "other.csv", *robot, "--rate", "80", "--duration", "2", "--seed", "2", "--perturb", "0.2",
-             "--controller", "computed_torque", "--torque-noise", "0.03", "--limits", "1.5",
-             "--payload", "0.4", "--json")  # fmt: skip
+             folder / "other.csv", *robot, "--rate", "80", "--duration", "2", "--seed", "2",
+             "--perturb", "0.2", "--controller", "computed_torque", "--torque-noise", "0.03",
+             "--limits", "1.5", "--payload", "0.4", "--json")  # fmt: skip
     runs.keep("other.csv", "other.csv")
     return runs, found
 
@@ -640,6 +642,7 @@ def faults(folder):
 def _late(columns):
     for name in [key for key in columns if key.startswith("tau_")]:
         columns[name] = np.roll(columns[name], 4)
+    columns["dq_reach"] = np.roll(columns["dq_reach"], 1)
 
 
 def _swapped(columns):
@@ -717,6 +720,7 @@ def tracked(folder):
 SCENARIOS = {
     f.__name__: f
     for f in (
-        arm, currents, motors, estimators, choice, static, commands, payload, design, faults, tracked,
+        arm, currents, motors, estimators, choice, static, commands, payload, design, faults,
+        tracked,
     )
 }  # fmt: skip
