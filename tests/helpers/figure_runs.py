@@ -557,9 +557,9 @@ def design(folder):
     loaded = ["--link", "tool", "--mass", "1.5", "--com", "0.02,0,0.1", "--moving", "lift,roll"]
     for name, kind, *words in (
         ("fourier", "fourier", "--duration", "5", "--harmonics", "3", "--points", "50",
-         "--criterion", "A", *limits, *first, "--report", folder / "fourier.html"),
+         "--criterion", "E", *limits, *first, "--report", folder / "fourier.html"),
         ("bspline", "bspline", "--duration", "4", "--harmonics", "2", "--points", "40",
-         "--criterion", "E", *limits, *first),
+         "--criterion", "A", *limits, *first),
         ("sweeps", "sweeps", "--points", "20", *around),
         ("stands", "stands", "--points", "20", *around),
         ("payload", "payload", "--duration", "5", "--harmonics", "2", *loaded, *limits, *first),

@@ -111,7 +111,7 @@ class Runs:
         if isinstance(value, dict):
             return {k: self.scrubbed(x, k) for k, x in value.items() if k not in _LEFT_OUT}
         if key == "principal_axes":
-            return [rounded(x) for x in turned(value, (1.0, 2.0, 3.0))]
+            return [rounded(x, 5) for x in turned(value, (1.0, 2.0, 3.0))]
         if key == "condition_number" and (value is None or value > _SINGULAR):
             return "of a singular matrix"
         if isinstance(value, list):
@@ -145,7 +145,7 @@ def _axes_apart(text):
 
 
 def _listed(values):
-    return "[" + ", ".join(f"{x + 0.0:.6g}" for x in values) + "]"
+    return "[" + ", ".join(f"{x + 0.0:.5g}" for x in values) + "]"
 
 
 def turned(quaternion, moments):
@@ -157,7 +157,8 @@ def turned(quaternion, moments):
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ])  # fmt: skip
     tensor = (R * np.array(moments)) @ R.T
-    return [float(x) if abs(x) > 1e-9 else 0.0 for x in tensor[np.triu_indices(3)]]
+    least = 2e-5 * max(moments)  # quaternions are printed to six digits
+    return [float(x) if abs(x) > least else 0.0 for x in tensor[np.triu_indices(3)]]
 
 
 def rounded(value, digits=_DIGITS):
@@ -360,7 +361,7 @@ def differences(stored, found, at="", *, times=1.0, room=0.0):
         if isinstance(stored, int) and isinstance(found, int):
             is_same = stored == found
         else:
-            of_size = _OF_SPREAD if at.endswith(("std_error", "half_width")) else RELATIVE
+            of_size = _OF_SPREAD if ("std_error" in at or "half_width" in at) else RELATIVE
             is_same = abs(stored - found) <= times * of_size * abs(stored) + room + 1e-12
         if not is_same:
             yield f"{at}: {stored} stored, {found} found"
@@ -404,9 +405,10 @@ def _same_number(stored, found, times, spread):
         return True
     if re.fullmatch(r"[-+]?\d+", a) and re.fullmatch(r"[-+]?\d+", b):  # a count, or of few digits
         behind = stored.string[stored.end() : stored.end() + 2]
-        return behind.strip()[:1] in ("%", "°") and abs(int(a) - int(b)) <= 1
+        is_measured = behind.strip()[:1] in ("%", "°") or (times > 1 and abs(int(a)) >= 100)
+        return is_measured and abs(int(a) - int(b)) <= 1
     unit = max(_last_digit(a), _last_digit(b))
-    room = 1.01 * unit + times * RELATIVE * abs(float(a)) + spread + 1e-9
+    room = (1.01 if times == 1 else 5.0) * unit + times * RELATIVE * abs(float(a)) + spread + 1e-9
     return abs(float(a) - float(b)) <= room
 
 
