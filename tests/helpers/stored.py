@@ -140,7 +140,7 @@ def _axes_apart(text):
     def axes(found):
         return f'"principal_axes": {_listed(turned(map(float, found[1].split(",")), (1, 2, 3)))}'
 
-    text = re.sub(r"(condition number) \d{7,}", r"\1 of a singular matrix", text)
+    text = re.sub(r"(condition number) (?:\d{7,}|infinite)", r"\1 of a singular matrix", text)
     return _AXES.sub(axes, _INERTIAL.sub(inertia, text))
 
 
