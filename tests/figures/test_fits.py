@@ -90,7 +90,7 @@ def test_sizes_rows_and_times_are_those_of_the_files(ran):
 
 
 def test_errors_are_shares_of_the_torque_that_the_robot_has(ran):
-    """RMS error over its percentage is the torque's RMS; the error is the noise behind the filter."""
+    """RMS error over its percentage is the torque's RMS; the error is the filtered noise."""
     known = ran("arm")[1]
     t, q, v, a, tau = known["logs"]["kept"]
     used = (t > 3.75) & (t < t[-1] - 0.25)

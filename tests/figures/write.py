@@ -11,11 +11,11 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path[:0] = [str(Path(__file__).resolve().parents[n]) for n in (1, 2)]  # of this checkout
 
-from helpers.figure_runs import SCENARIOS
-from helpers.stored import write
-
 
 def main() -> None:
+    from helpers.figure_runs import SCENARIOS
+    from helpers.stored import write
+
     for name in sys.argv[1:] or SCENARIOS:
         with tempfile.TemporaryDirectory() as folder:
             runs, _ = SCENARIOS[name](Path(folder))

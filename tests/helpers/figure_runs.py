@@ -97,11 +97,13 @@ def arm(folder):
     }
     for path in folder.glob("*.csv"):
         path.write_text(path.read_text().replace("tau_swing", "M1", 1))
+    runs = Runs(folder)
     turned = (folder / "faulty.csv").read_text().replace("tau_lift", "tau_", 1)
     turned = turned.replace("tau_roll", "tau_lift", 1).replace("tau_,", "tau_roll,", 1)
     (folder / "faulty.csv").write_text(turned)  # two torques exchanged
     (folder / "job.toml").write_text(ARM_JOB)
-    runs, out = Runs(folder), folder / "out"
+    out = folder / "out"
+    runs.run("doctor", "doctor", folder / "job.toml", "--verbose")
     runs.run("identify", "identify", folder / "job.toml", "--out", out, "--verbose")
     found = runs.keep("result.json", "out/result.json")
     runs.keep("report.html", "out/report.html")
@@ -201,7 +203,7 @@ name = "ols"
 [[transmission]]
 joints = ["swing", "lift"]
 motors = ["m1", "m2"]
-matrix = [[81.0, 0.0], [40.0, 60.0]]
+matrix = [[81.0, 0.0], [-40.0, 60.0]]
 efficiency = [0.85, 0.75]
 offset = [0.1, -0.2]
 [[identification]]
@@ -212,7 +214,7 @@ end = 26.0
 [[validation]]
 log = "three.csv"
 """
-MATRIX, EFFICIENCY, ZEROS = np.array([[81.0, 0.0], [40.0, 60.0]]), (0.85, 0.75), (0.1, -0.2)
+MATRIX, EFFICIENCY, ZEROS = np.array([[81.0, 0.0], [-40.0, 60.0]]), (0.85, 0.75), (0.1, -0.2)
 MOTOR_GAINS = (0.11, 0.13)  # [N m/A]
 
 
@@ -237,7 +239,7 @@ def motors(folder):
             own = drive.armature * dw + drive.viscous * w + drive.coulomb * np.sign(w)
             tau += own[:, None] * row
         tau += np.array([NOISE[j] for j in joints]) * rng.standard_normal(tau.shape)
-        turned = (q - ZEROS) @ MATRIX.T
+        turned = np.round((q - ZEROS) @ MATRIX.T / 0.15) * 0.15  # steps of the encoders
         amperes = np.linalg.solve(MATRIX.T, tau.T).T / EFFICIENCY / MOTOR_GAINS
         table = {"time": start + t}
         for k, motor in enumerate(("m1", "m2")):
@@ -444,7 +446,7 @@ def commands(folder):
         chirp = np.sin(2 * np.pi * (0.5 * told + 0.9 * told**2)[:, None] + [seed, 2 * seed])
         wanted = motion(joints, seed, told, 1.4)[0] + np.array([0.03, 0.006]) * chirp
         wanted = np.repeat(wanted, every, axis=0)[: len(t)]
-        q, v, tau = follow(hoist, replace(LOOP, limit={"reach": 80.0}), wanted, step=step)
+        q, _, _ = follow(hoist, replace(LOOP, limit={"reach": 80.0}), wanted, step=step)
         rng, rows = np.random.default_rng(seed), slice(None, None, every)
         table = {"time": start + t[rows]}
         for j, joint in enumerate(joints):
@@ -550,26 +552,33 @@ def design(folder):
               "--box", "post=-0.9,-0.5,0.2,-0.6,0.5,1.2"]  # fmt: skip
     around = ["--share", "0.6", "--clearance", "0.01", "--box", "post=-0.9,-0.5,0.2,-0.6,0.5,1.2"]
     found = {}
+    # the first motion of the search is taken: where it ends is a matter of rounding
+    first = ["--seconds", "0.001"]
+    loaded = ["--link", "tool", "--mass", "1.5", "--com", "0.02,0,0.1", "--moving", "lift,roll"]
     for name, kind, *words in (
-        ("fourier", "fourier", "--duration", "4", "--harmonics", "2", "--points", "50",
-         "--criterion", "A"),
+        ("fourier", "fourier", "--duration", "5", "--harmonics", "3", "--points", "50",
+         "--criterion", "E", *limits, *first, "--report", folder / "fourier.html"),
         ("bspline", "bspline", "--duration", "4", "--harmonics", "2", "--points", "40",
-         "--criterion", "D"),
-        ("sweeps", "sweeps", "--points", "20"),
-        ("stands", "stands", "--points", "20"),
-        ("payload", "payload", "--duration", "5", "--link", "tool", "--mass", "1.5",
-         "--com", "0.02,0,0.1", "--moving", "lift,roll", "--harmonics", "2"),
+         "--criterion", "A", *limits, *first),
+        ("sweeps", "sweeps", "--points", "20", *around),
+        ("stands", "stands", "--points", "20", *around),
+        ("payload", "payload", "--duration", "5", "--harmonics", "2", *loaded, *limits, *first),
     ):  # fmt: skip
-        file, page = folder / f"{name}.csv", folder / f"{name}.html"
-        more = ["--report", page] if name == "fourier" else []
-        of = around if kind in ("sweeps", "stands") else limits
-        found[name] = runs.run(f"excite {name}", *excite, *noise, *of, "--kind", kind, "--out", file,
-                               *words, *more, "--json")  # fmt: skip
+        file = folder / f"{name}.csv"
+        line = [*excite, *noise, "--kind", kind, "--out", file, *words, "--json"]
+        found[name] = runs.run(f"excite {name}", *line)
         runs.keep(f"{name}.csv", f"{name}.csv")
+    searched = ["--duration", "4", "--harmonics", "2", "--points", "50", *limits, *noise, "--json"]
+    found["searched"] = runs.run("searched", *excite, "--out", folder / "searched.csv", *searched)
+    del runs.documents["searched"]
     runs.keep("fourier.html", "fourier.html")
     runs.run("excite again", *excite, "--kind", "sweeps", "--out", folder / "motion.yaml",
              "--share", "0.5", "--clearance", "none")  # fmt: skip
-    motion_file = folder / "fourier.csv"
+    t, joints = np.arange(301) / 50, ("lift", "reach", "roll")
+    motion_file, table = folder / "motion.csv", {"time": t}
+    for key, values in zip(("q", "dq", "ddq"), motion(joints, 91, t), strict=True):
+        table |= {f"{key}_{joint}": values[:, j] for j, joint in enumerate(joints)}
+    write_table(motion_file, table)
     ahead = ["preview", folder / "hoist.urdf", motion_file, *robot, *noise, "--correlation", "0.07",
              "--friction", "viscous+coulomb+load", "--cutoff", "6"]  # fmt: skip
     runs.run("preview", *ahead)
@@ -582,9 +591,9 @@ def design(folder):
     runs.keep("log.csv", "log.csv")
     runs.keep("true.urdf", "true.urdf")
     runs.run("simulate by flags", "simulate", folder / "hoist.urdf", motion_file, "--out",
-             folder / "other.csv", *robot, "--rate", "80", "--duration", "2", "--seed", "2", "--perturb", "0.2",
-             "--controller", "computed_torque", "--torque-noise", "0.03", "--limits", "1.5",
-             "--payload", "0.4", "--json")  # fmt: skip
+             folder / "other.csv", *robot, "--rate", "80", "--duration", "2", "--seed", "2",
+             "--perturb", "0.2", "--controller", "computed_torque", "--torque-noise", "0.03",
+             "--limits", "1.5", "--payload", "0.4", "--json")  # fmt: skip
     runs.keep("other.csv", "other.csv")
     return runs, found
 
@@ -633,6 +642,7 @@ def faults(folder):
 def _late(columns):
     for name in [key for key in columns if key.startswith("tau_")]:
         columns[name] = np.roll(columns[name], 4)
+    columns["dq_reach"] = np.roll(columns["dq_reach"], 1)
 
 
 def _swapped(columns):
@@ -710,6 +720,7 @@ def tracked(folder):
 SCENARIOS = {
     f.__name__: f
     for f in (
-        arm, currents, motors, estimators, choice, static, commands, payload, design, faults, tracked,
+        arm, currents, motors, estimators, choice, static, commands, payload, design, faults,
+        tracked,
     )
 }  # fmt: skip

@@ -30,8 +30,10 @@ GRAVITY = (1.2, -0.9, -9.6)  # [m/s^2] the hoist stands on a slope
 # name, kind, parent, child, origin, rpy, axis, lower, upper, effort, speed
 _JOINTS = (
     ("swing", "revolute", "base", "post", (0, 0, 0.3), (0, 0, 0), (0, 0, 1), -2.5, 2.5, 120, 2.0),
-    ("lift", "revolute", "post", "boom", (0.1, 0, 0.25), (0.1, 0, 0), (0, 1, 0), -1.4, 1.2, 150, 2.5),
-    ("reach", "prismatic", "boom", "slide", (0.3, 0, 0.05), (0, 0.2, 0), (1, 0, 0), -0.2, 0.3, 90, 0.8),
+    ("lift", "revolute", "post", "boom", (0.1, 0, 0.25), (0.1, 0, 0), (0, 1, 0), -1.4, 1.2, 150,
+     2.5),
+    ("reach", "prismatic", "boom", "slide", (0.3, 0, 0.05), (0, 0.2, 0), (1, 0, 0), -0.2, 0.3, 90,
+     0.8),
     ("roll", "continuous", "slide", "hand", (0.35, 0, 0), (0, 1.5, 0), (0, 0, 1), 0, 0, 20, 4.0),
     ("finger", "prismatic", "hand", "jaw", (0, 0, 0.12), (0, 0, 0), (0, 1, 0), 0.0, 0.03, 10, 0.1),
 )  # fmt: skip
@@ -195,8 +197,8 @@ def motion(joints, seed, t, speed=1.0):
 
 
 def record(
-    path, hoist, seed, *, seconds, rate, start=0.0, noise=1.0, scale=None, velocity=False, speed=1.0,
-    kind="tau", cut=(),
+    path, hoist, seed, *, seconds, rate, start=0.0, noise=1.0, scale=None, velocity=False,
+    speed=1.0, kind="tau", cut=(),
 ):  # fmt: skip
     """Write a log as CSV with its own names of columns, and return (t, q, v, a, tau without noise).
 
