@@ -5,7 +5,7 @@ from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import OLS, TLS, WLS
-from robotid.estimators.batch import mixed_tls
+from robotid.estimators.batch import mixed_tls, solve_factor
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.settings import SignalSettings
@@ -186,3 +186,19 @@ def test_data_that_leave_parameters_open_are_refused(rng):
 def test_noise_beyond_the_signal_has_no_single_solution():
     with pytest.raises(DataError, match="no single smallest"):
         mixed_tls(np.eye(3), np.ones(2))
+
+
+def test_what_rows_leave_open_stays_at_the_prior_by_the_size_of_the_columns(rng):
+    W = rng.standard_normal((50, 4)) * [1.0, 30.0, 2.0, 0.1]
+    W[:, 2] = W[:, 0] - 0.05 * W[:, 1]
+    tau, prior = rng.standard_normal(50), np.array([0.3, -0.2, 1.0, 5.0])
+    found = solve_factor(compress(problem(W, tau, tuple("abcd"))), np.ones(1), prior)
+    scale = np.linalg.norm(W, axis=0)
+    s = np.linalg.svd(W / scale, compute_uv=False)
+    assert found.rank == 3
+    assert found.condition == pytest.approx(s[0] / s[2])
+    assert found.undetermined == ("a", "b", "c")
+    inverse = np.linalg.pinv(W / scale, rcond=1e-9)
+    np.testing.assert_allclose(found.theta, prior + inverse @ (tau - W @ prior) / scale)
+    wanted = inverse @ inverse.T / np.outer(scale, scale)
+    np.testing.assert_allclose(found.covariance, wanted, atol=1e-12 * wanted.max())

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from robotid.export.entries import build_preview
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.assumptions import TorqueNoise, assumed_noise
-from robotid.identification.previews import Run, _band, _Information, _seen, preview
+from robotid.identification.previews import Run, _band, _Information, _seen, _white_step, preview
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -131,6 +132,19 @@ def test_motions_of_two_lengths_and_filters_tell_as_much_as_their_rows(rng):
     alone = replace(both, share=1.0).without_motions()
     assert (alone.share, alone.levels) == (0.01, ())
     np.testing.assert_array_equal(alone.factors.rows, said.factors.rows)
+
+
+@pytest.mark.parametrize(
+    ("cutoff", "rate", "is_static", "wanted"),
+    [(5.0, None, False, 0.01), (None, None, False, 0.01), (5.0, 25.0, False, 0.01),
+     (None, 25.0, False, 0.04), (None, 25.0, True, 1.0)],
+)  # fmt: skip
+def test_white_noise_is_as_dense_as_the_samples_or_the_rows_of_no_filter(
+    cutoff, rate, is_static, wanted
+):
+    signals = SignalSettings(cutoff=cutoff, rate=rate)
+    log = SimpleNamespace(step=0.01, signals=signals, model=SimpleNamespace(is_static=is_static))
+    assert _white_step(log) == pytest.approx(wanted)
 
 
 def test_the_largest_of_several_motions_is_seen(rng):
