@@ -1,14 +1,17 @@
 """`robotid preview`: from positions to what they will tell, and to what they told."""
 
 import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
+from robotid.commands import preview
 from robotid.commands.identify import run_job
-from robotid.commands.job import job_from_settings
+from robotid.commands.job import LogEntry, job_from_settings
 from robotid.commands.preview import _motions
 from robotid.logs.formats import write_columns
 from robotid.logs.read import read_log, write_log
@@ -124,6 +127,38 @@ def test_of_each_motion_its_window_is_previewed(files):
     for motion, start, end in ((first, 2.0, 7.0), (second, 1.0, 4.5)):
         (look,) = motion.looks
         assert (look.t[0], look.t[-1]) == pytest.approx((start, end), abs=0.0101)
+
+
+@pytest.mark.parametrize(
+    ("given", "is_own", "beside"), [(None, False, None), ("r", False, "run"), ("r", True, "like")]
+)
+def test_noise_that_is_stated_is_that_of_every_preview(monkeypatch, given, is_own, beside):
+    heard = {}
+
+    def preview_logs(model, motions, estimator, **stated):
+        heard.update(stated, model=model, motions=motions, estimator=estimator)
+
+    entry, before = LogEntry(Path("new.csv")), LogEntry(Path("old.csv"))
+    job = SimpleNamespace(identification=(entry,), model=lambda: "bare", estimator="wls")
+    result = {
+        "inputs": [{"role": "identification", "sha256": "new.csv" if is_own else "old.csv"}],
+        "base_parameters": [],
+        "identification": {"per_joint": {}},
+    }
+    for name, stands_for in {
+        "preview_logs": preview_logs,
+        "build_preview": lambda _: {"base_parameters": [], "noise": {}},
+        "_motions": lambda job, model, entries: [str(entry.path) for entry in entries],
+        "result_run": lambda job, path: (job, [before], "found", "a run"),
+        "load_result": lambda path: SimpleNamespace(content=result),
+        "file_sha256": str,
+    }.items():
+        monkeypatch.setattr(preview, name, stands_for)
+    preview.preview_job(job, given, noise={"a": 0.2}, correlation=0.3)
+    assert (heard.pop("noise"), heard.pop("correlation")) == ({"a": 0.2}, 0.3)
+    wanted = {"model": "found" if given else "bare", "estimator": "wls"}
+    wanted["motions"] = ["old.csv" if is_own else "new.csv"]
+    assert heard == wanted | ({beside: "a run"} if beside else {})
 
 
 def test_the_text_says_what_it_rests_on(files, capsys):

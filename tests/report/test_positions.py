@@ -15,7 +15,7 @@ from robotid.export.result import load_result
 from robotid.logs.data import Log
 from robotid.report.advice import Origin
 from robotid.report.errors import worst_errors
-from robotid.report.positions import _charts, _horizons, _undetermined, shown_positions
+from robotid.report.positions import _charts, _held, _horizons, _undetermined, shown_positions
 from robotid.report.shown import page_of
 
 ERRORS = {"rmse": (2e-3, 4e-3, 8e-3), "command_rmse": (0.02, 0.05, 0.08), "urdf_rmse": (0.01,) * 3}
@@ -166,6 +166,17 @@ def test_of_two_logs_each_joint_shows_its_worse_error_and_each_log_its_own(conte
     html = _charts(run, "fitted", 1, LEG[1], "rad", link="log 0", points=500)
     rmse = 1e3 * np.sqrt(np.mean((run.log.q - q)[50:, 1] ** 2))
     assert f"kept.csv 1-5 s, fitted: RMSE {rmse:.3g} mrad" in html
+
+
+def test_what_is_held_of_every_joint_is_named_once():
+    stated = [("a.kp", 1.0), ("b.kp", 2.0), ("c.kp", 3.0), ("a.kd", 0.1), ("c.kd", 0.2),
+              ("b.zero", 0.0), ("c.delay", 0.01)]  # fmt: skip
+    entries = [
+        {"name": name, "value": x, "std_error": 1e-3 if name == "c.delay" else None}
+        for name, x in stated
+    ]
+    content = {"joints": ["a", "b", "c"], "drive_parameters": entries}
+    assert _held(content) == "kp of every joint, kd of a, c, masses of the URDF"
 
 
 def test_the_mean_over_the_horizon_is_of_all_joints_and_the_lines_of_the_worst(content):
