@@ -147,14 +147,15 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     else:
         torques = replace(_torques(job, motion, model, robots), noise=_noise(findings, model))
         marks += _contacts(torques, model)
+    n = model.layout.n_inertial  # the result's drives may have terms that the job's have not
     masses = {"URDF": model.standard_parameters(), **bodies} if bodies else {}
+    masses = {label: pi[:n] for label, pi in masses.items()}
     shown, q = model, motion.q
     base = None if ghosts else _base_poses(job, entry, motion)
     if base is not None:  # the same robot, whose first body is the trunk
         shown, q = _afloat(job, model), np.hstack([base, q])
         trunk = shown.standard_parameters()[:10]
-        n = model.layout.n_inertial
-        masses = {label: np.r_[trunk, pi[:n]] for label, pi in masses.items()}
+        masses = {label: np.r_[trunk, pi] for label, pi in masses.items()}
     return replay(
         shown,
         motion.t,

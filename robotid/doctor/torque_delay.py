@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.linalg import svd
 
 from robotid._typing import Array
 from robotid.doctor.sample import coupled_columns, smooth_motion
@@ -351,7 +352,8 @@ def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, int
         return None
     length = np.linalg.norm(X, axis=0)
     seen = length > _ROUNDING * length.max()  # other columns are 0 but for rounding
-    U, s, _ = np.linalg.svd(X[:, seen] / length[seen], full_matrices=False)
+    # by QR iterations: of so many dependent columns, divide and conquer need not converge
+    U, s, _ = svd(X[:, seen] / length[seen], full_matrices=False, lapack_driver="gesvd")
     Q = U[:, s > 1e-5 * s[0]]
     rest = (late - (late @ Q) @ Q.T) ** 2 / size[:, None]
     blocks = np.array_split(rest, _BLOCKS, axis=1)

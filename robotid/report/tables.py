@@ -96,7 +96,8 @@ def _parameter_table(entries: Sequence[Mapping[str, Any]], on_misfit: Collection
         words += ", on a misfit" if entry["name"] in on_misfit else ""
         if other := entry.get("correlated_with"):
             words += f", with {other.rpartition('.')[2]} (r = {entry['correlation']:.3f})"
-        low, high = entry.get("interval_95") or (None, None)
+        ends = entry.get("interval_95") or (None, None)
+        low, high = (number(x) if x is None else with_error(x, error)[0] for x in ends)
         rows.append(
             [
                 code(owner),
@@ -104,8 +105,8 @@ def _parameter_table(entries: Sequence[Mapping[str, Any]], on_misfit: Collection
                 number(prior),
                 value,
                 uncertain,
-                number(low),
-                number(high),
+                low,
+                high,
                 change,
                 text(words),
                 text(entry["unit"]),

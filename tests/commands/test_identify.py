@@ -19,6 +19,7 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.export.urdf import DYNAMICS_TERMS
 from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
+from robotid.identification.result import Identification
 from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.friction_projection import project_friction
@@ -227,7 +228,8 @@ def test_the_robot_of_a_result_is_that_of_the_job_that_is_saved_with_it(arm):
         job=None, friction={"*": ""}, signals=SignalSettings(cutoff=5.0), ignore=("late",)
     )
     estimator = EstimatorSettings(draws=17)
-    found = SimpleNamespace(
+    found = object.__new__(Identification)
+    vars(found).update(
         model=model, asked=asked, drives=(), estimator=estimator, fitted=(), validation=()
     )
     job = _job_of(found)

@@ -210,9 +210,13 @@ def test_a_robot_hears_commands_the_gravity_of_its_urdf_or_torques(hand, monkeyp
     monkeypatch.setattr(
         Job, "read", lambda self, entry, model, needs: f"log of {needs}" * (model == "the result's")
     )
-    monkeypatch.setattr(module, "driven_log", lambda robot, log, _: f"{log} driven by {robot}")
     monkeypatch.setattr(
-        module, "with_gravity", lambda model, log: f"{log} with gravity of {model.joints}"
+        "robotid.closed_loop.driven.driven_log",
+        lambda robot, log, _: f"{log} driven by {robot}",
+    )
+    monkeypatch.setattr(
+        "robotid.closed_loop.identify.with_gravity",
+        lambda model, log: f"{log} with gravity of {model.joints}",
     )
     job = replace(hand, controller=loop, estimator=SimulationSettings())
     result = SimpleNamespace(robot="the result's")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.commanded_results import drive_entries, written_result
 from helpers.mujoco_plant import plant, recorded
+from helpers.paths import ROOT
 from helpers.replay_data import shown
 from helpers.synthetic import exact_log, payload_log, truth
 
@@ -69,6 +70,26 @@ def test_a_result_predicts_and_shows_masses_before_and_after(folder):
     stated = {entry["name"]: entry["value"] for entry in result["standard_parameters"]}
     before, after = data["masses"]
     assert (before["label"], after["label"]) == ("URDF", "identified")
+    for body in after["bodies"]:
+        assert body["mass"] == pytest.approx(stated[f"{body['name']}.m"])
+
+
+def test_masses_are_shown_of_a_result_whose_drives_have_more_terms(tmp_path):
+    urdf = ROOT / "urdf" / "planar_2r.urdf"
+    model, rng = RobotModel.from_urdf(urdf), np.random.default_rng(0)
+    write_log(exact_log(model, truth(model), rng, samples=600, rate=100.0), tmp_path / "log.csv")
+    job, page = tmp_path / "job.toml", tmp_path / "page.html"
+    job.write_text(
+        f'urdf = "{urdf}"\n[estimator]\nname = "wls"\n[drives]\njoint_2 = ["load"]\n'
+        '[output]\nreport = false\n[[identification]]\nlog = "log.csv"\n'
+    )
+    assert main(["identify", str(job), "--out", str(tmp_path / "out")]) == 0
+    words = ["replay", str(urdf), str(tmp_path / "log.csv"), str(tmp_path / "out")]
+    assert main([*words, "--html", str(page)]) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    stated = {entry["name"]: entry["value"] for entry in result["standard_parameters"]}
+    assert "joint_2.load" in {entry["name"] for entry in result["drive_parameters"]}
+    _, after = shown(page.read_text(encoding="utf-8"))["masses"]
     for body in after["bodies"]:
         assert body["mass"] == pytest.approx(stated[f"{body['name']}.m"])
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from robotid.diagnosis.sample import (
+    Normal,
     Sample,
+    Trials,
     _is_steady,
-    _products,
     _spread_rows,
     _stretches,
     _usual_size,
-    trials,
 )
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
@@ -28,11 +28,11 @@ def sample(rng):
     W = weight[:, :, None] * rng.standard_normal((N, JOINTS, BASE))
     r = weight * rng.standard_normal((N, JOINTS))
     stretches = tuple(slice(k, k + 10) for k in range(0, N, 10))
-    A, B = _products(W, r, stretches)
+    normal = Normal.of(W, r, stretches, FITTED)
     return Sample(
-        joints=("a", "b"), slides=np.zeros(2, dtype=bool), motions=(), at=(), taken=(),
-        weight=weight, torque=np.ones(2), stretches=stretches, fitted=FITTED, rows=10 * FITTED,
-        W=W, r=r, independent=np.arange(BASE), U=np.eye(BASE), A=A, B=B,
+        joints=("a", "b"), slides=np.zeros(2, dtype=bool), motions=(), recordings=(), at=(),
+        taken=(), weight=weight, torque=np.ones(2), stretches=stretches, rows=10 * FITTED,
+        W=W, r=r, independent=np.arange(BASE), U=np.eye(BASE), normal=normal,
     )  # fmt: skip
 
 
@@ -44,7 +44,8 @@ def solved(X, r, prior):
 @pytest.mark.parametrize("which", [[0], [1], [0, 1]])
 def test_columns_on_all_joints_have_the_scatter_of_the_scores_of_stretches(sample, rng, which):
     Z = rng.standard_normal((N, JOINTS, 2)) + 0.4 * sample.r[:, :, None]
-    apart, whole = trials(sample, slice(None), Z)
+    tried = Trials(sample, Z)
+    apart, whole = tried.apart, tried.whole
     columns = (sample.weight[:, :, None] * Z)[..., which]
     k, own = len(which), slice(0, 10 * FITTED)
     C, R = columns[own].reshape(-1, k), sample.r[own].ravel()
@@ -82,8 +83,9 @@ def test_columns_on_all_joints_have_the_scatter_of_the_scores_of_stretches(sampl
 def test_a_column_of_a_joint_at_rest_takes_nothing(sample, rng):
     Z = rng.standard_normal((N, 1, 2))
     Z[:, 0, 1] = 0.0
-    apart, whole = trials(sample, slice(1, 2), Z)
-    assert whole.parameters([0, 1])[1] == 0.0
+    tried = Trials(sample.of_joint(1), Z)
+    assert tried.whole.parameters([0, 1])[1] == 0.0
+    apart = tried.apart
     np.testing.assert_allclose(apart.left([0, 1]), apart.left([0]))
 
 
@@ -95,8 +97,8 @@ def test_columns_beside_are_as_free_as_what_is_left(sample, rng):
     np.testing.assert_allclose(beside.W, np.concatenate([sample.W, spread * columns], axis=2))
     for k, rows in enumerate(sample.stretches):
         W = beside.W[rows].reshape(-1, BASE + 1)
-        np.testing.assert_allclose(beside.A[k], W.T @ W)
-        np.testing.assert_allclose(beside.B[k], W.T @ sample.r[rows].ravel())
+        np.testing.assert_allclose(beside.normal.A[k], W.T @ W)
+        np.testing.assert_allclose(beside.normal.B[k], W.T @ sample.r[rows].ravel())
 
 
 @pytest.mark.parametrize(
