@@ -127,7 +127,8 @@ def test_every_parameter_stands_beside_that_of_the_urdf(shown, identified):
             change = ("+" if value > urdf[i] else "−") + change
         else:
             change = "0"
-        ends = [number(x) for x in identified.standard_interval[i]]
+        digits_of = np.inf if at_bound else error
+        ends = [with_error(x, digits_of)[0] for x in identified.standard_interval[i]]
         assert row[2:5] == [number(urdf[i]), said, uncertain]
         assert row[5:] == [*ends, change, words[source], units[row[1]]]
     held = [".".join(row[:2]) for row in rows if row[8] == "at its bound" and row[4] == "–"]
