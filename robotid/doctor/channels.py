@@ -181,7 +181,7 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     )
     message = (
         f"the measured velocity is {1e3 * lag:.1f} +- {1e3 * error:.1f} ms late against d(q)/dt; "
-        f"{what}, or state [signals] velocity_delay = {lag + stated:.4f}"
+        f"{what}, or state [signals] velocity_delay = {lag + stated:z.4f}"
     )
     severity = "warning" if is_late else "note"
     yield log_finding(log.name, "velocity_delay", severity, message, delay=lag, std_error=error)

@@ -411,11 +411,16 @@ def _dense_bodies(fit: Fit) -> list[Finding]:
         density = least_density(now)
         if density <= max(_DENSEST, least_density(was)):
             continue
+        volume = (
+            f"a volume so small that its density is at least {density:.3g} kg/m^3, wanted at most "
+            f"{_DENSEST:g}"
+            if np.isfinite(density)
+            else "no volume at all: its inertia is that of a flat body, or of none"
+        )
         message = (
-            f"{body}: as identified, its mass of {now[0]:.3g} kg is in a volume so small that its "
-            f"density is at least {density:.3g} kg/m^3, wanted at most {_DENSEST:g}. The torque "
-            "may be right, the body is not: record motion that moves it in more ways, or pin it "
-            "to the URDF"
+            f"{body}: as identified, its mass of {now[0]:.3g} kg is in {volume}. The torque may be "
+            "right, the body is not: record motion that moves it in more ways, or pin it to the "
+            "URDF"
         )
         evidence = {"mass": float(now[0]), "density": density}
         findings.append(Finding("dense_body", "warning", f"link {body}", message, evidence))

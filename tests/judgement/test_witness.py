@@ -138,6 +138,10 @@ def test_a_needle_denser_than_any_material_is_named_unless_the_urdf_has_it(ur5, 
     assert "7.6 kg" in finding.message
     assert "at least 2.24e+05 kg/m^3, wanted at most 12000" in finding.message
     assert dense(replace(found, standard=needle, prior=needle)) == []
+    flat = found.standard.copy()
+    flat[second] = [7.6, 0.0, 0.0, 0.0, x, 0.0, x, 0.0, 0.0, x + x]  # all of it in a plane
+    (finding,) = dense(replace(found, standard=flat))
+    assert "its mass of 7.6 kg is in no volume at all: its inertia" in finding.message
 
 
 def test_a_result_that_its_prior_holds_back_bears_no_witness(ur5, rng):
