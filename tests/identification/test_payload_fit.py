@@ -13,10 +13,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.commands.job import LogEntry, read_job
 from robotid.estimators.stretches import quantile
 from robotid.exceptions import DataError, ModelError, SettingsError
-from robotid.fitting.recordings import Recordings
-from robotid.fitting.survey import hold_log
-from robotid.identification import payload_fit
-from robotid.identification.payload_fit import fit_payloads, identify_payload
+from robotid.identification.payload_fit import identify_payload
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -285,28 +282,6 @@ def test_errors_grow_with_the_correlation_of_the_noise(ur5):
     # of a motion that is slow beside the noise; of this one, less
     most = np.sqrt((1 + rho) / (1 - rho))
     assert 0.4 * most < errors[1] / errors[0] < most
-
-
-def test_rows_of_both_runs_are_as_independent_as_those_of_the_narrower_band(ur5, rng, monkeypatch):
-    shares = []
-
-    class Seen(Exception):
-        """The fit has begun."""
-
-    def seen(*runs, share, unknown):
-        shares.append(share)
-        raise Seen
-
-    monkeypatch.setattr(payload_fit, "payload_runs", seen)
-    log, without = recorded(ur5, rng, samples=400)
-    for cutoffs in ((10.0, 4.0), (4.0, 10.0)):  # [Hz], of 100 rows per second
-        runs = [
-            Recordings(ur5, structural_mapping(ur5), [hold_log(ur5, x, SignalSettings(cutoff=c))])
-            for x, c in zip((log, without), cutoffs, strict=True)
-        ]
-        with pytest.raises(Seen):
-            fit_payloads(*runs, links=["tool0"], masses={})
-    assert shares == pytest.approx([0.08, 0.08])
 
 
 def test_friction_of_the_reference_is_chosen_and_counts_in_both_runs(rng):
