@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
 
+from robotid.diagnosis import model_error
 from robotid.diagnosis.drive_choice import choose_drives
 from robotid.diagnosis.misfit import find_misfits
-from robotid.diagnosis.model_error import with_model_error
+from robotid.diagnosis.model_error import settled_shapes, with_model_error
 from robotid.diagnosis.sample import take_sample
 from robotid.fitting.bands import expected_band, friction_curve
 from robotid.fitting.open_terms import open_torques
@@ -184,6 +185,31 @@ def test_shapes_that_err_together_have_one_covariance(plain, hooked):
     assert np.linalg.eigvalsh(C / np.sqrt(np.outer(np.diag(C), np.diag(C)))).min() > -1e-9
     speed, excess = 1, 2
     assert abs(C[speed, excess]) > 0.5 * np.sqrt(C[speed, speed] * C[excess, excess])
+
+
+def test_shapes_are_settled_once_none_of_them_moves_by_a_fifth_of_its_error(
+    plain, hooked, monkeypatch
+):
+    found = found_in(plain, [hooked[1]], friction={ELBOW: "lugre", "*": "none"}, estimator="wls")
+    (choice,) = found.drives
+    values = np.array([shape.value for shape in choice.shapes])
+    errors = 0.01 * values * [1.0, 2.0, 3.0]
+    for shares, is_settled in (
+        ([0.1, -0.19, 0.0], True), ([0.3, 0.0, -0.1], False), ([0.1, 0.0, -0.3], False),
+    ):  # fmt: skip
+        step = np.array(shares) * errors
+
+        class Trial:
+            def estimate(self, chosen, fitted, step=step):
+                assert chosen == [0, 1, 2]
+                return step, np.diag(errors**2)
+
+        monkeypatch.setattr(model_error, "_shape_trial", lambda *args, trial=Trial: trial())
+        moved = settled_shapes(found)
+        assert (moved is None) == is_settled
+        if moved is not None:
+            np.testing.assert_allclose([s.value for s in moved[0].shapes], values + step)
+            np.testing.assert_allclose([s.std_error for s in moved[0].shapes], errors)
 
 
 def test_a_clean_robot_has_the_errors_of_its_noise(plain):

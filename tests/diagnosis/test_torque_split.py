@@ -188,6 +188,19 @@ def torque(residual, v, q, load, *, stretches=16):
     )  # fmt: skip
 
 
+def test_recordings_have_pieces_of_their_own_and_follow_each_other_in_time():
+    rows, starts = (37, 20, 5), (10.0, 3.0, 50.0)
+    recording = np.repeat(np.arange(3), rows)
+    t = np.concatenate([s + 0.1 * np.arange(n) for n, s in zip(rows, starts, strict=True)])
+    found = Rows(("a", "b", "c"), t, recording, 0 * recording, None)
+    pieces = [16 * k + (16 * i) // n for k, n in enumerate(rows) for i in range(n)]
+    assert found.pieces.tolist() == pieces
+    time = np.concatenate(
+        [0.1 * np.arange(37), 3.6 + 0.1 * np.arange(20), 5.5 + 0.1 * np.arange(5)]
+    )
+    np.testing.assert_allclose(found.time, time)
+
+
 def motion(rng, N=4000):
     """Speed, position and load that have nothing to do with each other, 40 s of them."""
     t = np.arange(N) / 100

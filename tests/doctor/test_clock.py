@@ -125,6 +125,10 @@ def test_rests_at_the_ends_are_those_of_all_joints(slider):
     assert "the first 2 s and the last 3.5 s" in rest.message
     assert "start = 5 and end = 9.5" in rest.message
     assert list(check_rest(*moved(slider, (50, 950, 0.1), (80, 920, 0.5)), slider.layout)) == []
+    for first, last, ends in ((150, 980, (1.5, 0.2)), (30, 870, (0.3, 1.3))):  # of one end alone
+        log, motion = moved(slider, (first, last, 0.1), (first, last, 0.5))
+        (rest,) = check_rest(log, motion, slider.layout)
+        assert list(rest.evidence.values()) == pytest.approx(ends)
 
 
 def test_joints_that_hardly_move_are_named_with_their_range_and_share(slider):

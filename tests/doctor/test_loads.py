@@ -1,6 +1,7 @@
 """Another scale of the torques, another robot's URDF, an uninformative torque: told apart."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from helpers.corruptions import clean_log, robot
 from robotid.doctor import hypotheses
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.hypotheses import explanations, own_share
-from robotid.doctor.loads import load_model
+from robotid.doctor.loads import _payload, load_model
 from robotid.doctor.sample import smooth_motion, take_probe
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
@@ -129,3 +130,20 @@ def test_exchanged_columns_keep_each_torque_s_own_share(ur5, ur5_log):
     whole = own_share(replace(moved, tau=probe.tau[:, order]))
     np.testing.assert_allclose(columns.share, whole[order], rtol=1e-9)
     assert abs(columns.share[1] - columns.share[4]) > 1e-3
+
+
+@pytest.mark.parametrize(("sign", "word"), [(1.0, "more"), (-1.0, "less")])
+def test_a_load_is_a_warning_if_it_surely_weighs_a_twelfth_of_the_arm_more_or_less(sign, word):
+    model, error = robot("ur5"), 0.1
+    masses = model.standard_parameters()[: model.layout.n_inertial : 10]
+    heavy = 0.08 * masses.sum() + 2 * error
+    found = {}
+    for mass in (2.9 * error, 3.1 * error, heavy - 0.01, heavy + 0.01):
+        load = sign * np.array([mass, 0.01, 0.02, 0.03])
+        found[mass] = list(_payload(SimpleNamespace(model=model), load, error, "run.csv"))
+    none, *others = found.values()
+    assert none == []
+    assert [f.severity for (f,) in others] == ["note", "note", "warning"]
+    (last,) = others[-1]
+    assert f"about {heavy + 0.01:.2g} +- 0.1 kg {word}" in last.message
+    assert list(last.evidence.values()) == pytest.approx([*load[:1], error, *load[1:]])

@@ -108,3 +108,24 @@ def test_errors_are_those_of_rows_that_last_as_long_as_their_noise(rng, hold):
     assert (ratio >= 1.0 - 1e-12).all()
     assert np.median(ratio) == pytest.approx(hold, rel=0.6)
     assert ((found.freedom > 2.0) & (found.freedom < 20.0)).all()  # of 20 stretches
+
+
+def test_freedom_is_that_of_the_scatter_whose_error_is_larger(rng):
+    """The first parameter differs from joint to joint, the third from stretch to stretch."""
+    n, N, count = 6, 240, 12
+    W = rng.standard_normal((2, n, N, 3))
+    beta = np.tile(BETA, (2, n, N, 1))
+    beta[..., 0] += 0.3 * (-1.0) ** np.arange(n)[:, None]
+    beta[..., 2] += 0.5 * np.repeat((-1.0) ** (np.arange(count) // 2), N // count)
+    tau = np.einsum("rjkc,rjkc->rjk", W, beta) + 0.02 * rng.standard_normal((2, n, N))
+    runs = TwoRuns(
+        of_rows(W[0], tau[0], count), of_rows(W[1], tau[1], count), np.eye(3)[:, 1:2], np.zeros(3),
+        np.zeros(4), 1e-6 * np.eye(4), 1.0, np.empty(0, dtype=int),
+    )  # fmt: skip
+    found, stretches = runs.compare(), runs.compare(by_joint=False)
+    grown = np.diag(found.covariance) > 1.01 * np.diag(stretches.covariance)
+    assert grown[[0, 2]].tolist() == [True, False]
+    assert (found.freedom[grown] != stretches.freedom[grown]).all()
+    assert (found.freedom[grown] < 12.0).all()  # of 12 parts, not of 24
+    np.testing.assert_array_equal(found.freedom[~grown], stretches.freedom[~grown])
+    assert stretches.freedom[0] > 12.0

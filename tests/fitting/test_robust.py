@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,10 +10,11 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.exceptions import SettingsError
 from robotid.fitting.recordings import Recordings
-from robotid.fitting.robust import LOSSES, loss_slope, loss_weight
+from robotid.fitting.robust import LOSSES, find_outliers, loss_slope, loss_weight
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import survey_log
 from robotid.identification.pipeline import conclude
+from robotid.logs.data import Log, Trajectory
 from robotid.logs.read import lay_out, write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -109,6 +111,46 @@ def test_outliers_are_named_with_time_joint_and_torque(model, logs):
     assert named == set(OUTLIERS)
     assert all(abs(o.torque - o.predicted) > 50 for o in found)
     assert [o.size for o in found] == sorted((o.size for o in found), reverse=True)
+
+
+def test_a_row_is_an_outlier_by_the_residual_and_the_torque_of_its_own_joint(model):
+    """From 12 times the usual residual and a tenth of the torque on, in each log by itself."""
+    t, torque = np.arange(400) / 100, np.array([100.0, 10.0, 1.0])
+    usual = 1.4826 * np.array([0.2, 0.1, 0.002])  # standard deviations by the median size
+    off = {  # by log, joint and row, in N m
+        (0, 0): {50: 9.0},  # less than a tenth
+        (0, 2): {50: 0.11, 60: -0.15, 200: 0.13, 350: 0.3},
+        (1, 1): {20: 1.7, 120: 1.9},  # 11.5 and 12.8 usual residuals
+        (1, 0): {300: -11.0},
+    }
+    evaluations = []
+    for k in range(2):
+        predicted = np.where(np.arange(400)[:, None] % 2, 1.0, -1.0) * torque
+        tau = predicted + 0.2 * np.where(np.arange(400)[:, None] % 4 < 2, 1, -1) * [1, 0.5, 0.01]
+        mask = np.ones((400, 3), dtype=bool)
+        mask[350, 2] = False
+        for (log, j), rows in off.items():
+            for row, size in rows.items() if log == k else ():
+                tau[row, j] = predicted[row, j] + size
+        v = np.ones((400, 3))
+        motion = Trajectory(t, v, v, 0 * v, tau, model.joints, 100.0, np.zeros(400, dtype=int))
+        log = Log(t, v, tau, model.joints, path=f"some/{k}.csv")
+        recording = SimpleNamespace(
+            trajectory=motion, mask=mask, log=log, signals=SignalSettings(cutoff=5.0)
+        )
+        evaluations.append(SimpleNamespace(recording=recording, torques={"estimate": predicted}))
+    found = find_outliers(model, evaluations, truth(model))
+    wanted = [
+        ("0.csv", 2, 60, -0.15, 2), ("0.csv", 2, 200, 0.13, 1), ("1.csv", 0, 300, -11.0, 1),
+        ("1.csv", 1, 120, 1.9, 1),
+    ]  # fmt: skip
+    assert [(o.log, model.joints.index(o.joint), round(100 * o.t), o.rows) for o in found] == [
+        (log, j, row, rows) for log, j, row, _, rows in wanted
+    ]
+    for outlier, (log, j, row, size, _) in zip(found, wanted, strict=True):
+        assert outlier.predicted == evaluations[int(log[0])].torques["estimate"][row, j]
+        assert outlier.torque == pytest.approx(outlier.predicted + size)
+        assert outlier.size == pytest.approx(abs(size) / usual[j])
 
 
 def test_friction_that_the_filter_smears_leaves_no_residual(model):

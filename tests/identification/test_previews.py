@@ -287,6 +287,8 @@ def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
     assert noise.origins[2] == "stated"
     assert set(noise.origins) == {"stated", "assumed"}
     before = TorqueNoise(STD, np.full(6, 0.3), ("found",) * 6)
+    slow = assumed_noise(ur5, size, {"elbow_joint": 0.7}, 0.03)
+    np.testing.assert_array_equal(slow.correlation, 0.03)  # of what is assumed, too
     told = assumed_noise(ur5, size, {"elbow_joint": 0.7}, 0.0, before)
     np.testing.assert_allclose(told.std, [2.0, 3.0, 0.7, 0.3, 0.2, 0.1])
     np.testing.assert_array_equal(told.correlation, [0.3, 0.3, 0.0, 0.3, 0.3, 0.3])

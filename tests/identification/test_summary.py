@@ -11,7 +11,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.identification.pipeline import identify
-from robotid.identification.summary import cell, friction_lines
+from robotid.identification.summary import cell, error_lines, friction_lines
 from robotid.logs.read import write_log
 from robotid.robot.model import RobotModel
 
@@ -105,6 +105,26 @@ def test_figures_above_a_thousand_have_no_decimals():
     assert [cell(x) for x in (None, 0.04, 99.96, 123.45, 999.94, 1234.5)] == [
         "-", "0.0", "100.0", "123.5", "999.9", "1234",
     ]  # fmt: skip
+
+
+def test_joints_worse_than_a_constant_are_marked_wherever_they_stand():
+    def lines(*better):
+        joints = {
+            joint: {
+                "rmse": 0.25, "unit": "N m", "relative_error_pct": 120.0,
+                "better_than_constant": is_so,
+            }
+            for joint, is_so in zip("abc", better, strict=True)
+        }  # fmt: skip
+        return error_lines({"per_joint": joints})
+
+    note = "  * worse than a constant"
+    for marked in ((0,), (1,), (0, 2)):
+        found = lines(*(k not in marked for k in range(3)))
+        assert found[-1] == note
+        rows = found[-4:-1]
+        assert [row.split()[1] == "*" for row in rows] == [k in marked for k in range(3)]
+    assert not any("*" in line for line in lines(True, True, True))
 
 
 def test_friction_is_said_from_the_first_step_to_the_last_that_was_taken():

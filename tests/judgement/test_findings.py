@@ -1,8 +1,19 @@
 """Which findings a result has."""
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
-from robotid.judgement.findings import locked_findings
+from robotid.fitting.robust import Outlier
+from robotid.fitting.settings import EstimatorSettings
+from robotid.judgement.findings import (
+    _grown,
+    _outlier_findings,
+    _total_mass,
+    consistency_findings,
+    locked_findings,
+)
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -30,3 +41,102 @@ def test_all_joints_of_a_floating_base_matter():
     (finding,) = locked_findings(model, [])
     assert finding.where.split(", ") == list(model.locked)
     assert len(model.locked) == 10
+
+
+def solved(**details):
+    """What a fit of a possible robot says of its solvers."""
+    check = SimpleNamespace(is_positive=True)
+    estimate = SimpleNamespace(details=details)
+    return SimpleNamespace(mass_matrix=check, estimate=estimate, estimator=EstimatorSettings())
+
+
+def test_of_several_starts_the_best_is_above_the_optimum_by_its_own_gap():
+    for gaps in ([0.3, 0.9e-3, 0.5], [0.0]):
+        assert consistency_findings(solved(gaps=gaps)) == []
+    (finding,) = consistency_findings(solved(gaps=[0.3, 0.0123, 0.5]))
+    assert (finding.code, finding.severity) == ("optimum_gap", "warning")
+    assert finding.message.startswith("log-Cholesky ended 1.2 % above the optimum")
+
+
+def test_two_solvers_differ_by_the_shares_that_are_said():
+    check = {"solver": "two", "torque_difference": 0.9e-3, "objective_difference": 0.5}
+    assert consistency_findings(solved(solver="one", check=check)) == []
+    check |= {"torque_difference": 0.0234, "objective_difference": 4.5e-4}
+    (finding,) = consistency_findings(solved(solver="one", check=check))
+    assert finding.code == "solvers_differ"
+    assert "one and two differ by 2.3 % of the torque (objective: 0.045 %)" in finding.message
+
+
+def test_the_share_of_poses_with_a_mass_matrix_that_is_none_is_said():
+    fit = solved()
+    fit.mass_matrix = SimpleNamespace(
+        is_positive=False, positive_share=0.935, poses=400, smallest_eigenvalue=-0.0125
+    )
+    (finding,) = consistency_findings(fit)
+    assert finding.code == "mass_matrix"
+    assert "not positive definite at 6.5 % of 400 random poses" in finding.message
+    assert "(smallest eigenvalue -0.0125)" in finding.message
+
+
+def test_five_outliers_are_named_and_the_others_counted():
+    def said(count, is_robust):
+        outliers = [
+            Outlier("run.csv", f"j{k}", 1.25 * k, 10.0 + k, -2.0 * k, 40.4 - k, 3)
+            for k in range(count)
+        ]
+        fit = SimpleNamespace(outliers=outliers, estimator=SimpleNamespace(is_robust=is_robust))
+        (finding,) = _outlier_findings(fit)
+        assert (finding.severity, finding.where) == ("warning", "j0")
+        assert finding.evidence == {"places": count, "largest": 40.4}
+        return finding.message
+
+    few, many = said(5, False), said(7, True)
+    assert few.startswith("5 places of the fitted logs are not explained: j0 at 0.000 s of run.csv")
+    assert few.endswith("j4 at 5.000 s of run.csv: 14 against -8 predicted, 36 times its usual "
+                        "residual; look at the recording there, cut it out, or set robust = "
+                        "'tukey' in [estimator]")  # fmt: skip
+    assert "j5" not in many
+    assert many.endswith("36 times its usual residual; and 2 more; they were weighted down")
+
+
+def test_the_parameter_that_terms_make_least_sure_is_named_from_tenfold_on():
+    def choice(joint, *names, **grown):
+        return SimpleNamespace(joint=joint, families=names, grown=grown)
+
+    drives = (
+        choice("a", "lugre", "load", coulomb=12.0, viscous=41.6, offset=3.0),
+        choice("b", "cubic", coulomb=9.9, viscous=2.0),
+        choice("c", "cubic", coulomb=50.0),  # of which it is said already
+        choice("d"),
+        choice("e", "load", offset=10.1),
+    )
+    first, last = _grown(SimpleNamespace(drives=drives), {"c"})
+    assert (first.where, first.evidence) == ("a", {"grown": 41.6})
+    assert first.message.startswith(
+        "a: lugre, load makes the standard error of viscous 42 times as large"
+    )
+    assert (last.where, last.evidence) == ("e", {"grown": 10.1})
+
+
+def test_all_links_weigh_within_a_factor_of_three_of_the_urdf_s():
+    model = SimpleNamespace(layout=SimpleNamespace(n_inertial=20))
+
+    def found(factor, total=None, urdf=4.0):
+        prior = np.concatenate([np.arange(20.0), [7.0, 8.0]])  # two bodies, two drive terms
+        prior[[0, 10]] = 0.25 * urdf, 0.75 * urdf
+        standard = 5.0 + prior
+        standard[[0, 10]] = urdf * factor * np.array([1.5, -0.5])
+        bounds = SimpleNamespace(total=total)
+        estimator = SimpleNamespace(bounds=bounds)
+        return _total_mass(
+            SimpleNamespace(model=model, prior=prior, standard=standard, estimator=estimator)
+        )
+
+    for factor in (1 / 2.9, 1.0, 2.9):
+        assert found(factor) == []
+    for factor in (-1.0, 1 / 3.1, 3.1):
+        (finding,) = found(factor)
+        assert (finding.code, finding.severity) == ("total_mass", "error")
+        assert finding.evidence == {"urdf": 4.0, "identified": pytest.approx(4.0 * factor)}
+        assert f"weigh {4 * factor:.4g} kg together, the URDF's 4 kg" in finding.message
+    assert found(3.1, total=(1.0, 20.0)) == found(3.1, urdf=0.0) == []

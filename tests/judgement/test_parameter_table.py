@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from robotid.export.entries import build_result
 from robotid.export.result import Result
 from robotid.judgement import parameter_table
+from robotid.judgement.correlation import correlated_parameters
 
 
 @pytest.fixture
@@ -76,3 +78,27 @@ def test_without_pandas_it_is_a_list_that_a_notebook_shows(identified, monkeypat
     html = rows._repr_html_()
     assert html.count("<tr>") == len(rows) + 1
     assert f"{identified.standard[k]:.4g}" in html
+
+
+def test_a_parameter_is_correlated_with_another_one_of_its_own_drive_that_has_an_error():
+    """Two drives of four parameters each, behind two of a body."""
+    drives = [(k // 4, None) for k in range(8)]
+    layout = SimpleNamespace(drives=("a", "b"), drive_parameters=drives, n_inertial=2)
+    R = np.eye(10)
+    for i, k, r in (
+        (2, 3, -0.97), (2, 4, 0.96), (3, 4, -0.94),  # the strongest is taken
+        (5, 6, 0.99),  # of different drives
+        (6, 7, 0.98), (8, 9, 0.951),  # the seventh is at its bound
+        (0, 1, 0.99),  # of a body
+    ):  # fmt: skip
+        R[i, k] = R[k, i] = r
+    error = np.array([1.0, 2.0, 0.3, 5.0, 0.7, 0.0, 2.0, 3.0, 0.1, 40.0])
+    found = SimpleNamespace(
+        model=SimpleNamespace(layout=layout),
+        standard_covariance=R * np.outer(error, error),
+        at_bound=np.arange(10) == 7,
+    )
+    wanted = {2: (3, -0.97), 3: (2, -0.97), 4: (2, 0.96), 8: (9, 0.951), 9: (8, 0.951)}
+    pairs = correlated_parameters(found)
+    assert {i: k for i, (k, _) in pairs.items()} == {i: k for i, (k, _) in wanted.items()}
+    assert [r for _, r in pairs.values()] == pytest.approx([r for _, r in wanted.values()])

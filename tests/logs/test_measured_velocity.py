@@ -60,6 +60,28 @@ def test_lags_of_joints_minimise_the_mean_distance_to_the_delayed_derivative(ste
         assert found == pytest.approx((k - 20 - slope / (2 * square)) * step, abs=1e-9)
 
 
+def test_stretches_between_gaps_count_by_their_rows_and_the_shortest_not():
+    step, rows, lags = 0.01, (160, 520, 100), (0.104, 0.027, 0.2)
+    parts = [7.0 * k + step * np.arange(n) for k, n in enumerate(rows)]
+    log = log_of_two(np.concatenate(parts))
+    v = [
+        np.column_stack([2 * np.cos(2 * (t - lag)), -3 * np.sin(3 * (t - lag))])
+        for t, lag in zip(parts, lags, strict=True)
+    ]
+    common, single = velocity_lags(replace(log, v=np.concatenate(v)))
+    summed = np.zeros((2, 63))
+    for t, x in zip(parts[:2], v[:2], strict=True):
+        slopes = np.gradient(np.column_stack([np.sin(2 * t), np.cos(3 * t)]), step, axis=0)
+        for own, pair in zip(summed, zip(slopes.T, x.T, strict=True), strict=True):
+            own += [len(t) * distance(*pair, k) for k in range(-31, 32)]
+    for found, own in zip([common, *single], [summed.sum(axis=0), *summed], strict=True):
+        k = int(np.argmin(own))
+        square, slope, _ = np.polyfit([-1, 0, 1], own[k - 1 : k + 2], 2)
+        # the grid of a stretch may lack its last row
+        assert found == pytest.approx((k - 31 - slope / (2 * square)) * step, abs=2e-4)
+    assert 0.027 < common < 0.06
+
+
 def distance(slope, v, shift):
     """Return the mean square of v - slope delayed by a number of rows."""
     pairs = [(v[i], slope[i - shift]) for i in range(len(v)) if 0 <= i - shift < len(v)]

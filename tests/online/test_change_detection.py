@@ -98,6 +98,11 @@ def test_a_load_may_be_as_heavy_as_a_mean_link():
     found = load_spread(spread)
     assert found[0] == 2.5
     np.testing.assert_allclose(found[1:4], 0.5)
+    # or as the last link, if that is heavier, which may be longest along any axis
+    spread[10:20] = [7.0, 0.3, 0.9, 0.6, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+    size = 2 * 0.9 / 7.0
+    wanted = 7.0 * np.array([1.0, *[size] * 3, *[size**2] * 6])
+    np.testing.assert_allclose(load_spread(spread), wanted)
 
 
 def test_the_noise_and_what_the_parameters_leave_open_are_their_recursions(rng):

@@ -42,6 +42,19 @@ def test_nothing_is_filtered_across_a_gap():
     np.testing.assert_allclose(found[:, 0], np.where(at < 2, 1.0, 2.0), atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("rate", "cutoff", "longest"),
+    [(1000.0, 8.0, 0.25 / 8.0), (100.0, 20.0, 2.5 / 100.0)],  # of a period, of the samples
+)
+def test_a_pause_is_a_gap_from_a_quarter_period_or_two_and_a_half_samples_on(rate, cutoff, longest):
+    for pause, is_gap in ((0.9 * longest, False), (1.1 * longest, True)):
+        t = np.arange(800) / rate
+        t[400:] += pause - 1 / rate
+        signals = LiveSignals(1, rate, cutoff, 4, FIXED)
+        at, *_ = run(signals, t, 0.5 + t[:, None], t[:, None])
+        assert (np.diff(at).max() > 1.5 / rate) == is_gap
+
+
 def test_full_turns_are_taken_out_of_joints_that_turn_freely():
     t = np.arange(2000) * 1e-3
     wrapped = (np.pi + 4 * t) % (2 * np.pi) - np.pi

@@ -19,6 +19,10 @@ ROBOTS = {
         "panda.urdf",
         {"joints": ["panda_finger_joint1", "panda_joint6", "panda_joint4"], "mimic": "coupled"},
     ),
+    "two legs": (
+        "solo12.urdf",
+        {"joints": ["HR_HFE", "FL_HAA", "FL_KFE"], "locked": {"FL_HFE": 0.4, "HR_HAA": -0.3}},
+    ),
 }  # fmt: skip
 H = 1e-6
 
