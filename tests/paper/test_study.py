@@ -85,6 +85,14 @@ def test_random_runs_tell_every_failure(rng):
         ),
         ({"errors": [0.5, 0.6]}, "the error grew, from 0.5 to 0.6"),
         ({"errors": [0.5, 0.5]}, "stalled: the motion excites too little; an error of 0.5 is left"),
+        (
+            {"errors": [0.9, 0.8, 0.5, *[0.48] * 9, 0.45]},
+            "slow: an error of 0.45 is left after 12 iterations and falls by 10 % in ten",
+        ),
+        (
+            {"errors": [0.9, *[0.4] * 11]},
+            "stalled: the motion excites too little; an error of 0.4 is left",
+        ),
     ],
 )
 def test_each_kind_of_failure_has_its_reason(change, reason, rng):
