@@ -129,7 +129,7 @@ def loops_of(
 
 
 def limit_of(drive: CommandedDrive, joint: Joint) -> float:
-    """Return the most that a drive gives: the controller's limit, else the URDF's, else inf.
+    """Return the most that a drive gives: what both controller and URDF allow, inf if anything.
 
     Args:
         drive: The drive.

@@ -108,6 +108,24 @@ def test_gains_come_from_a_known_mass(files, capsys, ur5):
     assert list(some["gains"]) == list(ur5.joints[1:])
 
 
+def test_friction_is_chosen_of_torques_in_the_gains_that_were_found(
+    files, capsys, ur5, monkeypatch
+):
+    asked_of = []
+
+    def no_terms(job, *_):
+        asked_of.append(job.gains)
+        return {}
+
+    monkeypatch.setattr("robotid.commands.payload._chosen_terms", no_terms)
+    words = [files / "loaded_currents.csv", "--reference", files / "bare_currents.csv", "--link",
+             "tool0", "--mass", "2", "--gains", "--gain", "elbow_joint=11", "--json"]  # fmt: skip
+    found = json.loads(asked(capsys, *words))["gains"]
+    gains = {joint: gain["gain"] for joint, gain in found.items()} | {"elbow_joint": 11.0}
+    assert asked_of == [gains]
+    np.testing.assert_allclose([gains[joint] for joint in ur5.joints], GAINS, rtol=0.1)
+
+
 def test_what_is_missing_is_named(files, capsys):
     loaded, bare = files / "loaded.csv", files / "bare.csv"
     said = asked(capsys, bare, "--reference", loaded, "--link", "tool0", code=1)

@@ -295,7 +295,7 @@ def test_a_motion_without_torques_plays_and_marks_where_it_uses_the_most_of_limi
     table = {"time": t}
     for j, joint in enumerate(model.joints):
         size = {"elbow_joint": 1.5, "wrist_1_joint": 0.4}.get(joint, 0.1)
-        table[f"q_{joint}"] = -0.5 * (j == 1) + size * np.sin(np.pi * t / 4 * (1 + j)) ** 2
+        table[f"q_{joint}"] = -0.5 * (j == 1) + size * np.sin(np.pi * t / 4 * (1.3 + j)) ** 2
     write_columns(table, folder / "motion.csv")
     code, data = run(folder, folder / "motion.csv")
     assert code == 0

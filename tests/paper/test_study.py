@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from robotid.exceptions import SettingsError
-from robotid.paper.equations import torque
+from robotid.paper.equations import LinearPlant, torque
 from robotid.paper.errata import energy_drift, errata
 from robotid.paper.planar_2r import PAPER_PARAMETERS
+from robotid.paper.procedure import LoopSettings, run_procedure
 from robotid.paper.study import (
     DURATION,
     PROGRAM,
@@ -18,6 +19,7 @@ from robotid.paper.study import (
     random_runs,
     study_model,
 )
+from robotid.simulation.motions import ProgramMotion
 
 
 def test_the_physical_arm_has_four_parameters_and_the_others_the_papers_five():
@@ -74,6 +76,22 @@ def test_random_runs_tell_every_failure(rng):
         assert runs.errors[number, r] < 1e-3 <= runs.errors[number - 1, r]
 
 
+def test_a_random_run_is_critically_damped_at_its_bandwidth(rng):
+    dynamics, P = paper_arm("physical")
+    runs = random_runs(dynamics, P, 2, 1, rng)
+    for r, w in enumerate(runs.gain):
+        history = run_procedure(
+            dynamics,
+            LinearPlant(dynamics, P),
+            ProgramMotion(runs.amplitude[r], runs.duration[r]),
+            runs.guess[[r]],
+            settings=LoopSettings(alpha=2 * w, beta=w**2, iterations=1),
+            offset=runs.offset[r],
+        )
+        np.testing.assert_allclose(history.relative_error(P)[:, 0], runs.errors[:, r], rtol=1e-9)
+        np.testing.assert_allclose(history.tracking[:, 0], runs.history.tracking[:, r], rtol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -85,6 +103,14 @@ def test_random_runs_tell_every_failure(rng):
         ),
         ({"errors": [0.5, 0.6]}, "the error grew, from 0.5 to 0.6"),
         ({"errors": [0.5, 0.5]}, "stalled: the motion excites too little; an error of 0.5 is left"),
+        (
+            {"errors": [0.9, 0.8, 0.5, *[0.48] * 9, 0.45]},
+            "slow: an error of 0.45 is left after 12 iterations and falls by 10 % in ten",
+        ),
+        (
+            {"errors": [0.9, *[0.4] * 11]},
+            "stalled: the motion excites too little; an error of 0.4 is left",
+        ),
     ],
 )
 def test_each_kind_of_failure_has_its_reason(change, reason, rng):

@@ -23,7 +23,7 @@ from robotid.logs.read import write_log
 from robotid.pages.html import code
 from robotid.report import comparison_page
 from robotid.report.comparison import _friction_curves, compare_results, write_comparison
-from robotid.robot.drives import LoadFriction, Stribeck
+from robotid.robot.drives import Asymmetric, LoadFriction, Stribeck
 from robotid.robot.model import RobotModel
 
 
@@ -475,3 +475,25 @@ def test_friction_is_compared_up_to_the_fastest_speed_of_any_result():
     # at 3 rad/s: 7 N m and 12.5 N m; 3 N and 3.3 N
     assert first["difference"] == pytest.approx(5.5 / 12.5)
     assert second["difference"] == pytest.approx(0.3 / 3.3)
+
+
+def test_friction_differs_by_a_share_of_the_most_in_either_direction():
+    facts = RobotModel.from_urdf(
+        ROOT / "urdf" / "planar_2r.urdf", own_terms={"joint_1": (Asymmetric(),)}
+    ).options["own_terms"]
+
+    def result(asymmetric):
+        values = {"joint_1.viscous": 2.0, "joint_1.asymmetric": asymmetric}
+        return {
+            "joints": ["joint_1"],
+            "own_terms": facts,
+            "friction": {"joint_1": {"seen": {"v": [0.1, 4.0]}}},
+            "drive_parameters": [{"name": k, "value": x} for k, x in values.items()],
+            "identification": {"per_joint": {}},
+        }
+
+    (found,) = _friction_curves([result(-0.5), result(-0.8)])
+    v = np.array(found["speeds"])
+    np.testing.assert_allclose(found["torques"][1], 2.0 * v - 0.8 * np.abs(v), atol=1e-12)
+    # at 4 rad/s: 6 N m and 4.8 N m; at -4 rad/s: -10 N m and -11.2 N m
+    assert found["difference"] == pytest.approx(1.2 / 11.2)

@@ -82,3 +82,21 @@ def test_friction_and_its_chord_are_those_of_the_terms(sticky, rng):
     over = (R.T * (along / np.abs(w))) @ R
     np.testing.assert_allclose(sticky.chord(F, v, load), over, rtol=1e-6)
     np.testing.assert_allclose(sticky.armature, R.T @ np.diag([0.1, 0.05, 0.2]) @ R)
+
+
+def test_a_motor_of_two_joints_bears_the_load_that_its_gear_leaves_it(rng):
+    coupling = Coupling("motor", (("joint_1", 2.0), ("joint_2", -0.5)))
+    own = {"motor": (LoadFriction(),)}
+    model = RobotModel.from_urdf(URDF / "planar_2r.urdf", couplings=(coupling,), own_terms=own)
+    pi = model.standard_parameters()
+    for name, value in {"motor.load": 0.15, "motor.coulomb": 0.4, "motor.armature": 0.03}.items():
+        pi[model.layout.names.index(name)] = value
+    plant, R = RobotPlant(model, pi), np.array([2.0, -0.5])
+    q, v, u = rng.uniform(0.3, 1.0, (3, 2))
+    v[1] = -v[1]
+    a = plant.acceleration(q, v, u)
+    load = plant.bodies_torque(q, v, a)
+    borne = abs(R @ load) / 4.25  # the least torque w with R w nearest to the load
+    friction = R * (0.4 + 0.15 * borne) * np.sign(R @ v)
+    np.testing.assert_allclose(plant.friction_torque(plant.friction(q, v), v, load), friction)
+    np.testing.assert_allclose(load + 0.03 * R * (R @ a) + friction, u, rtol=1e-9)

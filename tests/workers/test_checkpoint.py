@@ -11,6 +11,7 @@ from helpers.piecework import marks, pieces_in, reduce_all, same_bits
 
 from robotid.exceptions import DataError
 from robotid.workers.checkpoint import FOLDER, Checkpoint, released_on_error
+from robotid.workers.plan import WorkPlan
 
 INPUTS = {"robotid": "0.1", "signals": {"cutoff": 8.0, "order": 4}, "logs": [{"size": 10}]}
 
@@ -34,6 +35,16 @@ def test_only_missing_pieces_are_reduced_and_progress_starts_where_it_stood(tmp_
     assert all(map(same_bits, found, reduce_all(pieces_in(tmp_path / "other", 6))))
     checkpoint.remove()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["marks", "other"]
+
+
+def test_a_plan_reduces_only_what_its_checkpoint_lacks(tmp_path):
+    pieces = interrupted(tmp_path)
+    checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces, resume=True)
+    found = list(WorkPlan(1).reduce(pieces, checkpoint=checkpoint))
+    assert marks(tmp_path / "marks") == dict.fromkeys(range(6), 1)
+    assert checkpoint.finished() == set(range(6))
+    assert all(map(same_bits, found, reduce_all(pieces_in(tmp_path / "other", 6))))
+    checkpoint.remove()
 
 
 @pytest.mark.parametrize(
