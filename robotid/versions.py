@@ -30,7 +30,16 @@ def code_versions() -> dict[str, str]:
 
 def versions() -> dict[str, str]:
     """Return the versions of what runs: ``code_versions`` and the platform."""
-    return code_versions() | {"platform": platform.platform()}
+    return code_versions() | {"platform": _platform()}
+
+
+def _platform() -> str:
+    """Return platform.platform(), which starts a process to ask Linux for its processor's name."""
+    system = platform.uname()
+    if system.system != "Linux":
+        return platform.platform()
+    libc = "".join(platform.libc_ver())
+    return "-".join([system.system, system.release, system.machine, "with", libc]).rstrip("-")
 
 
 @cache  # each reads all that its package says of itself

@@ -1,6 +1,7 @@
 """The command line: flags to arguments, results to text; nothing is computed here."""
 
 import argparse
+import ctypes
 import gc
 import io
 import os
@@ -22,6 +23,10 @@ from robotid.versions import __version__
 __all__ = ["COMMANDS", "main"]
 
 _OBJECTS = 50_000  # made between two collections: a command makes many, and hardly a cycle of them
+# Parameters of glibc's mallopt: what is freed goes back to the system from this size of one array
+# on, and from this size in all. To have every array's pages anew takes a tenth of a run.
+_MMAP_THRESHOLD, _LARGE = -3, 2**25  # [bytes], the largest that glibc takes
+_TRIM_THRESHOLD, _SPARE = -1, 2**26  # [bytes]
 
 #: The commands in the order of the help; each is a module: SUMMARY, add_flags and run.
 COMMANDS = (
@@ -58,6 +63,7 @@ def _run(words: Sequence[str]) -> int:
     """Run a command line, tell what stops it, and return its exit code."""
     _complete()
     options = _parser(words).parse_args(words, argparse.Namespace(words=words))
+    _keep_pages()
     try:
         with terminations_raised(), shown_log(is_verbose=getattr(options, "verbose", False)):
             code: int | None = options.run(options)
@@ -77,6 +83,16 @@ def _run(words: Sequence[str]) -> int:
         print_error(error, "interrupted")
         return 128 + error.number if isinstance(error, Terminated) else 130
     return code or 0
+
+
+def _keep_pages() -> None:
+    """Keep the memory of small arrays for the next ones, where the C library is glibc."""
+    if sys.platform != "linux":
+        return
+    set_option = getattr(ctypes.CDLL(None), "mallopt", None)
+    if set_option is not None:
+        set_option(_MMAP_THRESHOLD, _LARGE)
+        set_option(_TRIM_THRESHOLD, _SPARE)
 
 
 def _complete() -> None:

@@ -346,7 +346,7 @@ def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, int
     )
     X = np.hstack([inertial, drive, np.ones((len(inertial), 1))])
     late = np.concatenate([window.late[:, :, j] for window in windows], axis=1)[:, steady]
-    late = late - late.mean(axis=1, keepdims=True)  # (delays, N)
+    late -= late.mean(axis=1, keepdims=True)  # (delays, N)
     size = np.einsum("dk,dk->d", late, late)
     if size.min() <= 0:
         return None
@@ -355,6 +355,6 @@ def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, int
     # by QR iterations: of so many dependent columns, divide and conquer need not converge
     U, s, _ = svd(X[:, seen] / length[seen], full_matrices=False, lapack_driver="gesvd")
     Q = U[:, s > 1e-5 * s[0]]
-    rest = (late - (late @ Q) @ Q.T) ** 2 / size[:, None]
-    blocks = np.array_split(rest, _BLOCKS, axis=1)
-    return np.array([block.sum(axis=1) for block in blocks]), len(inertial)
+    late -= (late @ Q) @ Q.T
+    blocks = np.array_split(late, _BLOCKS, axis=1)
+    return np.array([np.einsum("dk,dk->d", b, b) / size for b in blocks]), len(inertial)

@@ -1,14 +1,19 @@
 """Estimators: Problem or Factors -> Estimate. No physics engine below this folder."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from robotid.estimators.batch import OLS, TLS, WLS
 from robotid.estimators.consistent.constraints import Constraints
 from robotid.estimators.consistent.fit import Consistent
-from robotid.estimators.consistent.log_cholesky import LogCholesky
 from robotid.estimators.estimator import BatchEstimator, Estimate, Estimator
-from robotid.estimators.output_error import OutputError
-from robotid.estimators.recursive.base import RecursiveEstimator, fold, load_state, save_state
-from robotid.estimators.recursive.descent import PRX, DescentState, NormalisedGradient
-from robotid.estimators.recursive.filters import RLS, Kalman, KalmanState, RLSState
+
+if TYPE_CHECKING:
+    from robotid.estimators.consistent.log_cholesky import LogCholesky
+    from robotid.estimators.output_error import OutputError
+    from robotid.estimators.recursive.base import RecursiveEstimator, fold, load_state, save_state
+    from robotid.estimators.recursive.descent import PRX, DescentState, NormalisedGradient
+    from robotid.estimators.recursive.filters import RLS, Kalman, KalmanState, RLSState
 
 __all__ = [
     "OLS",
@@ -33,3 +38,19 @@ __all__ = [
     "load_state",
     "save_state",
 ]
+
+_HOMES = {
+    "consistent.log_cholesky": ["LogCholesky"],
+    "output_error": ["OutputError"],
+    "recursive.base": ["RecursiveEstimator", "fold", "load_state", "save_state"],
+    "recursive.descent": ["PRX", "DescentState", "NormalisedGradient"],
+    "recursive.filters": ["RLS", "Kalman", "KalmanState", "RLSState"],
+}
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401
+    """Import an estimator that few jobs ask for when it is first used."""
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"robotid.estimators.{home}"), name)
+    raise AttributeError(f"module 'robotid.estimators' has no attribute {name!r}")

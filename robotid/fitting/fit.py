@@ -242,7 +242,7 @@ class _Ground:
     before: Known  # without them
     segments: tuple[Factors, ...]  # those of segments of the logs; none of a fit in between
     rough: Estimate  # weighted least squares on them
-    determination: Determination  # which base parameters they determine
+    pinned: Array  # (p,), bool: standard parameters that are known
     grown: float  # by how much a robust loss widens the covariance [-]
     noise: RegressorNoise | None = None  # what the steps of the positions do
 
@@ -250,6 +250,13 @@ class _Ground:
     def factors(self) -> Factors:
         """The factors of all fitted rows."""
         return self.whole.factors
+
+    @cached_property
+    def determination(self) -> Determination:
+        """Which base parameters the rows determine."""
+        before, factors, K = self.before, self.factors, self.recordings.mapping.K
+        rows = factors.weighted(before.sigma / np.sqrt(before.share))[:, :-1]
+        return determine(factors.names, rows, base_spread(K, before.spread, self.pinned))
 
 
 def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool) -> _Ground:
@@ -267,10 +274,8 @@ def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
     held_out = segments or (factors,)
     before = Known(model, mapping, prior, spread, share, rough.sigma, held_out)
-    known = model.layout.owned_by(choice.bounds.pinned)
-    rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
-    determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
-    return _Ground(recordings, reduction, before, segments, rough, determination, understated**2)
+    pinned = model.layout.owned_by(choice.bounds.pinned)
+    return _Ground(recordings, reduction, before, segments, rough, pinned, understated**2)
 
 
 def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Ground:

@@ -24,7 +24,7 @@ from robotid.robot.model import RobotModel
 __all__ = ["prefers_measured"]
 
 _log = logging.getLogger(__name__)
-_ROWS = 1500  # instants of a log that are compared
+_ROWS = 1000  # instants of a log that are compared, at most
 _PARTS = 8  # of the log, every other one fitted
 _BETTER = 0.85  # a ratio of the errors below this is no chance
 _EXACT = 1e-6  # share of a torque that is missed at least: of a simulated log nothing is
@@ -76,7 +76,7 @@ def _errors(model: RobotModel, log: Log, settings: SignalSettings) -> Array:
             return found.T
     masks = [row_mask(model, motion, settings.min_velocity) for motion in motions]
     sure = masks[0] & masks[1]
-    every = max(1, len(sure) // _ROWS)
+    every = -(-len(sure) // _ROWS)
     for errors, motion in zip(found, motions, strict=True):
         errors[:] = _missed(model, motion, sure, every)
     return found.T

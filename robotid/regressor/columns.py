@@ -122,7 +122,7 @@ def drive_motion(
     R = layout.drive_ratios
     n = R.shape[1]
     w = R @ v[:, v.shape[1] - n :].T
-    still = np.zeros_like(w)
+    still = np.broadcast_to(0.0, w.shape)
     share = R / np.sum(R**2, axis=1, keepdims=True).clip(min=1e-300)  # a drive's part of the load
     return DriveMotion(
         q=R @ q[:, q.shape[1] - n :].T,

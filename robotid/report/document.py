@@ -2,22 +2,24 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from robotid._files import write_text
 from robotid._settings import require_each, require_kind
-from robotid.closed_loop.result import LoopIdentification
 from robotid.export.entries import build_result
 from robotid.identification.result import Identification
 from robotid.report.advice import Origin
-from robotid.report.positions import shown_positions
-from robotid.report.shown import page_of
+from robotid.report.shown import Shown, page_of
 from robotid.report.torques import shown_torques
+
+if TYPE_CHECKING:
+    from robotid.closed_loop.result import LoopIdentification
 
 __all__ = ["write_report"]
 
 
 def write_report(
-    identification: Identification | LoopIdentification,
+    identification: "Identification | LoopIdentification",
     target: str | Path,
     *,
     files: Mapping[str, str] | None = None,
@@ -40,18 +42,26 @@ def write_report(
     Raises:
         DataError: If the folder of the target does not exist.
     """
-    kinds = (Identification, LoopIdentification)
-    require_kind(identification, kinds, "identification", "a robotid.Identification")
     require_kind(target, (str, Path), "target", "the path of a page to write")
     require_kind(files, (Mapping, type(None)), "files", "a table of file names")
     for what, name in (files or {}).items():
         require_each([what, name], str, "an entry of files", "text, and the name of a file")
     require_kind(origin, (Origin, type(None)), "origin", "an Origin")
-    found, at = identification, origin or Origin()
-    if isinstance(found, Identification):
-        shown = shown_torques(found, at)
+    at = origin or Origin()
+    if isinstance(identification, Identification):
+        shown = shown_torques(identification, at)
     else:
-        runs, robot = (found.fitted, found.validation), (found.model, found.standard)
-        shown = shown_positions(build_result(found, {"estimator": found.estimator.to_dict()}),
-                                *runs, at, robot)  # fmt: skip
+        shown = _of_loops(identification, at)
     return write_text(page_of(shown, files or {}), target)
+
+
+def _of_loops(found: "LoopIdentification", at: Origin) -> Shown:
+    """Return what is shown of an identification by simulation, which few need to import."""
+    from robotid.closed_loop.result import LoopIdentification
+    from robotid.report.positions import shown_positions
+
+    require_kind(found, LoopIdentification, "identification", "a robotid.Identification")
+    result = build_result(found, {"estimator": found.estimator.to_dict()})
+    return shown_positions(
+        result, found.fitted, found.validation, at, (found.model, found.standard)
+    )

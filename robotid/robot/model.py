@@ -4,6 +4,7 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -343,6 +344,10 @@ class RobotModel:
 
         False where the regressor is 0 for every motion.
         """
+        return self._support
+
+    @cached_property
+    def _support(self) -> Array:
         pin_model = self.pin_model
         moves = np.zeros((pin_model.nv, pin_model.njoints), dtype=bool)  # which speeds, which body
         for body in range(1, pin_model.njoints):
@@ -352,7 +357,9 @@ class RobotModel:
         inertial = np.repeat((self.velocity_map.T != 0) @ moves[:, 1:], 10, axis=1)
         drive = np.zeros((self.n_rows, len(self.layout.drive_names)), dtype=bool)
         drive[self.n_rows - len(self.joints) :] = self.layout.drive_loads != 0.0
-        return np.hstack([inertial, drive])
+        support = np.hstack([inertial, drive])
+        support.flags.writeable = False
+        return support
 
 
 def _acts_at_rest(term: DriveTerm) -> bool:
