@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -9,8 +10,9 @@ import pytest
 from helpers.fitting import identify
 from helpers.misfits import EFFECTS, log_with
 from helpers.paths import ROOT
+from helpers.robots import motion, possible_parameters
 
-from robotid.diagnosis.discrepancies import explain_residual
+from robotid.diagnosis.discrepancies import _alterations, explain_residual
 from robotid.diagnosis.misfit import find_misfits
 from robotid.diagnosis.sample import Trials, along, take_sample
 from robotid.fitting.recordings import Recordings
@@ -20,6 +22,7 @@ from robotid.identification.pipeline import with_drives
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.prediction import inverse_dynamics
 from robotid.robot.examples import example_urdf
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
@@ -229,3 +232,31 @@ def test_a_small_share_of_the_residual_is_named_if_recordings_kept_apart_show_it
     assert (first.code, first.where) == ("time_scale", "all joints")
     assert 3 < first.evidence["share_pct"] < 10
     assert first.evidence["size"] == pytest.approx(0.21, rel=0.25)
+
+
+def test_what_may_be_otherwise_changes_torques_as_differences_do(model, rng):
+    pi = possible_parameters(model, rng)  # armatures and friction, too
+    at = [motion(model, rng, count) for count in (7, 4)]
+    direction = [SimpleNamespace(direction=np.ones(11)) for _ in model.joints]
+    sample = SimpleNamespace(at=at, motions=direction)
+    n, step = len(model.joints), 1e-6
+
+    def slope(scale, shift):
+        def torques(x):
+            f = 1 + x * scale
+            changed = [replace(m, q=f * m.q + x * shift, v=f * m.v, a=f * m.a) for m in at]
+            return np.concatenate([inverse_dynamics(model, pi, m) for m in changed])
+
+        return (torques(step) - torques(-step)) / (2 * step)
+
+    own = {(x.code, x.where): x.Z[..., 0] for x in _alterations(model, pi, sample)}
+    for j, joint in enumerate(model.joints):
+        only = np.eye(n)[j]
+        for code, wanted in (
+            ("angle_scale", slope(only, 0.0)),
+            ("position_offset", slope(0.0, only)),
+            ("torque_scale", only * np.concatenate([inverse_dynamics(model, pi, m) for m in at])),
+        ):
+            np.testing.assert_allclose(own[code, joint], wanted, rtol=1e-4, atol=1e-3)
+    every = slope(np.ones(n), 0.0)
+    np.testing.assert_allclose(own["angle_scale", ""], every, rtol=1e-4, atol=1e-3)
