@@ -6,8 +6,9 @@ tried first, then the direction that was best before, then those of Frank and Wo
 point of B - A that is nearest to 0. It ends where a bound suffices, or where that point shows that
 the hulls are nearer than asked for.
 
-References: Gilbert, Johnson, Keerthi (1988), A fast procedure for computing the distance between
-complex objects in three-dimensional space.
+References:
+    Gilbert, Johnson, Keerthi (1988), A fast procedure for computing the distance between complex
+    objects in three-dimensional space.
 """
 
 import numpy as np

@@ -1,0 +1,48 @@
+"""The first fit of a loop, from which the others go on."""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from robotid.closed_loop import fit
+from robotid.closed_loop.settings import LoopSettings
+
+
+class Seen(Exception):
+    """What was fitted first, and how."""
+
+
+@dataclass
+class Simulator:
+    unknowns: tuple
+    windows: tuple
+    prior: np.ndarray
+
+
+@dataclass
+class Estimator:
+    rounds: int
+
+    def fit(self, simulator):
+        raise Seen(simulator, self.rounds)
+
+
+@pytest.mark.parametrize("kind", ["pd", "torque"])
+def test_the_first_fit_is_of_drives_alone_with_the_bodies_of_the_urdf(monkeypatch, kind):
+    unknowns = tuple(
+        SimpleNamespace(name=name, what=what)
+        for name, what in (("m", "body"), ("kp", "kp"), ("mcx", "body"), ("coulomb", "term"))
+    )
+    simulator = Simulator(unknowns, ("first", "second", "third"), np.zeros(4))
+    begun = SimpleNamespace(simulator=simulator, estimator=Estimator(rounds=9))
+    named = {"pd": "_begun_by_commands", "torque": "_begun_by_torque"}
+    monkeypatch.setattr(fit, named[kind], lambda *_: begun)
+    monkeypatch.setattr(fit, "_check_settings", lambda *_: None)
+    monkeypatch.setattr(fit, "_few", lambda windows: windows[::2])
+    with pytest.raises(Seen) as caught:
+        fit.fit_loops(None, [], LoopSettings(kind=kind), None)
+    first, rounds = caught.value.args
+    assert [unknown.name for unknown in first.unknowns] == ["kp", "coulomb"]
+    assert (first.windows, rounds) == (("first", "third"), 1)
