@@ -123,7 +123,7 @@ def error_bars(
         has_why: Whether the page says why each joint is as it is.
     """
     worst, bars = worst_errors(recordings), []
-    # the one recording that was kept apart need not be named
+    # the only validation recording need not be named
     is_alone = len(recordings) == 1 and not recordings[0].is_fitted
     alone = f" on {recordings[0].name}" if is_alone else ""
     for joint in [*worst, *(joint for joint in verdicts if joint not in worst)]:
@@ -137,7 +137,7 @@ def error_bars(
         bars.append(Bar(row, joint, error, others, of_joint, f"joint-{row}", why))
     known = {key for bar in bars for key, error in bar.others.items() if error is not None}
     marks = {key: mark for key, mark in quantity.marks.items() if key in known}
-    kind = "fitted rows, for no recording was kept apart"
+    kind = "fitted rows, for there is no validation log"
     kind = kind if recordings[0].is_fitted else "not fitted"
     return bars_html(quantity.title, f"{quantity.share}, {kind}", bars, marks, quantity.limits)
 

@@ -57,7 +57,7 @@ def shown_positions(
     Args:
         content: Content of the result.json.
         fitted: The fitted logs, with the positions simulated for them.
-        kept: The same of logs kept apart.
+        kept: The same of validation logs.
         origin: Where the result is, for commands.
         changed: The robot of the URDF and its identified standard parameters, shape (p,), SI
             units; None if the URDF is not at hand.
@@ -136,7 +136,7 @@ def _source(entry: Mapping[str, Any]) -> str:
 
 
 def _entries(content: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """Return errors by recording with its role, those kept apart first."""
+    """Return errors by recording with its role, validation first."""
     found = content["simulation"]
     return [(role, entry) for role in _ROLES for entry in found.get(role, [])]
 
@@ -191,7 +191,7 @@ def _made(content: Mapping[str, Any], names: Mapping[str, Sequence[str]]) -> str
     return (
         f"{count} of {len(content['joints'])} joints were fitted to "
         f"{listed(names['identification'])} by {content['settings']['estimator']['name']}. "
-        + (f"Kept apart for validation: {listed(kept)}." if kept else "No log was kept apart.")
+        + (f"Validation: {listed(kept)}." if kept else "There is no validation log.")
     )
 
 
@@ -324,8 +324,9 @@ def _undetermined(content: Mapping[str, Any]) -> str:
     if _is_driven(content):
         return "".join(parts)
     parts.append(
-        "<p>Positions and commands tell torques up to one factor: with gains, inertias, frictions "
-        "and masses all larger by it, the motion is the same. What was stated or is held sets it: "
+        "<p>Positions and commands determine torques up to one factor: with gains, inertias, "
+        "frictions and masses all larger by it, the motion is the same. What was stated or is held "
+        "sets it: "
         f"{escape(_held(content))}.</p>\n"
     )
     return "".join(parts)

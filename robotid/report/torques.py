@@ -139,7 +139,7 @@ def _made(found: Identification) -> str:
         f"{len(found.base)} base parameters of {len(found.model.joints)} joints were fitted to "
         f"{_names(fitted)} ({samples} samples after filtering, {rows} torque rows used) by "
         f"{found.estimator.words} ({found.estimator.name}). "
-        + (f"Kept apart for validation: {_names(kept)}. " if kept else "No log was kept apart. ")
+        + (f"Validation: {_names(kept)}. " if kept else "There is no validation log. ")
         + f"Signals: {'; or '.join(chains)}."
     )
 
@@ -197,7 +197,7 @@ def _said(found: Identification, shown: Sequence[Evaluation], left: Sequence[Eva
         "all.</p>\n"
     ]
     if not found.validation:
-        parts.append("<p>No log was kept apart: these are the fitted logs.</p>\n")
+        parts.append("<p>There is no validation log: these are the fitted logs.</p>\n")
     for evaluation in shown:
         if evaluation.recording.is_partial:
             seen, whole = len(evaluation.recording.trajectory.t), evaluation.recording.extent.smooth

@@ -186,7 +186,7 @@ def test_samples_and_rows_are_those_of_the_fitted_logs_together(report, identifi
         f"{len(identified.base)} base parameters of 6 joints were fitted to {first}, {second} "
         f"({samples} samples after filtering, {rows} torque rows used) by " in said
     )
-    assert f"Kept apart for validation: {kept.recording.name}. " in said
+    assert f"Validation: {kept.recording.name}. " in said
     counts = [identified.sources.count(source) for source in ("data", "mixed")]
     assert min(counts) > 0
     every = len(identified.sources)
@@ -289,9 +289,9 @@ def test_a_joint_worse_than_the_urdf_is_flagged(model, tmp_path):
 def test_without_a_validation_log_the_fitted_rows_are_drawn(model, tmp_path):
     found = identify(model, [make_log(model, 1, path="a.csv")])
     text = Reader(write_report(found, tmp_path / "r.html").read_text(encoding="utf-8")).text
-    assert "No log was kept apart: these are the fitted logs." in text
+    assert "There is no validation log: these are the fitted logs." in text
     assert "a.csv 0-7.99 s, fitted" in text
-    assert "fitted rows, for no recording was kept apart" in text
+    assert "fitted rows, for there is no validation log" in text
 
 
 def test_long_recordings_stay_small(model, html, tmp_path):
