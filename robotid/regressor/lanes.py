@@ -9,16 +9,22 @@ on several states at a time. Entry ``at`` of a work space is one such quantity.
 """
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
+from llvmlite.ir import FunctionType
+from numba import cfunc, njit, types
+from numba.core.cgutils import unpack_tuple
+from numba.extending import intrinsic
 
 from robotid._typing import Array
 
 __all__ = [
     "Work",
     "add",
+    "applied",
     "compiled",
     "cos_sin",
     "cross",
@@ -26,6 +32,7 @@ __all__ = [
     "factor",
     "get",
     "get3",
+    "pointed",
     "put",
     "put3",
     "scale",
@@ -35,6 +42,7 @@ __all__ = [
     "work_space",
 ]
 
+_PAIR = types.UniTuple(types.float64, 2)
 _HALF_PI = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 _ROUND = 6755399441055744.0  # 1.5 2^52: adding and subtracting it rounds to the nearest integer
 
@@ -66,11 +74,39 @@ def compiled(function: Any) -> Any:
     Args:
         function: The function.
     """
-    options: dict[str, Any] = {"nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
+    return _kept(njit, function, nogil=True)
+
+
+def pointed(function: Callable[..., Any], arguments: int) -> Any:
+    """Compile a function of numbers that returns two, for ``applied``, which takes its address.
+
+    Args:
+        function: The function.
+        arguments: How many numbers it takes.
+    """
+    return _kept(partial(cfunc, _PAIR(*[types.float64] * arguments)), function)
+
+
+def _kept(compile: Any, function: Any, **options: Any) -> Any:
+    options |= {"fastmath": {"contract"}, "error_model": "numpy"}
     try:
-        return njit(cache=True, **options)(function)
+        return compile(cache=True, **options)(function)
     except RuntimeError:  # no folder to keep the code in: it lasts as long as the process
-        return njit(**options)(function)
+        return compile(**options)(function)
+
+
+def _applied(typing, address, x):
+    """Return what the function at an address of ``pointed`` returns of a tuple of numbers."""
+
+    def code(context, builder, signature, given):
+        numbers = unpack_tuple(builder, given[1])
+        kind = FunctionType(context.get_value_type(_PAIR), [number.type for number in numbers])
+        return builder.call(builder.inttoptr(given[0], kind.as_pointer()), numbers)
+
+    return _PAIR(address, x), code
+
+
+applied: Any = intrinsic(_applied)
 
 
 @compiled

@@ -7,22 +7,53 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
+from inspect import signature
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
 from robotid._settings import is_number
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
-from robotid.robot.drive_laws import CONSTANT, DIRECTED, LINEAR, LOADED, PLAIN, law
 
-__all__ = ["ANYWHERE", "DriveMotion", "DriveTerm", "Family", "MemorylessTerm", "Seen", "Shape"]
+__all__ = [
+    "ANYWHERE",
+    "BRISTLES",
+    "DIRECTED",
+    "LOADED",
+    "PLAIN",
+    "DriveMotion",
+    "DriveTerm",
+    "Family",
+    "Law",
+    "MemorylessTerm",
+    "Seen",
+    "Shape",
+    "Slope",
+    "linear",
+]
+
+#: A law's value and its derivative.
+Slope: TypeAlias = tuple[Array | float, Array | float]
+#: A law of the speed or the position, and of up to four numbers that shape it.
+Law: TypeAlias = Callable[..., Slope]
+#: What a term is beside a(v) b(q): nothing more; times the direction of friction; times that and
+#: the size of the gear's load; or a deflection that bristles take up over a way instead.
+PLAIN, DIRECTED, LOADED, BRISTLES = range(4)
 
 #: A range without ends.
 ANYWHERE = (-np.inf, np.inf)
-_NONE = (0.0,) * 4
 _ENDS = (-1e9, 1e9)  # numbers of a term's shape
+
+
+def linear(z: Array) -> Slope:
+    """Return a law y = z and its derivative.
+
+    Args:
+        z: Speeds or positions [rad/s or m/s; rad or m].
+    """
+    return z, 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,20 +174,18 @@ class DriveTerm(ABC):
 class MemorylessTerm(DriveTerm):
     """A term of the speed and position of an instant, a(v) b(q) beside direction and load.
 
-    The laws are those of ``drive_laws``; regressor, plant and roll-outs follow from them.
+    A law returns a(v) with da/dv, or b(q) with db/dq. Its arguments are the speed or position, and
+    up to four numbers of the term by their names; it works on NumPy's arrays and, compiled by
+    Numba, on single numbers. Regressor, plant and roll-outs follow from it.
 
     Class attributes:
-        speed_law: The law a of the speed.
-        speed_shape: Fields that shape it, up to four.
-        position_law: The law b of the position.
-        position_shape: Fields that shape it, up to four.
+        speed_law: The law a of the speed, a static method; None: 1.
+        position_law: The law b of the position, likewise.
         bears_load: Whether the size of the gear's load multiplies it, as direction does.
     """
 
-    speed_law: ClassVar[int] = CONSTANT
-    speed_shape: ClassVar[tuple[str, ...]] = ()
-    position_law: ClassVar[int] = CONSTANT
-    position_shape: ClassVar[tuple[str, ...]] = ()
+    speed_law: ClassVar[Law | None] = None
+    position_law: ClassVar[Law | None] = None
     bears_load: ClassVar[bool] = False
 
     @property
@@ -167,21 +196,30 @@ class MemorylessTerm(DriveTerm):
     @property
     def affine(self) -> int | None:
         """Which of 1, the speed and its direction it multiplies by, 0, 1 or 2; None: of others."""
-        if self.position_law != CONSTANT or self.guards:
+        if self.position_law is not None or self.guards:
             return None
-        simple = {(CONSTANT, PLAIN): 0, (LINEAR, PLAIN): 1, (CONSTANT, DIRECTED): 2}
+        simple = {(None, PLAIN): 0, (linear, PLAIN): 1, (None, DIRECTED): 2}
         return simple.get((self.speed_law, self.kind))
 
     @cached_property
-    def numbers(self) -> tuple[float, ...]:
-        """Four numbers of a(v), four of b(q), the largest size of v, the range of q."""
-        a, b = (
-            (*(float(getattr(self, name)) for name in names), *_NONE)[:4]
-            for names in (self.speed_shape, self.position_shape)
-        )
+    def speed_shape(self) -> tuple[float, ...]:
+        """The numbers that shape a(v)."""
+        return self._shape(self.speed_law)
+
+    @cached_property
+    def position_shape(self) -> tuple[float, ...]:
+        """The numbers that shape b(q)."""
+        return self._shape(self.position_law)
+
+    def _shape(self, law: Law | None) -> tuple[float, ...]:
+        names = [] if law is None else list(signature(law).parameters)[1:]
+        return tuple(float(getattr(self, name)) for name in names)
+
+    @property
+    def ranges(self) -> tuple[float, float, float]:
+        """The largest size of v and the range of q beyond which it stays as it is."""
         fastest = self.seen[1] if self.guards == "v" else np.inf
-        seen = self.seen if self.guards == "q" else ANYWHERE
-        return (*a, *b, fastest, *seen)
+        return (fastest, *(self.seen if self.guards == "q" else ANYWHERE))
 
     def amplitude(self, q: Array, v: Array) -> Array:
         """Return a(v) b(q), within the range seen: the column of positive direction and load 1.
@@ -190,14 +228,14 @@ class MemorylessTerm(DriveTerm):
             q: Angles or ways [rad or m].
             v: Speeds, shape as q [rad/s or m/s].
         """
-        x = self.numbers
+        fastest, lowest, highest = self.ranges
         y: Array | float = 1.0
-        if self.speed_law != CONSTANT:
-            w = np.clip(v, -x[8], x[8]) if self.guards == "v" else v  # of either sign
-            y = law(self.speed_law, x[0], x[1], x[2], x[3], w)[0]
-        if self.position_law != CONSTANT:
-            p = np.clip(q, x[9], x[10]) if self.guards == "q" else q
-            y = y * law(self.position_law, x[4], x[5], x[6], x[7], p)[0]
+        if self.speed_law is not None:
+            w = np.clip(v, -fastest, fastest) if self.guards == "v" else v  # of either sign
+            y = self.speed_law(w, *self.speed_shape)[0]
+        if self.position_law is not None:
+            p = np.clip(q, lowest, highest) if self.guards == "q" else q
+            y = y * self.position_law(p, *self.position_shape)[0]
         return y if isinstance(y, np.ndarray) else np.full_like(v, y)
 
     def column(self, motion: DriveMotion) -> Array:

@@ -1,15 +1,15 @@
 """The terms of a drive's torque: one class each, and the rest of the package loops over them.
 
-A term adds ``parameter * column`` to the torque of a drive. To add one, write its class with the
-laws of ``drive_laws`` that it is made of, and enter it in ``TERMS`` if it has no shape of its own,
-else in ``_CLASSES`` and ``FAMILIES``: its regressor, prior spread, plant, roll-outs with their
-sensitivities, choice, sidecar, tables, exports and job key follow.
+A term adds ``parameter * column`` to the torque of a drive. To add one, write its class with its
+laws, and enter it in ``TERMS`` if it has no shape of its own, else in ``TERM_CLASSES`` and
+``FAMILIES``: its regressor, prior spread, plant, roll-outs with their sensitivities, choice,
+sidecar, tables, curves, exports and job key follow.
 
 The columns of many terms are guarded: beyond the speeds or positions that the fit has seen they
 stay as they were at the end of that range, for no data say how they go on.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar
@@ -17,7 +17,6 @@ from typing import ClassVar
 import numpy as np
 
 from robotid._typing import Array
-from robotid.robot import drive_laws as laws
 from robotid.robot.drive_term import (
     DriveMotion,
     DriveTerm,
@@ -25,6 +24,8 @@ from robotid.robot.drive_term import (
     MemorylessTerm,
     Seen,
     Shape,
+    Slope,
+    linear,
 )
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "Seen",
 ]
 
+_LEAST = 1e-12  # [rad/s or m/s]: below it the slope of a power is that at it
 _POSITIVE = (1e-9, 1e9)  # numbers of a term's shape that it is divided by
 
 
@@ -73,7 +75,7 @@ class Viscous(MemorylessTerm):
     """Viscous friction, tau = Fv w."""
 
     label = "viscous"
-    speed_law = laws.LINEAR
+    speed_law = staticmethod(linear)
     units = ("N m s/rad", "N s/m")
     is_nonnegative = True
     usual = (0.5, 4.0)
@@ -107,8 +109,11 @@ class Asymmetric(MemorylessTerm):
     """Viscous friction that differs by direction, tau = x |w|; of Coulomb's, see ``Offset``."""
 
     label = "asymmetric"
-    speed_law = laws.SIZE
     units = ("N m s/rad", "N s/m")
+
+    @staticmethod
+    def speed_law(w: Array) -> Slope:
+        return np.abs(w), np.sign(w)
 
 
 @dataclass(frozen=True)
@@ -135,9 +140,12 @@ class Cubic(MemorylessTerm):
     """Friction that bends with speed, tau = x w^3."""
 
     label = "cubic"
-    speed_law = laws.CUBIC
     units = ("N m s^3/rad^3", "N s^3/m^3")
     guards = "v"
+
+    @staticmethod
+    def speed_law(w: Array) -> Slope:
+        return w * w * w, 3.0 * w * w
 
 
 @dataclass(frozen=True)
@@ -154,8 +162,6 @@ class Stribeck(MemorylessTerm):
     speed: float = 0.1
 
     label = "stribeck"
-    speed_law = laws.FADING
-    speed_shape = ("speed", "slowest")
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"speed": _POSITIVE}
     follows_direction = True
     guards = "v"
@@ -165,6 +171,12 @@ class Stribeck(MemorylessTerm):
         """The speed below which no data show how it goes on to 0."""
         return self.seen[0]
 
+    @staticmethod
+    def speed_law(w: Array, speed: float, slowest: float) -> Slope:
+        size = np.maximum(np.abs(w), slowest)
+        y = np.exp(-size / speed)
+        return y, -np.sign(w) * (size > slowest) * y / speed
+
 
 @dataclass(frozen=True)
 class Tanh(MemorylessTerm):
@@ -173,11 +185,14 @@ class Tanh(MemorylessTerm):
     speed: float = 0.1
 
     label = "tanh"
-    speed_law = laws.TANH
-    speed_shape = ("speed",)
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"speed": _POSITIVE}
     is_nonnegative = True
     guards = "v"
+
+    @staticmethod
+    def speed_law(w: Array, speed: float) -> Slope:
+        y = np.tanh(w / speed)
+        return y, (1.0 - y * y) / speed
 
 
 @dataclass(frozen=True)
@@ -187,12 +202,15 @@ class Power(MemorylessTerm):
     exponent: float = 1.0 / 3.0
 
     label = "power"
-    speed_law = laws.POWER
-    speed_shape = ("exponent",)
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"exponent": (0.0, 10.0)}
     units = ("N m (s/rad)^p", "N (s/m)^p")
     follows_direction = True
     guards = "v"
+
+    @staticmethod
+    def speed_law(w: Array, exponent: float) -> Slope:
+        y = np.abs(w) ** exponent
+        return y, np.sign(w) * exponent * y / np.maximum(np.abs(w), _LEAST)
 
 
 @dataclass(frozen=True)
@@ -203,8 +221,6 @@ class Ramp(MemorylessTerm):
     low: float = 0.0
     high: float = 1.0
 
-    speed_law = laws.RISE
-    speed_shape = ("low", "high")
     rising: ClassVar[tuple[str, ...]] = ("low", "high")
     is_nonnegative = True
     follows_direction = True
@@ -212,6 +228,11 @@ class Ramp(MemorylessTerm):
     @property
     def name(self) -> str:
         return f"rise{self.number}"
+
+    @staticmethod
+    def speed_law(w: Array, low: float, high: float) -> Slope:
+        y = np.minimum(np.maximum((np.abs(w) - low) / (high - low), 0.0), 1.0)
+        return y, np.sign(w) * (y > 0.0) * (y < 1.0) / (high - low)
 
 
 @dataclass(frozen=True)
@@ -224,7 +245,6 @@ class Harmonic(MemorylessTerm):
     order: float = 1.0
     is_sine: bool = False
 
-    position_shape = ("order",)
     is_shared = False
     guards = "q"
     part = "ripple"
@@ -233,10 +253,10 @@ class Harmonic(MemorylessTerm):
     def name(self) -> str:
         return f"{'sin' if self.is_sine else 'cos'}{self.order:g}"
 
-    @property
-    def position_law(self) -> int:  # type: ignore[override]
-        """Sine or cosine."""
-        return laws.SINE if self.is_sine else laws.COSINE
+    @staticmethod
+    def position_law(q: Array, order: float, is_sine: float) -> Slope:
+        c, s = np.cos(order * q), np.sin(order * q)
+        return (s, order * c) if is_sine else (c, -order * s)
 
 
 @dataclass(frozen=True)
@@ -246,8 +266,6 @@ class PositionCoulomb(MemorylessTerm):
     order: int = 1
     centre: float = 0.0
 
-    position_law = laws.POLYNOMIAL
-    position_shape = ("order", "centre")
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"order": (0, 10)}
     follows_direction = True
     is_shared = False
@@ -256,6 +274,11 @@ class PositionCoulomb(MemorylessTerm):
     @property
     def name(self) -> str:
         return f"coulomb_q{self.order}"
+
+    @staticmethod
+    def position_law(q: Array, order: float, centre: float) -> Slope:
+        lower = (q - centre) ** max(order - 1.0, 0.0)
+        return lower * (q - centre) if order > 0.0 else lower, order * lower
 
 
 @dataclass(frozen=True)
@@ -269,9 +292,28 @@ class Bristles(DriveTerm):
     follows_direction = True
     remembers = True
 
+    @staticmethod
+    def law(x: Sequence[float], way: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Return what a way leaves of the deflection z.
+
+        Over a way in one direction, at one speed, z becomes sign(v) g + (z - sign(v) g) kept;
+        g(v) = 1 + c exp(-(v / w)^2) is that of long sliding.
+
+        Args:
+            x: s_0, w and c [rad or m; rad/s or m/s; -].
+            way: How far the drive goes [rad or m].
+            v: Its speed meanwhile [rad/s or m/s].
+
+        Returns:
+            g, dg/dv, kept = exp(-|way| / (s_0 g)).
+        """
+        extra = x[2] * np.exp(-((v / x[1]) ** 2))
+        g = 1.0 + extra
+        return g, -2.0 * v / (x[1] * x[1]) * extra, np.exp(-np.abs(way) / (x[0] * g))
+
     @property
     def numbers(self) -> tuple[float, float, float]:
-        """Way, speed and excess of ``drive_laws.bristles``."""
+        """s_0, w and c of ``law``."""
         return self.displacement, 1.0, 0.0
 
     def level(self, v: Array) -> Array:
@@ -280,7 +322,7 @@ class Bristles(DriveTerm):
         Args:
             v: Speeds [rad/s or m/s].
         """
-        return laws.bristles(self.numbers, np.zeros_like(v), v)[0]
+        return self.law(self.numbers, np.zeros_like(v), v)[0]
 
     def column(self, motion: DriveMotion) -> Array:
         """Return z along stretches, from sliding where they begin.
@@ -296,7 +338,7 @@ class Bristles(DriveTerm):
         from scipy.linalg.lapack import dtbtrs
 
         way = np.diff(motion.q, prepend=motion.q[:1])
-        level, _, kept = laws.bristles(self.numbers, way, motion.v)
+        level, _, kept = self.law(self.numbers, way, motion.v)
         # z_k = kept_k z_k-1 + (1 - kept_k) sign(way_k) g_k: a triangle of two diagonals
         kept = np.where(motion.begins, 0.0, kept)
         ends = np.where(motion.begins, motion.direction, np.sign(way)) * level
@@ -337,7 +379,7 @@ class LuGre(Bristles):
 
     @property
     def numbers(self) -> tuple[float, float, float]:
-        """Way, speed and excess of ``drive_laws.bristles``."""
+        """s_0, w and c of ``law``."""
         return self.displacement, self.speed, self.excess
 
 
@@ -346,7 +388,7 @@ class Spring(MemorylessTerm):
     """A linear spring, tau = k q; the torque at q = 0 is the offset's."""
 
     label = "spring"
-    position_law = laws.LINEAR
+    position_law = staticmethod(linear)
     units = ("N m/rad", "N/m")
     is_shared = False
     is_friction = True
@@ -363,8 +405,6 @@ class Hat(MemorylessTerm):
     before: float = -1.0
     after: float = 1.0
 
-    position_law = laws.HAT
-    position_shape = ("before", "at", "after")
     rising: ClassVar[tuple[str, ...]] = ("before", "at", "after")
     is_shared = False
     guards = "q"
@@ -373,6 +413,12 @@ class Hat(MemorylessTerm):
     @property
     def name(self) -> str:
         return f"spring{self.number}"
+
+    @staticmethod
+    def position_law(q: Array, before: float, at: float, after: float) -> Slope:
+        y = np.maximum(np.minimum((q - before) / (at - before), (after - q) / (after - at)), 0.0)
+        rises, falls = (q > before) & (q <= at), (q > at) & (q < after)
+        return y, rises / (at - before) - falls / (after - at)
 
 
 @dataclass(frozen=True)
@@ -389,14 +435,21 @@ class Counterbalance(MemorylessTerm):
     rest: float = 0.0
 
     label = "counterbalance"
-    position_law = laws.LEVER
-    position_shape = ("arm", "base", "angle", "rest")
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"arm": _POSITIVE, "base": _POSITIVE}
     units = ("N/m", "N/m")
     is_nonnegative = True
     is_shared = False
     usual = (50.0, 90.0)
     part = "spring"
+
+    @staticmethod
+    def position_law(q: Array, arm: float, base: float, angle: float, rest: float) -> Slope:
+        c, s = arm * base * np.cos(q - angle), arm * base * np.sin(q - angle)
+        length = np.sqrt(arm * arm + base * base - 2.0 * c)
+        slope = s / length
+        return (length - rest) * slope, (
+            slope * slope + (length - rest) * (c - slope * slope) / length
+        )
 
 
 @dataclass(frozen=True)

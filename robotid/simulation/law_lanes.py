@@ -1,20 +1,67 @@
 """Laws of drives for roll-outs, with their derivatives, in Numba: friction, and position control.
 
-Imported only where a loop is rolled out. ``drive_laws`` states the laws.
+Imported only where a loop is rolled out. The laws are those of the terms of ``drives``, compiled
+one by one: what is compiled here calls a law by its address.
 """
 
 import math
+from functools import cache
 
-from robotid.regressor.lanes import compiled
-from robotid.robot import drive_laws
-from robotid.robot.drive_laws import CONSTANT, PLAIN
+from robotid.exceptions import SettingsError
+from robotid.regressor.lanes import applied, compiled, pointed
+from robotid.robot.drive_term import BRISTLES, PLAIN, DriveTerm, Law, MemorylessTerm
+from robotid.robot.drives import Bristles
 
-__all__ = ["loop_torque", "slid", "taken_up", "term", "turned"]
+__all__ = ["coded_term", "loop_torque", "slid", "taken_up", "term", "turned"]
 
 _SIGN = 1e-5  # [rad/s or m/s]: the speed over which friction turns
 
-_law = compiled(drive_laws.law)
-_bristles = compiled(drive_laws.bristles)
+_bristles = compiled(Bristles.law)
+_pointed = cache(pointed)
+
+
+def coded_term(term: DriveTerm) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Return what ``term`` and ``taken_up`` take of a term: its codes, five, and numbers, eleven.
+
+    Codes are the addresses of its laws of speed and position, 0 of none, its kind, and how many
+    numbers shape the one and the other. Numbers are four of each, and the ranges.
+
+    Args:
+        term: The term.
+
+    Raises:
+        SettingsError: If roll-outs have no such term.
+    """
+    if isinstance(term, Bristles):
+        return (0, 0, BRISTLES, 0, 0), (*term.numbers, *[0.0] * 8)
+    if isinstance(term, MemorylessTerm):
+        a, b = term.speed_shape, term.position_shape
+        laws = _address(term.speed_law, len(a)), _address(term.position_law, len(b))
+        shapes = *a, *[0.0] * (4 - len(a)), *b, *[0.0] * (4 - len(b))
+        return (*laws, term.kind, len(a), len(b)), (*shapes, *term.ranges)
+    raise SettingsError(
+        f"the term {type(term).__name__} has no place in roll-outs: it delays the measured torque, "
+        "and in a roll-out the commands are late; leave it out, and set delay in [controller] or "
+        "have it identified"
+    )
+
+
+def _address(law: Law | None, shapes: int) -> int:
+    return 0 if law is None else int(_pointed(law, 1 + shapes).address)
+
+
+@compiled
+def _law(address, shapes, z, x0, x1, x2, x3):
+    """Return a law of a speed or position and of as many numbers as shape it, and its slope."""
+    if shapes == 0:
+        return applied(address, (z,))
+    if shapes == 1:
+        return applied(address, (z, x0))
+    if shapes == 2:
+        return applied(address, (z, x0, x1))
+    if shapes == 3:
+        return applied(address, (z, x0, x1, x2))
+    return applied(address, (z, x0, x1, x2, x3))
 
 
 @compiled
@@ -25,13 +72,13 @@ def term(codes, shapes, k, q, u, s, s_u):
     """
     by_speed, by_position, kind = codes[k, 0], codes[k, 1], codes[k, 2]
     x, a, a_u, b, b_q = shapes[k], 1.0, 0.0, 1.0, 0.0
-    if by_speed != CONSTANT:
+    if by_speed:
         w = min(max(u, -x[8]), x[8])  # beyond what was seen it stays as it is
-        a, a_u = _law(by_speed, x[0], x[1], x[2], x[3], w)
+        a, a_u = _law(by_speed, codes[k, 3], w, x[0], x[1], x[2], x[3])
         a_u = a_u if w == u else 0.0
-    if by_position != CONSTANT:
+    if by_position:
         p = min(max(q, x[9]), x[10])
-        b, b_q = _law(by_position, x[4], x[5], x[6], x[7], p)
+        b, b_q = _law(by_position, codes[k, 4], p, x[4], x[5], x[6], x[7])
         b_q = b_q if p == q else 0.0
     if kind == PLAIN:
         return a * b, a_u * b, a * b_q

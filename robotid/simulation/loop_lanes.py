@@ -38,8 +38,8 @@ from robotid.regressor.tree_lanes import (
     mass_matrix,
     place,
 )
-from robotid.robot.drive_laws import BRISTLES, LOADED
-from robotid.simulation.law_lanes import loop_torque, slid, taken_up, term, turned
+from robotid.robot.drive_term import BRISTLES, LOADED
+from robotid.simulation.law_lanes import coded_term, loop_torque, slid, taken_up, term, turned
 
 __all__ = [
     "ARMATURE",
@@ -53,6 +53,7 @@ __all__ = [
     "START",
     "TERM",
     "ZERO",
+    "coded_term",
     "roll_out",
     "work_of",
 ]
@@ -72,7 +73,7 @@ class Terms(NamedTuple):
     """Friction and offset of the joints: T terms, joint by joint.
 
     Attributes:
-        codes: Law of speed, law of position and kind of each, shape (T, 3), int.
+        codes: Those of ``coded_term``, shape (T, 5), int; the kind of a term is the third.
         shapes: Numbers of its laws, or those of bristles and its number among them, shape (T, 11).
         values: Its parameter, shape (T,).
         spans: Where the terms of a joint begin, where those do that are bristles or are in the

@@ -21,7 +21,7 @@ from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.findings import listed
 from robotid.logs.data import Log
 from robotid.regressor.compiled import Tree, flatten, why_not
-from robotid.robot.drive_laws import BRISTLES, CONSTANT
+from robotid.robot.drive_term import BRISTLES
 from robotid.robot.drives import Bristles, DriveTerm, MemorylessTerm
 from robotid.robot.mass_matrix import rigid_mass_matrices
 from robotid.robot.model import RobotModel
@@ -35,7 +35,6 @@ __all__ = [
     "Loops",
     "RollOut",
     "Window",
-    "coded_term",
     "cut_windows",
     "open_loops",
 ]
@@ -348,8 +347,8 @@ class LoopedRobot:
         is_term = columns[:, 0] == lanes.TERM
         columns[is_term, 2] = [np.flatnonzero(places == k)[0] for k in columns[is_term, 2]]
         every_term = [term for terms in loops.terms for term in terms]
-        coded = [coded_term(every_term[k]) for k in places]
-        codes = np.array([code for code, _ in coded], dtype=np.int64).reshape(-1, 3)
+        coded = [lanes.coded_term(every_term[k]) for k in places]
+        codes = np.array([code for code, _ in coded], dtype=np.int64).reshape(-1, 5)
         shapes = np.array([numbers for _, numbers in coded]).reshape(-1, 11)
         remembers = codes[:, 2] == BRISTLES
         shapes[remembers, 3] = np.arange(remembers.sum())
@@ -515,26 +514,6 @@ def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
         places += [*others, *rest]
         spans[-1].append(len(places))
     return np.array(places, dtype=int), np.array(spans, dtype=np.int64), affine
-
-
-def coded_term(term: DriveTerm) -> tuple[tuple[int, int, int], tuple[float, ...]]:
-    """Return a term's law of speed, law of position and kind, and its numbers, eleven.
-
-    Args:
-        term: The term.
-
-    Raises:
-        SettingsError: If roll-outs have no such term.
-    """
-    if isinstance(term, Bristles):
-        return (CONSTANT, CONSTANT, BRISTLES), (*term.numbers, *[0.0] * 8)
-    if isinstance(term, MemorylessTerm):
-        return (term.speed_law, term.position_law, term.kind), term.numbers
-    raise SettingsError(
-        f"the term {type(term).__name__} has no place in roll-outs: it delays the measured torque, "
-        "and in a roll-out the commands are late; leave it out, and set delay in [controller] or "
-        "have it identified"
-    )
 
 
 def _lanes() -> ModuleType:

@@ -3,32 +3,33 @@
 import numpy as np
 import pytest
 
-from robotid.robot import drive_laws as laws
-from robotid.robot.drive_laws import bristles, law
+from robotid.robot.drive_term import linear
+from robotid.robot.drives import TERM_CLASSES, Bristles
 
 #: Law, what shapes it, its equation, and its kinks, between which it has a derivative.
 LAWS = {
-    "constant": (laws.CONSTANT, (), lambda z: 1.0 + 0 * z, ()),
-    "linear": (laws.LINEAR, (), lambda z: z, ()),
-    "size": (laws.SIZE, (), lambda z: np.sqrt(z * z), (0.0,)),
-    "cubic": (laws.CUBIC, (), lambda z: z**3, ()),
-    "tanh": (laws.TANH, (0.3,), lambda z: 1 - 2 / (np.exp(2 * z / 0.3) + 1), ()),
-    "fading": (
-        laws.FADING, (0.4, 0.5), lambda z: np.exp(-np.clip(abs(z), 0.5, 9.0) / 0.4),
+    "linear": (linear, (), lambda z: z, ()),
+    "asymmetric": ("Asymmetric", (), lambda z: np.sqrt(z * z), (0.0,)),
+    "cubic": ("Cubic", (), lambda z: z**3, ()),
+    "tanh": ("Tanh", (0.3,), lambda z: 1 - 2 / (np.exp(2 * z / 0.3) + 1), ()),
+    "stribeck": (
+        "Stribeck", (0.4, 0.5), lambda z: np.exp(-np.clip(abs(z), 0.5, 9.0) / 0.4),
         (-0.5, 0.0, 0.5),
     ),
-    "power": (laws.POWER, (1.7,), lambda z: np.exp(1.7 * np.log(abs(z) + 1e-300)), (0.0,)),
+    "power": ("Power", (1.7,), lambda z: np.exp(1.7 * np.log(abs(z) + 1e-300)), (0.0,)),
     "rise": (
-        laws.RISE, (0.2, 0.9), lambda z: np.interp(abs(z), [0.2, 0.9], [0, 1]),
+        "Ramp", (0.2, 0.9), lambda z: np.interp(abs(z), [0.2, 0.9], [0, 1]),
         (-0.9, -0.2, 0.0, 0.2, 0.9),
     ),
-    "order 0": (laws.POLYNOMIAL, (0.0, 0.3), lambda z: 1.0 + 0 * z, ()),
-    "order 1": (laws.POLYNOMIAL, (1.0, 0.3), lambda z: z - 0.3, ()),
-    "order 3": (laws.POLYNOMIAL, (3.0, 0.3), lambda z: z**3 - 0.9 * z**2 + 0.27 * z - 0.027, ()),
-    "cosine": (laws.COSINE, (2.5,), lambda z: np.sin(np.pi / 2 - 2.5 * z), ()),
-    "sine": (laws.SINE, (2.5,), lambda z: np.cos(np.pi / 2 - 2.5 * z), ()),
+    "order 0": ("PositionCoulomb", (0.0, 0.3), lambda z: 1.0 + 0 * z, ()),
+    "order 1": ("PositionCoulomb", (1.0, 0.3), lambda z: z - 0.3, ()),
+    "order 3": (
+        "PositionCoulomb", (3.0, 0.3), lambda z: z**3 - 0.9 * z**2 + 0.27 * z - 0.027, ()
+    ),
+    "cosine": ("Harmonic", (2.5, 0.0), lambda z: np.sin(np.pi / 2 - 2.5 * z), ()),
+    "sine": ("Harmonic", (2.5, 1.0), lambda z: np.cos(np.pi / 2 - 2.5 * z), ()),
     "hat": (
-        laws.HAT, (-0.7, 0.1, 1.1), lambda z: np.interp(z, [-0.7, 0.1, 1.1], [0, 1, 0]),
+        "Hat", (-0.7, 0.1, 1.1), lambda z: np.interp(z, [-0.7, 0.1, 1.1], [0, 1, 0]),
         (-0.7, 0.1, 1.1),
     ),
 }  # fmt: skip
@@ -37,16 +38,17 @@ H = 1e-6
 
 @pytest.mark.parametrize("name", LAWS)
 def test_a_law_is_its_equation_and_its_derivative_that_of_differences(name):
-    code, shape, equation, kinks = LAWS[name]
-    x = (*shape, 0.0, 0.0, 0.0, 0.0)[:4]
+    own, x, equation, kinks = LAWS[name]
+    kind = TERM_CLASSES.get(own)
+    law = own if kind is None else kind.speed_law or kind.position_law
     z = np.linspace(-1.93, 1.87, 77)
     z = z[np.all([abs(z - k) > 1e-3 for k in kinks], axis=0)] if kinks else z
-    y, slope = law(code, *x, z)
+    y, slope = law(z, *x)
     np.testing.assert_allclose(y + 0 * z, equation(z), atol=1e-12)
     exact = (equation(z + H) - equation(z - H)) / (2 * H)
     np.testing.assert_allclose(slope + 0 * z, exact, atol=1e-8)
     for one in (-1.3, 0.61):  # of single numbers, as it is compiled
-        np.testing.assert_allclose(law(code, *x, one)[0], equation(np.array(one)), atol=1e-12)
+        np.testing.assert_allclose(law(one, *x)[0], equation(np.array(one)), atol=1e-12)
 
 
 def test_a_lever_is_the_derivative_of_its_springs_energy():
@@ -57,7 +59,7 @@ def test_a_lever_is_the_derivative_of_its_springs_energy():
         ends = [0.5 * np.cos(z - 0.2) - 1.2, 0.5 * np.sin(z - 0.2)]
         return 0.5 * (np.hypot(*ends) - 0.3) ** 2
 
-    y, slope = law(laws.LEVER, 0.5, 1.2, 0.2, 0.3, z)
+    y, slope = TERM_CLASSES["Counterbalance"].position_law(z, 0.5, 1.2, 0.2, 0.3)
     h = 1e-4
     np.testing.assert_allclose(y, (energy(z + h) - energy(z - h)) / (2 * h), atol=1e-8)
     np.testing.assert_allclose(
@@ -69,7 +71,7 @@ def test_bristles_keep_what_the_solution_of_their_equation_keeps():
     s_0, w, c = 0.03, 0.4, 0.6
     v = np.array([0.0, 0.1, -0.3, 1.2, -2.0])
     way = np.array([0.0, 0.02, -0.05, 0.004, 0.1])
-    g, slope, kept = bristles((s_0, w, c), way, v)
+    g, slope, kept = Bristles.law((s_0, w, c), way, v)
 
     def level(v):
         return 1.0 + c * np.exp(-(v**2) / w**2)

@@ -5,8 +5,7 @@ import pytest
 from helpers.paths import URDF
 
 from robotid.regressor.torque import joint_torque_regressor
-from robotid.robot.drive_laws import LOADED
-from robotid.robot.drive_term import DriveTerm
+from robotid.robot.drive_term import LOADED, DriveTerm
 from robotid.robot.drives import (
     TERMS,
     Armature,
@@ -29,8 +28,7 @@ from robotid.robot.drives import (
     Tanh,
 )
 from robotid.robot.model import RobotModel
-from robotid.simulation.law_lanes import slid, taken_up, term, turned
-from robotid.simulation.loops import coded_term
+from robotid.simulation.law_lanes import coded_term, slid, taken_up, term, turned
 from robotid.simulation.plant import RobotPlant
 
 OWN = (

@@ -1,0 +1,121 @@
+"""A drive term that the package does not have is a class with its law, and its entries."""
+
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.driven import driven, driven_log, fitted_in
+from helpers.paths import URDF
+
+from robotid.export.mjcf import write_mjcf
+from robotid.identification.pictures import friction_chart
+from robotid.logs.data import Log
+from robotid.regressor.friction_projection import drive_moments, project_friction
+from robotid.robot.drive_term import Family, MemorylessTerm, Shape
+from robotid.robot.drives import FAMILIES, TERM_CLASSES
+from robotid.robot.families import term_from_dict
+from robotid.robot.model import RobotModel
+from robotid.simulation.loops import LoopedRobot, cut_windows, open_loops
+from robotid.simulation.plant import RobotPlant, rk4
+
+JOINT = "joint_1"
+TRUE, SIZE, SPEED = f"{JOINT}.bend", 1.4, 0.25
+
+
+@dataclass(frozen=True)
+class Bend(MemorylessTerm):
+    """Friction that sets in over a speed, tau = x atan(w / w_b)."""
+
+    speed: float = 0.1
+
+    label = "bend"
+    guards = "v"
+    usual = (0.3, 0.6)
+
+    @staticmethod
+    def speed_law(w, speed):
+        z = w / speed
+        return np.arctan(z), 1.0 / (speed * (1.0 + z * z))
+
+
+@pytest.fixture
+def bend(monkeypatch):
+    """The term with its family in the catalogue, a robot that has it, and its parameters."""
+    family = Family(
+        "bend", "friction that bends", lambda seen, speed: (Bend(seen=seen["v"], speed=speed),),
+        (Shape("speed", ("rad/s", "m/s"), (0.01, 0.5), "v"),), is_automatic=True,
+    )  # fmt: skip
+    monkeypatch.setitem(TERM_CLASSES, "Bend", Bend)
+    monkeypatch.setitem(FAMILIES, "bend", family)
+    plain = RobotModel.from_urdf(URDF / "planar_2r.urdf")
+    term = Bend(seen=(0.0, 30.0), speed=SPEED)
+    true, pi = driven(plain, {JOINT: (term,)}, {TRUE: SIZE})
+    return SimpleNamespace(plain=plain, true=true, pi=pi, term=term)
+
+
+def law(v):
+    """Return the friction of the joint beside viscous and Coulomb's."""
+    return SIZE * np.arctan(v / SPEED)
+
+
+def test_a_new_term_is_identified_drawn_and_exported(bend, tmp_path):
+    log = driven_log(bend.true, bend.pi, 3, duration=20.0, noise=0.001)
+    found = fitted_in(bend.plain, [log], friction={JOINT: "bend", "*": "none"})
+    (choice,) = found.drives
+    ((shape,), (own,)) = choice.shapes, found.model.layout.own[JOINT]
+    assert abs(shape.value - SPEED) < 3 * shape.std_error < 0.1 * SPEED
+    assert term_from_dict(own.to_dict()) == own
+    values = dict(zip(found.model.layout.names, found.standard, strict=True))
+    assert values[TRUE] == pytest.approx(SIZE, rel=0.1)
+
+    chart = friction_chart(found, JOINT)
+    steady, v = chart.series[2].y, chart.x
+    truth = dict(zip(bend.true.layout.names, bend.pi, strict=True))
+    viscous, coulomb, offset = (truth[f"{JOINT}.{x}"] for x in ("viscous", "coulomb", "offset"))
+    wanted = law(v) + viscous * v + coulomb * np.sign(v) + offset
+    drawn = np.isfinite(steady)  # the line breaks where friction reverses
+    np.testing.assert_allclose(steady[drawn], wanted[drawn], atol=0.05)
+    assert drawn.sum() > 100
+
+    rows = [(e.recording.trajectory, e.recording.mask) for e in found.fitted]
+    moments = drive_moments(found.model, rows)
+    simple = project_friction(found.model, found.standard, moments, ("viscous", "coulomb"))
+    (drive,) = simple.drives
+    assert drive.replaced == ("bend",)
+    write_mjcf(simple.model, simple.pi, tmp_path / "robot.xml")
+    (joint,) = (x for x in ET.parse(tmp_path / "robot.xml").iter("joint") if x.get("name") == JOINT)
+    assert float(joint.get("damping")) == pytest.approx(drive.values["viscous"])
+
+
+def test_a_new_term_is_rolled_out_with_its_sensitivity(bend):
+    t, n = np.arange(60) / 200.0, 2
+    tau = np.tile([6.0, -2.0], (60, 1)) * np.sin(9.0 * t)[:, None]
+    log = Log(t, np.zeros((60, n)), 0 * tau, bend.true.joints, tau_ref=tau, has_torque=False)
+    pi = bend.pi.copy()
+    pi[[k for k, name in enumerate(bend.true.layout.names) if name.endswith("coulomb")]] = 0.0
+
+    def moved(size):
+        x = np.where(pi == SIZE, size, pi)
+        loops = open_loops(bend.true, x)
+        place = loops.place(0, bend.term)
+        robot = LoopedRobot(bend.true, step=1e-3)
+        kind = robot.kinds["term"]
+        (out,) = robot.roll_out(loops, cut_windows(log, np.inf, 0.0), [(kind, 0, place)])
+        return out.q, out.slopes[0][2][:, :, 0]
+
+    q, slope = moved(SIZE)
+    plant = RobotPlant(bend.true, pi)
+
+    exact = [np.zeros((2, n))]
+    for u in tau[:-1]:
+        state = exact[-1]
+        for _ in range(2):
+            state = rk4(lambda q, v, _, u=u: plant.acceleration(q, v, u), *state, 2.5e-3)
+        exact.append(state)
+    exact = np.array(exact)[:, 0]
+    np.testing.assert_allclose(q, exact, atol=1e-3 * np.ptp(exact))
+    h = 1e-4
+    np.testing.assert_allclose(slope, (moved(SIZE + h)[0] - moved(SIZE - h)[0]) / (2 * h),
+                               atol=1e-6 * np.abs(slope).max())  # fmt: skip
