@@ -29,6 +29,7 @@ from robotid.fitting.evaluation import (
 )
 from robotid.fitting.metrics import Metrics
 from robotid.fitting.survey import SurveyedLog
+from robotid.judgement.evidence import Determined, Predictions
 from robotid.judgement.positions import judge_positions
 from robotid.judgement.verdict import Doubt, Verdict, alarming, doubts_of, judge
 from robotid.logs.data import Log
@@ -145,19 +146,25 @@ def _verdict(
     ]
     alarms = alarming(found, job.ignore, is_robust=job.estimator.is_robust)
     stated = result["verdict"]
-    return judge(
+    predictions = Predictions(
         Metrics({}, 0.0),
         {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)},
-        undetermined=result["structure"]["undetermined"],
-        is_poorly_excited=result["structure"].get("poorly_excited", True),
-        is_consistent=result["consistency"]["is_consistent"],
-        joints=model.joints,
+        model.joints,
+        refitted=[e.recording.name for e in compress(evaluations, again)],
+        hidden=hidden_joints(model, evaluations),
+    )
+    determined = Determined(
+        result["structure"]["undetermined"],
+        result["consistency"]["is_consistent"],
+        result["structure"].get("poorly_excited", True),
+        model.is_static,
+    )
+    return judge(
+        predictions,
+        determined,
         alarms=list(dict.fromkeys([*stated.get("alarms", ()), *(f.message for f in alarms)])),
         doubts=list(dict.fromkeys(_doubts(job, model, stated, found, names, missing))),
-        refitted=[e.recording.name for e in compress(evaluations, again)],
         witness=stated_witness(result),
-        is_static=model.is_static,
-        hidden=hidden_joints(model, evaluations),
     )
 
 

@@ -19,6 +19,7 @@ from robotid.identification.summary import (
     identification_text,
 )
 from robotid.identification.why_pictures import why_charts
+from robotid.judgement.evidence import Determined, Predictions
 from robotid.judgement.parameter_table import parameter_entries, parameter_table
 from robotid.judgement.verdict import Doubt, Verdict, judge
 from robotid.judgement.witness import Witness, call_witness
@@ -184,17 +185,19 @@ class Identification(Fit):
     @cached_property
     def verdict(self) -> Verdict:
         """How far to trust the result."""
-        return judge(
+        predictions = Predictions(
             self.metrics(),
             self.predictions,
-            undetermined=self.determination.undetermined,
-            is_poorly_excited=self.is_poorly_excited,
-            is_consistent=self.is_consistent,
-            joints=self.model.joints,
-            alarms=self.alarms,
-            doubts=self.doubts,
+            self.model.joints,
             refitted=[e.recording.name for e in self.refitted],
-            witness=self.witness,
-            is_static=self.model.is_static,
             hidden=hidden_joints(self.model, self.fitted),
+        )
+        determined = Determined(
+            self.determination.undetermined,
+            self.is_consistent,
+            self.is_poorly_excited,
+            self.model.is_static,
+        )
+        return judge(
+            predictions, determined, alarms=self.alarms, doubts=self.doubts, witness=self.witness
         )

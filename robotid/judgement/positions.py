@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 from robotid.findings import listed
 from robotid.fitting.metrics import JointMetrics, Metrics
-from robotid.judgement.verdict import BEATEN, JointVerdict, Verdict, concluded, error_of, on_joint
+from robotid.judgement.evidence import BEATEN, error_of
+from robotid.judgement.verdict import JointVerdict, Verdict, concluded, on_joint
 
 __all__ = ["GOOD", "POOR", "judge_positions"]
 

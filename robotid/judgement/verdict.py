@@ -1,7 +1,7 @@
 """How far to trust a result: findings with reasons, and a verdict that never passes the unknown."""
 
 import difflib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -11,14 +11,12 @@ from robotid._settings import require_kind
 from robotid.doctor.diagnosis import CODES
 from robotid.exceptions import SettingsError
 from robotid.findings import Finding, listed
-from robotid.fitting.metrics import JointMetrics, Metrics
+from robotid.fitting.metrics import Metrics
+from robotid.judgement.evidence import Determined, Predictions, error_of
 from robotid.judgement.witness import Witness
 
 __all__ = [
-    "BEATEN",
     "DOUBTFUL",
-    "GOOD",
-    "POOR",
     "Doubt",
     "JointVerdict",
     "Verdict",
@@ -26,25 +24,14 @@ __all__ = [
     "check_ignored",
     "concluded",
     "doubts_of",
-    "error_of",
-    "is_beaten",
     "is_outvoted",
     "judge",
     "on_joint",
     "refuted",
 ]
 
-#: [%] a joint predicted within this on kept recordings is predicted well.
-GOOD = 15.0
-#: [%] a joint predicted worse than this is not usable.
-POOR = 50.0
-#: A plainer model is better if it misses this many times less ...
-BEATEN = 1.05
-
-_TIE = 0.3  # [%] ... and, of the URDF with fitted drives, by this share of the torque
 _REFUTED = 5.0  # [%] a hypothesis on columns or masses is refuted by a prediction so good
 _SCALED = 2.0  # a gravity within this factor of the URDF's refutes another unit of the torque
-_OPTIMISM = 2.0  # an error this many times the fitted one on kept recordings shows over-fitting
 _WRONG = 2.0  # a fit that misses this many times what WLS misses ...
 _HARMLESS = 1.0  # [%] ... is doubtful, but not below this share of the torque
 _SMALL = 5.0  # [%] of the torque: a term that a drive lacks leaves no doubt below
@@ -109,7 +96,6 @@ _WORDS |= {
 #: Codes of the warnings that make a result doubtful.
 DOUBTFUL = (*_WORDS, "repeated_motion")
 _OF_RESULTS = ("total_mass",)  # errors that a result alone can show
-_NAMED = 8  # parameters that a reason names
 _HYPOTHESES = (
     "current_for_torque",
     "gravity",
@@ -189,68 +175,44 @@ class Verdict:
 
 
 def judge(
-    fit: Metrics,
-    validation: Mapping[str, Metrics],
+    predictions: Predictions,
+    determined: Determined,
     *,
-    undetermined: Sequence[str],
-    is_consistent: bool,
-    is_poorly_excited: bool = True,
-    joints: Sequence[str] = (),
     alarms: Sequence[str] = (),
     doubts: Sequence[Doubt] = (),
-    refitted: Sequence[str] = (),
     witness: Witness | None = None,
-    is_static: bool = False,
-    hidden: Sequence[str] = (),
 ) -> Verdict:
     """Return the verdict on a result.
 
     Args:
-        fit: Metrics over the fitted recordings.
-        validation: Metrics of each kept recording, by its name.
-        undetermined: Base parameters that the data do not determine by themselves.
-        is_consistent: Whether the parameters are physically possible.
-        is_poorly_excited: Whether a richer motion would determine them; else noise hides them.
-        joints: The model's joints; one without a row in any recording is not evaluated.
+        predictions: How well it predicts torque.
+        determined: What the data determine of its parameters.
         alarms: Faults of the recordings that make any result of them wrong.
         doubts: Why the result may be wrong however well it predicts.
-        refitted: Kept recordings, by name, that are left out since they hold fitted rows.
         witness: What speaks for the scale of the result but the sensors.
-        is_static: Whether the model is.
-        hidden: Joints that are not evaluated, as of ``hidden_joints``.
 
     Returns:
-        The verdict. Without a kept recording, or with a doubt, it is at best "usable"; so is that
+        The verdict. Without a validation log, or with a doubt, it is at best "usable"; so is that
         of a joint with a doubt, and that of all joints with one about all.
     """
-    fit = _without(fit, hidden)
-    validation = {name: _without(metrics, hidden) for name, metrics in validation.items()}
-    joints = [joint for joint in joints if joint not in hidden]
-    moved = [joint for m in (fit, *validation.values()) for joint in m.per_joint]
-    names = dict.fromkeys([*joints, *moved])
-    found = {joint: _found_on(joint, fit, validation) for joint in names}
+    found, hidden = predictions.on_each(), predictions.hidden
     poor = sorted((reason for worse, _, _ in found.values() for reason in worse), key=_rank)
-    reasons = []
-    if not validation:
-        held = f"{listed(refitted)} hold rows that were fitted"
-        why = held if refitted else "no validation log given"
-        reasons.append(f"the prediction of a new motion was not evaluated: {why}")
-    reasons += [reason for _, doubt, _ in found.values() for reason in doubt]
-    reasons += _left_to_urdf(validation)
-    reasons += _in_words(doubts)
-    if witness is not None and witness.is_against:
-        reasons.append(witness.message)
-    reasons += _unseen(names, fit, validation)
-    if undetermined and is_poorly_excited:
-        reasons.append(
-            f"the data do not determine {len(undetermined)} base parameters by themselves: "
-            f"{listed(undetermined, _NAMED)}"
-        )
-    if not is_consistent:
-        reasons.append(
-            "the standard parameters are not physically consistent, so no URDF was written; the "
-            "base parameters predict torque all the same"
-        )
+    against = witness is not None and witness.is_against
+    reasons = [
+        *predictions.untested(),
+        *(reason for _, doubt, _ in found.values() for reason in doubt),
+        *predictions.left_to_urdf(),
+        *_in_words(doubts),
+        *([witness.message] if witness is not None and against else []),
+        *predictions.unseen(),
+        *determined.doubts(),
+    ]
+    notes = [
+        *determined.notes(),
+        *([witness.message] if witness is not None and not against else []),
+        *([f"{listed(hidden)}: {_HIDDEN}: not evaluated"] if hidden else []),
+        *([_STATIC] if determined.is_static else []),
+    ]
     per_joint = {
         joint: on_joint(
             sorted(worse, key=_rank),
@@ -259,24 +221,12 @@ def judge(
             said=f"predicted within {max(errors):.1f} %, better than by a constant and than by the "
             "URDF"
             if errors
-            else _why_unseen(joint not in moved, bool(validation)),
+            else predictions.why_unseen(joint),
         )
         for joint, (worse, doubt, errors) in found.items()
     }
-    worst = max((error for _, _, errors in found.values() for error in errors), default=0.0)
-    notes = []
-    if undetermined and not is_poorly_excited:
-        notes.append(
-            f"{len(undetermined)} base parameters are lost in the noise of a rich motion or known "
-            "only in sums with others; what the data leave open keeps the URDF's values: "
-            f"{listed(undetermined, _NAMED)}"
-        )
-    if witness is not None and not witness.is_against:
-        notes.append(witness.message)
-    if hidden:
-        notes.append(f"{listed(hidden)}: {_HIDDEN}: not evaluated")
-    notes += [_STATIC] if is_static else []
     per_joint |= {joint: JointVerdict("not evaluated", (_HIDDEN,)) for joint in hidden}
+    worst = max((error for _, _, errors in found.values() for error in errors), default=0.0)
     good = (
         f"every joint is predicted within {worst:.1f} % on recordings that were not fitted, better "
         "than by a constant and than by the URDF, and every parameter is physically consistent"
@@ -448,60 +398,6 @@ def is_outvoted(finding: Finding) -> bool:
     return finding.code == "spikes" and finding.where.rsplit(": ", 1)[-1].startswith("tau_")
 
 
-def is_beaten(measured: JointMetrics) -> bool:
-    """Return whether the URDF's bodies with fitted drives predict a joint clearly better.
-
-    Args:
-        measured: How well it is predicted.
-    """
-    driven = measured.baselines.get("urdf_with_drives")
-    return driven is not None and error_of(measured) > max(BEATEN * driven, driven + _TIE)
-
-
-def _without(metrics: Metrics, joints: Sequence[str]) -> Metrics:
-    """Return metrics without those of some joints."""
-    kept = {joint: m for joint, m in metrics.per_joint.items() if joint not in joints}
-    return replace(metrics, per_joint=kept)
-
-
-def _found_on(
-    joint: str, fit: Metrics, validation: Mapping[str, Metrics]
-) -> tuple[list[str], list[str], list[float]]:
-    """Return what makes a joint poor, what makes it doubtful, and its errors [%], log by log."""
-    poor, doubts, errors = [], [], []
-    for log, metrics in validation.items():
-        measured = metrics.per_joint.get(joint)
-        if measured is not None:
-            found = _judge_joint(joint, log, measured, fit.per_joint.get(joint))
-            poor += found[0]
-            doubts += found[1]
-            errors.append(error_of(measured))
-    return poor, doubts, errors
-
-
-def _unseen(names: Iterable[str], fit: Metrics, validation: Mapping[str, Metrics]) -> list[str]:
-    """Return which joints move in no recording, and which in no kept one."""
-    kept = {joint for m in validation.values() for joint in m.per_joint}
-    fitted = fit.per_joint
-    still = [joint for joint in names if joint not in kept and joint not in fitted]
-    missing = [joint for joint in names if joint not in kept and joint in fitted]
-    if still and not fitted:  # measured again without the fitted recordings
-        still, missing = [], still
-    reasons = [f"the joints {listed(still)} move in no recording: not evaluated"] if still else []
-    if missing and validation:
-        reasons.append(
-            f"the joints {listed(missing)} do not move in any validation log: not evaluated"
-        )
-    return reasons
-
-
-def _why_unseen(is_still: bool, has_kept: bool) -> str:
-    """Return why a joint was evaluated on no kept recording."""
-    if is_still:
-        return "it does not move in any recording"
-    return "it does not move in any kept recording" if has_kept else "no recording was kept apart"
-
-
 def _in_words(doubts: Sequence[Doubt]) -> list[str]:
     """Return one sentence per kind of doubt, with the joints that share it."""
     shared: dict[tuple[str, str], list[str]] = {}
@@ -513,67 +409,9 @@ def _in_words(doubts: Sequence[Doubt]) -> list[str]:
     ]
 
 
-def _judge_joint(
-    joint: str, log: str, measured: JointMetrics, fitted: JointMetrics | None
-) -> tuple[list[str], list[str]]:
-    """Return what makes the result poor, and what makes it doubtful, on one joint."""
-    error = error_of(measured)
-    urdf = measured.baselines.get("urdf")
-    if measured.relative_error_pct is None:
-        return [f"{joint}: the torque on {log} is 0 throughout: nothing was predicted"], []
-    if not measured.better_than_constant:
-        constant = error / np.sqrt(1.0 - measured.r2)
-        why = f"{error:.1f} % of it is missed, by its mean {constant:.1f} %"
-        return [f"{joint}: worse than a constant torque on {log}: {why}"], []
-    if urdf is not None and error > urdf:
-        return [f"{joint}: {error:.1f} % on {log}, worse than the URDF's {urdf:.1f} %"], []
-    if error > POOR:
-        return [f"{joint}: predicted to {error:.1f} % only on {log}"], []
-    if error > GOOD:
-        why = f"predicted to {error:.1f} % on {log} (wanted: {GOOD:g} %)"
-        return [], [f"{joint}: {why}; see in the report what its residual holds"]
-    if fitted is not None and error > max(_OPTIMISM * error_of(fitted), 5.0):
-        return [], [
-            f"{joint}: {error:.1f} % on {log} against {error_of(fitted):.1f} % where it was "
-            "fitted; record a richer motion to fit"
-        ]
-    if is_beaten(measured):
-        driven = measured.baselines["urdf_with_drives"]
-        why = f"{error:.1f} % on {log}, {driven:.1f} % by the URDF with fitted drives"
-        return [], [f"{joint}: {why}: leave its link at the URDF"]
-    return [], []
-
-
-def _left_to_urdf(validation: Mapping[str, Metrics]) -> list[str]:
-    """Return which joints the URDF with fitted drives predicts better, and what to do."""
-    worse = [
-        joint
-        for metrics in validation.values()
-        for joint, measured in metrics.per_joint.items()
-        if is_beaten(measured)
-    ]
-    if not worse:
-        return []
-    return [
-        f"the URDF with fitted drives predicts {listed(dict.fromkeys(worse))} better than the "
-        "identified bodies: leave the links of these joints at the URDF, as pinned in "
-        "[estimator.constraints]"
-    ]
-
-
 def _rank(reason: str) -> int:
     """Return 0 for what is worse than a constant, 1 for worse than the URDF, 2 for the rest."""
     return 0 if "a constant" in reason else 1 if "the URDF" in reason else 2
-
-
-def error_of(measured: JointMetrics) -> float:
-    """Return the relative error of a joint [%], inf where nothing was measured.
-
-    Args:
-        measured: How well it is predicted.
-    """
-    value = measured.relative_error_pct
-    return float("inf") if value is None else value
 
 
 def _doubts(finding: Finding, joints: Sequence[str]) -> Iterator[Doubt]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from robotid.diagnosis.misfit_findings import setting_of, with_entries
 from robotid.export.formats import FORMATS
 from robotid.findings import Cause, grouped, listed, toml_key
-from robotid.judgement.verdict import GOOD, is_beaten
+from robotid.judgement.evidence import GOOD, is_beaten
 from robotid.robot.drives import COUNTERBALANCE, DriveTerm
 from robotid.robot.families import spring_family
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from robotid.identification.summary import verdict_cell
-from robotid.judgement import positions, verdict
+from robotid.judgement import evidence, positions
 from robotid.judgement.verdict import JointVerdict
 from robotid.pages.html import code, number, percent, table, text
 from robotid.report.bars import Bar, Mark, bars_html
@@ -39,7 +39,7 @@ class Quantity:
 TORQUE = Quantity(
     "Torque prediction error",
     "100 |τ − prediction| / |τ|",
-    (verdict.GOOD, verdict.POOR),
+    (evidence.GOOD, evidence.POOR),
     {
         "wls": Mark("WLS", "M-5 -1h10l-5 6z", "fill"),
         "urdf_with_drives": Mark("URDF + drives", "M-5 19h10l-5 -6z", "fill"),

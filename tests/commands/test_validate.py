@@ -190,9 +190,9 @@ def test_a_fault_of_the_second_of_two_new_logs_is_one_of_the_verdict(here, monke
         write_log(log, folder / f"{name}.csv")
     judged = {}
 
-    def noted(fitted, kept, **stated):
-        judged.update(stated, kept=kept)
-        return judge(fitted, kept, **stated)
+    def noted(predictions, determined, **stated):
+        judged.update(stated, predictions=predictions, determined=determined)
+        return judge(predictions, determined, **stated)
 
     judge = validate.judge
     monkeypatch.setattr(validate, "judge", noted)
@@ -204,13 +204,14 @@ def test_a_fault_of_the_second_of_two_new_logs_is_one_of_the_verdict(here, monke
     assert found["verdict"]["status"] == "poor"
     assert any("dq_joint_2 is 0.5 times d(q)/dt" in words for words in found["verdict"]["alarms"])
     names = ["sound.csv 0-4.99 s", "spoilt.csv 5-9.99 s"]
-    assert list(judged["kept"]) == list(judged["hidden"]) == names
+    predictions, determined = judged["predictions"], judged["determined"]
+    assert list(predictions.validation) == list(predictions.hidden) == names
     stated = json.loads((folder / "out" / "result.json").read_text())
-    assert judged["undetermined"] == stated["structure"]["undetermined"]
-    assert judged["is_poorly_excited"] is stated["structure"]["poorly_excited"]
+    assert determined.undetermined == stated["structure"]["undetermined"]
+    assert determined.is_poorly_excited is stated["structure"]["poorly_excited"]
     assert judged["witness"].to_dict() == stated["witness"]
-    assert judged["refitted"] == []
-    assert judged["joints"] == ("joint_1", "joint_2")
+    assert predictions.refitted == []
+    assert predictions.joints == ("joint_1", "joint_2")
 
 
 def test_few_fitted_rows_in_a_long_log_and_a_few_of_it_in_a_long_fitted_one_are_shared(rng):

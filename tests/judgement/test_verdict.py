@@ -11,15 +11,8 @@ from robotid.findings import Finding
 from robotid.fitting.metrics import JointMetrics, Metrics
 from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
-from robotid.judgement.verdict import (
-    Doubt,
-    alarming,
-    doubts_of,
-    is_beaten,
-    is_outvoted,
-    judge,
-    refuted,
-)
+from robotid.judgement.evidence import Determined, Predictions, is_beaten
+from robotid.judgement.verdict import Doubt, alarming, doubts_of, is_outvoted, judge, refuted
 from robotid.judgement.witness import Witness
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
@@ -37,10 +30,15 @@ def joint(error, *, urdf=100.0, constant=True, **others):
     return JointMetrics(1.0, "N m", error, r2, 100, {"urdf": urdf} | others, constant)
 
 
-def verdict(validation, fitted=None, undetermined=(), is_consistent=True):
+def judged(fit, validation, *, joints=(), refitted=(), alarms=(), doubts=(), witness=None, **open):
+    predictions = Predictions(fit, validation, joints, refitted)
+    return judge(predictions, Determined(**open), alarms=alarms, doubts=doubts, witness=witness)
+
+
+def verdict(validation, fitted=None, **open):
     fit = Metrics(fitted or {"a": joint(3.0)}, 1.0)
     logs = {"val.csv": Metrics(validation, 1.0)} if validation is not None else {}
-    return judge(fit, logs, undetermined=undetermined, is_consistent=is_consistent)
+    return judged(fit, logs, **open)
 
 
 def test_good_needs_every_joint_good_on_kept_recordings():
@@ -69,9 +67,7 @@ def test_worse_than_a_constant_is_said_first():
 def test_alarms_come_before_everything_and_constants_before_the_rest():
     joints = {"a": joint(60.0), "b": joint(40.0, constant=False)}
     logs = {"val.csv": Metrics(joints, 1.0)}
-    found = judge(
-        Metrics({}, 1.0), logs, undetermined=(), is_consistent=True, alarms=["torque of c swapped"]
-    )
+    found = judged(Metrics({}, 1.0), logs, alarms=["torque of c swapped"])
     assert found.status == "poor"
     assert found.reasons[0] == "torque of c swapped"
     assert found.reasons[1].startswith("b: worse than a constant")
@@ -108,7 +104,7 @@ def test_the_worst_of_several_recordings_decides_on_a_joint():
         "one.csv": Metrics({"a": joint(4.0)}, 1.0),
         "two.csv": Metrics({"a": joint(60.0)}, 1.0),
     }
-    found = judge(Metrics({"a": joint(3.0)}, 1.0), logs, undetermined=(), is_consistent=True)
+    found = judged(Metrics({"a": joint(3.0)}, 1.0), logs)
     assert found.joints["a"].status == "poor"
     assert found.to_dict()["per_joint"]["a"]["reasons"] == [
         "a: predicted to 60.0 % only on two.csv"
@@ -119,7 +115,7 @@ def test_what_is_good_is_said_with_the_worst_of_all_joints_and_recordings():
     logs = {"one": {"a": joint(3.0), "b": joint(2.0)}, "two": {"a": joint(4.5), "b": joint(1.0)}}
     kept = {name: Metrics(own, 1.0) for name, own in logs.items()}
     fit = Metrics({"a": joint(3.0), "b": joint(2.0)}, 1.0)
-    found = judge(fit, kept, undetermined=(), is_consistent=True)
+    found = judged(fit, kept)
     assert found.status == "good"
     assert found.reasons[0].startswith("every joint is predicted within 4.5 % on recordings")
     for name, worst in (("a", 4.5), ("b", 2.0)):
@@ -133,11 +129,9 @@ def test_without_a_kept_recording_no_joint_is_evaluated():
 
 
 def test_a_joint_that_moves_nowhere_is_not_evaluated():
-    found = judge(
+    found = judged(
         Metrics({"a": joint(3.0)}, 1.0),
         {"val.csv": Metrics({"a": joint(4.0)}, 1.0)},
-        undetermined=(),
-        is_consistent=True,
         joints=("a", "b"),
     )
     assert found.status == "usable"
@@ -148,7 +142,7 @@ def test_a_joint_that_moves_nowhere_is_not_evaluated():
 
 def test_a_result_that_is_validated_later_knows_only_what_was_kept():
     kept = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
-    found = judge(Metrics({}, 0.0), kept, undetermined=(), is_consistent=True, joints=("a", "b"))
+    found = judged(Metrics({}, 0.0), kept, joints=("a", "b"))
     assert found.reasons == ("the joints b do not move in any validation log: not evaluated",)
 
 
@@ -156,7 +150,7 @@ def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
     fit = {name: joint(3.0) for name in "abc"}
     logs = {"val.csv": Metrics({"a": joint(4.0), "b": joint(4.0), "c": joint(60.0)}, 1.0)}
     doubts = [Doubt("clipped", name, "it is clipped") for name in "bc"]
-    found = judge(Metrics(fit, 1.0), logs, undetermined=(), is_consistent=True, doubts=doubts)
+    found = judged(Metrics(fit, 1.0), logs, doubts=doubts)
     assert {name: v.status for name, v in found.joints.items()} == {
         "a": "good", "b": "usable", "c": "poor",
     }  # fmt: skip
@@ -165,7 +159,7 @@ def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
     assert found.status == "poor"
     whole = [Doubt("urdf_mismatch", "", "run.csv: masses do not fit")]
     logs = {"val.csv": Metrics({name: joint(4.0) for name in "abc"}, 1.0)}
-    found = judge(Metrics(fit, 1.0), logs, undetermined=(), is_consistent=True, doubts=whole)
+    found = judged(Metrics(fit, 1.0), logs, doubts=whole)
     assert found.status == "usable"
     assert found.reasons == ("run.csv: masses do not fit (urdf_mismatch)",)
     assert {v.status for v in found.joints.values()} == {"usable"}
@@ -175,9 +169,7 @@ def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
 
 
 def test_kept_recordings_that_were_fitted_are_named():
-    found = judge(
-        Metrics({"a": joint(3.0)}, 1.0), {}, undetermined=(), is_consistent=True, refitted=["x.csv"]
-    )
+    found = judged(Metrics({"a": joint(3.0)}, 1.0), {}, refitted=["x.csv"])
     assert found.status == "usable"
     (reason,) = found.reasons
     assert reason.endswith("was not evaluated: x.csv hold rows that were fitted")
@@ -210,9 +202,7 @@ def test_each_threshold_lies_where_it_is_stated(error, fitted, status):
 
 def test_an_alarm_alone_makes_a_good_prediction_poor():
     kept = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
-    found = judge(
-        Metrics({"a": joint(3.0)}, 1.0), kept, undetermined=(), is_consistent=True, alarms=["late"]
-    )
+    found = judged(Metrics({"a": joint(3.0)}, 1.0), kept, alarms=["late"])
     assert found.status == "poor"
     assert found.reasons == ("late",)
     assert found.to_dict()["alarms"] == ["late"]
@@ -288,8 +278,8 @@ def test_many_open_parameters_are_counted_and_the_first_eight_named():
     kept = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
     names = [f"x{k}.m" for k in range(11)]
     for is_poor in (True, False):
-        found = judge(
-            Metrics({"a": joint(3.0)}, 1.0), kept, undetermined=names, is_consistent=True,
+        found = judged(
+            Metrics({"a": joint(3.0)}, 1.0), kept, undetermined=names,
             is_poorly_excited=is_poor,
         )  # fmt: skip
         said = found.reasons[-1]
@@ -438,11 +428,10 @@ def test_spikes_in_torques_do_not_condemn_a_robust_fit(ur5):
 
 def test_what_noise_hides_of_a_rich_motion_is_said_and_does_not_condemn():
     logs = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
-    found = judge(
+    found = judged(
         Metrics({"a": joint(3.0)}, 1.0),
         logs,
         undetermined=("x.Ixy",),
-        is_consistent=True,
         is_poorly_excited=False,
     )
     assert found.status == "good"
@@ -521,11 +510,9 @@ def test_the_worst_of_several_recordings_refutes_no_hypothesis(errors):
     ],
 )
 def test_good_needs_a_witness_or_says_that_there_is_none(witness, status, said):
-    found = judge(
+    found = judged(
         Metrics({"a": joint(3.0)}, 1.0),
         {"val.csv": Metrics({"a": joint(4.0)}, 1.0)},
-        undetermined=(),
-        is_consistent=True,
         witness=witness,
     )
     assert found.status == status

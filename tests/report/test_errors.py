@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.pages import bars
 
-from robotid.judgement.verdict import GOOD, POOR
+from robotid.judgement.evidence import GOOD, POOR
 from robotid.report import bars as errors
 from robotid.report.advice import Origin, next_steps
 from robotid.report.errors import worst_errors
