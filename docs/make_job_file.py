@@ -13,7 +13,7 @@ from robotid.fitting.settings import ESTIMATORS, ConstraintSettings
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.transmission import Transmission
 from robotid.robot.drives import TERMS
-from robotid.robot.families import AUTO, FAMILIES
+from robotid.robot.families import AUTO
 from robotid.simulation.settings import Simulation
 
 PAGE = Path(__file__).with_name("job_file.md")
@@ -154,12 +154,7 @@ def estimators():
 
 def drive_terms(rows):
     """Return the lines on the terms of the drives, behind those of other keys."""
-    names = [name for name, term in TERMS.items() if term.is_friction]
-    words = (
-        f"{AUTO}: what held-out stretches of the fitted logs ask for, joint by joint; none; or "
-        f"some of these with + between them: {', '.join([*names, *FAMILIES])}"
-    )
-    rows += [f'| `friction` | `"{AUTO}"` | {words} |']
+    rows += [f'| `friction` | `"{AUTO}"` | {Job.paths()["model.friction"].words} |']
     for name, term in TERMS.items():
         if not term.is_friction:
             units = ", or ".join(term.units)

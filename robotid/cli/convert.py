@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from robotid.cli.flags import SOURCE, add_json, add_settings, stated_by
+from robotid.cli.flags import JOB, SOURCE, add_json
 from robotid.cli.printing import say
 from robotid.cli.running import show_found
 
@@ -22,7 +22,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("log", metavar="IN", help="a log of any format, or a bag's folder")
     add("out", metavar="OUT", help="file to write; its suffix says the format")
     add("--joints", metavar="A,B,...", help="joints to write; default: all")
-    add_settings(parser, SOURCE)
+    JOB.add(parser, SOURCE)
     add_json(parser)
 
 
@@ -49,7 +49,7 @@ def source_settings(options: argparse.Namespace) -> dict[str, Any]:
     Args:
         options: The flags of the command "convert".
     """
-    return dict(stated_by(options, SOURCE).get("log", {}))
+    return dict(JOB.stated(options, SOURCE).get("log", {}))
 
 
 def _show(done: dict[str, Any]) -> None:

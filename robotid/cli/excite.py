@@ -1,11 +1,12 @@
 """robotid excite: design the motion to record, within the robot's limits."""
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from robotid._settings import Settings
 from robotid.cli.console import terminal_progress
-from robotid.cli.flags import ROBOT, add_json, add_progress, add_settings, job_from_flags, pairs
+from robotid.cli.flags import JOB, ROBOT, Flags, add_json, add_progress, job_from_flags
 from robotid.cli.printing import say
 from robotid.cli.running import show_found
 from robotid.exceptions import SettingsError
@@ -14,7 +15,6 @@ from robotid.findings import listed
 if TYPE_CHECKING:
     from robotid.excitation.clearance import Box
     from robotid.excitation.settings import MotionSettings
-    from robotid.simulation.settings import Payload
 
 
 __all__ = ["SUMMARY", "add_flags", "run"]
@@ -35,12 +35,11 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("--given", metavar="RESULT", help="a result.json or its folder: what its logs have told")
     words = "page to write about the motion: its limits over time, what it will tell"
     add("--report", metavar="PAGE.html", help=words)
-    for flag, (at, about) in _FLAGS.items():
-        add(flag, **about, help=_words(at, is_again=about.get("action") == "append"))
+    _MOTION.add(parser)
     add_json(parser)
     add_progress(parser)
     flags = parser.add_argument_group("the robot, instead of a job file")
-    add_settings(flags, ROBOT[:3])
+    JOB.add(flags, ROBOT[:3])
 
 
 def run(options: argparse.Namespace) -> None:
@@ -75,25 +74,9 @@ def motion_settings(options: argparse.Namespace) -> "MotionSettings":
     """
     from robotid.excitation.settings import MotionSettings
 
-    stated: dict[str, Any] = {}
-    for flag, (at, _) in _FLAGS.items():
-        value = getattr(options, flag[2:].replace("-", "_"))
-        if value not in (None, []) and at not in _OF_PAYLOAD:
-            stated[at] = _READ[at](value, flag) if at in _READ else value
-    return MotionSettings(**stated, payload=_load(options))
-
-
-def _words(at: str, *, is_again: bool) -> str:
-    """Return the help of a flag, by the setting that it states."""
-    from robotid.excitation.settings import MotionSettings
-    from robotid.simulation.settings import Payload
-
-    settings = Payload if at in _OF_PAYLOAD else MotionSettings
-    (found, key) = next((f, key) for f, key, path in settings.entries() if path == [at])
-    words, default = key.text, found.default
-    if isinstance(default, int | float) and default not in (0.0, float("inf")):
-        words += f"; default: {default:g}"
-    return (words + ("; may be given again" if is_again else "")).replace("%", "%%")
+    if options.com is not None and not options.mass:
+        raise SettingsError(_COM.format(options.com))
+    return MotionSettings.from_dict(_MOTION.stated(options))
 
 
 def _boxes(words: Sequence[str], flag: str) -> tuple["Box", ...]:
@@ -121,25 +104,14 @@ def _boxes(words: Sequence[str], flag: str) -> tuple["Box", ...]:
     return tuple(boxes)
 
 
-def _load(options: argparse.Namespace) -> "Payload":
-    """Return what is stated of a payload.
-
-    Raises:
-        SettingsError: If a flag is not usable.
-    """
-    from robotid.simulation.settings import Payload
-
-    load = {"link": options.link, "mass": options.mass}
-    if options.com is not None:
-        try:
-            load["com"] = tuple(float(number) for number in options.com.split(","))
-        except ValueError:
-            load["com"] = ()
-        if len(load["com"]) != 3 or not options.mass:
-            raise SettingsError(
-                f"--com {options.com!r}: wanted X,Y,Z [m], three numbers, and --mass beside it"
-            )
-    return Payload(**{key: value for key, value in load.items() if value is not None})
+def _centre(word: str, _: str) -> tuple[float, ...]:
+    try:
+        found = tuple(float(number) for number in word.split(","))
+    except ValueError:
+        found = ()
+    if len(found) != 3:
+        raise SettingsError(_COM.format(word))
+    return found
 
 
 def _clearance(word: str, flag: str) -> float | None:
@@ -151,38 +123,40 @@ def _clearance(word: str, flag: str) -> float | None:
         raise SettingsError(f"{flag} {word!r}: wanted metres, or none") from error
 
 
-_OF_PAYLOAD = ("link", "mass", "com")
-_AGAIN: dict[str, Any] = {"action": "append", "default": []}
-#: Field of ``MotionSettings``, or of its payload, that each flag states.
-_FLAGS: Mapping[str, tuple[str, dict[str, Any]]] = {
-    "--kind": ("kind", {"choices": ("fourier", "bspline", "sweeps", "stands", "payload")}),
-    "--link": ("link", {"metavar": "NAME"}),
-    "--mass": ("mass", {"metavar": "KG", "type": float}),
-    "--com": ("com", {"metavar": "X,Y,Z"}),
-    "--moving": ("moving", {"metavar": "JOINTS"}),
-    "--duration": ("duration", {"metavar": "S", "type": float}),
-    "--harmonics": ("harmonics", {"metavar": "N", "type": int}),
-    "--criterion": ("criterion", {"choices": ("D", "A", "E", "condition", "widest")}),
-    "--share": ("share", {"metavar": "X", "type": float}),
-    "--max-acceleration": ("acceleration", {"metavar": "JOINT=X", **_AGAIN}),
-    "--max-jerk": ("jerk", {"metavar": "JOINT=X", **_AGAIN}),
-    "--max-power": ("power", {"metavar": "JOINT=X", **_AGAIN}),
-    "--clearance": ("clearance", {"metavar": "M"}),
-    "--floor": ("floor", {"metavar": "M", "type": float}),
-    "--box": ("boxes", {"metavar": "NAME=x0,y0,z0,x1,y1,z1", **_AGAIN}),
-    "--noise": ("noise", {"metavar": "JOINT=N_M", **_AGAIN}),
-    "--seed": ("seed", {"metavar": "N", "type": int}),
-    "--starts": ("starts", {"metavar": "N", "type": int}),
-    "--seconds": ("seconds", {"metavar": "S", "type": float}),
-    "--points": ("points", {"metavar": "HZ", "type": float}),
-}
-#: How the words of a flag become the value of its field, where they are not it themselves.
-_READ: Mapping[str, Callable[[Any, str], Any]] = {
-    "moving": lambda word, _: word.split(","),
-    "boxes": _boxes,
-    "clearance": _clearance,
-    **dict.fromkeys(("acceleration", "jerk", "power", "noise"), pairs),
-}
+def _motion() -> Settings:
+    from robotid.excitation.settings import MotionSettings
+
+    return MotionSettings()
+
+
+_COM = "--com {!r}: wanted X,Y,Z [m], three numbers, and --mass beside it"
+#: Flags of the motion that is wanted.
+_MOTION = Flags(
+    _motion,
+    {
+        "--kind": ("kind", ""),
+        "--link": ("payload.link", "NAME"),
+        "--mass": ("payload.mass", "KG"),
+        "--com": ("payload.com", "X,Y,Z"),
+        "--moving": ("moving", "JOINTS"),
+        "--duration": ("duration", "S"),
+        "--harmonics": ("harmonics", "N"),
+        "--criterion": ("criterion", ""),
+        "--share": ("share", "X"),
+        "--max-acceleration": ("acceleration", "JOINT=X"),
+        "--max-jerk": ("jerk", "JOINT=X"),
+        "--max-power": ("power", "JOINT=X"),
+        "--clearance": ("clearance", "M"),
+        "--floor": ("floor", "M"),
+        "--box": ("boxes", "NAME=x0,y0,z0,x1,y1,z1"),
+        "--noise": ("noise", "JOINT=N_M"),
+        "--seed": ("seed", "N"),
+        "--starts": ("starts", "N"),
+        "--seconds": ("seconds", "S"),
+        "--points": ("points", "HZ"),
+    },
+    {"--box": _boxes, "--clearance": _clearance, "--com": _centre},
+)
 
 
 def _show(content: dict[str, Any]) -> None:

@@ -2,10 +2,11 @@
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotid._settings import table_in
+from robotid._settings import Entries, Settings, table_in
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 
@@ -15,26 +16,25 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FIT",
-    "FLAGS",
+    "JOB",
     "LOG",
     "MOTION",
     "ONLINE",
     "OUTPUT",
     "ROBOT",
     "SOURCE",
+    "Flags",
     "add_job",
     "add_json",
     "add_out",
     "add_progress",
     "add_robot_and_log",
     "add_serve",
-    "add_settings",
     "add_verbose",
     "job_from_flags",
     "pairs",
     "refuse_log_flags",
     "source_words",
-    "stated_by",
 ]
 
 
@@ -65,68 +65,163 @@ def _of_all_or_pairs(words: Sequence[str], flag: str) -> float | dict[str, float
         raise SettingsError(f"{flag} {words[0]!r}: wanted NUMBER or JOINT=NUMBER") from error
 
 
-def _cutoff(word: str, flag: str) -> float | bool:
+def _number_or_false(word: str, flag: str) -> float | bool:
     try:
         return False if word == "false" else float(word)
     except ValueError as error:
-        raise SettingsError(f"{flag} {word!r}: wanted a frequency [Hz] or false") from error
+        raise SettingsError(f"{flag} {word!r}: wanted a number or false") from error
 
 
-#: Key of the job file that each flag states, and what argparse is told of it.
-FLAGS: Mapping[str, tuple[str, dict[str, Any]]] = {
-    "--estimator": ("estimator.name", {"metavar": "NAME"}),
-    "--kp": ("controller.kp", {"metavar": "[JOINT=]N_M_PER_RAD", "action": "append"}),
-    "--kd": ("controller.kd", {"metavar": "[JOINT=]N_M_S_PER_RAD", "action": "append"}),
-    "--joints": ("joints", {"metavar": "A,B,..."}),
-    "--lock": ("locked", {"metavar": "JOINT=POSITION", "action": "append"}),
-    "--snap-angles": ("snap_angles", {"action": "store_const", "const": True}),
-    "--gain": ("torque.gains", {"metavar": "JOINT=N_M_PER_A", "action": "append"}),
-    "--rate": ("signals.rate", {"metavar": "HZ", "type": float}),
-    "--cutoff": ("signals.cutoff", {"metavar": "HZ"}),
-    "--velocity": ("signals.velocity", {"metavar": "HOW"}),
-    "--acceleration": ("signals.acceleration", {"metavar": "HOW"}),
-    "--order": ("signals.order", {"metavar": "N", "type": int}),
-    "--trim": ("signals.trim", {"metavar": "S", "type": float}),
-    "--min-velocity": ("signals.min_velocity", {"metavar": "RAD_PER_S", "type": float}),
-    "--friction-band": ("signals.friction_band", {"metavar": "RAD_PER_S", "type": float}),
-    "--max-gap": ("signals.max_gap", {"metavar": "S", "type": float}),
-    "--torque-delay": ("signals.torque_delay", {"metavar": "S", "type": float}),
-    "--velocity-delay": ("signals.velocity_delay", {"metavar": "S", "type": float}),
-    "--friction": ("model.friction", {"metavar": "MODEL"}),
-    "--dynamics": ("output.dynamics", {"action": "store_const", "const": True}),
-    "--no-report": (
-        "output.report",
-        {"action": "store_const", "const": False, "help": "write no report.html"},
-    ),
-    "--ignore": ("doctor.ignore", {"metavar": "CODE", "action": "append"}),
-    "--time-unit": ("units.time", {"metavar": "UNIT"}),
-    "--angle-unit": ("units.angle", {"metavar": "UNIT"}),
-    "--topic": ("log.topic", {"metavar": "NAME"}),
-    "--command-topic": ("log.command", {"metavar": "NAME"}),
-    "--effort": ("log.effort", {"metavar": "MEANING"}),
-    "--stamp": ("log.stamp", {"metavar": "CLOCK"}),
-}
-#: How the words of a flag become the value of its key, where they are not it themselves.
-_READ: Mapping[str, Callable[[Any, str], Any]] = {
-    "--joints": lambda word, _: word.split(","),
-    "--lock": pairs,
-    "--gain": pairs,
-    "--kp": _of_all_or_pairs,
-    "--kd": _of_all_or_pairs,
-    "--cutoff": _cutoff,
-}
+@dataclass(frozen=True)
+class Flags:
+    """Flags that state settings, whose fields say their types, their help and their defaults.
+
+    Attributes:
+        defaults: Returns the settings that hold if no flag is given; it imports them.
+        keys: Of each flag the key that it states, as a job file has it, and what stands for its
+            value in the help; of a switch its own help, where that of the key is another; nothing
+            where the words that it may be stand for it.
+        read: How what is given becomes the value, where the type does not say it.
+    """
+
+    defaults: Callable[[], Settings]
+    keys: Mapping[str, tuple[str, str]]
+    read: Mapping[str, Callable[[Any, str], Any]] = field(default_factory=dict)
+
+    def add(self, parser: "argparse._ActionsContainer", wanted: Sequence[str] = ()) -> None:
+        """Add flags.
+
+        Args:
+            parser: The parser, or a group of it.
+            wanted: Which flags; all if none is named.
+        """
+        settings = self.defaults()
+        schema, about, values = settings.schema(), settings.paths(), settings.to_dict()
+        for flag in wanted or self.keys:
+            at, shown = self.keys[flag]
+            kinds, key, value = _in(schema, at), about[at], _in(values, at)
+            words, said = key.words, dict[str, Any](metavar=shown)
+            if kinds == (bool,):
+                words = shown or words
+                said = {"action": "store_const", "const": not flag.startswith("--no-")}
+            elif not shown:
+                words, said = key.text, {"choices": key.among}
+            elif _is_repeated(kinds):
+                words += "; may be given again"
+                said["action"] = "append"
+            elif flag not in self.read and bool not in kinds:
+                said["type"] = float if float in kinds else kinds[0]
+            if type(value) in (int, float) and 0 < value < float("inf"):
+                words += f"; default: {value:g}"
+            parser.add_argument(flag, help=words.replace("%", "%%"), **said)
+
+    def given(self, options: argparse.Namespace) -> list[str]:
+        """Return the flags that are given.
+
+        Args:
+            options: The flags of the command, which need not have all.
+        """
+        return [flag for flag in self.keys if getattr(options, _name(flag), None) is not None]
+
+    def stated(self, options: argparse.Namespace, wanted: Sequence[str] = ()) -> dict[str, Any]:
+        """Return what flags state, as a table of a job file.
+
+        Args:
+            options: The flags of the command, which need not have all.
+            wanted: Which flags; all if none is named.
+
+        Raises:
+            SettingsError: If what is given is no value of its type.
+        """
+        schema, table = self.defaults().schema(), dict[str, Any]()
+        for flag in self.given(options):
+            if wanted and flag not in wanted:
+                continue
+            at, value = self.keys[flag][0], getattr(options, _name(flag))
+            *tables, key = at.split(".")
+            read = self.read.get(flag) or _reader(_in(schema, at))
+            table_in(table, tables)[key] = read(value, flag)
+        return table
+
+
+def _in(table: Mapping[str, Any], at: str) -> Any:  # noqa: ANN401
+    """Return what tables inside tables have at a key, None if they have nothing."""
+    found: Any = table
+    for name in at.split("."):
+        found = found.get(name) if isinstance(found, Mapping) else None
+    return found
+
+
+def _is_repeated(kinds: Any) -> bool:  # noqa: ANN401
+    """Return whether a setting has entries, each of which a flag may give."""
+    return kinds.count is None if isinstance(kinds, Entries) else dict in kinds
+
+
+def _reader(kinds: Any) -> Callable[[Any, str], Any]:  # noqa: ANN401
+    """Return how what is given becomes a setting of some kinds, as of ``Settings.schema``."""
+    if isinstance(kinds, Entries):
+        return pairs if kinds.outer is dict else _listed
+    if dict in kinds:
+        return _of_all_or_pairs
+    return _number_or_false if {bool, float} <= {*kinds} else lambda value, _: value
+
+
+def _listed(words: Sequence[str], _: str) -> list[str]:
+    return [name for word in words for name in word.split(",")]
+
+
+def _job() -> Settings:
+    from robotid.commands.job import Job
+
+    return Job(Path())
+
+
+#: Flags of the keys of a job file.
+JOB = Flags(
+    _job,
+    {
+        "--estimator": ("estimator.name", "NAME"),
+        "--kp": ("controller.kp", "[JOINT=]N_M_PER_RAD"),
+        "--kd": ("controller.kd", "[JOINT=]N_M_S_PER_RAD"),
+        "--joints": ("joints", "A,B,..."),
+        "--lock": ("locked", "JOINT=POSITION"),
+        "--snap-angles": ("snap_angles", ""),
+        "--gain": ("torque.gains", "JOINT=N_M_PER_A"),
+        "--rate": ("signals.rate", "HZ"),
+        "--cutoff": ("signals.cutoff", "HZ"),
+        "--velocity": ("signals.velocity", "HOW"),
+        "--acceleration": ("signals.acceleration", "HOW"),
+        "--order": ("signals.order", "N"),
+        "--trim": ("signals.trim", "S"),
+        "--min-velocity": ("signals.min_velocity", "RAD_PER_S"),
+        "--friction-band": ("signals.friction_band", "RAD_PER_S"),
+        "--max-gap": ("signals.max_gap", "S"),
+        "--torque-delay": ("signals.torque_delay", "S"),
+        "--velocity-delay": ("signals.velocity_delay", "S"),
+        "--friction": ("model.friction", "MODEL"),
+        "--dynamics": ("output.dynamics", ""),
+        "--no-report": ("output.report", "write no report.html"),
+        "--ignore": ("doctor.ignore", "CODE"),
+        "--time-unit": ("units.time", "UNIT"),
+        "--angle-unit": ("units.angle", "UNIT"),
+        "--topic": ("log.topic", "NAME"),
+        "--command-topic": ("log.command", "NAME"),
+        "--effort": ("log.effort", "MEANING"),
+        "--stamp": ("log.stamp", "CLOCK"),
+    },
+)
 #: Flags of the estimator.
 FIT = ("--estimator", "--kp", "--kd")
 #: Flags that say which robot it is and how its logs are read.
 LOG = tuple(
-    flag for flag, (key, _) in FLAGS.items() if flag not in FIT and not key.startswith("output.")
+    flag for flag, (key, _) in JOB.keys.items() if flag not in FIT and not key.startswith("output.")
 )
 #: Flags of the files that "identify" writes.
 OUTPUT = ("--dynamics", "--no-report")
 #: Flags that a tracked or replayed log has a use for.
 ONLINE = tuple(
     flag
-    for flag, (key, _) in FLAGS.items()
+    for flag, (key, _) in JOB.keys.items()
     if flag in ("--rate", "--cutoff", "--min-velocity")
     or (flag in LOG and not key.startswith(("signals.", "doctor.")))
 )
@@ -137,7 +232,7 @@ ROBOT = ("--joints", "--lock", "--snap-angles", "--time-unit", "--angle-unit")
 #: Flags that a motion without torques has a use for.
 MOTION = tuple(
     flag
-    for flag, (key, _) in FLAGS.items()
+    for flag, (key, _) in JOB.keys.items()
     if flag in LOG and not key.startswith(("torque.", "doctor."))
     if flag not in ("--effort", "--torque-delay")
 )
@@ -216,43 +311,13 @@ def add_job(
         json_: What ``--json`` prints.
         output: Flags of files that are written.
     """
-    from robotid.fitting.settings import ESTIMATORS
-
     parser.add_argument("source", metavar="JOB.toml | URDF")
     parser.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
     add_json(parser, json_)
     flags = parser.add_argument_group("instead of a job file, with URDF LOG [LOG ...]")
     flags.add_argument("--validate", nargs="+", metavar="LOG", help="logs kept apart")
-    others = ", ".join(name for name in ESTIMATORS if name != "consistent")
-    names = f"which estimator: consistent (default), {others}"
-    flags.add_argument("--estimator", **FLAGS["--estimator"][1], help=names)
-    add_settings(flags, (*FIT[1:], *LOG, *output))
+    JOB.add(flags, (*FIT, *LOG, *output))
     add_verbose(parser)
-
-
-def add_settings(flags: "argparse._ActionsContainer", wanted: Sequence[str]) -> None:
-    """Add flags of settings; their help is that of the keys of the job file.
-
-    Args:
-        flags: The parser, or a group of it.
-        wanted: Which flags.
-    """
-    from robotid.commands.job import Job
-
-    keys = Job.paths()
-    for flag in wanted:
-        at, about = FLAGS[flag]
-        words = keys[at].words if at in keys else _friction_words()
-        flags.add_argument(flag, **{"help": words, **about})
-
-
-def _friction_words() -> str:
-    from robotid.robot.drives import FAMILIES
-
-    return (
-        "auto (default: chosen by the logs), none, viscous, viscous+coulomb, or some of these "
-        f"beside both, joined by +: {', '.join(FAMILIES)}"
-    )
 
 
 def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "Job":
@@ -284,7 +349,7 @@ def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "
         "urdf": options.source,
         "identification": [{"log": log} for log in options.logs],
         "validation": [{"log": log} for log in kept],
-        **stated_by(options, list(FLAGS)),
+        **JOB.stated(options),
     }
     return job_from_settings(table, "command line", Path())
 
@@ -321,27 +386,10 @@ def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
 
 
 def _given(options: argparse.Namespace) -> list[str]:
-    flags = ["--validate", *FLAGS]
-    return [flag for flag in flags if getattr(options, _name(flag), None) is not None]
+    kept = ["--validate"] if getattr(options, "validate", None) is not None else []
+    return kept + JOB.given(options)
 
 
 def _name(flag: str) -> str:
     """Return what argparse calls a flag."""
     return flag[2:].replace("-", "_")
-
-
-def stated_by(options: argparse.Namespace, flags: Sequence[str]) -> dict[str, Any]:
-    """Return what flags state, as a table of a job file.
-
-    Args:
-        options: The flags given.
-        flags: Which of them.
-    """
-    table: dict[str, Any] = {}
-    for flag in flags:
-        value = getattr(options, _name(flag), None)
-        if value is None:
-            continue
-        *tables, key = FLAGS[flag][0].split(".")
-        table_in(table, tables)[key] = _READ[flag](value, flag) if flag in _READ else value
-    return table

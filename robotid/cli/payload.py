@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from robotid._text import columns, in_digits_of
-from robotid.cli.flags import LOG, add_json, add_settings, job_from_flags, refuse_log_flags
+from robotid.cli.flags import JOB, LOG, add_json, job_from_flags, refuse_log_flags
 from robotid.cli.printing import say
 from robotid.cli.running import progress_of, show_found
 from robotid.findings import listed
@@ -34,7 +34,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     words = "find the gains of logged currents that no --gain states, from a known mass"
     add("--gains", action="store_true", help=words)
     add_json(parser)
-    add_settings(parser.add_argument_group("the logs, unless a RESULT says it"), LOG)
+    JOB.add(parser.add_argument_group("the logs, unless a RESULT says it"), LOG)
 
 
 def run(options: argparse.Namespace) -> None:

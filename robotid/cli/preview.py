@@ -8,10 +8,9 @@ from typing import Any
 
 from robotid._text import columns
 from robotid.cli.flags import (
-    FLAGS,
+    JOB,
     MOTION,
     add_json,
-    add_settings,
     job_from_flags,
     pairs,
     refuse_log_flags,
@@ -46,8 +45,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     words = "print standard parameters and whole expressions, too; say on stderr what is chosen"
     parser.add_argument("--verbose", action="store_true", help=words)
     flags = parser.add_argument_group("instead of a job file or a RESULT, with URDF MOTION")
-    flags.add_argument("--estimator", **FLAGS["--estimator"][1], help="as of identify")
-    add_settings(flags, MOTION)
+    JOB.add(flags, ("--estimator", *MOTION))
 
 
 def run(options: argparse.Namespace) -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from robotid._files import check_file
 from robotid.cli.flags import (
+    JOB,
     ONLINE,
     add_robot_and_log,
     add_serve,
-    add_settings,
     job_from_flags,
     refuse_log_flags,
 )
@@ -34,7 +34,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("--ghost", metavar="LOG", help="second motion, shown as a ghost")
     add_serve(parser, "track the log again, in true time, and show it as it goes")
     group = parser.add_argument_group("the log, unless a RESULT says it")
-    add_settings(group, ONLINE)
+    JOB.add(group, ONLINE)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -1,13 +1,12 @@
 """robotid simulate: a log of a motion by a robot whose truth is known."""
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotid._settings import table_in
+from robotid._settings import Settings
 from robotid.cli.console import terminal_progress
-from robotid.cli.flags import ROBOT, add_json, add_settings, stated_by
+from robotid.cli.flags import JOB, ROBOT, Flags, add_json
 from robotid.cli.printing import print_files, say
 from robotid.cli.running import show_found
 from robotid.exceptions import SettingsError
@@ -20,17 +19,28 @@ if TYPE_CHECKING:
 __all__ = ["SUMMARY", "add_flags", "run"]
 
 SUMMARY = "a log of a motion by a robot whose truth is known"
-#: Key of the file of a plant that each flag of "simulate" states.
-_SIMULATION: Mapping[str, tuple[str, dict[str, Any]]] = {
-    "--seed": ("seed", {"metavar": "N", "type": int}),
-    "--rate": ("rate", {"metavar": "HZ", "type": float}),
-    "--duration": ("duration", {"metavar": "S", "type": float}),
-    "--perturb": ("truth.inertials", {"metavar": "SIZE", "type": float}),
-    "--controller": ("controller.kind", {"metavar": "KIND"}),
-    "--torque-noise": ("sensors.noise.tau", {"metavar": "SHARE", "type": float}),
-    "--limits": ("actuator.effort", {"metavar": "TIMES", "type": float}),
-    "--payload": ("payload.mass", {"metavar": "KG", "type": float}),
-}
+
+
+def _simulation() -> Settings:
+    from robotid.simulation.settings import Simulation
+
+    return Simulation()
+
+
+#: Flags of the keys of a plant's file.
+_PLANT = Flags(
+    _simulation,
+    {
+        "--seed": ("seed", "N"),
+        "--rate": ("rate", "HZ"),
+        "--duration": ("duration", "S"),
+        "--perturb": ("truth.inertials", "SIZE"),
+        "--controller": ("controller.kind", "KIND"),
+        "--torque-noise": ("sensors.noise.tau", "[JOINT=]SHARE"),
+        "--limits": ("actuator.effort", "TIMES"),
+        "--payload": ("payload.mass", "KG"),
+    },
+)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -48,10 +58,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("--plant", metavar="FILE", help=words)
     add("--cutoff", type=float, metavar="HZ", help="smooth MOTION, a recorded one, to this")
     add_json(parser)
-    group = parser.add_argument_group("instead of, or over, the same in --plant")
-    for flag, (key, about) in _SIMULATION.items():
-        group.add_argument(flag, **about, help=_simulation_words(key))
-    add_settings(parser.add_argument_group("the robot"), ROBOT)
+    _PLANT.add(parser.add_argument_group("instead of, or over, the same in --plant"))
+    JOB.add(parser.add_argument_group("the robot"), ROBOT)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -84,13 +92,7 @@ def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation
     from robotid.commands.job import job_from_settings
     from robotid.simulation.settings import read_simulation
 
-    given: dict[str, Any] = {}
-    for flag, (path, _) in _SIMULATION.items():
-        value = getattr(options, flag[2:].replace("-", "_"))
-        if value is not None:
-            *tables, key = path.split(".")
-            table_in(given, tables)[key] = value
-    settings, drives = read_simulation(options.plant, given)
+    settings, drives = read_simulation(options.plant, _PLANT.stated(options))
     for joint, entries in drives.items():
         if named := [entry for entry in entries if isinstance(entry, str)]:
             raise SettingsError(
@@ -99,14 +101,8 @@ def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation
             )
     if options.plant:  # whose name errors about its drives have
         job_from_settings({"urdf": options.source, "drives": drives}, options.plant, Path())
-    table = {"urdf": options.source, "drives": drives, **stated_by(options, ROBOT)}
+    table = {"urdf": options.source, "drives": drives, **JOB.stated(options, ROBOT)}
     return job_from_settings(table, "command line", Path()), settings
-
-
-def _simulation_words(key: str) -> str:
-    from robotid.simulation.settings import Simulation
-
-    return Simulation.paths()[key].words.replace("%", "%%")
 
 
 def _show(content: dict[str, Any]) -> None:

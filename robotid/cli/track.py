@@ -6,12 +6,12 @@ from typing import Any
 
 from robotid._text import columns, in_digits_of
 from robotid.cli.flags import (
+    JOB,
     ONLINE,
     add_json,
     add_out,
     add_robot_and_log,
     add_serve,
-    add_settings,
     add_verbose,
     job_from_flags,
 )
@@ -32,7 +32,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add_robot_and_log(parser)
     add_out(parser, "robotid-track")
     add_json(parser, "track.json")
-    add_settings(parser.add_argument_group("the log"), ONLINE)
+    JOB.add(parser.add_argument_group("the log"), ONLINE)
     add_verbose(parser)
     add_serve(parser, "show it in the browser while it runs, in true time")
 

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robotid._files import check_path, missing_file
-from robotid._settings import Entries, Range, Settings, check_keys, require_kind, setting
+from robotid._settings import Entries, Key, Range, Settings, check_keys, require_kind, setting
 from robotid.closed_loop.settings import LoopSettings
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.fitting.settings import (
+    ESTIMATORS,
     ConsistentSettings,
     EstimatorSettings,
     SimulationSettings,
@@ -224,6 +225,17 @@ class Job(Settings):
         at="reduction.workers",
         within=Range("1 to 1024", lambda x: 1 <= x <= 1024),
     )
+
+    @classmethod
+    def paths(cls) -> dict[str, Key]:
+        """Return what each key says of itself, those too that no field of their own has."""
+        friction = Key(
+            "auto: what held-out stretches of the fitted logs ask for, joint by joint (default); "
+            f"none; or some of these with + between them: {', '.join([*_PLAIN, *FAMILIES])}"
+        )
+        others = ", ".join(name for name in ESTIMATORS if name != "consistent")
+        name = Key(f"which estimator: consistent (default), {others}", among=tuple(ESTIMATORS))
+        return super().paths() | {"model.friction": friction, "estimator.name": name}
 
     def __post_init__(self) -> None:
         super().__post_init__()

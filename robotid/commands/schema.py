@@ -30,7 +30,7 @@ def job_schema() -> dict[str, Any]:
     keys = dict(Job.paths())
     for kind in ESTIMATORS.values():
         keys |= {f"estimator.{name}": key for name, key in kind.paths().items()}
-    keys["estimator.name"] = Key("which estimator", among=tuple(ESTIMATORS))
+    keys["estimator.name"] = Job.paths()["estimator.name"]
     for at, inside in _TABLES.items():
         keys |= {f"{at}.{name}": key for name, key in inside.paths().items()}
     table = _table(Job.schema(), keys, "")

@@ -317,7 +317,7 @@ def test_a_stated_unit_overrides_the_suspicion(arm_logs, tmp_path, capsys):
 WRONG_USE = {
     "unknown estimator": (["--estimator", "magic"], 2, "estimator is 'magic'"),
     "bad gain": (["--gain", "elbow"], 2, "wanted JOINT=NUMBER"),
-    "bad cutoff": (["--cutoff", "no"], 2, "wanted a frequency [Hz] or false"),
+    "bad cutoff": (["--cutoff", "no"], 2, "wanted a number or false"),
     "unknown joint": (["--joints", "elbow"], 1, "joint 'elbow' is not in planar_2r.urdf"),
     "cutoff beyond half the rate": (["--cutoff", "80"], 2, "not below half the rate"),
     "unknown unit": (["--time-unit", "min"], 2, "time is 'min', wanted one of"),

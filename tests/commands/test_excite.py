@@ -390,7 +390,7 @@ def test_every_flag_states_its_setting():
     load = ["--link", "wrist_3_link", "--mass", "2", "--com", "0.1,0,-0.2", "--moving", "one,two"]
     found = stated_by_flags("--kind", "payload", "--clearance", "none", *load)
     payload = Payload(link="wrist_3_link", mass=2.0, com=(0.1, 0.0, -0.2))
-    assert (found.payload, found.moving, found.clearance) == (payload, ["one", "two"], None)
+    assert (found.payload, found.moving, found.clearance) == (payload, ("one", "two"), None)
     assert stated_by_flags() == MotionSettings()
 
 
