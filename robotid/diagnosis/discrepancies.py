@@ -202,7 +202,7 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
         across = np.linalg.svd(down[None])[2][1:]  # two directions at right angles to gravity
 
         def tilted(x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
-            return _pulled(model, _turned(x, across, down)), sample.at
+            return model.with_gravity(_turned(x, across, down)), sample.at
 
         Z = by_gravity @ (np.linalg.norm(down) * across).T
         yield _Alteration("gravity", "", Z, 0.05, _tilt(across, down), tilted)
@@ -220,13 +220,6 @@ def _torques(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
 def _drives(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
     """Return the torques of drives in motions, shape (N, n)."""
     return np.concatenate([drive_torque(model, pi, motion) for motion in at])
-
-
-def _pulled(model: RobotModel, gravity: Array) -> RobotModel:
-    """Return the robot under another gravity (3,) [m/s^2]."""
-    pin_model = model.pin_model.copy()
-    pin_model.gravity.linear = gravity
-    return replace(model, pin_model=pin_model)
 
 
 def _turned(x: Array, across: Array, down: Array) -> Array:

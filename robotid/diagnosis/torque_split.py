@@ -23,7 +23,7 @@ from robotid.regressor.prediction import rigid_parts
 from robotid.regressor.used_rows import independent_share
 from robotid.robot.model import RobotModel
 
-__all__ = ["JointTorque", "Rows", "TorqueSplit", "joint_torques", "split_torque"]
+__all__ = ["JointTorque", "Rows", "TorqueSplit", "joint_torques", "split_torque", "spread_rows"]
 
 _RIGID = ("gravity", "inertia", "Coriolis")
 _ROWS = 4000  # of all recordings together that are split
@@ -341,7 +341,7 @@ def _torques_of(found: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTor
     """Return the torque of each row in some recordings."""
     model, pi = found.model, found.standard
     most = _ROWS // len(evaluations)
-    own = [(e, _spread(len(e.recording.trajectory.t), most)) for e in evaluations]
+    own = [(e, spread_rows(len(e.recording.trajectory.t), most)) for e in evaluations]
     motions = [e.recording.trajectory.at(k) for e, k in own]
     splits = [split_torque(model, pi, m.q, m.v, m.a, m.direction, m.memory) for m in motions]
     used = np.concatenate([e.recording.mask[k] for e, k in own])
@@ -383,8 +383,13 @@ def _torques_of(found: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTor
     return tuple(judged)
 
 
-def _spread(count: int, most: int) -> Array:
-    """Return which of so many samples are taken, spread over all."""
+def spread_rows(count: int, most: int) -> Array:
+    """Return which of so many samples are taken, spread evenly over all.
+
+    Args:
+        count: Their number.
+        most: The most that are taken.
+    """
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 

@@ -52,7 +52,7 @@ class _Loads:
     def pulls(self) -> Array:
         """Of links at rest, per m/s^2 of gravity along x, y and z, shape (3, N, n, bodies)."""
         still = np.zeros_like(self.v)
-        pulled = [_in_gravity(self.model, axis) for axis in np.eye(3)]
+        pulled = [self.model.with_gravity(axis) for axis in np.eye(3)]
         columns = (carried_columns(model, self.q, still, still) for model in pulled)
         return np.array([self._by_link(x.reshape(len(x), -1, 10)) for x in columns])
 
@@ -238,9 +238,3 @@ def _probe(
     model: RobotModel, motion: Trajectory, rows: Array, state: tuple[Array, Array, Array]
 ) -> Probe:
     return Probe(model, motion, rows, *state, motion.tau[rows], _Loads(model, *state))
-
-
-def _in_gravity(model: RobotModel, gravity: Array) -> RobotModel:
-    pin_model = model.pin_model.copy()
-    pin_model.gravity.linear = gravity
-    return replace(model, pin_model=pin_model)

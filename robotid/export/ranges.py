@@ -40,6 +40,7 @@ __all__ = [
     "parameter_ranges",
     "projected_ranges",
     "ranges_text",
+    "source_of",
     "stated_ranges",
     "write_ranges",
 ]
@@ -196,7 +197,7 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
         ends = _range(
             entry["value"],
             math.inf if error is None else error,
-            _source(entry),
+            source_of(entry),
             is_positive=term == "kp",
             reach=entry.get("reach") or REACH,
             least=0.0 if term in _NOT_NEGATIVE else -math.inf,
@@ -269,8 +270,12 @@ def _joint_source(sources: Sequence[str]) -> str:
     return sources[0] if len(set(sources)) == 1 else "mixed"
 
 
-def _source(entry: Mapping[str, Any]) -> str:
-    """Return what a drive parameter of a result rests on."""
+def source_of(entry: Mapping[str, Any]) -> str:
+    """Return what a parameter of a result rests on, of results that do not state it, too.
+
+    Args:
+        entry: The parameter, as in result.json.
+    """
     found = "stated" if entry.get("std_error") is None else "data"
     return "bound" if entry.get("at_bound") else str(entry.get("source", found))
 

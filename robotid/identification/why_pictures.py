@@ -4,7 +4,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.diagnosis.dependence import Dependence
-from robotid.diagnosis.torque_split import JointTorque
+from robotid.diagnosis.torque_split import JointTorque, spread_rows
 from robotid.fitting.bands import REACH
 from robotid.identification.pictures import unused_spans
 from robotid.pages.charts import Chart, Series, broken
@@ -92,7 +92,7 @@ def _residual(torque: JointTorque, dependence: Dependence, link: str, points: in
     x = torque.rows.time if name == "time" else torque.quantities[name][1]
     rows = np.flatnonzero(torque.used)
     rows = rows[np.argsort(x[rows])]
-    k = rows[_evenly(len(rows), points)]
+    k = rows[spread_rows(len(rows), points)]
     mean, error = dependence.at(x[k])
     is_one = name == "time" and len(torque.rows.recordings) == 1
     residual, less = torque.against_time if name == "time" else (torque.residual, "")
@@ -115,8 +115,4 @@ def _residual(torque: JointTorque, dependence: Dependence, link: str, points: in
 def _first(torque: JointTorque, points: int) -> Array:
     """Return rows spread evenly over the first recording."""
     own = np.flatnonzero(torque.rows.recording == 0)
-    return own[_evenly(len(own), points)]
-
-
-def _evenly(count: int, most: int) -> Array:
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+    return own[spread_rows(len(own), points)]

@@ -11,6 +11,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.closed_loop.evaluation import DRIFTS, OpenLoop
 from robotid.exceptions import DataError
+from robotid.export.ranges import source_of
 from robotid.findings import Finding, listed
 from robotid.pages.charts import Chart, Series, chart_html
 from robotid.pages.html import code, number, table, text
@@ -83,7 +84,7 @@ def shown_positions(
         for entry in content["validation"]
     ]
     entries = [
-        entry | {"source": _source(entry)}
+        entry | {"source": source_of(entry)}
         for key in ("standard_parameters", "drive_parameters")
         for entry in content[key]
     ]
@@ -127,12 +128,6 @@ def shown_positions(
 def _is_driven(content: Mapping[str, Any]) -> bool:
     """Return whether the logged torque drove the robot, which no loop was closed on."""
     return bool(content["simulation"]["controller"]["kind"] == "torque")
-
-
-def _source(entry: Mapping[str, Any]) -> str:
-    """Return what determined a parameter, of results that do not say it, too."""
-    found = "stated" if entry.get("std_error") is None else "data"
-    return "bound" if entry.get("at_bound") else str(entry.get("source", found))
 
 
 def _entries(content: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:

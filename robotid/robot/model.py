@@ -265,6 +265,16 @@ class RobotModel:
         kept = {name: tuple(terms) for name, terms in own.items() if terms}
         return replace(self, layout=replace(self.layout, own=kept), reference=None)
 
+    def with_gravity(self, gravity: Array) -> "RobotModel":
+        """Return the same robot under another gravity.
+
+        Args:
+            gravity: In the root link's frame, shape (3,) [m/s^2].
+        """
+        pin_model = self.pin_model.copy()
+        pin_model.gravity.linear = gravity
+        return replace(self, pin_model=pin_model)
+
     def with_reference(self, pi: Array) -> "RobotModel":
         """Return the same robot with other parameters that drive terms depend on.
 

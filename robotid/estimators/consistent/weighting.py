@@ -104,7 +104,7 @@ def choose_weight(fit: Consistent, segments: Segments, how: str) -> WeightChoice
     def score(weight: float) -> tuple[float, Array]:
         nonlocal starts
         try:
-            errors, starts = _held_out(fit, segments, weight, starts)
+            errors, starts = held_out_errors(fit, segments, weight, starts)
         except NotConvergedError:
             if starts is None:
                 raise
@@ -139,41 +139,40 @@ def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]
     if not bodies or count < 2:
         return bodies
     try:
-        unbound = _held_out(free, segments, 1.0, [solution] * count)[0].sum(axis=1)
+        unbound = held_out_errors(free, segments, 1.0, [solution] * count)[0].sum(axis=1)
     except NotConvergedError:
         return ()
     try:
-        bound = _held_out(fit, segments, 1.0, None)[0].sum(axis=1)
+        bound = held_out_errors(fit, segments, 1.0)[0].sum(axis=1)
     except NotConvergedError:  # data without noise cannot be fitted at all
         return bodies
     is_clear = bound.sum() > (1.0 + _CLEAR) * unbound.sum() and not _is_as_good(bound, unbound)
     return bodies if is_clear else ()
 
 
-def held_out_errors(fit: Consistent, segments: Segments, weight: float) -> Array:
+def held_out_errors(
+    fit: Consistent,
+    segments: Segments,
+    weight: float,
+    starts: Sequence[ConeSolution] | None = None,
+) -> tuple[Array, list[ConeSolution]]:
     """Return how well each segment is predicted by the fit to all others, constraints included.
 
     Args:
         fit: The fit, whose own weight does not matter.
         segments: The fitted data, at least two segments.
         weight: Weight of the prior.
+        starts: Fits to start from, one without each segment.
 
     Returns:
         Sum of squares of the prediction errors by segment and joint, over the joint's noise level
         and its number of rows in all segments, shape (segments, n) [-]: the sum over segments is
-        the mean square of each joint.
+        the mean square of each joint; and the fits, to start others.
 
     Raises:
         DataError: If there are fewer than two segments.
         NotConvergedError: If a fit does not converge.
     """
-    return _held_out(fit, segments, weight, None)[0]
-
-
-def _held_out(
-    fit: Consistent, segments: Segments, weight: float, starts: Sequence[ConeSolution] | None
-) -> tuple[Array, list[ConeSolution]]:
-    """Return the errors of ``held_out_errors``, and the fits that made them, to start others."""
     if len(segments.kept) < 2:
         raise DataError(
             f"the prior's weight cannot be chosen from {len(segments.kept)} stretch; fit longer "

@@ -96,7 +96,8 @@ def test_the_held_out_errors_are_those_of_a_loop_by_hand(case):
         part = slice(200 * 6 * k, 200 * 6 * (k + 1))
         residual = (tau - W @ (fit.K @ pi))[part].reshape(-1, 6) / NOISE
         total, count = total + (residual**2).sum(axis=0), count + len(residual)
-    error = np.sqrt(held_out_errors(fit, Segments.of(fit, stretches, NOISE), 2.0).sum(axis=0))
+    squares, _ = held_out_errors(fit, Segments.of(fit, stretches, NOISE), 2.0)
+    error = np.sqrt(squares.sum(axis=0))
     # it is computed to the solver's tolerance only
     np.testing.assert_allclose(error, np.sqrt(total / count), rtol=2e-4)
 
@@ -126,7 +127,7 @@ def chosen(case, monkeypatch, excess):
     def errors(fit, segments, w, starts):
         return (1.0 + abs(np.log10(w) + 2.0) * np.asarray(excess)) / 6.0, []
 
-    monkeypatch.setattr("robotid.estimators.consistent.weighting._held_out", errors)
+    monkeypatch.setattr("robotid.estimators.consistent.weighting.held_out_errors", errors)
     return choose_weight(fit, Segments.of(fit, cut(problem, 6)), "cv")
 
 
@@ -165,7 +166,7 @@ def test_a_joint_at_rest_is_left_out_of_the_choice(case, monkeypatch):
         squares = (1.0 + abs(np.log10(w) + 2.0) * (0.009 + CHANCE)) / 6.0
         return np.hstack([squares, np.zeros_like(squares)]), []
 
-    monkeypatch.setattr("robotid.estimators.consistent.weighting._held_out", errors)
+    monkeypatch.setattr("robotid.estimators.consistent.weighting.held_out_errors", errors)
     choice = choose_weight(fit, Segments.of(fit, cut(problem, 6)), "cv")
     assert choice.weight == pytest.approx(100.0)
     assert choice.curve[-1][1] == pytest.approx(np.sqrt(1.036))
@@ -317,11 +318,11 @@ def test_an_extent_is_contradicted_by_four_errors_two_percent_and_two_errors_of_
     fit = Boxed(constraints, np.array([-8.1, -7.9, -2.1]))  # four times 2, 2 and 0.5
     swing = chance * np.tile([1.0, -1.0], 4)
 
-    def held_out(fit, segments, weight, starts):
+    def held_out(fit, segments, weight, starts=None):
         left = np.ones((8, 1)) if fit.constraints == "free" else ratio + swing[:, None]
         return left, []
 
-    monkeypatch.setattr("robotid.estimators.consistent.weighting._held_out", held_out)
+    monkeypatch.setattr("robotid.estimators.consistent.weighting.held_out_errors", held_out)
     segments = SimpleNamespace(rows=None, kept=[None] * 8)
     assert contradicted_extents(fit, segments) == named
 
