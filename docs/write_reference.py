@@ -1,6 +1,6 @@
-"""Write the keys of job files and of plants from the fields of the settings.
+"""Write the pages of the reference that follow from the code.
 
-``python docs/make_job_file.py`` writes docs/job_file.md, and the end of docs/simulating.md.
+``python docs/write_reference.py`` writes the keys of job files and of plants.
 """
 
 import math
@@ -16,14 +16,17 @@ from robotid.robot.drives import TERMS
 from robotid.robot.families import AUTO, FAMILIES
 from robotid.simulation.settings import Simulation
 
-PAGE = Path(__file__).with_name("job_file.md")
-SIMULATING = Path(__file__).with_name("simulating.md")
-KEYS = "## Keys of a plant"  # the rest of that page is written
+REFERENCE = Path(__file__).with_name("reference")
+PLANT = """# Keys of a plant
+
+`robotid simulate --plant plant.toml` reads these keys; [Simulating a log](../how_to/simulate.md) explains them. A flag
+overrides the file. This page is written by `python docs/write_reference.py` from the settings in the code.
+"""
 START = """# Job file
 
 A job file is TOML: `robotid identify job.toml`. Only `urdf` and one `[[identification]]` are needed; every other key has
 the default below. A misspelt key is an error that names the nearest right one. Paths are relative to the job file, and
-`$NAME` in them is filled in from the environment. This page is written by `python docs/make_job_file.py` from the settings
+`$NAME` in them is filled in from the environment. This page is written by `python docs/write_reference.py` from the settings
 in the code; `result.json` holds the same keys under `settings`. `robotid schema > job.schema.json` writes them as a JSON
 schema: with `#:schema job.schema.json` in its first line, editors that know TOML complete and check a job file. Shells complete commands and flags after
 `eval "$(register-python-argcomplete robotid)"`.
@@ -85,8 +88,8 @@ TABLES = {
 }
 
 
-def page():
-    """Return the text of the page."""
+def job_file():
+    """Return the text of the page on job files."""
     own = {
         key.at or field.name: (field, key)
         for field, key in keys(Job)
@@ -113,9 +116,9 @@ def page():
     return "\n".join(parts) + "\n"
 
 
-def simulating():
-    """Return the text of the page on simulation, the keys of a plant at its end."""
-    text, tables = SIMULATING.read_text().partition(KEYS)[0], {}
+def plant():
+    """Return the text of the page on the keys of a plant."""
+    tables = {}
     inside = [("", Simulation)]
     for at, kind in inside:
         for field, key in keys(kind):
@@ -123,9 +126,9 @@ def simulating():
                 inside.append((f"{at}.{field.name}".strip("."), field.type))
             else:
                 tables.setdefault(at, []).append(row(field.name, field, key))
-    parts = [f"{text.rstrip()}\n\n{KEYS}\n", *listing(tables.pop(""))]
+    parts = [PLANT, *listing(tables.pop(""))]
     for name, rows in tables.items():
-        parts += [f"\n### `[{name}]`\n", *listing(rows)]
+        parts += [f"\n## `[{name}]`\n", *listing(rows)]
     return "\n".join(parts) + "\n"
 
 
@@ -201,5 +204,5 @@ def default_of(field):
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
-    SIMULATING.write_text(simulating(), encoding="utf-8")
+    (REFERENCE / "job_file.md").write_text(job_file(), encoding="utf-8")
+    (REFERENCE / "plant.md").write_text(plant(), encoding="utf-8")
