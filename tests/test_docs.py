@@ -18,7 +18,9 @@ from helpers.synthetic import exact_log, truth
 import robotid
 from robotid.cli import COMMANDS, main
 from robotid.commands.job import Job, LogEntry, job_from_settings
+from robotid.doctor.diagnosis import CODES
 from robotid.fitting.settings import EstimatorSettings
+from robotid.judgement.verdict import DOUBTFUL
 from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
@@ -176,6 +178,54 @@ def test_doctor_lists_every_corruption_and_none_other():
     assert f"{sum(int(found) for *_, found in rows)} of {8 * len(CASES)}" in page
 
 
+def codes_of_findings():
+    """Return the codes that the code gives to findings, those of unread logs included."""
+    places = {"Finding": 0, "_Alteration": 0, "log_finding": 1, "Candidate": 1}
+    codes = {*CODES, *DOUBTFUL, "unusable_log"}
+    for path in (ROOT / "robotid").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call):
+                name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+                given = [k.value for k in node.keywords if k.arg == "code"]
+                given += node.args[places[name] :][:1] if name in places else []
+            elif isinstance(node, ast.Assign):
+                given = [
+                    value
+                    for target in node.targets
+                    for one, value in pairs(target, node.value)
+                    if getattr(one, "id", "") == "code"
+                ]
+            else:
+                continue
+            for value in given:
+                if isinstance(value, ast.Constant | ast.JoinedStr | ast.IfExp):
+                    codes |= {x.value for x in ast.walk(value) if isinstance(x, ast.Constant)}
+    return {code for code in codes if isinstance(code, str) and code.islower()}
+
+
+def pairs(target, value):
+    """Return the names and values of an assignment, one by one."""
+    both = [target, value]
+    if all(isinstance(x, ast.Tuple) for x in both):
+        return list(zip(target.elts, value.elts, strict=True))
+    return [(target, value)]
+
+
+def test_each_finding_has_its_section():
+    shown = [
+        code
+        for page in (DOCS / "reference/findings").glob("*.md")
+        for code in re.findall(r"^##+ ([a-z_]+)$", page.read_text(), re.MULTILINE)
+    ]
+    assert len(shown) == len(set(shown)), "a code has two sections"
+    codes = codes_of_findings()
+    begun = tuple(code for code in codes if code.endswith("_"))  # of a code in two parts
+    assert sorted(code for code in codes if code not in shown and code not in begun) == []
+    assert sorted(x for x in shown if x not in codes and not x.startswith(begun)) == []
+    index = (DOCS / "reference/findings/index.md").read_text()
+    assert sorted(re.findall(r"\[`(\w+)`\]\(\w+\.md#\1\)", index)) == sorted(shown)
+
+
 def pages():
     return sorted(DOCS.rglob("*.md"))
 
@@ -205,7 +255,9 @@ def test_every_page_of_measurements_has_its_table():
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
 def test_links_lead_somewhere(page):
     links = re.findall(r"\]\((?!http)([^)#]+)", page.read_text())
-    assert not [link for link in links if not (page.parent / link).is_file()]
+    places = [(page.parent / link).resolve() for link in links]
+    written = {DOCS / f"reference/commands/{name}.md" for name in COMMANDS}  # as the site is built
+    assert not [place for place in places if not place.is_file() and place not in written]
 
 
 def test_no_page_is_left_out_of_the_site():
@@ -243,7 +295,9 @@ def test_the_site_builds_and_documents_the_public_names(tmp_path):
         [*command, "-d", str(tmp_path)], cwd=ROOT, env=environment, capture_output=True, text=True
     )
     assert run.returncode == 0, run.stderr
-    shown = set(re.findall(r'id="robotid\.(\w+)"', (tmp_path / "reference/api.html").read_text()))
-    assert set(robotid.__all__) - {"__version__"} <= shown
+    pages = [page.read_text() for page in (tmp_path / "reference/api").glob("*.html")]
+    shown = [name for page in pages for name in re.findall(r'id="robotid\.(\w+)"', page)]
+    assert set(robotid.__all__) - {"__version__"} <= set(shown)
+    assert len(shown) == len(set(shown)), "a name is documented twice"
     home = (tmp_path / "index.html").read_text()
     assert "fonts." not in home, "the site is read without a network"
