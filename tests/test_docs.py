@@ -69,9 +69,13 @@ def test_the_job_of_commands_and_positions_is_accepted(tmp_path):
     job = job_from_settings(tomllib.loads(text), "job.toml", tmp_path)
     assert job.estimator.name == "simulation"
     assert (job.controller.kp, job.controller.kd) == (20.0, 1.5)
-    for key in re.findall(
-        r"`(\w+)(?: = \"find\")?`", page.partition("What is not stated")[2][:500]
-    ):
+    driven = re.findall(r"<!-- example -->\n```toml\n(.*?)```", page, re.DOTALL)[1]
+    job = job_from_settings(tomllib.loads(driven), "job.toml", tmp_path)
+    assert job.controller.kind == "torque"
+    unstated = page.partition("These keys of `[controller]`")[2].partition("- **Groups")[0]
+    keys = re.findall(r"`(\w+)(?: = \"find\")?`", unstated)
+    assert len(keys) > 4
+    for key in keys:
         assert f"controller.{key}" in Job.paths(), key
 
 
