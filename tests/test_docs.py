@@ -271,11 +271,11 @@ def test_no_page_is_left_out_of_the_site():
     assert {page.relative_to(DOCS).as_posix() for page in pages()} | written == listed
 
 
-def test_the_architecture_names_every_room():
+def test_the_architecture_names_every_package():
     rooms = {p.parent.name for p in (ROOT / "robotid").glob("*/__init__.py")} | {"cli"}
     text = (DOCS / "explanation/architecture.md").read_text()
     assert rooms == set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE))
-    figure = (DOCS / "pictures" / "rooms.svg").read_text()
+    figure = (DOCS / "pictures" / "packages.svg").read_text()
     assert not [room for room in rooms if f">{room}<" not in figure]
 
 
