@@ -230,6 +230,34 @@ def test_each_finding_has_its_section():
     assert sorted(re.findall(r"\[`(\w+)`\]\(\w+\.md#\1\)", index)) == sorted(shown)
 
 
+def test_the_page_of_result_files_lists_every_key_of_them():
+    page = (DOCS / "reference/result_files.md").read_text()
+    listed = {
+        title: set(
+            re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (.*?) \|", part, re.MULTILINE)))
+        )
+        for title, _, part in (x.partition("\n") for x in page.split("\n## "))
+    }
+    stored = [json.loads(path.read_text()) for path in (ROOT / "tests/figures").glob("*.json")]
+    results = [run["result.json"] for run in stored if "result.json" in run]
+    keys = {key for result in results for key in result} | {"robotid", "versions"}
+    assert listed["Keys of result.json"] == keys
+    parameters = [x for result in results for x in result["drive_parameters"]]
+    assert listed["Keys of a parameter"] == {key for x in parameters for key in x}
+    sides = {key for run in stored for key in run.get("sidecar", {})} - {"schema_version", "robot"}
+    assert sides
+    assert sides <= listed["Keys of the sidecar"] | {"robotid"}
+
+
+def test_the_drives_of_the_page_on_friction_are_accepted(tmp_path):
+    page = (DOCS / "explanation/friction.md").read_text()
+    text = re.search(r"<!-- example -->\n```toml\n(.*?)```", page, re.DOTALL).group(1)
+    start = 'urdf = "robot.urdf"\njoints = ["shoulder", "elbow", "lift"]\n'
+    whole = f'{start}{text}\n[[identification]]\nlog = "first.csv"\n'
+    job = job_from_settings(tomllib.loads(whole), "job.toml", tmp_path)
+    assert sorted(job.drives) == ["elbow", "lift", "shoulder"]
+
+
 def pages():
     return sorted(DOCS.rglob("*.md"))
 
