@@ -16,9 +16,11 @@ from helpers.paths import DOCS, ROOT
 from helpers.synthetic import exact_log, truth
 
 import robotid
-from robotid.cli import main
+from robotid.cli import COMMANDS, main
 from robotid.commands.job import Job, LogEntry, job_from_settings
+from robotid.doctor.diagnosis import CODES
 from robotid.fitting.settings import EstimatorSettings
+from robotid.judgement.verdict import DOUBTFUL
 from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
@@ -41,9 +43,9 @@ def run(name):
 
 
 def test_the_page_of_the_job_file_is_what_the_settings_say(tmp_path):
-    page = (DOCS / "job_file.md").read_text()
-    written = runpy.run_path(str(DOCS / "make_job_file.py"))["page"]()
-    assert page == written, "run python docs/make_job_file.py"
+    page = (DOCS / "reference/job_file.md").read_text()
+    written = runpy.run_path(str(DOCS / "write_reference.py"))["job_file"]()
+    assert page == written, "run python docs/write_reference.py"
     for key in Job.paths().keys() - {"model"}:
         assert f"| `{key.rpartition('.')[2]}` |" in page or key.startswith(
             ("ident", "valid", "transm")
@@ -62,21 +64,26 @@ def test_the_page_of_the_job_file_is_what_the_settings_say(tmp_path):
 
 
 def test_the_job_of_commands_and_positions_is_accepted(tmp_path):
-    page = (DOCS / "commands_and_positions.md").read_text()
+    page = (DOCS / "explanation/closed_loop.md").read_text()
     text = re.search(r"<!-- example -->\n```toml\n(.*?)```", page, re.DOTALL).group(1)
     job = job_from_settings(tomllib.loads(text), "job.toml", tmp_path)
     assert job.estimator.name == "simulation"
     assert (job.controller.kp, job.controller.kd) == (20.0, 1.5)
-    for key in re.findall(
-        r"`(\w+)(?: = \"find\")?`", page.partition("What is not stated")[2][:500]
-    ):
+    driven = re.findall(r"<!-- example -->\n```toml\n(.*?)```", page, re.DOTALL)[1]
+    job = job_from_settings(tomllib.loads(driven), "job.toml", tmp_path)
+    assert job.controller.kind == "torque"
+    unstated = page.partition("These keys of `[controller]`")[2].partition("- **Groups")[0]
+    keys = re.findall(r"`(\w+)(?: = \"find\")?`", unstated)
+    assert len(keys) > 4
+    for key in keys:
         assert f"controller.{key}" in Job.paths(), key
 
 
 def test_the_page_on_simulation_says_what_the_settings_say_and_runs(tmp_path, monkeypatch, ur5):
-    page = (DOCS / "simulating.md").read_text()
-    written = runpy.run_path(str(DOCS / "make_job_file.py"))["simulating"]()
-    assert page == written, "run python docs/make_job_file.py"
+    written = runpy.run_path(str(DOCS / "write_reference.py"))["plant"]()
+    keys = (DOCS / "reference/plant.md").read_text()
+    assert keys == written, "run python docs/write_reference.py"
+    page = (DOCS / "how_to/simulate.md").read_text()
     t = np.arange(0.0, 8.001, 0.01)
     q = random_fourier(ur5, np.random.default_rng(1), period=8.0).evaluate(t)[0]
     columns = {f"q_{joint}": q[:, j] for j, joint in enumerate(ur5.joints)}
@@ -89,7 +96,7 @@ def test_the_page_on_simulation_says_what_the_settings_say_and_runs(tmp_path, mo
     assert main([*words.split(), "--rate", "100"]) == 0
     line = re.search(r"robotid (simulate .*)", page).group(1)
     assert main([*line.split(), "--rate", "100"]) == 0
-    _, namespace = run("simulating.md")
+    _, namespace = run("how_to/simulate.md")
     error = np.abs(namespace["found"].base - namespace["beta"]) / namespace["found"].base_error
     assert np.mean(error < 3) > 0.9
 
@@ -100,7 +107,7 @@ def test_own_robot(tmp_path, monkeypatch, ur5, rng, capsys):
         log = exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0, noise=0.1)
         write_log(log, tmp_path / f"{name}.csv")
     monkeypatch.chdir(tmp_path)
-    blocks, namespace = run("own_robot.md")
+    blocks, namespace = run("tutorials/first_arm.md")
     assert len(blocks[0].strip().splitlines()) <= 5
     printed = capsys.readouterr().out
     assert "verdict good" in printed.splitlines()[0]
@@ -115,7 +122,7 @@ def test_own_robot(tmp_path, monkeypatch, ur5, rng, capsys):
 
 def test_the_notebook_of_first_steps_runs_and_shows_what_it_says(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    notebook = json.loads((DOCS / "first_steps.ipynb").read_text())
+    notebook = json.loads((DOCS / "tutorials/first_steps.ipynb").read_text())
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
     assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in cells)
     namespace, shown = {}, []
@@ -143,7 +150,7 @@ def test_the_notebook_of_first_steps_runs_and_shows_what_it_says(tmp_path, monke
 
 
 def test_paper(capsys):
-    _, namespace = run("paper.md")
+    _, namespace = run("explanation/paper.md")
     printed = capsys.readouterr().out
     assert printed.startswith("after 0 runs: relative error 0.500")
     errors = namespace["errors"]
@@ -154,7 +161,7 @@ def test_paper(capsys):
 
 
 def test_online_tracker(capsys):
-    _, namespace = run("online_tracker.md")
+    _, namespace = run("how_to/online.md")
     printed = capsys.readouterr().out
     shares = [float(x) for x in re.findall(r"excitation (\S+),", printed)]
     assert shares[:5] == sorted(shares[:5])  # before the load
@@ -167,7 +174,7 @@ def test_online_tracker(capsys):
 
 
 def test_doctor_lists_every_corruption_and_none_other():
-    page = (DOCS / "doctor.md").read_text()
+    page = (DOCS / "evidence/doctor.md").read_text()
     rows = re.findall(r"^\| (.+?) \| (.+?) \| (\d)/8 \| .+ \|$", page, re.MULTILINE)
     assert {name: codes for name, codes, _ in rows} == {
         name: ", ".join(case.codes) for name, case in CASES.items()
@@ -175,8 +182,84 @@ def test_doctor_lists_every_corruption_and_none_other():
     assert f"{sum(int(found) for *_, found in rows)} of {8 * len(CASES)}" in page
 
 
+def codes_of_findings():
+    """Return the codes that the code gives to findings, those of unread logs included."""
+    places = {"Finding": 0, "_Alteration": 0, "log_finding": 1, "Candidate": 1}
+    codes = {*CODES, *DOUBTFUL, "unusable_log"}
+    for path in (ROOT / "robotid").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call):
+                name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+                given = [k.value for k in node.keywords if k.arg == "code"]
+                given += node.args[places[name] :][:1] if name in places else []
+            elif isinstance(node, ast.Assign):
+                given = [
+                    value
+                    for target in node.targets
+                    for one, value in pairs(target, node.value)
+                    if getattr(one, "id", "") == "code"
+                ]
+            else:
+                continue
+            for value in given:
+                if isinstance(value, ast.Constant | ast.JoinedStr | ast.IfExp):
+                    codes |= {x.value for x in ast.walk(value) if isinstance(x, ast.Constant)}
+    return {code for code in codes if isinstance(code, str) and code.islower()}
+
+
+def pairs(target, value):
+    """Return the names and values of an assignment, one by one."""
+    both = [target, value]
+    if all(isinstance(x, ast.Tuple) for x in both):
+        return list(zip(target.elts, value.elts, strict=True))
+    return [(target, value)]
+
+
+def test_each_finding_has_its_section():
+    shown = [
+        code
+        for page in (DOCS / "reference/findings").glob("*.md")
+        for code in re.findall(r"^##+ ([a-z_]+)$", page.read_text(), re.MULTILINE)
+    ]
+    assert len(shown) == len(set(shown)), "a code has two sections"
+    codes = codes_of_findings()
+    begun = tuple(code for code in codes if code.endswith("_"))  # of a code in two parts
+    assert sorted(code for code in codes if code not in shown and code not in begun) == []
+    assert sorted(x for x in shown if x not in codes and not x.startswith(begun)) == []
+    index = (DOCS / "reference/findings/index.md").read_text()
+    assert sorted(re.findall(r"\[`(\w+)`\]\(\w+\.md#\1\)", index)) == sorted(shown)
+
+
+def test_the_page_of_result_files_lists_every_key_of_them():
+    page = (DOCS / "reference/result_files.md").read_text()
+    listed = {
+        title: set(
+            re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (.*?) \|", part, re.MULTILINE)))
+        )
+        for title, _, part in (x.partition("\n") for x in page.split("\n## "))
+    }
+    stored = [json.loads(path.read_text()) for path in (ROOT / "tests/figures").glob("*.json")]
+    results = [run["result.json"] for run in stored if "result.json" in run]
+    keys = {key for result in results for key in result} | {"robotid", "versions"}
+    assert listed["Keys of result.json"] == keys
+    parameters = [x for result in results for x in result["drive_parameters"]]
+    assert listed["Keys of a parameter"] == {key for x in parameters for key in x}
+    sides = {key for run in stored for key in run.get("sidecar", {})} - {"schema_version", "robot"}
+    assert sides
+    assert sides <= listed["Keys of the sidecar"] | {"robotid"}
+
+
+def test_the_drives_of_the_page_on_friction_are_accepted(tmp_path):
+    page = (DOCS / "explanation/friction.md").read_text()
+    text = re.search(r"<!-- example -->\n```toml\n(.*?)```", page, re.DOTALL).group(1)
+    start = 'urdf = "robot.urdf"\njoints = ["shoulder", "elbow", "lift"]\n'
+    whole = f'{start}{text}\n[[identification]]\nlog = "first.csv"\n'
+    job = job_from_settings(tomllib.loads(whole), "job.toml", tmp_path)
+    assert sorted(job.drives) == ["elbow", "lift", "shoulder"]
+
+
 def pages():
-    return sorted(DOCS.glob("*.md"))
+    return sorted(DOCS.rglob("*.md"))
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
@@ -187,7 +270,7 @@ def test_tables_of_benchmarks_are_as_these_wrote_them(page):
     for found in blocks:
         name, shown = found["name"], found["body"]
         again = f"write it anew: python benchmarks/write_tables.py {name}"
-        assert PAGES[name] == page.name
+        assert PAGES[name] == page.relative_to(DOCS).as_posix()
         if found["digest"] == "-":  # carried over from before there were marks
             continue
         assert digest(shown) == found["digest"], f"bench_{name} wrote other figures; {again}"
@@ -204,24 +287,30 @@ def test_every_page_of_measurements_has_its_table():
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
 def test_links_lead_somewhere(page):
     links = re.findall(r"\]\((?!http)([^)#]+)", page.read_text())
-    assert not [link for link in links if not (DOCS / link).is_file()]
+    places = [(page.parent / link).resolve() for link in links]
+    written = {DOCS / f"reference/commands/{name}.md" for name in COMMANDS}  # as the site is built
+    assert not [place for place in places if not place.is_file() and place not in written]
 
 
 def test_no_page_is_left_out_of_the_site():
     config = (ROOT / ".mkdocs.yml").read_text()
-    assert {page.name for page in pages()} == set(re.findall(r"- (?:\w+: )?(\w+\.md)", config))
+    listed = set(re.findall(r"- (?:[\w ]+: )?([\w/]+\.md)", config))
+    written = {f"reference/commands/{name}.md" for name in COMMANDS}  # as the site is built
+    assert {page.relative_to(DOCS).as_posix() for page in pages()} | written == listed
 
 
-def test_the_architecture_names_every_room():
+def test_the_architecture_names_every_package():
     rooms = {p.parent.name for p in (ROOT / "robotid").glob("*/__init__.py")} | {"cli"}
-    text = (DOCS / "architecture.md").read_text()
+    text = (DOCS / "explanation/architecture.md").read_text()
     assert rooms == set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE))
-    figure = (DOCS / "pictures" / "rooms.svg").read_text()
+    figure = (DOCS / "pictures" / "packages.svg").read_text()
     assert not [room for room in rooms if f">{room}<" not in figure]
 
 
 def test_the_job_file_of_the_docs_is_accepted(tmp_path):
-    text = re.search(r"```toml\n(.*?)```", (DOCS / "job_file.md").read_text(), re.DOTALL).group(1)
+    text = re.search(
+        r"```toml\n(.*?)```", (DOCS / "reference/job_file.md").read_text(), re.DOTALL
+    ).group(1)
     commented = re.sub(
         r"^# (joints|rate|topic|\[\[coupling|name = \"motor|ratios)", r"\1", text, flags=re.M
     )
@@ -238,7 +327,9 @@ def test_the_site_builds_and_documents_the_public_names(tmp_path):
         [*command, "-d", str(tmp_path)], cwd=ROOT, env=environment, capture_output=True, text=True
     )
     assert run.returncode == 0, run.stderr
-    shown = set(re.findall(r'id="robotid\.(\w+)"', (tmp_path / "api.html").read_text()))
-    assert set(robotid.__all__) - {"__version__"} <= shown
+    pages = [page.read_text() for page in (tmp_path / "reference/api").glob("*.html")]
+    shown = [name for page in pages for name in re.findall(r'id="robotid\.(\w+)"', page)]
+    assert set(robotid.__all__) - {"__version__"} <= set(shown)
+    assert len(shown) == len(set(shown)), "a name is documented twice"
     home = (tmp_path / "index.html").read_text()
     assert "fonts." not in home, "the site is read without a network"

@@ -15,7 +15,8 @@ In the eigenvectors of D against H, whose eigenvalues x are the share of noise i
 known of a direction, the correction is by 1 / (1 - x); D is not known so well that directions of
 nothing but noise could be corrected, so x counts up to a bound, and an error of D as an error. The
 correction amplifies errors by as much; the bias is uneven over a log, so segments scatter more than
-the errors do by about the same, and their scatter is taken as it is (docs/trust.md has coverages).
+the errors do by about the same, and their scatter is taken as it is (coverages:
+docs/explanation/intervals.md).
 
 What is linear in e, [s_{+e} - s_{-e}] / 2, is the noise of the score that the encoder makes. Where
 a motion is repeated so are its rounding errors, and segments of the log do not scatter as much as

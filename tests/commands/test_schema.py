@@ -33,7 +33,7 @@ def test_job_files_of_real_robots_are_valid(check, job):
 
 
 def test_the_example_of_the_docs_is_valid(check):
-    page = (ROOT / "docs/job_file.md").read_text()
+    page = (ROOT / "docs/reference/job_file.md").read_text()
     check(tomllib.loads(page.split("```toml\n")[1].split("```")[0]))
 
 

@@ -1,4 +1,4 @@
-"""docs/wrong_answers.md: wrong answers given elsewhere without a word, provoked here."""
+"""docs/evidence/wrong_answers.md: wrong answers given elsewhere without a word, provoked here."""
 
 import os
 import re
@@ -20,7 +20,7 @@ from robotid.regressor.prediction import predict
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
-DOCS = Path(__file__).parents[2] / "docs" / "wrong_answers.md"
+DOCS = Path(__file__).parents[2] / "docs" / "evidence/wrong_answers.md"
 URDF = example_urdf("ur5_robot.urdf")
 NOISE = np.array([2.0, 2.0, 1.0, 0.3, 0.3, 0.1])
 

@@ -14,7 +14,7 @@ from robotid.robot import geometry
 from robotid.robot.examples import example_urdfs
 from robotid.robot.model import RobotModel
 
-AUDIT, COUNTS = DOCS / "urdf_audit.md", DOCS / "base_counts.md"
+AUDIT, COUNTS = DOCS / "evidence/urdf_audit.md", DOCS / "evidence/base_counts.md"
 WRITES = {"ROBOTID_WRITE_AUDIT", "ROBOTID_WRITE_COUNTS"} & set(os.environ)
 #: Take two thirds of the time, and have no finding that no other robot has. All are inspected to
 #: write the tables; every robot is opened in tests/robot/test_model.py.

@@ -8,7 +8,7 @@ from robotid.doctor.urdf_geometry import audit_links
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
-DOCS = Path(__file__).parents[2] / "docs" / "urdf_audit.md"
+DOCS = Path(__file__).parents[2] / "docs" / "evidence/urdf_audit.md"
 ARM = """<robot name="arm">
   <link name="base"/>
   <joint name="j1" type="continuous"><parent link="base"/><child link="upper"/>

@@ -13,7 +13,7 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 
-DOCS = Path(__file__).resolve().parents[2] / "docs" / "base_counts.md"
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "evidence/base_counts.md"
 ARM = {"panda.urdf": [f"panda_joint{i}" for i in range(1, 8)]}
 COUNTS = {
     "ur3_robot.urdf": (36, None),

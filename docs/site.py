@@ -1,0 +1,97 @@
+"""Hooks of the site: one page for each command, and the gallery where one was built.
+
+``mkdocs build -f .mkdocs.yml`` calls them. ``python docs/gallery.py`` builds the gallery.
+"""
+
+import argparse
+import json
+import shutil
+from importlib import import_module
+from pathlib import Path
+
+from mkdocs.structure.files import File
+
+from robotid.cli import COMMANDS
+
+GALLERY = Path(__file__).parents[1] / "build" / "gallery"
+
+
+def on_files(files, config):
+    """Add the pages of the commands."""
+    for name in COMMANDS:
+        page = command_page(name)
+        files.append(File.generated(config, f"reference/commands/{name}.md", content=page))
+    return files
+
+
+def on_page_markdown(markdown, page, **_):
+    """Fill in the gallery, and the demo on the landing page."""
+    entries = {}
+    if (GALLERY / "entries.json").exists():
+        entries = {e["name"]: e for e in json.loads((GALLERY / "entries.json").read_text())}
+    if page.file.src_uri == "gallery.md":
+        return markdown + "\n".join(map(gallery_entry, entries.values()))
+    if page.file.src_uri == "index.md" and "demo" in entries:
+        return markdown.replace("<!-- demo -->", frames("demo"))
+    return markdown
+
+
+def on_post_build(config):
+    """Copy the reports and replays of the gallery."""
+    if GALLERY.exists():
+        shutil.copytree(GALLERY, Path(config["site_dir"]) / "gallery", dirs_exist_ok=True)
+
+
+def gallery_entry(entry):
+    """Return the section of one robot."""
+    facts = "\n".join(f"| {key} | {value} |" for key, value in entry["facts"].items())
+    command = f"```bash\n{entry['command']}\n```"
+    table = f"| | |\n|---|---|\n{facts}"
+    return f"\n## {entry['title']}\n\n{entry['lesson']}\n\n{table}\n\n{command}\n\n{frames(entry['name'])}\n"
+
+
+def frames(name):
+    """Return the report and the replay of an entry, each loaded when it is scrolled to."""
+    return "\n\n".join(
+        f'<iframe src="gallery/{name}/{page}.html" title="{page} of {name}" loading="lazy" '
+        f'style="width:100%;height:36rem;border:1px solid #8884"></iframe>\n\n'
+        f"[Open the {page} in a tab of its own](gallery/{name}/{page}.html){{target=_blank}}"
+        for page in ("report", "replay")
+    )
+
+
+def command_page(name):
+    """Return the page of a command: what it does, its arguments and its flags, group by group."""
+    module = import_module(f"robotid.cli.{name}")
+    parser = argparse.ArgumentParser(prog=f"robotid {name}")
+    module.add_flags(parser)
+    parts = [f"# robotid {name}\n", f"{module.SUMMARY[:1].upper()}{module.SUMMARY[1:]}.\n"]
+    usage = [a.metavar or a.dest for a in parser._actions if not a.option_strings]
+    parts += [f"```text\nrobotid {' '.join([name, *map(shown, usage)])} [flags]\n```\n"]
+    for group in parser._action_groups:
+        actions = [a for a in group._group_actions if a.dest != "help"]
+        if actions:
+            parts += [f"## {title_of(group.title)}\n", "| | |\n|---|---|", *map(row, actions), ""]
+    return "\n".join(parts)
+
+
+def title_of(title):
+    """Return the heading of a group of flags."""
+    return {"positional arguments": "Arguments", "options": "Flags"}.get(title, title)
+
+
+def shown(metavar):
+    """Return the words that stand for an argument."""
+    return " ".join(metavar) if isinstance(metavar, tuple) else metavar
+
+
+def row(action):
+    """Return the line of an argument or a flag."""
+    values = ""
+    if action.nargs != 0:
+        choices = "|".join(map(str, action.choices or ()))
+        values = shown(action.metavar or choices or action.dest.upper())
+    name = ", ".join(action.option_strings)
+    words = (action.help or "") % {"default": action.default} if action.help else ""
+    cell = f"{name} {values}".strip().replace("|", "\\|")
+    return f"| `{cell}` | {words.replace('|', chr(92) + '|').replace('<', '&lt;')} |"

@@ -1,0 +1,203 @@
+"""Write the pages of the reference that follow from the code.
+
+``python docs/write_reference.py`` writes the keys of job files and of plants.
+"""
+
+import math
+from dataclasses import MISSING
+from pathlib import Path
+
+from robotid.closed_loop.settings import LoopSettings
+from robotid.commands.job import Job, LogEntry
+from robotid.fitting.settings import ESTIMATORS, ConstraintSettings
+from robotid.logs.settings import LogSource, LogUnits, SignalSettings
+from robotid.logs.transmission import Transmission
+from robotid.robot.drives import TERMS
+from robotid.robot.families import AUTO
+from robotid.simulation.settings import Simulation
+
+REFERENCE = Path(__file__).with_name("reference")
+PLANT = """# Keys of a plant
+
+`robotid simulate --plant plant.toml` reads these keys; [Simulating a log](../how_to/simulate.md) explains them. A flag
+overrides the file. This page is written by `python docs/write_reference.py` from the settings in the code.
+"""
+START = """# Job file
+
+A job file is TOML: `robotid identify job.toml`. Only `urdf` and one `[[identification]]` are needed; every other key has
+the default below. A misspelt key is an error that names the nearest right one. Paths are relative to the job file, and
+`$NAME` in them is filled in from the environment. This page is written by `python docs/write_reference.py` from the settings
+in the code; `result.json` holds the same keys under `settings`. `robotid schema > job.schema.json` writes them as a JSON
+schema: with `#:schema job.schema.json` in its first line, editors that know TOML complete and check a job file. Shells complete commands and flags after
+`eval "$(register-python-argcomplete robotid)"`.
+
+<!-- example -->
+```toml
+urdf = "robot.urdf"
+joints = ["joint_1", "joint_2"]
+locked = { finger = 0.02 }
+
+[signals]
+cutoff = 8.0
+min_velocity = 0.02
+
+[log]
+topic = "/joint_states"
+joints = { joint_1 = "M1" }
+effort = "current"
+
+[torque]
+gains = { joint_1 = 14.87, joint_2 = 11.3 }
+
+[[coupling]]
+name = "motor_2"
+ratios = { joint_1 = 1.0, joint_2 = 1.0 }
+
+[[transmission]]
+joints = ["joint_1", "joint_2"]
+motors = ["m1", "m2"]
+matrix = [[101.0, 0.0], [50.0, 50.0]]
+efficiency = [0.8, 0.7]
+
+[estimator]
+name = "consistent"
+robust = "tukey"
+
+[estimator.constraints]
+mass = { forearm = [1.0, 3.0], wrist = 0.8 }
+com = { forearm = [[-0.1, -0.1, 0.0], [0.1, 0.1, 0.4]] }
+pinned = ["base"]
+
+[[identification]]
+log = "first.csv"
+start = 0.5
+end = 30.0
+
+[[validation]]
+log = "second.csv"
+```
+"""
+TABLES = {
+    "signals": SignalSettings,
+    "log": LogSource,
+    "units": LogUnits,
+    "controller": LoopSettings,
+    "estimator.constraints": ConstraintSettings,
+    "[transmission]": Transmission,
+    "[identification]": LogEntry,
+}
+
+
+def job_file():
+    """Return the text of the page on job files."""
+    own = {
+        key.at or field.name: (field, key)
+        for field, key in keys(Job)
+        if (key.at or field.name)
+        not in {*TABLES, "model", "estimator", "transmission", "identification", "validation"}
+    }
+    tables = {}
+    for at, (field, key) in own.items():
+        table, _, name = at.rpartition(".")
+        tables.setdefault(table, []).append(row(name, field, key))
+    parts = [START, "## Keys at the top\n", *listing(tables.pop(""))]
+    for name, kind in TABLES.items():
+        title = f"[{name}]" + "` and `[[validation]]" * (kind is LogEntry)
+        about = kind.__doc__.partition("\n\nAttributes")[0].replace("\n    ", "\n")
+        parts += [f"\n## `{title}`\n", f"{about.strip()}\n"]
+        parts += listing([row(key.at or field.name, field, key) for field, key in keys(kind)])
+        if name == "signals":
+            words = "What is identified, and with which drive terms.\n"
+            parts += ["\n## `[model]`\n", words, *drive_terms(tables.pop("model"))]
+        if name == "units":
+            for other, rows in tables.items():
+                parts += [f"\n## `[{other}]`\n", *listing(rows)]
+            parts += ["\n## `[estimator]`\n", *estimators()]
+    return "\n".join(parts) + "\n"
+
+
+def plant():
+    """Return the text of the page on the keys of a plant."""
+    tables = {}
+    inside = [("", Simulation)]
+    for at, kind in inside:
+        for field, key in keys(kind):
+            if hasattr(field.type, "entries"):
+                inside.append((f"{at}.{field.name}".strip("."), field.type))
+            else:
+                tables.setdefault(at, []).append(row(field.name, field, key))
+    parts = [PLANT, *listing(tables.pop(""))]
+    for name, rows in tables.items():
+        parts += [f"\n## `[{name}]`\n", *listing(rows)]
+    return "\n".join(parts) + "\n"
+
+
+def keys(kind):
+    """Return each field of a table with what it says of itself."""
+    return [(field, key) for field, key, _ in kind.entries()]
+
+
+def estimators():
+    """Return the lines on the estimators: what they are, and who has which setting."""
+    yield "| `name` | estimator |\n|---|---|"
+    for name, kind in ESTIMATORS.items():
+        default = ", the default" if name == "consistent" else ""
+        yield f"| `{name}`{default} | {kind.paths()['name'].text} |"
+    yield "\nEach has settings of its own; one of another estimator is refused.\n"
+    yield "| key | default | of | meaning |\n|---|---|---|---|"
+    said = {}
+    for name, kind in ESTIMATORS.items():
+        for field, key in keys(kind)[1:]:
+            if field.name != "constraints":
+                entry = (field.name, default_of(field), meaning(key))
+                said.setdefault(entry, []).append(f"`{name}`")
+    for (name, default, words), owners in said.items():
+        yield f"| `{name}` | {default} | {', '.join(owners)} | {words} |"
+
+
+def drive_terms(rows):
+    """Return the lines on the terms of the drives, behind those of other keys."""
+    rows += [f'| `friction` | `"{AUTO}"` | {Job.paths()["model.friction"].words} |']
+    for name, term in TERMS.items():
+        if not term.is_friction:
+            units = ", or ".join(term.units)
+            rows.append(f"| `{name}` | `true` | Whether it is identified [{units}] |")
+    return listing(rows)
+
+
+def listing(rows):
+    """Return the lines of a table of keys."""
+    return ["| key | default | meaning |\n|---|---|---|", *rows]
+
+
+def row(name, field, key):
+    """Return the line of a key."""
+    return f"| `{name}` | {default_of(field)} | {meaning(key)} |"
+
+
+def meaning(key):
+    """Return what a key is, and the range of its numbers."""
+    words = (key.words[:1].upper() + key.words[1:]).replace("<dynamics>", "`<dynamics>`")
+    return words if key.within is None else f"{words} ({key.within.words})"
+
+
+def default_of(field):
+    """Return a default as TOML has it."""
+    if field.default is MISSING and field.default_factory is MISSING:
+        return "required"
+    value = field.default_factory() if field.default is MISSING else field.default
+    if value is None:
+        return "not stated"
+    if isinstance(value, float) and not math.isclose(value, round(value, 6), rel_tol=1e-12):
+        return f"`{value!r}`"
+    words = {True: "true", False: "false"} if isinstance(value, bool) else {}
+    if isinstance(value, str):
+        return f'`"{value}"`'
+    if isinstance(value, tuple):
+        return f"`{list(value)}`"
+    return "`{}`" if isinstance(value, dict) else f"`{words.get(value, value)}`"
+
+
+if __name__ == "__main__":
+    (REFERENCE / "job_file.md").write_text(job_file(), encoding="utf-8")
+    (REFERENCE / "plant.md").write_text(plant(), encoding="utf-8")
