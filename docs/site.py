@@ -5,6 +5,7 @@
 
 import argparse
 import json
+import re
 import shutil
 from importlib import import_module
 from pathlib import Path
@@ -32,7 +33,8 @@ def on_page_markdown(markdown, page, **_):
     if page.file.src_uri == "gallery.md":
         return markdown + "\n".join(map(gallery_entry, entries.values()))
     if page.file.src_uri == "index.md" and "demo" in entries:
-        return markdown.replace("<!-- demo -->", frames("demo"))
+        pictures = re.compile("<!-- demo -->.*?<!-- end of demo -->", re.DOTALL)
+        return pictures.sub(frames("demo"), markdown)
     return markdown
 
 
