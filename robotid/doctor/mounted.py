@@ -15,7 +15,7 @@ from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
-from robotid.regressor.factors import Reduction, compress_stretches, join
+from robotid.regressor.factors import Reduction, compress_stretches
 from robotid.regressor.rows import keep_inertial_rows
 from robotid.regressor.used_rows import base_problem, row_mask
 from robotid.robot.bodies import link_places
@@ -127,8 +127,9 @@ def check_payload_change(
         name: What its log is called.
     """
     model, mapping = fitted.model, fitted.mapping
-    first, second = fitted.reductions, kept.reductions
-    layout, whole = model.layout, join([*first, *second])
+    first, second, layout = fitted.reductions, kept.reductions, model.layout
+    every = (*first, *second)
+    squares, samples = sum(r.squares for r in every), sum(r.samples for r in every)
     size = payload_spread(model)
     last = mapping.K[:, layout.n_inertial - 10 : layout.n_inertial]
     seconds = fitted.seconds + kept.seconds
@@ -138,9 +139,9 @@ def check_payload_change(
         layout,
         mapping.K,
         model.standard_parameters(),
-        prior_spread(model, whole.squares, whole.samples),
+        prior_spread(model, np.asarray(squares), samples),
         (last, np.full(10, np.nan), size),
-        share=min(1.0, 2.0 * (signals.cutoff or np.inf) * seconds / whole.samples),
+        share=min(1.0, 2.0 * (signals.cutoff or np.inf) * seconds / samples),
     )
     theta, covariance = runs.alike()
     least = -float(scipy.special.ndtri(_CHANCE)) * float(np.sqrt(covariance[-10, -10]))

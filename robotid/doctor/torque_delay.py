@@ -25,6 +25,7 @@ __all__ = ["check_torque_delay"]
 
 _LONGEST = 0.1  # [s] delays are sought up to this
 _ROUNDING = 1e-10  # of the longest column
+_DEPENDENT = 1e-5  # of the largest singular value: columns that hold no more are dependent
 _GRID = np.linspace(-_LONGEST, _LONGEST, 81)
 _NEAR = 0.01  # [s] about the delay, where the misfit is a parabola
 _FINEST = 0.001  # [s] by which friction that no curve describes imitates a delay
@@ -166,7 +167,7 @@ class _Window:
         inertial: Of the bodies that each joint carries, joint after joint, shape (N, columns).
         drive: Of each joint's inertia, frictions and position, and of coupled drives, (N, n, k).
         steady: Whether a joint is far from where its drive may stick, shape (N, n), bool.
-        late: Torques at each delay of the grid after the instants, shape (delays, N, n).
+        late: Torques at each delay of the grid after the instants, shape (n, delays, N).
     """
 
     inertial: Array
@@ -312,7 +313,7 @@ def _window(
     slow = turns | (np.abs(v) < _SLOW)
     steady = [_distance(at, t[slow[:, j]]) > _AWAY * period for j in range(v.shape[1])]
     tau = low_pass(motion.tau[rows], 1 / step, signals)
-    late = _interpolated(t, tau, at + _GRID[:, None])
+    late = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 2, 0).copy()
     drive = np.concatenate([own, coupled], axis=2)
     return _Window(inertial, drive, np.column_stack(steady), late)
 
@@ -337,24 +338,26 @@ def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, int
 
     Its inertial columns are ``own``. None of a joint that moves in too few.
     """
-    steady = np.concatenate([window.steady[:, j] for window in windows])
-    if steady.sum() < max(_FEW, _MOVING * len(steady)):
+    steady = [window.steady[:, j] for window in windows]
+    used = sum(map(np.count_nonzero, steady))
+    if used < max(_FEW, _MOVING * sum(map(len, steady))):
         return None
-    inertial, drive = (
-        np.concatenate(parts)[steady]
-        for parts in zip(*((w.inertial[:, own], w.drive[:, j]) for w in windows), strict=True)
-    )
-    X = np.hstack([inertial, drive, np.ones((len(inertial), 1))])
-    late = np.concatenate([window.late[:, :, j] for window in windows], axis=1)[:, steady]
+    pairs = list(zip(windows, steady, strict=True))
+    inertial = np.concatenate([window.inertial[at, own] for window, at in pairs])
+    drive = np.concatenate([window.drive[at, j] for window, at in pairs])
+    X = np.hstack([inertial, drive, np.ones((used, 1))])
+    late = np.concatenate([window.late[j][:, at] for window, at in pairs], axis=1)
     late -= late.mean(axis=1, keepdims=True)  # (delays, N)
     size = np.einsum("dk,dk->d", late, late)
     if size.min() <= 0:
         return None
     length = np.linalg.norm(X, axis=0)
     seen = length > _ROUNDING * length.max()  # other columns are 0 but for rounding
+    X = X[:, seen] / length[seen]
     # by QR iterations: of so many dependent columns, divide and conquer need not converge
-    U, s, _ = svd(X[:, seen] / length[seen], full_matrices=False, lapack_driver="gesvd")
-    Q = U[:, s > 1e-5 * s[0]]
+    _, s, Vt = svd(np.linalg.qr(X, mode="r"), lapack_driver="gesvd")
+    kept = s > _DEPENDENT * s[0]
+    Q = X @ (Vt[kept].T / s[kept])
     late -= (late @ Q) @ Q.T
     blocks = np.array_split(late, _BLOCKS, axis=1)
-    return np.array([np.einsum("dk,dk->d", b, b) / size for b in blocks]), len(inertial)
+    return np.array([np.einsum("dk,dk->d", b, b) / size for b in blocks]), used

@@ -40,6 +40,7 @@ __all__ = [
 #: Standard deviations that a 95 % band reaches.
 REACH = 1.96
 _HELD = 0.95
+_ROUNDING = 1e-9  # of a band, by which a row on its edge may lie beyond it
 _SPEEDS = 20  # of a friction curve, either way
 _MOST = 500  # samples that a band is computed at, spread over the trajectory
 
@@ -73,7 +74,9 @@ class TorqueBand:
         """
         used = mask[self.samples]
         miss = np.abs(tau[self.samples] - prediction[self.samples])
-        is_held, count = (miss <= REACH * self.total) & used, used.sum(axis=0)
+        # one of the rows that set the band may lie on its edge
+        is_held = (miss <= (1.0 + _ROUNDING) * REACH * self.total) & used
+        count = used.sum(axis=0)
         return np.where(count > 0, is_held.sum(axis=0) / np.maximum(count, 1), np.nan)
 
 

@@ -347,8 +347,6 @@ def gather(stretches: Sequence[Factors], count: int) -> tuple[Factors, ...]:
 def join(reductions: Sequence[Reduction]) -> Reduction:
     """Return what all the rows of several reductions come down to.
 
-    Neighbours are joined, then their neighbours, and so on: the order never depends on timing.
-
     Args:
         reductions: At least one; all with the same columns and joints.
 
@@ -357,10 +355,11 @@ def join(reductions: Sequence[Reduction]) -> Reduction:
     """
     if not reductions:
         raise DataError("no reduction was given; at least one log is needed")
-    level = list(reductions)
-    while len(level) > 1:
-        level = [_join_neighbours(level[k : k + 2]) for k in range(0, len(level), 2)]
-    return level[0]
+    return Reduction(
+        merge([r.factors for r in reductions]),
+        np.sum([r.squares for r in reductions], axis=0),
+        sum(r.samples for r in reductions),
+    )
 
 
 def join_stretches(reductions: Iterable[Reduction], count: int, most: int) -> list[Reduction]:
@@ -391,17 +390,6 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _join_neighbours(reductions: Sequence[Reduction]) -> Reduction:
-    """Return what one or two reductions come down to."""
-    if len(reductions) == 1:
-        return reductions[0]
-    return Reduction(
-        merge([r.factors for r in reductions]),
-        np.sum([r.squares for r in reductions], axis=0),
-        sum(r.samples for r in reductions),
-    )
 
 
 def _fold_blocks(

@@ -111,6 +111,12 @@ def test_result_json_states_bands_intervals_and_method(found):
     assert low < result["base_parameters"][0]["value"] < high
 
 
+def test_a_row_on_the_edge_of_the_band_lies_in_it():
+    band = TorqueBand(np.arange(3), np.zeros((3, 1)), np.ones(1))
+    edge = 1.96 * np.array([[1.0 + 1e-12], [1.0 + 1e-6], [0.5]])
+    assert band.held(edge, np.zeros((3, 1)), np.ones((3, 1), bool)) == pytest.approx(2 / 3)
+
+
 def test_rows_that_are_not_used_do_not_count():
     band = TorqueBand(np.array([0, 2]), np.zeros((2, 2)), np.ones(2))
     tau = np.array([[0.0, 9.0], [50.0, 50.0], [9.0, 9.0]])
