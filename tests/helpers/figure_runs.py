@@ -428,6 +428,7 @@ log = "three.csv"
 """
 LOOP = Loop({"lift": 900.0, "reach": 2500.0}, {"lift": 60.0, "reach": 130.0}, delay=0.012)
 LOOP_DRIVES = {"lift": Drive(1.3, 3.0, 2.5, 0.7), "reach": Drive(3.0, 16.0, 5.0, -1.0)}
+LOOP_STEP = 5e-4  # [s] semi-implicit: torques act half of it early
 
 
 def commands(folder):
@@ -436,7 +437,7 @@ def commands(folder):
     hoist = Hoist(joints, bodies=BODIES, drives=LOOP_DRIVES, locked=PAIR_STILL,
                   gravity=(0.0, 0.0, -9.81))  # fmt: skip
     (folder / "hoist.urdf").write_text(urdf())
-    step = 5e-4
+    step = LOOP_STEP
     for name, seed, seconds, rate, start in (
         ("one", 51, 4, 200, 3.8), ("two", 52, 1.9, 250, 0.4), ("three", 53, 3, 200, 70.0),
     ):  # fmt: skip

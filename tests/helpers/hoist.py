@@ -318,6 +318,23 @@ class Loop:
     limit: dict = field(default_factory=dict)
 
 
+def _rubbed(admittance, free, most):
+    """Return the speeds that friction, of impulses up to some size, leaves of free ones.
+
+    What would turn a joint round stops it; through the mass matrix it acts on other joints, too.
+    """
+    v, impulse = free.copy(), np.zeros_like(free)
+    for _ in range(100):
+        before = v.copy()
+        for j, own in enumerate(np.diag(admittance)):
+            new = np.clip(impulse[j] - v[j] / own, -most[j], most[j])
+            v += admittance[:, j] * (new - impulse[j])
+            impulse[j] = new
+        if np.abs(v - before).max() < 1e-14:
+            break
+    return v
+
+
 def follow(hoist, loop, wanted, *, step=5e-4):
     """Return positions, velocities and torques of a robot that follows commands, shape (N, n).
 
@@ -346,9 +363,7 @@ def follow(hoist, loop, wanted, *, step=5e-4):
         M = np.array(pin.crba(model, data, place))
         M = np.triu(M) + np.triu(M, 1).T + np.diag(armature)
         push = tau - offset - pin.rnea(model, data, place, v, np.zeros_like(v))
-        # friction of the next speed: what would turn it round stops it
-        free = np.linalg.solve(M + step * np.diag(viscous), M @ v + step * push)
-        held = step * coulomb / (np.diag(M) + step * viscous)
-        v = np.sign(free) * np.maximum(np.abs(free) - held, 0.0)
+        admittance = np.linalg.inv(M + step * np.diag(viscous))
+        v = _rubbed(admittance, admittance @ (M @ v + step * push), step * coulomb)
         q = q + step * v
     return tuple(np.array(x) for x in zip(*path, strict=True))
