@@ -14,6 +14,7 @@ from robotid.exceptions import ModelError
 from robotid.export.mjcf import write_mjcf
 from robotid.robot.drives import Cubic, Spring
 from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
 
 OFF = mujoco.mjtDisableBit
 SMALL = """<robot name="arm--1">
@@ -155,6 +156,18 @@ def test_joints_that_follow_are_held_to_their_leader(tmp_path):
     assert [robot.eq_obj1id[0], robot.eq_obj2id[0]] == pair
     np.testing.assert_array_equal(robot.eq_data[0, :5], [0, 1, 0, 0, 0])
     assert robot.nu == robot.nv - 1
+
+
+def test_an_actuator_takes_off_the_offsets_of_all_drives_that_turn_with_its_joint(tmp_path):
+    shared = Coupling("k", (("j", 0.5), ("k", -3.0)), replaces=True)
+    model = small(tmp_path, couplings=[shared])
+    pi = possible_parameters(model, np.random.default_rng(0))
+    for name, offset in {"j": 0.7, "k": 0.9}.items():
+        pi[model.layout.names.index(f"{name}.offset")] = offset
+    write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, _ = load(tmp_path / "robot.xml")
+    bias = [-(0.7 + 0.5 * 0.9), 3.0 * 0.9]
+    np.testing.assert_allclose(robot.actuator_biasprm[:, 0], bias, rtol=1e-12)
 
 
 def test_a_term_that_mjcf_has_no_place_for_is_named(tmp_path):
