@@ -313,6 +313,35 @@ def test_a_step_of_parameters_and_starts_together_settles_what_held_starts_bind(
     assert settled.details["at_bound"] == ("offset",)
 
 
+@pytest.mark.parametrize("spread", [np.inf, 0.01])
+def test_a_covariance_is_of_scores_rows_and_prior_together(rng, spread):
+    """Bell and McCaffrey's scatter of segments; rows and prior are as sure as they say."""
+    lag = lagging(rng, windows=16, prior=TRUTH + 0.003, prior_std=np.full(3, spread))
+    further = np.array([[400.0, -100.0, 30.0, 575.0], [0.0, 500.0, 0.0, 150.0]])
+    estimator = OutputError(whitens=False)
+    lag = replace(lag, further=further)
+    found = estimator.fit(lag, START)
+    sigma = found.sigma[0]
+    meat, H = further[:, :3].T @ further[:, :3] + np.eye(3) / spread**2, 0.0
+    segments = []
+    for r in lag.residuals(found.theta, with_slopes=True):
+        rows = np.hstack([r.slopes[1:, 0], r.e[1:]]) / sigma  # whitened by a correlation of 0
+        segments += np.array_split(rows, 3)
+        H = H + rows[:, :3].T @ rows[:, :3]
+    bread = np.linalg.inv(H + meat)
+    for rows in segments:  # 48 of them
+        A, e = rows[:, :3], rows[:, 3]
+        values, vectors = np.linalg.eigh(np.eye(len(A)) - A @ bread @ A.T)
+        assert values.min() > 0.05
+        score = A.T @ (vectors @ ((vectors.T @ e) / np.sqrt(values)))
+        meat = meat + np.outer(score, score)
+    wanted = bread @ meat @ bread
+    own, least = np.sqrt(np.diag(wanted)), np.sqrt(np.diag(bread))
+    assert (own > 1.1 * least).any()
+    wider = np.maximum(own, least) / own
+    np.testing.assert_allclose(found.covariance, wanted * np.outer(wider, wider), rtol=1e-5)
+
+
 def test_residuals_of_larger_variance_count_less_beside_further_rows(rng):
     lag = lagging(rng)
     row = np.array([[30.0, 0.0, 0.0, 30.0 * 1.6]])  # says 1.6 of the gain, which is 1.5
