@@ -84,6 +84,10 @@ def test_standard_parameters_come_back_from_base_ones(panda, rng):
     for spread in (None, rng.uniform(0.1, 2.0, len(prior))):
         pi = mapping.to_standard(beta, prior, spread)
         np.testing.assert_allclose(mapping.to_base(pi), beta, rtol=0, atol=1e-11)
+        # the nearest to the prior in units of the spread
+        S = np.diag(np.ones(len(prior)) if spread is None else spread)
+        nearest = prior + S @ np.linalg.pinv(mapping.K @ S) @ (beta - mapping.to_base(prior))
+        np.testing.assert_allclose(pi, nearest, rtol=0, atol=1e-9)
     np.testing.assert_allclose(
         mapping.to_standard(mapping.to_base(prior), prior), prior, atol=1e-12
     )
