@@ -13,6 +13,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid._files import file_sha256
 from robotid.cli import main
+from robotid.closed_loop.settings import LoopSettings
 from robotid.commands.identify import _job_of, run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.exceptions import DataError, SettingsError
@@ -24,6 +25,7 @@ from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.friction_projection import project_friction
 from robotid.robot.drives import Stribeck
+from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 
@@ -268,3 +270,25 @@ def test_dynamics_of_the_urdf_are_the_nearest_to_friction_of_more_terms(arm, arm
         assert float(figures["damping"]) == pytest.approx(own["viscous"], rel=1e-9)
         assert float(figures["friction"]) == pytest.approx(own["coulomb"], rel=1e-9)
     assert abs(drive.values["viscous"] - value["joint_2.viscous"]) > 1e-4
+
+
+def test_the_job_of_what_was_found_in_memory_builds_the_same_robot():
+    fingers = ["panda_joint4", "panda_finger_joint1"]
+    model = RobotModel.from_urdf(
+        example_urdf("panda.urdf"), joints=fingers, mimic="coupled", gravity=(1.0, -2.0, -9.0),
+        locked={"panda_joint1": 0.3, "*": -0.2}, terms=("viscous", "offset"),
+        couplings=[Coupling("both", (("panda_joint4", 1.0), ("panda_finger_joint1", 0.5)))],
+    )  # fmt: skip
+    asked = SimpleNamespace(job=None, friction="none", signals=SignalSettings(), ignore=("spikes",))
+    found = SimpleNamespace(
+        model=model, asked=asked, loop=LoopSettings(), fitted=(), validation=(),
+        estimator=EstimatorSettings("simulation"),
+    )  # fmt: skip
+    job = _job_of(found)
+    again = job.model()
+    assert again.layout == model.layout
+    assert (again.mimic, again.locked) == (model.mimic, model.locked)
+    assert again.options == model.options
+    np.testing.assert_array_equal(again.velocity_map, model.velocity_map)
+    np.testing.assert_allclose(again.standard_parameters(), model.standard_parameters())
+    assert (job.ignore, job.estimator, job.snap_angles) == (("spikes",), found.estimator, False)

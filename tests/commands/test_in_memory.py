@@ -61,6 +61,44 @@ def test_it_is_saved_and_loaded(found, tmp_path):
     assert loaded.content["settings"]["estimator"]["step"] == 4e-3
 
 
+def test_what_is_stated_reaches_the_simulation(arm, monkeypatch):
+    model, log, kept = arm
+    asked = []
+    monkeypatch.setattr(
+        "robotid.closed_loop.identify.identify_loops",
+        lambda *words, **options: asked.append((words, options)),
+    )
+    monkeypatch.setattr("robotid.commands.in_memory.diagnose", lambda *words: words)
+    choice = robotid.EstimatorSettings("simulation", **SETTINGS)
+    signals, told = robotid.SignalSettings(cutoff=7.0), []
+
+    def progress(*words):
+        told.append(words)
+
+    robotid.identify(
+        model, [kept, log], validation=log, estimator=choice, signals=signals,
+        controller={"kind": "torque"}, friction="viscous+coulomb",
+        ignore=("spikes",), progress=progress,
+    )  # fmt: skip
+    robotid.identify(
+        model, log, estimator="simulation", controller={"kind": "torque"}, doctor=False
+    )
+    (words, stated), (plain, blind) = asked
+    assert words[0] is model
+    assert [len(x.t) for x in (*words[1], *words[2])] == [len(x.t) for x in (kept, log, log)]
+    assert words[3].kind == "torque"
+    assert words[4] is choice
+    assert stated.pop("examined") == (*words[:3], signals)
+    assert stated == {
+        "signals": signals, "chooses": False, "ignore": ("spikes",), "progress": progress,
+    }  # fmt: skip
+    assert told[0][0] == "reading logs"
+    assert [len(x) for x in plain[1:3]] == [1, 0]
+    assert plain[4] == robotid.EstimatorSettings("simulation")
+    assert (blind["examined"], blind["chooses"], blind["ignore"]) == ((), True, ())
+    assert blind["signals"] == robotid.SignalSettings()
+
+
 def test_what_does_not_fit_it_is_refused(arm):
     model, log, _ = arm
     with pytest.raises(SettingsError, match="controller is of the estimator 'simulation', but"):

@@ -9,6 +9,8 @@ import pytest
 
 from robotid._files import file_sha256
 from robotid.cli import main, simulate
+from robotid.commands.job import Job
+from robotid.commands.simulate import SimulatedFiles, _motion
 from robotid.export.urdf import load_identified
 from robotid.identification.pipeline import identify
 from robotid.logs.formats import write_columns
@@ -277,3 +279,18 @@ def motion_of(path, model):
     """Return instants, positions, velocities and accelerations of a motion's table."""
     log = read_log(path, model.joints, needs="motion")
     return log.t, log.q, log.v, log.a
+
+
+def test_a_motion_passes_its_rows_with_their_speeds_and_accelerations(tmp_path, ur5):
+    t, w = 3.0 + 0.05 * np.arange(41), np.linspace(1.0, 3.0, 6)
+    angle = np.outer(t, w)
+    q, v, a = np.sin(angle), 1.05 * w * np.cos(angle), -0.9 * w**2 * np.sin(angle)
+    columns = {"time": t}
+    for key, values in (("q", q), ("dq", v), ("ddq", a)):
+        columns |= {f"{key}_{joint}": values[:, j] for j, joint in enumerate(ur5.joints)}
+    write_columns(columns, tmp_path / "motion.csv")
+    job = Job(urdf=URDF)
+    files = SimulatedFiles(tmp_path / "motion.csv", tmp_path / "log.csv")
+    found = _motion(job, ur5, files).evaluate(t - 3.0)
+    for one, stated in zip(found, (q, v, a), strict=True):
+        np.testing.assert_allclose(one, stated, atol=1e-9)

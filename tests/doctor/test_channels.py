@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from robotid.commands.job import LogEntry, read_job
-from robotid.doctor.channels import check_channels
+from robotid.doctor.channels import _velocity_scale, check_channels
 from robotid.doctor.torque_channels import check_torque_channels
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -118,3 +119,17 @@ def test_the_delay_of_a_velocity_is_as_sure_as_joints_agree():
     off = np.array([0.03, 0.033]) - found.evidence["delay"]
     expected = 1.48 * np.median(np.abs(off)) / np.sqrt(2)
     assert found.evidence["std_error"] == pytest.approx(expected, rel=0.05)
+
+
+def test_the_scale_of_a_velocity_is_the_ratio_of_sizes_with_noise_in_both(rng):
+    """Between the two regressions of which each takes the other's noise for a smaller factor."""
+    slope = rng.standard_normal((4000, 2))
+    v = slope * [2.0, 1.0] + [1.0, 0.3] * rng.standard_normal((4000, 2)) + 5.0
+    log = SimpleNamespace(name="run", joints=("one", "two"), q=slope, has_torque=True)
+    alike = np.diag(np.corrcoef(slope.T, v.T)[:2, 2:])
+    assert (alike > 0.8).all()
+    (found,) = _velocity_scale(log, slope, v, alike, "measured")
+    assert found.where == "run: one"
+    ratio = v[:, 0].std() / slope[:, 0].std()
+    assert f"dq_one is {ratio:.3g} times d(q)/dt of q_one" in found.message
+    assert ratio == pytest.approx(np.sqrt(5.0), rel=0.05)

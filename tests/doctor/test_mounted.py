@@ -8,7 +8,7 @@ from helpers.corruptions import NOISE, clean_log, robot
 from helpers.synthetic import perfect
 
 from robotid.doctor.diagnosis import diagnose
-from robotid.doctor.mounted import Segments
+from robotid.doctor.mounted import Segments, check_payload_change
 from robotid.doctor.sample import smooth_motion
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -134,3 +134,28 @@ def test_segments_are_of_all_motions(ur5):
     assert len(segments.reductions) == len(alone[0]) + len(alone[1])
     rows = [sum(part.samples for part in parts) for parts in (segments.reductions, *alone)]
     assert rows[0] == rows[1] + rows[2]
+
+
+def test_rows_of_both_logs_are_independent_by_the_band_of_the_filter(ur5, monkeypatch):
+    class Asked(Exception):
+        pass
+
+    def asked(first, second, *args, share, **others):
+        rows = sum(part.samples for part in (*first, *second))
+        raise Asked(share * rows)
+
+    monkeypatch.setattr("robotid.doctor.mounted.payload_runs", asked)
+    signals = SignalSettings(cutoff=3.0)
+    fitted, kept = (
+        Segments(
+            ur5,
+            structural_mapping(ur5),
+            [smooth_motion(ur5, clean_log(ur5, seed, duration=duration), signals)],
+            0.0,
+        )
+        for seed, duration in ((0, 3.0), (1, 5.0))
+    )
+    with pytest.raises(Asked) as found:
+        list(check_payload_change(fitted, kept, signals, "kept"))
+    seconds = sum(float(np.ptp(run.motions[0].t)) for run in (fitted, kept))
+    assert found.value.args[0] == pytest.approx(2 * 3.0 * seconds)

@@ -1,6 +1,13 @@
-import numpy as np
+from dataclasses import replace
 
-from robotid.doctor.sample import coupled_columns
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.corruptions import clean_log
+
+from robotid.doctor.hypotheses import compensated, own_share
+from robotid.doctor.sample import coupled_columns, smooth_motion, take_probe
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -17,3 +24,34 @@ def test_columns_of_coupled_drives_are_those_of_the_regressor(ur5, rng):
     np.testing.assert_array_equal(found, Y[:, :, chosen])
     assert found.any(axis=0)[[4, 5]].all()  # a load of both joints
     assert coupled_columns(ur5, q, v, a).shape == (20, 6, 0)
+
+
+@pytest.fixture(scope="module")
+def probe():
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
+    motion = smooth_motion(model, clean_log(model, 0, duration=3.0), SignalSettings())
+    return take_probe(model, motion, samples=60)
+
+
+def test_a_probe_at_other_rows_is_of_the_same_motion_and_counterbalance(probe):
+    balanced, rows = replace(probe, balanced=(1,)), probe.rows[3:40:5]
+    found = balanced.at(rows)
+    assert found.balanced == balanced.with_motion((probe.q, probe.v, probe.a)).balanced == (1,)
+    for key in ("q", "v", "a", "tau"):
+        np.testing.assert_array_equal(getattr(found, key), getattr(probe, key)[3:40:5])
+    np.testing.assert_allclose(found.loads(), probe.loads()[3:40:5], atol=1e-12)
+    assert found.drives.shape[2] == probe.drives.shape[2] + 4
+
+
+def test_torques_without_gravity_are_judged_by_their_own_size(probe, rng):
+    robot = probe.model.pin_model
+    data = robot.createData()
+    weight = np.array([pin.computeGeneralizedGravity(robot, data, q) for q in probe.q])
+    noise = 0.5 * weight.std(axis=0).clip(1e-3) * rng.standard_normal(weight.shape)
+    logged = replace(probe, tau=noise - 0.8 * weight)
+    whole, left = compensated(logged)
+    np.testing.assert_allclose(whole.tau, logged.tau + weight, atol=1e-9)
+    size = np.var(whole.tau, axis=0) / np.var(logged.tau, axis=0)
+    wanted = np.minimum(own_share(whole) * size, 1.0)
+    np.testing.assert_allclose(left, wanted, rtol=1e-6)
+    assert np.abs(size - 1.0).max() > 0.3

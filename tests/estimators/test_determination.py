@@ -7,7 +7,13 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.doctor.motions import check_excitation
-from robotid.estimators.determination import base_spread, determine
+from robotid.estimators.determination import (
+    Combination,
+    Determination,
+    Group,
+    base_spread,
+    determine,
+)
 from robotid.exceptions import RankDeficientError
 from robotid.export.entries import build_result
 from robotid.findings import listed
@@ -74,6 +80,57 @@ def test_units_and_scales_do_not_matter():
     # 3 a + 6000 b is measured; b leads, for its share of the sum is the largest
     assert str(one.groups[0].combinations[0]) == "b + 0.0005 a"
     assert str(other.groups[0].combinations[0]) == "b + 0.5 a"
+
+
+def test_words_name_the_four_largest_terms_of_a_sum_by_their_shares():
+    names, factors = tuple("abcdefg"), (-20.0, 0.5, 1.0, 1.0, 3.14159, -1.0, 7.0)
+    shares = (0.3, -0.2, 1.0, 0.9, 0.051, 0.4, 0.05)
+    sums = [Combination(names[:k], factors[:k], shares[:k]) for k in range(3, 8)]
+    assert list(map(str, sums)) == [
+        "c - 20 a + 0.5 b", "c + d - 20 a + 0.5 b", "c + d - 20 a + 0.5 b + ...",
+        "c + d - f - 20 a + ...", "c + d - f - 20 a + ...",
+    ]  # fmt: skip
+    assert str(Combination(names[2:5], factors[2:5], shares[2:5])) == "c + d + 3.14 e"
+    # g is too small to be a term, whatever its factor
+    assert str(Combination(("c", "g"), (1.0, 7.0), (1.0, 0.05))) == "c"
+
+
+def grouped(size, count):
+    names = tuple(f"p{k}" for k in range(size))
+    return Group(names, tuple(Combination(names[k : k + 1], (1.0,), (1.0,)) for k in range(count)))
+
+
+def test_words_of_groups_say_how_many_sums_are_determined():
+    said = [str(grouped(*sizes)) for sizes in ((2, 0), (2, 1), (5, 2), (4, 3), (6, 1), (1, 0))]
+    assert said == [
+        "of p0 and p1 nothing is determined", "of p0 and p1 only p0 is determined",
+        "of p0, p1, p2, p3 and p4 only p0 and p1 are determined",
+        "of the 4 parameters p0 ... p3 only 3 sums are determined, as p0",
+        "of the 6 parameters p0 ... p5 only 1 sum is determined, as p0",
+        "of p0 nothing is determined",
+    ]  # fmt: skip
+    a, b = Group(("x",), ()), Group(("y", "z"), ())
+    one, two, three, four = (grouped(size, 1) for size in (2, 3, 4, 5))
+    names = ("x", "y", "z", "p0", "p1", "p2", "p3", "p4", "alone")
+
+    def known(*groups):
+        return Determination(names, np.ones(9), np.ones(9), np.zeros((9, 4)), groups)
+
+    found = known(a, one, two, b, three, four)
+    assert found.merged == (one, two, three, four, Group(("x", "y", "z"), ()))
+    nothing = "of x, y and z nothing is determined"
+    assert found.in_words() == f"{one}; {two}; 2 more such groups; {nothing}"
+    assert known(one, two, three).in_words() == f"{one}; {two}; 1 more such group"
+    assert known(two, a).in_words() == f"{two}; of x nothing is determined"
+    assert found.rank == 5
+    assert found.undetermined == names[:-1]
+    assert known().merged == ()
+    assert known().in_words() == ""
+    error = RankDeficientError(3, ("x",), 9)
+    assert known().refusal(error) is error
+    said = found.refusal(error)
+    assert (said.rank, said.undetermined) == (5, names[:-1])
+    assert f"{one}; {two}; 2 more such groups" in str(said)
 
 
 @pytest.mark.parametrize(("noise", "is_determined"), [(1.0, True), (2.0, True), (2.2, False)])

@@ -6,7 +6,7 @@ import pytest
 from scipy.signal import lfilter
 
 from robotid.estimators import Estimator
-from robotid.estimators.output_error import OutputError, Residual, linearised
+from robotid.estimators.output_error import OutputError, Residual, _freed, linearised
 from robotid.exceptions import DataError, NotConvergedError
 
 DT, RHO, SIGMA = 0.02, 0.9, 0.02
@@ -311,6 +311,75 @@ def test_a_step_of_parameters_and_starts_together_settles_what_held_starts_bind(
     settled = OutputError().settle(low, replace(held, theta=np.array([1.5, 0.3, 0.2001])))
     assert settled.theta[2] == 0.2
     assert settled.details["at_bound"] == ("offset",)
+
+
+@pytest.mark.parametrize("spread", [np.inf, 0.01])
+def test_a_covariance_is_of_scores_rows_and_prior_together(rng, spread):
+    """Bell and McCaffrey's scatter of segments; rows and prior are as sure as they say."""
+    lag = lagging(rng, windows=16, prior=TRUTH + 0.003, prior_std=np.full(3, spread))
+    further = np.array([[400.0, -100.0, 30.0, 575.0], [0.0, 500.0, 0.0, 150.0]])
+    estimator = OutputError(whitens=False)
+    lag = replace(lag, further=further)
+    found = estimator.fit(lag, START)
+    sigma = found.sigma[0]
+    meat, H = further[:, :3].T @ further[:, :3] + np.eye(3) / spread**2, 0.0
+    segments = []
+    for r in lag.residuals(found.theta, with_slopes=True):
+        rows = np.hstack([r.slopes[1:, 0], r.e[1:]]) / sigma  # whitened by a correlation of 0
+        segments += np.array_split(rows, 3)
+        H = H + rows[:, :3].T @ rows[:, :3]
+    bread = np.linalg.inv(H + meat)
+    for rows in segments:  # 48 of them
+        A, e = rows[:, :3], rows[:, 3]
+        values, vectors = np.linalg.eigh(np.eye(len(A)) - A @ bread @ A.T)
+        assert values.min() > 0.05
+        score = A.T @ (vectors @ ((vectors.T @ e) / np.sqrt(values)))
+        meat = meat + np.outer(score, score)
+    wanted = bread @ meat @ bread
+    own, least = np.sqrt(np.diag(wanted)), np.sqrt(np.diag(bread))
+    assert (own > 1.1 * least).any()
+    wider = np.maximum(own, least) / own
+    np.testing.assert_allclose(found.covariance, wanted * np.outer(wider, wider), rtol=1e-5)
+
+
+def test_a_better_start_is_sought_by_residuals_over_their_size(rng):
+    """Of two joints, one in small units, and two numbers that a start has."""
+    e, G = rng.standard_normal((40, 2)) * [1.0, 1e-3], rng.standard_normal((40, 2, 2))
+    G[:, 1] *= 1e-3
+    residual = Residual(e, None, np.array([0, 1]), np.arange(0), G)
+    size = np.sqrt(np.mean(e**2, axis=0))
+    H = np.einsum("kji,kjl,j->il", G, G, size**-2.0)
+    x = np.linalg.solve(H, np.einsum("kji,kj,j->i", G, e, size**-2.0))
+    np.testing.assert_allclose(_freed(residual), e - G @ x, rtol=1e-9, atol=1e-12)
+    assert _freed(replace(residual, by_start=None)) is e
+
+
+def test_other_residuals_move_an_estimate_by_its_normal_equations(rng):
+    """Whitened by the other residuals, free starts taken out, without parameters at a bound."""
+    one = lagging(rng, windows=5)
+    other = replace(one, measured=one.measured + SIGMA * rng.standard_normal(one.told.shape))
+    theta, std = np.array([1.4, 0.32, 0.1]), np.array([2.0, 0.1, 0.3])
+    known = {"prior": np.array([1.3, 0.4, 0.0]), "prior_std": std}
+    known["further"] = np.array([[3.0, -5.0, 1.0, 0.5]])
+    known["lowest"] = np.array([-np.inf, 0.0, 0.1])  # at which the offset is
+    simulators = [Started(**{**vars(lag), **known}) for lag in (one, other)]
+    change, error = OutputError(inflation=3.0).moved(*simulators, theta)
+    e = [lag.measured - one.simulated(theta) for lag in (one, other)]
+    rho = np.sum(e[1][:, 1:] * e[1][:, :-1]) / np.sum(e[1][:, :-1] ** 2)
+    assert 0.1 < rho < 0.95
+    sigma = np.sqrt(3.0 * np.mean((e[1][:, 1:] - rho * e[1][:, :-1]) ** 2))
+    slopes = np.stack([r.slopes[:, 0] for r in one.residuals(theta, with_slopes=True)])
+    fades = 0.97 ** np.arange(one.told.shape[1])
+    u = fades[1:] - rho * fades[:-1]
+    without = np.eye(len(u)) - np.outer(u, u) / (u @ u)
+    A = without @ (slopes[:, 1:] - rho * slopes[:, :-1]) / sigma
+    H = np.einsum("wki,wkl->il", A, A) + np.diag(std**-2.0)
+    H += known["further"][:, :3].T @ known["further"][:, :3]
+    pulls = [np.einsum("wki,wk->i", A, (x[:, 1:] - rho * x[:, :-1]) @ without / sigma) for x in e]
+    inverse = np.linalg.inv(H[:2, :2])
+    wanted = inverse @ (pulls[1] - pulls[0])[:2]
+    np.testing.assert_allclose(change, [*wanted, 0.0], rtol=1e-9)
+    np.testing.assert_allclose(error, [*np.sqrt(np.diag(inverse)), 0.0], rtol=1e-9)
 
 
 def test_residuals_of_larger_variance_count_less_beside_further_rows(rng):

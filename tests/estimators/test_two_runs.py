@@ -129,3 +129,69 @@ def test_freedom_is_that_of_the_scatter_whose_error_is_larger(rng):
     assert (found.freedom[grown] < 12.0).all()  # of 12 parts, not of 24
     np.testing.assert_array_equal(found.freedom[~grown], stretches.freedom[~grown])
     assert stretches.freedom[0] > 12.0
+
+
+def scattered(parts, theta, bread):
+    """Return sum and degrees of freedom of scores of parts (A, b), by matrices of all rows.
+
+    Bell and McCaffrey (2002): residuals over (I - leverage)^(1/2), as if rows were independent.
+    """
+    A = np.concatenate([X for X, _ in parts])
+    residual_maker = np.eye(len(A)) - A @ bread @ A.T
+    edges = np.cumsum([0, *(len(X) for X, _ in parts)])
+    pull, meat = np.zeros((len(parts), len(theta), len(A))), np.zeros((len(theta),) * 2)
+    for k, (X, y) in enumerate(parts):
+        values, V = np.linalg.eigh(np.eye(len(X)) - X @ bread @ X.T)
+        assert values.min() > 0.05
+        pull[k, :, edges[k] : edges[k + 1]] = X.T @ (V / np.sqrt(values)) @ V.T
+        meat += np.outer(*2 * [pull[k][:, edges[k] : edges[k + 1]] @ (y - X @ theta)])
+    freedom = []
+    for loads in (bread @ pull).swapaxes(0, 1):  # what each part adds to one parameter
+        G = loads @ residual_maker @ loads.T
+        freedom.append(np.trace(G) ** 2 / np.sum(G**2))
+    return meat, np.array(freedom)
+
+
+@pytest.mark.parametrize("by_joint", [True, False])
+def test_errors_are_the_larger_of_what_stretches_and_what_joints_scatter(rng, by_joint):
+    n, N, count, share = 6, 56, 7, 0.5
+    D, known = np.array([[0.0], [0.4], [1.0]]), np.array([0.2, 0.0, -0.3])
+    mean, precision = np.array([1.0, 0.0, 0.0, 0.1]), np.diag([3.0, 0.5, 1.0, 20.0])
+    W = rng.standard_normal((2, n, N, 3))
+    tau = np.stack([W[0] @ BETA, W[1] @ (BETA + known + 0.3 * D[:, 0])])
+    tau += np.linspace(0.2, 0.4, n)[:, None] * rng.standard_normal((2, n, N))
+    tau += 0.2 * W[..., 0] * np.array([1, -1, 1, -1, 1, -1])[:, None]  # joints disagree
+    tau += 0.4 * W[..., 1] * np.repeat(rng.standard_normal((2, 1, count)), N // count, axis=2)
+    runs = TwoRuns(
+        of_rows(W[0], tau[0], count), of_rows(W[1], tau[1], count), D, known, mean, precision,
+        share, np.empty(0, dtype=int),
+    )  # fmt: skip
+    found = runs.compare(by_joint=by_joint)
+    own = np.array([
+        np.linalg.lstsq(W[k, j], tau[k, j], rcond=None)[1][0] for k in (0, 1) for j in range(n)
+    ]).reshape(2, n).sum(axis=0)  # fmt: skip
+    noise = np.sqrt(own / (2 * N - 6 / share))[:, None]
+    A = np.stack([np.concatenate([W[0], np.zeros((n, N, 1))], axis=2),
+                  np.concatenate([W[1], W[1] @ D], axis=2)]) / noise[..., None]  # fmt: skip
+    b = np.stack([tau[0], tau[1] - W[1] @ known]) / noise
+    bread = np.linalg.inv(share * np.einsum("rjki,rjkl->il", A, A) + precision)
+    times = [
+        (X.reshape(-1, 4), y.ravel())
+        for run in zip(A, b, strict=True)
+        for X, y in zip(*(np.split(x, count, axis=1) for x in run), strict=True)
+    ]
+    joints = [pair for run in zip(A, b, strict=True) for pair in zip(*run, strict=True)]
+    (covariance, freedom), (other, few) = (
+        (bread @ (share**2 * meat + precision) @ bread, freedom)
+        for meat, freedom in (scattered(x, found.theta, share * bread) for x in (times, joints))
+    )
+    is_wider = np.diag(other) > np.diag(covariance)
+    assert 0 < is_wider.sum() < 4
+    least = np.diag(bread)
+    if by_joint:
+        freedom = np.where(is_wider, few, freedom)
+        least = np.maximum(least, np.diag(other))
+    own = np.sqrt(np.diag(covariance))
+    wider = np.maximum(own, np.sqrt(least)) / own
+    np.testing.assert_allclose(found.freedom, np.maximum(freedom, 1.0), rtol=1e-6)
+    np.testing.assert_allclose(found.covariance, covariance * np.outer(wider, wider), rtol=1e-6)

@@ -3,6 +3,7 @@
 import shutil
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
@@ -49,6 +50,30 @@ def test_a_result_has_the_robot_its_parameters_verdict_and_metrics(written):
         f"<Result of {found.model.name}: {len(found.base)} base parameters by consistent, verdict "
         f"{found.verdict.status}>"
     )
+
+
+def test_it_predicts_inverse_dynamics_and_friction_at_instants(written):
+    folder, found = written
+    result, n = robotid.load_result(folder), len(found.model.joints)
+    q, v, a = np.random.default_rng(1).uniform(-2, 2, (3, 5, n))
+    robot = found.model.with_parameters(found.standard).pin_model
+    data = robot.createData()
+    values = dict(zip(found.model.layout.names, found.standard, strict=True))
+    Ia, Fv, Fc, offset = (
+        np.array([values[f"{joint}.{term}"] for joint in found.model.joints])
+        for term in ("armature", "viscous", "coulomb", "offset")
+    )
+
+    def torque(q, v, a):
+        rigid = np.array([pin.rnea(robot, data, *state) for state in zip(q, v, a, strict=True)])
+        return rigid + Ia * a + Fv * v + Fc * np.sign(v) + offset
+
+    wanted = torque(q, v, a)
+    np.testing.assert_allclose(result.predict(q, v, a), wanted, rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(result.predict(q[1], v[1], a[1]), wanted[1], rtol=1e-8, atol=1e-9)
+    still = np.zeros_like(v)
+    np.testing.assert_allclose(result.predict(q, v), torque(q, v, still), rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(result.predict(q), torque(q, still, still), rtol=1e-8, atol=1e-9)
 
 
 def test_a_result_without_a_urdf_says_why_there_is_no_robot(written, tmp_path):

@@ -11,9 +11,11 @@ from helpers.simulators import SIMULATED, simulated, states
 from scipy.spatial.distance import pdist
 
 from robotid.exceptions import ModelError
+from robotid.export.commanded import CommandedDrive
 from robotid.export.mjcf import write_mjcf
 from robotid.robot.drives import Cubic, Spring
 from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
 
 OFF = mujoco.mjtDisableBit
 SMALL = """<robot name="arm--1">
@@ -155,6 +157,42 @@ def test_joints_that_follow_are_held_to_their_leader(tmp_path):
     assert [robot.eq_obj1id[0], robot.eq_obj2id[0]] == pair
     np.testing.assert_array_equal(robot.eq_data[0, :5], [0, 1, 0, 0, 0])
     assert robot.nu == robot.nv - 1
+
+
+def test_an_actuator_takes_off_the_offsets_of_all_drives_that_turn_with_its_joint(tmp_path):
+    shared = Coupling("k", (("j", 0.5), ("k", -3.0)), replaces=True)
+    model = small(tmp_path, couplings=[shared])
+    pi = possible_parameters(model, np.random.default_rng(0))
+    for name, offset in {"j": 0.7, "k": 0.9}.items():
+        pi[model.layout.names.index(f"{name}.offset")] = offset
+    write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, _ = load(tmp_path / "robot.xml")
+    bias = [-(0.7 + 0.5 * 0.9), 3.0 * 0.9]
+    np.testing.assert_allclose(robot.actuator_biasprm[:, 0], bias, rtol=1e-12)
+
+
+def test_springs_are_at_rest_at_the_zero_of_the_urdf_wherever_the_encoder_has_its_own(tmp_path):
+    model = small(tmp_path, own_terms={"j": [Spring()], "k": [Spring()]})
+    pi = possible_parameters(model, np.random.default_rng(0))
+    values = dict(zip(model.layout.names, pi.tolist(), strict=True))
+    drives = [
+        CommandedDrive(
+            joint, 50.0, 2.0, 0.0, zero,
+            *(values[f"{joint}.{term}"] for term in ("armature", "viscous", "coulomb", "offset")),
+            np.inf,
+        )
+        for joint, zero in (("j", 0.3), ("k", -0.7))
+    ]  # fmt: skip
+    write_mjcf(model, pi, tmp_path / "robot.xml", commanded=drives)
+    robot, data = load(tmp_path / "robot.xml")
+    read = np.array([0.25, 0.4])  # by the encoders
+    data.qpos = read
+    mujoco.mj_forward(robot, data)
+    stiffness = np.array([values["j.spring"], values["k.spring"]])
+    assert (stiffness != 0.0).all()
+    np.testing.assert_allclose(data.qfrc_passive, -stiffness * (read + np.array([0.3, -0.7])))
+    np.testing.assert_allclose(robot.qpos0, [-0.3, 0.7])
+    np.testing.assert_allclose(robot.jnt_range[0], [-1.3, 1.7])
 
 
 def test_a_term_that_mjcf_has_no_place_for_is_named(tmp_path):

@@ -2,6 +2,7 @@ import hashlib
 import json
 import os
 import re
+import xml.etree.ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
@@ -217,6 +218,21 @@ def test_friction_goes_into_dynamics_only_when_asked(source, tmp_path, rng):
         f'<dynamics damping="{values["elbow.viscous"]!r}" '
         f'friction="{values["elbow.coulomb"]!r}"/>\r\n',
     )
+
+
+def test_friction_of_a_drive_that_turns_several_joints_is_in_no_dynamics(source, tmp_path, rng):
+    shared = Coupling("elbow", (("shoulder", 1.0), ("elbow", -0.5)), replaces=True)
+    model = RobotModel.from_urdf(source, couplings=[shared])
+    pi = possible_parameters(model, rng)
+    write_urdf(model, pi, tmp_path / "new.urdf", dynamics=True)
+    values = dict(zip(model.layout.names, pi.tolist(), strict=True))
+    root = ET.parse(tmp_path / "new.urdf").getroot()
+    joints = {joint.get("name"): joint for joint in root.findall("joint")}
+    assert joints["elbow"].find("dynamics") is None
+    for name in ("shoulder", "slide"):
+        found = joints[name].find("dynamics")
+        assert float(found.get("damping")) == values[f"{name}.viscous"]
+        assert float(found.get("friction")) == values[f"{name}.coulomb"]
 
 
 def test_the_sidecar_says_what_a_urdf_cannot(source, tmp_path, rng):

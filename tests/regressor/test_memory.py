@@ -94,3 +94,11 @@ def test_bristles_alone_remember_the_same_whatever_the_bodies_weigh(ur5, rng, te
     trajectory, pi = motion(model, rng, 50), model.standard_parameters()
     light, heavy = (remember(model.with_reference(x * pi), trajectory).memory for x in (1.0, 2.0))
     assert np.array_equal(light, heavy) is not is_loaded
+
+
+def test_one_drive_that_bears_a_load_is_enough(ur5):
+    first, second, third = ur5.joints[:3]
+    assert not bears_load(ur5)
+    assert not bears_load(ur5.with_terms({first: (Presliding(),), second: (Presliding(),)}))
+    own = {first: (Presliding(),), second: (Lag(),), third: (Presliding(),)}
+    assert bears_load(ur5.with_terms(own))

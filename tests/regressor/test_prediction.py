@@ -8,7 +8,7 @@ from robotid.exceptions import DataError
 from robotid.regressor import prediction
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_speeds
-from robotid.regressor.prediction import predict, predict_instants
+from robotid.regressor.prediction import body_slopes, predict, predict_instants
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.drives import Lag, LoadFriction, Presliding, Stribeck
 from robotid.robot.examples import example_urdf
@@ -72,6 +72,29 @@ def test_bodies_that_are_none_keep_their_digits(mass, ur5, rng):
     assert_is_regressor_times(ur5, [pi], trajectory, compiled=False)
     pi[11:14] = 0.0
     assert_is_regressor_times(ur5, [pi], trajectory, compiled=False)
+
+
+def test_slopes_of_bodies_that_are_none_are_those_of_differences(ur5, rng):
+    m, h, n = motion(ur5, rng, 3), 1e-6, len(ur5.joints)
+    pi = ur5.standard_parameters()
+    pi[10:20] = [-0.5, 0.3, -0.2, 0.5, 0.1, 0.0, 0.2, 0.0, 0.0, 0.1]
+    found = body_slopes(ur5, pi, m)
+    state = (m.q, m.v, m.a)
+    for k, slope in enumerate((found.by_q, found.by_v, found.by_a)):
+        for j in range(n):
+            up, down = ([x + s * h * (i == k) * np.eye(n)[j] for i, x in enumerate(state)]
+                        for s in (1, -1))  # fmt: skip
+            rows = [joint_torque_regressor(ur5, *moved) @ pi for moved in (up, down)]
+            wanted = ((rows[0] - rows[1]) / (2 * h)).reshape(-1, n)
+            np.testing.assert_allclose(slope[:, :, j], wanted, atol=1e-6 * np.abs(wanted).max())
+    for axis in range(3):
+        g = np.array([0.0, 0.0, -9.81]) + np.eye(3)[axis]
+        other = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), gravity=tuple(g))
+        rows = [joint_torque_regressor(robot, *state) @ pi for robot in (other, ur5)]
+        wanted = (rows[0] - rows[1]).reshape(-1, n)
+        np.testing.assert_allclose(
+            found.by_gravity[:, :, axis], wanted, atol=1e-9 * np.abs(wanted).max()
+        )
 
 
 def test_other_joints_are_refused(ur5, panda, rng):

@@ -112,6 +112,34 @@ def test_another_filter_is_said(changed):
     assert remark.startswith("second.csv was prepared in other ways (cutoff 8 | 3)")
 
 
+def test_each_common_recording_is_compared_by_its_own_signals_and_rows(folder, tmp_path):
+    results = [copy.deepcopy(read_result(folder / f"{name}.json")) for name in "ab"]
+    for result in results:  # a recording more, read before the other one
+        *others, kept = result["inputs"]
+        more = kept | {"path": "more.csv", "sha256": "1" * 64, "signals": {"cutoff": 5.0}}
+        result["inputs"] = [*others, more | {"rows_used": 9}, kept]
+        result["validation"].insert(0, result["validation"][0] | {"log": "more.csv"})
+    paths = [tmp_path / f"{name}.json" for name in "ab"]
+
+    def remarks():
+        for path, result in zip(paths, results, strict=True):
+            write_json(result, path)
+        return compare_results(paths)["remarks"]
+
+    assert remarks() == []
+    last = results[1]["inputs"][-1]
+    rows = last["rows_used"]
+    last["rows_used"] = 77
+    last["signals"] = last["signals"] | {"cutoff": 3.0}
+    (remark,) = remarks()
+    said = f"second.csv was prepared in other ways (cutoff 8 | 3; rows {rows} | 77)"
+    assert remark.startswith(said)
+    results[1]["inputs"][-2]["signals"] = {"cutoff": 4.5}
+    first, second = remarks()
+    assert first.startswith("more.csv was prepared in other ways (cutoff 5 | 4.5)")
+    assert second == remark
+
+
 def test_other_fitted_recordings_and_versions_are_said(changed):
     def older(result):
         result["inputs"][1]["sha256"] = "1" * 64

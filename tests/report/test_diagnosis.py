@@ -8,6 +8,8 @@ import pytest
 from helpers.pages import charts, tables
 
 from robotid.fitting.information import information
+from robotid.identification.pictures import residual_charts
+from robotid.pages.charts import Chart, Series
 from robotid.report.diagnosis import _choice, _correlations, _residual_figures, information_section
 from robotid.report.errors import _remarks
 from robotid.report.torques import _beside
@@ -31,6 +33,26 @@ def test_a_correlation_falls_where_its_chart_first_does(identified, row):
     first = correlation["x"][np.flatnonzero(np.abs(series["y"]) < 0.2)[0]]
     said = re.search(r"correlation falls below 0.2 after ([\d.e-]+) s", html)[1]
     assert float(said) == pytest.approx(first, rel=0.06)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ([1.0, 0.4, -0.6, -0.3, 0.19, 0.5], "falls below 0.2 after 1 s"),
+        ([1.0, -0.19, 0.6], "falls below 0.2 after 0.25 s"),
+        ([1.0, -0.9, 0.8], "stays high"),
+    ],
+)
+def test_a_correlation_that_turns_negative_has_not_fallen(identified, monkeypatch, values, said):
+    x = 0.25 * np.arange(len(values))
+    spectrum, _ = residual_charts(identified, identified.validation[0], 1)
+    series = (Series("residual", np.array(values), "residual"),)
+    correlation = Chart("autocorrelation", x, series, "lag [s]", "correlation")
+    monkeypatch.setattr(
+        "robotid.report.diagnosis.residual_charts", lambda *_: (spectrum, correlation)
+    )
+    name = identified.model.row_names[1]
+    assert f"<strong>{name}</strong>: correlation {said}<" in _residual_figures(identified, 1)
 
 
 def test_what_was_tried_of_a_joint_stands_with_error_chance_and_shape():

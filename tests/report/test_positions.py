@@ -141,6 +141,7 @@ def test_charts_show_commanded_measured_and_simulated(page, followed):
     error = chart(page, f"position error of {LEG[2]}")
     left = {series["label"]: series["y"] for series in error["series"]}
     np.testing.assert_allclose(left["measured − simulated"], 6.0, atol=1e-3)  # [mrad]
+    np.testing.assert_allclose(left["measured − commanded"], -30.0, atol=1e-3)
     assert "kept.csv 1-5 s, not fitted: RMSE 6 mrad" in page
 
 
