@@ -105,8 +105,7 @@ def test_a_random_run_is_critically_damped_at_its_bandwidth(rng):
         ({"errors": [0.5, 0.5]}, "stalled: the motion excites too little; an error of 0.5 is left"),
         (
             {"errors": [0.9, 0.8, 0.5, *[0.48] * 9, 0.45]},
-            "slow: an error of 0.45 is left after 12 iterations and falls by 10 % in the last "
-            "10",
+            "slow: an error of 0.45 is left after 12 iterations and falls by 10 % in the last 10",
         ),
         (
             {"errors": [0.8, *[0.7] * 8, 0.6]},
