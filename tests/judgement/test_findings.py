@@ -8,8 +8,10 @@ import pytest
 from robotid.fitting.robust import Outlier
 from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement.findings import (
+    _drive_findings,
     _grown,
     _outlier_findings,
+    _static_findings,
     _total_mass,
     consistency_findings,
     locked_findings,
@@ -116,6 +118,78 @@ def test_the_parameter_that_terms_make_least_sure_is_named_from_tenfold_on():
         "a: lugre, load makes the standard error of viscous 42 times as large"
     )
     assert (last.where, last.evidence) == ("e", {"grown": 10.1})
+
+
+def test_drives_whose_friction_has_no_direction_where_all_of_their_joints_count_are_named():
+    yes, no = True, False
+    first = [[yes, no], [no, yes], [yes, yes]], [[0, 0, 1], [1, 1, 1], [0, 0, 0]]
+    second = [[yes, yes], [no, no]], [[0, 0, 0], [1, 1, 1]]
+    third = [[yes, no]], None
+
+    def said(*logs):
+        layout = SimpleNamespace(
+            drives=[SimpleNamespace(name=name) for name in ("a", "b", "pair")],
+            drive_ratios=np.array([[1.0, 0.0], [0.0, 1.0], [1.0, -2.0]]),
+        )
+        recordings = [
+            SimpleNamespace(
+                mask=np.array(mask),
+                trajectory=SimpleNamespace(direction=None if sign is None else np.array(sign)),
+                extent=SimpleNamespace(samples=100 * k, smooth=7 * k),
+            )
+            for k, (mask, sign) in enumerate(logs, start=1)
+        ]
+        fitted = [SimpleNamespace(recording=r) for r in recordings]
+        model = SimpleNamespace(is_static=True, layout=layout)
+        (finding,) = _static_findings(SimpleNamespace(model=model, fitted=fitted))
+        return finding
+
+    found = said(first, second)
+    assert found.evidence == {"rows": 300.0, "samples": 21.0}
+    assert "the 300 rows count as 21 stands" in found.message
+    assert "the Coulomb friction of a, pair, which holds" in found.message
+    assert "the Coulomb friction of a, b, pair, which holds" in said(second).message
+    assert "Coulomb" not in said(first, third).message
+
+
+def test_the_share_of_a_validation_log_beyond_what_friction_was_fitted_to_is_said(rng):
+    """Slower than the fit has seen is not beyond it; rows that are not used do not count."""
+    v, q = np.full((120, 2), 9.0), np.full((120, 2), 9.0)
+    v[:, 1], q[:, 1] = np.resize([0.05, 0.5, -0.5], 120), 0.1
+    v[:5, 1], v[5:8, 1], q[10:13, 1], q[20, 1] = 1.2, -1.2, -0.6, 0.9
+    mask = np.zeros((120, 2), dtype=bool)
+    mask[:100, 1] = True
+    v[100:, 1] = q[100:, 1] = 5.0
+    term = SimpleNamespace(guards="v", seen=(0.1, 1.0))
+    other = SimpleNamespace(guards="q", seen=(-0.5, 0.8))
+    loose = SimpleNamespace(guards="q", seen=(-np.inf, np.inf))
+    shape = SimpleNamespace(name="stribeck.speed", value=0.0123, unit="rad/s", is_at_bound=True)
+
+    def said(*terms):
+        choice = SimpleNamespace(
+            joint="b", shapes=[shape, SimpleNamespace(is_at_bound=False)], terms=terms,
+            seen={"v": (0.1, 1.0), "q": (-0.5, 0.8)}, families=("stribeck", "position"),
+        )  # fmt: skip
+        motion = SimpleNamespace(v=v, q=q)
+        recording = SimpleNamespace(trajectory=motion, mask=mask, name="run.csv 0-2 s")
+        fit = SimpleNamespace(
+            model=SimpleNamespace(joints=("a", "b")), drives=[choice],
+            validation=[SimpleNamespace(recording=recording)],
+        )  # fmt: skip
+        first, *found = _drive_findings(fit)
+        assert (first.code, first.where) == ("shape_at_bound", "b")
+        assert "b: stribeck.speed is 0.0123 rad/s, at the end" in first.message
+        return found
+
+    places, speeds = said(term, other, loose)
+    assert (places.code, places.where, places.evidence) == ("beyond_seen", "b", {"share_pct": 4.0})
+    assert places.message.startswith(
+        "b: 4 % of the rows of run.csv 0-2 s have positions beyond -0.5 to 0.8, which the fit has "
+        "seen; stribeck, position stays there as it was"
+    )
+    assert speeds.evidence == {"share_pct": 8.0}
+    assert "8 % of the rows of run.csv 0-2 s have speeds beyond 0 to 1, which" in speeds.message
+    assert said(loose) == []
 
 
 def test_all_links_weigh_within_a_factor_of_three_of_the_urdf_s():

@@ -196,6 +196,33 @@ def test_a_half_command_names_the_joints():
     )
 
 
+@pytest.mark.parametrize(
+    ("torques", "commands", "read"),
+    [
+        (2, 2, "both"), (2, 1, "torque"), (2, 0, "torque"), (0, 2, "commands"),
+        (1, 2, "tau_elbow"), (1, 1, "tau_elbow"), (1, 0, "tau_elbow"), (0, 0, "tau_shoulder"),
+        (0, 1, "qref_elbow"),
+    ],
+)  # fmt: skip
+def test_of_torques_or_commands_what_there_is_must_be_whole(torques, commands, read):
+    """A joint without what another has is refused; not commands of some beside all torques."""
+    log = make_log()
+    table = {"time": log.t, **columns("q", log.q)}
+    table |= {f"tau_{joint}": log.t + k for k, joint in enumerate(JOINTS[:torques])}
+    table |= {f"qref_{joint}": log.q_ref[:, k] for k, joint in enumerate(JOINTS[:commands])}
+    if "_" in read:
+        with pytest.raises(DataError, match=f"no column '{read}'"):
+            read_log(pd.DataFrame(table), JOINTS, needs="any")
+        return
+    found = read_log(pd.DataFrame(table), JOINTS, needs="any")
+    assert found.has_torque is (read != "commands")
+    wanted = log.t[:, None] + [0, 1] if found.has_torque else np.zeros((300, 2))
+    np.testing.assert_array_equal(found.tau, wanted)
+    assert (found.q_ref is None) is (read == "torque")
+    if found.q_ref is not None:
+        np.testing.assert_array_equal(found.q_ref, log.q_ref)
+
+
 def test_half_of_the_rest_is_noted():
     part = np.ones(300)
     log = read_log(frame(dqref_elbow=part, tau_elbow=part), JOINTS, needs="commands")
