@@ -120,6 +120,48 @@ def test_the_parameter_that_terms_make_least_sure_is_named_from_tenfold_on():
     assert (last.where, last.evidence) == ("e", {"grown": 10.1})
 
 
+def test_bounds_that_bind_are_a_warning_where_data_or_masses_contradict_a_stated_one():
+    def said(*active, ours=(1.04, 2.08), masses=(0.11, 3.9)):
+        fit = solved(active=active)
+        wls = (1.0, 2.0)
+        fit.metrics = lambda name: SimpleNamespace(
+            per_joint={
+                joint: SimpleNamespace(rmse=x)
+                for joint, x in zip("ab", wls if name == "wls" else ours, strict=True)
+            }
+        )
+        prior, standard = np.full((2, 22), 7.0)
+        prior[[0, 10]], standard[[0, 10]] = (2.0, 4.0), masses
+        layout = SimpleNamespace(n_inertial=20, bodies=("one", "two"))
+        fit.model = SimpleNamespace(layout=layout, standard_parameters=lambda: prior)
+        fit.standard = standard
+        bounds = SimpleNamespace(mass={"one": [0.1, 2.0]}, com={"two": []})
+        fit.estimator = SimpleNamespace(bounds=bounds)
+        found = consistency_findings(fit)
+        assert all(f.code == "bound_binds" for f in found)
+        return [(f.severity, f.where, f.message) for f in found]
+
+    fine = "the URDF's values lie beyond them, and the torque is explained as well as without"
+    assert said("mass one") == [("note", "mass one", f"the bounds mass one bind: {fine}")]
+    ((severity, where, message),) = said("mass one", "cone two", "mass two", ours=(1.06, 2.11))
+    assert (severity, where) == ("warning", "mass one, mass two")
+    assert message.startswith(
+        "the bounds mass one, mass two bind: the data push against them at a, b; check these"
+    )
+    ((severity, _, message),) = said("total_mass all", ours=(1.0, 2.11))
+    assert severity == "warning"
+    assert "push against them at b; check" in message
+    # next to nothing is left of a link
+    ((severity, _, message),) = said("centre_of_mass two", masses=(0.09, 0.21))
+    assert severity == "warning"
+    assert "bind: they leave 0.09 of its 2 kg to one; check" in message
+    # a bound of the geometry is no one's statement
+    ((severity, _, message),) = said("mass two", masses=(0.09, 0.19))
+    assert severity == "note"
+    assert "they leave 0.09 of its 2 kg to one, 0.19 of its 4 kg to two; check" in message
+    assert said("cone one", "inertia two") == []
+
+
 def test_drives_whose_friction_has_no_direction_where_all_of_their_joints_count_are_named():
     yes, no = True, False
     first = [[yes, no], [no, yes], [yes, yes]], [[0, 0, 1], [1, 1, 1], [0, 0, 0]]
