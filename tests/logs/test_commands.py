@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from helpers.recorders import (
     StoragePlugin,
@@ -453,6 +454,22 @@ def test_an_episode_of_lerobot_is_read(tmp_path, version):
         "episode 0; its time stamps are the numbers of the frames over their rate, so what was "
         "sent and measured may be a frame apart",
     )
+
+
+def test_frames_of_an_episode_are_in_their_order_whatever_that_of_the_rows_and_files(tmp_path, rng):
+    path = dataset(tmp_path, "v3.0", episodes=(0, 3))
+    (file,) = path.glob("data/**/*.parquet")
+    table = pq.read_table(file)
+    table = table.take(rng.permutation(len(table)))
+    for k, rows in enumerate((slice(0, 90), slice(90, 150), slice(150, None))):
+        part = table.take(np.arange(len(table))[rows])
+        pq.write_table(part, file.with_name(f"file-00{2 - k}.parquet"))
+    for number in (0, 3):
+        source, log = LogSource(topic=f"episode_{number}"), make_log(100 + number)
+        back = read_log(path, JOINTS, needs="commands", units=DEGREES, source=source)
+        np.testing.assert_allclose(back.t, np.arange(100 + number) / 50, atol=1e-6)
+        np.testing.assert_allclose(back.q, log.q + np.deg2rad(number), atol=1e-6)
+        np.testing.assert_allclose(back.q_ref, log.q_ref, atol=1e-6)
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
