@@ -8,6 +8,7 @@ import pytest
 from robotid.fitting.robust import Outlier
 from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement.findings import (
+    _correlated,
     _drive_findings,
     _grown,
     _outlier_findings,
@@ -118,6 +119,41 @@ def test_the_parameter_that_terms_make_least_sure_is_named_from_tenfold_on():
         "a: lugre, load makes the standard error of viscous 42 times as large"
     )
     assert (last.where, last.evidence) == ("e", {"grown": 10.1})
+
+
+def test_correlated_terms_of_a_drive_are_said_by_their_worst_pair_and_sum():
+    names = ("one.m", "a.viscous", "a.coulomb", "b.viscous", "b.coulomb", "b.offset", "c.offset")
+    R = np.eye(7)
+    for i, k, r in ((1, 2, -0.97), (3, 4, 0.955), (4, 5, -0.98), (0, 6, 0.99), (2, 6, 0.99)):
+        R[i, k] = R[k, i] = r
+    size = np.array([1.0, 0.5, 0.25, 2.0, 0.125, 3.0, 1.0])
+    drives = (0, 0, 1, 1, 1, 2)
+    layout = SimpleNamespace(
+        names=names, n_inertial=1, prismatic={"b"}, drives=("a", "b", "c"),
+        drive_parameters=[(d, None) for d in drives],
+    )  # fmt: skip
+    v = np.array([-2.0, -1.0, -0.5, 0.5, 1.0, 3.0])
+    curves = {
+        joint: SimpleNamespace(v=v, torque=10 * v + k, std=0.1 * np.arange(1, 7))
+        for k, joint in enumerate("ab")
+    }
+    found = SimpleNamespace(
+        model=SimpleNamespace(layout=layout), standard_covariance=R * np.outer(size, size),
+        at_bound=np.zeros(7, dtype=bool), standard=np.arange(7) + 0.25, standard_error=size,
+        friction=curves.__getitem__, drives=(),
+    )  # fmt: skip
+    a, b = _correlated(found)
+    assert (a.code, a.severity, a.where, a.evidence) == (
+        "correlated_terms", "note", "a", {"r": pytest.approx(-0.97)}
+    )  # fmt: skip
+    assert a.message == (
+        "a: viscous 1.25 +- 0.5, coulomb 2.25 +- 0.25 are strongly correlated (r = -0.970): use "
+        "their sum; friction and offset are 5 +- 0.4 at 0.5 and 30 +- 0.6 at 3 rad/s"
+    )
+    assert b.message == (
+        "b: coulomb 4.25 +- 0.12, offset 5.25 +- 3 are strongly correlated (r = -0.980): use their "
+        "sum; friction and offset are 6 +- 0.4 at 0.5 and 31 +- 0.6 at 3 m/s"
+    )
 
 
 def test_bounds_that_bind_are_a_warning_where_data_or_masses_contradict_a_stated_one():
