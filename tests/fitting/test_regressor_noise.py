@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -311,3 +312,14 @@ def test_of_a_log_in_a_file_windows_stand_for_all_rows(planar, motion, tmp_path,
     found = find_regressor_noise(recordings, whole, wls.theta, wls.sigma, wls.sigma)
     worst = int(np.argmax(np.abs(whole_log.shift) / wls.std_error))
     assert found.shift[worst] == pytest.approx(whole_log.shift[worst], rel=0.3)
+
+
+def test_the_share_of_the_noise_is_that_of_the_log_in_which_it_is_largest():
+    logs = [SimpleNamespace(step=h, signals=SIGNALS) for h in (0.01, 0.004)]
+    steps = [np.array([0.02, 0.0, 1e-4]), np.array([1e-3, 0.0, 0.03])]
+    whole = SimpleNamespace(squares=np.array([[0.0] * 3, [0.0] * 3, [8e4, 5.0, 2e5]]), samples=20)
+    noise = [e / np.sqrt(12) * acceleration_noise(x.step, SIGNALS)
+             for x, e in zip(logs, steps, strict=True)]  # fmt: skip
+    wanted = np.maximum(*noise) / np.sqrt(whole.squares[2] / 20)
+    assert (wanted < 1.0).all()
+    np.testing.assert_allclose(regressor_noise._share(logs, steps, whole), wanted, rtol=1e-12)
