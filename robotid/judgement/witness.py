@@ -112,10 +112,13 @@ class Witness:
 
     @property
     def _off(self) -> float:
-        """How far gravity and total mass are off, a payload left out if it explains them [-]."""
+        """How far gravity and total mass are off, a payload left out if it explains them [-].
+
+        A payload without mass is none: it says nothing of the scale.
+        """
         before, after, payload = self.masses
-        if not before > 0:
-            return np.inf
+        if not (before > 0 and payload > 0):
+            return self._off_whole
         with_load = max(abs((after - payload) / before - 1.0), abs((self.scale or 1.0) - 1.0))
         return min(with_load, self._off_whole)
 

@@ -336,12 +336,13 @@ def random_runs(
 def _course(error: Array) -> str:
     """Return why an error, shape (L + 1,), is not small at its end."""
     count = len(error) - 1
-    lost = 1.0 - error[-1] / error[max(0, count - 10)]
+    last = min(count, 10)
+    lost = 1.0 - error[-1] / error[count - last]
     if error[-1] > error[0]:
         return f"the error grew, from {error[0]:.2g} to {error[-1]:.2g}"
     if lost < _STALLED:
         return f"stalled: the motion excites too little; an error of {error[-1]:.2g} is left"
     return (
         f"slow: an error of {error[-1]:.2g} is left after {count} iterations and falls by "
-        f"{100 * lost:.2g} % in ten"
+        f"{100 * lost:.2g} % in the last {last}"
     )

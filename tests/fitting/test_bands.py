@@ -1,15 +1,30 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.driven import ELBOW, JOINTS, LIFT, WRIST
 from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.export.entries import build_result
-from robotid.fitting.bands import TorqueBand, expected_band, recording_bands, torque_band
+from robotid.fitting.bands import (
+    TorqueBand,
+    expected_band,
+    friction_curve,
+    recording_bands,
+    torque_band,
+    usual_friction,
+)
+from robotid.fitting.open_terms import OpenTerm
 from robotid.fitting.settings import EstimatorSettings
+from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.drives import LoadFriction, PositionCoulomb
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
 
 NOISE = np.array([2.0, 2.0, 1.0, 0.3, 0.3, 0.1])
 
@@ -124,3 +139,87 @@ def test_rows_that_are_not_used_do_not_count():
     share = band.held(tau, np.zeros((3, 2)), mask)
     assert share[0] == 0.5
     assert np.isnan(share[1])
+
+
+def coupled_fit(rng):
+    """Return what a fit of a drive of two joints to two logs has, all of it by chance."""
+    model = RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"),
+        joints=JOINTS,
+        couplings=[Coupling("pair", ((LIFT, 1.0), (WRIST, -2.5)))],
+        own_terms={"pair": [PositionCoulomb(centre=0.3)], ELBOW: [LoadFriction()]},
+    )
+    fitted = []
+    for count in (31, 40):
+        q, v, a, tau = rng.standard_normal((4, count, 3))
+        motion = Trajectory(
+            np.arange(count) / 50, q, v, a, tau, JOINTS, 50.0, np.zeros(count, dtype=int)
+        )
+        mask = rng.random((count, 3)) < 0.6
+        mask[:2], v[:2] = [True, False, False], 9.0  # fast only where the other joint is not used
+        motion = replace(motion, v=v)
+        fitted.append(SimpleNamespace(recording=SimpleNamespace(trajectory=motion, mask=mask)))
+    size = len(model.layout.names)
+    root = rng.standard_normal((size, size))
+    standard = model.standard_parameters() + 0.1 * rng.random(size)
+    return SimpleNamespace(
+        model=model.with_reference(standard), fitted=fitted, standard=standard,
+        standard_covariance=root @ root.T, open_terms=(),
+    )  # fmt: skip
+
+
+def test_usual_friction_of_a_coupled_drive_is_over_the_rows_that_all_of_its_joints_have(rng):
+    found = coupled_fit(rng)
+    ratios = np.array([1.0, 0.0, -2.5])
+    rows = [(e.recording.mask[:, [0, 2]]).all(axis=1) for e in found.fitted]
+    q, v = (
+        np.concatenate(
+            [
+                getattr(e.recording.trajectory, x)[r] @ ratios
+                for e, r in zip(found.fitted, rows, strict=True)
+            ]
+        )
+        for x in "qv"
+    )
+    assert 10 < len(q) < 40
+    curve = usual_friction(found, "pair")
+    side = np.linspace(np.abs(v).min(), np.abs(v).max(), 20)
+    np.testing.assert_allclose(curve.v, [*-side[::-1], *side], rtol=1e-12)
+    names = [f"pair.{x}" for x in ("viscous", "coulomb", "coulomb_q1")]
+    k = [found.model.layout.names.index(name) for name in names]
+    sign = np.sign(curve.v)
+    X = np.column_stack([curve.v, sign, sign * (np.median(q) - 0.3)])
+    np.testing.assert_allclose(curve.torque, X @ found.standard[k], rtol=1e-12)
+    C = found.standard_covariance[np.ix_(k, k)]
+    np.testing.assert_allclose(curve.std, np.sqrt([x @ C @ x for x in X]), rtol=1e-12)
+    np.testing.assert_array_equal(curve.half_width, 1.96 * curve.std)
+    assert curve.load == 0.0
+    # of stated speeds and position
+    asked = usual_friction(found, "pair", [0.7, -0.2], q=1.1, load=3.0)
+    X = np.array([[0.7, 1.0, 0.8], [-0.2, -1.0, -0.8]])
+    np.testing.assert_allclose(asked.torque, X @ found.standard[k], rtol=1e-12)
+    assert asked.load == 3.0
+
+
+def test_a_term_that_is_open_adds_its_own_torque_to_what_it_moves(rng):
+    found, v = coupled_fit(rng), np.array([-0.8, 0.3, 1.7])
+    layout = found.model.layout
+    names = [f"{ELBOW}.{x}" for x in ("viscous", "coulomb", "offset", "load")]
+    k = [layout.names.index(name) for name in names]
+    C = np.diag(rng.random(len(layout.names)) + 1.0)
+    moves = 0.3 * rng.standard_normal((2, len(C)))
+    C += moves.T @ moves
+    own = [OpenTerm(ELBOW, moves[0], lambda drive, motion: drive.v**3),
+           OpenTerm(LIFT, moves[1], lambda drive, motion: drive.v**2)]  # fmt: skip
+    found = replace_in(found, standard_covariance=C, open_terms=tuple(own))
+    curve = friction_curve(found, ELBOW, v, load=-2.0)
+    X = np.column_stack([v, np.sign(v), np.ones(3), 2.0 * np.sign(v)])
+    np.testing.assert_allclose(curve.torque, X @ found.standard[k], rtol=1e-12)
+    alone = np.diag(C - moves.T @ moves)[k]
+    variance = X**2 @ alone + (X @ moves[0, k] + v**3) ** 2 + (X @ moves[1, k]) ** 2
+    np.testing.assert_allclose(curve.std, np.sqrt(variance), rtol=1e-12)
+    assert curve.load == -2.0
+
+
+def replace_in(found, **changes):
+    return SimpleNamespace(**{**vars(found), **changes})

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from helpers.paths import ROOT
 from helpers.synthetic import truth
 
 from robotid.estimators import OLS, WLS
-from robotid.fitting import survey
+from robotid.fitting import regressor_noise, survey
 from robotid.fitting.fit import solve_recordings
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.regressor_noise import (
@@ -269,6 +270,33 @@ def test_total_least_squares_have_a_correction_of_their_own(planar, motion):
     assert found.regressor_noise is None
 
 
+def test_rows_that_are_not_looked_at_scale_the_covariance_of_the_score(planar, motion, monkeypatch):
+    """Of thrice the rows, D, H and the shift's score are three times as large, its variance nine.
+
+    The scatter of repeated rounding errors is a variance of rows: three times as large.
+    """
+    monkeypatch.setattr(regressor_noise, "_is_enough", lambda moves: len(moves) == 4)
+    log = recorded(planar, [x[:700] for x in motion])
+    recordings, parts, whole, wls = fitted(planar, log)
+
+    def found(reduction):
+        return find_regressor_noise(recordings, reduction, wls.theta, wls.sigma, wls.sigma)
+
+    thrice = join(parts * 3)
+    both = found(whole), found(thrice)
+    monkeypatch.setattr(regressor_noise, "_repeated", lambda odd: np.zeros(odd.shape[-1]))
+    alone = found(whole), found(thrice)
+    size = np.sqrt(np.outer(np.diag(both[1].meat), np.diag(both[1].meat)))
+    for one, more in (both, alone):
+        np.testing.assert_allclose(more.shift / one.std_error, one.shift / one.std_error, atol=1e-6)
+        np.testing.assert_allclose(more.std_error, one.std_error / np.sqrt(3), rtol=1e-6)
+        np.testing.assert_allclose(more.share, one.share, rtol=1e-9)
+    np.testing.assert_allclose(alone[1].meat / size, 9 * alone[0].meat / size, atol=1e-6)
+    repeated = [x.meat - y.meat for x, y in zip(both, alone, strict=True)]
+    assert (np.diag(repeated[0]) > 0).any()
+    np.testing.assert_allclose(repeated[1] / size, 3 * repeated[0] / size, atol=1e-6)
+
+
 def test_of_a_log_in_a_file_windows_stand_for_all_rows(planar, motion, tmp_path, monkeypatch):
     log = recorded(planar, motion)
     whole_log = found_in(planar, log)
@@ -284,3 +312,14 @@ def test_of_a_log_in_a_file_windows_stand_for_all_rows(planar, motion, tmp_path,
     found = find_regressor_noise(recordings, whole, wls.theta, wls.sigma, wls.sigma)
     worst = int(np.argmax(np.abs(whole_log.shift) / wls.std_error))
     assert found.shift[worst] == pytest.approx(whole_log.shift[worst], rel=0.3)
+
+
+def test_the_share_of_the_noise_is_that_of_the_log_in_which_it_is_largest():
+    logs = [SimpleNamespace(step=h, signals=SIGNALS) for h in (0.01, 0.004)]
+    steps = [np.array([0.02, 0.0, 1e-4]), np.array([1e-3, 0.0, 0.03])]
+    whole = SimpleNamespace(squares=np.array([[0.0] * 3, [0.0] * 3, [8e4, 5.0, 2e5]]), samples=20)
+    noise = [e / np.sqrt(12) * acceleration_noise(x.step, SIGNALS)
+             for x, e in zip(logs, steps, strict=True)]  # fmt: skip
+    wanted = np.maximum(*noise) / np.sqrt(whole.squares[2] / 20)
+    assert (wanted < 1.0).all()
+    np.testing.assert_allclose(regressor_noise._share(logs, steps, whole), wanted, rtol=1e-12)

@@ -1,8 +1,11 @@
 """What a fit says of its parameters, by figures that are given."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
+
+from robotid.fitting.result import Fit
 
 
 def test_a_bound_is_the_source_of_what_it_moved_and_the_data_do_not_show(identified):
@@ -27,3 +30,10 @@ def test_a_bound_is_the_source_of_what_it_moved_and_the_data_do_not_show(identif
     pinned = details | {"constraints": False, "pinned": (body,)}
     held = replace(found, estimate=replace(found.estimate, details=pinned))
     assert {held.sources[i] for i in own} == {"prior"}
+
+
+def test_the_reach_of_a_standard_parameter_is_the_largest_of_its_base_parameters():
+    K = np.array([[1.0, 0.0, 2.0, 0.0], [0.0, 0.0, -0.5, 0.0], [0.0, 0.0, 0.0, 3.0]])
+    errors = SimpleNamespace(reach=np.array([2.125, 2.5, 1.97]))
+    found = SimpleNamespace(mapping=SimpleNamespace(K=K), errors=errors)
+    assert Fit.standard_reach.fget(found).tolist() == [2.125, 1.96, 2.5, 1.97]

@@ -126,6 +126,7 @@ def test_a_row_is_an_outlier_by_the_residual_and_the_torque_of_its_own_joint(mod
     evaluations = []
     for k in range(2):
         predicted = np.where(np.arange(400)[:, None] % 2, 1.0, -1.0) * torque
+        predicted[:, 0] = torque[0]  # a constant load is a torque, too
         tau = predicted + 0.2 * np.where(np.arange(400)[:, None] % 4 < 2, 1, -1) * [1, 0.5, 0.01]
         mask = np.ones((400, 3), dtype=bool)
         mask[350, 2] = False

@@ -8,8 +8,11 @@ import pytest
 from robotid.fitting.robust import Outlier
 from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement.findings import (
+    _correlated,
+    _drive_findings,
     _grown,
     _outlier_findings,
+    _static_findings,
     _total_mass,
     consistency_findings,
     locked_findings,
@@ -116,6 +119,155 @@ def test_the_parameter_that_terms_make_least_sure_is_named_from_tenfold_on():
         "a: lugre, load makes the standard error of viscous 42 times as large"
     )
     assert (last.where, last.evidence) == ("e", {"grown": 10.1})
+
+
+def test_correlated_terms_of_a_drive_are_said_by_their_worst_pair_and_sum():
+    names = ("one.m", "a.viscous", "a.coulomb", "b.viscous", "b.coulomb", "b.offset", "c.offset")
+    R = np.eye(7)
+    for i, k, r in ((1, 2, -0.97), (3, 4, 0.955), (4, 5, -0.98), (0, 6, 0.99), (2, 6, 0.99)):
+        R[i, k] = R[k, i] = r
+    size = np.array([1.0, 0.5, 0.25, 2.0, 0.125, 3.0, 1.0])
+    drives = (0, 0, 1, 1, 1, 2)
+    layout = SimpleNamespace(
+        names=names, n_inertial=1, prismatic={"b"}, drives=("a", "b", "c"),
+        drive_parameters=[(d, None) for d in drives],
+    )  # fmt: skip
+    v = np.array([-2.0, -1.0, -0.5, 0.5, 1.0, 3.0])
+    curves = {
+        joint: SimpleNamespace(v=v, torque=10 * v + k, std=0.1 * np.arange(1, 7))
+        for k, joint in enumerate("ab")
+    }
+    found = SimpleNamespace(
+        model=SimpleNamespace(layout=layout), standard_covariance=R * np.outer(size, size),
+        at_bound=np.zeros(7, dtype=bool), standard=np.arange(7) + 0.25, standard_error=size,
+        friction=curves.__getitem__, drives=(),
+    )  # fmt: skip
+    a, b = _correlated(found)
+    assert (a.code, a.severity, a.where, a.evidence) == (
+        "correlated_terms", "note", "a", {"r": pytest.approx(-0.97)}
+    )  # fmt: skip
+    assert a.message == (
+        "a: viscous 1.25 +- 0.5, coulomb 2.25 +- 0.25 are strongly correlated (r = -0.970): use "
+        "their sum; friction and offset are 5 +- 0.4 at 0.5 and 30 +- 0.6 at 3 rad/s"
+    )
+    assert b.message == (
+        "b: coulomb 4.25 +- 0.12, offset 5.25 +- 3 are strongly correlated (r = -0.980): use their "
+        "sum; friction and offset are 6 +- 0.4 at 0.5 and 31 +- 0.6 at 3 m/s"
+    )
+
+
+def test_bounds_that_bind_are_a_warning_where_data_or_masses_contradict_a_stated_one():
+    def said(*active, ours=(1.04, 2.08), masses=(0.11, 3.9)):
+        fit = solved(active=active)
+        wls = (1.0, 2.0)
+        fit.metrics = lambda name: SimpleNamespace(
+            per_joint={
+                joint: SimpleNamespace(rmse=x)
+                for joint, x in zip("ab", wls if name == "wls" else ours, strict=True)
+            }
+        )
+        prior, standard = np.full((2, 22), 7.0)
+        prior[[0, 10]], standard[[0, 10]] = (2.0, 4.0), masses
+        layout = SimpleNamespace(n_inertial=20, bodies=("one", "two"))
+        fit.model = SimpleNamespace(layout=layout, standard_parameters=lambda: prior)
+        fit.standard = standard
+        bounds = SimpleNamespace(mass={"one": [0.1, 2.0]}, com={"two": []})
+        fit.estimator = SimpleNamespace(bounds=bounds)
+        found = consistency_findings(fit)
+        assert all(f.code == "bound_binds" for f in found)
+        return [(f.severity, f.where, f.message) for f in found]
+
+    fine = "the URDF's values lie beyond them, and the torque is explained as well as without"
+    assert said("mass one") == [("note", "mass one", f"the bounds mass one bind: {fine}")]
+    ((severity, where, message),) = said("mass one", "cone two", "mass two", ours=(1.06, 2.11))
+    assert (severity, where) == ("warning", "mass one, mass two")
+    assert message.startswith(
+        "the bounds mass one, mass two bind: the data push against them at a, b; check these"
+    )
+    ((severity, _, message),) = said("total_mass all", ours=(1.0, 2.11))
+    assert severity == "warning"
+    assert "push against them at b; check" in message
+    # next to nothing is left of a link
+    ((severity, _, message),) = said("centre_of_mass two", masses=(0.09, 0.21))
+    assert severity == "warning"
+    assert "bind: they leave 0.09 of its 2 kg to one; check" in message
+    # a bound of the geometry is no one's statement
+    ((severity, _, message),) = said("mass two", masses=(0.09, 0.19))
+    assert severity == "note"
+    assert "they leave 0.09 of its 2 kg to one, 0.19 of its 4 kg to two; check" in message
+    assert said("cone one", "inertia two") == []
+
+
+def test_drives_whose_friction_has_no_direction_where_all_of_their_joints_count_are_named():
+    yes, no = True, False
+    first = [[yes, no], [no, yes], [yes, yes]], [[0, 0, 1], [1, 1, 1], [0, 0, 0]]
+    second = [[yes, yes], [no, no]], [[0, 0, 0], [1, 1, 1]]
+    third = [[yes, no]], None
+
+    def said(*logs):
+        layout = SimpleNamespace(
+            drives=[SimpleNamespace(name=name) for name in ("a", "b", "pair")],
+            drive_ratios=np.array([[1.0, 0.0], [0.0, 1.0], [1.0, -2.0]]),
+        )
+        recordings = [
+            SimpleNamespace(
+                mask=np.array(mask),
+                trajectory=SimpleNamespace(direction=None if sign is None else np.array(sign)),
+                extent=SimpleNamespace(samples=100 * k, smooth=7 * k),
+            )
+            for k, (mask, sign) in enumerate(logs, start=1)
+        ]
+        fitted = [SimpleNamespace(recording=r) for r in recordings]
+        model = SimpleNamespace(is_static=True, layout=layout)
+        (finding,) = _static_findings(SimpleNamespace(model=model, fitted=fitted))
+        return finding
+
+    found = said(first, second)
+    assert found.evidence == {"rows": 300.0, "samples": 21.0}
+    assert "the 300 rows count as 21 stands" in found.message
+    assert "the Coulomb friction of a, pair, which holds" in found.message
+    assert "the Coulomb friction of a, b, pair, which holds" in said(second).message
+    assert "Coulomb" not in said(first, third).message
+
+
+def test_the_share_of_a_validation_log_beyond_what_friction_was_fitted_to_is_said(rng):
+    """Slower than the fit has seen is not beyond it; rows that are not used do not count."""
+    v, q = np.full((120, 2), 9.0), np.full((120, 2), 9.0)
+    v[:, 1], q[:, 1] = np.resize([0.05, 0.5, -0.5], 120), 0.1
+    v[:5, 1], v[5:8, 1], q[10:13, 1], q[20, 1] = 1.2, -1.2, -0.6, 0.9
+    mask = np.zeros((120, 2), dtype=bool)
+    mask[:100, 1] = True
+    v[100:, 1] = q[100:, 1] = 5.0
+    term = SimpleNamespace(guards="v", seen=(0.1, 1.0))
+    other = SimpleNamespace(guards="q", seen=(-0.5, 0.8))
+    loose = SimpleNamespace(guards="q", seen=(-np.inf, np.inf))
+    shape = SimpleNamespace(name="stribeck.speed", value=0.0123, unit="rad/s", is_at_bound=True)
+
+    def said(*terms):
+        choice = SimpleNamespace(
+            joint="b", shapes=[shape, SimpleNamespace(is_at_bound=False)], terms=terms,
+            seen={"v": (0.1, 1.0), "q": (-0.5, 0.8)}, families=("stribeck", "position"),
+        )  # fmt: skip
+        motion = SimpleNamespace(v=v, q=q)
+        recording = SimpleNamespace(trajectory=motion, mask=mask, name="run.csv 0-2 s")
+        fit = SimpleNamespace(
+            model=SimpleNamespace(joints=("a", "b")), drives=[choice],
+            validation=[SimpleNamespace(recording=recording)],
+        )  # fmt: skip
+        first, *found = _drive_findings(fit)
+        assert (first.code, first.where) == ("shape_at_bound", "b")
+        assert "b: stribeck.speed is 0.0123 rad/s, at the end" in first.message
+        return found
+
+    places, speeds = said(term, other, loose)
+    assert (places.code, places.where, places.evidence) == ("beyond_seen", "b", {"share_pct": 4.0})
+    assert places.message.startswith(
+        "b: 4 % of the rows of run.csv 0-2 s have positions beyond -0.5 to 0.8, which the fit has "
+        "seen; stribeck, position stays there as it was"
+    )
+    assert speeds.evidence == {"share_pct": 8.0}
+    assert "8 % of the rows of run.csv 0-2 s have speeds beyond 0 to 1, which" in speeds.message
+    assert said(loose) == []
 
 
 def test_all_links_weigh_within_a_factor_of_three_of_the_urdf_s():

@@ -77,6 +77,20 @@ def test_a_load_that_is_left_out_is_said_with_its_mass_and_both_figures():
     assert "agree within 5 %: gravity torque 1.04 x" in alike.message
 
 
+@pytest.mark.parametrize(
+    ("factor", "mass", "is_against"), [(1.37, 20.4, True), (1.2, 20.4, False), (1.01, 27.3, True)]
+)
+def test_a_load_without_mass_confirms_no_scale(factor, mass, is_against):
+    """Only a load with a mass of its own may be left out of gravity and total mass."""
+    witness = Witness(scale=1.01, factor=factor, masses=(20.0, mass, 0.0), unexplained=(0.2, 0.01))
+    assert not witness.agrees
+    assert witness.is_against is is_against
+    assert "could not be checked" in witness.message
+    assert f"gravity torque {factor:.2f} x the URDF's, total mass {mass:.4g} kg" in witness.message
+    assert replace(witness, factor=1.05 - 1e-9, masses=(20.0, 20.8, 0.0)).agrees
+    assert replace(witness, factor=1.05 + 1e-9, masses=(20.0, 20.8, 0.7)).agrees
+
+
 def test_without_gravity_nothing_bears_witness(ur5):
     model = ur5.from_urdf(ur5.tree.path, gravity=(0.0, 0.0, 0.0))
     found = found_of(model, near_urdf(model))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from helpers.recorders import (
     StoragePlugin,
@@ -194,6 +195,33 @@ def test_a_half_command_names_the_joints():
         "commanded positions found: none. Record what the controller was told, rename the columns, "
         "or pass columns={'qref_<joint>': ...}"
     )
+
+
+@pytest.mark.parametrize(
+    ("torques", "commands", "read"),
+    [
+        (2, 2, "both"), (2, 1, "torque"), (2, 0, "torque"), (0, 2, "commands"),
+        (1, 2, "tau_elbow"), (1, 1, "tau_elbow"), (1, 0, "tau_elbow"), (0, 0, "tau_shoulder"),
+        (0, 1, "qref_elbow"),
+    ],
+)  # fmt: skip
+def test_of_torques_or_commands_what_there_is_must_be_whole(torques, commands, read):
+    """A joint without what another has is refused; not commands of some beside all torques."""
+    log = make_log()
+    table = {"time": log.t, **columns("q", log.q)}
+    table |= {f"tau_{joint}": log.t + k for k, joint in enumerate(JOINTS[:torques])}
+    table |= {f"qref_{joint}": log.q_ref[:, k] for k, joint in enumerate(JOINTS[:commands])}
+    if "_" in read:
+        with pytest.raises(DataError, match=f"no column '{read}'"):
+            read_log(pd.DataFrame(table), JOINTS, needs="any")
+        return
+    found = read_log(pd.DataFrame(table), JOINTS, needs="any")
+    assert found.has_torque is (read != "commands")
+    wanted = log.t[:, None] + [0, 1] if found.has_torque else np.zeros((300, 2))
+    np.testing.assert_array_equal(found.tau, wanted)
+    assert (found.q_ref is None) is (read == "torque")
+    if found.q_ref is not None:
+        np.testing.assert_array_equal(found.q_ref, log.q_ref)
 
 
 def test_half_of_the_rest_is_noted():
@@ -426,6 +454,22 @@ def test_an_episode_of_lerobot_is_read(tmp_path, version):
         "episode 0; its time stamps are the numbers of the frames over their rate, so what was "
         "sent and measured may be a frame apart",
     )
+
+
+def test_frames_of_an_episode_are_in_their_order_whatever_that_of_the_rows_and_files(tmp_path, rng):
+    path = dataset(tmp_path, "v3.0", episodes=(0, 3))
+    (file,) = path.glob("data/**/*.parquet")
+    table = pq.read_table(file)
+    table = table.take(rng.permutation(len(table)))
+    for k, rows in enumerate((slice(0, 90), slice(90, 150), slice(150, None))):
+        part = table.take(np.arange(len(table))[rows])
+        pq.write_table(part, file.with_name(f"file-00{2 - k}.parquet"))
+    for number in (0, 3):
+        source, log = LogSource(topic=f"episode_{number}"), make_log(100 + number)
+        back = read_log(path, JOINTS, needs="commands", units=DEGREES, source=source)
+        np.testing.assert_allclose(back.t, np.arange(100 + number) / 50, atol=1e-6)
+        np.testing.assert_allclose(back.q, log.q + np.deg2rad(number), atol=1e-6)
+        np.testing.assert_allclose(back.q_ref, log.q_ref, atol=1e-6)
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])

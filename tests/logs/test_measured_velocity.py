@@ -8,6 +8,7 @@ import pytest
 from robotid.logs.data import Log
 from robotid.logs.measured_velocity import (
     coarse_velocities,
+    is_timely,
     is_trustworthy,
     quantum,
     unlike_velocities,
@@ -98,6 +99,19 @@ def test_a_late_velocity_is_its_positions_and_noise_is_not(lag):
     assert (joint, others) == ("b", [])
     assert alike < 0.5
     assert not is_trustworthy(replace(log, v=late))
+
+
+@pytest.mark.parametrize(
+    ("lag", "stated", "is_used"),
+    [(0.03, 0.0, False), (0.03, 0.005, False), (0.03, 0.02, True), (0.015, 0.0, True),
+     (0.0, -0.05, False)],
+)  # fmt: skip
+def test_what_a_velocity_is_stated_to_be_late_does_not_count(lag, stated, is_used):
+    log = log_of_two()
+    truth = np.column_stack([2 * np.cos(2 * (T - lag)), -3 * np.sin(3 * (T - lag))])
+    late = replace(log, v=truth)
+    assert is_timely(late, stated) is is_used
+    assert is_trustworthy(late, stated) is is_used
 
 
 def test_a_velocity_of_few_steps_is_coarse():

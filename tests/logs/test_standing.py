@@ -90,3 +90,29 @@ def test_the_slope_of_a_short_stretch_counts_as_far_as_it_goes():
         wanted = np.outer([share, 1.0], [0.05, -0.08])
         np.testing.assert_allclose(motion.v, wanted, rtol=1e-9)
         assert motion.segment.tolist() == [0, 1]
+
+
+def test_stretches_on_both_sides_of_a_jump_of_the_speed_are_left_out():
+    """One joint jumps by 0.15 rad/s in a quarter of a second, which is 0.6 rad/s^2, above 0.3."""
+    row = np.arange(200)  # eight stretches of 25 rows
+    for jump, kept in ((0.15, [0, 1, 2, 5, 6, 7]), (0.05, list(range(8)))):
+        for sign in (1.0, -1.0):
+            speed = np.where(row < 100, 0.1, 0.1 + jump)
+            q = np.column_stack([0.05 * row, np.cumsum(speed)]) * sign / 100
+            motion, stands = means(log_of(2.5 + row / 100, q))
+            assert not stands.any()
+            np.testing.assert_allclose(motion.t, 2.5 + 0.12 + 0.25 * np.array(kept))
+            v = np.column_stack([np.full(8, 0.05), np.repeat([0.1, 0.1 + jump], 4)])
+            np.testing.assert_allclose(motion.v, sign * v[kept], atol=1e-12)
+            np.testing.assert_allclose(motion.q, q.reshape(8, 25, 2).mean(axis=1)[kept])
+
+
+def test_two_stands_are_one_unless_a_gap_lies_between_them():
+    t = np.concatenate([np.arange(30), np.arange(30) + 35, np.arange(20) + 300]) / 100
+    q = np.tile([0.3, -0.2], (80, 1))
+    tau = np.arange(160.0).reshape(80, 2)
+    motion, stands = means(log_of(t, q, tau), max_gap=1.0)
+    assert stands.tolist() == [True, True]
+    assert motion.segment.tolist() == [0, 1]
+    np.testing.assert_allclose(motion.tau, [tau[:60].mean(axis=0), tau[60:].mean(axis=0)])
+    np.testing.assert_allclose(motion.t, [t[:60].mean(), t[60:].mean()])

@@ -106,6 +106,14 @@ def test_motors_of_several_joints_drive_in_the_place_of_the_joints_without_their
     crossed = Transmission(joints=("a", "b"), motors=("x", "y"), matrix=((0, 7.0), (8.0, 8.0)))
     assert crossed.shared == {"a": (("a", 1.0), ("b", 1.0))}
     assert crossed.gears == {"b": 7.0, "a": 8.0}
+    back = Transmission(
+        joints=("a", "b", "c"), matrix=((5.0, 0, 0), (0, 3.0, -32.0), (0, 2.0, 7.0))
+    )
+    assert back.shared == {
+        "b": (("b", 3.0 / -32.0), ("c", 1.0)),
+        "c": (("b", 2.0 / 7.0), ("c", 1.0)),
+    }
+    assert back.gears == {"a": 5.0, "b": -32.0, "c": 7.0}
 
 
 def refused(text, kind=DataError):

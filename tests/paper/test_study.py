@@ -98,14 +98,18 @@ def test_a_random_run_is_critically_damped_at_its_bandwidth(rng):
         ({"lost": 3}, "the robot ran away from its program in iteration 3"),
         (
             {"skipped": 7},
-            "slow: an error of 0.4 is left after 1 iterations and falls by 20 % in ten; 7 updates "
-            "were left out, as D(q, P^) was not positive definite",
+            "slow: an error of 0.4 is left after 1 iterations and falls by 20 % in the last 1; 7 "
+            "updates were left out, as D(q, P^) was not positive definite",
         ),
         ({"errors": [0.5, 0.6]}, "the error grew, from 0.5 to 0.6"),
         ({"errors": [0.5, 0.5]}, "stalled: the motion excites too little; an error of 0.5 is left"),
         (
             {"errors": [0.9, 0.8, 0.5, *[0.48] * 9, 0.45]},
-            "slow: an error of 0.45 is left after 12 iterations and falls by 10 % in ten",
+            "slow: an error of 0.45 is left after 12 iterations and falls by 10 % in the last 10",
+        ),
+        (
+            {"errors": [0.8, *[0.7] * 8, 0.6]},
+            "slow: an error of 0.6 is left after 9 iterations and falls by 25 % in the last 9",
         ),
         (
             {"errors": [0.9, *[0.4] * 11]},

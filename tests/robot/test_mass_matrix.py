@@ -143,3 +143,25 @@ def test_both_solvers_lead_to_the_same_result(forearm, rng):
     )
     assert "SCS: Solved" in other.estimate.message
     np.testing.assert_allclose(other.base, one.base, atol=1e-4 * np.abs(one.base).max())
+
+
+def test_a_slider_without_limits_stays_within_a_metre_and_a_joint_goes_half_a_turn(tmp_path):
+    """A bar turns with m x^2 - I at the way x of its slider: possible where x^2 > I / m."""
+    moments = 'ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"'
+    inertial = f'<inertial><mass value="1"/><inertia {moments}/></inertial>'
+    (tmp_path / "bar.urdf").write_text(f"""<robot name="bar"><link name="base"/>
+        <link name="arm">{inertial}</link><link name="hand">{inertial}</link>
+        <joint name="turn" type="continuous"><parent link="base"/><child link="arm"/>
+            <axis xyz="0 0 1"/></joint>
+        <joint name="slide" type="prismatic"><parent link="arm"/><child link="hand"/>
+            <axis xyz="1 0 0"/></joint></robot>""")
+    model = RobotModel.from_urdf(tmp_path / "bar.urdf", terms=())
+    pi = np.zeros(20)
+    pi[9], pi[10] = -0.5, 2.0  # izz of the arm, mass of the hand
+    check = check_mass_matrix(model, pi, poses=450, seed=3)
+    draws = np.random.default_rng(3).uniform([-np.pi, -1.0], [np.pi, 1.0], (450, 2))
+    turning = 2.0 * draws[:, 1] ** 2 - 0.5
+    assert check.poses == 450
+    assert check.positive_share == np.mean(turning > 0)
+    assert check.smallest_eigenvalue == pytest.approx(turning.min(), rel=1e-9)
+    assert not check.is_positive
