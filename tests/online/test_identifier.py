@@ -143,6 +143,9 @@ def test_smooth_motion_can_be_given_as_it_is(ur5, rng):
     assert reading.t == log.t[-1]
     assert identifier.changes == ()
     assert identifier.estimate.n_iter == len(log.t)
+    # each sample is a step of its own
+    assert identifier._share == pytest.approx(2 * 2.0 / 50.0)
+    assert identifier._kalman.walk == pytest.approx(1e-4 / np.sqrt(50.0))
     error = np.abs(reading.theta - identifier.mapping.to_base(truth(ur5))) / reading.std_error
     assert np.sqrt(np.mean(error**2)) < 1.5
     np.testing.assert_allclose(reading.sigma, 0.1 * noise, rtol=0.3)
