@@ -2,6 +2,7 @@
 
 import pickle
 import re
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -237,6 +238,22 @@ def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
         wanted = np.sqrt((u @ after @ u) / (u @ before @ u))
         assert grown[name] == pytest.approx(wanted, rel=0.02), name
     assert grown[f"{ELBOW}.coulomb"] > 1.5
+    # a shape has the error of its derivative's column beside that of the term
+    for slides, unit in ((False, "rad/s"), (True, "m/s")):
+        sliding = replace(drive, slides=slides)
+        choice = drive_choice._found(alone, sliding, [(family, [speed])], ())
+        (shape,) = choice.shapes
+        assert (shape.name, shape.unit) == ("stribeck.speed", unit)
+    anew = drive_choice._weighed_anew(alone, drive, [(family, [shape.value])])
+    Z = np.hstack(
+        [drive.columns([Stribeck(speed=shape.value + x, seen=SEEN["v"])]) for x in (0.0, 1e-6)]
+    )
+    Z[:, 1] -= Z[:, 0]
+    size = drive_choice.Trials(anew, Z[:, None, :1], 1e-10).whole.parameters([0])[0]
+    Z[:, 1] *= size / 1e-6
+    C = drive_choice.Trials(anew, Z[:, None], 1e-10).whole.estimate([0, 1], anew.fitted)[1]
+    assert shape.std_error == pytest.approx(np.sqrt(C[1, 1]), rel=0.01)
+    assert choice.shape_covariance == ((pytest.approx(shape.std_error**2),),)
     # rows that are weighed by what terms leave keep their residual's share of the torque
     anew = drive_choice._weighed_anew(alone, drive, [(family, [speed])])
     factor = anew.r[:, 0] @ alone.r[:, 0] / np.sum(alone.r[:, 0] ** 2)

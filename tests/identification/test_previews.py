@@ -16,7 +16,12 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.export.entries import build_preview
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
-from robotid.identification.assumptions import TorqueNoise, assumed_noise
+from robotid.identification.assumptions import (
+    TorqueNoise,
+    assumed_noise,
+    assumed_parameters,
+    largest_torques,
+)
 from robotid.identification.previews import Run, _band, _Information, _seen, _white_step, preview
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -298,6 +303,34 @@ def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
         assumed_noise(ur5, size, {"elbow_joint": -1.0})
     with pytest.raises(SettingsError, match="correlation is -1 s"):
         assumed_noise(ur5, size, {}, -1.0)
+
+
+def test_friction_of_a_usual_size_is_a_twentieth_of_each_joints_torque_at_its_own_speed(ur5):
+    speeds = (3.0, np.inf, 0.0, 2.0, np.inf, np.inf)
+    limits = tuple(replace(x, velocity=v) for x, v in zip(ur5.limits, speeds, strict=True))
+    model = SimpleNamespace(
+        joints=ur5.joints,
+        layout=ur5.layout,
+        limits=limits,
+        standard_parameters=ur5.standard_parameters,
+    )
+    size, fastest = np.array([80.0, 70.0, 50.0, 9.0, 8.0, 7.0]), np.array([9, 5, 0.5, 9, 1e-6, 4.0])
+    pi = assumed_parameters(model, size, fastest)
+    names, given = list(model.layout.names), ur5.standard_parameters()
+    counted = []
+    for joint, torque, speed in zip(ur5.joints, size, (3.0, 5.0, 0.5, 2.0, 1e-3, 4.0), strict=True):
+        own = {f"{joint}.coulomb": 0.05 * torque, f"{joint}.viscous": 0.05 * torque / speed}
+        for name, value in own.items():
+            counted.append(names.index(name))
+            assert pi[counted[-1]] == pytest.approx(value), name
+    others = np.delete(np.arange(len(pi)), counted)
+    np.testing.assert_array_equal(pi[others], given[others])
+    # a limit that is stated is the largest torque, but not one of 0; what carries nothing has some
+    efforts = (90.0, np.inf, 0.0, np.inf, 6.0, np.inf)
+    limits = tuple(replace(x, effort=e) for x, e in zip(ur5.limits, efforts, strict=True))
+    peak = np.array([1.0, 2.0, 40.0, 0.0, 50.0, 0.3])
+    found = largest_torques(SimpleNamespace(limits=limits), peak)
+    np.testing.assert_allclose(found, [90.0, 2.0, 40.0, 0.05, 6.0, 0.3])
 
 
 def test_a_joint_without_an_effort_limit_has_the_torque_of_its_bodies(ur5, motion, tmp_path):
