@@ -135,13 +135,33 @@ def test_a_recording_that_was_fitted_does_not_show_what_repeats(rng):
     for beside, repeated, is_doubted in (
         ([kept[0], own[0]], "b", True),
         (kept, "b", False),
-        (kept, "bc", True),
     ):
         guesses = [Finding("repeated_motion", "warning", f"{name}.csv", "") for name in repeated]
         recordings = Recordings(arm, mapping, own, beside)
         found = conclude(recordings, choice, guesses, friction="none")
         assert found.validation[1].is_refitted == (beside[1] is own[0])
         assert ("repeated_motion" in {doubt.code for doubt in found.doubts}) == is_doubted
+
+
+def test_a_fit_that_fails_says_what_the_doctor_warned_of(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=300)
+    still = hold_log(ur5, replace(log, v=0.0 * log.v), SignalSettings(cutoff=None))
+    recordings = Recordings(ur5, structural_mapping(ur5), [still], [])
+    with pytest.raises(DataError, match="0 torque rows") as caught:
+        conclude(recordings, EstimatorSettings("wls"))
+    assert not hasattr(caught.value, "__notes__")
+    guesses = [
+        Finding("jitter", "note", "run", "It shakes"),
+        Finding("static_joint", "warning", "run", "It stands"),
+        Finding("rows", "error", "run", str(caught.value)),
+        Finding("clock", "error", "run", "It stops"),
+    ]
+    with pytest.raises(DataError, match="0 torque rows") as caught:
+        conclude(recordings, EstimatorSettings("wls"), guesses)
+    assert caught.value.__notes__ == [
+        "doctor: warning: static_joint: It stands",
+        "doctor: error: clock: It stops",
+    ]
 
 
 def test_an_unknown_estimator_is_refused():

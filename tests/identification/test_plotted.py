@@ -7,9 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scipy.signal
+from scipy.stats import norm
 
+from robotid.diagnosis.torque_split import joint_torques
 from robotid.exceptions import DataError
 from robotid.identification.pictures import residual_charts
+from robotid.identification.why_pictures import why_charts
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 
@@ -81,6 +84,33 @@ def test_a_spectrum_goes_to_twice_the_cut_off_and_lags_to_two_seconds(rng, cutof
     assert (power.y_label, lags.x_label) == ("density [N/√Hz]", "lag [s]")
     recording.mask[:, 1] = 0.0
     assert residual_charts(found, evaluation, 1) is None
+
+
+def test_what_a_residual_follows_is_drawn_with_its_interval_and_what_friction_takes(identified):
+    (j,) = (k for k, n in enumerate(identified.model.joints) if n == "wrist_2_joint")
+    torque = joint_torques(identified)[j]
+    charts = why_charts(torque)
+    speed = torque.quantities["speed"][1]
+    assert [d.name for d in torque.follows if d.name in charts] == [
+        "position", "speed", "acceleration", "load", "time",
+    ]  # fmt: skip
+    for dependence in torque.follows[1:]:
+        chart = charts[dependence.name]
+        x = torque.quantities.get(dependence.name, ("s", torque.rows.time))[1][torque.used]
+        left = torque.against_time[0] if dependence.name == "time" else torque.residual
+        order = np.argsort(x)
+        np.testing.assert_array_equal(chart.x, x[order])
+        np.testing.assert_array_equal(series(chart, "residual").y, left[torque.used][order])
+        mean = series(chart, "mean")
+        own = (dependence.centres, dependence.means, dependence.errors)
+        wanted, error = (np.interp(chart.x, own[0], y, np.nan, np.nan) for y in own[1:])
+        np.testing.assert_array_equal(mean.y, wanted)
+        np.testing.assert_allclose(mean.half, norm.ppf(0.975) * error, rtol=1e-4)
+    power = charts["power"]
+    whole, heat = (series(power, label).y for label in ("torque", "into friction"))
+    drawn = np.isfinite(whole)  # a gap has no line
+    np.testing.assert_allclose(whole[drawn], torque.tau * speed)
+    np.testing.assert_allclose(heat[drawn], torque.parts["friction"] * speed)
 
 
 @pytest.mark.parametrize("plot", ["plot_torques", "plot_friction", "plot_why"])

@@ -139,6 +139,30 @@ def test_motions_of_two_lengths_and_filters_tell_as_much_as_their_rows(rng):
     np.testing.assert_array_equal(alone.factors.rows, said.factors.rows)
 
 
+def test_the_noise_of_a_short_run_counts_the_parameters_that_its_rows_pay_for(rng):
+    model = arm()
+    mapping = structural_mapping(model)
+    log = moved(model, rng, period=4.0)[0].window(0.0, 2.0)
+    held = hold_log(model, log, SignalSettings())
+    motion, mask = held.whole.trajectory, held.whole.mask
+    W = trajectory_regressor(model, motion).reshape(*motion.v.shape, -1)
+    pi = truth(model)
+    r = rng.standard_normal(motion.v.shape) * [2.0, 0.5, 0.1]
+    noisy = replace(motion, tau=W @ pi + r)
+    part = compress(base_problem(model, mapping, noisy, mask))
+    run = Run((part,), pi, motion.squares, len(motion.t), 0.2, 0.03)
+    noise = run.noise(mapping.K)
+    rows = mask.sum(axis=0)
+    sigma = np.sqrt(np.sum(np.where(mask, r, 0.0) ** 2, axis=0) / rows)
+    X = [W[mask[:, j], j][:, mapping.independent] / sigma[j] for j in range(3)]
+    bread = np.linalg.inv(sum(x.T @ x for x in X))
+    free = 1.0 - np.array([np.trace(x @ bread @ x.T) for x in X]) / rows
+    assert (free < 0.98).all()
+    np.testing.assert_allclose(noise.std, sigma / np.sqrt(free), rtol=1e-6)
+    np.testing.assert_allclose(noise.correlation, free * 0.03 / 0.2, rtol=1e-6)
+    assert noise.origins == ("found",) * 3
+
+
 @pytest.mark.parametrize(
     ("cutoff", "rate", "is_static", "wanted"),
     [(5.0, None, False, 0.01), (None, None, False, 0.01), (5.0, 25.0, False, 0.01),

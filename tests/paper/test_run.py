@@ -11,8 +11,9 @@ from helpers.pages import number, tables
 from matplotlib.figure import Figure
 
 from robotid.cli import main
+from robotid.paper import page
 from robotid.paper import run as paper
-from robotid.paper.errata import energy_drift
+from robotid.paper.errata import EnergyDrift, energy_drift
 from robotid.paper.run import run_paper
 from robotid.paper.study import CASES, MODELS, PaperSettings
 from robotid.robot.model import RobotModel
@@ -53,6 +54,8 @@ def test_the_json_has_the_schema_of_the_design(written):
         assert runs["runs"] == 4 == runs["converged"] + len(runs["failures"])
         assert runs["converged"] == len(runs["iterations"])
         assert all(failure["reason"] for failure in runs["failures"])
+        for key in ("trajectories", "trajectories_on_program"):
+            assert found[key][name]["most_iterations"] == 2 == min(FEW.patience, FEW.iterations)
         for case in ("on_program", "disturbed", "noisy", "noisy_dead_zone"):
             assert len(found[case][name]["relative_error"]) == 20
             assert found[case][name]["converged"] is False
@@ -237,6 +240,44 @@ def test_runs_that_failed_are_counted_by_reason(shown, content):
             if len(counted) == 1:
                 median, most = float(np.median(errors)), max(errors)
                 assert counted[0][3:] == [number(median, ".2g"), number(most, ".2g")]
+
+
+def test_many_motions_have_quantiles_and_failures_their_median():
+    taken = [3, 4, 6, 9, 13, 20, 31, 40, 47, 90, 120]
+    failures = [
+        {"reason": reason, "relative_error": error}
+        for reason, error in (
+            ("slow: an error of 0.1 is left", 0.1), ("slow: an error of 0.4 is left", 0.4),
+            ("the robot ran away from its program in iteration 3", 7.0),
+            ("slow: an error of 0.2 is left", 0.2), ("the error grew, from 0.5 to 0.6", 0.6),
+            ("the robot ran away from its program in iteration 9", 2.0),
+        )
+    ]  # fmt: skip
+    one = {"runs": 17, "converged": 11, "iterations": taken, "failures": failures}
+    none = {"runs": 2, "converged": 0, "iterations": [], "failures": failures[:1]}
+    content = {
+        "trajectories": {"a": {**one, "most_iterations": 150}},
+        "trajectories_on_program": {"b": {**none, "most_iterations": 9}},
+    }
+    shown = tables(page._trajectories(content))
+    assert shown["Iterations to a relative error of 10⁻³"].rows == [
+        ["a", "up to 0.05 rad beside the program", "17", "11", "3", "20", "90", "120", "150"],
+        ["b", "on the program", "2", "0", "–", "–", "–", "–", "9"],
+    ]
+    title = "Runs that did not converge{}; each one is in paper.json"
+    assert shown[title.format("")].rows == [
+        ["a", "slow", "3", "0.2", "0.4"],
+        ["a", "the robot ran away from its program", "2", "4.5", "7"],
+        ["a", "the error grew", "1", "0.6", "0.6"],
+    ]
+    on_program = shown[title.format(", start on the program")]
+    assert on_program.rows == [["b", "slow", "1", "0.1", "0.1"]]
+
+
+def test_energy_that_is_lost_is_no_less_than_energy_that_is_gained():
+    drift = EnergyDrift(np.array([0.0, 0.5, 1.5]), {"a": np.array([0.0, -0.3, 0.1])})
+    content = paper._content(FEW, [], {}, {}, drift)
+    assert content["energy_drift"] == {"duration": 1.5, "max_relative": {"a": 0.3}}
 
 
 def test_errata_energy_and_settings(shown, content):
