@@ -229,6 +229,26 @@ def test_a_disturbance_keeps_the_estimate_from_settling(rng):
     np.testing.assert_array_equal(history.NA, [0])
 
 
+def test_updates_are_left_out_and_counted_of_runs_that_go_on(rng):
+    motion = ProgramMotion(np.tile([1.0, 1.5], (3, 1)), np.full(3, 2.0))
+    guesses = np.array([-P4, -P4, P4 / 2])  # of the first two D is negative
+    loop = _Loop(ARM, PLANT, motion, short(1), Influences(), guesses, 0.0)
+    loop.active = np.array([True, False, True])
+    states = rng.uniform(-1, 1, (3, 3, 2))
+    q = states[0]
+    Psi, eta = ARM.regressor(*states), rng.standard_normal((3, 2))
+    for done in (1, 2):
+        loop._update(q, Psi, eta, np.ones(3, dtype=bool))
+        np.testing.assert_array_equal(loop.skipped, [done, 0, 0])
+        np.testing.assert_array_equal(loop.P[:2], guesses[:2])
+        if done == 1:
+            D = mass_matrix(ARM, q[2:], P4 / 2)[0]
+            sigma = np.linalg.eigvalsh(D).min()
+            step = sigma / np.sum(Psi[2] ** 2) * Psi[2].T @ eta[2]
+            np.testing.assert_allclose(loop.P[2], P4 / 2 - step)
+            loop.P[2] = P4 / 2
+
+
 @pytest.mark.parametrize("substeps", [1, 3])
 def test_between_updates_the_torque_is_held_and_the_arm_moves_on(substeps, rng):
     motion = ProgramMotion(np.array([[1.0, 1.5], [0.7, -1.1]]), np.array([2.0, 1.5]))

@@ -306,6 +306,17 @@ def test_the_verdict_is_that_of_the_last_iteration(html, content):
         )
 
 
+def test_the_verdict_is_good_if_all_models_are(content):
+    for last, status in (((1e-5, 9e-5, 1e-4), "good"), ((1e-5, 2e-4, 1e-5), "poor")):
+        models = {
+            name: {**content["models"][name], "relative_error": [0.5, error]}
+            for name, error in zip(MODELS, last, strict=True)
+        }
+        box = page._summary({**content, "models": models}).split('<div class="verdict ')[1]
+        assert box.startswith(status)
+        assert "After <strong>1 iterations</strong>" in box
+
+
 def test_the_summary_says_what_the_start_beside_the_program_does(html, content):
     last = {name: content["models"][name]["relative_error"][-1] for name in MODELS}
     gains = [content["on_program"][n]["relative_error"][-1] / last[n] for n in MODELS]
