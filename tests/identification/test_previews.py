@@ -5,6 +5,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import scipy.signal
 from helpers.driven import arm
@@ -20,6 +21,7 @@ from robotid.identification.assumptions import (
     TorqueNoise,
     assumed_noise,
     assumed_parameters,
+    largest_gravity,
     largest_torques,
 )
 from robotid.identification.previews import Run, _band, _Information, _seen, _white_step, preview
@@ -327,6 +329,17 @@ def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
         assumed_noise(ur5, size, {"elbow_joint": -1.0})
     with pytest.raises(SettingsError, match="correlation is -1 s"):
         assumed_noise(ur5, size, {}, -1.0)
+
+
+def test_the_largest_gravity_is_of_either_sign():
+    model = arm()
+    found = largest_gravity(model)
+    low, high = np.array([(j.lower, j.upper) for j in model.limits]).T
+    q = np.random.default_rng(0).uniform(low, high, (200, 3))
+    data = model.pin_model.createData()
+    g = np.array([pin.computeGeneralizedGravity(model.pin_model, data, x) for x in q])
+    np.testing.assert_allclose(found, np.abs(g).max(axis=0), atol=1e-12)
+    assert (np.abs(g.max(axis=0)) < found - 1e-3).any()
 
 
 def test_friction_of_a_usual_size_is_a_twentieth_of_each_joints_torque_at_its_own_speed(ur5):

@@ -4,6 +4,7 @@ import json
 import math
 import re
 import xml.etree.ElementTree as ET
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -272,6 +273,28 @@ def test_many_motions_have_quantiles_and_failures_their_median():
     ]
     on_program = shown[title.format(", start on the program")]
     assert on_program.rows == [["b", "slow", "1", "0.1", "0.1"]]
+
+
+def test_a_case_is_judged_at_its_end_by_a_tenth_and_by_the_mean_of_the_later_half(rng):
+    P, count = np.array([3.0, -4.0]), len(CASES)
+    errors = np.append(0.5 * 0.9 ** np.arange(20), 5e-5)
+    estimates = P + rng.standard_normal((21, count, 2))
+    study = SimpleNamespace(
+        P=P, history=SimpleNamespace(estimates=estimates), errors=lambda case: errors
+    )
+    for k, case in enumerate(CASES):
+        found = paper._case(study, case)
+        mean = estimates[-10:, k].mean(axis=0)  # of 21, five tenths of two each
+        assert found["averaged"] == pytest.approx(np.hypot(*(mean - P)) / 5.0)
+        assert found["last_tenth"] == pytest.approx((errors[-2] + errors[-1]) / 2)
+        assert found["relative_error"] == errors.tolist()
+        assert (found["converged"], found["reason"]) == (True, "converged")
+        assert found["conditions"] == CASES[case].title
+    errors = 2.0 * errors + 1e-6
+    said = {case: paper._case(study, case) for case in ("on_program", "noisy")}
+    assert not any(found["converged"] for found in said.values())
+    assert said["on_program"]["reason"].startswith("slow: every run follows the same curve")
+    assert said["noisy"]["reason"].startswith("A disturbance v enters the deviation")
 
 
 def test_energy_that_is_lost_is_no_less_than_energy_that_is_gained():
