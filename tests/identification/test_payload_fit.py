@@ -15,7 +15,14 @@ from scipy.stats import t as t_of
 from robotid.commands.job import LogEntry, read_job
 from robotid.estimators.stretches import quantile
 from robotid.exceptions import DataError, ModelError, SettingsError
-from robotid.identification.payload_fit import _gains, _payload, identify_payload
+from robotid.identification.payload_fit import (
+    Gain,
+    Payload,
+    PayloadFit,
+    _gains,
+    _payload,
+    identify_payload,
+)
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -155,6 +162,50 @@ def test_gains_are_exact_without_noise_and_some_may_be_known(ur5, rng):
     )
     assert found["tool0"].mass == pytest.approx(MASS, rel=1e-6)
     assert found.gains["elbow_joint"].value == pytest.approx(GAINS[2], rel=1e-6)
+
+
+def test_a_fit_is_said_and_written_with_its_figures():
+    one, two = (
+        Payload(
+            link, mass, error, mass + 2 * np.array([-error, error]), COM, COM / 10,
+            INERTIA, INERTIA / 20, reasons,
+        )
+        for link, mass, error, reasons in (
+            ("tool", MASS, 0.125, {}), ("elbow", 3.0, 0.0, {"inertia": "it turns too little"}),
+        )
+    )  # fmt: skip
+    found = PayloadFit(
+        SimpleNamespace(name="arm", row_names=("a", "b")), (one, two),
+        {"b": Gain(7.25, 0.5, (6.25, 8.25))}, ("x", "y"), np.array([1.5, 2.5]),
+        np.array([0.25, 0.75]), np.array([0.0625, 0.5]),
+    )  # fmt: skip
+    assert str(found).splitlines() == [
+        "tool: 2 +- 0.12 kg, 95 %: [1.75, 2.25]",
+        "  centre of mass: 0.02 +- 0.002, 0.03 +- 0.003, 0.08 +- 0.008 m",
+        "  inertia about it, diagonal: 0.03 +- 0.0015, 0.025 +- 0.0013, 0.02 +- 0.001 kg m^2",
+        "elbow: 3 +- 0 kg, known",
+        "  centre of mass: 0.02 +- 0.002, 0.03 +- 0.003, 0.08 +- 0.008 m",
+        "  inertia about it, diagonal: it turns too little",
+        "gain of b: 7.25 +- 0.5 [6.25, 8.25]",
+        "torque left [%]: a 6.2, b 50.0",
+    ]
+    assert repr(found) == "<PayloadFit of arm: tool 2 +- 0.12 kg, elbow 3 +- 0 kg>"
+    assert (found["tool"], found["elbow"]) == (one, two)
+    content = found.to_dict()
+    assert content["relative_error_pct"] == {"a": 6.25, "b": 50.0}
+    assert content["gains"] == {"b": {"gain": 7.25, "std_error": 0.5, "interval": [6.25, 8.25]}}
+    assert content["base_parameters"] == [
+        {"name": "x", "value": 1.5, "std_error": 0.25},
+        {"name": "y", "value": 2.5, "std_error": 0.75},
+    ]
+    written, other = content["payloads"]
+    at_link = INERTIA + MASS * (COM @ COM * np.eye(3) - np.outer(COM, COM))
+    np.testing.assert_allclose(written["inertia_at_link"], at_link)
+    assert written["inertia_std_error"] == (INERTIA / 20).tolist()
+    assert written["mass_interval"] == [1.75, 2.25]
+    assert (other["inertia"], other["inertia_std_error"]) == (None, None)
+    assert "inertia_at_link" not in other
+    assert other["determined"] == ["mass", "com"]
 
 
 def test_a_gain_has_the_interval_of_its_logarithm(rng):
