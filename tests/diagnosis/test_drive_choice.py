@@ -296,6 +296,11 @@ def test_segments_are_alike_within_a_slack_or_their_scatter():
     assert drive_choice._is_alike(best, other, 0.0)
     assert not drive_choice._is_alike(best, best + 0.1, 0.29)
     assert drive_choice._is_alike(best, best + 0.1, 0.31)
+    # the scatter of the sum of nine differences is three times that of one
+    swing = np.array([1.0, -1.0, 1.0, -1.0, 0.0, 1.0, -1.0, 1.0, -1.0])
+    best = np.arange(9.0)
+    assert drive_choice._is_alike(best, best + swing + 0.3, 0.0)  # 2.7 of 3
+    assert not drive_choice._is_alike(best, best + swing + 0.4, 0.0)
 
 
 def test_a_grid_of_a_wide_range_has_its_end_too():

@@ -24,7 +24,15 @@ from robotid.identification.assumptions import (
     largest_gravity,
     largest_torques,
 )
-from robotid.identification.previews import Run, _band, _Information, _seen, _white_step, preview
+from robotid.identification.previews import (
+    Preview,
+    Run,
+    _band,
+    _Information,
+    _seen,
+    _white_step,
+    preview,
+)
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -329,6 +337,20 @@ def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
         assumed_noise(ur5, size, {"elbow_joint": -1.0})
     with pytest.raises(SettingsError, match="correlation is -1 s"):
         assumed_noise(ur5, size, {}, -1.0)
+
+
+def test_what_a_run_before_left_open_was_not_wider_than_is_plausible():
+    K, spread = np.array([[1.0, 0.0], [2.0, 1.0], [0.0, 3.0]]), np.array([2.0, 3.0])
+    error, before = np.array([0.5, np.inf, 2.0]), np.array([np.inf, 1.0, 30.0])
+    expected = SimpleNamespace(
+        mapping=SimpleNamespace(K=K), prior_std=spread, base_error=error, standard_error=spread
+    )
+    found = Preview(expected, white(), before)
+    np.testing.assert_allclose(found.plausible, [2.0, 5.0, 9.0])
+    np.testing.assert_allclose(found.gain, [4.0, 0.2, 4.5])
+    np.testing.assert_array_equal(found.base_error, error)
+    np.testing.assert_array_equal(found.standard_error, spread)
+    assert Preview(expected, white()).gain is None
 
 
 def test_the_largest_gravity_is_of_either_sign():
