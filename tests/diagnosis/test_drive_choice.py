@@ -4,6 +4,7 @@ import pickle
 import re
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -301,6 +302,15 @@ def test_segments_are_alike_within_a_slack_or_their_scatter():
     best = np.arange(9.0)
     assert drive_choice._is_alike(best, best + swing + 0.3, 0.0)  # 2.7 of 3
     assert not drive_choice._is_alike(best, best + swing + 0.4, 0.0)
+
+
+def test_what_was_seen_is_of_the_rows_that_count_in_all_recordings():
+    q = [np.array([9.0, 0.5, -1.5, 7.0]), np.array([0.8, -8.0, 1.25])]
+    v = [np.array([5.0, -0.25, 1.0, 0.0]), np.array([-2.0, 9.0, 0.5])]
+    motions = [SimpleNamespace(q=own, v=speed) for own, speed in zip(q, v, strict=True)]
+    taken = [np.array([1, 2, 3]), np.array([0, 1, 2])]
+    used = np.array([True, True, False, True, False, True])
+    assert drive_choice._seen(motions, taken, used) == {"q": (-1.5, 1.25), "v": (0.25, 2.0)}
 
 
 def test_a_grid_of_a_wide_range_has_its_end_too():

@@ -456,6 +456,23 @@ def test_a_coupled_drive_turns_by_the_ratio_of_the_other_joint(rng):
     assert [(c.coupled, c.ratio) for c in couplings_of(motion)] == [("b", 1.0), ("b", -1.0)]
 
 
+def test_a_coupling_is_shown_by_both_joints_or_by_most_of_the_residual_of_one(monkeypatch):
+    def term(joint, coupled, share):
+        return SimpleNamespace(joint=joint, term=SimpleNamespace(coupled=coupled), share=share)
+
+    each = (
+        [term("a", "b", 0.5), term("a", "", 0.1)],
+        [term("b", "a", 0.2), term("b", "c", 0.59)],
+        [term("c", "a", 0.61)],
+    )
+    monkeypatch.setattr(misfit, "_of_joint", lambda sample, j: iter(each[j]))
+    found = find_misfits(SimpleNamespace(joints=("a", "b", "c")))
+    assert [(m.joint, m.term.coupled) for m in found] == [
+        ("a", "b"), ("a", ""), ("b", "a"), ("c", "a"),
+    ]  # fmt: skip
+    assert find_misfits(None) == ()
+
+
 def test_a_misfit_matters_by_its_part_of_the_torque_if_nothing_denies_it():
     (load, tanh) = (c for c in CANDIDATES if c.name in ("load", "tanh"))
     still = np.zeros(3)
