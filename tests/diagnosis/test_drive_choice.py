@@ -2,7 +2,9 @@
 
 import pickle
 import re
+from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -237,6 +239,22 @@ def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
         wanted = np.sqrt((u @ after @ u) / (u @ before @ u))
         assert grown[name] == pytest.approx(wanted, rel=0.02), name
     assert grown[f"{ELBOW}.coulomb"] > 1.5
+    # a shape has the error of its derivative's column beside that of the term
+    for slides, unit in ((False, "rad/s"), (True, "m/s")):
+        sliding = replace(drive, slides=slides)
+        choice = drive_choice._found(alone, sliding, [(family, [speed])], ())
+        (shape,) = choice.shapes
+        assert (shape.name, shape.unit) == ("stribeck.speed", unit)
+    anew = drive_choice._weighed_anew(alone, drive, [(family, [shape.value])])
+    Z = np.hstack(
+        [drive.columns([Stribeck(speed=shape.value + x, seen=SEEN["v"])]) for x in (0.0, 1e-6)]
+    )
+    Z[:, 1] -= Z[:, 0]
+    size = drive_choice.Trials(anew, Z[:, None, :1], 1e-10).whole.parameters([0])[0]
+    Z[:, 1] *= size / 1e-6
+    C = drive_choice.Trials(anew, Z[:, None], 1e-10).whole.estimate([0, 1], anew.fitted)[1]
+    assert shape.std_error == pytest.approx(np.sqrt(C[1, 1]), rel=0.01)
+    assert choice.shape_covariance == ((pytest.approx(shape.std_error**2),),)
     # rows that are weighed by what terms leave keep their residual's share of the torque
     anew = drive_choice._weighed_anew(alone, drive, [(family, [speed])])
     factor = anew.r[:, 0] @ alone.r[:, 0] / np.sum(alone.r[:, 0] ** 2)
@@ -279,6 +297,20 @@ def test_segments_are_alike_within_a_slack_or_their_scatter():
     assert drive_choice._is_alike(best, other, 0.0)
     assert not drive_choice._is_alike(best, best + 0.1, 0.29)
     assert drive_choice._is_alike(best, best + 0.1, 0.31)
+    # the scatter of the sum of nine differences is three times that of one
+    swing = np.array([1.0, -1.0, 1.0, -1.0, 0.0, 1.0, -1.0, 1.0, -1.0])
+    best = np.arange(9.0)
+    assert drive_choice._is_alike(best, best + swing + 0.3, 0.0)  # 2.7 of 3
+    assert not drive_choice._is_alike(best, best + swing + 0.4, 0.0)
+
+
+def test_what_was_seen_is_of_the_rows_that_count_in_all_recordings():
+    q = [np.array([9.0, 0.5, -1.5, 7.0]), np.array([0.8, -8.0, 1.25])]
+    v = [np.array([5.0, -0.25, 1.0, 0.0]), np.array([-2.0, 9.0, 0.5])]
+    motions = [SimpleNamespace(q=own, v=speed) for own, speed in zip(q, v, strict=True)]
+    taken = [np.array([1, 2, 3]), np.array([0, 1, 2])]
+    used = np.array([True, True, False, True, False, True])
+    assert drive_choice._seen(motions, taken, used) == {"q": (-1.5, 1.25), "v": (0.25, 2.0)}
 
 
 def test_a_grid_of_a_wide_range_has_its_end_too():

@@ -3,6 +3,7 @@
 import tomllib
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from robotid.diagnosis.misfit_findings import (
     settled,
     with_entries,
 )
-from robotid.diagnosis.sample import RIDGE, Trials, take_sample
+from robotid.diagnosis.sample import RIDGE, Normal, Sample, Trials, take_sample
 from robotid.doctor.diagnosis import check_logs
 from robotid.findings import Finding
 from robotid.fitting.joint_motion import JointMotion
@@ -134,6 +135,42 @@ def test_the_size_of_several_columns_is_their_torque(ur5):
     # gravity explains a part of a slow harmonic
     assert 0.6 * added < found.size < 1.05 * added
     assert (found.unit, found.std_error < 0.05 * added) == ("N m rms", True)
+
+
+def test_a_size_without_a_unit_is_that_of_the_torque_beside_base_parameters(rng):
+    """Of two columns found after another one; its error by finite differences."""
+    count, fitted = 80, 60  # the last two stretches are validation
+    weight = rng.uniform(0.5, 2.0, (count, 2))
+    W, r = rng.standard_normal((count, 2, 3)), rng.standard_normal((count, 2))
+    stretches = tuple(slice(k, k + 10) for k in range(0, count, 10))
+    sample = Sample(
+        joints=("a", "b"), slides=np.array([False, True]), motions=(), recordings=(), at=(),
+        taken=(), weight=weight, torque=np.ones(2), stretches=stretches, rows=fitted,
+        W=W, r=r, independent=np.arange(3), U=np.eye(3), normal=Normal.of(W, r, stretches, 6),
+    )  # fmt: skip
+    Z = rng.standard_normal((count, 3)) + r[:, [1]]
+    whole = Trials(sample.of_joint(1), Z[:, None]).whole
+    found = misfit._size(sample, 1, SimpleNamespace(units=None), whole, [0], [1, 2])
+    theta, C = (x[1:] for x in whole.estimate([0, 1, 2], 6))
+    X, own = weight[:fitted, [1]] * Z[:fitted, 1:], W[:fitted].reshape(-1, 3)
+    B = W[:fitted, 1].T @ X
+    S = X.T @ X - B.T @ np.linalg.solve(own.T @ own + np.eye(3), B)
+    S += RIDGE * np.diag(np.sum(X**2, axis=0))
+
+    def size(theta):
+        return np.sqrt(theta @ S @ theta / np.sum(weight[:fitted, 1] ** 2))
+
+    step = 1e-6
+    slope = np.array([(size(theta + step * e) - size(theta - step * e)) for e in np.eye(2)])
+    slope /= 2 * step
+    wanted = size(theta), np.sqrt(slope @ C[:, 1:] @ slope)
+    assert found[:2] == pytest.approx(wanted, rel=1e-6)
+    assert found[2] == "N rms"
+    # one column with a unit has the size and the error of its parameter
+    units = SimpleNamespace(units=("N m/rad", "N/m"))
+    value, error, unit = misfit._size(sample, 1, units, whole, [0], [1])
+    theta, C = whole.estimate([0, 1], 6)
+    assert (value, error, unit) == (theta[1], np.sqrt(C[1, 1]), "N/m")
 
 
 def test_coulomb_friction_that_was_left_out_is_asked_for(ur5):
@@ -417,6 +454,23 @@ def test_a_coupled_drive_turns_by_the_ratio_of_the_other_joint(rng):
         expected = np.column_stack([a, turned, np.tanh(w / (0.05 * usual))])
         np.testing.assert_allclose(candidate.columns(motion), expected)
     assert [(c.coupled, c.ratio) for c in couplings_of(motion)] == [("b", 1.0), ("b", -1.0)]
+
+
+def test_a_coupling_is_shown_by_both_joints_or_by_most_of_the_residual_of_one(monkeypatch):
+    def term(joint, coupled, share):
+        return SimpleNamespace(joint=joint, term=SimpleNamespace(coupled=coupled), share=share)
+
+    each = (
+        [term("a", "b", 0.5), term("a", "", 0.1)],
+        [term("b", "a", 0.2), term("b", "c", 0.59)],
+        [term("c", "a", 0.61)],
+    )
+    monkeypatch.setattr(misfit, "_of_joint", lambda sample, j: iter(each[j]))
+    found = find_misfits(SimpleNamespace(joints=("a", "b", "c")))
+    assert [(m.joint, m.term.coupled) for m in found] == [
+        ("a", "b"), ("a", ""), ("b", "a"), ("c", "a"),
+    ]  # fmt: skip
+    assert find_misfits(None) == ()
 
 
 def test_a_misfit_matters_by_its_part_of_the_torque_if_nothing_denies_it():

@@ -144,6 +144,26 @@ def test_without_rows_to_judge_by_errors_stay_as_they_are(fits):
     assert on_misfit == ()
 
 
+def test_errors_grow_by_the_squares_of_all_that_is_open(fits, rng):
+    found = fits("loaded", PLAIN)
+    sample, b = take_sample(found), len(found.base)
+    shifts = rng.standard_normal((3, b))
+    moved = [
+        model_error._Move(joint, shift, lambda motion, alone: motion.v)
+        for joint, shift in zip((ELBOW, LIFT, ELBOW), shifts, strict=True)
+    ]
+    wider = model_error._wider(found, sample, moved)
+    X = shifts @ sample.U  # of base parameters
+    np.testing.assert_allclose(wider.base_error**2, found.base_error**2 + np.sum(X**2, axis=0))
+    terms = wider.open_terms[len(found.open_terms) :]
+    assert [term.joint for term in terms] == [ELBOW, LIFT, ELBOW]
+    moves = np.array([term.moves for term in terms])
+    np.testing.assert_allclose(moves @ found.mapping.K.T, X, atol=1e-9 * np.abs(X).max())
+    more = wider.standard_covariance - found.standard_covariance
+    np.testing.assert_allclose(more, moves.T @ moves, atol=1e-9 * np.abs(more).max())
+    assert model_error._wider(found, sample, []) is found
+
+
 def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked, fits):
     """The oracle: fits with the shape stated, larger and smaller by its standard error."""
     true, log = hooked

@@ -319,3 +319,27 @@ def test_filtered_noise_is_quick_and_what_is_slow_is_not(kind, low, high):
     )  # fmt: skip
     (quick,) = _quick_shares([e])
     assert low <= quick <= high
+
+
+def test_what_is_forgotten_is_one_less_the_autocorrelation_of_all_recordings(rng):
+    """Of two recordings of other rates, with gaps and rows left out; without a filter of a row."""
+    shares = np.zeros((2, 3))  # products and squares
+    evaluations = []
+    for rate, cutoff, lag in ((100.0, 9.0, 11), (40.0, None, 1), (None, 5.0, 1)):
+        r = rng.standard_normal((60, 3)).cumsum(axis=0) + 2.0
+        mask, segment = rng.uniform(size=r.shape) < 0.8, np.repeat([0, 1], 30)
+        mask[:, 2] = False  # a joint that does not move
+        tau = rng.standard_normal(r.shape)
+        recording = SimpleNamespace(
+            trajectory=SimpleNamespace(tau=tau, segment=segment, rate=rate),
+            signals=SignalSettings(cutoff=cutoff), mask=mask,
+        )  # fmt: skip
+        evaluations.append(SimpleNamespace(recording=recording, torques={"estimate": tau - r}))
+        for j in range(3):
+            for i in range(60 - lag):
+                if mask[i, j] and mask[i + lag, j] and segment[i] == segment[i + lag]:
+                    a, b = r[i, j], r[i + lag, j]
+                    shares[:, j] += a * b, (a**2 + b**2) / 2
+    *found, still = _quick_shares(evaluations)
+    np.testing.assert_allclose(found, 1.0 - shares[0, :2] / shares[1, :2])
+    assert still is None

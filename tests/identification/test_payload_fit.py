@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -9,11 +10,19 @@ import pytest
 import scipy.signal
 from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
+from scipy.stats import t as t_of
 
 from robotid.commands.job import LogEntry, read_job
 from robotid.estimators.stretches import quantile
 from robotid.exceptions import DataError, ModelError, SettingsError
-from robotid.identification.payload_fit import identify_payload
+from robotid.identification.payload_fit import (
+    Gain,
+    Payload,
+    PayloadFit,
+    _gains,
+    _payload,
+    identify_payload,
+)
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -153,6 +162,112 @@ def test_gains_are_exact_without_noise_and_some_may_be_known(ur5, rng):
     )
     assert found["tool0"].mass == pytest.approx(MASS, rel=1e-6)
     assert found.gains["elbow_joint"].value == pytest.approx(GAINS[2], rel=1e-6)
+
+
+def test_a_fit_is_said_and_written_with_its_figures():
+    one, two = (
+        Payload(
+            link, mass, error, mass + 2 * np.array([-error, error]), COM, COM / 10,
+            INERTIA, INERTIA / 20, reasons,
+        )
+        for link, mass, error, reasons in (
+            ("tool", MASS, 0.125, {}), ("elbow", 3.0, 0.0, {"inertia": "it turns too little"}),
+        )
+    )  # fmt: skip
+    found = PayloadFit(
+        SimpleNamespace(name="arm", row_names=("a", "b")), (one, two),
+        {"b": Gain(7.25, 0.5, (6.25, 8.25))}, ("x", "y"), np.array([1.5, 2.5]),
+        np.array([0.25, 0.75]), np.array([0.0625, 0.5]),
+    )  # fmt: skip
+    assert str(found).splitlines() == [
+        "tool: 2 +- 0.12 kg, 95 %: [1.75, 2.25]",
+        "  centre of mass: 0.02 +- 0.002, 0.03 +- 0.003, 0.08 +- 0.008 m",
+        "  inertia about it, diagonal: 0.03 +- 0.0015, 0.025 +- 0.0013, 0.02 +- 0.001 kg m^2",
+        "elbow: 3 +- 0 kg, known",
+        "  centre of mass: 0.02 +- 0.002, 0.03 +- 0.003, 0.08 +- 0.008 m",
+        "  inertia about it, diagonal: it turns too little",
+        "gain of b: 7.25 +- 0.5 [6.25, 8.25]",
+        "torque left [%]: a 6.2, b 50.0",
+    ]
+    assert repr(found) == "<PayloadFit of arm: tool 2 +- 0.12 kg, elbow 3 +- 0 kg>"
+    assert (found["tool"], found["elbow"]) == (one, two)
+    content = found.to_dict()
+    assert content["relative_error_pct"] == {"a": 6.25, "b": 50.0}
+    assert content["gains"] == {"b": {"gain": 7.25, "std_error": 0.5, "interval": [6.25, 8.25]}}
+    assert content["base_parameters"] == [
+        {"name": "x", "value": 1.5, "std_error": 0.25},
+        {"name": "y", "value": 2.5, "std_error": 0.75},
+    ]
+    written, other = content["payloads"]
+    at_link = INERTIA + MASS * (COM @ COM * np.eye(3) - np.outer(COM, COM))
+    np.testing.assert_allclose(written["inertia_at_link"], at_link)
+    assert written["inertia_std_error"] == (INERTIA / 20).tolist()
+    assert written["mass_interval"] == [1.75, 2.25]
+    assert (other["inertia"], other["inertia_std_error"]) == (None, None)
+    assert "inertia_at_link" not in other
+    assert other["determined"] == ["mass", "com"]
+
+
+def test_a_gain_has_the_interval_of_its_logarithm(rng):
+    """Of the first and the third joint; the last rows of the covariance are theirs."""
+    root = 0.1 * rng.standard_normal((5, 5))
+    found = SimpleNamespace(
+        theta=np.zeros(3),
+        gain=np.array([5.0, 1.0, -8.0]),
+        covariance=root @ root.T,
+        freedom=np.array([3.0, 4.0, 5.0, 7.0, 11.0]),
+    )
+    model = SimpleNamespace(joints=("a", "b", "c"))
+    gains = _gains(model, SimpleNamespace(unknown=[2, 0]), found)
+    assert list(gains) == ["c", "a"]
+    for joint, k, value in (("c", 3, -8.0), ("a", 4, 5.0)):
+        error = np.sqrt(found.covariance[k, k])
+        reach = t_of(found.freedom[k]).ppf(0.975) * error
+        assert gains[joint].value == value
+        assert gains[joint].std_error == pytest.approx(abs(value) * error)
+        ends = sorted([value * np.exp(-reach), value * np.exp(reach)])
+        assert gains[joint].interval == pytest.approx(tuple(ends))
+
+
+def test_errors_about_the_centre_of_mass_are_those_of_first_order(rng):
+    """By finite differences of the ten parameters in the frame of the link."""
+
+    def about(x):
+        com = x[1:4] / x[0]
+        at_link = np.array([[x[4], x[5], x[7]], [x[5], x[6], x[8]], [x[7], x[8], x[9]]])
+        inertia = at_link - x[0] * (com @ com * np.eye(3) - np.outer(com, com))
+        return np.concatenate([com, inertia.ravel()])
+
+    at_link = INERTIA + MASS * (COM @ COM * np.eye(3) - np.outer(COM, COM))
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = at_link.tolist()
+    x = np.array([MASS, *(MASS * COM), xx, xy, yy, xz, yz, zz])
+    scale = np.array([0.1, *[0.01] * 3, *[0.0005] * 6])
+    root = scale[:, None] * rng.standard_normal((10, 10)) / 3
+    C, freedom = root @ root.T, np.linspace(5.0, 14.0, 10)
+    step = 1e-6 * scale
+    J = np.array(
+        [about(x + h * e) - about(x - h * e) for h, e in zip(step, np.eye(10), strict=True)]
+    )
+    J = (J / (2 * step)[:, None]).T
+    errors = np.sqrt(np.diag(J @ C @ J.T))
+    found = _payload(SimpleNamespace(length=1.0), "tool", x, C, freedom)
+    np.testing.assert_allclose(found.com, COM)
+    np.testing.assert_allclose(found.inertia, INERTIA, atol=1e-12)
+    np.testing.assert_allclose(found.com_std_error, errors[:3], rtol=1e-5)
+    np.testing.assert_allclose(found.inertia_std_error.ravel(), errors[3:], rtol=1e-5)
+    np.testing.assert_allclose(found.parameters, x)
+    reach = t_of(5.0).ppf(0.975) * np.sqrt(C[0, 0])
+    np.testing.assert_allclose(found.mass_interval, [MASS - reach, MASS + reach])
+    assert found.mass_std_error == np.sqrt(C[0, 0])
+    assert found.determined == ("mass", "com", "inertia")
+    # an inertia is open from 0.3 of the mean principal moment on, a centre from 0.05 lengths
+    for factor, is_open in ((0.95, False), (1.05, True)):
+        wider = (factor * 0.3 * np.trace(INERTIA) / 3 / errors[3:].max()) ** 2 * C
+        long = _payload(SimpleNamespace(length=100.0), "tool", x, wider, np.full(10, np.inf))
+        assert ("inertia" in long.reasons, "com" in long.reasons) == (is_open, False)
+        length = errors[:3].max() / 0.05 / factor
+        short = _payload(SimpleNamespace(length=length), "tool", x, C, freedom)
+        assert ("com" in short.reasons) == is_open
 
 
 def test_friction_that_grows_with_the_load_is_reckoned_with_the_payload(ur5, rng):

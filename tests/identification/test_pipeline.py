@@ -3,13 +3,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.fitting import fit, identify
+from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import batch
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
+from robotid.findings import Finding
+from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
+from robotid.fitting.survey import hold_log
+from robotid.identification.pipeline import conclude
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import MassMatrixCheck
 from robotid.robot.model import RobotModel
@@ -115,6 +121,47 @@ def test_no_log_and_too_few_rows_are_refused(ur5, rng):
     still = replace(still, v=0.0 * still.v)
     with pytest.raises(DataError, match="0 torque rows for 58 parameters: no joint moves faster"):
         identify(ur5, [still], signals=SignalSettings(cutoff=None))
+
+
+def test_a_recording_that_was_fitted_does_not_show_what_repeats(rng):
+    """Of recordings kept apart, those that hold fitted rows do not count."""
+    arm = RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
+    logs = [
+        replace(exact_log(arm, truth(arm), rng, samples=300, noise=0.1), path=f"/logs/{name}.csv")
+        for name in "abc"
+    ]
+    own, kept = ([hold_log(arm, log, EXACT) for log in some] for some in (logs[:1], logs[1:]))
+    mapping, choice = structural_mapping(arm), EstimatorSettings("wls")
+    for beside, repeated, is_doubted in (
+        ([kept[0], own[0]], "b", True),
+        (kept, "b", False),
+    ):
+        guesses = [Finding("repeated_motion", "warning", f"{name}.csv", "") for name in repeated]
+        recordings = Recordings(arm, mapping, own, beside)
+        found = conclude(recordings, choice, guesses, friction="none")
+        assert found.validation[1].is_refitted == (beside[1] is own[0])
+        assert ("repeated_motion" in {doubt.code for doubt in found.doubts}) == is_doubted
+
+
+def test_a_fit_that_fails_says_what_the_doctor_warned_of(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=300)
+    still = hold_log(ur5, replace(log, v=0.0 * log.v), SignalSettings(cutoff=None))
+    recordings = Recordings(ur5, structural_mapping(ur5), [still], [])
+    with pytest.raises(DataError, match="0 torque rows") as caught:
+        conclude(recordings, EstimatorSettings("wls"))
+    assert not hasattr(caught.value, "__notes__")
+    guesses = [
+        Finding("jitter", "note", "run", "It shakes"),
+        Finding("static_joint", "warning", "run", "It stands"),
+        Finding("rows", "error", "run", str(caught.value)),
+        Finding("clock", "error", "run", "It stops"),
+    ]
+    with pytest.raises(DataError, match="0 torque rows") as caught:
+        conclude(recordings, EstimatorSettings("wls"), guesses)
+    assert caught.value.__notes__ == [
+        "doctor: warning: static_joint: It stands",
+        "doctor: error: clock: It stops",
+    ]
 
 
 def test_an_unknown_estimator_is_refused():

@@ -2,11 +2,19 @@
 
 import re
 from html import unescape
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.signal
+from scipy.stats import norm
 
+from robotid.diagnosis.torque_split import joint_torques
 from robotid.exceptions import DataError
+from robotid.identification.pictures import residual_charts
+from robotid.identification.why_pictures import why_charts
+from robotid.logs.data import Trajectory
+from robotid.logs.settings import SignalSettings
 
 
 def series(chart, label):
@@ -43,6 +51,66 @@ def test_friction_and_reasons_are_of_the_joint_named(identified):
     parts = [s for s in split.series if s.kind == "area"]
     whole = np.sum([s.y for s in parts], axis=0)
     np.testing.assert_allclose(whole, series(split, "measured").y, atol=1e-9)
+
+
+@pytest.mark.parametrize("cutoff", [30.0, None])
+def test_a_spectrum_goes_to_twice_the_cut_off_and_lags_to_two_seconds(rng, cutoff):
+    """Of a recording at 1024 Hz, of whose lags every fifth is shown."""
+    rate = 1024.0
+    t = 3.0 + np.arange(6000) / rate
+    tau, predicted = rng.standard_normal((2, len(t), 2)).cumsum(axis=1)
+    still = np.zeros_like(tau)
+    motion = Trajectory(t, still, still, still, tau, ("a", "b"), rate, np.zeros(len(t), dtype=int))
+    recording = SimpleNamespace(
+        trajectory=motion, mask=np.ones(tau.shape), signals=SignalSettings(cutoff=cutoff)
+    )
+    evaluation = SimpleNamespace(recording=recording, torques={"estimate": predicted})
+    found = SimpleNamespace(model=SimpleNamespace(row_names=("a", "b"), row_units=("N m", "N")))
+    power, lags = residual_charts(found, evaluation, 1)
+    residual = (tau - predicted)[:, 1]
+    for x, label in ((tau[:, 1], "torque"), (residual, "residual")):
+        window = np.hanning(5122)[1:-1]
+        f, density = scipy.signal.welch(x, rate, window, nperseg=5120, detrend=False)
+        shown = (f > 0) & (f <= (np.inf if cutoff is None else 60.0))
+        np.testing.assert_allclose(power.x, f[shown])
+        np.testing.assert_allclose(series(power, label).y, np.sqrt(density[shown]))
+    ks = np.arange(0, 2049, 5)
+    np.testing.assert_allclose(lags.x, ks / rate)
+    pairs = [(residual[: len(t) - k], residual[k:]) for k in ks]
+    wanted = [a @ b / np.sqrt((a @ a) * (b @ b)) for a, b in pairs]
+    np.testing.assert_allclose(series(lags, "residual").y, wanted, atol=1e-9)
+    marks = () if cutoff is None else (30.0,), () if cutoff is None else (1 / 60.0,)
+    assert (power.marks, lags.marks) == (marks[0], pytest.approx(marks[1]))
+    assert (power.y_label, lags.x_label) == ("density [N/√Hz]", "lag [s]")
+    recording.mask[:, 1] = 0.0
+    assert residual_charts(found, evaluation, 1) is None
+
+
+def test_what_a_residual_follows_is_drawn_with_its_interval_and_what_friction_takes(identified):
+    (j,) = (k for k, n in enumerate(identified.model.joints) if n == "wrist_2_joint")
+    torque = joint_torques(identified)[j]
+    charts = why_charts(torque)
+    speed = torque.quantities["speed"][1]
+    assert [d.name for d in torque.follows if d.name in charts] == [
+        "position", "speed", "acceleration", "load", "time",
+    ]  # fmt: skip
+    for dependence in torque.follows[1:]:
+        chart = charts[dependence.name]
+        x = torque.quantities.get(dependence.name, ("s", torque.rows.time))[1][torque.used]
+        left = torque.against_time[0] if dependence.name == "time" else torque.residual
+        order = np.argsort(x)
+        np.testing.assert_array_equal(chart.x, x[order])
+        np.testing.assert_array_equal(series(chart, "residual").y, left[torque.used][order])
+        mean = series(chart, "mean")
+        own = (dependence.centres, dependence.means, dependence.errors)
+        wanted, error = (np.interp(chart.x, own[0], y, np.nan, np.nan) for y in own[1:])
+        np.testing.assert_array_equal(mean.y, wanted)
+        np.testing.assert_allclose(mean.half, norm.ppf(0.975) * error, rtol=1e-4)
+    power = charts["power"]
+    whole, heat = (series(power, label).y for label in ("torque", "into friction"))
+    drawn = np.isfinite(whole)  # a gap has no line
+    np.testing.assert_allclose(whole[drawn], torque.tau * speed)
+    np.testing.assert_allclose(heat[drawn], torque.parts["friction"] * speed)
 
 
 @pytest.mark.parametrize("plot", ["plot_torques", "plot_friction", "plot_why"])

@@ -5,6 +5,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import scipy.signal
 from helpers.driven import arm
@@ -16,8 +17,22 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.export.entries import build_preview
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
-from robotid.identification.assumptions import TorqueNoise, assumed_noise
-from robotid.identification.previews import Run, _band, _Information, _seen, _white_step, preview
+from robotid.identification.assumptions import (
+    TorqueNoise,
+    assumed_noise,
+    assumed_parameters,
+    largest_gravity,
+    largest_torques,
+)
+from robotid.identification.previews import (
+    Preview,
+    Run,
+    _band,
+    _Information,
+    _seen,
+    _white_step,
+    preview,
+)
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -132,6 +147,30 @@ def test_motions_of_two_lengths_and_filters_tell_as_much_as_their_rows(rng):
     alone = replace(both, share=1.0).without_motions()
     assert (alone.share, alone.levels) == (0.01, ())
     np.testing.assert_array_equal(alone.factors.rows, said.factors.rows)
+
+
+def test_the_noise_of_a_short_run_counts_the_parameters_that_its_rows_pay_for(rng):
+    model = arm()
+    mapping = structural_mapping(model)
+    log = moved(model, rng, period=4.0)[0].window(0.0, 2.0)
+    held = hold_log(model, log, SignalSettings())
+    motion, mask = held.whole.trajectory, held.whole.mask
+    W = trajectory_regressor(model, motion).reshape(*motion.v.shape, -1)
+    pi = truth(model)
+    r = rng.standard_normal(motion.v.shape) * [2.0, 0.5, 0.1]
+    noisy = replace(motion, tau=W @ pi + r)
+    part = compress(base_problem(model, mapping, noisy, mask))
+    run = Run((part,), pi, motion.squares, len(motion.t), 0.2, 0.03)
+    noise = run.noise(mapping.K)
+    rows = mask.sum(axis=0)
+    sigma = np.sqrt(np.sum(np.where(mask, r, 0.0) ** 2, axis=0) / rows)
+    X = [W[mask[:, j], j][:, mapping.independent] / sigma[j] for j in range(3)]
+    bread = np.linalg.inv(sum(x.T @ x for x in X))
+    free = 1.0 - np.array([np.trace(x @ bread @ x.T) for x in X]) / rows
+    assert (free < 0.98).all()
+    np.testing.assert_allclose(noise.std, sigma / np.sqrt(free), rtol=1e-6)
+    np.testing.assert_allclose(noise.correlation, free * 0.03 / 0.2, rtol=1e-6)
+    assert noise.origins == ("found",) * 3
 
 
 @pytest.mark.parametrize(
@@ -298,6 +337,59 @@ def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
         assumed_noise(ur5, size, {"elbow_joint": -1.0})
     with pytest.raises(SettingsError, match="correlation is -1 s"):
         assumed_noise(ur5, size, {}, -1.0)
+
+
+def test_what_a_run_before_left_open_was_not_wider_than_is_plausible():
+    K, spread = np.array([[1.0, 0.0], [2.0, 1.0], [0.0, 3.0]]), np.array([2.0, 3.0])
+    error, before = np.array([0.5, np.inf, 2.0]), np.array([np.inf, 1.0, 30.0])
+    expected = SimpleNamespace(
+        mapping=SimpleNamespace(K=K), prior_std=spread, base_error=error, standard_error=spread
+    )
+    found = Preview(expected, white(), before)
+    np.testing.assert_allclose(found.plausible, [2.0, 5.0, 9.0])
+    np.testing.assert_allclose(found.gain, [4.0, 0.2, 4.5])
+    np.testing.assert_array_equal(found.base_error, error)
+    np.testing.assert_array_equal(found.standard_error, spread)
+    assert Preview(expected, white()).gain is None
+
+
+def test_the_largest_gravity_is_of_either_sign():
+    model = arm()
+    found = largest_gravity(model)
+    low, high = np.array([(j.lower, j.upper) for j in model.limits]).T
+    q = np.random.default_rng(0).uniform(low, high, (200, 3))
+    data = model.pin_model.createData()
+    g = np.array([pin.computeGeneralizedGravity(model.pin_model, data, x) for x in q])
+    np.testing.assert_allclose(found, np.abs(g).max(axis=0), atol=1e-12)
+    assert (np.abs(g.max(axis=0)) < found - 1e-3).any()
+
+
+def test_friction_of_a_usual_size_is_a_twentieth_of_each_joints_torque_at_its_own_speed(ur5):
+    speeds = (3.0, np.inf, 0.0, 2.0, np.inf, np.inf)
+    limits = tuple(replace(x, velocity=v) for x, v in zip(ur5.limits, speeds, strict=True))
+    model = SimpleNamespace(
+        joints=ur5.joints,
+        layout=ur5.layout,
+        limits=limits,
+        standard_parameters=ur5.standard_parameters,
+    )
+    size, fastest = np.array([80.0, 70.0, 50.0, 9.0, 8.0, 7.0]), np.array([9, 5, 0.5, 9, 1e-6, 4.0])
+    pi = assumed_parameters(model, size, fastest)
+    names, given = list(model.layout.names), ur5.standard_parameters()
+    counted = []
+    for joint, torque, speed in zip(ur5.joints, size, (3.0, 5.0, 0.5, 2.0, 1e-3, 4.0), strict=True):
+        own = {f"{joint}.coulomb": 0.05 * torque, f"{joint}.viscous": 0.05 * torque / speed}
+        for name, value in own.items():
+            counted.append(names.index(name))
+            assert pi[counted[-1]] == pytest.approx(value), name
+    others = np.delete(np.arange(len(pi)), counted)
+    np.testing.assert_array_equal(pi[others], given[others])
+    # a limit that is stated is the largest torque, but not one of 0; what carries nothing has some
+    efforts = (90.0, np.inf, 0.0, np.inf, 6.0, np.inf)
+    limits = tuple(replace(x, effort=e) for x, e in zip(ur5.limits, efforts, strict=True))
+    peak = np.array([1.0, 2.0, 40.0, 0.0, 50.0, 0.3])
+    found = largest_torques(SimpleNamespace(limits=limits), peak)
+    np.testing.assert_allclose(found, [90.0, 2.0, 40.0, 0.05, 6.0, 0.3])
 
 
 def test_a_joint_without_an_effort_limit_has_the_torque_of_its_bodies(ur5, motion, tmp_path):

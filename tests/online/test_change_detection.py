@@ -30,6 +30,18 @@ def test_a_change_began_when_its_evidence_last_left_zero():
     assert found == [None] * 6 + [0.0]
 
 
+def test_after_a_change_every_row_starts_anew():
+    detector = ChangeDetector(3, 40.0, 4.0)
+    # 12 more, 11 more and 3 less each: the second row is nearly there when the first is flagged
+    found = [detector.push(0.1 * k, np.array([16.0, 15.0, 1.0]), 1.0) for k in range(8)]
+    assert found == [None] * 3 + [0.0] + [None] * 3 + [pytest.approx(0.4)]
+    # the row that is flagged says when, not one that began before it
+    detector = ChangeDetector(2, 40.0, 4.0)
+    squares = [[5.0, 1.0], [5.0, 1.0], *[[5.0, 25.0]] * 2]
+    found = [detector.push(0.1 * k, np.array(row), 1.0) for k, row in enumerate(squares)]
+    assert found == [None] * 3 + [pytest.approx(0.2)]
+
+
 def test_a_single_outlier_is_no_change():
     detector = ChangeDetector(1, 40.0, 4.0)
     assert detector.push(0.0, np.array([1e6]), 1.0) is None
@@ -64,6 +76,11 @@ def test_a_row_that_is_not_used_teaches_nothing():
     assert monitor.variance[0] == before[0]
     assert monitor.variance[1] < before[1]
     assert np.isinf(monitor.doubt[0])
+    # one row that is open is enough not to have converged
+    assert monitor.doubt[1] == 0.0
+    assert not monitor.is_converged
+    monitor.push(0.01, e, e, e, np.zeros(2), np.array([True, False]), 1.0)
+    assert monitor.is_converged
 
 
 @pytest.mark.parametrize(("model_error", "is_flagged"), [(0.0, True), (0.1, False)])

@@ -10,6 +10,8 @@ from helpers.synthetic import exact_log, payload_log, truth
 from robotid.exceptions import DataError, SettingsError
 from robotid.online.identifier import OnlineIdentifier
 from robotid.online.settings import OnlineSettings
+from robotid.online.signals import LiveSignals
+from robotid.regressor.torque import joint_torque_regressor
 
 
 def run(identifier, log, start=0, end=None):
@@ -58,6 +60,11 @@ def test_what_the_data_leave_of_the_prior_is_the_mean_share_of_variances(picked_
     reading = identifier.reading
     share = reading.std_error**2 / identifier._prior_variance
     assert reading.excitation == pytest.approx(1.0 - np.minimum(share, 1.0).mean())
+    # after a change a load may have come, and all the rest may be off by a tenth of its spread
+    size = identifier.model.layout.n_inertial
+    KL = identifier.mapping.K[:, size - 10 : size] * identifier._load_spread
+    wanted = np.sum(KL**2, axis=1) + 0.01 * identifier._prior_variance
+    np.testing.assert_allclose(np.diag(identifier._reopening), wanted)
     # behind the filter two rows per period of the cut-off are independent
     s = identifier.settings
     step = max(1, int(s.rate / (12.0 * s.cutoff))) / s.rate
@@ -109,6 +116,9 @@ def test_the_new_parameters_are_followed(panda, picked_up):
     miss = np.linalg.norm(reading.theta - beta)
     assert miss < 0.5 * np.linalg.norm(before - beta)
     assert identifier.estimate.names == identifier.names
+    np.testing.assert_array_equal(identifier.estimate.sigma, reading.sigma)
+    np.testing.assert_array_equal(identifier.estimate.std_error, reading.std_error)
+    assert identifier.estimate.converged == reading.converged
     np.testing.assert_array_equal(identifier.estimate.theta, reading.theta)
 
 
@@ -143,9 +153,21 @@ def test_smooth_motion_can_be_given_as_it_is(ur5, rng):
     assert reading.t == log.t[-1]
     assert identifier.changes == ()
     assert identifier.estimate.n_iter == len(log.t)
+    # each sample is a step of its own
+    assert identifier._share == pytest.approx(2 * 2.0 / 50.0)
+    assert identifier._kalman.walk == pytest.approx(1e-4 / np.sqrt(50.0))
     error = np.abs(reading.theta - identifier.mapping.to_base(truth(ur5))) / reading.std_error
     assert np.sqrt(np.mean(error**2)) < 1.5
     np.testing.assert_allclose(reading.sigma, 0.1 * noise, rtol=0.3)
+    # a torque is compared with what the estimate makes of it once it has seen it
+    q, v, a, tau = (getattr(log, key)[5] for key in ("q", "v", "a", "tau"))
+    v = np.where(np.arange(6) == 2, 0.01, v)  # too slow for a sign
+    identifier.update(log.t[-1] + 0.02, q, v, a, tau + 1.0)
+    measured, predicted = identifier.compared
+    np.testing.assert_array_equal(measured, tau + 1.0)
+    W = joint_torque_regressor(ur5, q[None], v[None], a[None])[:, identifier.mapping.independent]
+    wanted = np.where(np.abs(v) < 0.02, np.nan, W @ identifier.reading.theta)
+    np.testing.assert_allclose(predicted, wanted)
 
 
 def test_a_bad_sample_is_refused_without_harm(ur5, rng):
@@ -179,6 +201,16 @@ def test_before_the_robot_has_moved_there_is_no_estimate(ur5):
         _ = identifier.reading
     with pytest.raises(DataError, match="there is no change -1: 0 were flagged"):
         identifier.payload()
+    # of two hundred instants a second every other one is a step; one joint that moves is enough
+    signals, seen = LiveSignals(6, 200.0, 8.0, 4, np.zeros(6, dtype=bool)), 0
+    identifier = OnlineIdentifier(ur5)
+    for k in range(140):
+        q = np.append(np.zeros(5), k / 200.0)
+        seen += len(list(signals.push(k / 200.0, q, np.ones(6))))
+        identifier.update(k / 200.0, q, np.ones(6))
+    assert seen > 80
+    with pytest.raises(DataError, match=rf"moved for {seen // 2 / 100:.2f} s of the 1 s of the"):
+        _ = identifier.compared
 
 
 def test_settings_out_of_range_are_refused():

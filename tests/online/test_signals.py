@@ -62,6 +62,17 @@ def test_full_turns_are_taken_out_of_joints_that_turn_freely():
         LiveSignals(1, 1000.0, 8.0, 4, np.array([True])), t, wrapped[:, None], 0 * t[:, None]
     )
     np.testing.assert_allclose(v[500:], 4.0, atol=0.01)
+    # and of no others
+    both, alone = (
+        run(LiveSignals(len(turns), 1000.0, 8.0, 4, np.array(turns)), t, q, 0 * q)
+        for turns, q in (
+            ([True, False], np.column_stack(2 * [wrapped])),
+            ([False], wrapped[:, None]),
+        )
+    )
+    np.testing.assert_allclose(both[2][:, 0], v[:, 0], atol=1e-9)
+    np.testing.assert_allclose(both[2][:, 1], alone[2][:, 0], atol=1e-9)
+    assert np.abs(alone[2]).max() > 50.0
 
 
 def test_a_bad_sample_is_refused_and_leaves_no_trace():

@@ -41,6 +41,9 @@ def test_figure_4_is_the_control_of_its_joint_by_iterations(studies, figures, jo
             np.testing.assert_array_equal(upper.lines[k].get_ydata(), u[iteration - 1])
             np.testing.assert_array_equal(lower.lines[k].get_ydata(), u[iteration - 1] - u[-1])
             assert upper.lines[k].get_label() == f"iteration {iteration}"
+            for axes_of in (upper, lower):  # a hundred updates in two seconds, the first at 0
+                times = axes_of.lines[k].get_xdata()
+                np.testing.assert_allclose(times, 0.02 * np.arange(100), atol=1e-12)
         program = study.program_control(201)[1][:, joint]
         np.testing.assert_array_equal(upper.lines[-1].get_ydata(), program)
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.base_dynamics import BaseDynamics
 from helpers.synthetic import truth
+from scipy.integrate import solve_ivp
 
 from robotid.exceptions import DataError, RankDeficientError, SettingsError
 from robotid.paper import planar_2r
@@ -15,7 +16,13 @@ from robotid.paper.equations import (
     recursive_update,
     smallest_eigenvalue,
 )
-from robotid.paper.procedure import Influences, LoopSettings, random_torque, run_procedure
+from robotid.paper.procedure import (
+    Influences,
+    LoopSettings,
+    _Loop,
+    random_torque,
+    run_procedure,
+)
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.simulation.motions import ProgramMotion
@@ -220,6 +227,43 @@ def test_a_disturbance_keeps_the_estimate_from_settling(rng):
     assert (error > 1e-4).all()
     assert (error < 0.1).all()
     np.testing.assert_array_equal(history.NA, [0])
+
+
+def test_updates_are_left_out_and_counted_of_runs_that_go_on(rng):
+    motion = ProgramMotion(np.tile([1.0, 1.5], (3, 1)), np.full(3, 2.0))
+    guesses = np.array([-P4, -P4, P4 / 2])  # of the first two D is negative
+    loop = _Loop(ARM, PLANT, motion, short(1), Influences(), guesses, 0.0)
+    loop.active = np.array([True, False, True])
+    states = rng.uniform(-1, 1, (3, 3, 2))
+    q = states[0]
+    Psi, eta = ARM.regressor(*states), rng.standard_normal((3, 2))
+    for done in (1, 2):
+        loop._update(q, Psi, eta, np.ones(3, dtype=bool))
+        np.testing.assert_array_equal(loop.skipped, [done, 0, 0])
+        np.testing.assert_array_equal(loop.P[:2], guesses[:2])
+        if done == 1:
+            D = mass_matrix(ARM, q[2:], P4 / 2)[0]
+            sigma = np.linalg.eigvalsh(D).min()
+            step = sigma / np.sum(Psi[2] ** 2) * Psi[2].T @ eta[2]
+            np.testing.assert_allclose(loop.P[2], P4 / 2 - step)
+            loop.P[2] = P4 / 2
+
+
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_between_updates_the_torque_is_held_and_the_arm_moves_on(substeps, rng):
+    motion = ProgramMotion(np.array([[1.0, 1.5], [0.7, -1.1]]), np.array([2.0, 1.5]))
+    settings = short(1, updates=10, substeps=substeps)
+    loop = _Loop(ARM, PLANT, motion, settings, Influences(), np.tile(P4, (2, 1)), 0.0)
+    q, v, u = rng.uniform(-1, 1, (3, 2, 2)) * np.array([2.0, 3.0, 40.0])[:, None, None]
+    found = np.hstack(loop._advance(q, v, PLANT.acceleration(q, v, u), u))
+    for r, dt in enumerate((0.2, 0.15)):
+
+        def slope(t, x, u=u[[r]]):
+            return np.append(x[2:], PLANT.acceleration(x[None, :2], x[None, 2:], u))
+
+        exact = solve_ivp(slope, (0.0, dt), np.append(q[r], v[r]), rtol=1e-11, atol=1e-12)
+        # of order 4: a third of the step leaves a 243rd of the error, times three
+        np.testing.assert_allclose(found[r], exact.y[:, -1], atol=0.1 / substeps**4)
 
 
 def test_a_constant_torque_is_a_disturbance_too():

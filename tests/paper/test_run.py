@@ -4,6 +4,7 @@ import json
 import math
 import re
 import xml.etree.ElementTree as ET
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from helpers.pages import number, tables
 from matplotlib.figure import Figure
 
 from robotid.cli import main
+from robotid.paper import page
 from robotid.paper import run as paper
-from robotid.paper.errata import energy_drift
+from robotid.paper.errata import EnergyDrift, energy_drift
 from robotid.paper.run import run_paper
 from robotid.paper.study import CASES, MODELS, PaperSettings
 from robotid.robot.model import RobotModel
@@ -53,6 +55,8 @@ def test_the_json_has_the_schema_of_the_design(written):
         assert runs["runs"] == 4 == runs["converged"] + len(runs["failures"])
         assert runs["converged"] == len(runs["iterations"])
         assert all(failure["reason"] for failure in runs["failures"])
+        for key in ("trajectories", "trajectories_on_program"):
+            assert found[key][name]["most_iterations"] == 2 == min(FEW.patience, FEW.iterations)
         for case in ("on_program", "disturbed", "noisy", "noisy_dead_zone"):
             assert len(found[case][name]["relative_error"]) == 20
             assert found[case][name]["converged"] is False
@@ -239,6 +243,66 @@ def test_runs_that_failed_are_counted_by_reason(shown, content):
                 assert counted[0][3:] == [number(median, ".2g"), number(most, ".2g")]
 
 
+def test_many_motions_have_quantiles_and_failures_their_median():
+    taken = [3, 4, 6, 9, 13, 20, 31, 40, 47, 90, 120]
+    failures = [
+        {"reason": reason, "relative_error": error}
+        for reason, error in (
+            ("slow: an error of 0.1 is left", 0.1), ("slow: an error of 0.4 is left", 0.4),
+            ("the robot ran away from its program in iteration 3", 7.0),
+            ("slow: an error of 0.2 is left", 0.2), ("the error grew, from 0.5 to 0.6", 0.6),
+            ("the robot ran away from its program in iteration 9", 2.0),
+        )
+    ]  # fmt: skip
+    one = {"runs": 17, "converged": 11, "iterations": taken, "failures": failures}
+    none = {"runs": 2, "converged": 0, "iterations": [], "failures": failures[:1]}
+    content = {
+        "trajectories": {"a": {**one, "most_iterations": 150}},
+        "trajectories_on_program": {"b": {**none, "most_iterations": 9}},
+    }
+    shown = tables(page._trajectories(content))
+    assert shown["Iterations to a relative error of 10⁻³"].rows == [
+        ["a", "up to 0.05 rad beside the program", "17", "11", "3", "20", "90", "120", "150"],
+        ["b", "on the program", "2", "0", "–", "–", "–", "–", "9"],
+    ]
+    title = "Runs that did not converge{}; each one is in paper.json"
+    assert shown[title.format("")].rows == [
+        ["a", "slow", "3", "0.2", "0.4"],
+        ["a", "the robot ran away from its program", "2", "4.5", "7"],
+        ["a", "the error grew", "1", "0.6", "0.6"],
+    ]
+    on_program = shown[title.format(", start on the program")]
+    assert on_program.rows == [["b", "slow", "1", "0.1", "0.1"]]
+
+
+def test_a_case_is_judged_at_its_end_by_a_tenth_and_by_the_mean_of_the_later_half(rng):
+    P, count = np.array([3.0, -4.0]), len(CASES)
+    errors = np.append(0.5 * 0.9 ** np.arange(20), 5e-5)
+    estimates = P + rng.standard_normal((21, count, 2))
+    study = SimpleNamespace(
+        P=P, history=SimpleNamespace(estimates=estimates), errors=lambda case: errors
+    )
+    for k, case in enumerate(CASES):
+        found = paper._case(study, case)
+        mean = estimates[-10:, k].mean(axis=0)  # of 21, five tenths of two each
+        assert found["averaged"] == pytest.approx(np.hypot(*(mean - P)) / 5.0)
+        assert found["last_tenth"] == pytest.approx((errors[-2] + errors[-1]) / 2)
+        assert found["relative_error"] == errors.tolist()
+        assert (found["converged"], found["reason"]) == (True, "converged")
+        assert found["conditions"] == CASES[case].title
+    errors = 2.0 * errors + 1e-6
+    said = {case: paper._case(study, case) for case in ("on_program", "noisy")}
+    assert not any(found["converged"] for found in said.values())
+    assert said["on_program"]["reason"].startswith("slow: every run follows the same curve")
+    assert said["noisy"]["reason"].startswith("A disturbance v enters the deviation")
+
+
+def test_energy_that_is_lost_is_no_less_than_energy_that_is_gained():
+    drift = EnergyDrift(np.array([0.0, 0.5, 1.5]), {"a": np.array([0.0, -0.3, 0.1])})
+    content = paper._content(FEW, [], {}, {}, drift)
+    assert content["energy_drift"] == {"duration": 1.5, "max_relative": {"a": 0.3}}
+
+
 def test_errata_energy_and_settings(shown, content):
     assert shown["Errata"].rows == [
         [e["where"], e["printed"], e["corrected"], number(e["max_torque_difference"], ".1f"),
@@ -263,6 +327,17 @@ def test_the_verdict_is_that_of_the_last_iteration(html, content):
             f"<li>{name}: relative error {number(error, '.2g')}, or {number(on, '.2g')} where"
             in box
         )
+
+
+def test_the_verdict_is_good_if_all_models_are(content):
+    for last, status in (((1e-5, 9e-5, 1e-4), "good"), ((1e-5, 2e-4, 1e-5), "poor")):
+        models = {
+            name: {**content["models"][name], "relative_error": [0.5, error]}
+            for name, error in zip(MODELS, last, strict=True)
+        }
+        box = page._summary({**content, "models": models}).split('<div class="verdict ')[1]
+        assert box.startswith(status)
+        assert "After <strong>1 iterations</strong>" in box
 
 
 def test_the_summary_says_what_the_start_beside_the_program_does(html, content):

@@ -59,6 +59,8 @@ def test_the_errata_make_the_torques_differ_as_worked_out_by_hand():
 
 def test_only_the_physical_arm_keeps_its_energy():
     drift = energy_drift(duration=4.0, dt=4e-3)
+    np.testing.assert_allclose(drift.t, np.linspace(0.0, 4.0, 1001), atol=1e-12)
+    assert {len(gained) for gained in drift.gained.values()} == {1001}
     assert np.abs(drift.gained["physical"]).max() < 1e-9  # error of the integration
     assert np.abs(drift.gained["printed"]).max() > 0.2
     assert np.abs(drift.gained["corrected"]).max() > 0.1  # p3 != p4
@@ -69,6 +71,7 @@ def test_random_runs_tell_every_failure(rng):
     runs = random_runs(dynamics, P, 8, 12, rng)
     content = runs.to_dict()
     assert 0 < content["converged"] < 8
+    assert (content["runs"], content["most_iterations"], content["tolerance"]) == (8, 12, 1e-3)
     for failure in content["failures"]:
         assert runs.errors[:, failure["run"]].min() >= 1e-3
         assert re.match(r"slow: an error of .* is left after 12 iterations", failure["reason"])
