@@ -11,7 +11,7 @@ plain baseline of the recording's description. --arms: recordings without comman
 drives the robot: torque rows alone, roll-outs alone, both, each with viscous and Coulomb friction
 and offset; and the last with what friction other windows confirm. The simulated arm is MuJoCo's,
 16 kHz, written at 100 Hz, its torque with noise of 1 % of its size, encoders of 0.05 mrad.
---coverage: MuJoCo rolls out a robot with known
+--coverage: MuJoCo simulates a robot with known
 drives on a multi-sine of 10 s at 500 Hz, at a step of 0.05 ms and with stiff friction, encoders
 with noise of 0.3 mrad; gains are stated, bodies are those of the URDF. --driven: again without
 commands, the torque drives: logs as of the simulated arm at 250 Hz, the noise 5 %.
@@ -42,9 +42,9 @@ from mujoco import rollout
 from robotid.closed_loop.driven import driven_log
 from robotid.closed_loop.evaluation import run_open_loop
 from robotid.closed_loop.fit import stated_loops
+from robotid.closed_loop.free_parameters import LoopSimulator, free_body_parameters
 from robotid.closed_loop.identify import identify_loops
 from robotid.closed_loop.settings import LoopSettings
-from robotid.closed_loop.unknowns import LoopSimulator, body_unknowns
 from robotid.commands.job import read_job
 from robotid.exceptions import SettingsError
 from robotid.export.commanded import CommandedDrive, loops_of
@@ -57,7 +57,7 @@ from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.families import AUTO
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot, Window, open_loops
+from robotid.simulation.loops import ClosedLoopRobot, Window, open_loops
 
 FINE = 5e-5  # [s] step of the plant
 STEP = 5e-4  # [s] of our roll-outs beside it
@@ -65,7 +65,7 @@ STIFF = (0.9999, 0.9999, 0.001, 0.5, 2.0)  # impedance of its friction
 HELD_RATE, HELD_STEP = 250.0, 1e-4  # [Hz], [s]: of commands that are held, and of their plant
 RATE, DURATION, NOISE = 500.0, 10.0, 3e-4  # [Hz], [s], [rad]
 TORQUE_NOISE = 2e-3  # [rad]: times kp
-REACH = 1.96
+QUANTILE = 1.96
 KHZ = 1e-3  # [s] step and period of the roll-outs that are timed
 
 GO2_GAINS = (20.0, 1.5)  # [N m/rad], [N m s/rad]
@@ -159,7 +159,7 @@ def by_job(text):
         path = Path(folder) / "job.toml"
         path.write_text(text)
         job = read_job(path)
-        begun = clocks()
+        initialised = clocks()
         model = job.model()
         logs, kept = (
             [job.read(entry, model, needs="commands") for entry in entries]
@@ -168,7 +168,7 @@ def by_job(text):
         found = identify_loops(
             model, logs, kept, job.controller, job.estimator, chooses=AUTO in job.terms
         )
-        return found, clocks() - begun
+        return found, clocks() - initialised
 
 
 def geometric_mean(ratios):
@@ -218,11 +218,11 @@ def go2(sysid_steps):
 
 
 def sysid_fit(found, most):
-    """Return the errors of mujoco.sysid on the kept log, parameters, steps and times."""
+    """Return the errors of mujoco.sysid on the validation log, parameters, steps and times."""
     from mujoco import sysid
 
     log, kept = found.fitted[0].log, found.validation[0].log
-    model, begun = found.model, clocks()
+    model, initialised = found.model, clocks()
     spec = sysid_spec(model)
     params = sysid.ParameterDict()
     for joint in model.joints:
@@ -240,7 +240,7 @@ def sysid_fit(found, most):
     )  # fmt: skip
     residual = sysid.build_residual_fn(models_sequences=[sequences])
     best, result = sysid.optimize(params, residual, verbose=False, max_iters=most)
-    took = clocks() - begun
+    took = clocks() - initialised
     fitted = sysid.apply_param_modifiers(best, spec)
     t, q_ref = held(kept)
     data = mujoco.MjData(fitted)
@@ -338,7 +338,7 @@ def so101():
         f"[controller.groups]\nservo = [{groups}]\n[columns]\n{columns}"
         + "".join(f'[[{what}]]\nlog = "{folder / name}.parquet"\n' for what, name in entries)
     )
-    print(f"| kept motion, error in mrad | {' | '.join(found.model.joints)} | ratio |")
+    print(f"| validation motion, error in mrad | {' | '.join(found.model.joints)} | ratio |")
     print("|---" * (len(found.model.joints) + 2) + "|")
     ratios, rows = [], {}
     for (name, plain), run in zip(SO101_PLAIN.items(), found.validation, strict=True):
@@ -357,7 +357,7 @@ def so101():
 
 
 def arms():
-    """Print what rows of torque, roll-outs and both make of logs kept apart; return the figures."""
+    """Print what rows of torque, roll-outs and both make of validation logs; return the figures."""
     print("| robot | fitted to | torque missed, N m | 0.5 s position missed, mrad "
           "| torque, ratio | position, ratio | processor, s |")  # fmt: skip
     print("|---" * 7 + "|")
@@ -386,30 +386,30 @@ def arms():
 
 def arm_rows(name, model, logs, kept, signals, truth=None):
     """Print the rows of one arm; return the figures."""
-    loop, rows, begun = LoopSettings(kind="torque"), {}, time.process_time()
+    loop, rows, initialised = LoopSettings(kind="torque"), {}, time.process_time()
     linear = identify(model, logs, signals=signals, friction="none", doctor=False)
-    took = time.process_time() - begun
+    took = time.process_time() - initialised
     ways = {"roll-outs alone": (False, False), "both": (True, False),
             "both, friction chosen": (True, True)}  # fmt: skip
     for way, (torques, chooses) in ways.items():
-        begun = time.process_time()
+        initialised = time.process_time()
         settings = SimulationSettings(torques=torques)
         found = identify_loops(model, logs, kept, loop, settings, signals=signals, chooses=chooses)
-        spent = time.process_time() - begun
+        spent = time.process_time() - initialised
         if not rows:
-            missed = missed_torque(model, linear.standard, kept, signals)
+            missed = torque_mismatch(model, linear.standard, kept, signals)
             rows["torque rows alone"] = (missed, found.validation[0].baselines["rows"], took)
-        missed = missed_torque(found.model, found.standard, kept, signals)
+        missed = torque_mismatch(found.model, found.standard, kept, signals)
         rows[way] = (missed, found.validation[0].rmse, spent)
     if truth is not None:
         position = driven_error(model, truth, kept[0], signals)
-        rows["the truth"] = (missed_torque(model, truth, kept, signals), position, 0.0)
-    begun = time.process_time()
+        rows["the truth"] = (torque_mismatch(model, truth, kept, signals), position, 0.0)
+    initialised = time.process_time()
     linear = identify(model, logs, signals=signals, doctor=False)
     rows["torque rows alone, friction chosen"] = (
-        missed_torque(linear.model, linear.standard, kept, signals),
+        torque_mismatch(linear.model, linear.standard, kept, signals),
         driven_error(linear.model, linear.standard, kept[0], signals),
-        time.process_time() - begun,
+        time.process_time() - initialised,
     )
     plain = rows["torque rows alone"]
     for way, (torque, position, spent) in rows.items():
@@ -430,12 +430,12 @@ def driven_error(model, pi, log, signals):
     """Return the error of position of a robot that the torque of a log drives, joint by joint."""
     heard = driven_log(model, log, signals)
     try:
-        return run_open_loop(LoopedRobot(model), open_loops(model, pi), heard).rmse
+        return run_open_loop(ClosedLoopRobot(model), open_loops(model, pi), heard).rmse
     except SettingsError:  # a term that rows of torque have, and roll-outs have not: shown as "-"
         return np.full(len(model.joints), np.nan)
 
 
-def missed_torque(model, pi, logs, signals):
+def torque_mismatch(model, pi, logs, signals):
     """Return the root mean square of the torque that parameters miss in logs, joint by joint."""
     kept = [hold_log(model, log, signals) for log in logs]
     _, [found] = evaluate_logs((), kept, {"own": pi}, model.standard_parameters())
@@ -471,7 +471,7 @@ def rollout_row(name, plant, seconds):
     q_ref = mujoco_plant.multisine(t, plant.middle, plant.reach, np.random.default_rng(1))
     log = Log(t, q_ref, 0 * q_ref, plant.model.joints, q_ref=q_ref, has_torque=False)
     robot, loops = (
-        LoopedRobot(plant.model, step=KHZ),
+        ClosedLoopRobot(plant.model, step=KHZ),
         loops_of(plant.model, drive_pi(plant), plant.drives),
     )
     windows = [Window(log, 0, 0, len(t))] * many
@@ -492,8 +492,8 @@ def rollout_row(name, plant, seconds):
     best = {way: np.full(2, np.inf) for way in ways}
     for way in ways.values():
         way()  # what is compiled is ready then
-    begun = time.perf_counter()
-    while time.perf_counter() - begun < seconds or not np.isfinite(best["mujoco 2"]).all():
+    initialised = time.perf_counter()
+    while time.perf_counter() - initialised < seconds or not np.isfinite(best["mujoco 2"]).all():
         for key, way in ways.items():  # in turn, so that all meet the same load
             start = clocks()
             way()
@@ -544,12 +544,12 @@ def coverage(
 
 def covered(name, runs, seconds, run=None, **how):
     """Return errors, standard errors and reaches by kind of parameter, of shape (3, values)."""
-    found, begun = {}, time.process_time()
+    found, initialised = {}, time.process_time()
     for seed in range(runs):
         rng = np.random.default_rng([17, seed])
         for kind, *own in (run or one_run)(name, rng, seconds, **how):
             found.setdefault(kind, []).append(own)
-    print(f"{name}: {(time.process_time() - begun) / runs:.1f} s of processor a run",
+    print(f"{name}: {(time.process_time() - initialised) / runs:.1f} s of processor a run",
           file=sys.stderr)  # fmt: skip
     return {kind: np.array(own).T for kind, own in found.items()}
 
@@ -579,7 +579,7 @@ def driven_errors(name, runs, seconds):
             error = linear.standard[place(key)] - plant.truth[key]
             said = np.sqrt(linear.standard_covariance[place(key), place(key)])
             if kind != "armature":  # which rows tell with the bodies alone
-                errors["torque rows alone"].setdefault(kind, []).append((error, said, REACH))
+                errors["torque rows alone"].setdefault(kind, []).append((error, said, QUANTILE))
     return {
         way: {kind: np.array(pairs).T for kind, pairs in own.items()} for way, own in errors.items()
     }
@@ -671,10 +671,10 @@ def stiff(robot, step):
 
 def with_drawn_bodies(plant, rng, spread):
     """Return a plant whose bodies differ from the URDF's, and how, by name of the coordinate."""
-    robot = LoopedRobot(plant.model)
-    unknowns = tuple(body_unknowns(robot, spread))
-    simulator = LoopSimulator(robot, (), stated_loops(plant.model, LoopSettings()), unknowns)
-    coordinates = spread * rng.standard_normal(len(unknowns))
+    robot = ClosedLoopRobot(plant.model)
+    free_parameters = tuple(free_body_parameters(robot, spread))
+    simulator = LoopSimulator(robot, (), stated_loops(plant.model, LoopSettings()), free_parameters)
+    coordinates = spread * rng.standard_normal(len(free_parameters))
     bodies = simulator.loops(coordinates).bodies
     drawn = dict(zip(simulator.names, coordinates.tolist(), strict=True))
     return replace(plant, bodies=bodies.reshape(-1)), drawn

@@ -79,9 +79,9 @@ def main():
     parser.add_argument("--quick", action="store_true", help="one robot, few motions: a try-out")
     options = parser.parse_args()
     cases, count, seeds = (CASES[1:], 20, 1) if options.quick else (CASES, 500, 5)
-    begun = time.process_time()
+    initialised = time.process_time()
     row_lanes()
-    start = time.process_time() - begun
+    start = time.process_time() - initialised
     tasks = {name: designer(name) for name in cases}
     print(
         f"| robot | best of {count} random | design | condition | better than those after "

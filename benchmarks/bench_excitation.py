@@ -101,7 +101,7 @@ def identified(folder, robot, log):
 
 def robot_row(folder, name, joints, seconds):
     robot = (example_urdf(f"{name}.urdf"), *(("--joints", ",".join(joints)) if joints else ()))
-    motion, begun = folder / f"{name}-motion.parquet", time.monotonic()
+    motion, initialised = folder / f"{name}-motion.parquet", time.monotonic()
     code, said = run(
         "excite", *robot, "--out", motion, "--json", "--starts", 1, "--seconds", seconds
     )
@@ -110,9 +110,9 @@ def robot_row(folder, name, joints, seconds):
     if code:
         raise SystemExit(f"{name}: {said}")
     design = json.loads(said)
-    taken = time.monotonic() - begun
+    taken = time.monotonic() - initialised
     errors = identified(folder, robot, record(folder, robot, name, motion, 1))[1]
-    condition, rest = design["condition_number"], time.monotonic() - begun - taken
+    condition, rest = design["condition_number"], time.monotonic() - initialised - taken
     return (
         f"| {name} | {len(design['joints'])} | {len(errors)} | "
         f"{'--' if condition is None else f'{condition:.3g}'} | {np.median(errors):.2f} | "
@@ -136,12 +136,12 @@ class TimeIsOver(Exception):
 def slsqp(task, start, seconds):
     """Return the history of SLSQP by differences: time and criterion of each better motion."""
     unit, least = task.limits.sizes[0], task.clearance.least
-    begun, history, known = time.monotonic(), [], {}
+    initialised, history, known = time.monotonic(), [], {}
 
     def looked_at(x):
         key = x.tobytes()
         if key not in known:
-            if time.monotonic() - begun > seconds:
+            if time.monotonic() - initialised > seconds:
                 raise TimeIsOver
             if len(known) > 2 * start.size:  # the differences of value and limits are the same
                 known.clear()
@@ -158,7 +158,7 @@ def slsqp(task, start, seconds):
         C = task._feasible(x.reshape(start.shape) * unit, 1.0)
         objective = task._objective(C)
         if not history or objective < history[-1][1]:
-            history.append((time.monotonic() - begun, objective))
+            history.append((time.monotonic() - initialised, objective))
 
     free = replace(task, clearance=None)
     x = (start / unit).ravel()
@@ -183,8 +183,8 @@ def at(history, seconds):
 def against_time(name, task, budgets, count):
     """Print the criterion against time; return the design that took as long as it wanted."""
     rng = np.random.default_rng(1)
-    begun = time.monotonic()
-    random = [(task.random(rng), time.monotonic() - begun) for _ in range(count)]
+    initialised = time.monotonic()
+    random = [(task.random(rng), time.monotonic() - initialised) for _ in range(count)]
     values = [(when, task._objective(C)) for C, when in random]
     best = at(values, np.inf)
     starts = np.random.default_rng(0)  # those that a design begins with

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from robotid.commands.job import read_job
-from robotid.fitting.bands import REACH, friction_curve
+from robotid.fitting.bands import QUANTILE, friction_curve
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -38,7 +38,7 @@ PLAIN = "viscous+coulomb"
 PAN, LIFT, ELBOW = "shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"
 TRUTH = {LIFT: "load", ELBOW: "load", PAN: "stribeck"}
 SHARE, HOOK, SPEED = 0.07, 8.0, 0.15  # [-], [N m], [rad/s]
-RATE, DURATION, NOISE = 100.0, 48.0, 0.02  # [Hz], [s], of the usual torque
+RATE, DURATION, NOISE = 100.0, 48.0, 0.02  # [Hz], [s], of the RMS torque
 FORGETS = 0.05  # [s]
 SAMPLES = 100_000  # of the arm that is timed
 ARM = "panda"
@@ -64,7 +64,9 @@ def main():
 
 
 def real_recordings(names):
-    print("| kept recording of | joint | RMSE, viscous and Coulomb | RMSE, auto | ratio | chosen |")
+    print(
+        "| validation recording of | joint | RMSE, viscous and Coulomb | RMSE, auto | ratio | chosen |"
+    )
     print("|---|---|---|---|---|---|")
     for name in names:
         job = read_job(JOBS / f"{name}.toml")
@@ -176,7 +178,7 @@ def parameters(found, joint, true):
             yield term, miss <= found.errors.reach[k] * found.base_error[k]
     for choice in found.drives:
         for shape in choice.shapes if choice.joint == joint else ():
-            yield shape.name, abs(shape.value - SPEED) <= REACH * shape.std_error
+            yield shape.name, abs(shape.value - SPEED) <= QUANTILE * shape.std_error
 
 
 def curve(found, truth, joint, true):
@@ -194,7 +196,7 @@ def curve(found, truth, joint, true):
             if d == j and not term.is_inertia
         )
         own = friction_curve(found, joint, v, load=load)
-        held += list(np.abs(own.torque - wanted) <= REACH * own.std)
+        held += list(np.abs(own.torque - wanted) <= QUANTILE * own.std)
     return held
 
 

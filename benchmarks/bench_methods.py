@@ -2,7 +2,7 @@
 
     python benchmarks/bench_methods.py [--quick] [--runs RUNS]
 
-MuJoCo rolls out three joints of a leg with known drives at a step of 0.05 ms, with stiff friction,
+MuJoCo simulates three joints of a leg with known drives at a step of 0.05 ms, with stiff friction,
 on multi-sines of 6 s at 500 Hz; encoders have a noise of 0.3 mrad, logged torques one of 0.05 N m.
 Gains and delay are stated, as the direct method needs it; bodies are those of the URDF. All methods
 begin with a fit to some windows, which is in their time.
@@ -20,7 +20,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 
 import mujoco
-from bench_commands import FINE, RATE, REACH, STIFF
+from bench_commands import FINE, QUANTILE, RATE, STIFF
 from helpers import mujoco_plant
 
 from robotid.closed_loop.fit import fit_loops
@@ -84,9 +84,9 @@ def one_fit(plant, log, changes):
     groups = {joint: [joint] for joint in plant.model.joints}  # every joint has its own drive
     loop = LoopSettings(**gains, delay=DELAY, groups=groups)
     settings = SimulationSettings(bodies=0.0, step=STEP, **changes)
-    begun = time.process_time()
+    initialised = time.process_time()
     estimate = fit_loops(plant.model, [log], loop, settings, chooses=False).estimate
-    took = time.process_time() - begun
+    took = time.process_time() - initialised
     return estimate, np.array([plant.truth[name] for name in estimate.names]), took
 
 
@@ -96,7 +96,7 @@ def row(case, method, fits):
     errors = np.array([estimate.theta - truth for estimate, truth, _ in fits])
     said = np.array([estimate.std_error for estimate, *_ in fits])
     sizes = np.array([truth for _, truth, _ in fits])
-    is_held = np.abs(errors) <= REACH * said
+    is_held = np.abs(errors) <= QUANTILE * said
     shares = [
         f"{100 * np.median(np.abs(errors[:, terms == term] / sizes[:, terms == term])):.2g} %"
         for term in ("armature", "viscous", "coulomb")

@@ -85,7 +85,7 @@ def recordings():
     if "ROBOTID_DATA" not in os.environ:
         print("\nno recordings: set ROBOTID_DATA")
         return
-    print("\n| recording | joint | finding | share | of the kept log's | size | s |")
+    print("\n| recording | joint | finding | share | of the validation log's | size | s |")
     print("|---|---|---|---|---|---|---|")
     for path in sorted((ROOT / "tests" / "jobs").glob("*.toml")):
         job = read_job(path)

@@ -1,10 +1,10 @@
 """Prediction of a NEW motion: weighted least squares against fits that know the URDF.
 
-Every fit sees one stretch of motion only, and chooses the weight of its prior from that alone;
-figures are the error per joint in % of the torque of another stretch. Simulated: a UR10 whose
+Every fit sees one segment of motion only, and chooses the weight of its prior from that alone;
+figures are the error per joint in % of the torque of another segment. Simulated: a UR10 whose
 masses are unlike its URDF's. Recorded, if ROBOTID_DATA names the folder: other laboratories' logs,
 and the first tenth of each ("short"), where the excitation is poor. "auto" is the default: by
-held-out stretches where the log is long enough, else 1.
+held-out segments where the log is long enough, else 1.
 
     ROBOTID_DATA=folder python benchmarks/bench_priors.py [--quick | --weights]
 
@@ -72,7 +72,7 @@ def main():
                 (shorts if "short" in title else ratios)[name].append((ratio, seconds))
     print("\n### Error over that of WLS, geometric mean over joints and recordings\n")
     print(
-        "| fit | stretches | short ones | worst stretch | worst short one | s per identification |"
+        "| fit | segments | short ones | worst segment | worst short one | s per identification |"
     )
     print("|---|---|---|---|---|---|")
     for name in names:
@@ -128,7 +128,7 @@ def cases(quick):
         fitted, kept = (
             [job.read(e, model) for e in x] for x in (job.identification, job.validation)
         )
-        yield f"{name}, one stretch -> the rest", model, job.signals, fitted, kept
+        yield f"{name}, one segment -> the rest", model, job.signals, fitted, kept
         yield from short(name, model, job.signals, fitted, kept)
     for name in ("tx40", "ur10e"):
         job = read_job(JOBS / f"{name}.toml")

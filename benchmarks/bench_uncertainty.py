@@ -40,7 +40,7 @@ from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inerti
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.logs.settings import SignalSettings
 from robotid.simulation.closed_loop import another_robot
-from robotid.estimators.stretches import quantile
+from robotid.estimators.segments import quantile
 
 CHAINS = {"filtered": SignalSettings(), "raw": SignalSettings(cutoff=None)}
 NOISES = ("white", "unequal", "coloured")

@@ -38,7 +38,7 @@ QUICK = (("ur5", "tiago"), ("clean", "clean, far from the URDF", "torque 20 ms l
          "mounted on a wall", "all torques x 0.8"))  # fmt: skip
 
 OF_URDF = ("rounded_rpy",)  # true of the URDF, whatever was recorded
-UNCHECKED = "rests on the sensors alone"
+UNCHECKED = "depends on the sensors alone"
 NOTE = re.compile(r"doctor: \w+: (?P<code>\w+): ")
 
 
@@ -52,7 +52,7 @@ class Answer:
     codes: tuple[str, ...]  # of warnings and errors
     reasons: tuple[str, ...]
     held: float  # share of the true parameters that lie in their 95 % intervals [-]
-    worst: float  # largest error of a joint on the kept recording [%]
+    worst: float  # largest error of a joint on the validation recording [%]
     seconds: float
 
     @property
@@ -64,7 +64,7 @@ class Answer:
 
     @property
     def says_unchecked(self):
-        """Whether it says that the scale of the recordings rests on the sensors alone."""
+        """Whether it says that the scale of the recordings depends on the sensors alone."""
         return any(UNCHECKED in reason for reason in self.reasons)
 
     @property
@@ -77,7 +77,7 @@ class Answer:
         return not (self.is_right and set(self.codes) <= {*CASES[self.case].allowed, *OF_URDF})
 
     @property
-    def in_words(self):
+    def described(self):
         return f"{self.status}: {', '.join(self.codes) or 'nothing'}"
 
 
@@ -218,7 +218,7 @@ def table(title, answers):
         named = sum((not a.is_alarm) if is_clean else a.is_named for a in of_case)
         said = f"{named}/{count}" if codes or is_clean else "-"
         inside = [100 * a.held for a in of_case if np.isfinite(a.held)]
-        wrong = Counter(a.in_words for a in of_case if is_off(a))
+        wrong = Counter(a.described for a in of_case if is_off(a))
         others = "; ".join(f"{words} (x {times})" for words, times in wrong.most_common(2)) or "-"
         middle = f"{np.mean(inside):.0f} %" if inside else "-"
         print(f"| {case} | {right}/{count} | {said} | {middle} | {others} |")

@@ -28,7 +28,7 @@ FIT, KEPT = 30.0, 20.0  # [s] length of the log to fit and of the one kept apart
 RATES = (100.0, 125.0, 200.0)  # [Hz]
 TONES = 8  # sinusoids of a motion
 LOWEST, HIGHEST = 0.05, 0.8  # [Hz]
-REACH = {"turns": 1.5, "slides": 0.3}  # [rad or m] largest amplitude
+QUANTILE = {"turns": 1.5, "slides": 0.3}  # [rad or m] largest amplitude
 SPEED = {"turns": 1.5, "slides": 0.3}  # [rad/s or m/s] largest speed
 SIGN_SPEED = 1e-3  # [rad/s or m/s] over which Coulomb friction changes its sign
 #: Sensor noise: position [rad or m], velocity [same/s], torque, white and coloured, as a share of
@@ -128,7 +128,7 @@ class Arm:
         return np.random.default_rng([*self.key, *what.encode()])
 
     def rigid(self, run, *, still=False, loaded=0.0):
-        """Return the torque of the bodies; of gravity alone if it stands still; (N, n)."""
+        """Return the torque of the bodies; of gravity alone if it is at rest; (N, n)."""
         pi = self.pi[: self.model.layout.n_inertial].copy()
         if loaded:
             pi[-10:] += loaded * self.load_shape()
@@ -231,7 +231,7 @@ def move(model, rng, rate, duration, is_kept=False):
     for j, joint in enumerate(model.limits):
         kind = "slides" if joint.type == "prismatic" else "turns"
         low, high = (joint.lower, joint.upper) if joint.has_limits else (-3.0, 3.0)
-        reach = min(REACH[kind], 0.45 * (high - low))
+        reach = min(QUANTILE[kind], 0.45 * (high - low))
         centre = (low + high) / 2 + rng.uniform(-1, 1) * max(0.0, 0.45 * (high - low) - reach) * 0.5
         w = 2 * np.pi * rng.uniform(LOWEST, HIGHEST, TONES)  # [rad/s]
         size = rng.uniform(0.3, 1.0, TONES) / w
@@ -549,7 +549,7 @@ class Case:
     is_off_scale: bool = False
 
 
-VELOCITY = ("unlike_velocity", "velocity_order", "velocity_scale", "quantised")
+VELOCITY = ("velocity_mismatch", "velocity_order", "velocity_scale", "quantised")
 
 CASES = {
     # nothing is wrong
@@ -572,7 +572,7 @@ CASES = {
     "torque 20 ms late": Case(NOT_GOOD, ("torque_delay",), plant=late(0.020)),
     "torque filtered at 5 Hz": Case(NOT_GOOD, ("torque_delay",), plant=filtered),
     "torque held for 40 ms": Case(
-        NOT_GOOD, ("held_torque", "torque_delay"), record=held
+        NOT_GOOD, ("repeated_torque", "torque_delay"), record=held
     ),
     "all torques reversed": Case(REFUSED, ("torque_sign",), record=of_torque(lambda arm: -1.0)),
     "one torque reversed": Case(REFUSED, ("torque_sign",), record=negated("tau")),
@@ -617,7 +617,7 @@ CASES = {
     "1 kg in the fitted log": Case(
         NOT_GOOD, ("payload", "payload_change", "urdf_mismatch"), loads=(True, False)
     ),
-    "1 kg in the kept log": Case(
+    "1 kg in the validation log": Case(
         NOT_GOOD, ("payload", "payload_change", "urdf_mismatch"), loads=(False, True)
     ),
     "1 kg in both": Case(FINE, loads=(True, True)),
@@ -627,7 +627,7 @@ CASES = {
     "mounted on a wall": Case(NOT_GOOD, ("gravity",), world="turned", fits=has_gravity),
     "base tilted by 15 deg": Case(NOT_GOOD, ("gravity",), world="tilted", fits=has_gravity),
     # little to learn from
-    "one joint stands still": Case(
+    "one joint is at rest": Case(
         NOT_GOOD, ("static_joint", "excitation", "undetermined"), plant=still_joint
     ),
     "2 s only": Case(NOT_GOOD, ("excitation", "undetermined", "too_short"), seconds=2.0),

@@ -26,7 +26,7 @@ class Finding:
         severity: "note", "warning" or "error".
         where: What it is about: a link, a joint, a parameter or a file.
         message: What was found, what was wanted, what to do.
-        evidence: The figures it rests on, by name.
+        evidence: The figures it depends on, by name.
     """
 
     code: str
@@ -66,7 +66,7 @@ def log_finding(
         severity: "note", "warning" or "error".
         message: What was found, what was wanted, what to do.
         part: Joint, link or channel that it is about; the whole log if empty.
-        evidence: The figures it rests on, by name.
+        evidence: The figures it depends on, by name.
 
     Returns:
         The finding.

@@ -20,7 +20,7 @@ from robotid.cli import COMMANDS, main
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.doctor.diagnosis import CODES
 from robotid.fitting.settings import EstimatorSettings
-from robotid.judgement.verdict import DOUBTFUL
+from robotid.judgement.verdict import WARNING_CODES
 from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
@@ -185,7 +185,7 @@ def test_doctor_lists_every_corruption_and_none_other():
 def codes_of_findings():
     """Return the codes that the code gives to findings, those of unread logs included."""
     places = {"Finding": 0, "_Alteration": 0, "log_finding": 1, "Candidate": 1}
-    codes = {*CODES, *DOUBTFUL, "unusable_log"}
+    codes = {*CODES, *WARNING_CODES, "unusable_log"}
     for path in (ROOT / "robotid").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call):
@@ -223,9 +223,9 @@ def test_each_finding_has_its_section():
     ]
     assert len(shown) == len(set(shown)), "a code has two sections"
     codes = codes_of_findings()
-    begun = tuple(code for code in codes if code.endswith("_"))  # of a code in two parts
-    assert sorted(code for code in codes if code not in shown and code not in begun) == []
-    assert sorted(x for x in shown if x not in codes and not x.startswith(begun)) == []
+    initialised = tuple(code for code in codes if code.endswith("_"))  # of a code in two parts
+    assert sorted(code for code in codes if code not in shown and code not in initialised) == []
+    assert sorted(x for x in shown if x not in codes and not x.startswith(initialised)) == []
     index = (DOCS / "reference/findings/index.md").read_text()
     assert sorted(re.findall(r"\[`(\w+)`\]\(\w+\.md#\1\)", index)) == sorted(shown)
 

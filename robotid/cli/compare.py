@@ -54,8 +54,8 @@ def _show(content: dict[str, Any]) -> None:
         verdict = result["verdict"]["status"]
         said = f"{result['label']}  {verdict:7} {result['estimator']:10} "
         print(tinted(f"{said}{result['path']}", verdict, verdict, sys.stdout))
-    for remark in content["remarks"]:
-        say(f"- {remark}", "  ")
+    for note in content["notes"]:
+        say(f"- {note}", "  ")
     alike = "" if content["fitted_alike"] else "; other recordings, not comparable"
     tables = [
         (f"not fitted: {window_name(entry['name'], entry)}, error %", entry["per_joint"])

@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> int:
     """
     from robotid.commands.logs import examine
     from robotid.doctor.diagnosis import findings_to_dict
-    from robotid.judgement.verdict import alarming
+    from robotid.judgement.verdict import blocking
 
     with progress_of(options) as progress:
         job = job_from_flags(options)
@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> int:
         findings = examine(job, model, progress=progress)
     content = findings_to_dict(findings) | {"joints": list(model.joints)}
     show_found(content, options, partial(show, is_verbose=options.verbose))
-    return 1 if alarming(findings, job.ignore) else 0
+    return 1 if blocking(findings, job.ignore) else 0
 
 
 def show(content: dict[str, Any], *, is_verbose: bool) -> None:

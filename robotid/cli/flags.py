@@ -315,7 +315,7 @@ def add_job(
     parser.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
     add_json(parser, json_)
     flags = parser.add_argument_group("instead of a job file, with URDF LOG [LOG ...]")
-    flags.add_argument("--validate", nargs="+", metavar="LOG", help="logs kept apart")
+    flags.add_argument("--validate", nargs="+", metavar="LOG", help="validation logs")
     JOB.add(flags, (*FIT, *LOG, *output))
     add_verbose(parser)
 

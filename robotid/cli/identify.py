@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
             print_steps(next_steps(found, origin))
         else:
             print_steps(loop_steps(result, origin))
-    return 1 if result["verdict"]["alarms"] else 0
+    return 1 if result["verdict"]["log_errors"] else 0
 
 
 def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
@@ -109,7 +109,7 @@ def _found(result: Mapping[str, Any]) -> str:
         over = f" over {DRIFTS:g} s" if kind["kind"] == "torque" else ""
         said = f"{fit['parameters']} unknowns; {fit['message']}; errors are those of positions"
         return said + over
-    structure, (before, after, _) = result["structure"], result["witness"]["masses"]
+    structure, (before, after, _) = result["structure"], result["scale_check"]["masses"]
     return (
         f"{structure['base']} base parameters ({structure['base_inertial']} inertial), condition "
         f"number {structure['condition']:.3g}, total mass {before:.2f} -> {after:.2f} kg"

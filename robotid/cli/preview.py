@@ -120,7 +120,7 @@ def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
 
 
 def _print_expected_torque(content: Mapping[str, Any]) -> None:
-    """Print each joint's torque with its band, and the noise that all rests on."""
+    """Print each joint's torque with its band, and the noise that all depends on."""
     say(
         "\ntorque of the motion, 95 % band of a measurement about its prediction, and the part of "
         "that which is due to the parameters"

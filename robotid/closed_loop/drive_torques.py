@@ -54,7 +54,7 @@ class DriveTorques:
 
         Args:
             joints: Which, shape (k,).
-            columns: What they are by: columns as of ``LoopedRobot.roll_out``, each with the place,
+            columns: What they are by: columns as of ``ClosedLoopRobot.roll_out``, each with the place,
                 of c, of its sensitivity.
             motion: Derivatives of their positions and then speeds, shape (N, 2k, c).
             kinds: Numbers of the columns' kinds.
@@ -81,7 +81,7 @@ def drive_torques(out: RollOut, loops: Loops, behind: Array) -> DriveTorques:
 
     Args:
         out: The roll-out.
-        loops: The loops that it was rolled out with.
+        loops: The loops that it was simulated with.
         behind: How many rows the command that a torque follows is behind it, shape (n,); between
             two rows it is their mean, by how near they are.
     """

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robotid.closed_loop.unknowns import TorqueRows
+from robotid.closed_loop.free_parameters import TorqueRows
 from robotid.exceptions import DataError
 from robotid.identification.pipeline import identify
 from robotid.identification.result import Identification
@@ -66,7 +66,7 @@ def identified_rows(
 def torque_rows(found: Identification, inflation: float = 1.0) -> TorqueRows:
     """Return what an identification's rows come down to.
 
-    Their weight is that of rows as independent as the scatter of stretches shows them to be.
+    Their weight is that of rows as independent as the scatter of segments shows them to be.
 
     Args:
         found: The identification.

@@ -10,7 +10,7 @@ from robotid.exceptions import NotConvergedError
 from robotid.fitting.metrics import JointMetrics, Metrics
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot, Loops, cut_windows
+from robotid.simulation.loops import ClosedLoopRobot, Loops, cut_windows
 
 __all__ = ["DRIFTS", "HORIZONS", "OpenLoop", "position_metrics", "position_units", "run_open_loop"]
 
@@ -68,7 +68,7 @@ class OpenLoop:
 
 
 def run_open_loop(
-    robot: LoopedRobot,
+    robot: ClosedLoopRobot,
     loops: Loops,
     log: Log,
     others: Mapping[str, Loops] | None = None,
@@ -85,7 +85,7 @@ def run_open_loop(
         horizons: How long open loops run, beside the whole log, before they are put back [s].
 
     Raises:
-        NotConvergedError: If the identified robot cannot be rolled out.
+        NotConvergedError: If the identified robot cannot be simulated.
     """
     q, is_driven = np.full_like(log.q, np.nan), not loops.kp.any()
     length = DRIFTS if is_driven else np.inf
@@ -176,7 +176,7 @@ def _size(e: Array) -> Array:
     return size
 
 
-def _error(robot: LoopedRobot, loops: Loops, log: Log, length: float) -> Array | None:
+def _error(robot: ClosedLoopRobot, loops: Loops, log: Log, length: float) -> Array | None:
     """Return the error of loops put back to the log every so often; None if they run away."""
     try:
         outs = robot.roll_out(loops, cut_windows(log, length, 0.0))

@@ -50,7 +50,7 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
             "on the masses of the URDF and on gravity. What is sure are ratios, as kp over "
             "armature; state kp in [controller], or log a torque, to tell them apart",
         )
-    yield from _torques_missed(found)
+    yield from _torque_mismatches(found)
     if found.is_scaled_by_gain:
         yield Finding("scale", "note", "controller", STATED_SCALE)
     yield from _gains_contradicted(found)
@@ -78,10 +78,10 @@ def _settled_delay(finding: Finding, found: LoopIdentification) -> Finding:
     """Return a finding of the logs; "slow_command" as a note where the delay is known after all."""
     if finding.code != "slow_command":
         return finding
-    estimate, unknowns = found.estimate, found.fit.simulator.unknowns
+    estimate, free_parameters = found.estimate, found.fit.simulator.free_parameters
     errors = [
         float(error)
-        for unknown, error in zip(unknowns, estimate.std_error, strict=True)
+        for unknown, error in zip(free_parameters, estimate.std_error, strict=True)
         if unknown.what == "delay"
     ]
     span = finding.evidence["longest"] - finding.evidence["shortest"]
@@ -161,7 +161,7 @@ def _limits_found(found: LoopIdentification) -> Iterator[Finding]:
     """Yield the largest torques that were found."""
     estimate = found.estimate
     for unknown, value, error in zip(
-        found.fit.simulator.unknowns, estimate.theta, estimate.std_error, strict=True
+        found.fit.simulator.free_parameters, estimate.theta, estimate.std_error, strict=True
     ):
         if unknown.what == "limit":
             joint = found.model.limits[unknown.joints[0]]
@@ -191,16 +191,16 @@ def _soft_loop(left: float) -> Iterator[Finding]:
         )
 
 
-def _torques_missed(found: LoopIdentification) -> Iterator[Finding]:
+def _torque_mismatches(found: LoopIdentification) -> Iterator[Finding]:
     """Yield which logged torques are not those of the loops, though they weigh."""
     simulator = found.fit.simulator
     if simulator.behind is None:
         return
-    missed = simulator.missed_torque(found.estimate.theta)
+    missed = simulator.torque_mismatch(found.estimate.theta)
     for joint, share in zip(found.model.joints, missed.tolist(), strict=True):
         if share > _MISSED:
             yield Finding(
-                "torque_missed",
+                "torque_mismatch",
                 "warning",
                 joint,
                 f"{joint}: its loop and the logged torque, by which gains and friction are scaled, "
@@ -253,7 +253,7 @@ def _encoder_findings(found: LoopIdentification) -> Iterator[Finding]:
             )
         elif margin > CLEAR:
             yield Finding(
-                "encoder_kept",
+                "encoder_uncorrected",
                 "note",
                 joint,
                 f"{joint}: its encoder has zero and sense of the URDF, by gravity, which explains "
@@ -273,7 +273,7 @@ def _untold_encoders(found: LoopIdentification, open_: Sequence[str]) -> Iterato
         margin = max(0.0, *margins)
         names = listed(open_, _NAMED)
         yield Finding(
-            "encoder_open",
+            "encoder_undetermined",
             "note",
             names,
             f"gravity does not tell zero and sense of {names}: they move little, or bear so "

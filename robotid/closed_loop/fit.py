@@ -9,20 +9,25 @@ from robotid._typing import Array, ProgressCallback, ignore_progress, report_sta
 from robotid.closed_loop.drive_torques import find_gains, measured_motion
 from robotid.closed_loop.driven import identified_rows, torque_rows
 from robotid.closed_loop.evaluation import DRIFTS
+from robotid.closed_loop.free_parameters import (
+    FreeParameter,
+    LoopSimulator,
+    free_body_parameters,
+    with_terms,
+)
 from robotid.closed_loop.gain_check import GainScale, gain_scale
 from robotid.closed_loop.initial_values import (
-    drive_unknowns,
     first_loops,
+    free_drive_parameters,
+    free_zeros,
     is_stated,
     likeness,
-    usual_sizes,
-    usual_sizes_of_torques,
-    zero_unknowns,
+    typical_sizes,
+    typical_sizes_of_torques,
 )
 from robotid.closed_loop.second_order import SecondOrder, fit_second_order
 from robotid.closed_loop.settings import LoopSettings, groups_of
 from robotid.closed_loop.term_choice import Tried, candidates, choose
-from robotid.closed_loop.unknowns import LoopSimulator, Unknown, body_unknowns, with_terms
 from robotid.closed_loop.zeros import Encoders, find_encoders, same_encoders
 from robotid.doctor.command_channels import largest_speeds
 from robotid.estimators.estimator import Estimate
@@ -35,7 +40,7 @@ from robotid.logs.data import Log
 from robotid.logs.measured_velocity import is_trustworthy
 from robotid.logs.settings import SignalSettings
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot, Loops, Window, cut_windows, open_loops
+from robotid.simulation.loops import ClosedLoopRobot, Loops, Window, cut_windows, open_loops
 from robotid.simulation.settings import by_joint
 
 __all__ = ["STAGES", "Fitted", "fit_loops", "stated_loops"]
@@ -111,26 +116,26 @@ def fit_loops(
 
     Raises:
         DataError: If a log lacks what is to be compared.
-        NotConvergedError: If nothing that is tried can be rolled out.
+        NotConvergedError: If nothing that is tried can be simulated.
         SettingsError: If a setting does not fit the robot.
     """
     _check_settings(model, logs, loop, settings)
-    begin = _begun_by_torque if loop.kind == "torque" else _begun_by_commands
-    begun = begin(model, logs, loop, settings, signals, progress)
-    simulator, estimator = begun.simulator, begun.estimator
+    begin = _initialise_from_torque if loop.kind == "torque" else _initialise_from_commands
+    initialised = begin(model, logs, loop, settings, signals, progress)
+    simulator, estimator = initialised.simulator, initialised.estimator
     # the URDF's bodies first: with bodies that change, too, many scales suit nearly as well
-    drives = [k for k, unknown in enumerate(simulator.unknowns) if unknown.what != "body"]
+    drives = [k for k, unknown in enumerate(simulator.free_parameters) if unknown.what != "body"]
     few = replace(
         simulator,
         windows=_few(simulator.windows),
-        unknowns=tuple(simulator.unknowns[k] for k in drives),
+        free_parameters=tuple(simulator.free_parameters[k] for k in drives),
     )
     theta = simulator.prior.copy()
     theta[drives] = replace(estimator, rounds=1).fit(few).theta
     simulator = replace(simulator, error=settings.error)
-    is_plain = settings.error == "output" and begun.linear is None
+    is_plain = settings.error == "output" and initialised.linear is None
     for left in reversed(range(_STARTS)):
-        simulator = simulator.begun_better(theta)
+        simulator = simulator.with_better_start(theta)
         if simulator.behind is not None:
             outs = simulator.roll_out(theta, _few(simulator.windows))
             gains, is_last = (simulator.loops(theta), _open_gains(loop, model)), left == 0
@@ -140,14 +145,14 @@ def fit_loops(
         rounds = 1 if left and is_plain else estimator.rounds
         estimate = replace(estimator, rounds=rounds).fit(simulator, theta, exact=simulator.exact)
         theta = estimator.joint_step(simulator, estimate.theta)
-        if begun.linear is not None and simulator.torque is not None:
+        if initialised.linear is not None and simulator.torque is not None:
             estimator = replace(estimator, inflation=_BOTH * estimate.details["inflation"])
     tried: list[Tried] = []
     for _ in range(_PASSES if chooses else 0):
         report_stage(progress, "trying friction", STAGES)
         offered = [
             set_
-            for set_ in candidates(simulator, begun.torque)
+            for set_ in candidates(simulator, initialised.torque)
             if set_[0].name not in simulator.names
         ]
         wide, theta = _with(simulator, estimate.theta, offered)
@@ -160,25 +165,25 @@ def fit_loops(
         simulator, theta = _with(simulator, estimate.theta, taken)
         if simulator.torque is not None:
             own = with_terms(model, simulator.base)
-            rows = torque_rows(identified_rows(own, logs, signals), begun.share)
+            rows = torque_rows(identified_rows(own, logs, signals), initialised.share)
             simulator = replace(simulator, torque=rows)
         estimate = estimator.fit(simulator, theta, exact=simulator.exact)
     scale = None
-    if begun.linear is None:
+    if initialised.linear is None:
         simulator, estimate = refine_steps(simulator, estimator, estimate)
         if is_stated(loop.kp, model).all() and simulator.error == "output":
             scale = gain_scale(simulator, estimator, estimate)
-    chosen = (begun.encoders, tuple(tried), begun.linear, scale)
-    return Fitted(simulator, estimate, begun.plain, *chosen)
+    chosen = (initialised.encoders, tuple(tried), initialised.linear, scale)
+    return Fitted(simulator, estimate, initialised.plain, *chosen)
 
 
 @dataclass(frozen=True, eq=False)
-class _Begun:
+class _Initial:
     """What a fit begins with."""
 
     simulator: LoopSimulator
     estimator: OutputError
-    torque: Array  # usual ones, shape (n,) [N m or N]
+    torque: Array  # typical ones, shape (n,) [N m or N]
     encoders: Encoders
     plain: SecondOrder | None = None
     linear: Identification | None = None
@@ -189,16 +194,16 @@ class _Begun:
         return 1.0 if self.linear is None else _BOTH
 
 
-def _begun_by_commands(
+def _initialise_from_commands(
     model: RobotModel,
     logs: Sequence[Log],
     loop: LoopSettings,
     settings: SimulationSettings,
     signals: SignalSettings | None,
     progress: ProgressCallback,
-) -> _Begun:
+) -> _Initial:
     """Return loops on commands, begun with a plain loop of each joint."""
-    robot = LoopedRobot(model, step=settings.step)
+    robot = ClosedLoopRobot(model, step=settings.step)
     encoders = find_encoders(model, logs) if loop.zeros == "find" else same_encoders(model)
     logs = [log.turned(encoders.sign) for log in logs]
     length, lead = settings.window or _WINDOW, _LEAD if settings.lead is None else settings.lead
@@ -217,37 +222,37 @@ def _begun_by_commands(
     plain = fit_second_order(robot, windows, stated, finds_delay=loop.delay is None)
     groups = groups_of(loop, model.joints, likeness(model))
     top = _largest_speeds(model, loop, logs)
-    usual = usual_sizes(robot, plain, windows, has_gain, top)
+    usual = typical_sizes(robot, plain, windows, has_gain, top)
     finds_limit = (top > 0.0) | (loop.limit == "find")
     base = first_loops(model, stated, plain, usual, finds_limit)
     # positions alone tell the sum of kd and viscous friction
     tells_kd = weighs or all(log.v_ref is not None for log in logs)
-    unknowns = drive_unknowns(
+    free_parameters = free_drive_parameters(
         model, loop, groups, base, usual, tells_kd=tells_kd, finds_limit=finds_limit
     )
-    unknowns += zero_unknowns(model, encoders) if loop.zeros == "find" else []
-    unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
+    free_parameters += free_zeros(model, encoders) if loop.zeros == "find" else []
+    free_parameters += free_body_parameters(robot, settings.bodies) if settings.bodies else []
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
     most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 3)  # positions, speeds, torques
     estimator = OutputError(_NAMES[settings.error], settings.whiten, most, progress=progress)
     simulator = LoopSimulator(
-        robot, windows, base, tuple(unknowns), velocities=settings.velocities, behind=behind
+        robot, windows, base, tuple(free_parameters), velocities=settings.velocities, behind=behind
     )
     report_stage(progress, "fitting loops", STAGES)
     if weighs and behind is None:
         rows = torque_rows(identified_rows(with_terms(model, base), logs, signals))
         simulator = replace(simulator, torque=rows)
-    return _Begun(simulator, estimator, usual.torque, encoders, plain)
+    return _Initial(simulator, estimator, usual.torque, encoders, plain)
 
 
-def _begun_by_torque(
+def _initialise_from_torque(
     model: RobotModel,
     logs: Sequence[Log],
     loop: LoopSettings,
     settings: SimulationSettings,
     signals: SignalSettings | None,
     progress: ProgressCallback,
-) -> _Begun:
+) -> _Initial:
     """Return a robot that the logged torque drives, begun with what its rows tell by themselves.
 
     Where these rows weigh, bodies change about what they tell; else about the URDF's, or stay.
@@ -257,21 +262,25 @@ def _begun_by_torque(
     linear = open_loops(model, found.standard)
     is_urdf = not (settings.torques and settings.bodies)
     base = replace(linear, bodies=stated_loops(model, loop).bodies) if is_urdf else linear
-    robot = LoopedRobot(model, step=settings.step)
+    robot = ClosedLoopRobot(model, step=settings.step)
     length, lead = settings.window or DRIFTS, settings.lead or 0.0
     windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
-    usual = usual_sizes_of_torques(model, found.standard, base.armature, windows)
+    usual = typical_sizes_of_torques(model, found.standard, base.armature, windows)
     groups = groups_of(loop, model.joints, range(len(model.joints)))
     none = np.zeros(len(groups), dtype=bool)
-    unknowns = drive_unknowns(model, loop, groups, base, usual, tells_kd=False, finds_limit=none)
-    unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
-    simulator = LoopSimulator(robot, windows, base, tuple(unknowns), velocities=settings.velocities)
+    free_parameters = free_drive_parameters(
+        model, loop, groups, base, usual, tells_kd=False, finds_limit=none
+    )
+    free_parameters += free_body_parameters(robot, settings.bodies) if settings.bodies else []
+    simulator = LoopSimulator(
+        robot, windows, base, tuple(free_parameters), velocities=settings.velocities
+    )
     report_stage(progress, "fitting loops", STAGES)
     if settings.torques:
         simulator = replace(simulator, torque=torque_rows(found, _BOTH))
     estimator = OutputError(whitens=settings.whiten, frees=True, progress=progress)
     encoders = same_encoders(model)
-    return _Begun(simulator, estimator, usual.torque, encoders, linear=found)
+    return _Initial(simulator, estimator, usual.torque, encoders, linear=found)
 
 
 def refine_steps(
@@ -284,7 +293,7 @@ def refine_steps(
     still moves counts in the covariance; as many steps as that follow would move as much again.
 
     Args:
-        simulator: What rolls out.
+        simulator: What simulates.
         estimator: The estimator.
         estimate: The estimate at the steps of ``simulator``.
 
@@ -296,7 +305,7 @@ def refine_steps(
     step = dt / np.ceil(dt / simulator.robot.step - 1e-9)
     finest, now = step / _FINEST, simulator
     while True:
-        half = replace(simulator, fine=LoopedRobot(model, step=0.5 * step, corrects=True))
+        half = replace(simulator, fine=ClosedLoopRobot(model, step=0.5 * step, corrects=True))
         change, error = estimator.moved(now, half, theta)
         share = float(np.max(np.abs(change) / np.maximum(error, 1e-300), initial=0.0))
         if share <= _MOVED or 0.5 * step < finest:
@@ -318,23 +327,23 @@ def _settled(
     derivatives are not exact, it is a fit from the best starts.
 
     Args:
-        simulator: What rolls out.
+        simulator: What simulates.
         estimator: The estimator.
         estimate: The estimate of earlier starts, or of larger steps.
     """
     if simulator.exact is not None:
-        simulator = simulator.begun_better(estimate.theta)
+        simulator = simulator.with_better_start(estimate.theta)
         return simulator, estimator.fit(simulator, estimate.theta, exact=simulator.exact)
     level, first = np.inf, estimate.theta
     for _ in range(_SETTLING):
-        begun = simulator.begun_better(estimate.theta)
-        found = estimator.settle(begun, estimate)
+        initialised = simulator.with_better_start(estimate.theta)
+        found = estimator.settle(initialised, estimate)
         before, level = level, float(np.mean(np.log(found.sigma)))
         if level > before + _RAISED:
-            simulator = simulator.begun_better(first)
+            simulator = simulator.with_better_start(first)
             return simulator, estimator.fit(simulator, first)
         change = np.abs(found.theta - estimate.theta)
-        simulator, estimate = begun, found
+        simulator, estimate = initialised, found
         if (change <= _MOVED * found.std_error).all():
             break
     return simulator, estimate
@@ -430,10 +439,10 @@ def _open_gains(loop: LoopSettings, model: RobotModel) -> Array:
 
 
 def _with(
-    simulator: LoopSimulator, theta: Array, sets: Sequence[tuple[Unknown, ...]]
+    simulator: LoopSimulator, theta: Array, sets: Sequence[tuple[FreeParameter, ...]]
 ) -> tuple[LoopSimulator, Array]:
     """Return the simulator with further terms, which are 0, and its parameters."""
-    further = [unknown for unknowns in sets for unknown in unknowns]
+    further = [unknown for free_parameters in sets for unknown in free_parameters]
     loops = simulator.base
     terms = [list(own) for own in loops.terms]
     for unknown in further:
@@ -445,5 +454,5 @@ def _with(
         for term in own
     ]
     base = replace(loops, terms=tuple(map(tuple, terms)), values=np.array(values))
-    wide = replace(simulator, base=base, unknowns=(*simulator.unknowns, *further))
+    wide = replace(simulator, base=base, free_parameters=(*simulator.free_parameters, *further))
     return wide, np.concatenate([theta, np.zeros(len(further))])

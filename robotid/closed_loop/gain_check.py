@@ -7,7 +7,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.closed_loop.unknowns import LoopSimulator, Unknown
+from robotid.closed_loop.free_parameters import FreeParameter, LoopSimulator
 from robotid.estimators.estimator import Estimate
 from robotid.estimators.output_error import OutputError
 
@@ -59,11 +59,11 @@ def gain_scale(simulator: LoopSimulator, estimator: OutputError, estimate: Estim
         estimate: The estimate.
 
     Raises:
-        NotConvergedError: If it cannot be rolled out.
+        NotConvergedError: If it cannot be simulated.
     """
     n, c = len(simulator.base.kp), len(estimate.theta)
     gains = tuple(_gains(simulator))
-    wide = replace(simulator, unknowns=(*simulator.unknowns, *gains))
+    wide = replace(simulator, free_parameters=(*simulator.free_parameters, *gains))
     theta = np.concatenate([estimate.theta, [gain.prior for gain in gains]])
     H, g = estimator.normal(wide, estimator.weights(wide, theta), theta, frees=True)
     T = np.zeros((len(theta), c + n))  # parameters of the scales of joints
@@ -80,14 +80,14 @@ def gain_scale(simulator: LoopSimulator, estimator: OutputError, estimate: Estim
     return GainScale(change, spread * error, float(common[0]), float(spread * own[0]))
 
 
-def _gains(simulator: LoopSimulator) -> Iterator[Unknown]:
+def _gains(simulator: LoopSimulator) -> Iterator[FreeParameter]:
     """Yield the gains of all joints as unknowns, of which nothing else is known."""
     for what in _GAINS:
-        if any(unknown.what == what for unknown in simulator.unknowns):
+        if any(unknown.what == what for unknown in simulator.free_parameters):
             continue  # it is found, and follows the other one by itself
         for j, value in enumerate(getattr(simulator.base, what).tolist()):
             joint = simulator.robot.model.joints[j]
-            yield Unknown(f"{joint}.{what} as stated", what, (j,), value, np.inf)
+            yield FreeParameter(f"{joint}.{what} as stated", what, (j,), value, np.inf)
 
 
 def _last(H: Array, g: Array, n: int) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from robotid.exceptions import DataError
 from robotid.findings import Finding
 from robotid.fitting.settings import SimulationSettings
 from robotid.identification.result import Asked
-from robotid.judgement.verdict import alarming
+from robotid.judgement.verdict import blocking
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.prediction import predict_instants
@@ -45,7 +45,7 @@ def identify_loops(
         model: The robot.
         logs: Logs to fit, of its joints in its order, with commands, or with torques if these
             drive the robot.
-        kept: Logs kept apart.
+        kept: Validation Logs.
         loop: What is known of the loops.
         settings: The estimator's.
         signals: How torques become rows, and how late they are.
@@ -57,7 +57,7 @@ def identify_loops(
     Raises:
         DataError: If there is no log, or one has no commands.
         MissingDependencyError: If Numba is not installed.
-        NotConvergedError: If it cannot be rolled out.
+        NotConvergedError: If it cannot be simulated.
         SettingsError: If a setting does not fit the robot.
     """
     if not logs:
@@ -92,7 +92,7 @@ def identify_loops(
     found = identified_loops(model, loop, settings, fitted, *map(tuple, runs))
     found = replace(
         found,
-        alarms=tuple(finding.message for finding in alarming(examined, ignore)),
+        log_errors=tuple(finding.message for finding in blocking(examined, ignore)),
         asked=Asked(told, ignore=tuple(ignore)),
     )
     return replace(found, findings=loop_findings(found, examined))
@@ -107,7 +107,7 @@ def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, 
         driven, found = fitted.linear.urdf_with_drives, fitted.linear.standard
         return {"urdf": open_loops(model, driven), "rows": open_loops(model, found)}
     others = {} if fitted.plain is None else {"second_order": fitted.plain.loops}
-    if loop.kp is not None and not any(u.what == "kp" for u in fitted.simulator.unknowns):
+    if loop.kp is not None and not any(u.what == "kp" for u in fitted.simulator.free_parameters):
         n, stated = len(model.joints), stated_loops(model, loop)
         bare = replace(stated, terms=((),) * n, values=np.zeros(0), armature=np.full(n, 1e-9))
         others["urdf"] = bare

@@ -6,40 +6,40 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robotid._typing import Array
+from robotid.closed_loop.free_parameters import FreeParameter
 from robotid.closed_loop.second_order import SecondOrder
 from robotid.closed_loop.settings import LoopSettings
-from robotid.closed_loop.unknowns import Unknown
 from robotid.closed_loop.zeros import Encoders
 from robotid.robot.drives import DriveTerm, Viscous
 from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot, Loops, Window
+from robotid.simulation.loops import ClosedLoopRobot, Loops, Window
 from robotid.simulation.settings import PerJoint
 
 __all__ = [
-    "UsualSizes",
-    "drive_unknowns",
+    "TypicalSizes",
     "first_loops",
+    "free_drive_parameters",
+    "free_zeros",
     "is_stated",
     "likeness",
-    "usual_sizes",
-    "usual_sizes_of_torques",
-    "zero_unknowns",
+    "typical_sizes",
+    "typical_sizes_of_torques",
 ]
 
-_WIDE = 10.0  # spreads of drives are so many times their usual size: they bind nothing
+_WIDE = 10.0  # spreads of drives are so many times their typical size: they bind nothing
 _SHARE = 0.5  # of the loop's inertia by which gains are unknown, that bodies have to begin with
 _SLOWEST = 0.1  # [s] spread of a delay
 _TURN = 0.3  # [rad or m] spread of an encoder's zero about where it was found
 _LIGHTEST = 0.3  # of the largest such inertia: small joints have a motor behind a gear, too
 _POSES = 50  # that the bodies' inertia is looked at in
-_LEAST = 0.05  # of a usual size, that an inertia begins with, or a gain keeps
+_LEAST = 0.05  # of a typical size, that an inertia begins with, or a gain keeps
 _LIMITED = 0.8  # of the largest torque that was asked for, that a limit begins with
 
 
 @dataclass(frozen=True, eq=False)
-class UsualSizes:
-    """Usual sizes, joint by joint: where unknowns begin, and how far from there they may be.
+class TypicalSizes:
+    """Typical sizes, joint by joint: where unknowns begin, and how far from there they may be.
 
     Attributes:
         inertia: Of the whole loop, shape (n,) [kg m^2 or kg].
@@ -58,15 +58,19 @@ class UsualSizes:
     scale: Array
 
 
-def usual_sizes(
-    robot: LoopedRobot, plain: SecondOrder, windows: Sequence[Window], has_gain: Array, top: Array
-) -> UsualSizes:
-    """Return usual sizes; where a gain is unknown, the bodies' inertia measures all torques.
+def typical_sizes(
+    robot: ClosedLoopRobot,
+    plain: SecondOrder,
+    windows: Sequence[Window],
+    has_gain: Array,
+    top: Array,
+) -> TypicalSizes:
+    """Return typical sizes; where a gain is unknown, the bodies' inertia measures all torques.
 
     A joint at its largest speed, ``top`` if more than 0, gives what friction takes there.
 
     Args:
-        robot: The robot, which can be rolled out.
+        robot: The robot, which can be simulated.
         plain: A plain loop of each joint.
         windows: Windows of the logs.
         has_gain: Joints whose gain is known, shape (n,), bool.
@@ -82,13 +86,13 @@ def usual_sizes(
     asked = _LIMITED * plain.loops.kp * np.abs(error).max(axis=0)
     taken = plain.friction("viscous") * top + plain.friction("coulomb")
     largest = scale * np.where(top > 0.0, np.minimum(taken, asked), asked)
-    return UsualSizes(inertia, bodies, plain.torque * scale, largest, _speed(windows), scale)
+    return TypicalSizes(inertia, bodies, plain.torque * scale, largest, _speed(windows), scale)
 
 
-def usual_sizes_of_torques(
+def typical_sizes_of_torques(
     model: RobotModel, pi: Array, armature: Array, windows: Sequence[Window]
-) -> UsualSizes:
-    """Return usual sizes where torques are logged and no loop is closed.
+) -> TypicalSizes:
+    """Return typical sizes where torques are logged and no loop is closed.
 
     Args:
         model: The robot.
@@ -99,11 +103,11 @@ def usual_sizes_of_torques(
     tau = np.concatenate([w.log.tau[w.counted] for w in windows])
     torque = np.maximum(np.sqrt(np.mean(tau**2, axis=0)), 1e-6)
     inertia, one = _inertia(model, pi, windows), np.ones(len(armature))
-    return UsualSizes(inertia, inertia - armature, torque, np.inf * one, _speed(windows), one)
+    return TypicalSizes(inertia, inertia - armature, torque, np.inf * one, _speed(windows), one)
 
 
 def _inertia(model: RobotModel, pi: Array, windows: Sequence[Window]) -> Array:
-    """Return the usual inertia that each joint moves, shape (n,)."""
+    """Return the typical inertia that each joint moves, shape (n,)."""
     q = np.concatenate([w.log.q[w.counted] for w in windows])
     M = joint_mass_matrices(model, pi, q[:: max(1, len(q) // _POSES)])
     usual: Array = np.median(np.diagonal(M, axis1=1, axis2=2), axis=0)
@@ -111,7 +115,7 @@ def _inertia(model: RobotModel, pi: Array, windows: Sequence[Window]) -> Array:
 
 
 def _speed(windows: Sequence[Window]) -> Array:
-    """Return the usual speed of each joint, shape (n,)."""
+    """Return the typical speed of each joint, shape (n,)."""
     steps = [np.diff(w.log.q[w.counted], axis=0) / _period(w) for w in windows]
     speed: Array = np.maximum(np.sqrt(np.mean(np.concatenate(steps) ** 2, axis=0)), 1e-6)
     return speed
@@ -123,7 +127,7 @@ def _period(window: Window) -> float:
 
 
 def first_loops(
-    model: RobotModel, stated: Loops, plain: SecondOrder, usual: UsualSizes, finds_limit: Array
+    model: RobotModel, stated: Loops, plain: SecondOrder, usual: TypicalSizes, finds_limit: Array
 ) -> Loops:
     """Return the loops that the fit begins with.
 
@@ -131,7 +135,7 @@ def first_loops(
         model: The robot.
         stated: What is stated of the loops.
         plain: A plain loop of each joint.
-        usual: Usual sizes.
+        typical: Typical sizes.
         finds_limit: Joints whose limit is to be found, shape (n,), bool.
     """
     friction = {name: plain.friction(name) * usual.scale for name in ("viscous", "coulomb")}
@@ -156,16 +160,16 @@ def first_loops(
     )
 
 
-def drive_unknowns(
+def free_drive_parameters(
     model: RobotModel,
     loop: LoopSettings,
     groups: Sequence[str],
     base: Loops,
-    usual: UsualSizes,
+    usual: TypicalSizes,
     *,
     tells_kd: bool,
     finds_limit: Array,
-) -> list[Unknown]:
+) -> list[FreeParameter]:
     """Return what is unknown of drives and loops, beginning with what the loops have.
 
     Args:
@@ -173,7 +177,7 @@ def drive_unknowns(
         loop: What is known of the loops.
         groups: Name of the group of each joint.
         base: The loops that the fit begins with.
-        usual: Usual sizes.
+        typical: Typical sizes.
         tells_kd: Whether the logs can show gains of the speed.
         finds_limit: Joints whose limit is to be found, shape (n,), bool.
     """
@@ -209,7 +213,7 @@ def drive_unknowns(
                 begin = float(np.median(getattr(base, what)[list(own)]))
                 wide = _WIDE * float(np.median(spread[what][list(own)]))
                 lowest = _LEAST * begin if what in ("kp", "limit") else 0.0
-                found.append(Unknown(f"{name}.{what}", what, own, begin, wide, lowest))
+                found.append(FreeParameter(f"{name}.{what}", what, own, begin, wide, lowest))
     for group, joints in members.items():
         for term in {t: None for j in joints for t in base.terms[j]}:
             having = [j for j in joints if term in base.terms[j]]
@@ -221,17 +225,19 @@ def drive_unknowns(
 
 
 def _term(
-    owner: str, term: DriveTerm, joints: Sequence[int], base: Loops, usual: UsualSizes
-) -> Unknown:
+    owner: str, term: DriveTerm, joints: Sequence[int], base: Loops, usual: TypicalSizes
+) -> FreeParameter:
     """Return the unknown of a term of one joint, or of several that share it."""
     begin = float(np.median([base.values[base.place(j, term)] for j in joints]))
     size = usual.torque / (usual.speed if isinstance(term, Viscous) else 1.0)
     wide = _WIDE * float(np.median(size[list(joints)]))
     lowest = 0.0 if term.is_nonnegative else -np.inf
-    return Unknown(f"{owner}.{term.name}", "term", tuple(joints), begin, wide, lowest, term=term)
+    return FreeParameter(
+        f"{owner}.{term.name}", "term", tuple(joints), begin, wide, lowest, term=term
+    )
 
 
-def zero_unknowns(model: RobotModel, encoders: Encoders) -> list[Unknown]:
+def free_zeros(model: RobotModel, encoders: Encoders) -> list[FreeParameter]:
     """Return the zeros of encoders that are not the URDF's, near where they were found.
 
     Args:
@@ -239,7 +245,7 @@ def zero_unknowns(model: RobotModel, encoders: Encoders) -> list[Unknown]:
         encoders: Signs and zeros of the encoders.
     """
     return [
-        Unknown(f"{model.joints[j]}.zero", "zero", (int(j),), float(encoders.zero[j]), _TURN)
+        FreeParameter(f"{model.joints[j]}.zero", "zero", (int(j),), float(encoders.zero[j]), _TURN)
         for j in np.flatnonzero(encoders.gain > 0)
     ]
 

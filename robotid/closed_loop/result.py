@@ -8,11 +8,11 @@ import numpy as np
 from robotid._typing import Array
 from robotid.closed_loop.evaluation import OpenLoop, position_metrics
 from robotid.closed_loop.fit import Fitted
+from robotid.closed_loop.free_parameters import with_terms
 from robotid.closed_loop.settings import LoopSettings
-from robotid.closed_loop.unknowns import with_terms
 from robotid.estimators.estimator import Estimate
 from robotid.findings import Finding
-from robotid.fitting.bands import REACH
+from robotid.fitting.bands import QUANTILE
 from robotid.fitting.identified import FROM_PRIOR, Identified, sources_of
 from robotid.fitting.metrics import Metrics
 from robotid.fitting.settings import SimulationSettings
@@ -48,9 +48,9 @@ class LoopIdentification(Identified):
         estimator: The estimator's settings.
         fit: The fit.
         fitted: The fitted logs, with the positions simulated for them.
-        validation: The same of the logs that were kept apart.
+        validation: The same of the validation logs.
         findings: What the user should know.
-        alarms: Faults of the logs that make the result wrong, as the doctor found them.
+        log_errors: Faults of the logs that make the result wrong, as the doctor found them.
         report: File of the report, if one was written with the result.
         asked: Signals and findings to ignore, as they were asked for.
     """
@@ -61,7 +61,7 @@ class LoopIdentification(Identified):
     fitted: tuple[OpenLoop, ...]
     validation: tuple[OpenLoop, ...]
     findings: tuple[Finding, ...] = ()
-    alarms: tuple[str, ...] = ()
+    log_errors: tuple[str, ...] = ()
     report: str = ""
     asked: Asked = field(default_factory=Asked)
 
@@ -84,19 +84,19 @@ class LoopIdentification(Identified):
         return _errors(self.standard_covariance)
 
     @cached_property
-    def standard_reach(self) -> Array:
+    def standard_quantile(self) -> Array:
         """How many standard errors the 95 % interval of each standard parameter reaches, (p,).
 
         The quantile is that of the unknown, of those it follows from, whose standard error has the
         fewest degrees of freedom.
         """
-        own = np.where(self._slopes != 0.0, self.estimate.reach, REACH)
-        reach: Array = own.max(axis=1, initial=REACH)
+        own = np.where(self._slopes != 0.0, self.estimate.reach, QUANTILE)
+        reach: Array = own.max(axis=1, initial=QUANTILE)
         return reach
 
     @property
-    def base_reach(self) -> Array:
-        reach: Array = np.where(self.mapping.K != 0.0, self.standard_reach, REACH).max(axis=1)
+    def base_quantile(self) -> Array:
+        reach: Array = np.where(self.mapping.K != 0.0, self.standard_quantile, QUANTILE).max(axis=1)
         return reach
 
     @property
@@ -122,16 +122,18 @@ class LoopIdentification(Identified):
         """Unknowns that the logs say nothing of, bodies left out."""
         return tuple(
             unknown.name
-            for unknown, share in zip(self.fit.simulator.unknowns, self.shrunk, strict=True)
+            for unknown, share in zip(self.fit.simulator.free_parameters, self.shrunk, strict=True)
             if share > FROM_PRIOR and unknown.what != "body"
         )
 
     @property
     def correlated(self) -> tuple[tuple[str, ...], ...]:
         """Sets of unknowns of loops that are strongly correlated: their ratios are known."""
-        unknowns, C = self.fit.simulator.unknowns, self.estimate.covariance
-        own = [k for k, u in enumerate(unknowns) if u.what != "body" and C[k, k] > 0]
-        return tuple(tuple(unknowns[k].name for k in each) for each in correlated_sets(C, own))
+        free_parameters, C = self.fit.simulator.free_parameters, self.estimate.covariance
+        own = [k for k, u in enumerate(free_parameters) if u.what != "body" and C[k, k] > 0]
+        return tuple(
+            tuple(free_parameters[k].name for k in each) for each in correlated_sets(C, own)
+        )
 
     @property
     def moments(self) -> dict[str, DriveMoments]:
@@ -155,7 +157,7 @@ class LoopIdentification(Identified):
     @property
     def has_gains(self) -> bool:
         """Whether the gains of the position were stated, of every joint."""
-        return not any(unknown.what == "kp" for unknown in self.fit.simulator.unknowns)
+        return not any(unknown.what == "kp" for unknown in self.fit.simulator.free_parameters)
 
     @property
     def is_scaled_by_gain(self) -> bool:
@@ -175,7 +177,7 @@ class LoopIdentification(Identified):
             self.model.joints,
             is_kept=bool(self.validation),
             is_settled=self.estimate.converged,
-            alarms=self.alarms,
+            log_errors=self.log_errors,
             cautions=[f.message for f in self.findings if f.code in _CAUTIONS],
             scale=STATED_SCALE if self.is_scaled_by_gain else "",
         )
@@ -197,7 +199,7 @@ def identified_loops(
         estimator: The estimator's settings.
         fit: The fit.
         fitted: The fitted logs, with the positions simulated for them.
-        validation: The same of the logs that were kept apart.
+        validation: The same of the validation logs.
     """
     model = with_terms(model, fit.loops)
     standard, slopes = fit.simulator.standard(model, fit.estimate.theta)

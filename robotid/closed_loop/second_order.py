@@ -10,22 +10,22 @@ from itertools import product
 import numpy as np
 
 from robotid._typing import Array
-from robotid.closed_loop.unknowns import LoopSimulator, Unknown
+from robotid.closed_loop.free_parameters import FreeParameter, LoopSimulator
 from robotid.estimators.output_error import OutputError
 from robotid.exceptions import NotConvergedError
 from robotid.robot.drives import TERMS
-from robotid.simulation.loops import LoopedRobot, Loops, Window
+from robotid.simulation.loops import ClosedLoopRobot, Loops, Window
 
 __all__ = ["SecondOrder", "fit_second_order"]
 
 _FREQUENCIES = (6.0, 12.0, 24.0, 48.0, 96.0)  # [rad/s] of the loop, that are tried
 _DAMPINGS = (0.5, 1.5)  # of critical
-_FRICTIONS = (0.05, 0.5)  # of the loop's usual torque
+_FRICTIONS = (0.05, 0.5)  # of the loop's typical torque
 _DELAYS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08)  # [s]
 _TRIED = 8  # windows that the tries look at ...
 _FITTED = 16  # ... and the fit
 _SHOWS = 1e-3  # of the inertia of the fastest loop: below it, none is told
-_LEAST = 1e-6  # of the usual inertia, that a joint must have
+_LEAST = 1e-6  # of the typical inertia, that a joint must have
 _TERMS = (TERMS["viscous"], TERMS["coulomb"], TERMS["offset"])
 _STEPS = 12  # of the fit
 
@@ -35,10 +35,10 @@ class SecondOrder:
     """The plain model of every joint; arrays of shape (n,).
 
     Attributes:
-        simulator: What it rolls out with.
+        simulator: What it simulates with.
         theta: Its parameters.
         loops: The same as loops without bodies.
-        torque: Usual torque of the loop, kp rms(q_ref - q) [N m or N].
+        torque: Typical torque of the loop, kp rms(q_ref - q) [N m or N].
     """
 
     simulator: LoopSimulator
@@ -72,7 +72,7 @@ class SecondOrder:
 
 
 def fit_second_order(
-    robot: LoopedRobot, windows: tuple[Window, ...], stated: Loops, *, finds_delay: bool
+    robot: ClosedLoopRobot, windows: tuple[Window, ...], stated: Loops, *, finds_delay: bool
 ) -> SecondOrder:
     """Fit the plain model to windows: a coarse grid of every joint, then least squares.
 
@@ -84,7 +84,7 @@ def fit_second_order(
         finds_delay: Whether the delay is found, joint by joint.
 
     Raises:
-        NotConvergedError: If nothing that is tried can be rolled out.
+        NotConvergedError: If nothing that is tried can be simulated.
     """
     n = len(stated.kp)
     error = np.concatenate([w.log.q_ref[w.counted] - w.log.q[w.counted] for w in windows])  # type: ignore[index]
@@ -98,34 +98,36 @@ def fit_second_order(
         values=np.zeros(n * len(_TERMS)),
     )
     start = _coarse(robot, windows[:_TRIED], bare, torque, finds_delay)
-    unknowns = _unknowns(robot, start, torque, finds_delay)
+    free_parameters = _free_parameters(robot, start, torque, finds_delay)
     some = windows[:: max(1, len(windows) // _FITTED)]
-    simulator = LoopSimulator(robot, some, start, unknowns)
+    simulator = LoopSimulator(robot, some, start, free_parameters)
     theta = OutputError(whitens=False, steps=_STEPS).fit(simulator).theta
     return SecondOrder(simulator, theta, simulator.loops(theta), torque)
 
 
-def _unknowns(
-    robot: LoopedRobot, start: Loops, torque: Array, finds_delay: bool
-) -> tuple[Unknown, ...]:
+def _free_parameters(
+    robot: ClosedLoopRobot, start: Loops, torque: Array, finds_delay: bool
+) -> tuple[FreeParameter, ...]:
     """Return inertia, friction, offset and delay of each joint as unknowns that begin there."""
     found = []
     for j, joint in enumerate(robot.model.joints):
         J = start.armature[j]
-        found.append(Unknown(f"{joint}.armature", "armature", (j,), J, 10 * J, _LEAST * J))
+        found.append(FreeParameter(f"{joint}.armature", "armature", (j,), J, 10 * J, _LEAST * J))
         for k, term in enumerate(_TERMS):
             value = float(start.values[len(_TERMS) * j + k])
             spread = 100 * torque[j] * (10.0 if term.name == "viscous" else 1.0)
             lowest = 0.0 if term.is_nonnegative else -np.inf
             name = f"{joint}.{term.name}"
-            found.append(Unknown(name, "term", (j,), value, spread, lowest, term=term))
+            found.append(FreeParameter(name, "term", (j,), value, spread, lowest, term=term))
         if finds_delay:
-            found.append(Unknown(f"{joint}.delay", "delay", (j,), float(start.delay[j]), 0.1, 0.0))
+            found.append(
+                FreeParameter(f"{joint}.delay", "delay", (j,), float(start.delay[j]), 0.1, 0.0)
+            )
     return tuple(found)
 
 
 def _coarse(
-    robot: LoopedRobot,
+    robot: ClosedLoopRobot,
     windows: tuple[Window, ...],
     bare: Loops,
     torque: Array,
@@ -149,20 +151,20 @@ def _coarse(
     if not np.isfinite(best).all():
         rate = "" if bare.rate is None else f" and a rate other than {bare.rate:g} Hz, or none,"
         raise NotConvergedError(
-            f"no plain loop that was tried can be rolled out; state gains{rate} in [controller]",
+            f"no plain loop that was tried can be simulated; state gains{rate} in [controller]",
             "no start",
         )
     return found
 
 
 def _better(
-    robot: LoopedRobot, windows: tuple[Window, ...], trial: Loops, best: Array, found: Loops
+    robot: ClosedLoopRobot, windows: tuple[Window, ...], trial: Loops, best: Array, found: Loops
 ) -> tuple[Array, Loops]:
     """Return the squares and loops of the joints, those of the trial where it is better."""
     try:
         outs = robot.roll_out(trial, windows)
     except NotConvergedError:
-        return best, found  # this try cannot be rolled out; others can
+        return best, found  # this try cannot be simulated; others can
     cost = sum(((out.window.log.q[out.window.counted] - out.q) ** 2).sum(axis=0) for out in outs)
     better = cost < best
     k = len(_TERMS)

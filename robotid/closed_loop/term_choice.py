@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.closed_loop.unknowns import LoopSimulator, Unknown
+from robotid.closed_loop.free_parameters import FreeParameter, LoopSimulator
 from robotid.diagnosis.selection import Round, Rule
 from robotid.estimators.output_error import OutputError, linearised
 from robotid.robot.drive_term import ANYWHERE
@@ -22,10 +22,10 @@ __all__ = ["Tried", "candidates", "choose"]
 
 _OFFERED = ("stribeck", "load", "position")  # families beside viscous and Coulomb friction
 # Of a joint's squared residual in other windows, whose noise level is 1 a row: bench_commands.py
-_RULE = Rule(most=len(_OFFERED), share=0.02, chance=None, alike=0.0)
+_RULE = Rule(most=len(_OFFERED), share=0.02, p_value=None, alike=0.0)
 _FOLDS = 6
 _FEWEST = 2  # windows: one is judged by what others were fitted to
-_SLOW = 0.3  # of a joint's usual speed, over which Stribeck's hook fades
+_SLOW = 0.3  # of a joint's typical speed, over which Stribeck's hook fades
 _WIDE = 0.05  # [rad or m] of motion from which friction can depend on the position
 
 _log = logging.getLogger(__name__)
@@ -48,12 +48,12 @@ class Tried:
     is_chosen: bool
 
 
-def candidates(simulator: LoopSimulator, torque: Array) -> list[tuple[Unknown, ...]]:
+def candidates(simulator: LoopSimulator, torque: Array) -> list[tuple[FreeParameter, ...]]:
     """Return what friction each joint may have beside viscous and Coulomb's.
 
     Args:
         simulator: The fit without them.
-        torque: Usual torque of each joint, shape (n,), that sizes their spread [N m or N].
+        torque: Typical torque of each joint, shape (n,), that sizes their spread [N m or N].
     """
     model = simulator.robot.model
     q = np.concatenate([w.log.q[w.counted] for w in simulator.windows])
@@ -71,21 +71,23 @@ def candidates(simulator: LoopSimulator, torque: Array) -> list[tuple[Unknown, .
             terms = family.make(seen, *[_SLOW * speed for _ in family.shapes])
             if half <= _WIDE and any(term.guards == "q" for term in terms):
                 continue
-            unknowns = []
+            free_parameters = []
             for term in terms:
                 size = half**term.order if isinstance(term, PositionCoulomb) else 1.0
                 spread = 1.0 if isinstance(term, LoadFriction) else torque[j] / size
                 lowest = 0.0 if term.is_nonnegative else -np.inf
                 name = f"{joint}.{term.name}"
-                unknowns.append(Unknown(name, "term", (j,), 0.0, spread, lowest, term=term))
-            found.append(tuple(unknowns))
+                free_parameters.append(
+                    FreeParameter(name, "term", (j,), 0.0, spread, lowest, term=term)
+                )
+            found.append(tuple(free_parameters))
     return found
 
 
 def choose(
     simulator: LoopSimulator,
     theta: Array,
-    offered: Sequence[tuple[Unknown, ...]],
+    offered: Sequence[tuple[FreeParameter, ...]],
     estimator: OutputError,
 ) -> list[Tried]:
     """Return which candidates lower the residual of windows that they were not fitted to.
@@ -107,7 +109,7 @@ def choose(
             len(simulator.windows), _FEWEST,
         )  # fmt: skip
     place = {name: k for k, name in enumerate(simulator.names)}
-    sets = [[place[unknown.name] for unknown in unknowns] for unknowns in offered]
+    sets = [[place[unknown.name] for unknown in free_parameters] for free_parameters in offered]
     folds = _folds(simulator, theta, estimator)
     rows = sum(fold.rows for fold in folds)  # of one joint, whose noise level is 1
     spare = {k for places in sets for k in places}
@@ -127,17 +129,17 @@ def choose(
         open_sets -= chosen
     return [
         Tried(
-            joints[unknowns[0].joints[0]],
-            tuple(unknown.term.name for unknown in unknowns if unknown.term is not None),
+            joints[free_parameters[0].joints[0]],
+            tuple(unknown.term.name for unknown in free_parameters if unknown.term is not None),
             gains[s],
             s in chosen,
         )
-        for s, unknowns in enumerate(offered)
+        for s, free_parameters in enumerate(offered)
     ]
 
 
 def _by_joint(
-    offered: Sequence[tuple[Unknown, ...]], removed: Mapping[int, Array], rows: int
+    offered: Sequence[tuple[FreeParameter, ...]], removed: Mapping[int, Array], rows: int
 ) -> list[Round[int]]:
     """Return the round of each joint's candidates, by what they remove from each fold."""
     joints: dict[int, dict[int, Array]] = {}

@@ -48,7 +48,7 @@ class Encoders:
         gain: Share of the loops' squared error that leaving the URDF's zero and sense explains.
         explained: Share of the joint's own squared error that gravity explains.
         margin: Squared error of the next best zero or sense, beyond the best's neighbours, over
-            that of the best, less 1; 0 of a joint that slides, or hardly moves.
+            that of the best, less 1; 0 of a prismatic joint, or hardly moves.
         next_sign, next_zero: That next best.
     """
 
@@ -131,7 +131,7 @@ def _descend(
 ) -> tuple[Array, Array, Array, float, Array]:
     """Return sign, zero and gain of the best zeros of joints that are free, and the costs.
 
-    The last two are the cost, and that of each trial of each joint that turns.
+    The last two are the cost, and that of each trial of each revolute joint.
     """
     N, n = motion.q.shape
     sign, zero, gain = np.ones(n), np.zeros(n), np.zeros(n)

@@ -71,7 +71,7 @@ def design_motion(
         if progress is not None:
             progress("designing", start, settings.starts, "starts")
 
-    begun, carried = time.monotonic(), None
+    initialised, carried = time.monotonic(), None
     if settings.kind == "payload":
         carried = design_payload(
             designer, np.random.default_rng(settings.seed), settings.payload,
@@ -81,7 +81,7 @@ def design_motion(
         designer, design = carried.designer, carried.design
     else:
         design = _designed(designer, settings, told)
-    design = replace(design, seconds=time.monotonic() - begun)
+    design = replace(design, seconds=time.monotonic() - initialised)
     course = Course.of_design(designer, design)
     if settings.kind in ROUTES:
         _check_jerk(course, model.joints)
@@ -90,7 +90,7 @@ def design_motion(
         expected = (
             _expected(job, model, design, settings, run, str(target))
             if carried is None
-            else carried.in_words()
+            else carried.described()
         )
     write_motion(design.motion, model.joints, design.duration, settings.points, target)
     content = _content(designer, design, course, settings)

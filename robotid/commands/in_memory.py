@@ -76,7 +76,7 @@ def identify(
         logs: Recordings to fit: a ``Log`` that has the model's joints, the path of a file, a
             DataFrame with the columns of such a file, or several of these. Files are read whole,
             as by ``read_log``; ``robotid.run_job`` reads long ones in pieces.
-        validation: Recordings kept apart to measure the prediction with, likewise.
+        validation: Validation Recordings to measure the prediction with, likewise.
         signals: How logs become trajectories; the defaults if None.
         estimator: Name or settings of the estimator. With "simulation" the robot is simulated on
             the commands of the logs, or on their torques.

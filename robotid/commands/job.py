@@ -209,7 +209,7 @@ class Job(Settings):
         at="output.report",
     )
     identification: tuple[LogEntry, ...] = setting((), "logs to fit")
-    validation: tuple[LogEntry, ...] = setting((), "logs kept apart")
+    validation: tuple[LogEntry, ...] = setting((), "validation logs")
     ignore: tuple[str, ...] = setting(
         (), "codes of the doctor's errors that you know better", at="doctor.ignore"
     )
@@ -230,7 +230,7 @@ class Job(Settings):
     def paths(cls) -> dict[str, Key]:
         """Return what each key says of itself, those too that no field of their own has."""
         friction = Key(
-            "auto: what held-out stretches of the fitted logs ask for, joint by joint (default); "
+            "auto: what held-out segments of the fitted logs ask for, joint by joint (default); "
             f"none; or some of these with + between them: {', '.join([*_PLAIN, *FAMILIES])}"
         )
         others = ", ".join(name for name in ESTIMATORS if name != "consistent")

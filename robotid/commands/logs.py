@@ -134,7 +134,7 @@ class LockedLogs:
         job: The job.
         model: Its robot.
         fitted: Its logs to fit.
-        kept: Its logs kept apart.
+        kept: Its validation logs.
         notes: The joints that were locked so and their positions, if there are any.
     """
 
@@ -156,7 +156,7 @@ def locked_as_logged(
         job: The job.
         model: Its robot.
         fitted: Its logs to fit.
-        kept: Its logs kept apart.
+        kept: Its validation logs.
     """
     there, logs = {}, (*fitted, *kept)
     for joint in [joint for joint in model.locked if joint not in job.placed(model)]:
@@ -186,7 +186,7 @@ def examine_logs(
         job: The job.
         model: Its robot.
         fitted: Its logs to fit.
-        kept: Its logs kept apart.
+        kept: Its validation logs.
 
     Raises:
         SettingsError: If a setting does not fit a log.

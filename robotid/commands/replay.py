@@ -300,7 +300,7 @@ def _torques(job: Job, log: Log, model: RobotModel, robots: Mapping[str, RobotMo
 
 
 def _sure(torque: Array, mask: Array) -> Array:
-    """Return a prediction without the rows of joints that stand still: friction has no sign."""
+    """Return a prediction without the rows of joints at rest: friction has no sign."""
     return np.where(mask, torque, np.nan)
 
 

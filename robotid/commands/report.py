@@ -33,7 +33,7 @@ def rewrite_report(
     """Write the report of a result again, as this version of robotid shows it.
 
     The fit is made again, from the inputs and with the settings that the result names; of drives
-    that follow commands the result is rolled out instead.
+    that follow commands the result is simulated instead.
 
     Args:
         path: A result.json, or its folder.

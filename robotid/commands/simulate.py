@@ -20,7 +20,7 @@ from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
-from robotid.simulation.closed_loop import Run, carried, follow, lateness
+from robotid.simulation.closed_loop import Run, carried, delay, follow
 from robotid.simulation.motions import SampledMotion
 from robotid.simulation.sensors import measure
 from robotid.simulation.settings import Simulation
@@ -94,8 +94,8 @@ def simulate_log(
         model, pi, motion, rate=settings.rate, duration=duration, settings=settings,
         progress=progress or ignore_progress,
     )  # fmt: skip
-    late = lateness(model, pi, settings)
-    log = measure(run, settings.sensors, model.joints, rng, lateness=late)
+    late = delay(model, pi, settings)
+    log = measure(run, settings.sensors, model.joints, rng, delay=late)
     content = _truth(model, pi, settings, run, log) | {
         "urdf": str(job.urdf),
         "motion": {"path": str(files.motion), "sha256": file_sha256(files.motion)},

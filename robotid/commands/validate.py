@@ -17,8 +17,8 @@ from robotid.export.result import (
     load_result,
     stated_model,
     stated_parameters,
+    stated_scale_check,
     stated_urdf_with_drives,
-    stated_witness,
 )
 from robotid.findings import Finding, listed
 from robotid.fitting.evaluation import (
@@ -31,7 +31,7 @@ from robotid.fitting.metrics import Metrics
 from robotid.fitting.survey import SurveyedLog
 from robotid.judgement.evidence import Determined, Predictions
 from robotid.judgement.positions import judge_positions
-from robotid.judgement.verdict import Doubt, Verdict, alarming, doubts_of, judge
+from robotid.judgement.verdict import Verdict, VerdictWarning, blocking, judge, warnings_of
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
 
@@ -88,12 +88,12 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
     runs = [loaded.open_loop(log) for log in logs]
     hashes = {i["sha256"] for i in loaded.content["inputs"] if i["role"] == "identification"}
     is_kept = not any(file_sha256(entry.path) in hashes for entry in entries)
-    alarms = alarming(diagnose(model, (), logs, job.signals), job.ignore)
+    log_errors = blocking(diagnose(model, (), logs, job.signals), job.ignore)
     verdict = judge_positions(
         position_metrics(model, runs, moving=True),
         model.joints,
         is_kept=is_kept,
-        alarms=[finding.message for finding in alarms],
+        log_errors=[finding.message for finding in log_errors],
     )
     return {
         "result": str(loaded.path),
@@ -144,7 +144,7 @@ def _verdict(
         for finding in diagnose(model, fitted, looks, job.signals)
         if finding.where.split(": ")[0] in names and finding.code not in job.ignore
     ]
-    alarms = alarming(found, job.ignore, is_robust=job.estimator.is_robust)
+    log_errors = blocking(found, job.ignore, is_robust=job.estimator.is_robust)
     stated = result["verdict"]
     predictions = Predictions(
         Metrics({}, 0.0),
@@ -162,32 +162,34 @@ def _verdict(
     return judge(
         predictions,
         determined,
-        alarms=list(dict.fromkeys([*stated.get("alarms", ()), *(f.message for f in alarms)])),
-        doubts=list(dict.fromkeys(_doubts(job, model, stated, found, names, missing))),
-        witness=stated_witness(result),
+        log_errors=list(
+            dict.fromkeys([*stated.get("log_errors", ()), *(f.message for f in log_errors)])
+        ),
+        warnings=list(dict.fromkeys(_warnings(job, model, stated, found, names, missing))),
+        scale_check=stated_scale_check(result),
     )
 
 
-def _doubts(
+def _warnings(
     job: Job,
     model: RobotModel,
     stated: Mapping[str, Any],
     found: Sequence[Finding],
     names: Sequence[str],
     missing: Sequence[str],
-) -> list[Doubt]:
+) -> list[VerdictWarning]:
     """Return the doubts of the result, but for its own validation, and those of the new logs."""
-    own = [Doubt(d["code"], d["joint"], d["message"]) for d in stated.get("doubts", ())]
+    own = [VerdictWarning(d["code"], d["joint"], d["message"]) for d in stated.get("warnings", ())]
     is_robust = job.estimator.is_robust
-    doubts = [doubt for doubt in own if doubt.code != "repeated_motion"]
-    doubts += doubts_of(found, model.joints, names, is_robust=is_robust)
+    warnings = [doubt for doubt in own if doubt.code != "repeated_motion"]
+    warnings += warnings_of(found, model.joints, names, is_robust=is_robust)
     if missing:
         message = (
             f"the fitted logs {listed(missing)} are not where they were, or were changed: whether "
             "these recordings hold fitted rows was not looked at"
         )
-        doubts.append(Doubt("fitted_logs_missing", "", message))
-    return doubts
+        warnings.append(VerdictWarning("fitted_logs_missing", "", message))
+    return warnings
 
 
 def _share(one: Log, other: Log) -> bool:

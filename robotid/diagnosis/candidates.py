@@ -16,9 +16,9 @@ __all__ = ["CANDIDATES", "Candidate", "couplings", "ripples"]
 _RIPPLES = np.arange(5, 241)  # times a turn that it may repeat beyond: 200 of a gear of 100 : 1
 _PEAKS = 6  # of them are tried, those at which the residual is most periodic
 _STEEP = 8  # twice the order of the filter, which runs both ways
-_TURNS_OVER = 0.05  # of the usual speed, over which the sign of a coupling's speed turns
-_WINDUP = (0.02, 0.1)  # of the usual way between two reversals, on which a torque is taken up
-_TURNED = 0.05  # of the usual rigid torque, over which the side of a gear changes
+_TURNS_OVER = 0.05  # of the typical speed, over which the sign of a coupling's speed turns
+_WINDUP = (0.02, 0.1)  # of the typical way between two reversals, on which a torque is taken up
+_TURNED = 0.05  # of the typical rigid torque, over which the side of a gear changes
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Candidate:
         families: Friction of a job that has it, see ``FAMILIES``; advised is the first for which
             the joint turned far enough.
         terms: Terms of a job's [drives] that are it, if no family is.
-        units: Unit of the parameter of a joint that turns, and of one that slides; None: the size
+        units: Unit of the parameter of a revolute joint, and of one that slides; None: the size
             is the torque of the term, root mean square.
-        turns: Whether only a joint that turns has it.
+        turns: Whether only a revolute joint has it.
         coupled: The other joint of a coupling; empty for none.
         ratio: Its ratio beside 1 of the joint's own.
         tried: How many such terms it was selected from by the residual.
@@ -127,8 +127,10 @@ def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
 
 def _windup(m: JointMotion) -> Array:
     way = m.travelled[:, None] / (np.array(_WINDUP) * _usual(m, attrgetter("travelled")))
-    taken_up = m.direction[:, None] * np.exp(-way)
-    return np.column_stack([taken_up, np.tanh(m.load / (_TURNED * _usual(m, attrgetter("load"))))])
+    deflection = m.direction[:, None] * np.exp(-way)
+    return np.column_stack(
+        [deflection, np.tanh(m.load / (_TURNED * _usual(m, attrgetter("load"))))]
+    )
 
 
 def _drift(m: JointMotion) -> Array:

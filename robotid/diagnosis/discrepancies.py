@@ -5,7 +5,7 @@ that the estimate gives in its own way. To first order, in all joints together,
 
     tau_measured - tau = W delta + Z x + e,    Z = d tau / d x,
 
-where W delta is what other base parameters may do, and x is refitted without one stretch of the
+where W delta is what other base parameters may do, and x is refitted without one segment of the
 recordings after the other (``misfit``). x is the size of what is otherwise, with its own error.
 """
 
@@ -18,13 +18,13 @@ import numpy as np
 from robotid._typing import Array
 from robotid.diagnosis.decisions import (
     ALTERATION,
-    ALTERATION_CHANCE,
+    ALTERATION_P_VALUE,
     ALTERATION_SHARE,
     CONFIRMED,
-    FAINT,
-    FAINT_CHANCE,
-    FAINT_SIZE,
     SURE,
+    WEAK,
+    WEAK_P_VALUE,
+    WEAK_SIZE,
 )
 from robotid.diagnosis.misfit import Misfit, find_misfits
 from robotid.diagnosis.sample import Sample, Trials, along
@@ -121,7 +121,7 @@ def _columns(misfits: Sequence[Misfit], sample: Sample) -> Array:
 
 
 def _left(sample: Sample, Z: Array) -> float:
-    """Return the squared residual that columns leave of stretches they were not fitted to."""
+    """Return the squared residual that columns leave of segments they were not fitted to."""
     left = Trials(sample, Z).apart.left(list(range(Z.shape[2])))
     return float(left[: sample.fitted].sum())
 
@@ -249,18 +249,18 @@ def _found(fit: Fit, sample: Sample, own: Sequence[_Alteration]) -> Iterator[_Fo
         if best is None:
             return
         kept = float((before - this.left[best])[sample.fitted :].sum()) / max(of_kept, 1e-300)
-        share, by_chance = this.share(best), this.chance(best)
-        has_kept, is_faint = len(total) > sample.fitted, share < ALTERATION_SHARE
+        share, by_p_value = this.share(best), this.p_value(best)
+        has_kept, is_weak = len(total) > sample.fitted, share < ALTERATION_SHARE
         is_confirmed = not has_kept or kept > CONFIRMED * share
-        if is_faint:
-            is_confirmed = has_kept and kept > share > FAINT and by_chance < FAINT_CHANCE
-        if by_chance > ALTERATION_CHANCE or not is_confirmed:
+        if is_weak:
+            is_confirmed = has_kept and kept > share > WEAK and by_p_value < WEAK_P_VALUE
+        if by_p_value > ALTERATION_P_VALUE or not is_confirmed:
             return
         which = untried.pop(best)
         chosen, before = [*chosen, *which], this.left[best]
         sizes, covariance = whole.estimate(chosen, sample.fitted)
         size, error = (x[-len(which) :] for x in (sizes, np.sqrt(np.diag(covariance))))
-        least = best.least * (FAINT_SIZE if is_faint else 1.0)
+        least = best.least * (WEAK_SIZE if is_weak else 1.0)
         if np.linalg.norm(size) < max(least, SURE * float(np.linalg.norm(error))):
             return
         there = sample

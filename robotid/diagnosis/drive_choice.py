@@ -1,8 +1,8 @@
 """Which terms the drive of each joint has: the fewest that explain what was held out.
 
 Terms are tried beside viscous and Coulomb friction, joint by joint, on rows spread over the fitted
-logs. The family that explains most of the stretches left out is taken if it does so beyond chance,
-then the next one beside it, until nothing is left to gain. Recordings kept apart have no say in it.
+logs. The family that explains most of the segments left out is taken if it does so beyond chance,
+then the next one beside it, until nothing is left to gain. Validation Recordings have no say in it.
 
 What a family is not linear in, its shape, is sought on a grid; then all shapes of a joint together,
 with the linear parameters refitted each time (Golub, Pereyra 2003, variable projection).
@@ -23,7 +23,7 @@ from robotid.findings import listed
 from robotid.fitting.drives import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.fitting.result import Solution
 from robotid.regressor.memory import drive_motion_along
-from robotid.robot.drives import FAMILIES, DriveMotion, DriveTerm, Family, MemorylessTerm, Seen
+from robotid.robot.drives import FAMILIES, DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm
 
 __all__ = ["choose_drives"]
 
@@ -45,7 +45,7 @@ class _Drive:
     slides: bool
     motions: tuple[DriveMotion, ...]  # of each recording, all its rows
     taken: tuple[Array, ...]  # rows of each recording in the sample
-    seen: Seen
+    seen: DataRange
     largest: float  # of its torques there, by their size [N m or N]
     plain: Mapping[str, Array]  # what of x is each of its plain parameters, U^T x, by name
     known: dict[DriveTerm, Array] = field(default_factory=dict)  # columns of terms, (N,)
@@ -70,7 +70,7 @@ def choose_drives(
 
     Args:
         fit: What was found with viscous and Coulomb friction alone.
-        wanted: Families that joints are to have, by name; None: those that held-out stretches of
+        wanted: Families that joints are to have, by name; None: those that held-out segments of
             the fitted logs ask for; see ``wanted_families``.
         balanced: Family of the counterbalance of joints whose families are to be chosen.
 
@@ -105,7 +105,7 @@ def choose_drives(
     return tuple(choices)
 
 
-def _seen(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Array) -> Seen:
+def _seen(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Array) -> DataRange:
     """Return the ranges of position and of the size of speed in the rows that count."""
     own = [(m.q[rows], m.v[rows]) for m, rows in zip(motions, taken, strict=True)]
     q, v = (np.concatenate(x)[used] for x in zip(*own, strict=True))
@@ -156,11 +156,11 @@ class _Options:
         return cls(own, place, positive, highest, _trials(sample, drive, flat))
 
     def left(self, chosen: Sequence[int]) -> Array:
-        """Return the squared residual of each stretch with some candidates."""
+        """Return the squared residual of each segment with some candidates."""
         return self.trials.apart.left(self._columns(chosen))
 
     def left_each(self, beside: Mapping[int, Sequence[int]]) -> dict[int, Array]:
-        """Return the squared residual of each stretch with each candidate beside some others.
+        """Return the squared residual of each segment with each candidate beside some others.
 
         Only of those whose parameters have no size that physics forbids: friction is of one sign,
         and below the largest torque of the joint.
@@ -229,7 +229,7 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
         tried += list(_told(every, this, torque, beside, best))
         if found is None or best is None:
             nearest = min(this.left, key=lambda i: float(this.left[i].sum()), default=None)
-            if nearest is not None and this.chance(nearest) < DOUBTED:
+            if nearest is not None and this.p_value(nearest) < DOUBTED:
                 doubted = [every.own[nearest]]
             break
         own = found.own
@@ -338,7 +338,7 @@ def _told(
             by_family[name] = i
     for name, i in by_family.items():
         names = [every.own[k][0].name for k in beside[i]]
-        yield Tried((*names, name), _percent(left[i], torque), this.chance(i), i == best)
+        yield Tried((*names, name), _percent(left[i], torque), this.p_value(i), i == best)
 
 
 def _percent(left: Array, torque: float) -> float:

@@ -32,9 +32,9 @@ class Misfit:
     Attributes:
         joint: The joint.
         term: The term.
-        share: Share of the joint's squared residual that it explains in stretches that were left
+        share: Share of the joint's squared residual that it explains in segments that were left
             out of the fit, beyond the terms found before it [-].
-        chance: How likely that is without such a term [-].
+        p_value: How likely that is without such a term [-].
         confirmed: The same share of the validation recordings; None without one.
         size: Its parameter, or the root mean square of its torque, as the term's units say.
         std_error: Standard error of the size.
@@ -49,7 +49,7 @@ class Misfit:
     joint: str
     term: Candidate
     share: float
-    chance: float
+    p_value: float
     confirmed: float | None
     size: float
     std_error: float
@@ -134,7 +134,7 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
                 joint=sample.joints[j],
                 term=best,
                 share=share,
-                chance=this.chance(best),
+                p_value=this.p_value(best),
                 confirmed=float((kept[1] - kept[2]) / kept[0]) if kept[0] > 0 else None,
                 size=size,
                 std_error=std_error,

@@ -171,7 +171,7 @@ def _finding(misfit: Misfit, found: Fit, on_misfit: Sequence[str]) -> Finding:
         "error_pct": 100 * misfit.error,
         "size": misfit.size,
         "std_error": misfit.std_error,
-        "chance": misfit.chance,
+        "p_value": misfit.p_value,
     }
     if kept is not None:
         evidence["validation_share_pct"] = 100 * kept

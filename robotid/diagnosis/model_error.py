@@ -56,7 +56,7 @@ def with_model_error(
         return found, ()
     motions = _motions(found, sample) if found.drives else []
     found = _wider(found, sample, list(_of_shapes(found, sample, motions)))
-    found = _wider(found, sample, list(_of_doubts(found, sample, motions)))
+    found = _wider(found, sample, list(_of_warnings(found, sample, motions)))
     wider = _wider(found, sample, [_of_misfit(misfit) for misfit in misfits])
     before, after = found.standard_error, wider.standard_error
     drives = np.arange(len(before)) >= found.model.layout.n_inertial
@@ -174,7 +174,7 @@ def settled_shapes(found: Solution) -> "tuple[DriveChoice, ...] | None":
     return tuple(drives) if farthest > _MOVES else None
 
 
-def _of_doubts(found: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
+def _of_warnings(found: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
     """Yield what is open by terms that were nearly taken."""
     for choice in found.drives:
         if not choice.doubted:

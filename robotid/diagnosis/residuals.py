@@ -24,9 +24,9 @@ def spectrum(
     Args:
         x: The signal, shape (N,) [unit].
         used: Rows used, shape (N,), bool.
-        segment: Number of the uninterrupted stretch of each row, shape (N,).
+        segment: Number of the uninterrupted segment of each row, shape (N,).
         dt: Sample period [s].
-        length: Length of a window [s]; that of the longest stretch where it is shorter.
+        length: Length of a window [s]; that of the longest segment where it is shorter.
 
     Returns:
         Frequencies, shape (F,) [Hz], and the one-sided density, shape (F,) [unit^2/Hz]. Its
@@ -58,12 +58,12 @@ def autocorrelation(x: Array, used: NDArray[np.bool_], segment: Array, lags: int
     """Return the autocorrelation of a signal that has gaps and rows left out.
 
     r(k) = sum x(i) x(i + k) / sqrt(sum x(i)^2 sum x(i + k)^2), all over the pairs of used rows in
-    one stretch: by Cauchy and Schwarz it never exceeds 1, however few pairs are so far apart.
+    one segment: by Cauchy and Schwarz it never exceeds 1, however few pairs are so far apart.
 
     Args:
         x: The signal, shape (N,); its mean is not taken out.
         used: Rows used, shape (N,), bool.
-        segment: Number of the uninterrupted stretch of each row, shape (N,).
+        segment: Number of the uninterrupted segment of each row, shape (N,).
         lags: Longest lag [samples].
 
     Returns:

@@ -1,12 +1,12 @@
 """Rows of the recordings to test terms on, and what columns beside the regressor explain of them.
 
-Columns Z of a candidate term join the regressor, and theta is refitted without one stretch of the
+Columns Z of a candidate term join the regressor, and theta is refitted without one segment of the
 logs after the other, base parameters and all:
 
     r = W delta + Z theta + e,    theta = (Z^T M Z)^-1 Z^T M r,    M = 1 - W (W^T W + C^-1)^-1 W^T,
 
 so that what base parameters can explain does not count (Frisch, Waugh 1933); C is their covariance
-before the data. What a term explains of the stretches left out, it explains beyond chance.
+before the data. What a term explains of the segments left out, it explains beyond chance.
 """
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -33,11 +33,11 @@ RIDGE = 1e-4
 _ROWS = 3000  # of all fitted logs, and of all kept ones, that are read
 _NUMBERS = 2**24  # of the regressor in them
 _PER_INDEPENDENT = 2.0  # rows for each that is independent behind the filter
-_STRETCHES = 16  # left out in turn
-_SHORTEST = 10  # independent rows in a stretch
-_FEWEST = 6  # stretches to judge by
+_SEGMENTS = 16  # left out in turn
+_SHORTEST = 10  # independent rows in a segment
+_FEWEST = 6  # segments to judge by
 _NEAR = 0.5  # periods of the filter's cut-off
-_OUTLIER = 12.0  # usual residuals from which a row is left out
+_OUTLIER = 12.0  # typical residuals from which a row is left out
 _FREE = 1e3  # residuals that a column beside the base parameters may explain before the data
 
 OptionT = TypeVar("OptionT", bound=Hashable)
@@ -45,12 +45,12 @@ OptionT = TypeVar("OptionT", bound=Hashable)
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations of the base parameters in K stretches of the rows, all joints together.
+    """Normal equations of the base parameters in K segments of the rows, all joints together.
 
     Attributes:
-        A: W^T W of each stretch, shape (K, b, b).
+        A: W^T W of each segment, shape (K, b, b).
         B: W^T r likewise, shape (K, b).
-        fitted: How many of the stretches are of fitted logs, the first ones.
+        fitted: How many of the segments are of fitted logs, the first ones.
     """
 
     A: Array
@@ -58,27 +58,27 @@ class Normal:
     fitted: int
 
     @classmethod
-    def of(cls, W: Array, r: Array, stretches: Sequence[slice], fitted: int) -> "Normal":
+    def of(cls, W: Array, r: Array, segments: Sequence[slice], fitted: int) -> "Normal":
         """Return those of rows.
 
         Args:
             W: Regressor, shape (N, n, b).
             r: Residual, shape (N, n).
-            stretches: Which of the N rows each has.
+            segments: Which of the N rows each has.
             fitted: How many of them are of fitted logs.
         """
-        rows = [(W[k].reshape(-1, W.shape[2]), r[k].ravel()) for k in stretches]
+        rows = [(W[k].reshape(-1, W.shape[2]), r[k].ravel()) for k in segments]
         A, B = (np.array(x) for x in zip(*[(w.T @ w, w.T @ e) for w, e in rows], strict=True))
         return cls(A, B, fitted)
 
     @cached_property
     def is_fitted(self) -> Array:
-        """Which of the stretches are of fitted logs, shape (K,), bool."""
+        """Which of the segments are of fitted logs, shape (K,), bool."""
         return np.arange(len(self.A)) < self.fitted
 
     @cached_property
     def apart(self) -> tuple[Array, Array]:
-        """What row k of stretches is fitted to that judges it not, (K, K), and its inverses."""
+        """What row k of segments is fitted to that judges it not, (K, K), and its inverses."""
         K, fitted = len(self.A), self.fitted
         used = (self.is_fitted & ~np.eye(K, dtype=bool)).astype(float)
         own, whole = self._inverse(used[:fitted]), self.whole[1]
@@ -86,7 +86,7 @@ class Normal:
 
     @cached_property
     def whole(self) -> tuple[Array, Array]:
-        """All stretches of fitted logs, shape (K,), and the inverse (A + 1)^-1 of their sum."""
+        """All segments of fitted logs, shape (K,), and the inverse (A + 1)^-1 of their sum."""
         used = self.is_fitted.astype(float)
         return used, self._inverse(used)
 
@@ -97,7 +97,7 @@ class Normal:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Rows of the recordings, each joint's over its usual residual, 0 where they are not used.
+    """Rows of the recordings, each joint's over its typical residual, 0 where they are not used.
 
     Attributes:
         joints: Names of the n joints.
@@ -108,14 +108,14 @@ class Sample:
         taken: Which of their rows these are.
         weight: What torques of the rows are multiplied by, shape (N, n) [1/(N m), 1/N].
         torque: Sum of the squared torques of fitted rows, likewise weighted, shape (n,).
-        stretches: Which rows each of the K stretches has, those of the logs kept apart last.
+        segments: Which rows each of the K segments has, those of the validation logs last.
         rows: How many of the rows are of fitted logs.
         W: Regressor of the base parameters over their spread before the data, shape (N, n, b), and
             columns that are refitted beside them.
         r: Residual of the estimate, shape (N, n).
         independent: Which columns of the regressor are those of base parameters, shape (b,), int.
         U: Factor of the covariance of base parameters before the data, C = U^T U, shape (b, b).
-        normal: Normal equations of the stretches, of all joints of the robot.
+        normal: Normal equations of the segments, of all joints of the robot.
     """
 
     joints: tuple[str, ...]
@@ -126,7 +126,7 @@ class Sample:
     taken: tuple[Array, ...]
     weight: Array
     torque: Array
-    stretches: tuple[slice, ...]
+    segments: tuple[slice, ...]
     rows: int
     W: Array
     r: Array
@@ -136,7 +136,7 @@ class Sample:
 
     @property
     def fitted(self) -> int:
-        """How many of the stretches are of fitted logs."""
+        """How many of the segments are of fitted logs."""
         return self.normal.fitted
 
     def beside(self, Z: Array) -> "Sample":
@@ -149,7 +149,7 @@ class Sample:
         size = np.linalg.norm(columns, axis=(0, 1))
         spread = _FREE * np.linalg.norm(self.r) / np.where(size > 0, size, np.inf)
         W = np.concatenate([self.W, columns * spread], axis=2)
-        return replace(self, W=W, normal=Normal.of(W, self.r, self.stretches, self.fitted))
+        return replace(self, W=W, normal=Normal.of(W, self.r, self.segments, self.fitted))
 
     def of_joint(self, j: int) -> "Sample":
         """Return the rows of one joint; the others count by the normal equations alone.
@@ -172,7 +172,7 @@ class Sample:
     @cached_property
     def own(self) -> Normal:
         """Normal equations of its own rows, those of one joint."""
-        return Normal.of(self.W, self.r, self.stretches, self.fitted)
+        return Normal.of(self.W, self.r, self.segments, self.fitted)
 
     def weighed(self, factor: float) -> "Sample":
         """Return the rows of one joint weighed anew.
@@ -191,13 +191,13 @@ class Sample:
         )
 
     def joined(self) -> "Sample":
-        """Return the rows of fitted logs as one stretch, for what is fitted to all of them."""
+        """Return the rows of fitted logs as one segment, for what is fitted to all of them."""
         normal, rows = self.normal, slice(self.rows)
         A, B = (x[: self.fitted].sum(axis=0, keepdims=True) for x in (normal.A, normal.B))
         return replace(
             self,
             weight=self.weight[rows],
-            stretches=(rows,),
+            segments=(rows,),
             W=self.W[rows],
             r=self.r[rows],
             normal=Normal(A, B, 1),
@@ -222,8 +222,8 @@ def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
         del parts[len(fit.fitted) :]
     rows = [k for _, k in parts]
     own = sum(map(len, rows[: len(fit.fitted)]))
-    stretches = _stretches(own, sum(map(len, rows)) - own, independent)
-    number = sum(part.stop <= own for part in stretches)
+    segments = _segments(own, sum(map(len, rows)) - own, independent)
+    number = sum(part.stop <= own for part in segments)
     if model.free_flyer or number < _FEWEST:
         return None
     motion = [e.recording.trajectory.at(k) for e, k in parts]
@@ -252,13 +252,13 @@ def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
         taken=tuple(rows),
         weight=weight,
         torque=np.sum((weight * tau)[:own] ** 2, axis=0),
-        stretches=stretches,
+        segments=segments,
         rows=own,
         W=W,
         r=r,
         independent=mapping.independent,
         U=U,
-        normal=Normal.of(W, r, stretches, number),
+        normal=Normal.of(W, r, segments, number),
     )
 
 
@@ -276,7 +276,7 @@ def along(sample: Sample, model: RobotModel, at: Sequence[Trajectory], tau: Arra
     W = sample.weight[:, :, None] * (Y @ sample.U.T)
     W = np.concatenate([W, sample.W[:, :, W.shape[2] :]], axis=2)
     r = sample.weight * (np.concatenate([motion.tau for motion in at]) - tau)
-    normal = Normal.of(W, r, sample.stretches, sample.fitted)
+    normal = Normal.of(W, r, sample.segments, sample.fitted)
     return replace(sample, at=tuple(at), W=W, r=r, normal=normal)
 
 
@@ -296,11 +296,11 @@ def _spread_rows(
     return rows, min(shares)
 
 
-def _stretches(fitted: int, kept: int, independent: float) -> tuple[slice, ...]:
-    """Return how the rows of fitted and kept recordings are cut into stretches."""
+def _segments(fitted: int, kept: int, independent: float) -> tuple[slice, ...]:
+    """Return how the rows of fitted and validation recordings are cut into segments."""
     edges = [0]
     for rows in (fitted, kept):
-        count = min(_STRETCHES, max(1, int(rows * independent / _SHORTEST))) if rows else 0
+        count = min(_SEGMENTS, max(1, int(rows * independent / _SHORTEST))) if rows else 0
         first = edges[-1]
         edges += [first + rows * (i + 1) // count for i in range(count)]
     return tuple(slice(*pair) for pair in pairwise(edges))
@@ -319,7 +319,7 @@ def _usual_size(r: Array, used: Array) -> Array:
 
 
 def _is_steady(recording: Recording) -> Array:
-    """Return where no reversal of a joint, nor its standing still, is near, shape (N, n), bool.
+    """Return where no reversal of a joint, nor its at rest, is near, shape (N, n), bool.
 
     A drive that sticks there is smeared by the filter, and no friction.
     """
@@ -343,7 +343,7 @@ class Trial:
     Attributes:
         S: [Z r]^T M [Z r] of the rows fitted, shape (..., c + 1, c + 1).
         T: What of the columns of W imitates [Z r], shape (..., b, c + 1).
-        rows: W and [Z r] of each of K stretches, shapes (N_k, b) and (N_k, c + 1).
+        rows: W and [Z r] of each of K segments, shapes (N_k, b) and (N_k, c + 1).
     """
 
     S: Array
@@ -352,7 +352,7 @@ class Trial:
 
     @cached_property
     def H(self) -> Array:
-        """What [Z r] leaves of each stretch after the regressor's fit, (K, c + 1, c + 1)."""
+        """What [Z r] leaves of each segment after the regressor's fit, (K, c + 1, c + 1)."""
         every_T = np.broadcast_to(self.T, (len(self.rows), *self.T.shape[-2:]))
         left = [X - W @ T for (W, X), T in zip(self.rows, every_T, strict=True)]
         return np.array([E.T @ E for E in left])
@@ -372,12 +372,12 @@ class Trial:
     def estimate(self, which: Sequence[int], fitted: int) -> tuple[Array, Array]:
         """Return the parameters of some columns and their covariance, shapes (k,) and (k, k).
 
-        Of a fit to all rows; from scores that scatter from stretch to stretch, as noise of any
+        Of a fit to all rows; from scores that scatter from segment to segment, as noise of any
         colour does.
 
         Args:
             which: The k columns.
-            fitted: How many of the stretches are of fitted logs.
+            fitted: How many of the segments are of fitted logs.
         """
         theta, S = self.parameters(which), self.S[which][:, which]
         H = self.H[:fitted, which]
@@ -387,7 +387,7 @@ class Trial:
         return theta, covariance
 
     def left(self, which: Sequence[int] | Array) -> Array:
-        """Return the squared residual of each stretch with some columns fitted, shape (K,).
+        """Return the squared residual of each segment with some columns fitted, shape (K,).
 
         Args:
             which: The k columns; or m choices of k, shape (m, k), for residuals (K, m).
@@ -401,7 +401,7 @@ class Trial:
         return left
 
     def left_each(self, choices: Mapping[OptionT, Sequence[int]]) -> dict[OptionT, Array]:
-        """Return the squared residual of each stretch with columns of each option, shapes (K,).
+        """Return the squared residual of each segment with columns of each option, shapes (K,).
 
         Args:
             choices: Columns of each option.
@@ -449,25 +449,25 @@ class Trials:
 
     @cached_property
     def apart(self) -> Trial:
-        """Fitted without the stretch that judges."""
+        """Fitted without the segment that judges."""
         return self._trial(*self.sample.normal.apart)
 
     @cached_property
     def whole(self) -> Trial:
-        """Fitted to all stretches of fitted logs."""
+        """Fitted to all segments of fitted logs."""
         return self._trial(*self.sample.normal.whole)
 
     @cached_property
     def _rows(self) -> list[tuple[Array, Array]]:
-        """W and X = [Z r] of each stretch."""
+        """W and X = [Z r] of each segment."""
         W, r, weight = self.sample.W, self.sample.r, self.sample.weight
         X = np.concatenate([weight[..., None] * self.Z, r[..., None]], axis=2)
         return [(W[k].reshape(-1, W.shape[2]), X[k].reshape(-1, X.shape[2]))
-                for k in self.sample.stretches]  # fmt: skip
+                for k in self.sample.segments]  # fmt: skip
 
     @cached_property
     def _products(self) -> tuple[Array, Array]:
-        """X^T X and W^T X of each stretch, shapes (K, c + 1, c + 1) and (K, b, c + 1)."""
+        """X^T X and W^T X of each segment, shapes (K, c + 1, c + 1) and (K, b, c + 1)."""
         D = np.array([X.T @ X for _, X in self._rows])
         B = np.array([W.T @ X for W, X in self._rows])
         B[:, :, -1] = self.sample.normal.B  # other joints know of the base parameters, too

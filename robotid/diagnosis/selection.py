@@ -16,9 +16,9 @@ from scipy.special import stdtr
 
 from robotid._typing import Array
 
-__all__ = ["Round", "Rule", "chance", "select"]
+__all__ = ["Round", "Rule", "p_value", "select"]
 
-_STILL = 1e-9  # of the squared residual of another segment: the joint stands still in it
+_STILL = 1e-9  # of the squared residual of another segment: the joint is at rest in it
 _FEWEST = 3  # segments that show chance
 _NOTHING = 1e-300
 
@@ -32,13 +32,13 @@ class Rule:
     Attributes:
         most: Options that are found, at most.
         share: Share of the squared residual from which an option is found [-].
-        chance: p-value of an option that is found, at most [-]; None: it is not tested.
+        p_value: p-value of an option that is found, at most [-]; None: it is not tested.
         alike: Share of the squared residual within which options explain alike [-].
     """
 
     most: int
     share: float
-    chance: float | None
+    p_value: float | None
     alike: float
 
 
@@ -76,13 +76,13 @@ class Round(Generic[Option]):
         """
         return self.gain(option) / max(self.whole, _NOTHING)
 
-    def chance(self, option: Option) -> float:
+    def p_value(self, option: Option) -> float:
         """Return the p-value of what an option gains [-].
 
         Args:
             option: The option.
         """
-        return chance(self.before, self.left[option], self.fitted)
+        return p_value(self.before, self.left[option], self.fitted)
 
     def alike(self, rule: Rule, tried: Callable[[Option], int] = lambda option: 1) -> list[Option]:
         """Return the options that may be found and explain as much as the best of them.
@@ -97,7 +97,7 @@ class Round(Generic[Option]):
             for share in [self.share(option)]
             if share > rule.share
             and self.gain(option) > self.least
-            and (rule.chance is None or tried(option) * self.chance(option) < rule.chance)
+            and (rule.p_value is None or tried(option) * self.p_value(option) < rule.p_value)
         }
         largest = max(shares.values(), default=0.0)
         return [option for option, share in shares.items() if share >= largest - rule.alike]
@@ -141,11 +141,11 @@ def select(
             return
 
 
-def chance(before: Array, after: Array, fitted: int) -> float:
+def p_value(before: Array, after: Array, fitted: int) -> float:
     """Return how likely segments gain that much, in the mean of their shares, by chance [-].
 
     By Student's test of the shares, each between -1 and 1, of the segments of fitted logs or of
-    all, whichever is surer; those in which the joint stands still do not count.
+    all, whichever is surer; those in which the joint is at rest do not count.
 
     Args:
         before: Squared residual of each segment, shape (K,).

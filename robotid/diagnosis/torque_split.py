@@ -27,12 +27,12 @@ __all__ = ["JointTorque", "Rows", "TorqueSplit", "joint_torques", "split_torque"
 
 _RIGID = ("gravity", "inertia", "Coriolis")
 _ROWS = 4000  # of all recordings together that are split
-_STRETCHES = 16  # left out in turn
-_SHORTEST = 10  # independent rows in a stretch
-_OUTLIER = 12.0  # usual residuals from which a row is left out
+_SEGMENTS = 16  # left out in turn
+_SHORTEST = 10  # independent rows in a segment
+_OUTLIER = 12.0  # typical residuals from which a row is left out
 _QUARTERS = 4  # of a recording, between which its residual may drift; and pieces of each
 _ROUNDING = 1e-10  # of the torque, below which a part is none
-_SLOW = 0.25  # of the usual speed: below it is low speed
+_SLOW = 0.25  # of the typical speed: below it is low speed
 _FORGOTTEN = 0.5  # share that is as quick as noise, from which the rest needs no other reason
 _ADVICE = {
     "constant": "Zero the torque sensor, and look for a spring or a weight that the model lacks",
@@ -145,8 +145,8 @@ class Rows:
         recordings: Names of the recordings.
         t: Time stamps, shape (N,) [s].
         recording: Which recording each row is of, shape (N,), int.
-        segment: Which uninterrupted stretch of it, shape (N,), int.
-        stretches: Which of the stretches that are left out in turn, shape (N,), int; None if the
+        segment: Which uninterrupted segment of it, shape (N,), int.
+        segments: Which of the segments that are left out in turn, shape (N,), int; None if the
             recordings are too short for six.
     """
 
@@ -154,7 +154,7 @@ class Rows:
     t: Array
     recording: Array
     segment: Array
-    stretches: Array | None
+    segments: Array | None
 
     @property
     def time(self) -> Array:
@@ -248,11 +248,11 @@ class JointTorque:
             return ()
         used = self.used & (np.abs(r) <= _OUTLIER * np.median(np.abs(r[self.used])))
         everywhere, piece = np.zeros(int(used.sum()), dtype=int), self.rows.pieces[used]
-        stretches = None if self.rows.stretches is None else self.rows.stretches[used]
-        found = [follow("constant", self.unit, r[used], r[used], everywhere, stretches)]
+        segments = None if self.rows.segments is None else self.rows.segments[used]
+        found = [follow("constant", self.unit, r[used], r[used], everywhere, segments)]
         for name, (unit, x) in self.quantities.items():
             if np.ptp(x[used]) > 0:
-                found.append(follow(name, unit, x[used], r[used], even_bins(x[used]), stretches))
+                found.append(follow(name, unit, x[used], r[used], even_bins(x[used]), segments))
         left = self._less_best(found)[0]
         quarter = np.unique(piece // _QUARTERS, return_inverse=True)[1]
         time = follow("time", "s", self.rows.time[used], left[used], quarter, piece)
@@ -291,7 +291,7 @@ class JointTorque:
         if best is not None:
             advice = _CHANGED if self._has_changed(best.name) else _ADVICE[best.name]
             return f"{left} and {self._said(best)}. {advice}"
-        if self.quick is None or self.rows.stretches is None:
+        if self.quick is None or self.rows.segments is None:
             return f"{left}; too little was recorded to tell what it follows"
         quick = f"{_percent(self.quick)} of its square is as quick as noise"
         if self.quick >= _FORGOTTEN:
@@ -323,7 +323,7 @@ class JointTorque:
 def joint_torques(found: Fit) -> tuple[JointTorque, ...]:
     """Return the torque of each row, split, and what its residual follows.
 
-    It is that of the recordings kept apart, or of the fitted ones without any; of at most 4000
+    It is that of the validation recordings, or of the fitted ones without any; of at most 4000
     samples spread over what is at hand of them.
 
     Args:
@@ -360,7 +360,7 @@ def _torques_of(found: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTor
             "acceleration": (f"{angle}/s^2", a[:, j]),
             "load": (model.row_units[j], load[:, j]),
         }
-        if model.is_static:  # its samples are means of stretches, without speeds
+        if model.is_static:  # its samples are means of segments, without speeds
             quantities = {name: quantities[name] for name in ("position", "load")}
         judged.append(
             JointTorque(
@@ -394,19 +394,19 @@ def spread_rows(count: int, most: int) -> Array:
 
 
 def _rows(own: Sequence[tuple[Evaluation, Array]]) -> Rows:
-    """Return samples of recordings, cut into stretches long enough to be left out in turn."""
+    """Return samples of recordings, cut into segments long enough to be left out in turn."""
     counts = [len(k) for _, k in own]
     independent = sum(
         min(len(k), independent_share(e.recording.signals) * len(e.recording.trajectory.t))
         for e, k in own
     )
-    many, total = min(_STRETCHES, int(independent / _SHORTEST)), sum(counts)
+    many, total = min(_SEGMENTS, int(independent / _SHORTEST)), sum(counts)
     return Rows(
         recordings=tuple(e.recording.name for e, _ in own),
         t=np.concatenate([e.recording.trajectory.t[k] for e, k in own]),
         recording=np.repeat(np.arange(len(own)), counts),
         segment=np.concatenate([e.recording.trajectory.segment[k] for e, k in own]),
-        stretches=np.arange(total) * many // total if many >= FEWEST else None,
+        segments=np.arange(total) * many // total if many >= FEWEST else None,
     )
 
 

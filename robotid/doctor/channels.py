@@ -18,10 +18,10 @@ from robotid.logs.settings import SignalSettings
 
 __all__ = ["check_channels"]
 
-_SPIKE = 15.0  # a row this many times farther off its neighbours than usual is a spike
+_SPIKE = 15.0  # a row this many times farther off its neighbours than typical is a spike
 _BEYOND = 1.5  # ... if it is also farther off than this many times what the channel ever is
 _RESTING = 3.0  # within so many times its noise a channel stays at a value
-_LEAST = {"q": 1e-3, "dq": 0.02}  # [rad or m, rad/s or m/s] less than this is standing still
+_LEAST = {"q": 1e-3, "dq": 0.02}  # [rad or m, rad/s or m/s] less than this is at rest
 _LEAST_TORQUE = 0.01  # of the median joint's torque that is as good as none
 _ABSURD = 5.0  # a spike this many times what the channel ever is cannot be motion
 _HARM = 0.02  # share of a channel's energy in its spikes that ruins a least-squares fit
@@ -44,7 +44,7 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         few steps unless they are differentiated, else a note; "spikes" per channel: an error where
         they are absurd and strong enough to ruin a fit; notes "noise" per kind of channel and
         "noisy_torque" where noise prevails; of measured velocities an error "velocity_order" for
-        each that is the derivative of another joint's position, "unlike_velocity" for each other
+        each that is the derivative of another joint's position, "velocity_mismatch" for each other
         one that is not that of its own: an error where they are used, a warning where "auto"
         leaves them out, else a note; at most one "velocity_delay", with the scatter over the
         joints as its uncertainty, and "velocity_scale" per joint: an error where they are used,
@@ -160,7 +160,7 @@ def _unlike_velocity(log: Log, velocity: str) -> Iterator[Finding]:
             f"0.3 s): the channel holds noise or another quantity; correct it, {todo}"
         )
         yield log_finding(
-            log.name, "unlike_velocity", severity, message, f"dq_{joint}", correlation=alike
+            log.name, "velocity_mismatch", severity, message, f"dq_{joint}", correlation=alike
         )
 
 
@@ -173,17 +173,17 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     error = max(scatter / np.sqrt(max(len(used), 1)), 0.02 * step)
     if abs(lag) < max(_LAG, 3 * error, 0.1 * step):
         return
-    is_late = abs(lag) >= LATE
+    is_delayed = abs(lag) >= LATE
     what = (
         "velocity = 'auto' takes it only if it predicts torque as well as the differentiated one"
-        if is_late
+        if is_delayed
         else "if the torque is as late, keep velocity = 'measured'; else differentiate"
     )
     message = (
         f"the measured velocity is {1e3 * lag:.1f} +- {1e3 * error:.1f} ms late against d(q)/dt; "
         f"{what}, or state [signals] velocity_delay = {lag + stated:z.4f}"
     )
-    severity = "warning" if is_late else "note"
+    severity = "warning" if is_delayed else "note"
     yield log_finding(log.name, "velocity_delay", severity, message, delay=lag, std_error=error)
 
 
@@ -241,7 +241,7 @@ def _jumps(off: Array, noise: float, reach: float) -> tuple[Array, Array]:
 
 
 def _reach(x: Array, smooth: Array, noise: float) -> float:
-    """Return how far a channel goes from its usual value, spikes apart.
+    """Return how far a channel goes from its typical value, spikes apart.
 
     A joint that rests most of the log is judged by the rest of it.
     """

@@ -16,11 +16,11 @@ _GAP = 2.5  # a step longer than this many median steps is a gap
 _LONG = 0.05  # [s] ... if it is longer than this, too
 _SET = 1.0  # [s] a gap this long over which the position goes on as in one step is none
 _STALE = 0.05  # share of stale rows that is more than a blemish
-_STILL = 0.02  # [rad/s, of a slider at rest m/s] slower than this a joint stands still
+_STILL = 0.02  # [rad/s, of a slider at rest m/s] slower than this a joint is at rest
 _REST = 1.0  # [s] a rest this long at an end is reported
 _STATIC = 1e-3  # [rad or m] a joint that moves less than this does not move
 _HARDLY = 0.2  # [rad] a joint that moves less than this hardly does
-_HARDLY_SLIDES = 0.05  # [m] the same of a joint that slides
+_HARDLY_SLIDES = 0.05  # [m] the same of a prismatic joint
 _MOVING = 0.1  # share of the log below which a joint's motion is thin
 
 
@@ -62,7 +62,7 @@ def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterato
         if reach < _STATIC:
             code, severity = "static_joint", "warning"
             message = (
-                f"{joint} stands still (range {reach:.2g}): its friction, its inertia and much of "
+                f"{joint} is at rest (range {reach:.2g}): its friction, its inertia and much of "
                 "what it carries cannot be identified from this log; move it, or lock it"
             )
         elif reach < (_HARDLY_SLIDES if joint in layout.prismatic else _HARDLY) or share < _MOVING:
@@ -119,7 +119,7 @@ def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
         message = (
             f"the clock jumps by {jump:.6g} s at t = {log.t[k]:.10g} s while the position goes on "
             "as in one step: the clock was set while it logged, and both sides are taken for "
-            f"stretches of their own; take {jump:.6g} s off the later time stamps, or log a "
+            f"segments of their own; take {jump:.6g} s off the later time stamps, or log a "
             "monotonic clock"
         )
         evidence = {"jump": jump, "at": float(log.t[k]), "steps": float(is_set.sum())}

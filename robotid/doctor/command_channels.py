@@ -15,8 +15,8 @@ from robotid.logs.measured_velocity import quantum
 
 __all__ = ["check_commands", "largest_speeds"]
 
-_SECONDS = 5.0  # [s] of the stretches whose spectra are averaged
-_GAP = 5  # median steps from which a gap ends the stretch that is looked at
+_SECONDS = 5.0  # [s] of the segments whose spectra are averaged
+_GAP = 5  # median steps from which a gap ends the segment that is looked at
 _COHERENT = 0.8  # share of a position's spectrum that its command explains, from which it counts
 _EXCITED = 1e-4  # of its strongest frequency, below which a command does not excite
 _SUREST = 0.999  # coherence beyond which no response is known: joints are not linear
@@ -57,10 +57,10 @@ def check_commands(log: Log) -> Iterator[Finding]:
 
     Yields:
         A note "no_torque"; a note "loops", of bandwidth and lag of each joint; a note
-        "held_command"; a warning "commands_alike" per group of joints
-        that are told the same; an error "late_command" of joints that move before their command;
+        "repeated_command"; a warning "proportional_commands" per group of joints
+        that are told the same; an error "delayed_command" of joints that move before their command;
         warnings "slow_command", "small_command", "saturated", "slow_sampling" and a warning
-        "gives_way" of joints that move though they are told to stand.
+        "moved_by_others" of joints that move though they are told to stand.
     """
     if not log.has_torque:
         yield _without_torque(log)
@@ -93,7 +93,7 @@ def largest_speeds(log: Log) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class _Loop:
-    """The loop of one joint, in the longest stretch of a log without a gap."""
+    """The loop of one joint, in the longest segment of a log without a gap."""
 
     log: Log
     joint: int
@@ -109,7 +109,7 @@ class _Loop:
 
     @cached_property
     def rows(self) -> slice:
-        """The longest stretch without a gap."""
+        """The longest segment without a gap."""
         breaks = np.flatnonzero(np.diff(self.log.t) > _GAP * self.step) + 1
         edges = np.array([0, *breaks, len(self.log.t)])
         k = int(np.argmax(np.diff(edges)))
@@ -147,9 +147,9 @@ class _Loop:
         told, seen = welch(self.told, **how)[1], welch(self.q, **how)[1]
         share = np.abs(both) ** 2 / np.where(told * seen > 0, told * seen, np.inf)
         used = (share > _COHERENT) & (told > _EXCITED * told.max()) & (f > 0)
-        stretches = 2 * len(self.q) / n - 1
+        segments = 2 * len(self.q) / n - 1
         share = np.minimum(share[used], _SUREST)
-        return f[used], both[used] / told[used], 2 * stretches * share / (1 - share)
+        return f[used], both[used] / told[used], 2 * segments * share / (1 - share)
 
     @cached_property
     def bandwidth(self) -> float:
@@ -270,7 +270,7 @@ def _shown(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
 
 
 def _held(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
-    """Yield whether smooth commands are renewed less often than they are logged."""
+    """Yield whether smooth commands are updated less often than they are logged."""
     rows: dict[str, Array] = {}
     for loop in loops:
         changes = np.flatnonzero(np.diff(loop.told))
@@ -286,14 +286,14 @@ def _held(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     mean, step = float(lengths.mean()), loops[0].step
     span = f"{least}" if least == most else f"{least} to {most}"
     message = (
-        f"the command of {listed(rows)} is renewed every {span} rows, {1 / (mean * step):.3g} "
+        f"the command of {listed(rows)} is updated every {span} rows, {1 / (mean * step):.3g} "
         f"times a second in the mean, and held for {1e3 * mean * step:.3g} ms: this acts as a "
         f"delay of half of that; simulate the rows as they are held, or {500 * mean * step:.2g} ms "
         "are taken for the drive's own delay"
     )
     part = "" if len(rows) == len(log.joints) else listed(rows)
     yield log_finding(
-        log.name, "held_command", "note", message, part, rows=mean, period=mean * step
+        log.name, "repeated_command", "note", message, part, rows=mean, period=mean * step
     )
 
 
@@ -323,7 +323,7 @@ def _alike(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
             "inertia and friction; give each joint frequencies or phases of its own"
         )
         yield log_finding(
-            log.name, "commands_alike", "warning", message, listed(names),
+            log.name, "proportional_commands", "warning", message, listed(names),
             correlation=float(least), joints=len(names),
         )  # fmt: skip
 
@@ -340,7 +340,7 @@ def _early(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
             "sent to the drive, when it is sent"
         )
         yield log_finding(
-            log.name, "late_command", "error", message, loop.name, lag=lag, std_error=error
+            log.name, "delayed_command", "error", message, loop.name, lag=lag, std_error=error
         )
 
 
@@ -476,5 +476,5 @@ def _gives_way(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
             "way, as its gains are low for its load; fix the base, and fit this joint's stiffness"
         )
         yield log_finding(
-            log.name, "gives_way", "warning", message, loop.name, size=size, share=share
+            log.name, "moved_by_others", "warning", message, loop.name, size=size, share=share
         )

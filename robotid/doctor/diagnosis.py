@@ -31,9 +31,9 @@ __all__ = ["CODES", "check_logs", "diagnose", "findings_to_dict"]
 
 #: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
 CODES = (
-    "gravity", "gravity_compensated", "joint_axis", "joint_order", "late_command",
+    "gravity", "gravity_compensated", "joint_axis", "joint_order", "delayed_command",
     "locked_position", "position_offset", "position_order", "position_sign", "spikes",
-    "torque_order", "torque_sign", "unlike_velocity", "unsigned_torque", "velocity_order",
+    "torque_order", "torque_sign", "velocity_mismatch", "unsigned_torque", "velocity_order",
     "velocity_scale",
 )  # fmt: skip
 
@@ -51,7 +51,7 @@ def check_logs(
         model: The robot.
         logs: Logs to fit, one or several: of the model's joints in its order, or paths or
             DataFrames that hold them.
-        validation: Logs kept apart, likewise.
+        validation: Validation Logs, likewise.
         signals: How logs become trajectories; the defaults if None.
 
     Returns:
@@ -78,7 +78,7 @@ def diagnose(
     Args:
         model: The robot.
         fitted: Logs to fit, of the model's joints in its order.
-        kept: Logs kept apart to validate with.
+        kept: Validation Logs to validate with.
         signals: How the logs become trajectories.
 
     Returns:

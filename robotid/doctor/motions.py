@@ -48,9 +48,9 @@ def check_repeated_motion(
     from scipy.spatial import cKDTree
 
     size = np.maximum(np.ptp(kept.q, axis=0), 1e-3)
-    seen = _stretches(kept, size, _INSTANTS)
+    seen = _segments(kept, size, _INSTANTS)
     share = 0.0
-    for known in [_stretches(motion, size, None) for motion in fitted if len(seen)]:
+    for known in [_segments(motion, size, None) for motion in fitted if len(seen)]:
         if len(known):
             distance, _ = cKDTree(known).query(seen, p=np.inf, distance_upper_bound=_NEAR)
             share = max(share, float(np.mean(np.isfinite(distance))))
@@ -125,7 +125,7 @@ def excitation_finding(wls: Estimate, known: Determination, name: str) -> Findin
     is_poor = is_poorly_excited(wls, count)
     if known.groups:
         advice = f"record {_RICHER[:-1]}" if is_poor else f"{_LOST}: faster motion would show more"
-        message += f": {known.in_words()}; {advice}"
+        message += f": {known.described()}; {advice}"
     elif is_poor:
         left = 100 * known.shrinkage[-1]
         message += f"; the least known sum keeps {left:.2g} % of its plausible spread: {_RICHER}"
@@ -146,7 +146,7 @@ def is_poorly_excited(wls: Estimate, count: int) -> bool:
     return wls.rank < count or wls.condition > _ILL_CONDITIONED
 
 
-def _stretches(motion: Trajectory, size: Array, count: int | None) -> Array:
+def _segments(motion: Trajectory, size: Array, count: int | None) -> Array:
     """Return the positions now and a little later, in units of the size, where something moves."""
     step = float(np.median(np.diff(motion.t)))
     ahead = [round(s / step) for s in _AHEAD]

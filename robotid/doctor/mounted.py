@@ -15,7 +15,7 @@ from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
-from robotid.regressor.factors import Reduction, compress_stretches
+from robotid.regressor.factors import Reduction, compress_segments
 from robotid.regressor.rows import keep_inertial_rows
 from robotid.regressor.used_rows import base_problem, row_mask
 from robotid.robot.bodies import link_places
@@ -28,12 +28,12 @@ _LIGHTER = 4.0  # drop of the misfit, of a factor 7 in likelihood, from which a 
 _ALIKE = 2.0  # misfits that differ by less are alike
 _LIGHT = 0.02  # of the arm's mass, below which a part is not missed
 _NO_LOAD = 1e-6  # [kg, kg m] spread of a payload that is left out
-_CHANCE = 3e-7  # that a log without another load seems to have one, as of five standard errors
+_P_VALUE = 3e-7  # that a log without another load seems to have one, as of five standard errors
 _NOTHING = 0.01  # share of the arm's mass that a change of load has at least
 _CLEARLY = 1.5  # how many times more the logs leave if torques have other scales, not a load
 _ROWS = 2000  # of a motion: more say nothing new behind the filter
-_STRETCH = 0.4  # [s] longer than the correlation of noise
-_STRETCHES = 24
+_SEGMENT = 0.4  # [s] longer than the correlation of noise
+_SEGMENTS = 24
 
 
 def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
@@ -103,11 +103,11 @@ class Segments:
     def _of(self, motion: Trajectory) -> Iterator[Reduction]:
         thin = motion.every(max(1, len(motion.t) // _ROWS))
         keep_inertial_rows(self.model, thin)  # whose excitation is looked at, too
-        count = int(np.clip(np.ptp(thin.t) / _STRETCH, 1, _STRETCHES))
+        count = int(np.clip(np.ptp(thin.t) / _SEGMENT, 1, _SEGMENTS))
         length = -(-len(thin.t) // count)
         rows = row_mask(self.model, thin, self.min_velocity)
         problem = base_problem(self.model, self.mapping, thin, rows, compiled=False)
-        for i, factors in enumerate(compress_stretches(problem, length)):
+        for i, factors in enumerate(compress_segments(problem, length)):
             part = thin.part(i * length, (i + 1) * length)
             yield Reduction(factors, part.squares, len(part.t))
 
@@ -144,13 +144,13 @@ def check_payload_change(
         share=min(1.0, 2.0 * (signals.cutoff or np.inf) * seconds / samples),
     )
     theta, covariance = runs.alike()
-    least = -float(scipy.special.ndtri(_CHANCE)) * float(np.sqrt(covariance[-10, -10]))
+    least = -float(scipy.special.ndtri(_P_VALUE)) * float(np.sqrt(covariance[-10, -10]))
     if abs(theta[-10]) <= max(least, _NOTHING * size[0]):
         return  # errors that count what changes with time are no smaller
     # whether there is one at all is asked of what changes with time; scales are tried below
     found = runs.compare(by_joint=False)
     mass, error = float(found.theta[-10]), float(np.sqrt(found.covariance[-10, -10]))
-    reach = -float(scipy.special.stdtrit(found.freedom[-10], _CHANCE)) * error
+    reach = -float(scipy.special.stdtrit(found.freedom[-10], _P_VALUE)) * error
     if not max(reach, _NOTHING * size[0]) < abs(mass) < size[0]:
         return
     left = runs.held_together(found.theta) - 1.0

@@ -15,7 +15,7 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["Probe", "coupled_columns", "smooth_motion", "take_probe"]
 
-_MARGIN = 0.15  # [s] rows nearer to the end of a stretch are left out: the filter has not settled
+_MARGIN = 0.15  # [s] rows nearer to the end of a segment are left out: the filter has not settled
 _STILL = 0.02  # [rad/s] slower than this the sign of a friction torque is not known
 _SLOW = 0.05  # ... of a joint that is slow throughout: this share of its largest speed
 
@@ -221,7 +221,7 @@ def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> 
 
 
 def _inner(motion: Trajectory) -> Array:
-    """Return which rows are not near the end of a stretch, shape (N,), bool."""
+    """Return which rows are not near the end of a segment, shape (N,), bool."""
     inner = np.ones(len(motion.t), dtype=bool)
     for number in np.unique(motion.segment):
         part = motion.segment == number

@@ -29,7 +29,7 @@ def check_torque_channels(log: Log) -> Iterator[Finding]:
 
     Yields:
         Warnings "clipped" per joint and limit, or "constant_torque" per joint; one error
-        "unsigned_torque" if no torque has a sign; one warning "held_torque" of the joints whose
+        "unsigned_torque" if no torque has a sign; one warning "repeated_torque" of the joints whose
         torque is updated less often than it is logged.
     """
     moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
@@ -111,7 +111,7 @@ def _held(log: Log) -> Iterator[Finding]:
         )
         part = "" if len(names) == len(log.joints) else listed(names)
         yield log_finding(
-            log.name, "held_torque", "warning", message, part, rows=length, delay=late
+            log.name, "repeated_torque", "warning", message, part, rows=length, delay=late
         )
 
 

@@ -31,7 +31,9 @@ _NEAR = 0.01  # [s] about the delay, where the misfit is a parabola
 _FINEST = 0.001  # [s] by which friction that no curve describes imitates a delay
 _HELD = 0.1  # [samples] ... or a torque that is held from row to row
 _SURE = 3.0  # standard errors from which a delay is reported
-_LATE = 0.04  # [s] a longer delay that hardly shows is none: other errors of the model imitate it
+_DELAYED = (
+    0.04  # [s] a longer delay that hardly shows is none: other errors of the model imitate it
+)
 _HELPS = 0.15  # share of what is unexplained that it must take away
 _FEW = 100  # rows from which a joint counts for the delay
 _MOVING = 0.1  # share of the instants in which it must move
@@ -39,14 +41,14 @@ _SLOW = 0.05  # [rad/s] slower than this a drive may stick
 _STILL = 0.02  # [rad/s] about which the direction of friction changes
 _AWAY = 0.75  # [periods of the filter] so near a slow instant friction is not known
 _ROWS = 2000  # instants that are looked at
-_WINDOWS = 8  # stretches they are in, where the log has more of them
+_WINDOWS = 8  # segments they are in, where the log has more of them
 _BLOCKS = 8  # parts of the log that are left out in turn
 _OVERSAMPLED = 8.0  # instants per period of the filter: products of motions are faster than they
 # Cut-off of the comparison over the job's, and over the rate at most: noise that is interpolated
 # between rows would be smoothed there.
 _BAND = 1.5, 0.15
 _WIDE = 3.0, 0.4  # the same of the motion that the regressor is made of
-_SETTLED = 1.5  # [periods of the filter] from an end the filter of a stretch has settled
+_SETTLED = 1.5  # [periods of the filter] from an end the filter of a segment has settled
 _HARMONICS = 4  # of a torque that is periodic in the position, as of gears and magnets
 _EXACT = 1e-5  # share of a torque that is taken for noise in a log without any
 # One joint's torque is delayed by itself if that explains so much of what is unexplained, and part
@@ -186,8 +188,8 @@ def check_torque_delay(
 
     The delay minimises what physics, friction of any odd curve of the speed and a torque that is
     periodic in the position leave of the delayed torque, instants near slow ones apart. Its
-    uncertainty is the jackknife's over the joints and over stretches of the log. It is a warning
-    from three standard errors on, if the delay of the other stretches explains each stretch better:
+    uncertainty is the jackknife's over the joints and over segments of the log. It is a warning
+    from three standard errors on, if the delay of the other segments explains each segment better:
     one of more than 40 ms clearly so.
 
     Args:
@@ -226,7 +228,7 @@ def _common(misfit: _Misfit, step: float, signals: SignalSettings, name: str) ->
     if not np.isfinite([delay, error, gain]).all():
         return
     error = float(np.hypot(error, max(_FINEST, _HELD * step)))
-    is_sure = abs(delay) > _SURE * error and gain > (_HELPS if abs(delay) > _LATE else 0.0)
+    is_sure = abs(delay) > _SURE * error and gain > (_HELPS if abs(delay) > _DELAYED else 0.0)
     late = f"{1e3 * abs(delay):.1f} +- {1e3 * error:.1f} ms {'late' if delay > 0 else 'early'}"
     total = delay + signals.torque_delay
     if not is_sure:
@@ -254,7 +256,7 @@ def _misfit(
     every = max(1, int(period / (step * _OVERSAMPLED)))
     windows = [
         _window(model, motion, part, step, every, signals, period)
-        for part in _stretches(model, motion, every)
+        for part in _segments(model, motion, every)
     ]
     ends = np.cumsum(model.support()[:, : model.layout.n_inertial].sum(axis=1)).tolist()
     own = [slice(*pair) for pair in pairwise([0, *ends])]
@@ -266,7 +268,7 @@ def _misfit(
     return _Misfit(np.array(squares), np.array(rows, dtype=float), tuple(used))
 
 
-def _stretches(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
+def _segments(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
     """Return contiguous rows, of one segment each, spread over the motion."""
     moving = np.flatnonzero((np.abs(motion.v) > _STILL * _units(model)).any(axis=1))
     if len(moving) == 0:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from robotid._settings import require_flag, require_kind
-from robotid.doctor.urdf_base import faint_parameters, rounded_angles
+from robotid.doctor.urdf_base import rounded_angles, weak_parameters
 from robotid.doctor.urdf_geometry import audit_links
 from robotid.doctor.urdf_inertials import impossible_inertial, negative_masses
 from robotid.exceptions import ModelError
@@ -129,7 +129,7 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
     rounded = list(rounded_angles(model, full))
     findings += rounded
     if not any(finding.evidence["felt"] for finding in rounded):
-        findings += faint_parameters(model, full)
+        findings += weak_parameters(model, full)
     structure = Structure(
         standard=model.layout.n_inertial,
         base_inertial=len(inertial.K),

@@ -11,7 +11,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint, Tree
 from robotid.robot.urdf_text import exact_angle
 
-__all__ = ["faint_parameters", "rounded_angles", "rounded_robot"]
+__all__ = ["rounded_angles", "rounded_robot", "weak_parameters"]
 
 _NOISE = 1e-10  # pivots below this share of the largest are rounding
 _HARMLESS = "the identifiable parameters do not change"
@@ -69,7 +69,7 @@ def rounded_robot(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
         yield Finding("rounded_rpy", severity, where, message, {"joints": float(len(joints))})
 
 
-def faint_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
+def weak_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
     """Yield a warning if parameters lie between those that motion shows and those it cannot.
 
     Args:
@@ -77,16 +77,16 @@ def faint_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Findin
         mapping: Its base parameters.
 
     Yields:
-        "faint_parameters" of the file.
+        "weak_parameters" of the file.
     """
-    if faint := _between(mapping):
+    if weak := _between(mapping):
         where = Path(model.tree.path).name
         message = (
-            f"{where}: {faint} parameters load the joints less than 1e-4 as much as others, and "
+            f"{where}: {weak} parameters load the joints less than 1e-4 as much as others, and "
             f"are left out of the {len(mapping.K)} base parameters; identify fewer of the "
             f"{len(model.joints)} joints at a time"
         )
-        yield Finding("faint_parameters", "warning", f"file {where}", message, {"faint": faint})
+        yield Finding("weak_parameters", "warning", f"file {where}", message, {"faint": weak})
 
 
 def _between(mapping: BaseMapping) -> int:

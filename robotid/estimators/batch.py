@@ -9,7 +9,7 @@ import scipy.linalg
 
 from robotid._typing import Array
 from robotid.estimators.estimator import BatchEstimator, Estimate, Weighing
-from robotid.estimators.stretches import sandwich
+from robotid.estimators.segments import sandwich
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
 from robotid.regressor.factors import Factors
 

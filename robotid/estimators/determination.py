@@ -118,7 +118,7 @@ class Determination:
         alone = [name for group in self.groups if not group.combinations for name in group.names]
         return (*sums, Group(tuple(alone), ())) if alone else sums
 
-    def in_words(self) -> str:
+    def described(self) -> str:
         """Return what is determined of the rest, as "of a and b only a + b is determined".
 
         Returns:
@@ -139,7 +139,7 @@ class Determination:
         """
         if not self.groups:
             return error
-        return RankDeficientError(self.rank, self.undetermined, len(self.names), self.in_words())
+        return RankDeficientError(self.rank, self.undetermined, len(self.names), self.described())
 
     def to_list(self) -> list[dict[str, Any]]:
         """Return the groups as plain values, as result.json has them.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeAlias, Ty
 import numpy as np
 
 from robotid._typing import Array
-from robotid.estimators.stretches import quantile
+from robotid.estimators.segments import quantile
 from robotid.exceptions import DataError
 from robotid.pages.html import code, number, table
 from robotid.regressor.factors import Factors, compress

@@ -16,7 +16,7 @@ import scipy.linalg
 
 from robotid._typing import Array, ProgressCallback, ignore_progress
 from robotid.estimators.estimator import Estimate, Estimator
-from robotid.estimators.stretches import FEWEST_STRETCHES, at_least, sandwich, scatter
+from robotid.estimators.segments import FEWEST_SEGMENTS, at_least, sandwich, scatter
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, triangle_of
 
@@ -33,9 +33,9 @@ _UPHILL = 1e-2  # relative increase that a step with inexact derivatives may cos
 _NEAR = 1e-2  # of a standard error, squared, that such a step ends at
 _MOST_RHO = 0.95  # beyond it, whitening takes away what stays: offsets and gains
 _NO_TRACE = 1e-3  # noise levels that a start moves a window by, below which it is no matter
-#: Rows are cut into so many stretches, to see how their scores scatter: few enough that each is
+#: Rows are cut into so many segments, to see how their scores scatter: few enough that each is
 #: longer than an encoder shows the same step while a joint turns back.
-_STRETCHES = 48
+_SEGMENTS = 48
 _LOST = 1e-6  # share of its prior's variance, below which a direction's gain in knowledge is none
 
 
@@ -60,7 +60,7 @@ class Residual:
 
 
 class Simulator(Protocol):
-    """What rolls out, and which parameters it has.
+    """What simulates, and which parameters it has.
 
     Attributes:
         names: Of the c parameters.
@@ -168,7 +168,7 @@ class OutputError(Estimator[Simulator]):
         1 - (A'A)^-1 A'S of what it should correct; ``details`` has the largest, ``left``.
 
         Args:
-            data: What rolls out.
+            data: What simulates.
             start: Initial values, shape (c,); the prior if None.
             exact: The same with exact derivatives, if its own are not.
 
@@ -202,7 +202,7 @@ class OutputError(Estimator[Simulator]):
         """Return correlation and level of the residuals, which they are weighed by.
 
         Args:
-            simulator: What rolls out.
+            simulator: What simulates.
             theta: Parameters, shape (c,).
         """
         return self._weigh(self._left(simulator, theta))
@@ -245,7 +245,7 @@ class OutputError(Estimator[Simulator]):
         """Return the parameters after a step that moves them and the starts of windows together.
 
         Args:
-            simulator: What rolls out.
+            simulator: What simulates.
             theta: Parameters that fit best with the starts as they are, shape (c,).
         """
         H, g = self.normal(simulator, self.weights(simulator, theta), theta, frees=True)
@@ -258,7 +258,7 @@ class OutputError(Estimator[Simulator]):
         earlier parameters. The errors of an estimate are those of one whose starts are free.
 
         Args:
-            simulator: What rolls out, from starts that suit the estimate.
+            simulator: What simulates, from starts that suit the estimate.
             estimate: As of ``fit``, with exact derivatives.
         """
         found = simulator.residuals(estimate.theta, with_slopes=True, with_starts=True)
@@ -270,7 +270,7 @@ class OutputError(Estimator[Simulator]):
         """Return how far other residuals move the estimate, to first order, and its errors.
 
         Args:
-            simulator: What rolls out.
+            simulator: What simulates.
             other: The same with other residuals, as of smaller steps.
             theta: Parameters near the estimate, shape (c,).
 
@@ -296,7 +296,7 @@ class OutputError(Estimator[Simulator]):
         """Return H = A'A and A'b of the linearised problem, prior included.
 
         Args:
-            simulator: What rolls out.
+            simulator: What simulates.
             weights: As of ``weights``.
             theta: Parameters, shape (c,).
             frees: Whether what starts of windows could do is taken out.
@@ -360,7 +360,7 @@ class OutputError(Estimator[Simulator]):
         exact: Simulator | None = None,
         found: Sequence[Residual] | None = None,
     ) -> Estimate:
-        """Return the estimate, its errors from how much the scores of stretches scatter.
+        """Return the estimate, its errors from how much the scores of segments scatter.
 
         With residuals found, it is that after a step of parameters and starts together.
         """
@@ -381,10 +381,10 @@ class OutputError(Estimator[Simulator]):
         scale = 1.0 / np.sqrt(np.diag(H))
         values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
         bread = (vectors / np.maximum(values, 1e-13)) @ vectors.T * np.outer(scale, scale)
-        stretches = _stretches(parts, len(theta), are_windows=self.frees)
+        segments = _segments(parts, len(theta), are_windows=self.frees)
         meat, inflation, freedom = H - np.diag(known), 1.0, np.full(len(theta), np.inf)
-        if len(stretches) >= FEWEST_STRETCHES:
-            seen = scatter(stretches, change, np.ones(1), bread)
+        if len(segments) >= FEWEST_SEGMENTS:
+            seen = scatter(segments, change, np.ones(1), bread)
             meat, inflation, freedom = seen.meat, seen.inflation, seen.freedom()
             further = simulator.rows(theta)[0]
             meat = meat + further.T @ further
@@ -448,7 +448,7 @@ def linearised(
     """Yield rows A, b and their columns, whitened, window by window and part by part.
 
     Args:
-        simulator: What rolls out.
+        simulator: What simulates.
         weights: As of ``OutputError.weights``.
         theta: Parameters, shape (c,).
         frees: Whether what the start of a window could do is taken out of its rows.
@@ -525,24 +525,24 @@ def _bounded_step(H: Array, g: Array, theta: Array, lowest: Array, damping: floa
     return trial
 
 
-def _stretches(
+def _segments(
     found: Sequence[tuple[Array, Array, Array]], c: int, *, are_windows: bool
 ) -> list[Factors]:
-    """Return the factors of the whitened rows of c parameters, stretch by stretch.
+    """Return the factors of the whitened rows of c parameters, segment by segment.
 
-    Windows in which nothing takes back what drifts are stretches as they are: what is wrong early
+    Windows in which nothing takes back what drifts are segments as they are: what is wrong early
     stays until their end.
     """
     total = sum(len(b) for _, b, _ in found)
-    stretches: list[Factors] = []
+    segments: list[Factors] = []
     for A, b, columns in found:
-        cuts = max(1, round(_STRETCHES * len(b) / total))
+        cuts = max(1, round(_SEGMENTS * len(b) / total))
         if are_windows:
-            cuts = math.ceil(FEWEST_STRETCHES / len(found))
+            cuts = math.ceil(FEWEST_SEGMENTS / len(found))
         for rows in np.array_split(np.arange(len(b)), cuts):
             triangle = triangle_of(np.column_stack([A[rows], b[rows]]))
-            stretches.append(Factors((triangle,), (columns,), np.array([len(rows)]), _names(c)))
-    return stretches
+            segments.append(Factors((triangle,), (columns,), np.array([len(rows)]), _names(c)))
+    return segments
 
 
 def _names(count: int) -> tuple[str, ...]:

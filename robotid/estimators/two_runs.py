@@ -18,7 +18,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.estimators.stretches import FEWEST_STRETCHES, at_least, sandwich, scatter
+from robotid.estimators.segments import FEWEST_SEGMENTS, at_least, sandwich, scatter
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, Reduction, merge, triangle_of
 from robotid.robot.parameters import ParameterLayout
@@ -59,7 +59,7 @@ class TwoRuns:
     """Factors of two runs and what is known of their difference.
 
     Attributes:
-        reference: Factors of the stretches of the reference run, of b base parameters.
+        reference: Factors of the segments of the reference run, of b base parameters.
         loaded: Those of the loaded run.
         D: Columns of the difference in base parameters, shape (b, d).
         known: Known part c of the difference, shape (b,).
@@ -81,8 +81,8 @@ class TwoRuns:
     def compare(self, *, by_joint: bool = True) -> Compared:
         """Fit both runs at once, and the unknown gains with them.
 
-        Standard errors come from the scatter of the scores of stretches and of joints, and are at
-        least those of rows that are independent by ``share``; of fewer than 12 stretches, they are
+        Standard errors come from the scatter of the scores of segments and of joints, and are at
+        least those of rows that are independent by ``share``; of fewer than 12 segments, they are
         these.
 
         Args:
@@ -277,19 +277,19 @@ class TwoRuns:
     ) -> tuple[Array, Array]:
         """Return covariance and degrees of freedom; the prior adds its own uncertainty.
 
-        Scores are compared stretch by stretch, which shows what changes with time, and joint by
+        Scores are compared segment by segment, which shows what changes with time, and joint by
         joint of each run, which shows what does not: a gain, friction of the day. Of a parameter
         the larger error counts. Few parts scatter less than they should by chance: it is never
         less than noise would make it.
         """
-        if len(self.reference) + len(self.loaded) < FEWEST_STRETCHES:
+        if len(self.reference) + len(self.loaded) < FEWEST_SEGMENTS:
             return bread, np.full(len(solution), np.inf)
         runs = list(enumerate((self.reference, self.loaded)))
-        stretches = [self._extended(f, loaded, gain, at) for loaded, run in runs for f in run]
-        covariance, freedom = self._scattered(stretches, gain, solution, bread)
+        segments = [self._extended(f, loaded, gain, at) for loaded, run in runs for f in run]
+        covariance, freedom = self._scattered(segments, gain, solution, bread)
         whole = [self._extended(run, loaded, gain, at) for loaded, run in enumerate(self._whole)]
         joints = [_of_joint(run, j) for run in whole for j in range(len(gain))]
-        if by_joint and len(joints) >= FEWEST_STRETCHES:
+        if by_joint and len(joints) >= FEWEST_SEGMENTS:
             other, few = self._scattered(joints, gain, solution, bread)
             freedom = np.where(np.diag(other) > np.diag(covariance), few, freedom)
             covariance = at_least(covariance, np.diag(other))
@@ -331,7 +331,7 @@ def payload_runs(
     and temperature.
 
     Args:
-        reference: The stretches of the run without payloads.
+        reference: The segments of the run without payloads.
         loaded: Those of the run with them.
         layout: The robot's standard parameters.
         K: Map to the base parameters, shape (b, p).

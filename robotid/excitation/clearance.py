@@ -34,13 +34,13 @@ _SURE = 5e-4  # [m] by which a lower bound may be too low
 _WIDE = 100.0  # [m] extent of the floor
 _SPARE = 0.002  # [m] of distances, that a design leaves for what lies between its instants ...
 _SPARE_ROOM = 0.25  # ... of the room that links have which are built near each other: at most that
-_SEEN = 0.01  # [m] short of which margins are reckoned
+_DATA_RANGE = 0.01  # [m] short of which margins are reckoned
 _SIGNS = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T  # corners of a box, (8, 3)
 
 
 @dataclass(frozen=True)
 class Box:
-    """A box that stands still beside the robot, in the frame of the root link.
+    """A box at rest beside the robot, in the frame of the root link.
 
     Attributes:
         name: What it is called.
@@ -100,7 +100,7 @@ class Nearness:
 
 @dataclass(frozen=True, eq=False)
 class _Hull:
-    """A convex piece of a link, or of what stands still (body -1), in the frame of its body."""
+    """A convex piece of a link, or of what is at rest (body -1), in the frame of its body."""
 
     name: str
     body: int
@@ -219,7 +219,7 @@ class Clearance:
 
     @cached_property
     def _supports(self) -> Array:
-        """Which joints move which body, shape (m + 1, m), bool; the last row stands still."""
+        """Which joints move which body, shape (m + 1, m), bool; the last row is at rest."""
         is_below = self._tree.is_below
         return np.vstack([is_below, np.zeros(len(is_below), dtype=bool)])
 
@@ -254,7 +254,7 @@ class Clearance:
             hints: As of ``near``.
         """
         kept = self.kept[:, None] + spare * self.spare
-        seen = np.minimum(_SEEN, self.room[:, None] / 4)
+        seen = np.minimum(_DATA_RANGE, self.room[:, None] / 4)
         return self.near(placed, kept + seen, hints=hints).distance - kept
 
     def placed(self, q: Array) -> Placements:
@@ -298,15 +298,15 @@ class Clearance:
         shapes = [self._hulls[k].shape for k in hulls.ravel().tolist()]
         poses = [coal.Transform3s(R, x) for R, x in zip(turns, centres, strict=True)]
         count, result, exact = len(pairs), coal.DistanceResult(), np.empty(len(pairs))
-        witness, normals = np.empty((2, count, 3)), np.empty((count, 3))
+        scale_check, normals = np.empty((2, count, 3)), np.empty((count, 3))
         for k in range(count):
             one, other = (shapes[k], poses[k]), (shapes[count + k], poses[count + k])
             result.clear()
             exact[k] = coal.distance(*one, *other, self._request, result)
-            witness[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
+            scale_check[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
             normals[k] = result.normal
         bound[pairs, samples], hints[pairs, samples] = exact, normals
-        gradient = self._gradient(placed, pairs, samples, witness, normals)
+        gradient = self._gradient(placed, pairs, samples, scale_check, normals)
         return Nearness(bound, pairs, samples, gradient)
 
     def nearest(self, motion: Motion, duration: float) -> Contact | None:
@@ -393,7 +393,7 @@ class Clearance:
         return np.where(stands[:, None], middles, centres), np.ascontiguousarray(turns)
 
     def _gradient(
-        self, placed: Placements, pairs: Array, samples: Array, witness: Array, normals: Array
+        self, placed: Placements, pairs: Array, samples: Array, scale_check: Array, normals: Array
     ) -> Array:
         """Return what distances change by with each joint: normal . (velocity of the points)."""
         slides = self._tree.slides[:, None]
@@ -402,7 +402,7 @@ class Clearance:
         bodies = np.array([hull.body for hull in self._hulls])[self.pairs[pairs]]  # (k, 2)
         out = np.zeros(axes.shape[:2])
         for side, sign in ((0, -1.0), (1, 1.0)):
-            levers = np.cross(axes, witness[side][:, None] - origins)
+            levers = np.cross(axes, scale_check[side][:, None] - origins)
             along = np.einsum("kjc,kc->kj", np.where(slides, axes, levers), normals)
             out += sign * np.where(self._supports[bodies[:, side]], along, 0.0)
         by_joint: Array = out @ self._ratios

@@ -105,7 +105,7 @@ class Designer:
         given: Information that is there already, shape (b, b), in units of the spread; 1 if None.
         name: The criterion, as of ``criterion``.
         clearance: What keeps it from collisions; None: they are not looked at.
-        finer: How many times finer than usual the grid of instants is.
+        finer: How many times finer than typical the grid of instants is.
         aim: What is asked for, if not the base parameters; nothing is known of them then.
         moving: Which joints move, shape (n,), bool; all if None. The others rest where the motion
             begins, and tell nothing, for friction holds them.
@@ -195,12 +195,12 @@ class Designer:
         Raises:
             SettingsError: If the robot cannot even rest within its limits.
         """
-        begun, best = time.monotonic(), np.inf
+        initialised, best = time.monotonic(), np.inf
         history: list[tuple[float, float]] = []
         followed: list[_State] = []
 
         def is_over() -> bool:
-            return bool(history) and time.monotonic() - begun > seconds
+            return bool(history) and time.monotonic() - initialised > seconds
 
         def follow(designer: Designer, state: _State, rounds: int, settled: float) -> _State:
             """Return what a start leads to."""
@@ -208,7 +208,7 @@ class Designer:
             for state in designer._search(state, rounds, settled, is_over):  # noqa: B020
                 if state.objective < best:
                     best = state.objective
-                    history.append((time.monotonic() - begun, best))
+                    history.append((time.monotonic() - initialised, best))
                 if progress is not None:
                     progress(len(followed), best)
             return state
@@ -227,7 +227,7 @@ class Designer:
         found = replace(self, finer=_FINER * self.finer).checked(polished.kept)
         return replace(
             found,
-            seconds=time.monotonic() - begun,
+            seconds=time.monotonic() - initialised,
             starts=len(followed),
             is_converged=polished.is_settled,
             history=tuple(history),

@@ -153,7 +153,7 @@ def lower_bounds(
         out: The bounds, shape (pairs, N); written.
         R: Rotations of the m bodies at N instants, shape (3, 3, m, N).
         p: Origins of the bodies, shape (3, m, N) [m].
-        bodies: Body of each of h hulls, shape (h,), int; -1: it stands still.
+        bodies: Body of each of h hulls, shape (h,), int; -1: it is at rest.
         middles: Middle of each in the frame of its body, shape (h, 3) [m].
         radii: Of the spheres about them that hold the hulls, shape (h,) [m].
         half: Half the box around each in the frame of its body, shape (h, 3) [m].

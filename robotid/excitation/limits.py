@@ -16,7 +16,7 @@ __all__ = ["LIMITS", "MotionLimits"]
 
 #: What is limited, in the order of ``MotionLimits.sizes``.
 LIMITS = ("position", "velocity", "acceleration", "jerk", "torque", "power")
-_FREE = np.pi  # [rad] either way of a joint that turns freely
+_FREE = np.pi  # [rad] either way of a revolute joint freely
 
 
 @dataclass(frozen=True, eq=False)

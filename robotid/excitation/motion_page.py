@@ -100,7 +100,7 @@ def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
     said = facts_html({name: escape(value) for name, value in facts.items()})
     return (
         f"<h1>{escape(model.name)}: a motion to record</h1>\n{said}"
-        "<p>Torques rest on the URDF's masses and on assumed friction. Play the motion slowly "
+        "<p>Torques depend on the URDF's masses and on assumed friction. Play the motion slowly "
         f'first.</p>\n<p class="note">Written by robotid {__version__}.</p>\n'
     )
 

@@ -59,7 +59,7 @@ class PayloadDesign:
     determination: Determination
     fewer: dict[tuple[str, ...], Determination]
 
-    def in_words(self) -> list[str]:
+    def described(self) -> list[str]:
         """Return what the motion is expected to tell, in sentences."""
         joints = self.designer.information.model.joints
         resting = [joint for joint in joints if joint not in self.moving]
@@ -77,9 +77,9 @@ class PayloadDesign:
                 "kg m^2 at most."
             )
         else:
-            said.append(f"It leaves open: {self.determination.in_words()}. Move more joints.")
+            said.append(f"It leaves open: {self.determination.described()}. Move more joints.")
         for fewer, told in self.fewer.items():
-            said.append(f"With {listed(fewer)} alone, {told.in_words()}.")
+            said.append(f"With {listed(fewer)} alone, {told.described()}.")
         if not self.payload.mass:
             said.append("Limits are kept without a load; state its mass to keep them with it.")
         return said
@@ -100,7 +100,7 @@ class PayloadDesign:
                 {"moving": list(joints), "undetermined": told.to_list()}
                 for joints, told in self.fewer.items()
             ],
-            "words": self.in_words(),
+            "words": self.described(),
         }
 
 

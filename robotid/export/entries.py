@@ -8,7 +8,7 @@ import numpy as np
 
 from robotid._files import finite, source_entry
 from robotid.export.ranges import parameter_ranges
-from robotid.fitting.bands import REACH, usual_friction
+from robotid.fitting.bands import QUANTILE, typical_friction
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.identified import SOURCES, Identified
@@ -92,7 +92,7 @@ def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[
         "structure": _determined(found),
         "uncertainty": {
             "method": found.errors.method,
-            "stretches": found.errors.stretches,
+            "segments": found.errors.segments,
             "inflation": found.errors.inflation,
         },
         "motors": _motors(found, settings),
@@ -111,7 +111,7 @@ def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[
             "identification": found.metrics("wls").to_dict(),
             "validation": [recording_metrics(e, "wls") for e in found.validation],
         },
-        "witness": found.witness.to_dict(),
+        "scale_check": found.scale_check.to_dict(),
     }
 
 
@@ -186,7 +186,7 @@ def _curve(found: Identification, joint: str) -> dict[str, Any]:
     seen = [e.recording.trajectory.v[e.recording.mask[:, row], row] for e in found.fitted]
     if not np.any(np.concatenate(seen)):
         return {}
-    return {"curve": usual_friction(found, joint).to_dict()}
+    return {"curve": typical_friction(found, joint).to_dict()}
 
 
 def _structure(found: Identified) -> dict[str, Any]:
@@ -205,7 +205,7 @@ def _determined(found: Identification) -> dict[str, Any]:
         "rank": found.determination.rank,
         "condition": finite(found.wls.condition),
         "poorly_excited": found.is_poorly_excited,
-        "not_told_apart": found.determination.to_list(),
+        "indistinguishable": found.determination.to_list(),
     }
 
 
@@ -218,8 +218,10 @@ def _expected_torque(preview: "Preview") -> dict[str, dict[str, Any]]:
     """Return size and 95 % band of each joint's torque on the motions, root mean squares."""
     found, bands = preview.expected, preview.bands
     torque = np.vstack([e.recording.trajectory.tau for e in found.fitted])
-    of_parameters = REACH * np.sqrt(np.mean(np.vstack([b.parameters for b in bands]) ** 2, axis=0))
-    half = REACH * np.sqrt(np.mean(np.vstack([b.total for b in bands]) ** 2, axis=0))
+    of_parameters = QUANTILE * np.sqrt(
+        np.mean(np.vstack([b.parameters for b in bands]) ** 2, axis=0)
+    )
+    half = QUANTILE * np.sqrt(np.mean(np.vstack([b.total for b in bands]) ** 2, axis=0))
     rms = np.sqrt(np.mean(torque**2, axis=0))
     model = found.model
     return {
@@ -315,9 +317,9 @@ def _band(identification: Identification, evaluation: Evaluation) -> dict[str, A
     held = band.held(recording.trajectory.tau, evaluation.torques["estimate"], recording.mask)
     return {
         row: {
-            "half_width": float(REACH * np.sqrt(np.mean(total**2))),
-            "of_parameters": float(REACH * np.sqrt(np.mean(parameters**2))),
-            "held_pct": finite(100 * share),
+            "half_width": float(QUANTILE * np.sqrt(np.mean(total**2))),
+            "of_parameters": float(QUANTILE * np.sqrt(np.mean(parameters**2))),
+            "coverage_pct": finite(100 * share),
         }
         for row, total, parameters, share in zip(
             identification.model.row_names, band.total.T, band.parameters.T, held, strict=True

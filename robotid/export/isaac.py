@@ -26,7 +26,7 @@ _TERMS = ("armature", "viscous", "coulomb", "offset")
 _STEP = 0.005  # [s]
 _HEAD = """\
 Actuators of {robot} for Isaac Lab 2.2 or later (Isaac Sim 5, where friction is a torque), by
-robotid {version}. N m, N m s/rad, kg m^2, rad/s; N, N s/m, kg, m/s of joints that slide.
+robotid {version}. N m, N m s/rad, kg m^2, rad/s; N, N s/m, kg, m/s of prismatic joints.
 
   import yaml
   from isaaclab.actuators import DelayedPDActuatorCfg

@@ -30,10 +30,10 @@ def loop_entries(found: LoopIdentification) -> dict[str, Any]:
         "structure": {
             "rank": estimate.rank,
             "condition": finite(estimate.condition),
-            "not_told_apart": [{"names": list(names)} for names in found.correlated],
+            "indistinguishable": [{"names": list(names)} for names in found.correlated],
         },
         "uncertainty": {
-            "method": "scatter of the scores of stretches of the whitened residual",
+            "method": "scatter of the scores of segments of the whitened residual",
             "inflation": estimate.details["inflation"],
         },
         "ranges": {"undetermined": [*unfitted, *found.undetermined]},
@@ -82,7 +82,7 @@ def _loop_parameters(found: LoopIdentification) -> list[dict[str, Any]]:
     errors = {
         (unknown.what, j): (float(error), float(reach))
         for unknown, error, reach in zip(
-            found.fit.simulator.unknowns, estimate.std_error, estimate.reach, strict=True
+            found.fit.simulator.free_parameters, estimate.std_error, estimate.reach, strict=True
         )
         for j in unknown.joints
     }

@@ -37,10 +37,10 @@ _OFFSET = "offset"  # stated by the actuator's bias
 _TERMS = (*_ATTRIBUTES, _OFFSET)
 #: Sizes of a geom over those of a shape in a URDF: MuJoCo states half lengths.
 _SIZES = {"box": (0.5,), "sphere": (1.0,), "cylinder": (1.0, 0.5)}
-_SEEN = {"group": "2"}  # what the viewer shows by default
+_DATA_RANGE = {"group": "2"}  # what the viewer shows by default
 #: What is only seen, and what touches the world but not the robot itself.
 _GEOMS = {
-    "visual": _SEEN | {"contype": "0", "conaffinity": "0"},
+    "visual": _DATA_RANGE | {"contype": "0", "conaffinity": "0"},
     "collision": {"group": "3", "contype": "1", "conaffinity": "0"},
 }
 #: How friction gives way: with MuJoCo's 0.9 a light joint creeps under less than its friction, and
@@ -189,7 +189,7 @@ def write_mjcf(
 
 
 def _is_readable(mesh: Path) -> bool:
-    """Whether MuJoCo reads a mesh: OBJ, or STL in binary with a usual number of faces."""
+    """Whether MuJoCo reads a mesh: OBJ, or STL in binary with a typical number of faces."""
     if mesh.suffix.lower() != ".stl":
         return mesh.suffix.lower() == ".obj"
     with mesh.open("rb") as stream:
@@ -255,7 +255,7 @@ def _add_geoms(body: ET.Element, link: SimulatedLink, assets: ET.Element) -> Non
     """Add the shapes of a link; what it touches with is shown if nothing else can be."""
     is_seen = any(tag == "visual" for tag, *_ in link.shapes)
     for tag, shape, pose, mesh in link.shapes:
-        at = {"class": tag} | ({} if is_seen else _SEEN) | _pose(pose)
+        at = {"class": tag} | ({} if is_seen else _DATA_RANGE) | _pose(pose)
         if mesh is None:
             sizes = numbers_text(np.multiply(shape.size, _SIZES[shape.kind]))
             at |= {"type": shape.kind, "size": sizes}

@@ -21,7 +21,7 @@ from robotid.export.commanded import commanded_drives
 from robotid.export.exported import Written
 from robotid.export.urdf import link_parameters
 from robotid.export.yaml_text import yaml_text
-from robotid.fitting.bands import REACH
+from robotid.fitting.bands import QUANTILE
 from robotid.fitting.identified import Identified
 from robotid.identification.result import Identification
 from robotid.regressor.friction_projection import project_friction
@@ -53,7 +53,7 @@ _HEAD = """\
 Ranges for domain randomisation of {robot}, by robotid {version}. kg, m, kg m^2, in a link's frame.
 
 nominal is the identified value, low to high its 95 % interval, cut to what is possible. Low ends of
-what must be more than 0 are those of its logarithm. source says what the interval rests on:
+what must be more than 0 are those of its logarithm. source says what the interval depends on:
   data   the motion;
   prior  the motion says nothing, and it is how wrong the URDF may plausibly be;
   mixed  both, or in sums with others;
@@ -113,7 +113,7 @@ def parameter_ranges(found: Identified) -> dict[str, Any]:
     """
     layout, sources = found.model.layout, found.sources
     errors, covariance = found.standard_error, found.standard_covariance
-    reach = found.standard_reach
+    reach = found.standard_quantile
     drives: dict[str, dict[str, Any]] = {drive.name: {} for drive in layout.drives}
     for k, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
         name, least = layout.drives[d].name, 0.0 if term.is_nonnegative else -math.inf
@@ -170,7 +170,7 @@ def projected_ranges(found: Identified) -> dict[str, Any]:
     for drive in drives:
         C = found.standard_covariance[np.ix_(drive.own, drive.own)]
         errors = np.sqrt(np.maximum(np.diag(drive.transfer @ C @ drive.transfer.T), 0.0))
-        reach = float(found.standard_reach[list(drive.own)].max())
+        reach = float(found.standard_quantile[list(drive.own)].max())
         ranges[drive.name] = {
             term: _range(
                 value, error, "data", reach=reach, least=0.0 if term in _NOT_NEGATIVE else -math.inf
@@ -199,7 +199,7 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
             math.inf if error is None else error,
             source_of(entry),
             is_positive=term == "kp",
-            reach=entry.get("reach") or REACH,
+            reach=entry.get("reach") or QUANTILE,
             least=0.0 if term in _NOT_NEGATIVE else -math.inf,
         )
         drives.setdefault(drive, {})[term] = ends | {"unit": entry["unit"]}
@@ -266,12 +266,12 @@ def _body(pi: Array, covariance: Array, sources: Sequence[str], reach: float) ->
 
 
 def _joint_source(sources: Sequence[str]) -> str:
-    """Return what a figure of several parameters rests on."""
+    """Return what a figure of several parameters depends on."""
     return sources[0] if len(set(sources)) == 1 else "mixed"
 
 
 def source_of(entry: Mapping[str, Any]) -> str:
-    """Return what a parameter of a result rests on, of results that do not state it, too.
+    """Return what a parameter of a result depends on, of results that do not state it, too.
 
     Args:
         entry: The parameter, as in result.json.
@@ -287,7 +287,7 @@ def _range(
     *,
     is_positive: bool = False,
     least: float = -math.inf,
-    reach: float = REACH,
+    reach: float = QUANTILE,
 ) -> dict[str, Any]:
     """Return the range of a figure; without ends if its standard error is not known."""
     nominal, half = float(value), reach * float(error)

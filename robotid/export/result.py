@@ -25,8 +25,8 @@ from robotid.export.urdf import load_identified, terms_from_facts
 from robotid.findings import listed
 from robotid.fitting.bands import FrictionCurve
 from robotid.judgement.parameter_table import parameter_table
-from robotid.judgement.verdict import Doubt
-from robotid.judgement.witness import Witness
+from robotid.judgement.scale_check import ScaleCheck
+from robotid.judgement.verdict import VerdictWarning
 from robotid.logs.data import Log, suggestion
 from robotid.regressor.friction_projection import (
     DriveMoments,
@@ -44,8 +44,8 @@ __all__ = [
     "read_result",
     "stated_model",
     "stated_parameters",
+    "stated_scale_check",
     "stated_urdf_with_drives",
-    "stated_witness",
 ]
 
 _STATUSES = ("good", "usable", "poor", "not evaluated")
@@ -91,7 +91,7 @@ _SHAPE = {
         "reasons": [TEXT],
         "per_joint?": {...: {"status": _STATUS, "reasons": [TEXT]}},
         "alarms?": [TEXT],
-        "doubts?": [{field.name: TEXT for field in dataclasses.fields(Doubt)}],
+        "doubts?": [{field.name: TEXT for field in dataclasses.fields(VerdictWarning)}],
     },
 }
 
@@ -184,15 +184,15 @@ class Result:
         Raises:
             MissingDependencyError: If Numba is not installed.
             NotConvergedError: If a step has no solution.
-            SettingsError: If a term of the drives cannot be rolled out.
+            SettingsError: If a term of the drives cannot be simulated.
         """
         from robotid.closed_loop.evaluation import HORIZONS, run_open_loop
-        from robotid.simulation.loops import LoopedRobot, open_loops
+        from robotid.simulation.loops import ClosedLoopRobot, open_loops
 
         (model, pi), drives = self.identified, self.commanded
         loops = loops_of(model, pi, drives, self.rate) if drives else open_loops(model, pi)
         far = HORIZONS if horizons is None else horizons
-        return run_open_loop(LoopedRobot(model), loops, log.turned(self._signs), horizons=far)
+        return run_open_loop(ClosedLoopRobot(model), loops, log.turned(self._signs), horizons=far)
 
     @property
     def _signs(self) -> Array:
@@ -270,7 +270,7 @@ class Result:
 
     @property
     def metrics(self) -> dict[str, Mapping[str, Any]]:
-        """Metrics by joint: of the "fitted" rows, and of each log kept apart, by its file."""
+        """Metrics by joint: of the "fitted" rows, and of each validation log, by its file."""
         kept = {entry["log"]: entry["per_joint"] for entry in self.content["validation"]}
         return {"fitted": self.content["identification"]["per_joint"], **kept}
 
@@ -316,13 +316,13 @@ def read_result(path: str | Path) -> dict[str, Any]:
     kept = [entry for entry in recordings if entry["role"] == "validation"]
     if len(kept) != len(result["validation"]):
         raise DataError(
-            f"{name} has {len(kept)} recordings kept apart among its inputs and errors of "
+            f"{name} has {len(kept)} validation recordings among its inputs and errors of "
             f"{len(result['validation'])}: it is not whole; identify again"
         )
     return dict(result)
 
 
-def stated_witness(result: Mapping[str, Any]) -> Witness | None:
+def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:
     """Return what speaks for the scale of a result, if it says so.
 
     Args:
@@ -331,13 +331,13 @@ def stated_witness(result: Mapping[str, Any]) -> Witness | None:
     Raises:
         DataError: If figures of it are missing.
     """
-    stated = result.get("witness")
+    stated = result.get("scale_check")
     if stated is None:
         return None
     for name, size in (("unexplained", 2), ("masses", 3)):
         if len(stated[name]) != size:
             raise DataError(f"witness.{name} has {len(stated[name])} numbers, wanted {size}")
-    return Witness(**{each.name: stated[each.name] for each in dataclasses.fields(Witness)})
+    return ScaleCheck(**{each.name: stated[each.name] for each in dataclasses.fields(ScaleCheck)})
 
 
 def stated_urdf_with_drives(result: Mapping[str, Any], model: RobotModel) -> Array | None:

@@ -155,7 +155,7 @@ def urdf_changes(model: RobotModel, pi: Array, *, dynamics: Projection | bool = 
         dynamics: As of ``write_urdf``.
 
     Returns:
-        A unified diff without context, each stretch with the name of its link or joint; empty if
+        A unified diff without context, each segment with the name of its link or joint; empty if
         the original is gone.
 
     Raises:

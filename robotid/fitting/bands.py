@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from robotid.fitting.result import Fit
 
 __all__ = [
-    "REACH",
+    "QUANTILE",
     "FrictionCurve",
     "TorqueBand",
     "expected_band",
@@ -34,11 +34,11 @@ __all__ = [
     "friction_curve",
     "recording_bands",
     "torque_band",
-    "usual_friction",
+    "typical_friction",
 ]
 
 #: Standard deviations that a 95 % band reaches.
-REACH = 1.96
+QUANTILE = 1.96
 _HELD = 0.95
 _ROUNDING = 1e-9  # of a band, by which a row on its edge may lie beyond it
 _SPEEDS = 20  # of a friction curve, either way
@@ -75,7 +75,7 @@ class TorqueBand:
         used = mask[self.samples]
         miss = np.abs(tau[self.samples] - prediction[self.samples])
         # one of the rows that set the band may lie on its edge
-        is_held = (miss <= (1.0 + _ROUNDING) * REACH * self.total) & used
+        is_held = (miss <= (1.0 + _ROUNDING) * QUANTILE * self.total) & used
         count = used.sum(axis=0)
         return np.where(count > 0, is_held.sum(axis=0) / np.maximum(count, 1), np.nan)
 
@@ -159,7 +159,7 @@ def _residual_noise(own: Sequence[tuple[TorqueBand, "Evaluation"]]) -> Array:
         residual = e.recording.trajectory.tau - e.torques["estimate"]
         rows.append((band.parameters, residual[band.samples], e.recording.mask[band.samples]))
     std, residual, mask = (np.concatenate(part) for part in zip(*rows, strict=True))
-    needed = (residual / REACH) ** 2 - std**2
+    needed = (residual / QUANTILE) ** 2 - std**2
     for j, used in enumerate(mask.T.astype(bool)):
         if used.any():
             noise[j] = np.sqrt(max(np.quantile(needed[used, j], _HELD), 0.0))
@@ -200,7 +200,7 @@ class FrictionCurve:
     @property
     def half_width(self) -> Array:
         """Half the width of the 95 % band about the torque, shape (k,) [N m or N]."""
-        return REACH * self.std
+        return QUANTILE * self.std
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, as ``curve`` of a joint's friction in result.json has them."""
@@ -212,7 +212,7 @@ class FrictionCurve:
         }
 
 
-def usual_friction(
+def typical_friction(
     found: "Fit",
     joint: str,
     v: ArrayLike | None = None,
@@ -231,7 +231,7 @@ def usual_friction(
             the friction grows with it, else 0.
 
     Raises:
-        DataError: If there is no such drive; or without speeds, if it stood still.
+        DataError: If there is no such drive; or without speeds, if it was at rest.
     """
     layout, d = found.model.layout, _drive_number(found, joint)
     ratios, first = layout.drive_ratios[d], found.model.n_rows - len(found.model.joints)
@@ -245,7 +245,7 @@ def usual_friction(
         speeds = np.concatenate([np.abs(m.v[kept, first:] @ ratios) for m, kept in used])
         if not speeds.any():
             raise DataError(
-                f"{joint} stood still in the fitted logs, so no speeds are known to show its "
+                f"{joint} was at rest in the fitted logs, so no speeds are known to show its "
                 "friction at; state them, friction(joint, v)"
             )
         side = np.linspace(speeds.min(), speeds.max(), _SPEEDS)

@@ -20,15 +20,15 @@ class Tried:
 
     Attributes:
         families: Names of what was tried beside viscous and Coulomb friction.
-        held_out_error_pct: Residual of held-out stretches over the torque [%].
-        chance: How likely held-out stretches gain that much by chance [-]; 1 without a gain.
-        is_taken: Whether it was taken.
+        held_out_error_pct: Residual of held-out segments over the torque [%].
+        p_value: How likely held-out segments gain that much by chance [-]; 1 without a gain.
+        is_selected: Whether it was taken.
     """
 
     families: tuple[str, ...]
     held_out_error_pct: float
-    chance: float
-    is_taken: bool
+    p_value: float
+    is_selected: bool
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class DriveChoice:
         seen: Ranges of position "q" and of the size of speed "v" that the fit has seen.
         grown: How many times larger the terms make the standard errors of the drive's armature,
             viscous and Coulomb friction and offset, by name.
-        doubted: Terms that held-out stretches favour, but not beyond chance: they were not taken,
+        doubted: Terms that held-out segments favour, but not beyond chance: they were not taken,
             and errors count what they would move.
     """
 

@@ -46,7 +46,7 @@ class Extent:
         end: Last time stamp [s].
         smooth: Samples of its trajectory.
         rows_used: Torque rows of these that are used.
-        segments: Uninterrupted stretches of the trajectory.
+        segments: Uninterrupted segments of the trajectory.
     """
 
     samples: int
@@ -60,12 +60,12 @@ class Extent:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A log made ready for a model. Of a long log, only some stretches are at hand.
+    """A log made ready for a model. Of a long log, only some segments are at hand.
 
     Attributes:
         log: The raw log, or its first rows.
         signals: The settings it was processed with, everything automatic decided.
-        trajectory: The smooth motion, N samples, or stretches of it.
+        trajectory: The smooth motion, N samples, or segments of it.
         mask: Rows used, shape (N, n_rows), bool.
         extent: How much of the whole log there is.
     """
@@ -78,13 +78,13 @@ class Recording:
 
     @property
     def name(self) -> str:
-        """Name of the log's file and the stretch of it, as ``run3.parquet 5-7.4 s``."""
+        """Name of the log's file and the segment of it, as ``run3.parquet 5-7.4 s``."""
         file = Path(self.log.path).name or "log"
         return f"{file} {self.extent.start:.4g}-{self.extent.end:.4g} s"
 
     @property
     def is_partial(self) -> bool:
-        """Whether only stretches of the motion are at hand."""
+        """Whether only segments of the motion are at hand."""
         return len(self.trajectory.t) < self.extent.smooth
 
 
@@ -122,7 +122,7 @@ def evaluate_logs(
 
     Args:
         fitted: Logs that were fitted, surveyed with the model that predicts.
-        kept: Logs kept apart.
+        kept: Validation Logs.
         parameters: Standard parameters by name, each of shape (p,).
         prior: Those of the URDF, shape (p,): the baselines are its torque, with and without motion;
             None: no baselines.
@@ -131,7 +131,7 @@ def evaluate_logs(
 
     Returns:
         Evaluations of the fitted logs, and of those kept apart; of logs in files, the torques are
-        those of the stretches that are kept for plots.
+        those of the segments that are kept for plots.
 
     Raises:
         DataError: If no row of a log is used.
@@ -206,9 +206,9 @@ class _Score:
     sums: Mapping[str, TorqueSums]  # what the metrics are made of, by name of the parameters
     smooth: int  # samples
     used: int  # torque rows used
-    segments: frozenset[int]  # numbers of the stretches that have samples
+    segments: frozenset[int]  # numbers of the segments that have samples
     turned: Array  # (n,), bool: joints whose full turns were taken out
-    shown: tuple[_Shown, ...]  # all samples, or a few stretches
+    shown: tuple[_Shown, ...]  # all samples, or a few segments
     sampled: Array  # (m, 2 n), recorded rows spread over the log
     found: tuple[Array, ...]  # which of the sampled rows of each other log are in this one
 
@@ -228,7 +228,7 @@ class _Score:
 
 @dataclass(frozen=True, eq=False)
 class _Part(PieceTask):
-    """A piece, and what is kept of it: recorded rows spread over it, and a stretch for plots."""
+    """A piece, and what is kept of it: recorded rows spread over it, and a segment for plots."""
 
     sampled: slice
     shown: slice | None

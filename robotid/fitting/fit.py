@@ -30,7 +30,7 @@ from robotid.fitting.standard_errors import (
     with_wls_errors,
 )
 from robotid.regressor.factors import Factors, Reduction, join
-from robotid.regressor.memory import bears_load
+from robotid.regressor.memory import is_loaded
 from robotid.robot.prior import prior_spread
 
 __all__ = ["Solved", "fit_recordings", "rough_choice", "solve_recordings"]
@@ -199,7 +199,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
     Least squares are iterated until their torque is the load; the estimator takes the last step.
     """
     model, mapping = recordings.model, recordings.mapping
-    if not bears_load(model):
+    if not is_loaded(model):
         return recordings
     choice = rough_choice(choice)
     own = replace(recordings, kept=())  # nothing is predicted meanwhile

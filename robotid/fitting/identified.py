@@ -63,12 +63,12 @@ class Identified(ABC):
 
     @property
     @abstractmethod
-    def standard_reach(self) -> Array:
+    def standard_quantile(self) -> Array:
         """How many standard errors the 95 % interval of each standard parameter reaches, (p,)."""
 
     @property
     @abstractmethod
-    def base_reach(self) -> Array:
+    def base_quantile(self) -> Array:
         """How many standard errors the 95 % interval of each base parameter reaches, (b,)."""
 
     @property
@@ -100,9 +100,9 @@ class Identified(ABC):
     def standard_interval(self) -> Array:
         """95 % interval of each standard parameter, shape (p, 2); infinite where there is none.
 
-        It reaches as far as ``standard_reach`` says.
+        It reaches as far as ``standard_quantile`` says.
         """
-        half = self.standard_reach * self.standard_error
+        half = self.standard_quantile * self.standard_error
         return np.column_stack([self.standard - half, self.standard + half])
 
     @property
@@ -111,7 +111,7 @@ class Identified(ABC):
 
         It is open where the data say nothing, and where the parameter is at its bound.
         """
-        half = self.base_reach * self.base_error
+        half = self.base_quantile * self.base_error
         return np.column_stack([self.base - half, self.base + half])
 
     def predict(

@@ -31,7 +31,7 @@ class JointMotion:
         time: Time since the recording began, over the longest recording's, shape (N,).
         passes: Cut-off of the filter of torques [Hz]; infinite without one.
         others: The joints before and after it, by name.
-        scale: The motion whose usual speeds, ways and loads scale columns; None: this one.
+        scale: The motion whose typical speeds, ways and loads scale columns; None: this one.
     """
 
     q: Array

@@ -8,7 +8,7 @@ from robotid._typing import Array
 from robotid.fitting.survey import ReducedPiece, SurveyedLog
 from robotid.logs.data import Trajectory
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
-from robotid.regressor.factors import Factors, Reduction, compress_stretches, join_stretches
+from robotid.regressor.factors import Factors, Reduction, compress_segments, join_segments
 from robotid.regressor.problem import Block, Problem, concatenate
 from robotid.regressor.rows import keep_inertial_rows
 from robotid.regressor.used_rows import base_problem, independent_share
@@ -18,9 +18,9 @@ from robotid.workers.plan import WorkPlan
 
 __all__ = ["Recordings"]
 
-_STRETCHES = 48  # of all logs in memory: enough to see how much their scores scatter
-_CORRELATIONS = 10  # shortest stretch in correlation times of noise behind the filter
-_STRETCHES_IN_FILE = 64  # of each log in a file whose factors are kept apart
+_SEGMENTS = 48  # of all logs in memory: enough to see how much their scores scatter
+_CORRELATIONS = 10  # shortest segment in correlation times of noise behind the filter
+_SEGMENTS_IN_FILE = 64  # of each log in a file whose factors are kept apart
 _FACTORS = 2**26  # bytes of them all, if that leaves each log a few
 _FEW = 8
 
@@ -33,7 +33,7 @@ class Recordings:
         model: The robot.
         mapping: Standard to base parameters.
         fitted: Logs to fit.
-        kept: Logs kept apart.
+        kept: Validation Logs.
         plan: Who works on the pieces of logs in files; this process if None.
         checkpoint: Where reductions are kept until the run is complete.
         weights: Weights of the rows of each log to fit, shapes (N, n_rows); 1 if None.
@@ -82,28 +82,28 @@ class Recordings:
         """Reduce the logs to fit.
 
         Args:
-            is_cut: Whether logs in memory are cut into stretches, which a fit's errors stand on.
+            is_cut: Whether logs in memory are cut into segments, which a fit's errors stand on.
 
         Returns:
-            One reduction per stretch of a log, in order of time. A stretch of a log in memory is
+            One reduction per segment of a log, in order of time. A segment of a log in memory is
             longer than the correlation of filtered noise; one in a file is of neighbouring pieces.
 
         Raises:
-            DataError: If a row cannot be used, or no stretch of a log is long enough.
+            DataError: If a row cannot be used, or no segment of a log is long enough.
         """
         if self.is_held:
             for log in (*self.fitted, *self.kept):  # refused before any fit
                 keep_inertial_rows(self.model, log.whole.trajectory)
-            reduced = self._stretches if is_cut else self._whole
+            reduced = self._segments if is_cut else self._whole
             return tuple(chain.from_iterable(map(reduced, range(len(self.fitted)))))
         plan = self.plan or WorkPlan()
         found = iter(plan.reduce(self.pieces, checkpoint=self.checkpoint))
         reductions = []
         size = 8 * self.model.n_rows * (len(self.mapping.independent) + 1) ** 2 * len(self.fitted)
-        most = max(_FEW, min(_STRETCHES_IN_FILE, _FACTORS // size))
+        most = max(_FEW, min(_SEGMENTS_IN_FILE, _FACTORS // size))
         for log in self.fitted:
             count = len(log.pieces)
-            own = join_stretches(islice(found, count), count, most)
+            own = join_segments(islice(found, count), count, most)
             if not any(reduction.samples for reduction in own):
                 raise log.too_short()
             reductions += own
@@ -153,7 +153,7 @@ class Recordings:
                 weights are those of its own.
             joined: How many of the segments are one.
         """
-        return compress_stretches(self._problem(k, motion), joined * self._length(k))
+        return compress_segments(self._problem(k, motion), joined * self._length(k))
 
     def _problem(self, k: int, motion: Trajectory, with_mass: bool = False) -> Problem:
         """Return the rows of a log in memory, weighted, on a motion of as many samples."""
@@ -163,14 +163,14 @@ class Recordings:
 
     def _length(self, k: int) -> int:
         """Return the samples of each segment of a log in memory."""
-        samples, count = len(self.fitted[k].whole.trajectory.t), -(-_STRETCHES // len(self.fitted))
+        samples, count = len(self.fitted[k].whole.trajectory.t), -(-_SEGMENTS // len(self.fitted))
         shortest = round(_CORRELATIONS / independent_share(self.fitted[k].signals))
-        if self.model.is_static:  # means of stretches, behind no filter
+        if self.model.is_static:  # means of segments, behind no filter
             shortest = 1
         return max(-(-samples // count), shortest)
 
-    def _stretches(self, k: int) -> Iterator[Reduction]:
-        """Yield what each stretch of a log in memory comes down to."""
+    def _segments(self, k: int) -> Iterator[Reduction]:
+        """Yield what each segment of a log in memory comes down to."""
         motion, length = self.fitted[k].whole.trajectory, self._length(k)
         for i, factors in enumerate(self.segments(k, motion)):
             part = motion.part(i * length, (i + 1) * length)

@@ -12,13 +12,13 @@ from robotid.estimators import Estimate
 from robotid.estimators.determination import Determination
 from robotid.exceptions import SettingsError
 from robotid.fitting.bands import (
-    REACH,
+    QUANTILE,
     FrictionCurve,
     TorqueBand,
     expected_band,
     fitted_moments,
     recording_bands,
-    usual_friction,
+    typical_friction,
 )
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.evaluation import Evaluation, pool
@@ -78,7 +78,7 @@ class Fit(Identified, Solution):
         estimate: What the estimator returned: base parameters, or standard ones ("consistent").
         wls: Weighted least squares on the same factors, base parameters.
         urdf_with_drives: The prior with the drive terms that then fit best, shape (p,).
-        errors: What the standard errors rest on.
+        errors: What the standard errors depend on.
         factors: What the fitted rows come down to, base parameters.
         determination: Which base parameters the fitted rows determine.
         open_terms: What is open of its drives, which ``standard_covariance`` counts.
@@ -118,9 +118,9 @@ class Fit(Identified, Solution):
             The curve: ``v``, ``torque``, ``std``, ``half_width`` of the 95 % band, ``load``.
 
         Raises:
-            DataError: If there is no such drive; or without speeds, if it stood still.
+            DataError: If there is no such drive; or without speeds, if it was at rest.
         """
-        return usual_friction(self, joint, v, q=q, load=load)
+        return typical_friction(self, joint, v, q=q, load=load)
 
     @property
     def is_consistent(self) -> bool:
@@ -183,18 +183,18 @@ class Fit(Identified, Solution):
         return sources_of(share, kept, held)
 
     @property
-    def standard_reach(self) -> Array:
+    def standard_quantile(self) -> Array:
         """How many standard errors the 95 % interval of each standard parameter reaches, (p,).
 
         The quantile is that of the base parameter, of those it is part of, whose standard error has
         the fewest degrees of freedom.
         """
-        own = np.where(self.mapping.K != 0.0, self.errors.reach[:, None], REACH)  # (b, p)
+        own = np.where(self.mapping.K != 0.0, self.errors.reach[:, None], QUANTILE)  # (b, p)
         reach: Array = own.max(axis=0)
         return reach
 
     @property
-    def base_reach(self) -> Array:
+    def base_quantile(self) -> Array:
         return self.errors.reach
 
     @property

@@ -40,7 +40,7 @@ class Outlier:
         t: Time of the worst row [s].
         torque: Torque there, as filtered [N m or N].
         predicted: Predicted torque [N m or N].
-        size: Their difference over the joint's usual residual [-].
+        size: Their difference over the joint's typical residual [-].
         rows: How many rows there are.
     """
 
@@ -148,7 +148,7 @@ def find_outliers(
         standard: The estimate, shape (p,).
 
     Returns:
-        Outliers of 12 times the joint's usual residual and 10 % of its torque, and more; rows
+        Outliers of 12 times the joint's typical residual and 10 % of its torque, and more; rows
         within half a second of each other are one.
     """
     found: list[Outlier] = []

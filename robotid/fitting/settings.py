@@ -234,7 +234,7 @@ class BoundedSettings(EstimatorSettings):
     prior_weight: float | str = setting(
         "auto",
         "weight of the URDF's values [-], or how it is chosen from the fitted logs: cv "
-        "(stretches held out in turn), evidence, or auto (cv, or 1 for a log too short to be cut)",
+        "(segments held out in turn), evidence, or auto (cv, or 1 for a log too short to be cut)",
         among=("auto", "cv", "evidence"),
         within=_FINITE,
     )
@@ -443,15 +443,15 @@ class GradientSettings(DescentSettings):
 
 @dataclass(frozen=True)
 class SimulationSettings(EstimatorSettings):
-    """Output error: closed loops are rolled out on the commands, and fitted to the positions."""
+    """Output error: closed loops are simulated on the commands, and fitted to the positions."""
 
     name: str = _called(
         "simulation",
-        "closed loops rolled out on the commands of logs and fitted to their positions; "
+        "closed loops simulated on the commands of logs and fitted to their positions; "
         "[controller] says what is known of the loops",
     )
     window: float | None = setting(
-        None, "length of the windows that are rolled out [s]; if not stated 2.5, or 0.5 where the "
+        None, "length of the windows that are simulated [s]; if not stated 2.5, or 0.5 where the "
         "logged torque drives the robot", within=_WINDOW,
     )  # fmt: skip
     lead: float | None = setting(
@@ -471,7 +471,7 @@ class SimulationSettings(EstimatorSettings):
     error: str = setting(
         "output",
         "what is compared: output, the positions (closed-loop output error, CLOE); input, the "
-        "torques of the loops, rolled out, with those logged (closed-loop input error, CLIE); "
+        "torques of the loops, simulated, with those logged (closed-loop input error, CLIE); "
         "direct, the same with derivatives that neglect that the motion changes, which are those "
         "of inverse dynamics (DIDIM; gains and delay must be stated)",
         among=("output", "input", "direct"),

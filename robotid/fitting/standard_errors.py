@@ -1,9 +1,9 @@
-"""Standard errors that hold for coloured noise, from how much the scores of stretches scatter.
+"""Standard errors that hold for coloured noise, from how much the scores of segments scatter.
 
 Residuals behind a low-pass filter are correlated, and what a model misses is correlated still
-longer, so rows do not count as independent measurements. Stretches that are longer than the
-correlation do: the score of stretch s, W_s^T (tau_s - W_s theta), scatters as the noise makes it,
-whatever its colour. The factors of the stretches tell it without a second pass over the rows.
+longer, so rows do not count as independent measurements. Segments that are longer than the
+correlation do: the score of segment s, W_s^T (tau_s - W_s theta), scatters as the noise makes it,
+whatever its colour. The factors of the segments tell it without a second pass over the rows.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.estimators import Consistent, Estimate
 from robotid.estimators.batch import solve_factor
-from robotid.estimators.stretches import FEWEST_STRETCHES, quantile, scatter
+from robotid.estimators.segments import FEWEST_SEGMENTS, quantile, scatter
 from robotid.exceptions import NotConvergedError
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import Factors
@@ -33,11 +33,11 @@ _LEAST_SOLVED = 0.8  # share of the redrawn fits below which they tell nothing
 
 @dataclass(frozen=True, eq=False)
 class StandardErrors:
-    """What the standard errors of an estimate rest on.
+    """What the standard errors of an estimate depend on.
 
     Attributes:
         method: In words.
-        stretches: Number of stretches whose scores were compared.
+        segments: Number of segments whose scores were compared.
         inflation: How much more the scores scatter than those of independent rows would [-].
         freedom: Degrees of freedom of each base parameter's standard error, shape (b,).
         unbounded: Standard errors of the standard parameters with the bounds left out, shape (p,);
@@ -45,7 +45,7 @@ class StandardErrors:
     """
 
     method: str
-    stretches: int
+    segments: int
     inflation: float
     freedom: Array
     unbounded: Array | None = None
@@ -67,7 +67,7 @@ class Redraws:
 
 def measured_errors(
     estimate: Estimate,
-    stretches: Sequence[Factors],
+    segments: Sequence[Factors],
     factors: Factors,
     share: float,
     K: Array,
@@ -78,7 +78,7 @@ def measured_errors(
     redraws: Redraws | None = None,
     more: Array | None = None,
 ) -> tuple[Estimate, StandardErrors]:
-    """Return an estimate with the covariance that the scatter of the stretches shows.
+    """Return an estimate with the covariance that the scatter of the segments shows.
 
     With bread B, the covariance if rows were independent, and meat M, the covariance of the score:
 
@@ -92,18 +92,18 @@ def measured_errors(
     Args:
         estimate: Base parameters, shape (b,), or standard ones, shape (p,), with the covariance
             that rows would leave of which ``share`` are independent.
-        stretches: Factors of the stretches, base parameters.
-        factors: Those of all stretches together.
+        segments: Factors of the segments, base parameters.
+        factors: Those of all segments together.
         share: Share of the rows that the covariance takes to be independent [-].
         K: Map to the base parameters, shape (b, p).
         sigma: Noise level per joint that weighted the rows, shape (n,) [N m or N].
         is_filter: Whether it weighs rows otherwise, too, as a filter that forgets or gates.
         pull: How much heavier the prior weighs than the truth's plausible spread says [-].
         redraws: How the spread is told of an estimate whose details name active bounds.
-        more: Covariance of the score that stretches do not show, shape (b, b); None: nothing.
+        more: Covariance of the score that segments do not show, shape (b, b); None: nothing.
 
     Returns:
-        The estimate, and what its standard errors rest on. With fewer than 12 stretches rows count
+        The estimate, and what its standard errors depend on. With fewer than 12 segments rows count
         as independent by that share.
 
     Raises:
@@ -112,12 +112,12 @@ def measured_errors(
     b = len(factors.names)
     if not (estimate.details.get("active") and redraws is not None and redraws.draws > 0):
         redraws = None  # no bound binds, or it is left out
-    if len(stretches) < FEWEST_STRETCHES:
+    if len(segments) < FEWEST_SEGMENTS:
         method = (
             f"the filter's band: {share:.3g} of the rows count as independent, since the logs have "
-            f"only {len(stretches)} stretches longer than the filter's memory"
+            f"only {len(segments)} segments longer than the filter's memory"
         )
-        errors = StandardErrors(method, len(stretches), 1 / share, np.full(b, np.inf))
+        errors = StandardErrors(method, len(segments), 1 / share, np.full(b, np.inf))
         R = factors.weighted(sigma)[:b, :b]
         if redraws is not None:
             return _bounded(estimate, errors, redraws, factors, sigma, share * R.T @ R)
@@ -128,24 +128,24 @@ def measured_errors(
     is_open = ~np.isfinite(np.diag(estimate.covariance))
     C = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
     if len(estimate.theta) != b:
-        found = scatter(stretches, K @ estimate.theta, sigma, share * K @ C @ K.T)
+        found = scatter(segments, K @ estimate.theta, sigma, share * K @ C @ K.T)
         found = found if more is None else replace(found, meat=found.meat + more)
         R = factors.weighted(sigma)[:b, :b]
         covariance = about_prior(C, K, share**2 * found.meat, R, share, pull)
     elif not is_filter:
         bread = solve_factor(factors, sigma, estimate.theta).covariance
-        found = scatter(stretches, estimate.theta, sigma, bread)
+        found = scatter(segments, estimate.theta, sigma, bread)
         found = found if more is None else replace(found, meat=found.meat + more)
         covariance = found.covariance
     else:
-        found = scatter(stretches, estimate.theta, sigma, share * C)
+        found = scatter(segments, estimate.theta, sigma, share * C)
         covariance = C * (share * found.inflation)
         if more is not None:
             covariance += share**2 * C @ more @ C
     covariance[is_open, is_open] = np.inf
     estimate = replace(estimate, covariance=covariance)
-    method = f"the scatter of the scores of {len(stretches)} stretches"
-    errors = StandardErrors(method, len(stretches), found.inflation, found.freedom())
+    method = f"the scatter of the scores of {len(segments)} segments"
+    errors = StandardErrors(method, len(segments), found.inflation, found.freedom())
     if redraws is not None:
         return _bounded(estimate, errors, redraws, factors, sigma, share**2 * found.meat)
     return estimate, errors

@@ -1,7 +1,7 @@
 """Logs of any length: surveyed once, then read in pieces. A log in memory is one piece.
 
 The survey of a file reads the time stamps of all rows and a few windows of the rest, and decides
-everything automatic for the whole log. A piece is a fixed stretch of rows, read with rows around
+everything automatic for the whole log. A piece is a fixed segment of rows, read with rows around
 it.
 """
 
@@ -22,14 +22,14 @@ from robotid.logs.formats import open_table
 from robotid.logs.read import LogLayout
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import decide, unwrap
-from robotid.logs.smoothing import SPLINE, Stretch, filter_reach, process_stretches, too_short
+from robotid.logs.smoothing import SPLINE, Segment, filter_reach, process_segments, too_short
 from robotid.logs.table import Place, RowReader, Table, prefixes
 from robotid.logs.time_stamps import blocks_of, map_stamps, median_step
 from robotid.logs.units import check_reach, check_units
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import friction_speeds
 from robotid.regressor.factors import Reduction
-from robotid.regressor.memory import bears_load, remember
+from robotid.regressor.memory import is_loaded, remember
 from robotid.regressor.rows import COMPILED, choose_engine
 from robotid.regressor.used_rows import base_problem, row_mask, static_rows
 from robotid.robot.model import RobotModel
@@ -89,14 +89,14 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class LogPiece:
-    """A stretch of rows of a log, with what is needed to read it and to smooth it as the whole."""
+    """A segment of rows of a log, with what is needed to read it and to smooth it as the whole."""
 
     header: _Header  # what the pieces of the log have in common
     first: int  # its first row
     stop: int  # the row after its last one
     span: tuple[int, int]  # first row that is read with it, and the row after the last one
     near: Place  # where in the file the span starts, or a little before
-    stretches: tuple[Stretch, ...]  # the uninterrupted ones that it has rows of
+    segments: tuple[Segment, ...]  # the uninterrupted ones that it has rows of
 
     @property
     def name(self) -> str:
@@ -124,8 +124,8 @@ class LogPiece:
             before: The robot that they are of, with the same friction speeds.
         """
         model, motion, mask = self.header.model, rows.trajectory, rows.mask
-        if model.layout != before.layout or bears_load(model):
-            motion = remember(model, motion.with_memory(None))
+        if model.layout != before.layout or is_loaded(model):
+            motion = remember(model, motion.with_states(None))
         if not model.is_static:  # whose stands were chosen with their speeds
             mask = row_mask(model, motion, self.header.signals.min_velocity)
         vars(self)["_kept"] = replace(rows, trajectory=motion, mask=mask)
@@ -142,9 +142,9 @@ class LogPiece:
         if header.model.is_static:
             trajectory, mask = static_rows(header.model, log, header.signals)
         else:
-            trajectory = process_stretches(
+            trajectory = process_segments(
                 log,
-                self.stretches,
+                self.segments,
                 header.signals,
                 first=self.span[0],
                 own=slice(self.first, self.stop),
@@ -194,7 +194,7 @@ class SurveyedLog:
         stamps: Time stamps of all rows of the file, shape (N,) [s].
         first: Its first row in the file, of the window.
         stop: The row after its last one.
-        windows: Stretches of rows that were looked at closely: all, or first, middle and last ones.
+        windows: Segments of rows that were looked at closely: all, or first, middle and last ones.
         held: Positions in them of locked joints that the file has, by name [rad or m].
         length: Rows per piece.
         places: Where rows of the file start.
@@ -272,14 +272,14 @@ class SurveyedLog:
         )
 
     @cached_property
-    def stretches(self) -> tuple[Stretch, ...]:
-        """Its uninterrupted stretches."""
+    def segments(self) -> tuple[Segment, ...]:
+        """Its uninterrupted segments."""
         edges = [self.first]
         for row, t in blocks_of(self.stamps[self.first : self.stop]):
             breaks = np.flatnonzero(np.diff(t) > (self.signals.max_gap or np.inf)) + 1
             edges += (self.first + row + breaks).tolist()
         return tuple(
-            Stretch(i, j, float(self.stamps[i]), float(self.stamps[j - 1]), number)
+            Segment(i, j, float(self.stamps[i]), float(self.stamps[j - 1]), number)
             for number, (i, j) in enumerate(pairwise([*edges, self.stop]))
         )
 
@@ -302,7 +302,7 @@ class SurveyedLog:
         """All rows of a log in memory, and their smooth motion.
 
         Raises:
-            DataError: If no stretch is long enough, or an angle jumps.
+            DataError: If no segment is long enough, or an angle jumps.
         """
         (piece,) = self.pieces
         rows = piece.read()
@@ -311,26 +311,26 @@ class SurveyedLog:
         return rows
 
     def too_short(self) -> DataError:
-        """Return the error of a log without a stretch that is long enough."""
+        """Return the error of a log without a segment that is long enough."""
         if self.model.is_static:
             return DataError(
-                f"{self.path or 'log'}: no stretch of a quarter of a second is slow enough for "
+                f"{self.path or 'log'}: no segment of a quarter of a second is slow enough for "
                 "dynamics = 'static'; record poses that are held for a second or longer, or slow "
                 "motion at one speed, or set dynamics = 'full'",
                 code="too_short",
             )
-        return too_short(self.path or "log", len(self.stretches), self.signals)
+        return too_short(self.path or "log", len(self.segments), self.signals)
 
     @cached_property
     def pieces(self) -> tuple[LogPiece, ...]:
         """Its pieces, in order, each with the rows that are read around it."""
-        stamps, stretches, window = self.stamps, self.stretches, (self.first, self.stop)
+        stamps, segments, window = self.stamps, self.segments, (self.first, self.stop)
         header = _Header(self.model, self.source, self.signals, self.stop - self.first)
         reach = filter_reach(self.signals)
-        begins, found = [stretch.first for stretch in stretches], list[LogPiece]()
+        begins, found = [segment.first for segment in segments], list[LogPiece]()
         for first in range(*window, self.length):
             stop = min(first + self.length, window[1])
-            mine = stretches[bisect_right(begins, first) - 1 : bisect_right(begins, stop - 1)]
+            mine = segments[bisect_right(begins, first) - 1 : bisect_right(begins, stop - 1)]
             before = int(np.searchsorted(stamps, stamps[first] - reach)) - SPLINE
             after = int(np.searchsorted(stamps, stamps[stop - 1] + reach)) + SPLINE
             span = max(before, mine[0].first), min(after, mine[-1].stop)
@@ -354,7 +354,7 @@ def hold_log(
         held: Positions of locked joints, if it has them, by name [rad or m].
     """
     count = len(log.t)
-    if model.is_static:  # means of stretches take the place of filters
+    if model.is_static:  # means of segments take the place of filters
         signals = replace(
             signals, cutoff=None, rate=None, velocity="differentiated",
             acceleration="differentiated",

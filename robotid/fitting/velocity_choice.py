@@ -52,7 +52,7 @@ def prefers_measured(model: RobotModel, logs: Sequence[Log], settings: SignalSet
     ratio = float(np.median(errors[told, 1] / errors[told, 0]))
     chosen = "measured" if ratio > _BETTER else "differentiated"
     _log.info(
-        "%s: velocity = 'auto' is %s: in stretches that were not fitted, differentiated ones miss "
+        "%s: velocity = 'auto' is %s: in segments that were not fitted, differentiated ones miss "
         "%.2f times as much of the torque as measured ones",
         logs[0].name, chosen, ratio,
     )  # fmt: skip

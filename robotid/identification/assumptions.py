@@ -1,4 +1,4 @@
-"""What is assumed where nothing was recorded: noise of torques, drives of a usual size."""
+"""What is assumed where nothing was recorded: noise of torques, drives of a typical size."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -124,7 +124,7 @@ def largest_torques(model: RobotModel, peak: Array) -> Array:
 
 
 def assumed_parameters(model: RobotModel, size: Array, fastest: Array) -> Array:
-    """Return the URDF's bodies with friction of a usual size, shape (p,).
+    """Return the URDF's bodies with friction of a typical size, shape (p,).
 
     Args:
         model: The robot.

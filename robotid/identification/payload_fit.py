@@ -10,7 +10,7 @@ import numpy as np
 from robotid._settings import is_number, require_each, require_kind
 from robotid._typing import Array
 from robotid.estimators import Consistent, Constraints, Estimate
-from robotid.estimators.stretches import quantile
+from robotid.estimators.segments import quantile
 from robotid.estimators.two_runs import Compared, TwoRuns, payload_runs
 from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.findings import listed

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from robotid._typing import Array
 from robotid.diagnosis.residuals import autocorrelation, friction_split, spectrum
-from robotid.fitting.bands import REACH, TorqueBand, friction_curve
+from robotid.fitting.bands import QUANTILE, TorqueBand, friction_curve
 from robotid.fitting.evaluation import Evaluation
 from robotid.pages.charts import Chart, Series, broken
 from robotid.regressor.memory import drive_motion_along
@@ -65,7 +65,7 @@ def torque_charts(
     motion, used = evaluation.recording.trajectory, evaluation.recording.mask[:, row].astype(bool)
     name, unit = found.model.row_names[row], found.model.row_units[row]
     band = found.band(evaluation) if band is None else band
-    half = REACH * np.interp(np.arange(len(motion.t)), band.samples, band.total[:, row])
+    half = QUANTILE * np.interp(np.arange(len(motion.t)), band.samples, band.total[:, row])
     model, urdf = (
         np.where(used, evaluation.torques[key][:, row], np.nan) for key in ("estimate", "urdf")
     )
@@ -78,8 +78,8 @@ def torque_charts(
         f"{kind.capitalize()} of {name} over time: measured, identified, the URDF's",
         t,
         (
-            Series("URDF", urdf, "urdf", is_faint=True, is_hidden=_dwarfs(urdf, tau, model)),
-            Series("measured", tau, "text", is_faint=True),
+            Series("URDF", urdf, "urdf", is_weak=True, is_hidden=_dwarfs(urdf, tau, model)),
+            Series("measured", tau, "text", is_weak=True),
             Series("identified, 95 % band", model, "predicted", half=half),
         ),
         "time [s]",
@@ -92,7 +92,7 @@ def torque_charts(
         f"Residual of {name} over time, measured less identified",
         t,
         (
-            Series("95 % band", zero, "residual", half=half, is_faint=True),
+            Series("95 % band", zero, "residual", half=half, is_weak=True),
             Series("residual", tau - model, "residual"),
         ),
         "time [s]",
@@ -113,7 +113,7 @@ def _dwarfs(y: Array, *others: Array) -> bool:
 
 
 def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
-    """Return the stretches of time that lie between used rows; those closer than a pixel as one.
+    """Return the segments of time that lie between used rows; those closer than a pixel as one.
 
     Args:
         t: Times, shape (N,) [s].
@@ -159,7 +159,7 @@ def residual_charts(
             f"Spectrum of torque and residual of {name}",
             f[shown],
             (
-                Series("torque", np.sqrt(torque[shown]), "text", is_faint=True),
+                Series("torque", np.sqrt(torque[shown]), "text", is_weak=True),
                 Series("residual", np.sqrt(density[shown]), "residual"),
             ),
             "frequency [Hz]",
@@ -215,9 +215,9 @@ def friction_chart(
         f"Friction of {joint} against speed, measured and identified",
         v,
         (
-            Series("measured", left, "text", "dots", is_faint=True),
+            Series("measured", left, "text", "dots", is_weak=True),
             Series("identified", friction, "predicted", "dots"),
-            Series(f"steady{under}, 95 % band", steady, "residual", half=REACH * std),
+            Series(f"steady{under}, 95 % band", steady, "residual", half=QUANTILE * std),
         ),
         "speed [m/s]" if unit == "N" else "speed [rad/s]",
         f"friction [{unit}]",
@@ -246,7 +246,7 @@ def parameter_charts(found: "Identification", terms: Sequence[str]) -> tuple[Cha
                 )
             ]
             if found.prior[part].any():
-                series.insert(0, Series(before, found.prior[part], "urdf", "bars", is_faint=True))
+                series.insert(0, Series(before, found.prior[part], "urdf", "bars", is_weak=True))
             charts.append(
                 Chart(
                     f"{term} of each {'body' if before == 'URDF' else 'drive'}, {before} and "

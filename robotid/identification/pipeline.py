@@ -32,7 +32,7 @@ from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.result import Asked, Identification
 from robotid.judgement.findings import fit_findings, log_findings, unwritten
-from robotid.judgement.verdict import alarming, check_ignored, doubts_of, refuted
+from robotid.judgement.verdict import blocking, check_ignored, rejected, warnings_of
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -64,7 +64,7 @@ def identify(
         logs: Recordings to fit: a ``Log`` that has the model's joints, the path of a file, a
             DataFrame with the columns of such a file, or several of these. Files are read whole,
             as by ``read_log``; ``robotid.run_job`` reads long ones in pieces.
-        validation: Recordings kept apart to measure the prediction with, likewise.
+        validation: Validation Recordings to measure the prediction with, likewise.
         signals: How logs become trajectories; the defaults if None.
         estimator: Name or settings of the estimator.
         friction: What friction joints have beside viscous and Coulomb's, as of
@@ -175,18 +175,18 @@ def conclude(
     before = [f for f in found if f.severity != "note" and f.code != "excitation"]
     of_fit = fit_findings(fit, misfits, on_misfit, discrepancies)
     beside = settled(with_known_springs(before, fit), of_fit)
-    beside = refuted(beside, result.predictions, result.witness)
-    alarms = alarming(beside, ignore, is_robust=is_robust)
+    beside = rejected(beside, result.predictions, result.scale_check)
+    log_errors = blocking(beside, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.kept)]
     findings = [*log_findings(heads), *impossible_inertials(model), *beside]
-    findings += unwritten(fit, alarms)
+    findings += unwritten(fit, log_errors)
     counted = [finding for finding in findings if finding.code not in ignore]
     names = [Path(e.recording.log.path).name for e in fit.validation if not e.is_refitted]
     return replace(
         result,
         findings=tuple(findings),
-        alarms=tuple(finding.message for finding in alarms),
-        doubts=doubts_of(counted, model.joints, names, is_robust=is_robust),
+        log_errors=tuple(finding.message for finding in log_errors),
+        warnings=warnings_of(counted, model.joints, names, is_robust=is_robust),
     )
 
 

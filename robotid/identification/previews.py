@@ -23,7 +23,7 @@ from robotid.doctor.motions import excitation_finding
 from robotid.estimators import Estimate
 from robotid.estimators.batch import solve_factor
 from robotid.estimators.determination import base_spread, determine
-from robotid.estimators.stretches import FEWEST_STRETCHES, scatter
+from robotid.estimators.segments import FEWEST_SEGMENTS, scatter
 from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.fitting.bands import TorqueBand, expected_band
@@ -54,7 +54,7 @@ from robotid.robot.prior import prior_spread
 __all__ = ["Preview", "Run", "preview", "preview_logs"]
 
 #: The same of a consistent fit's prior where "auto" weighs it, and what is plausible beside that:
-#: the heaviest weight that held-out stretches do not reject, of robots as far from their URDF.
+#: the heaviest weight that held-out segments do not reject, of robots as far from their URDF.
 _WEIGHT = (10.0, 1.0)
 _EXACT = 1e-9  # share of the largest residual that every joint has at least
 _LEAST_FREE = 0.1  # share of a joint's rows that are left to tell its noise, at least
@@ -66,7 +66,7 @@ class Run:
     """What was recorded and identified before.
 
     Attributes:
-        stretches: Factors of its stretches, base parameters.
+        segments: Factors of its segments, base parameters.
         standard: The parameters found, shape (p,).
         squares: As of ``Reduction``.
         samples: As of ``Reduction``.
@@ -76,7 +76,7 @@ class Run:
             none.
     """
 
-    stretches: tuple[Factors, ...]
+    segments: tuple[Factors, ...]
     standard: Array
     squares: Array
     samples: int
@@ -98,18 +98,16 @@ class Run:
         """
         reductions = recordings.reduce()
         whole = join(reductions)
-        stretches = tuple(part.factors for part in reductions if part.factors.rows.any())
+        segments = tuple(part.factors for part in reductions if part.factors.rows.any())
         step = float(np.mean([_row_step(log) for log in recordings.fitted]))
         prior = details.get("prior")
         weight = None if prior is None else (prior["weight"], prior.get("plausible_weight", 1.0))
-        return cls(
-            stretches, standard, whole.squares, whole.samples, recordings.share, step, weight
-        )
+        return cls(segments, standard, whole.squares, whole.samples, recordings.share, step, weight)
 
     @property
     def factors(self) -> Factors:
-        """Those of all stretches together."""
-        return merge(self.stretches)
+        """Those of all segments together."""
+        return merge(self.segments)
 
     def noise(self, K: Array) -> TorqueNoise:
         """Return the noise that it shows: its residuals, correlated as their scores scatter.
@@ -125,13 +123,13 @@ class Run:
         sigma = np.maximum(sigma, _EXACT * max(float(sigma.max()), _EXACT))
         bread = solve_factor(factors, sigma, beta).covariance
         inflation = np.full(len(sigma), 1.0 / self.share)
-        if len(self.stretches) >= FEWEST_STRETCHES:
+        if len(self.segments) >= FEWEST_SEGMENTS:
             for j in np.flatnonzero(factors.rows):
                 alone = np.where(np.arange(len(sigma)) == j, sigma, np.inf)
                 own = np.diag(bread @ factors.information(alone**-2.0) @ bread)
                 share = own / np.diag(bread)  # of each parameter's variance, by this joint
                 told = share > FAINTEST
-                scattered = np.diag(scatter(self.stretches, beta, alone, bread).covariance)
+                scattered = np.diag(scatter(self.segments, beta, alone, bread).covariance)
                 ratio = np.log(scattered[told] / own[told])
                 inflation[j] = np.exp(np.average(ratio, weights=share[told]))
         spent = factors.leverages(bread) / sigma**2
@@ -149,10 +147,10 @@ class Run:
             sigma: Noise level per joint, shape (n,) [N m or N].
         """
         factors, beta = self.factors, K @ self.standard
-        if len(self.stretches) < FEWEST_STRETCHES:
+        if len(self.segments) < FEWEST_SEGMENTS:
             return factors.information(1.0 / sigma**2) / self.share
         bread = solve_factor(factors, sigma, beta).covariance
-        return scatter(self.stretches, beta, sigma, bread).meat
+        return scatter(self.segments, beta, sigma, bread).meat
 
 
 @dataclass(frozen=True, eq=False)
@@ -425,7 +423,7 @@ def _errors(
     """Return the estimate and that of WLS to be expected, both at the prior.
 
     The bounds of a consistent fit are left out, for which of them bind is not known before the
-    data; nor is the weight of its prior, and the plausible one, unless it is stated: the usual.
+    data; nor is the weight of its prior, and the plausible one, unless it is stated: the typical.
     """
     factors, K = said.factors, known.mapping.K
     plain, alike = (

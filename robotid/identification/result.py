@@ -21,8 +21,8 @@ from robotid.identification.summary import (
 from robotid.identification.why_pictures import why_charts
 from robotid.judgement.evidence import Determined, Predictions
 from robotid.judgement.parameter_table import parameter_entries, parameter_table
-from robotid.judgement.verdict import Doubt, Verdict, judge
-from robotid.judgement.witness import Witness, call_witness
+from robotid.judgement.scale_check import ScaleCheck, check_scale
+from robotid.judgement.verdict import Verdict, VerdictWarning, judge
 from robotid.logs.data import suggestion
 from robotid.logs.settings import SignalSettings
 from robotid.pages.plots import Plot
@@ -54,8 +54,8 @@ class Identification(Fit):
 
     Attributes:
         findings: What the user should know of the robot, of the logs and of the fit.
-        alarms: Faults of the recordings that make the result wrong, as the doctor found them.
-        doubts: Why it may be wrong however well it predicts, as the doctor and the fit found.
+        log_errors: Faults of the recordings that make the result wrong, as the doctor found them.
+        warnings: Why it may be wrong however well it predicts, as the doctor and the fit found.
         report: File of the report, if one was written with the result.
         misfits: Terms that the model of its drives still lacks.
         on_misfit: Names of drive parameters whose errors grew by these.
@@ -63,8 +63,8 @@ class Identification(Fit):
     """
 
     findings: tuple[Finding, ...] = ()
-    alarms: tuple[str, ...] = ()
-    doubts: tuple[Doubt, ...] = ()
+    log_errors: tuple[str, ...] = ()
+    warnings: tuple[VerdictWarning, ...] = ()
     report: str = ""
     misfits: tuple[Misfit, ...] = ()
     on_misfit: tuple[str, ...] = ()
@@ -175,12 +175,12 @@ class Identification(Fit):
     @property
     def has_urdf(self) -> bool:
         """Whether a URDF may be written of it: it is possible, and no fault makes it wrong."""
-        return self.is_consistent and not self.alarms
+        return self.is_consistent and not self.log_errors
 
     @cached_property
-    def witness(self) -> Witness:
+    def scale_check(self) -> ScaleCheck:
         """Gravity and masses against the URDF's: what speaks for the scale but the sensors."""
-        return call_witness(self)
+        return check_scale(self)
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -199,5 +199,9 @@ class Identification(Fit):
             self.model.is_static,
         )
         return judge(
-            predictions, determined, alarms=self.alarms, doubts=self.doubts, witness=self.witness
+            predictions,
+            determined,
+            log_errors=self.log_errors,
+            warnings=self.warnings,
+            scale_check=self.scale_check,
         )

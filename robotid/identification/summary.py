@@ -110,7 +110,7 @@ def friction_lines(friction: Mapping[str, Any]) -> list[str]:
         if found["families"]:
             before, after = (
                 step["held_out_error_pct"]
-                for step in (found["tried"][0], [s for s in found["tried"] if s["is_taken"]][-1])
+                for step in (found["tried"][0], [s for s in found["tried"] if s["is_selected"]][-1])
             )
             gain = f"held-out error {before:.1f} -> {after:.1f} %"
             lines.append(f"  {joint}: {' + '.join(found['families'])} ({gain})")

@@ -5,7 +5,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.diagnosis.dependence import Dependence
 from robotid.diagnosis.torque_split import JointTorque, spread_rows
-from robotid.fitting.bands import REACH
+from robotid.fitting.bands import QUANTILE
 from robotid.identification.pictures import unused_spans
 from robotid.pages.charts import Chart, Series, broken
 
@@ -102,8 +102,8 @@ def _residual(torque: JointTorque, dependence: Dependence, link: str, points: in
         "interval",
         x=x[k],
         series=(
-            Series("residual", residual[k], "residual", "dots", is_faint=True),
-            Series("mean", mean, "text", half=REACH * error),
+            Series("residual", residual[k], "residual", "dots", is_weak=True),
+            Series("mean", mean, "text", half=QUANTILE * error),
         ),
         x_label=f"{name} [{unit}]",
         y_label=f"residual [{torque.unit}]",

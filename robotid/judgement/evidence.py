@@ -1,4 +1,4 @@
-"""What a verdict rests on: how well torque is predicted, and what the data determine."""
+"""What a verdict depends on: how well torque is predicted, and what the data determine."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from robotid.fitting.metrics import JointMetrics, Metrics
 
 __all__ = ["BEATEN", "GOOD", "POOR", "Determined", "Predictions", "error_of", "is_beaten"]
 
-#: [%] a joint predicted within this on kept recordings is predicted well.
+#: [%] a joint predicted within this on validation recordings is predicted well.
 GOOD = 15.0
 #: [%] a joint predicted worse than this is not usable.
 POOR = 50.0
@@ -19,7 +19,9 @@ POOR = 50.0
 BEATEN = 1.05
 
 _TIE = 0.3  # [%] ... and, of the URDF with fitted drives, by this share of the torque
-_OPTIMISM = 2.0  # an error this many times the fitted one on kept recordings shows over-fitting
+_OPTIMISM = (
+    2.0  # an error this many times the fitted one on validation recordings shows over-fitting
+)
 _NAMED = 8  # parameters that a reason names
 
 
@@ -61,15 +63,15 @@ class Predictions:
         return {joint: self._on(joint) for joint in dict.fromkeys([*named, *moved])}
 
     def _on(self, joint: str) -> tuple[list[str], list[str], list[float]]:
-        poor, doubts, errors = [], [], []
+        poor, warnings, errors = [], [], []
         for log, metrics in self.tested.items():
             measured = metrics.get(joint)
             if measured is not None:
                 found = _judge_joint(joint, log, measured, self.fitted.get(joint))
                 poor += found[0]
-                doubts += found[1]
+                warnings += found[1]
                 errors.append(error_of(measured))
-        return poor, doubts, errors
+        return poor, warnings, errors
 
     def untested(self) -> list[str]:
         """Return why no prediction of a new motion was evaluated, if none was."""
@@ -116,7 +118,7 @@ class Predictions:
         if joint not in self.fitted:
             return "it does not move in any recording"
         if self.validation:
-            return "it does not move in any kept recording"
+            return "it does not move in any validation recording"
         return "no recording was kept apart"
 
 
@@ -136,7 +138,7 @@ class Determined:
     is_poorly_excited: bool = True
     is_static: bool = False
 
-    def doubts(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """Return what keeps the result from being good."""
         reasons = []
         if self.undetermined and self.is_poorly_excited:

@@ -68,7 +68,7 @@ def fit_findings(
     if known.groups:
         message = (
             f"the data determine {known.rank} of {len(known.names)} base parameters: "
-            f"{known.in_words()}. What they leave open keeps the URDF's values; record a richer "
+            f"{known.described()}. What they leave open keeps the URDF's values; record a richer "
             "trajectory to determine it"
         )
         severity = "warning" if fit.is_poorly_excited else "note"
@@ -115,7 +115,7 @@ def _static_findings(fit: Fit) -> list[Finding]:
         sum(getattr(r.extent, key) for r in recordings) for key in ("samples", "smooth")
     )
     message = (
-        f"the {rows} rows count as {samples} stands and slow stretches of a quarter of a "
+        f"the {rows} rows count as {samples} stands and slow segments of a quarter of a "
         "second; inertias about the centres of mass keep the URDF's values"
     )
     if still := _standing_drives(fit):
@@ -171,7 +171,9 @@ def _drive_findings(fit: Fit) -> list[Finding]:
                         "at the end of that range"
                     )
                     evidence = {"share_pct": 100 * share}
-                    findings.append(Finding("beyond_seen", "note", choice.joint, message, evidence))
+                    findings.append(
+                        Finding("beyond_range", "note", choice.joint, message, evidence)
+                    )
     return findings
 
 
@@ -217,15 +219,15 @@ def _grown(found: Fit, said: Collection[str]) -> list[Finding]:
     return findings
 
 
-def unwritten(fit: Fit, alarms: Sequence[Finding]) -> list[Finding]:
+def unwritten(fit: Fit, log_errors: Sequence[Finding]) -> list[Finding]:
     """Return a warning that no URDF is written, and why.
 
     Args:
         fit: What was found.
-        alarms: Faults that make it wrong.
+        log_errors: Faults that make it wrong.
     """
-    if alarms:
-        codes = listed(dict.fromkeys(finding.code for finding in alarms))
+    if log_errors:
+        codes = listed(dict.fromkeys(finding.code for finding in log_errors))
         message = (
             f"no URDF was written, for the result is wrong by what was found: {codes}. Correct it, "
             "or, if you know better, state these codes as ignore in [doctor]"
@@ -336,7 +338,7 @@ def consistency_findings(fit: Fit) -> list[Finding]:
         is_stated = bool(_stated(fit).intersection(bounds))
         severity = "warning" if against and is_stated else "note"
         message = f"the bounds {listed(bounds)} bind: {why}"
-        findings.append(Finding("bound_binds", severity, ", ".join(bounds), message))
+        findings.append(Finding("active_bound", severity, ", ".join(bounds), message))
     gap = min(details.get("gaps", [0.0]))
     if gap > _SAME_OPTIMUM:
         message = (
@@ -454,7 +456,7 @@ def _outlier_findings(fit: Fit) -> list[Finding]:
         return []
     places = [
         f"{o.joint} at {o.t:.3f} s of {o.log}: {o.torque:.4g} against {o.predicted:.4g} predicted, "
-        f"{o.size:.0f} times its usual residual"
+        f"{o.size:.0f} times its typical residual"
         for o in outliers[:_NAMED]
     ]
     more = f"; and {len(outliers) - _NAMED} more" if len(outliers) > _NAMED else ""

@@ -47,7 +47,7 @@ def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dic
         found: What was identified.
     """
     layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
-    errors, ends, reach = found.standard_error, found.standard_interval, found.standard_reach
+    errors, ends, reach = found.standard_error, found.standard_interval, found.standard_quantile
     pairs = correlated_parameters(found)
     entries = [
         {

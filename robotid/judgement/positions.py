@@ -28,7 +28,7 @@ def judge_positions(
     *,
     is_kept: bool,
     is_settled: bool = True,
-    alarms: Sequence[str] = (),
+    log_errors: Sequence[str] = (),
     cautions: Sequence[str] = (),
     scale: str = "",
 ) -> Verdict:
@@ -39,29 +39,29 @@ def judge_positions(
         joints: Names of the model's joints; one without metrics is not evaluated.
         is_kept: Whether the logs were kept apart from the fit.
         is_settled: Whether the fit has settled.
-        alarms: Faults of the logs that make the result wrong.
+        log_errors: Faults of the logs that make the result wrong.
         cautions: What keeps a result from being good, whatever its errors are.
-        scale: What the scale of all parameters rests on, if nothing measured shows it.
+        scale: What the scale of all parameters depends on, if nothing measured shows it.
     """
     found = {joint: _judge_joint(joint, metrics.per_joint.get(joint), is_kept) for joint in joints}
     reasons = {
         status: [why for own in found.values() if own.status == status for why in own.reasons]
         for status in ("poor", "not evaluated", "usable")
     }
-    doubts = list(cautions)
+    warnings = list(cautions)
     if not is_kept:
-        doubts.append("the prediction of a new motion was not evaluated: no validation log given")
+        warnings.append("the prediction of a new motion was not evaluated: no validation log given")
     if not is_settled:
-        doubts.append("the fit has not settled")
+        warnings.append("the fit has not settled")
     worst = max(map(error_of, metrics.per_joint.values()), default=0.0)
     return concluded(
         found,
         poor=reasons["poor"],
-        doubts=[*doubts, *reasons["not evaluated"], *reasons["usable"]],
+        warnings=[*warnings, *reasons["not evaluated"], *reasons["usable"]],
         good=f"simulated position error on validation logs: at most {worst:.2g} % of each joint's "
         "RMS motion, smaller than that of plainer models",
         notes=[scale] if scale else [],
-        alarms=alarms,
+        log_errors=log_errors,
         is_tested=is_kept and bool(metrics.per_joint),
     )
 
@@ -69,7 +69,7 @@ def judge_positions(
 def _judge_joint(joint: str, measured: JointMetrics | None, is_kept: bool) -> JointVerdict:
     """Return the verdict on one joint; measured is None if no log commands it to move."""
     if measured is None:
-        still = f"{joint}: commanded to stand still in all logs: not evaluated"
+        still = f"{joint}: commanded to are at rest in all logs: not evaluated"
         return on_joint([], [], is_tested=False, said=still)
     error, baselines = error_of(measured), measured.baselines
     names = _DRIVEN if "steady" in baselines else _PLAINER

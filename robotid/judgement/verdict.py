@@ -13,25 +13,25 @@ from robotid.exceptions import SettingsError
 from robotid.findings import Finding, listed
 from robotid.fitting.metrics import Metrics
 from robotid.judgement.evidence import Determined, Predictions, error_of
-from robotid.judgement.witness import Witness
+from robotid.judgement.scale_check import ScaleCheck
 
 __all__ = [
-    "DOUBTFUL",
-    "Doubt",
+    "WARNING_CODES",
     "JointVerdict",
     "Verdict",
-    "alarming",
+    "VerdictWarning",
+    "blocking",
     "check_ignored",
     "concluded",
-    "doubts_of",
-    "is_outvoted",
+    "is_downweighted",
     "judge",
     "on_joint",
-    "refuted",
+    "rejected",
+    "warnings_of",
 ]
 
-_REFUTED = 5.0  # [%] a hypothesis on columns or masses is refuted by a prediction so good
-_SCALED = 2.0  # a gravity within this factor of the URDF's refutes another unit of the torque
+_REJECTED = 5.0  # [%] a hypothesis on columns or masses is rejected by a prediction so good
+_SCALED = 2.0  # a gravity within this factor of the URDF's contradicts another unit of the torque
 _WRONG = 2.0  # a fit that misses this many times what WLS misses ...
 _HARMLESS = 1.0  # [%] ... is doubtful, but not below this share of the torque
 _SMALL = 5.0  # [%] of the torque: a term that a drive lacks leaves no doubt below
@@ -39,7 +39,7 @@ _SMALL = 5.0  # [%] of the torque: a term that a drive lacks leaves no doubt bel
 #: figure of the evidence.
 _WORDS = {
     "angle_scale": "positions fit best times another factor",
-    "bound_binds": "the data, or the masses that it leaves, speak against a stated bound",
+    "active_bound": "the data, or the masses that it leaves, contradict a stated bound",
     "com_outside": "its centre of mass lies {outside:.2g} m outside its geometry: no such body",
     "clipped": "the torque is clipped at a limit",
     "constant_torque": "the torque never changes: the channel is dead",
@@ -52,7 +52,7 @@ _WORDS = {
     "density": "its mass makes {density:.2g} kg/m^3 of the box around its geometry",
     "gravity": "the direction of gravity may be stated wrongly",
     "gravity_compensated": "the torque may be logged without gravity",
-    "held_torque": "the torque is held for {rows:.0f} rows at a time, so it is late and stepped",
+    "repeated_torque": "the torque is held for {rows:.0f} rows at a time, so it is late and stepped",
     "gyration": "its mass lies {gyration:.2g} m from its centre on average, its geometry ends at "
     "{farthest:.2g} m: no body can be so",
     "joint_origin": "the joint seems to lie elsewhere than the URDF has it",
@@ -94,7 +94,7 @@ _WORDS |= {
     for code, term in _MISFITS.items()
 }
 #: Codes of the warnings that make a result doubtful.
-DOUBTFUL = (*_WORDS, "repeated_motion")
+WARNING_CODES = (*_WORDS, "repeated_motion")
 _OF_RESULTS = ("total_mass",)  # errors that a result alone can show
 _HYPOTHESES = (
     "current_for_torque",
@@ -103,7 +103,7 @@ _HYPOTHESES = (
     "unexplained_torque",
     "urdf_mismatch",
 )
-_REPEATED = "the motion kept apart is in a fitted log, too, so no prediction was tested"
+_REPEATED = "the validation motion is in a fitted log, too, so no prediction was tested"
 _STATIC = (
     "static: gravity, offsets and friction that needs no speed were identified; inertias, armature "
     "and viscous friction were not, and keep the URDF's values: the result holds for standing and "
@@ -115,7 +115,7 @@ _OF_THE_FIT = ("all joints", "estimator", "recordings", "standard_parameters")
 
 
 @dataclass(frozen=True)
-class Doubt:
+class VerdictWarning:
     """Why a result may be wrong although it predicts torque well.
 
     Attributes:
@@ -150,15 +150,15 @@ class Verdict:
         status: "good", "usable", "poor" or "not evaluated".
         reasons: Why, the worst first; for "good" what was checked.
         joints: The same of each joint of the model.
-        alarms: Faults of the recordings that it was told of.
-        doubts: Doubts that it was told of.
+        log_errors: Faults of the recordings that it was told of.
+        warnings: Doubts that it was told of.
     """
 
     status: str
     reasons: tuple[str, ...]
     joints: Mapping[str, JointVerdict] = field(default_factory=dict)
-    alarms: tuple[str, ...] = ()
-    doubts: tuple[Doubt, ...] = ()
+    log_errors: tuple[str, ...] = ()
+    warnings: tuple[VerdictWarning, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as plain values, as result.json has it."""
@@ -169,8 +169,8 @@ class Verdict:
                 joint: {"status": verdict.status, "reasons": list(verdict.reasons)}
                 for joint, verdict in self.joints.items()
             },
-            "alarms": list(self.alarms),
-            "doubts": [asdict(doubt) for doubt in self.doubts],
+            "log_errors": list(self.log_errors),
+            "warnings": [asdict(doubt) for doubt in self.warnings],
         }
 
 
@@ -178,18 +178,18 @@ def judge(
     predictions: Predictions,
     determined: Determined,
     *,
-    alarms: Sequence[str] = (),
-    doubts: Sequence[Doubt] = (),
-    witness: Witness | None = None,
+    log_errors: Sequence[str] = (),
+    warnings: Sequence[VerdictWarning] = (),
+    scale_check: ScaleCheck | None = None,
 ) -> Verdict:
     """Return the verdict on a result.
 
     Args:
         predictions: How well it predicts torque.
         determined: What the data determine of its parameters.
-        alarms: Faults of the recordings that make any result of them wrong.
-        doubts: Why the result may be wrong however well it predicts.
-        witness: What speaks for the scale of the result but the sensors.
+        log_errors: Faults of the recordings that make any result of them wrong.
+        warnings: Why the result may be wrong however well it predicts.
+        scale_check: What speaks for the scale of the result but the sensors.
 
     Returns:
         The verdict. Without a validation log, or with a doubt, it is at best "usable"; so is that
@@ -197,26 +197,26 @@ def judge(
     """
     found, hidden = predictions.on_each(), predictions.hidden
     poor = sorted((reason for worse, _, _ in found.values() for reason in worse), key=_rank)
-    against = witness is not None and witness.is_against
+    against = scale_check is not None and scale_check.is_against
     reasons = [
         *predictions.untested(),
         *(reason for _, doubt, _ in found.values() for reason in doubt),
         *predictions.left_to_urdf(),
-        *_in_words(doubts),
-        *([witness.message] if witness is not None and against else []),
+        *_described(warnings),
+        *([scale_check.message] if scale_check is not None and against else []),
         *predictions.unseen(),
-        *determined.doubts(),
+        *determined.warnings(),
     ]
     notes = [
         *determined.notes(),
-        *([witness.message] if witness is not None and not against else []),
+        *([scale_check.message] if scale_check is not None and not against else []),
         *([f"{listed(hidden)}: {_HIDDEN}: not evaluated"] if hidden else []),
         *([_STATIC] if determined.is_static else []),
     ]
     per_joint = {
         joint: on_joint(
             sorted(worse, key=_rank),
-            [*doubt, *_in_words([d for d in doubts if d.joint in ("", joint)])],
+            [*doubt, *_described([d for d in warnings if d.joint in ("", joint)])],
             is_tested=bool(errors),
             said=f"predicted within {max(errors):.1f} %, better than by a constant and than by the "
             "URDF"
@@ -231,18 +231,20 @@ def judge(
         f"every joint is predicted within {worst:.1f} % on recordings that were not fitted, better "
         "than by a constant and than by the URDF, and every parameter is physically consistent"
     )
-    verdict = concluded(per_joint, poor=poor, doubts=reasons, good=good, notes=notes, alarms=alarms)
-    return replace(verdict, doubts=tuple(doubts))
+    verdict = concluded(
+        per_joint, poor=poor, warnings=reasons, good=good, notes=notes, log_errors=log_errors
+    )
+    return replace(verdict, warnings=tuple(warnings))
 
 
 def concluded(
     joints: Mapping[str, JointVerdict],
     *,
     poor: Sequence[str],
-    doubts: Sequence[str],
+    warnings: Sequence[str],
     good: str,
     notes: Sequence[str] = (),
-    alarms: Sequence[str] = (),
+    log_errors: Sequence[str] = (),
     is_tested: bool = True,
 ) -> Verdict:
     """Return the verdict that reasons make up.
@@ -250,33 +252,33 @@ def concluded(
     Args:
         joints: The verdict on each joint.
         poor: What makes the result poor.
-        doubts: What keeps it from being good.
+        warnings: What keeps it from being good.
         good: What was checked, if it is good.
         notes: What follows the reasons, and changes no verdict.
-        alarms: Faults of the recordings that make it poor, whatever else is found.
+        log_errors: Faults of the recordings that make it poor, whatever else is found.
         is_tested: Whether anything was evaluated; else a result that is not poor has no verdict.
     """
-    status = "usable" if doubts else "good"
-    status = "poor" if poor or alarms else status if is_tested else "not evaluated"
-    reasons = (*alarms, *poor, *doubts) or (good,)
-    return Verdict(status, (*reasons, *notes), joints, tuple(alarms))
+    status = "usable" if warnings else "good"
+    status = "poor" if poor or log_errors else status if is_tested else "not evaluated"
+    reasons = (*log_errors, *poor, *warnings) or (good,)
+    return Verdict(status, (*reasons, *notes), joints, tuple(log_errors))
 
 
 def on_joint(
-    poor: Sequence[str], doubts: Sequence[str], *, is_tested: bool, said: str
+    poor: Sequence[str], warnings: Sequence[str], *, is_tested: bool, said: str
 ) -> JointVerdict:
     """Return the verdict on a joint.
 
     Args:
         poor: What makes it poor.
-        doubts: What keeps it from being good.
+        warnings: What keeps it from being good.
         is_tested: Whether a validation log tests it.
         said: What was checked, if it is good; why nothing was, if it is not tested.
     """
     if not is_tested:  # never a pass
-        return JointVerdict("not evaluated", (said, *doubts))
-    if poor or doubts:
-        return JointVerdict("poor" if poor else "usable", (*poor, *doubts))
+        return JointVerdict("not evaluated", (said, *warnings))
+    if poor or warnings:
+        return JointVerdict("poor" if poor else "usable", (*poor, *warnings))
     return JointVerdict("good", (said,))
 
 
@@ -289,7 +291,7 @@ def check_ignored(ignore: Sequence[str]) -> None:
     Raises:
         SettingsError: If a code is unknown.
     """
-    known = sorted({*CODES, *DOUBTFUL, *_OF_RESULTS})
+    known = sorted({*CODES, *WARNING_CODES, *_OF_RESULTS})
     require_kind(ignore, (list, tuple, set, frozenset), "ignore", "a list of codes")
     for code in ignore:
         require_kind(code, str, "a code in ignore", "the code of a finding")
@@ -301,7 +303,7 @@ def check_ignored(ignore: Sequence[str]) -> None:
             )
 
 
-def alarming(
+def blocking(
     findings: Sequence[Finding], ignore: Sequence[str], *, is_robust: bool = False
 ) -> tuple[Finding, ...]:
     """Return the errors that make an identification wrong, but for those the user knows better.
@@ -312,23 +314,23 @@ def alarming(
         is_robust: Whether a robust loss was set, which outvotes jumps of the torque.
     """
     errors = (f for f in findings if f.severity == "error" and f.code not in ignore)
-    return tuple(f for f in errors if not (is_robust and is_outvoted(f)))
+    return tuple(f for f in errors if not (is_robust and is_downweighted(f)))
 
 
-def refuted(
-    findings: Sequence[Finding], kept: Mapping[str, Metrics], witness: Witness
+def rejected(
+    findings: Sequence[Finding], kept: Mapping[str, Metrics], scale_check: ScaleCheck
 ) -> list[Finding]:
-    """Return findings, hypotheses that a prediction of unseen motion refutes as notes.
+    """Return findings, hypotheses that a prediction of unseen motion contradicts as notes.
 
     That masses or the direction of gravity are not as stated, or that no physics explains a
-    torque, is refuted where the result predicts these torques of every kept recording within 5 %;
+    torque, is rejected where the result predicts these torques of every validation recording within 5 %;
     another unit of the torque, or an error that it holds no gravity, if gravity as identified is
     also within a factor of two of the URDF's there.
 
     Args:
         findings: What was found.
-        kept: Metrics of each recording that was kept apart and shows a prediction.
-        witness: The identified gravity against the URDF's.
+        kept: Metrics of each validation recording and shows a prediction.
+        scale_check: The identified gravity against the URDF's.
     """
     errors: dict[str, float] = {}
     for metrics in kept.values():
@@ -341,55 +343,59 @@ def refuted(
         named = [j for j in finding.where.rpartition(": ")[2].split(", ") if j in errors]
         joints = named or [*errors]
         worst = max((errors[joint] for joint in joints), default=np.inf)
-        is_refuted = finding.code in _HYPOTHESES and worst < _REFUTED
+        is_rejected = finding.code in _HYPOTHESES and worst < _REJECTED
         if finding.where == "all joints":
-            is_refuted = False  # it was found in what the prediction leaves
+            is_rejected = False  # it was found in what the prediction leaves
         elif finding.code == "current_for_torque":
-            ratios = [witness.gravity[j] for j in joints if j in witness.gravity]
-            is_refuted &= all(1 / _SCALED < ratio < _SCALED for ratio in ratios)
+            ratios = [scale_check.gravity[j] for j in joints if j in scale_check.gravity]
+            is_rejected &= all(1 / _SCALED < ratio < _SCALED for ratio in ratios)
         elif finding.code == "gravity_compensated":
-            is_refuted &= witness.scale is not None and 1 / _SCALED < witness.factor < _SCALED
+            is_rejected &= (
+                scale_check.scale is not None and 1 / _SCALED < scale_check.factor < _SCALED
+            )
         elif finding.severity == "error":
-            is_refuted = False
-        if is_refuted:
+            is_rejected = False
+        if is_rejected:
             but = f"; but the result predicts unseen motion within {worst:.1f} %"
             finding = replace(finding, severity="note", message=f"{finding.message}{but}")
         found.append(finding)
     return found
 
 
-def doubts_of(
+def warnings_of(
     findings: Sequence[Finding],
     joints: Sequence[str],
     kept: Sequence[str] = (),
     *,
     is_robust: bool = False,
-) -> tuple[Doubt, ...]:
+) -> tuple[VerdictWarning, ...]:
     """Return the doubts that findings raise, each once.
 
     Args:
         findings: What the doctor and the fit found; notes and errors raise no doubt.
         joints: The model's joints. A finding whose place names some is about these only.
-        kept: Names of the recordings kept apart, one each.
+        kept: Names of the validation recordings, one each.
         is_robust: Whether a robust loss was set.
     """
     # the places of jumps of a torque, as other findings call them: log and joint
-    outvoted = {f.where.replace(": tau_", ": ") for f in findings if is_robust and is_outvoted(f)}
-    found: list[Doubt] = []
+    downweighted = {
+        f.where.replace(": tau_", ": ") for f in findings if is_robust and is_downweighted(f)
+    }
+    found: list[VerdictWarning] = []
     for finding in findings:
         if finding.severity != "warning" or finding.code not in _WORDS or _is_harmless(finding):
             continue
         # spikes that a robust fit leaves out are what physics could not explain
-        if finding.code == "unexplained_torque" and finding.where in outvoted:
+        if finding.code == "unexplained_torque" and finding.where in downweighted:
             continue
-        found += _doubts(finding, joints)
+        found += _warnings(finding, joints)
     repeated = {f.where for f in findings if f.code == "repeated_motion"}
     if kept and repeated.issuperset(kept):
-        found.append(Doubt("repeated_motion", "", _REPEATED))
+        found.append(VerdictWarning("repeated_motion", "", _REPEATED))
     return tuple(dict.fromkeys(found))
 
 
-def is_outvoted(finding: Finding) -> bool:
+def is_downweighted(finding: Finding) -> bool:
     """Return whether a robust loss makes it harmless: it is about jumps of the torque only.
 
     Args:
@@ -398,10 +404,10 @@ def is_outvoted(finding: Finding) -> bool:
     return finding.code == "spikes" and finding.where.rsplit(": ", 1)[-1].startswith("tau_")
 
 
-def _in_words(doubts: Sequence[Doubt]) -> list[str]:
+def _described(warnings: Sequence[VerdictWarning]) -> list[str]:
     """Return one sentence per kind of doubt, with the joints that share it."""
     shared: dict[tuple[str, str], list[str]] = {}
-    for doubt in doubts:
+    for doubt in warnings:
         shared.setdefault((doubt.message, doubt.code), []).append(doubt.joint)
     return [
         f"{', '.join(joints)}: {message} ({code})" if any(joints) else f"{message} ({code})"
@@ -414,15 +420,15 @@ def _rank(reason: str) -> int:
     return 0 if "a constant" in reason else 1 if "the URDF" in reason else 2
 
 
-def _doubts(finding: Finding, joints: Sequence[str]) -> Iterator[Doubt]:
+def _warnings(finding: Finding, joints: Sequence[str]) -> Iterator[VerdictWarning]:
     message = _WORDS[finding.code].format(**finding.evidence)
     log, _, last = finding.where.rpartition(": ")
     named = [joint for joint in last.split(", ") if joint in joints]
     for joint in named:
-        yield Doubt(finding.code, joint, message)
+        yield VerdictWarning(finding.code, joint, message)
     if not named:
         where = "" if finding.where in _OF_THE_FIT else f"{log or last}: "
-        yield Doubt(finding.code, "", f"{where}{message}")
+        yield VerdictWarning(finding.code, "", f"{where}{message}")
 
 
 def _is_harmless(finding: Finding) -> bool:

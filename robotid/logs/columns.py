@@ -277,7 +277,7 @@ class Finder:
         raise DataError(
             f"{self.where} has commanded positions, but none of {listed(without)}: no column "
             f"'qref_{self._named(without[0])}'; found: {listed(known)}. Record or rename what is "
-            "missing, pass columns={'qref_<joint>': ...}, or lock joints that stood still",
+            "missing, pass columns={'qref_<joint>': ...}, or lock joints that was at rest",
             code="missing_column",
         )
 
@@ -307,7 +307,7 @@ class Finder:
         if absent and joint in self.joints:
             locks = " ".join(f"--lock {name}=0" for name in absent)
             also = (
-                f". There is no torque of {listed(absent)} either; if they stood still, lock them "
+                f". There is no torque of {listed(absent)} either; if they was at rest, lock them "
                 f"where they stood, as with {locks}"
             )
         return DataError(
@@ -345,7 +345,7 @@ class Finder:
         sought = f"{kind}_{named}" if joint else kind
         stood = ""
         if joint in self.joints and kind in NOUNS:
-            stood = f"; if {joint!r} stood still, leave it out of joints and lock it"
+            stood = f"; if {joint!r} was at rest, leave it out of joints and lock it"
             stood += self._how_to_lock()
         if at_motors := [name for name in self.names if name.startswith(f"{kind}m_")]:
             stood = (

@@ -163,7 +163,7 @@ class Trajectory:
         tau: Torques, shape (N, n) [N m or N].
         joints: Names of the n joints, in the order of the columns.
         rate: Rate of the uniform grid [Hz]; None if the rows are as recorded.
-        segment: Rows of one uninterrupted stretch share a number, shape (N,), int.
+        segment: Rows of one uninterrupted segment share a number, shape (N,), int.
         direction: Sign of each speed that Coulomb friction follows, filtered as the torque is,
             shape (N, c) [-], in the order of ``friction_speeds``; None: the speed's own sign.
         memory: What drive parameters multiply that an instant alone does not show, shape (N, m),
@@ -207,15 +207,15 @@ class Trajectory:
             raise DataError(f"trajectory: rate is {self.rate!r}, wanted a positive number or None")
 
     def __repr__(self) -> str:
-        stretches = len(np.unique(self.segment))
-        return f"<Trajectory: {_extent(self, self.rate)}, in {stretches} stretches>"
+        segments = len(np.unique(self.segment))
+        return f"<Trajectory: {_extent(self, self.rate)}, in {segments} segments>"
 
     @cached_property
     def derived(self) -> dict[str, Any]:
         """What was computed of this motion and is kept with it, by name."""
         return {}
 
-    def with_memory(self, memory: Array | None) -> "Trajectory":
+    def with_states(self, memory: Array | None) -> "Trajectory":
         """Return the same motion with other memory, and what was computed of it.
 
         Args:

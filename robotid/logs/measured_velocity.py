@@ -22,12 +22,12 @@ __all__ = [
 LATE = 0.02
 #: A channel of fewer steps than this over its range is uninformative.
 COARSE = 100
-_FEWEST = 8  # rows of a stretch in which a lag is sought
+_FEWEST = 8  # rows of a segment in which a lag is sought
 _LONGEST = 0.3  # [s] lags are sought up to this
 _GAP = 5  # a step longer than this many median steps is a gap
-_STRETCH = 0.1  # [s] motion is compared over stretches this long: noise averages out
+_SEGMENT = 0.1  # [s] motion is compared over segments this long: noise averages out
 _UNLIKE = 0.5  # correlation below which a velocity is not that of its position
-_MOVED, _SPEED = 1e-3, 0.02  # [rad or m], [rad/s or m/s] less than this is standing still
+_MOVED, _SPEED = 1e-3, 0.02  # [rad or m], [rad/s or m/s] less than this is at rest
 
 
 def is_trustworthy(log: Log, stated: float = 0.0) -> bool:
@@ -66,8 +66,8 @@ def velocity_lags(log: Log) -> tuple[float, Array]:
     """Return how late measured velocities are against the derivatives of the positions [s].
 
     The delay minimises the distance between the measured velocity and the delayed derivative;
-    found on a uniform grid in stretches without gaps, and refined by a parabola. It is positive if
-    the measured velocity is late, and 0 if the joints stand still.
+    found on a uniform grid in segments without gaps, and refined by a parabola. It is positive if
+    the measured velocity is late, and 0 if the joints are at rest.
 
     Args:
         log: A log with measured velocities.
@@ -130,7 +130,7 @@ def unlike_velocities(log: Log) -> dict[str, float]:
     v, dt = _measured(log), np.diff(log.t)[:, None]
     median = float(np.median(dt))
     usual = dt < _GAP * median
-    length = int(np.clip(round(_STRETCH / median), 1, max(1, len(dt) // 4)))
+    length = int(np.clip(round(_SEGMENT / median), 1, max(1, len(dt) // 4)))
     moved = _means(np.where(usual, np.diff(np.unwrap(log.q, axis=0), axis=0), 0.0), length)
     swept = _means(np.where(usual, dt * (v[1:] + v[:-1]) / 2, 0.0), length)
     reach = min(round(_LONGEST / median), len(moved) // 2)
@@ -172,7 +172,7 @@ def _measured(log: Log) -> Array:
 
 
 def _means(steps: Array, length: int) -> Array:
-    """Return the means over each stretch of so many consecutive rows."""
+    """Return the means over each segment of so many consecutive rows."""
     total = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
     means: Array = (total[length:] - total[:-length]) / length
     return means

@@ -69,7 +69,7 @@ def read_log(
         start: First time stamp kept, on the log's own clock [s].
         end: Last time stamp kept [s].
         units: Units of the file, if not SI.
-        prismatic: Names of joints that slide; the others turn. Names that are not read are ignored.
+        prismatic: Names of prismatic joints; the others turn. Names that are not read are ignored.
         source: Which topic of a bag or group of a file, names of joints in it, meaning of effort.
         transmissions: The motors and gears, where the file has columns of motors.
         needs: What is wanted beside positions, as of ``lay_out``.
@@ -100,7 +100,7 @@ def read_logs(
     Args:
         given: A log that has these joints, a path, a DataFrame, or a sequence of these.
         joints: Names of the joints wanted, in the order wanted.
-        prismatic: Names of joints that slide; the others turn.
+        prismatic: Names of prismatic joints; the others turn.
         needs: What is wanted beside positions, as of ``lay_out``.
 
     Raises:
@@ -144,7 +144,7 @@ def _of_joints(log: Log, joints: Sequence[str], needs: Needs) -> Log:
         held = ", ".join(f"{joint!r}: 0.0" for joint in absent)
         raise DataError(
             f"{log.name} has the joints {listed(log.joints)}, but not {listed(absent)}, which the "
-            "model has; record them, or if they stood still, lock them where they stood: "
+            "model has; record them, or if they was at rest, lock them where they stood: "
             f"RobotModel.from_urdf(..., locked={{{held}}})"
         )
     return log if log.joints == tuple(joints) else log.select(joints)
@@ -166,7 +166,7 @@ class LogLayout:
     columns: Mapping[str, Sequence[str]]  # names in the file of "time", "q", "tau", "dq", "ddq"
     factors: tuple[float, ...]  # what makes each torque column a torque, by joint
     units: LogUnits  # of the file
-    prismatic: tuple[str, ...]  # names of joints that slide
+    prismatic: tuple[str, ...]  # names of prismatic joints
     source: LogSource  # where in the file
     notes: tuple[str, ...]  # what the reader should know
     motors: Mapping[str, tuple[bool, ...]]  # by kind: which columns are a motor's

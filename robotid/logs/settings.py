@@ -48,7 +48,7 @@ class SignalSettings(Settings):
     velocity: str = setting(
         "auto",
         "measured, differentiated (from the position), or auto: measured if the log has it, it "
-        "is fine and that of its position, and predicts torque in stretches that were not fitted "
+        "is fine and that of its position, and predicts torque in segments that were not fitted "
         "as well as differentiated",
         among=_MEASURED,
     )
@@ -59,18 +59,18 @@ class SignalSettings(Settings):
         among=_MEASURED,
     )
     trim: float = setting(
-        0.2, "time cut at each end of each uninterrupted stretch [s]", within=NOT_NEGATIVE
+        0.2, "time cut at each end of each uninterrupted segment [s]", within=NOT_NEGATIVE
     )
     min_velocity: float = setting(
         0.02,
         "joint speed below which its rows are left out while Coulomb friction is identified "
-        "[rad/s], and within which a drive may stick; of a joint that slides, that at which it "
+        "[rad/s], and within which a drive may stick; of a prismatic joint, that at which it "
         "crosses its range (1 m if the URDF has none) in the time of a full turn; 0 keeps all rows",
         within=NOT_NEGATIVE,
     )
     friction_band: float = setting(
         0.0,
-        "speed from which Coulomb friction has its full size [rad/s], of joints that slide as for "
+        "speed from which Coulomb friction has its full size [rad/s], of prismatic joints as for "
         "min_velocity: it changes linearly between that speed and its negative; 0: at once, as "
         "Coulomb has it",
         within=Range("0, or 1e-9 or more", lambda x: x == 0 or x >= 1e-9),
@@ -99,7 +99,7 @@ class LogUnits(Settings):
         None, "unit of the time stamps; velocities stay per second", among=tuple(PER_SECOND)
     )
     angle: str | None = setting(
-        None, "unit of q, dq and ddq of joints that turn", among=("rad", "deg")
+        None, "unit of q, dq and ddq of revolute joints", among=("rad", "deg")
     )
 
 

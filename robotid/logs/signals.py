@@ -16,7 +16,7 @@ from robotid.findings import listed
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.measured_velocity import is_trustworthy
 from robotid.logs.settings import SignalSettings
-from robotid.logs.smoothing import Stretch, process_stretches, too_short
+from robotid.logs.smoothing import Segment, process_segments, too_short
 
 __all__ = ["decide", "process", "resolve", "turns_note", "unwrap"]
 
@@ -106,28 +106,28 @@ def decide(
 
 
 def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> Trajectory:
-    """Return the smooth trajectory of a log, with a ``segment`` number per stretch without a gap.
+    """Return the smooth trajectory of a log, with a ``segment`` number per segment without a gap.
 
     Args:
         log: The log.
         settings: The settings; what is automatic in them is resolved first.
-        speeds: As of ``process_stretches``; a model with Coulomb friction needs them wherever a
+        speeds: As of ``process_segments``; a model with Coulomb friction needs them wherever a
             filter smears its torque.
 
     Raises:
-        DataError: If no stretch is long enough.
+        DataError: If no segment is long enough.
         SettingsError: If the cut-off is not below half the rate.
     """
     settings = resolve(log, settings)
     breaks = np.flatnonzero(np.diff(log.t) > (settings.max_gap or np.inf)) + 1
     edges = [0, *breaks.tolist(), len(log.t)]
-    stretches = [
-        Stretch(first, stop, float(log.t[first]), float(log.t[stop - 1]), number)
+    segments = [
+        Segment(first, stop, float(log.t[first]), float(log.t[stop - 1]), number)
         for number, (first, stop) in enumerate(pairwise(edges))
     ]
-    trajectory = process_stretches(log, stretches, settings, speeds=speeds)
+    trajectory = process_segments(log, segments, settings, speeds=speeds)
     if len(trajectory.t) == 0:
-        raise too_short(log.path or "log", len(stretches), settings)
+        raise too_short(log.path or "log", len(segments), settings)
     numbers = np.unique(trajectory.segment, return_inverse=True)[1]
     return replace(trajectory, segment=numbers)
 

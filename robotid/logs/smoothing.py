@@ -1,4 +1,4 @@
-"""Smooth motion of stretches without gaps, of whole ones or part by part.
+"""Smooth motion of segments without gaps, of whole ones or part by part.
 
 A part is resampled and filtered with rows around its own, which are cut off behind the filter.
 """
@@ -16,7 +16,7 @@ from robotid.logs.friction_direction import acting_directions
 from robotid.logs.settings import SignalSettings
 from robotid.logs.splines import cubic_spline
 
-__all__ = ["SPLINE", "Stretch", "filter_reach", "low_pass", "process_stretches", "too_short"]
+__all__ = ["SPLINE", "Segment", "filter_reach", "low_pass", "process_segments", "too_short"]
 
 #: Rows after which nothing is left of an end of a cubic spline: it fades by half or more per row.
 SPLINE = 64
@@ -27,14 +27,14 @@ _ALL = slice(None)
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """A stretch of a log without a gap."""
+class Segment:
+    """A segment of a log without a gap."""
 
     first: int  # its first row
     stop: int  # the row after its last one
     start: float  # time stamp of its first row [s]
     end: float  # time stamp of its last row [s]
-    number: int = 0  # of the stretch
+    number: int = 0  # of the segment
 
     @property
     def rows(self) -> int:
@@ -42,48 +42,48 @@ class Stretch:
         return self.stop - self.first
 
 
-def process_stretches(
+def process_segments(
     log: Log,
-    stretches: Sequence[Stretch],
+    segments: Sequence[Segment],
     settings: SignalSettings,
     *,
     first: int = 0,
     own: slice = _ALL,
     speeds: Array | None = None,
 ) -> Trajectory:
-    """Return the smooth motion of uninterrupted stretches, or of a part of them.
+    """Return the smooth motion of uninterrupted segments, or of a part of them.
 
     A part is as smooth as if the whole had been processed, if the log has the rows of its
-    stretches that are within ``filter_reach`` of its own rows.
+    segments that are within ``filter_reach`` of its own rows.
 
     Args:
-        log: Rows of the stretches, all of them or a part.
-        stretches: The whole stretches, in order.
+        log: Rows of the segments, all of them or a part.
+        segments: The whole segments, in order.
         settings: The settings, resolved.
-        first: Row number that the log's first row has in the stretches.
-        own: Rows wanted, numbered as in the stretches; the log must have the row that follows.
+        first: Row number that the log's first row has in the segments.
+        own: Rows wanted, numbered as in the segments; the log must have the row that follows.
         speeds: Ratios of the speeds that Coulomb friction follows [rad/s] to those of the joints,
             shape (c, n), as of ``friction_speeds``.
 
     Returns:
-        The trajectory, of no samples if no stretch is long enough; the segment numbers of its
-        samples are those of their stretches. Its directions are those that Coulomb friction acts
+        The trajectory, of no samples if no segment is long enough; the segment numbers of its
+        samples are those of their segments. Its directions are those that Coulomb friction acts
         in, behind the filter of the torque: None without speeds, and where they are plain signs.
     """
     n = len(log.joints)
     is_sharp = settings.cutoff is None and settings.friction_band == 0
     ratios = np.empty((0, n)) if speeds is None or is_sharp else speeds
     parts, counts = [], []
-    for stretch in stretches:
-        rows = slice(max(stretch.first - first, 0), min(stretch.stop - first, len(log.t)))
-        part = _process_part(log, rows, stretch, settings, first, own, ratios)
+    for segment in segments:
+        rows = slice(max(segment.first - first, 0), min(segment.stop - first, len(log.t)))
+        part = _process_part(log, rows, segment, settings, first, own, ratios)
         counts.append(0 if part is None else len(part[0]))
         parts += [] if part is None else [part]
     nothing = (np.empty(0), *[np.empty((0, n))] * 4, np.empty((0, len(ratios))))
     t, q, v, a, tau, direction = (np.concatenate(x) for x in zip(nothing, *parts, strict=True))
     return Trajectory(
         t=t, q=q, v=v, a=a, tau=tau, joints=log.joints, rate=settings.rate,
-        segment=np.repeat([stretch.number for stretch in stretches], counts),
+        segment=np.repeat([segment.number for segment in segments], counts),
         direction=direction if len(ratios) else None,
     )  # fmt: skip
 
@@ -124,16 +124,16 @@ def low_pass(values: Array, rate: float, settings: SignalSettings) -> Array:
     return zero_phase(values, settings.order, settings.cutoff, rate, pad)
 
 
-def too_short(where: str, stretches: int, settings: SignalSettings) -> DataError:
-    """Return the error of a log without a stretch that is long enough.
+def too_short(where: str, segments: int, settings: SignalSettings) -> DataError:
+    """Return the error of a log without a segment that is long enough.
 
     Args:
         where: What the log is called.
-        stretches: How many uninterrupted stretches it has.
+        segments: How many uninterrupted segments it has.
         settings: The settings.
     """
     return DataError(
-        f"{where}: none of its {stretches} uninterrupted stretches is long "
+        f"{where}: none of its {segments} uninterrupted segments is long "
         f"enough for the filter and a trim of {settings.trim:g} s at each end; record longer, "
         "or lower trim",
         code="too_short",
@@ -143,7 +143,7 @@ def too_short(where: str, stretches: int, settings: SignalSettings) -> DataError
 def _process_part(
     log: Log,
     rows: slice,
-    stretch: Stretch,
+    segment: Segment,
     settings: SignalSettings,
     first: int,
     own: slice,
@@ -151,13 +151,13 @@ def _process_part(
 ) -> tuple[Array, Array, Array, Array, Array, Array] | None:
     """Return t, q, v, a, tau and direction of the own rows, None if none is left."""
     t = log.t[rows]
-    if stretch.rows < 5 or stretch.end - stretch.start <= 2 * settings.trim:
+    if segment.rows < 5 or segment.end - segment.start <= 2 * settings.trim:
         return None
-    grid = _Grid.of(stretch, settings)
+    grid = _Grid.of(segment, settings)
     if grid.count < 5:
         return None
-    local = rows.start + first - stretch.first  # number in the stretch of the first row here
-    numbers = grid.numbers(t, local, is_last=rows.stop + first == stretch.stop)
+    local = rows.start + first - segment.first  # number in the segment of the first row here
+    numbers = grid.numbers(t, local, is_last=rows.stop + first == segment.stop)
     times = t if grid.step is None else grid.at(numbers)
     channels = {"q": log.q, "tau": log.tau}
     if settings.velocity == "measured" and log.v is not None:
@@ -176,9 +176,9 @@ def _process_part(
     inside = (times >= grid.start + settings.trim) & (times <= grid.last - settings.trim)
     if grid.keep_every > 1:
         inside &= (numbers - grid.number_of(grid.start + settings.trim)) % grid.keep_every == 0
-    if own.start is not None and own.start > stretch.first:
+    if own.start is not None and own.start > segment.first:
         inside &= times >= log.t[own.start - first]
-    if own.stop is not None and own.stop < stretch.stop:
+    if own.stop is not None and own.stop < segment.stop:
         inside &= times < log.t[own.stop - first]
     kept = np.flatnonzero(inside)
     if len(kept) == 0:
@@ -189,7 +189,7 @@ def _process_part(
 
 @dataclass(frozen=True)
 class _Grid:
-    """The times that a stretch is filtered on: ``count`` points, every so many of them kept.
+    """The times that a segment is filtered on: ``count`` points, every so many of them kept.
 
     Without a step, they are the rows as recorded.
     """
@@ -201,21 +201,21 @@ class _Grid:
     keep_every: int = 1
 
     @classmethod
-    def of(cls, stretch: Stretch, settings: SignalSettings) -> "_Grid":
-        """Return the grid of a whole stretch."""
+    def of(cls, segment: Segment, settings: SignalSettings) -> "_Grid":
+        """Return the grid of a whole segment."""
         if settings.rate is None:
-            return cls(stretch.start, stretch.end, None, stretch.rows)
-        native = (stretch.rows - 1) / (stretch.end - stretch.start)
+            return cls(segment.start, segment.end, None, segment.rows)
+        native = (segment.rows - 1) / (segment.end - segment.start)
         # a rate below the log's is reached by decimation after the filter, against aliasing
         keep_every = max(1, round(native / settings.rate)) if settings.cutoff is not None else 1
         step = 1.0 / (settings.rate * keep_every)
-        count = int(np.floor((stretch.end - stretch.start) / step * (1 + 1e-12))) + 1
-        if count > _FINEST * stretch.rows:
+        count = int(np.floor((segment.end - segment.start) / step * (1 + 1e-12))) + 1
+        if count > _FINEST * segment.rows:
             raise SettingsError(
-                f"{stretch.rows} rows over {stretch.end - stretch.start:.6g} s would become "
+                f"{segment.rows} rows over {segment.end - segment.start:.6g} s would become "
                 f"{count} at {1 / step:.6g} Hz; lower rate, or max_gap if the clock jumps"
             )
-        return cls(stretch.start, stretch.start + step * (count - 1), step, count, keep_every)
+        return cls(segment.start, segment.start + step * (count - 1), step, count, keep_every)
 
     @property
     def rate(self) -> float:
@@ -233,7 +233,7 @@ class _Grid:
         return int(k[np.argmax(self.at(k) >= t)])
 
     def numbers(self, t: Array, first: int, *, is_last: bool) -> Array:
-        """Return the points among rows t, numbered from ``first``, of the stretch."""
+        """Return the points among rows t, numbered from ``first``, of the segment."""
         if self.step is None:
             return np.arange(first, first + len(t))
         start = 0 if first == 0 else self.number_of(float(t[0]))

@@ -9,22 +9,22 @@ from robotid.logs.data import Log, Trajectory
 
 __all__ = ["standing_motion"]
 
-_LENGTH = 0.25  # [s] of a stretch whose rows become one sample
+_LENGTH = 0.25  # [s] of a segment whose rows become one sample
 
 
 def standing_motion(
     log: Log, max_gap: float, least: Array, fastest: Array, hardest: Array
 ) -> tuple[Trajectory, Array]:
-    """Return the means of a log over short stretches, and which of them are stands.
+    """Return the means of a log over short segments, and which of them are stands.
 
-    A stretch is a quarter of a second, or a row if rows are farther apart. Stretches in which a
+    A segment is a quarter of a second, or a row if rows are farther apart. Segments in which a
     joint is too fast, or has just been or is about to be, are left out. Those in which no joint
     moves are joined: a stand is one sample, however long it is. No filter, no derivative of noise:
-    the speed is the slope of the positions over the stretch, and of a single row 0.
+    the speed is the slope of the positions over the segment, and of a single row 0.
 
     Args:
         log: The log, without full turns.
-        max_gap: A longer step between two rows is a gap, which ends a stretch [s].
+        max_gap: A longer step between two rows is a gap, which ends a segment [s].
         least: Speeds below which joints stand, shape (n,) [rad/s or m/s].
         fastest: Speeds above which they are too fast, shape (n,).
         hardest: Likewise of changes of speed, shape (n,) [rad/s^2 or m/s^2].
@@ -32,7 +32,7 @@ def standing_motion(
     Returns:
         K samples with their speeds, 0 at stands and where a joint sets out, stops or turns round,
         without accelerations; and which are stands, shape (K,), bool. The segments are the
-        stretches between gaps.
+        segments between gaps.
     """
     of_block, segment = _blocks(log.t, max_gap)
     first = np.flatnonzero(np.diff(of_block, prepend=-1))
@@ -52,7 +52,7 @@ def standing_motion(
     slow = np.all((np.abs(v) <= fastest) & (change <= hardest), axis=1)
     signs = np.where(np.abs(v) < least, 0.0, np.sign(v))
     still = slow & ~signs.any(axis=1)
-    # beside a stretch of another sign a joint may have turned round within this one
+    # beside a segment of another sign a joint may have turned round within this one
     turns = (np.diff(signs, axis=0) != 0) & beside[:, None]
     v[1:][turns] = v[:-1][turns] = 0.0
     alike = (np.abs(np.diff(q, axis=0)) < least * np.diff(t)[:, None]).all(axis=1)
@@ -72,7 +72,7 @@ def standing_motion(
 
 
 def _blocks(t: Array, max_gap: float) -> tuple[Array, Array]:
-    """Return the short stretch that each row is in, and the number between gaps of each."""
+    """Return the short segment that each row is in, and the number between gaps of each."""
     of_block, segment, number = np.empty(len(t), dtype=int), list[int](), 0
     edges = [0, *(np.flatnonzero(np.diff(t) > max_gap) + 1).tolist(), len(t)]
     for k, (i, j) in enumerate(pairwise(edges)):

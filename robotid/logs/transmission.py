@@ -111,7 +111,9 @@ class Transmission(Settings):
         turns = np.abs(self.T) > 0
         alone = turns.sum(axis=1) == 1
         taken = turns[alone].any(axis=0)  # joints with a motor of their own
-        places = [joint for joint, is_taken in zip(self.joints, taken, strict=True) if not is_taken]
+        places = [
+            joint for joint, is_selected in zip(self.joints, taken, strict=True) if not is_selected
+        ]
         shared = np.flatnonzero(~alone).tolist()
         return {
             place: tuple(

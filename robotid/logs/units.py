@@ -17,7 +17,7 @@ _DEGREES = 180 / np.pi  # degrees in a radian
 _EPOCHS = 6e8, 5e9  # [s] since 1970: dates from 1989 to 2128
 _SLOWEST = 0.1  # [s] a longer median step is taken for another unit
 _FARTHEST = 4 * np.pi  # [rad] joints beyond two turns are taken for degrees
-_STRETCH = 0.1  # [s] motion is compared over stretches this long: noise and jitter average out
+_SEGMENT = 0.1  # [s] motion is compared over segments this long: noise and jitter average out
 _GAP = 5  # a step longer than this many median steps is a gap
 _ALIKE = 0.9  # correlation from which two signals are one but for a factor
 _NEAR = 0.1  # relative tolerance on that factor
@@ -26,13 +26,13 @@ _NEAR = 0.1  # relative tolerance on that factor
 def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> None:
     """Refuse a log whose numbers look like another unit than SI, unless the unit was stated.
 
-    The measured velocity is compared with the position over short stretches: the factor between
+    The measured velocity is compared with the position over short segments: the factor between
     the integral of dq and the change of q is 1 if both are in SI units.
 
     Args:
         log: The log.
         units: The units that were stated; what is stated is not suspected.
-        prismatic: Names of the joints that slide; the others turn.
+        prismatic: Names of the prismatic joints; the others turn.
 
     Raises:
         DataError: If time, angle or the sign of the velocity is suspect.
@@ -83,12 +83,12 @@ def _check_clock(log: Log, factor: Array) -> None:
 
 
 def check_reach(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> None:
-    """Refuse joints that turn too far for radians, unless the unit was stated.
+    """Refuse revolute joints too far for radians, unless the unit was stated.
 
     Args:
         log: The log, or rows of it.
         units: The units that were stated.
-        prismatic: Names of the joints that slide.
+        prismatic: Names of the prismatic joints.
 
     Raises:
         DataError: If a joint turns too far.
@@ -160,7 +160,7 @@ def _velocity_factor(log: Log) -> Array:
         return factor
     dt = np.diff(log.t)
     median = float(np.median(dt))
-    length = int(np.clip(round(_STRETCH / median), 1, max(1, len(dt) // 4)))
+    length = int(np.clip(round(_SEGMENT / median), 1, max(1, len(dt) // 4)))
     for j, (q, v) in enumerate(zip(log.q.T, log.v.T, strict=True)):
         step = np.diff(q)
         jump = _is_near(np.abs(step), 2 * np.pi) | _is_near(np.abs(step), 360.0)  # a full turn
@@ -175,7 +175,7 @@ def _velocity_factor(log: Log) -> Array:
 
 
 def _sums(steps: Array, length: int) -> Array:
-    """Return the sums over each stretch of so many consecutive steps."""
+    """Return the sums over each segment of so many consecutive steps."""
     total = np.concatenate([[0.0], np.cumsum(steps)])
     sums: Array = total[length:] - total[:-length]
     return sums

@@ -146,7 +146,7 @@ class OnlineIdentifier:
     def compared(self) -> tuple[Array, Array]:
         """Torque at the reading's moment and what the estimate makes of it, shape (n,) each.
 
-        The latter is NaN where a joint stands still: its friction has no sign.
+        The latter is NaN where a joint is at rest: its friction has no sign.
         """
         self._require_ready()
         return self._compared

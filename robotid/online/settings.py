@@ -18,7 +18,7 @@ class OnlineSettings(Settings):
     min_velocity: float = setting(
         0.02,
         "speed below which a joint's row is left out while Coulomb friction is identified "
-        "[rad/s]; of a joint that slides as of ``SignalSettings``",
+        "[rad/s]; of a prismatic joint as of ``SignalSettings``",
         within=NOT_NEGATIVE,
     )
     warmup: float = setting(

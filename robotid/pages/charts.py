@@ -36,7 +36,7 @@ class Series:
         kind: "line", "dots", "bars", which stand side by side, or "area"; the areas of a chart
             are stacked, what is positive upwards and what is negative downwards.
         half: Half width of a band about a line, of error bars about dots and bars, shape (N,).
-        is_faint: Whether it stands back behind the others.
+        is_weak: Whether it stands back behind the others.
         is_hidden: Whether it is seen only when its key in the legend is pressed.
     """
 
@@ -45,7 +45,7 @@ class Series:
     tone: str
     kind: str = "line"
     half: Array | None = None
-    is_faint: bool = False
+    is_weak: bool = False
     is_hidden: bool = False
 
 
@@ -60,7 +60,7 @@ class Chart:
         x_label: Its name and unit, as "time [s]".
         y_label: Name and unit of the values, as "torque [N m]".
         link: Charts of one link share the cursor and the zoom along x.
-        spans: Stretches of x with a shaded ground, as rows that are not used.
+        spans: Segments of x with a shaded ground, as rows that are not used.
         marks: Where dotted lines stand on x.
         logarithmic: Which axes are: "", "x", "y" or "xy".
         height: Of the plot [px].
@@ -122,7 +122,7 @@ def chart_html(chart: Chart, caption: str, *, points: int = _POINTS, still: int 
                 "label": s.label,
                 "tone": s.tone,
                 "kind": s.kind,
-                "faint": s.is_faint,
+                "faint": s.is_weak,
                 "hidden": s.is_hidden,
                 "y": _packed(y[rows], is_log=is_log),
                 "half": None if half is None else _packed(half[rows]),
@@ -175,10 +175,10 @@ def thin(y: Array, points: int) -> NDArray[np.int_]:
 
 
 def broken(segment: Array, x: Array, *lines: Array) -> tuple[Array, ...]:
-    """Return x and lines with a row of NaN between the stretches of a recording.
+    """Return x and lines with a row of NaN between the segments of a recording.
 
     Args:
-        segment: Number of the uninterrupted stretch of each row, shape (N,).
+        segment: Number of the uninterrupted segment of each row, shape (N,).
         x: Times, shape (N,).
         *lines: Values over it, shape (N,) each.
     """
@@ -329,7 +329,7 @@ def _still(chart: Chart, x: Array, series: Sequence[_Drawn], points: int) -> str
 
 
 def _frame(chart: Chart, across: _Axis, up: _Axis) -> str:
-    """Return shaded stretches, grid, ticks, dotted marks and the name of the x axis."""
+    """Return shaded segments, grid, ticks, dotted marks and the name of the x axis."""
     bottom, right = up.start, across.stop
     parts = []
     for start, end in chart.spans:
@@ -375,7 +375,7 @@ def _legend(chart: Chart, height: float) -> tuple[str, float]:
         if place + width > _WIDTH + 3 * _LETTER:
             place, down = float(_LEFT), height + 8
             height += _LINE
-        opacity = 0.5 if series.is_faint else 1.0
+        opacity = 0.5 if series.is_weak else 1.0
         parts.append(
             f'<path d="M{place:.0f} {down - 4:.0f}h12" stroke="var(--{series.tone})" '
             f'stroke-width="4" stroke-opacity="{opacity}"/>'
@@ -396,7 +396,7 @@ def _drawn(
 ) -> str:
     """Return one series as paths."""
     series, y, half = item
-    colour, faint = f"var(--{series.tone})", 0.5 if series.is_faint else 1.0
+    colour, weak = f"var(--{series.tone})", 0.5 if series.is_weak else 1.0
     if series.kind == "bars":
         group = [s for s in chart.series if s.kind == "bars"]
         slot = 0.8 / len(group) * float(np.min(np.diff(x))) if len(x) > 1 else 0.8 / len(group)
@@ -407,17 +407,17 @@ def _drawn(
             f"M{a - width / 2:.1f} {zero:.1f}h{width:.1f}V{b:.1f}h{-width:.1f}z"
             for a, b in _finite(across(x), up(y))
         )
-        drawn = f'<path d="{path}" fill="{colour}" fill-opacity="{faint}"/>'
+        drawn = f'<path d="{path}" fill="{colour}" fill-opacity="{weak}"/>'
         return drawn + (_whiskers(x, y, half, across, up, "currentColor"))
     if series.kind == "dots":
         rows = np.flatnonzero(np.isfinite(y))[:: max(1, int(np.isfinite(y).sum()) // (2 * points))]
         path = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in _finite(across(x[rows]), up(y[rows])))
         return (
             f'<path d="{path}" stroke="{colour}" stroke-width="3" stroke-linecap="round" '
-            f'stroke-opacity="{faint}"/>{_whiskers(x, y, half, across, up, colour)}'
+            f'stroke-opacity="{weak}"/>{_whiskers(x, y, half, across, up, colour)}'
         )
     if series.kind == "area":
-        style = f'fill="{colour}" fill-opacity="{0.7 * faint}"'
+        style = f'fill="{colour}" fill-opacity="{0.7 * weak}"'
         return _band(x, y, cover, across, up, style, points)
     under = ""
     if half is not None:
@@ -427,7 +427,7 @@ def _drawn(
     path = "".join(_path(across(x[rows])[r], up(y[rows])[r]) for r in _runs(y[rows]))
     return (
         f'{under}<path d="{path}" fill="none" stroke="{colour}" stroke-width="1.2" '
-        f'stroke-opacity="{faint}"/>'
+        f'stroke-opacity="{weak}"/>'
     )
 
 
@@ -467,7 +467,7 @@ def _whiskers(x: Array, y: Array, half: Array | None, across: _Axis, up: _Axis, 
 
 
 def _runs(y: Array) -> list[slice]:
-    """Return the stretches of finite numbers."""
+    """Return the segments of finite numbers."""
     is_inside = np.zeros(len(y) + 2, dtype=bool)
     is_inside[1:-1] = np.isfinite(y)
     edges = np.flatnonzero(is_inside[1:] != is_inside[:-1])

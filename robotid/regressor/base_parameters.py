@@ -70,7 +70,7 @@ class BaseMapping:
         """Names of the standard parameters that load no joint in any motion."""
         return tuple(self.names[i] for i in np.flatnonzero(~self.K.any(axis=0)))
 
-    def in_words(self, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    def described(self, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
         """Return how far each of some standard parameters can be known from any motion.
 
         Args:
@@ -212,7 +212,7 @@ def base_mapping(
 def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
     """Return factors of parts of a regressor that have no equation and no column in common.
 
-    Arms on a base that stands still are such parts.
+    Arms on a base at rest are such parts.
 
     Args:
         W: Regressor, shape (N n_rows, p).

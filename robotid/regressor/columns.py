@@ -17,7 +17,7 @@ __all__ = [
     "drive_values",
     "friction_directions",
     "friction_speeds",
-    "instant_memory",
+    "instant_state",
     "plan_rows",
     "remembered",
     "sure_rows",
@@ -117,7 +117,7 @@ def drive_motion(
         direction: As of ``friction_directions``, shape (N, c).
         load: Torque of the rigid bodies in the rows of the joints, shape (N, n) [N m, N]; None: 0.
         rate: Change of the whole torque in them, shape (N, n) [N m/s, N/s]; None: 0.
-        begins: Where a stretch begins, shape (N,), bool; None: the instants do not follow another.
+        begins: Where a segment begins, shape (N,), bool; None: the instants do not follow another.
     """
     R = layout.drive_ratios
     n = R.shape[1]
@@ -135,7 +135,7 @@ def drive_motion(
     )
 
 
-def instant_memory(
+def instant_state(
     layout: ParameterLayout, q: Array, v: Array, a: Array, direction: Array | None, load: Array
 ) -> Array:
     """Return what drives remember at instants that do not follow each other, shape (N, m).

@@ -2,7 +2,7 @@
 
 All that least squares, weighted least squares and convex fits need of W and tau is the
 triangular factor R_j of each joint's rows, with R_j^T R_j = [W_j tau_j]^T [W_j tau_j].
-Factors of two logs merge into the factor of both. A reduction is what a stretch of a log comes
+Factors of two logs merge into the factor of both. A reduction is what a segment of a log comes
 down to: its factors, and what else is summed over its samples.
 """
 
@@ -28,10 +28,10 @@ __all__ = [
     "Reduction",
     "available_cores",
     "compress",
-    "compress_stretches",
+    "compress_segments",
     "gather",
     "join",
-    "join_stretches",
+    "join_segments",
     "merge",
     "triangle_of",
 ]
@@ -270,23 +270,23 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
     return Factors(found, tuple(columns), rows, problem.names)
 
 
-def compress_stretches(
+def compress_segments(
     problem: Problem, length: int, *, threads: int | None = None
 ) -> tuple[Factors, ...]:
-    """Fold each stretch of a problem into factors of its own, as for held-out stretches.
+    """Fold each segment of a problem into factors of its own, as for held-out segments.
 
     Args:
         problem: The rows, of one log or several; not one that comes in blocks only.
-        length: Samples per stretch, at least 1; the last stretch of each log may have fewer.
+        length: Samples per segment, at least 1; the last segment of each log may have fewer.
         threads: As of ``compress``.
 
     Raises:
         DataError: If a row is not finite, or the problem comes in blocks only.
     """
     if not problem.sources:
-        raise DataError("the problem comes in blocks only; it cannot be cut into stretches")
+        raise DataError("the problem comes in blocks only; it cannot be cut into segments")
     columns = tuple(np.flatnonzero(row) for row in problem.support)
-    part = -(-_PART // length) * length  # whole stretches
+    part = -(-_PART // length) * length  # whole segments
     found = []
     for source in problem.sources:
         places = _places(source, columns)
@@ -333,15 +333,15 @@ def merge(factors: Sequence[Factors]) -> Factors:
     return Factors(tuple(triangles), tuple(columns), rows, first.names)
 
 
-def gather(stretches: Sequence[Factors], count: int) -> tuple[Factors, ...]:
-    """Return fewer, longer stretches: neighbours merged, as for held-out stretches.
+def gather(segments: Sequence[Factors], count: int) -> tuple[Factors, ...]:
+    """Return fewer, longer segments: neighbours merged, as for held-out segments.
 
     Args:
-        stretches: Factors of stretches, in order.
+        segments: Factors of segments, in order.
         count: Number wanted, at least 1.
     """
-    edges = np.linspace(0, len(stretches), min(count, len(stretches)) + 1).round().astype(int)
-    return tuple(merge(stretches[i:j]) for i, j in pairwise(edges))
+    edges = np.linspace(0, len(segments), min(count, len(segments)) + 1).round().astype(int)
+    return tuple(merge(segments[i:j]) for i, j in pairwise(edges))
 
 
 def join(reductions: Sequence[Reduction]) -> Reduction:
@@ -362,27 +362,27 @@ def join(reductions: Sequence[Reduction]) -> Reduction:
     )
 
 
-def join_stretches(reductions: Iterable[Reduction], count: int, most: int) -> list[Reduction]:
-    """Return the reductions of at most so many stretches of neighbouring pieces, in order.
+def join_segments(reductions: Iterable[Reduction], count: int, most: int) -> list[Reduction]:
+    """Return the reductions of at most so many segments of neighbouring pieces, in order.
 
     They are joined as they come, so that no more are in memory; the last one may be shorter.
 
     Args:
         reductions: One per piece, in order.
         count: Number of pieces, at least 1.
-        most: Largest number of stretches, at least 1.
+        most: Largest number of segments, at least 1.
 
     Raises:
         DataError: If their columns or joints differ.
     """
     length = -(-count // most)
-    stretches: list[Reduction] = []
+    segments: list[Reduction] = []
     for k, reduction in enumerate(reductions):
         if k % length:
-            stretches[-1] = join([stretches[-1], reduction])
+            segments[-1] = join([segments[-1], reduction])
         else:
-            stretches.append(reduction)
-    return stretches
+            segments.append(reduction)
+    return segments
 
 
 def available_cores() -> int:
@@ -465,12 +465,12 @@ def _in_order(
         yield from pool.map(work, items)
 
 
-def _fold_part(source: RowSource, length: int, stretch: int, start: int) -> list[list[Array]]:
-    """Return the factors of each stretch of a part of so many samples, joint by joint."""
+def _fold_part(source: RowSource, length: int, segment: int, start: int) -> list[list[Array]]:
+    """Return the factors of each segment of a part of so many samples, joint by joint."""
     folded: list[list[Triangle]] = []
     done = 0
-    for block in source.blocks(start, min(start + length, source.samples), stretch):
-        if done % stretch == 0:
+    for block in source.blocks(start, min(start + length, source.samples), segment):
+        if done % segment == 0:
             folded.append([Triangle(len(own) + 1) for own in source.columns])
         done += len(block[0])
         for triangle, rows in zip(folded[-1], block, strict=True):

@@ -14,10 +14,10 @@ from robotid.regressor.prediction import predict
 from robotid.robot.drives import Bristles, DriveMotion
 from robotid.robot.model import RobotModel
 
-__all__ = ["bears_load", "drive_motion_along", "remember"]
+__all__ = ["drive_motion_along", "is_loaded", "remember"]
 
 
-def bears_load(model: RobotModel) -> bool:
+def is_loaded(model: RobotModel) -> bool:
     """Return whether what the drives of a robot remember changes with the torque of its reference.
 
     That of bristles does not: it is their way alone.
@@ -42,7 +42,7 @@ def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:
     if not model.layout.remembering:
         return trajectory
     motion = drive_motion_along(model, trajectory)
-    return trajectory.with_memory(remembered(model.layout, motion))
+    return trajectory.with_states(remembered(model.layout, motion))
 
 
 def drive_motion_along(model: RobotModel, trajectory: Trajectory) -> DriveMotion:
@@ -59,7 +59,7 @@ def drive_motion_along(model: RobotModel, trajectory: Trajectory) -> DriveMotion
         Arrays of shape (d, N).
     """
     layout, pi = model.layout, model.carried_by
-    m = trajectory.with_memory(None)  # that of another reference, if it has one
+    m = trajectory.with_states(None)  # that of another reference, if it has one
     first = model.n_rows - len(model.joints)
     signs = friction_directions(layout, m.v, m.direction)
     begins = np.diff(m.segment, prepend=m.segment[:1] - 1) != 0
@@ -69,14 +69,14 @@ def drive_motion_along(model: RobotModel, trajectory: Trajectory) -> DriveMotion
     load = predict(plain, [bodies], m)[0][:, first:]
     motion = drive_motion(layout, m.q, m.v, m.a, signs, load, None, begins)
     if layout.remembering:
-        m = m.with_memory(remembered(layout, motion))
+        m = m.with_states(remembered(layout, motion))
     drives = trajectory_values(layout, m).T @ (layout.drive_loads * pi[layout.n_inertial :]).T
     rate = _rate(load + drives, m)
     return drive_motion(layout, m.q, m.v, m.a, signs, load, rate, begins)
 
 
 def _rate(torque: Array, motion: Trajectory) -> Array:
-    """Return the change of torques within each stretch, shape (N, n) [N m/s, N/s]."""
+    """Return the change of torques within each segment, shape (N, n) [N m/s, N/s]."""
     rate = np.zeros_like(torque)
     edges = np.flatnonzero(np.diff(motion.segment)) + 1
     for part in np.split(np.arange(len(motion.t)), edges):

@@ -64,13 +64,13 @@ class RowSource(ABC):
         """Whether several threads read it faster than one."""
 
     @abstractmethod
-    def blocks(self, start: int, stop: int, stretch: int | None = None) -> Iterator[list[Array]]:
+    def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
         """Yield the rows of samples start to stop, a few hundred samples at a time.
 
         Args:
             start: First sample.
             stop: Sample after the last one.
-            stretch: After so many samples each a block ends; None: wherever it does.
+            segment: After so many samples each a block ends; None: wherever it does.
 
         Yields:
             Per joint j the rows sqrt(weight) [W_j tau_j], shape (k, c_j + 1), column-major. They

@@ -191,8 +191,8 @@ class TrajectoryRows(RowSource):
     def select(self, columns: Array) -> "TrajectoryRows":
         return replace(self, kept=self.kept[columns])
 
-    def blocks(self, start: int, stop: int, stretch: int | None = None) -> Iterator[list[Array]]:
-        plan, stretch = self._plan, stretch or stop - start
+    def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
+        plan, segment = self._plan, segment or stop - start
         length = _block_length(int(plan.first[-1]))
         out = np.empty((plan.first[-1], length))
         motion = self.trajectory
@@ -207,7 +207,7 @@ class TrajectoryRows(RowSource):
             weights = self.weights[part] if self._is_weighted else None
             values = trajectory_values(self.model.layout, motion, part)
             writer.load(motion, part, values, weights)
-            ends = range(start + stretch, last, stretch)  # of stretches
+            ends = range(start + segment, last, segment)  # of segments
             edges = {*range(first, last, length), *(end for end in ends if end > first), last}
             for k, end in pairwise(sorted(edge - first for edge in edges)):
                 writer.write(k, end)

@@ -11,7 +11,7 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.data import Trajectory
-from robotid.regressor.columns import drive_values, friction_directions, instant_memory
+from robotid.regressor.columns import drive_values, friction_directions, instant_state
 from robotid.regressor.problem import Block, Problem
 from robotid.regressor.rows import BLOCK, kept_rows, trajectory_rows
 from robotid.robot.drives import TERMS, DriveMotion
@@ -71,7 +71,7 @@ def joint_torque_regressor(
     _write_inertial(model, q, v, a, Y[:, :, :size])
     if memory is None and model.layout.remembering:
         load = Y[:, model.n_rows - len(model.joints) :, :size] @ model.carried_by[:size]
-        memory = instant_memory(model.layout, q, v, a, direction, load)
+        memory = instant_state(model.layout, q, v, a, direction, load)
     _write_drives(model, q, v, a, direction, memory, Y[:, :, size:])
     return Y.reshape(len(q) * model.n_rows, -1)
 
@@ -212,7 +212,7 @@ class InstantRegressor:
         size, memory = layout.n_inertial, None
         if layout.remembering:
             load = Y[:, :size] @ model.carried_by[:size]
-            memory = instant_memory(layout, q[None], v[None], a[None], None, load[None])
+            memory = instant_state(layout, q[None], v[None], a[None], None, load[None])
         _write_drives(model, q[None], v[None], a[None], None, memory, Y[None, :, size:])
         return Y[:, self._columns]
 

@@ -16,7 +16,7 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["base_problem", "independent_share", "row_mask", "static_rows"]
 
-_MOVES = 2e-3  # [rad/s] the mean over a stretch of a slow log tells the sign from this on
+_MOVES = 2e-3  # [rad/s] the mean over a segment of a slow log tells the sign from this on
 _NEGLECTED = 0.02  # share of gravity's torque on a link that its inertia may have
 
 
@@ -32,7 +32,7 @@ def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> 
 
 
 def static_rows(model: RobotModel, log: Log, signals: SignalSettings) -> tuple[Trajectory, Array]:
-    """Return what a static model uses of a log: stands and slow stretches, one sample each.
+    """Return what a static model uses of a log: stands and slow segments, one sample each.
 
     Where a joint moves, friction has its sign. Where it stands, friction holds anything between
     its two bounds: stands are used without friction, which leaves that in the residual, and only

@@ -197,8 +197,8 @@ def _of_verdict(found: Identification) -> list[Cause]:
         causes.append(Cause("unseen", "warning", (), (), ()))
     if not found.is_consistent:
         causes.append(Cause("impossible", "warning", (), (), ()))
-    if not found.witness.agrees:
-        severity = "warning" if found.witness.is_against else "note"
+    if not found.scale_check.agrees:
+        severity = "warning" if found.scale_check.is_against else "note"
         causes.append(Cause("unweighed", severity, (), (), ()))
     return causes
 
@@ -215,7 +215,7 @@ def _named(causes: Sequence[Cause], wanted: Sequence[str] = ()) -> str:
 
 
 def _weigh(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    before, after, _ = found.witness.masses
+    before, after, _ = found.scale_check.masses
     check = ""
     if any(cause.code in ("total_mass", "urdf_mismatch") for cause in causes):
         check = "Check the sign, the order and the unit of the torques and the URDF's masses. "
@@ -418,7 +418,7 @@ def _uses(found: Identification, origin: Origin, asked: Sequence[Step]) -> list[
     ]
     if found.has_urdf:
         steps = [*_exports(found.model.name, origin), *steps]
-    if not found.witness.agrees:
+    if not found.scale_check.agrees:
         steps.insert(0, _weigh(found, origin, ()))
     typed = {block for step in asked for block in step.blocks}
     return [step for step in steps if step.blocks and typed.isdisjoint(step.blocks)]
@@ -442,7 +442,7 @@ _CAUSES = {
 #: What names a cause but has nothing to type: its message says what to do.
 _AS_FOUND = (
     "angle_scale",
-    "bound_binds",
+    "active_bound",
     "com_outside",
     "constant_torque",
     "density",
@@ -450,7 +450,7 @@ _AS_FOUND = (
     "gravity",
     "gravity_compensated",
     "gyration",
-    "held_torque",
+    "repeated_torque",
     "joint_axis",
     "joint_order",
     "joint_origin",
@@ -486,7 +486,7 @@ _STEPS: Sequence[tuple[_Maker, tuple[str, ...]]] = (
     (_possible, ("impossible",)),
     (_watch, (*_UNNAMED, "outliers", "spikes")),
     (_pin, ("beaten",)),
-    (_richer, ("undetermined", "excitation", "faint_parameters", "no_motion")),
+    (_richer, ("undetermined", "excitation", "weak_parameters", "no_motion")),
     (
         _inspect,
         (

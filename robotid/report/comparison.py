@@ -46,7 +46,7 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
     for path, result in zip(paths[1:], results[1:], strict=True):
         _require_same_mapping(str(paths[0]), results[0], str(path), result)
     logs = _told_apart([entry["log"] for result in results for entry in result["validation"]])
-    common, remarks = _common_recordings(results, logs)
+    common, notes = _common_recordings(results, logs)
     names = _told_apart(paths)
     return {
         "results": [
@@ -72,7 +72,7 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
         ],
         "fitted": _errors([result["identification"] for result in results]),
         "fitted_alike": len({_recordings(result, "identification") for result in results}) == 1,
-        "remarks": remarks,
+        "notes": notes,
         "friction": _friction_curves(results),
         "base_parameters": _base_parameters(results),
         "settings": _differences([_flat(_chosen(result)) for result in results]),
@@ -188,27 +188,27 @@ def _common_recordings(
     """Return the validation recordings that every result has, and what is not comparable."""
     each = [_by_recording(result) for result in results]
     common = {k: v for k, v in each[0].items() if all(k in other for other in each[1:])}
-    remarks = []
+    notes = []
     for k, by_recording in enumerate(each):
         left = [names[v["log"]] for key, v in by_recording.items() if key not in common]
         if left:
-            remarks.append(
+            notes.append(
                 f"{_label(k)} was validated on {', '.join(left)}, which not every result was: "
                 "these errors are not compared"
             )
     if not common:
-        remarks.append(
+        notes.append(
             "no validation recording is common to all results: their errors of prediction cannot "
             "be compared; run 'robotid validate' on one log with each"
         )
     for key, entry in common.items():
         prepared = [_flat(_signals(result, key)) for result in results]
         if other := [f"{d['name']} {' | '.join(d['values'])}" for d in _differences(prepared)]:
-            remarks.append(
+            notes.append(
                 f"{names[entry['log']]} was prepared in other ways ({'; '.join(other)}): a "
                 "smoother torque, and fewer rows, are easier to predict"
             )
-    return common, remarks
+    return common, notes
 
 
 def _errors(metrics: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

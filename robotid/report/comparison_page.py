@@ -76,14 +76,14 @@ def _labels(content: Mapping[str, Any], unit: str = "") -> list[str]:
 
 
 def _errors_section(content: Mapping[str, Any]) -> str:
-    remarks = "".join(f"<li>{escape(remark)}</li>" for remark in content["remarks"])
+    notes = "".join(f"<li>{escape(note)}</li>" for note in content["notes"])
     parts = [
         "<p>error = 100 |τ − prediction| / |τ| over the rows used. What differs most comes first; "
         "the least in bold, if it is one result's alone.</p>\n",
         _legend(content),
     ]
-    if remarks:
-        parts.append(f"<ul>{remarks}</ul>\n")
+    if notes:
+        parts.append(f"<ul>{notes}</ul>\n")
     parts += [
         _error_table(
             f"{entry['name']} {entry['start']:.4g}-{entry['end']:.4g} s: not fitted",

@@ -39,7 +39,7 @@ def residual_section(found: Identification) -> str:
         found: The identification.
     """
     if found.model.is_static:
-        return "<p>Stands and slow stretches are no signal that has a spectrum.</p>\n"
+        return "<p>Stands and slow segments are no signal that has a spectrum.</p>\n"
     figures = "".join(_residual_figures(found, row) for row in range(found.model.n_rows))
     name = escape(shown_evaluation(found).recording.name)
     return (
@@ -70,7 +70,7 @@ def drive_figures(found: Identification) -> str:
     if choice:
         choice = (
             "<h3>Which friction the logs show</h3>\n<p>Beside viscous and Coulomb friction, for "
-            "each joint: the error of stretches that were held out of the fit, and how likely they "
+            "each joint: the error of segments that were held out of the fit, and how likely they "
             f"gain that much by chance.</p>\n{choice}"
         )
     curves = ""
@@ -173,12 +173,12 @@ def _choice(found: Identification, drive: DriveChoice) -> str:
         [
             text(" + ".join(tried.families) or "viscous and Coulomb"),
             number(tried.held_out_error_pct, ".2f"),
-            number(tried.chance, ".1e") if tried.families else text(""),
-            text("taken" if tried.is_taken else ""),
+            number(tried.p_value, ".1e") if tried.families else text(""),
+            text("taken" if tried.is_selected else ""),
         ]
         for tried in drive.tried
     ]
-    headers = ["terms", "held-out error %", "chance", ""]
+    headers = ["terms", "held-out error %", "p_value", ""]
     return f"<details><summary>{escape(said)}</summary>{table(said, headers, rows)}</details>\n"
 
 

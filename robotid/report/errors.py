@@ -170,7 +170,7 @@ def error_table(
             nothing = text(f"{status}; no rows used")
             cells.append([code(name), number(None), nothing, number(None), text(""), *dashes[1:]])
             continue
-        said = "; ".join([status, *(remark for remark in _remarks(m) if remark not in status)])
+        said = "; ".join([status, *(note for note in _notes(m) if note not in status)])
         cells.append(
             [
                 code(name),
@@ -186,9 +186,9 @@ def error_table(
     return table(errors.caption, headers, cells, is_data=True)
 
 
-def _remarks(measured: Mapping[str, Any]) -> list[str]:
-    remarks = [] if measured.get("better_than_constant", True) else ["worse than a constant"]
+def _notes(measured: Mapping[str, Any]) -> list[str]:
+    notes = [] if measured.get("better_than_constant", True) else ["worse than a constant"]
     error, urdf = measured["relative_error_pct"], measured.get("urdf_relative_error_pct")
     if error is not None and urdf is not None and error > urdf:
-        remarks.append("worse than the URDF")
-    return remarks
+        notes.append("worse than the URDF")
+    return notes

@@ -199,7 +199,7 @@ def _horizons(content: Mapping[str, Any]) -> str:
     lines = {name: [errors[h].get(name) for h in x.tolist()] for name, _ in order}
     means = [_mean([own[k] for own in lines.values()]) for k in range(len(x))]
     series = [
-        Series(name, _curve(ys), f"tone-{k + 1}", is_faint=True)
+        Series(name, _curve(ys), f"tone-{k + 1}", is_weak=True)
         for k, (name, ys) in enumerate([*lines.items()][:_NAMED])
     ]
     chart = Chart(
@@ -305,16 +305,16 @@ def _undetermined(content: Mapping[str, Any]) -> str:
     if names:
         items = "".join(f"<li>{escape(name)}</li>" for name in names)
         parts.append(f"<p>The logs leave these open:</p>\n<ul>{items}</ul>\n")
-    elif alike := [f for f in content.get("warnings", ()) if f["code"] == "commands_alike"]:
+    elif alike := [f for f in content.get("warnings", ()) if f["code"] == "proportional_commands"]:
         names = escape(listed([f["where"] for f in alike]))
         parts.append(
             "<p>Every parameter has a standard error by this model, but some commands are "
-            f"proportional (commands_alike: {names}): effects of one joint on another are not "
+            f"proportional (proportional_commands: {names}): effects of one joint on another are not "
             "distinguishable from its own.</p>\n"
         )
     else:
         parts.append("<p>The logs determine all that was to be found.</p>\n")
-    for entry in structure.get("not_told_apart", []):
+    for entry in structure.get("indistinguishable", []):
         parts.append(f"<p>Only together: {escape(listed(entry['names']))}.</p>\n")
     if _is_driven(content):
         return "".join(parts)

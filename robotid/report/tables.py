@@ -47,7 +47,7 @@ _METRICS = {
 }
 _ROLES = {"urdf": "URDF", "identification": "fitted", "validation": "validation"}
 _CHOSEN = {
-    "cv": "chosen by predicting stretches of the fitted logs from the others",
+    "cv": "chosen by predicting segments of the fitted logs from the others",
     "evidence": "chosen by the evidence of the fitted logs",
 }
 
@@ -211,7 +211,7 @@ def base_table(found: Identification) -> str:
     return (
         "<p>The combinations of parameters that torque depends on. Each is named after one of "
         "its terms; a dash as error: not determined by the data by itself. Errors are standard "
-        f"errors, which rest on {escape(found.errors.method)}.</p>\n"
+        f"errors, which depend on {escape(found.errors.method)}.</p>\n"
         + table("Base parameters", headers, rows, is_data=True)
     )
 
@@ -262,14 +262,14 @@ def open_section(found: Identification) -> str:
     return (
         f"<p>The data determine {found.determination.rank} of {len(found.base)} base parameters; "
         f"condition number {wls.condition:.3g} (columns scaled to unit norm).</p>\n"
-        + _not_told_apart(found)
+        + _indistinguishable(found)
         + _listed("Parameters that no motion can show", found.mapping.unidentifiable)
         + _combinations(found)
         + _listed("Standard parameters that remain as the URDF has them, or nearly", kept)
     )
 
 
-def _not_told_apart(found: Identification) -> str:
+def _indistinguishable(found: Identification) -> str:
     """Return which base parameters the data do not tell apart, and what of them they determine."""
     groups = found.determination.merged
     title = "Base parameters that the data do not determine by themselves"
@@ -298,7 +298,7 @@ def _combinations(found: Identification) -> str:
     rows = []
     for i, body in enumerate(layout.bodies):
         names = layout.names[10 * i : 10 * i + 10]
-        kinds = found.mapping.in_words(names)
+        kinds = found.mapping.described(names)
         short = {key: ", ".join(n.rsplit(".", 1)[1] for n in kinds[key]) or "–" for key in kinds}
         rows.append([code(body), *[text(short[key]) for key in ("alone", "in sums", "never")]])
     return table(
@@ -356,7 +356,7 @@ def input_table(inputs: Iterable[Mapping[str, Any]]) -> str:
         ]
         for entry in inputs
     ]
-    headers = ["role", "file", "samples", "rate Hz", "from s", "to s", "stretches", "SHA-256"]
+    headers = ["role", "file", "samples", "rate Hz", "from s", "to s", "segments", "SHA-256"]
     return table("Files read", headers, rows)
 
 

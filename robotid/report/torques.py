@@ -118,7 +118,7 @@ def _names(evaluations: Sequence[Evaluation]) -> str:
 
 
 def _facts(found: Identification) -> dict[str, str]:
-    before, after, _ = found.witness.masses
+    before, after, _ = found.scale_check.masses
     change = f" ({100 * (after / before - 1):+.0f} %)".replace("-", "−") if before > 0 else ""
     return {
         "Total mass": f"<strong>{before:.2f} → {after:.2f} kg</strong>{change}",
@@ -146,10 +146,10 @@ def _made(found: Identification) -> str:
 
 def _beside(found: Identification) -> str:
     """Return masses, gravity and friction in a sentence, beside which a verdict is read."""
-    witness = found.witness
-    shares = [f"{joint} {100 * share:.0f} %" for joint, share in witness.friction.items()]
-    before, after, _ = witness.masses
-    gravity = [f"{joint} {ratio:.2f}" for joint, ratio in witness.gravity.items()]
+    scale_check = found.scale_check
+    shares = [f"{joint} {100 * share:.0f} %" for joint, share in scale_check.friction.items()]
+    before, after, _ = scale_check.masses
+    gravity = [f"{joint} {ratio:.2f}" for joint, ratio in scale_check.gravity.items()]
     return (
         f"Total mass {before:.2f} -> {after:.2f} kg. Gravity torque over the URDF's: "
         f"{listed(gravity)}. Friction as a share of the torque: {listed(shares)}."
@@ -192,7 +192,7 @@ def _said(found: Identification, shown: Sequence[Evaluation], left: Sequence[Eva
     """Return what the charts show, and of which recordings."""
     parts = [
         "<p>Measured torque, the identified model's with its 95 % band, the URDF's; below, the "
-        "residual (measured − identified). Shaded: rows not used, for the joint stands still and "
+        "residual (measured − identified). Shaded: rows not used, for the joint is at rest and "
         "the sign of its friction is unknown, and gaps. Drag to zoom; double-click or Escape shows "
         "all.</p>\n"
     ]

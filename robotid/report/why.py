@@ -43,7 +43,7 @@ def why_section(found: Identification) -> str:
     return (
         "<p>The torque of each joint, split into what it consists of, and what its residual "
         f"follows. Of the recordings {kind}: {escape(shown)}. A residual follows a quantity if its "
-        "mean over bins of it, without a stretch of the recording, explains more of that stretch "
+        "mean over bins of it, without a segment of the recording, explains more of that segment "
         f"than chance does.</p>\n{joints}"
     )
 

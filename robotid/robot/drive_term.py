@@ -23,12 +23,12 @@ __all__ = [
     "DIRECTED",
     "LOADED",
     "PLAIN",
+    "DataRange",
     "DriveMotion",
     "DriveTerm",
     "Family",
     "Law",
     "MemorylessTerm",
-    "Seen",
     "Shape",
     "Slope",
     "linear",
@@ -67,7 +67,7 @@ class DriveMotion:
         direction: Which way friction acts: the signs of w, or what stands for them [-].
         load: Torque of the rigid bodies [N m or N].
         rate: Change of the whole torque [N m/s or N/s].
-        begins: Where a stretch without gaps begins, bool; None of instants that do not follow each
+        begins: Where a segment without gaps begins, bool; None of instants that do not follow each
             other, whose drives have slid for long.
     """
 
@@ -106,11 +106,11 @@ class DriveTerm(ABC):
         is_inertia: Whether it multiplies the acceleration and so adds to the mass matrix.
         is_friction: Whether a job's ``friction`` chooses it; if not, it has a switch of its own.
         follows_direction: Whether its column holds the direction of friction.
-        remembers: Whether its column needs more than q, v, a and direction of an instant.
+        has_state: Whether its column needs more than q, v, a and direction of an instant.
         is_measured: Whether it is in what is measured alone, and does not act on the robot.
         guards: "v" or "q" if its column stays as it is beyond the range seen, else "".
         preference: How much it is favoured as the name of a base parameter [-].
-        usual: From where to where it usually lies, for simulated robots.
+        typical: From where to where it usually lies, for simulated robots.
         dynamics: Attribute of the URDF's ``<dynamics>`` that states it, or None.
         part: What it counts as where a torque is split: "friction", "spring" and the like.
         ends: Smallest and largest value of its numbers, by name; -1e9 and 1e9 of others.
@@ -127,7 +127,7 @@ class DriveTerm(ABC):
     is_inertia: ClassVar[bool] = False
     is_friction: ClassVar[bool] = True
     follows_direction: ClassVar[bool] = False
-    remembers: ClassVar[bool] = False
+    has_state: ClassVar[bool] = False
     is_measured: ClassVar[bool] = False
     guards: ClassVar[str] = ""
     preference: ClassVar[float] = 1.0
@@ -181,17 +181,17 @@ class MemorylessTerm(DriveTerm):
     Class attributes:
         speed_law: The law a of the speed, a static method; None: 1.
         position_law: The law b of the position, likewise.
-        bears_load: Whether the size of the gear's load multiplies it, as direction does.
+        is_loaded: Whether the size of the gear's load multiplies it, as direction does.
     """
 
     speed_law: ClassVar[Law | None] = None
     position_law: ClassVar[Law | None] = None
-    bears_load: ClassVar[bool] = False
+    is_loaded: ClassVar[bool] = False
 
     @property
     def kind(self) -> int:
         """What it is beside a(v) b(q)."""
-        return LOADED if self.bears_load else DIRECTED if self.follows_direction else PLAIN
+        return LOADED if self.is_loaded else DIRECTED if self.follows_direction else PLAIN
 
     @property
     def affine(self) -> int | None:
@@ -247,11 +247,11 @@ class MemorylessTerm(DriveTerm):
         column = self.amplitude(motion.q, motion.v)
         if self.follows_direction:
             column = motion.direction * column
-        return np.abs(motion.load) * column if self.bears_load else column
+        return np.abs(motion.load) * column if self.is_loaded else column
 
 
 #: Ranges of position "q" and of the size of speed "v" that a fit has seen.
-Seen = Mapping[str, tuple[float, float]]
+DataRange = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -270,7 +270,7 @@ class Shape:
     bounds: tuple[float, float]
     of: str = ""
 
-    def within(self, seen: Seen) -> tuple[float, float]:
+    def within(self, seen: DataRange) -> tuple[float, float]:
         """Return the bounds in the shape's own unit.
 
         Args:

@@ -18,11 +18,11 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.robot.drive_term import (
+    DataRange,
     DriveMotion,
     DriveTerm,
     Family,
     MemorylessTerm,
-    Seen,
     Shape,
     Slope,
     linear,
@@ -35,13 +35,13 @@ __all__ = [
     "TERMS",
     "TERM_CLASSES",
     "Bristles",
+    "DataRange",
     "DriveMotion",
     "DriveTerm",
     "Family",
     "Lag",
     "LoadFriction",
     "MemorylessTerm",
-    "Seen",
 ]
 
 _LEAST = 1e-12  # [rad/s or m/s]: below it the slope of a power is that at it
@@ -130,8 +130,8 @@ class LoadFriction(MemorylessTerm):
     is_nonnegative = True
     highest = 0.5  # a gear that loses more holds what it should lower
     follows_direction = True
-    bears_load = True
-    remembers = True
+    is_loaded = True
+    has_state = True
     usual = (0.04, 0.1)
 
 
@@ -290,7 +290,7 @@ class Bristles(DriveTerm):
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"displacement": _POSITIVE}
     is_nonnegative = True
     follows_direction = True
-    remembers = True
+    has_state = True
 
     @staticmethod
     def law(x: Sequence[float], way: Array, v: Array) -> tuple[Array, Array, Array]:
@@ -325,7 +325,7 @@ class Bristles(DriveTerm):
         return self.law(self.numbers, np.zeros_like(v), v)[0]
 
     def column(self, motion: DriveMotion) -> Array:
-        """Return z along stretches, from sliding where they begin.
+        """Return z along segments, from sliding where they begin.
 
         Exact between two samples if v keeps its sign and level there.
 
@@ -458,7 +458,7 @@ class Lag(DriveTerm):
 
     label = "lag"
     units = ("s", "s")
-    remembers = True
+    has_state = True
     is_measured = True
     is_friction = True
     usual = (0.005, 0.02)
@@ -500,7 +500,7 @@ _KNOTS = 4  # of a piecewise-linear curve of friction
 _TABLE = 8  # entries of a tabulated spring
 
 
-def _curve(seen: Seen) -> tuple[DriveTerm, ...]:
+def _curve(seen: DataRange) -> tuple[DriveTerm, ...]:
     """Return the rises of a monotone curve over the speeds seen, closer together at low speed."""
     knots = seen["v"][1] * np.linspace(0.0, 1.0, _KNOTS + 1) ** 2
     return tuple(
@@ -508,7 +508,7 @@ def _curve(seen: Seen) -> tuple[DriveTerm, ...]:
     )
 
 
-def _table(seen: Seen) -> tuple[DriveTerm, ...]:
+def _table(seen: DataRange) -> tuple[DriveTerm, ...]:
     """Return the entries of a tabulated spring but the middle one, which is the offset's."""
     knots = np.linspace(*seen["q"], _TABLE + 1).tolist()
     step = knots[1] - knots[0]
@@ -519,8 +519,8 @@ def _table(seen: Seen) -> tuple[DriveTerm, ...]:
     )
 
 
-def _harmonics(highest: int) -> Callable[[Seen], tuple[DriveTerm, ...]]:
-    def make(seen: Seen) -> tuple[DriveTerm, ...]:
+def _harmonics(highest: int) -> Callable[[DataRange], tuple[DriveTerm, ...]]:
+    def make(seen: DataRange) -> tuple[DriveTerm, ...]:
         return tuple(
             Harmonic(seen=seen["q"], order=float(k), is_sine=is_sine)
             for k in range(1, highest + 1)
@@ -535,7 +535,7 @@ def _once_a_turn() -> tuple[DriveTerm, ...]:
     return (Harmonic(), Harmonic(is_sine=True))
 
 
-def _by_position(seen: Seen) -> tuple[DriveTerm, ...]:
+def _by_position(seen: DataRange) -> tuple[DriveTerm, ...]:
     centre = 0.5 * (seen["q"][0] + seen["q"][1])
     return tuple(PositionCoulomb(seen=seen["q"], order=k, centre=centre) for k in (1, 2))
 

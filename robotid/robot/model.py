@@ -223,7 +223,7 @@ class RobotModel:
 
     @property
     def row_units(self) -> tuple[str, ...]:
-        """Unit of the torque in each row: N m, or N for forces and joints that slide."""
+        """Unit of the torque in each row: N m, or N for forces and prismatic joints."""
         is_force = [n in self.layout.prismatic or n.startswith("base.f") for n in self.row_names]
         return tuple("N" if force else "N m" for force in is_force)
 

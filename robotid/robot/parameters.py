@@ -74,7 +74,7 @@ class ParameterLayout:
         joints: Names of the driven joints.
         terms: The drive terms that are identified, names in ``TERMS`` in its order.
         couplings: Drives that turn with several joints.
-        prismatic: Names of the joints that slide.
+        prismatic: Names of the prismatic joints.
         strokes: Ranges of those whose range the URDF states, by name [m].
         own: Further terms of single drives, by the drive's name; they follow the others.
     """
@@ -158,7 +158,7 @@ class ParameterLayout:
     def drive_speeds(self) -> Array:
         """Speed of each of the d drives that counts as 1 rad/s, shape (d,) [rad/s or m/s].
 
-        A joint that slides crosses its stroke (1 m if the URDF states none) at it in the time of a
+        A prismatic joint crosses its stroke (1 m if the URDF states none) at it in the time of a
         full turn at 1 rad/s. A coupling has the mean of its joints, weighted by their ratios.
         """
         joints = [
@@ -183,7 +183,7 @@ class ParameterLayout:
     @cached_property
     def remembering(self) -> tuple[int, ...]:
         """Which drive parameters multiply more than an instant shows; see ``Trajectory.memory``."""
-        return tuple(k for k, (_, term) in enumerate(self.drive_parameters) if term.remembers)
+        return tuple(k for k, (_, term) in enumerate(self.drive_parameters) if term.has_state)
 
     @property
     def follows_direction(self) -> bool:

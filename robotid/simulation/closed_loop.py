@@ -28,7 +28,7 @@ from robotid.simulation.settings import (
 )
 from robotid.simulation.truth import another_robot
 
-__all__ = ["Noise", "Run", "another_robot", "carried", "follow", "lateness", "simulate"]
+__all__ = ["Noise", "Run", "another_robot", "carried", "delay", "follow", "simulate"]
 
 _LONGEST_STEP = 2.5e-3  # [s] of the integration, whatever the rate of the log
 _ELASTIC_STEP = 0.3  # of 1 / w of the fastest elastic gear
@@ -96,7 +96,7 @@ def simulate(
     chosen = settings or Simulation()
     sensors = chosen.sensors if noise is None else replace(chosen.sensors, noise=noise)
     run = follow(model, pi, motion, rate=rate, duration=duration, settings=chosen)
-    return measure(run, sensors, model.joints, rng, lateness=lateness(model, pi, chosen))
+    return measure(run, sensors, model.joints, rng, delay=delay(model, pi, chosen))
 
 
 def follow(
@@ -135,19 +135,19 @@ def follow(
     _check_size(duration * rate, 1)
     t = np.arange(round(duration * rate) + 1) / rate
     loaded = carried(model, pi, settings.payload)
-    taken_up = settings.payload.start if settings.payload.mass > 0 else math.inf
+    deflection = settings.payload.start if settings.payload.mass > 0 else math.inf
     if settings.controller.kind == "perfect":
-        return _perfect(model, pi, loaded, motion, t, taken_up)
+        return _perfect(model, pi, loaded, motion, t, deflection)
     loops = [_Loop(model, x, settings) for x in (pi, loaded)]
     steps = max(1, math.ceil(1.0 / rate / min(loop.longest_step for loop in loops) - 1e-9))
     _check_size(len(t), steps)
     h = 1.0 / rate / steps
-    loop, *later = loops if taken_up > 0 else loops[1:]
+    loop, *later = loops if deflection > 0 else loops[1:]
     seen = np.empty((len(t), 4, len(model.joints)))
     reference, limited = np.empty_like(seen[:, 0]), np.zeros(len(model.joints))
     y: Array | None = None
     for k, wanted in enumerate(_wanted(loop.controller, motion, len(t), steps, h)):
-        if later and t[k] >= taken_up - 1e-9 / rate:
+        if later and t[k] >= deflection - 1e-9 / rate:
             loop = later.pop()
         y = loop.start(*wanted[0, 0, :3]) if y is None else y
         F = loop.friction(y)
@@ -229,7 +229,7 @@ def carried(model: RobotModel, pi: Array, payload: Payload) -> Array:
 
 
 def _perfect(
-    model: RobotModel, pi: Array, loaded: Array, motion: Motion, t: Array, taken_up: float
+    model: RobotModel, pi: Array, loaded: Array, motion: Motion, t: Array, deflection: float
 ) -> Run:
     """Return the run of a robot that follows exactly, by inverse dynamics."""
     q, v, a = motion.evaluate(t)
@@ -240,11 +240,11 @@ def _perfect(
     for x in [pi] if loaded is pi else [pi, loaded]:
         robot = model.with_reference(x)
         torques += predict(robot, [x], remember(robot, rows))
-    tau = np.where((t >= taken_up)[:, None], torques[-1], torques[0])
+    tau = np.where((t >= deflection)[:, None], torques[-1], torques[0])
     return Run(t, q, v, a, tau, q, np.zeros(q.shape[1]))
 
 
-def lateness(model: RobotModel, pi: Array, settings: Simulation) -> Array:
+def delay(model: RobotModel, pi: Array, settings: Simulation) -> Array:
     """Return how late the terms of the drives make each logged torque, shape (n,) [s].
 
     Args:
@@ -294,8 +294,8 @@ class _Loop:
         if self.gear is not None:
             load = self.plant.bodies_torque(q, v, a)
             moving += [q + self.gear.twist(load), v]
-        _, taken_up = self.plant.taking_up(v)
-        return np.concatenate([*moving, taken_up])
+        _, deflection = self.plant.taking_up(v)
+        return np.concatenate([*moving, deflection])
 
     def friction(self, y: Array) -> Friction:
         """Return the friction of a state."""

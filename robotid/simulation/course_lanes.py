@@ -1,6 +1,6 @@
 """What loops are told on average over each step, and where their steps begin, in Numba.
 
-Imported only where a loop is rolled out.
+Imported only where a loop is simulated.
 """
 
 import numpy as np

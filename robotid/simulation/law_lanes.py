@@ -1,6 +1,6 @@
 """Laws of drives for roll-outs, with their derivatives, in Numba: friction, and position control.
 
-Imported only where a loop is rolled out. The laws are those of the terms of ``drives``, compiled
+Imported only where a loop is simulated. The laws are those of the terms of ``drives``, compiled
 one by one: what is compiled here calls a law by its address.
 """
 
@@ -12,7 +12,7 @@ from robotid.regressor.lanes import applied, compiled, pointed
 from robotid.robot.drive_term import BRISTLES, PLAIN, DriveTerm, Law, MemorylessTerm
 from robotid.robot.drives import Bristles
 
-__all__ = ["coded_term", "loop_torque", "slid", "taken_up", "term", "turned"]
+__all__ = ["coded_term", "deflection", "loop_torque", "slid", "term", "turned"]
 
 _SIGN = 1e-5  # [rad/s or m/s]: the speed over which friction turns
 
@@ -21,7 +21,7 @@ _pointed = cache(pointed)
 
 
 def coded_term(term: DriveTerm) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """Return what ``term`` and ``taken_up`` take of a term: its codes, five, and numbers, eleven.
+    """Return what ``term`` and ``deflection`` take of a term: its codes, five, and numbers, eleven.
 
     Codes are the addresses of its laws of speed and position, 0 of none, its kind, and how many
     numbers shape the one and the other. Numbers are four of each, and the ranges.
@@ -93,7 +93,7 @@ def turned(u, over=_SIGN):
 
 
 @compiled
-def taken_up(x, before, u, span):
+def deflection(x, before, u, span):
     """Return z after a time at the speed u, and its derivatives by u and by z before."""
     g, g_u, kept = _bristles(x, span * u, u)
     s = 1.0 if u > 0.0 or (u == 0.0 and before < 0.0) else -1.0  # at rest, of the stiffer side

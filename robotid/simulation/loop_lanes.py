@@ -1,6 +1,6 @@
 """Roll-outs of a robot under the loops of its drives, with their sensitivities, in Numba.
 
-Imported only where a loop is rolled out. ``LANES`` roll-outs go on at once, one in each
+Imported only where a loop is simulated. ``LANES`` roll-outs go on at once, one in each
 lane of the work space of ``tree_lanes``: windows of logs, which begin where the log was.
 
 One step solves for the speed u at the instant t + theta dt
@@ -39,7 +39,7 @@ from robotid.regressor.tree_lanes import (
     place,
 )
 from robotid.robot.drive_term import BRISTLES, LOADED
-from robotid.simulation.law_lanes import coded_term, loop_torque, slid, taken_up, term, turned
+from robotid.simulation.law_lanes import coded_term, deflection, loop_torque, slid, term, turned
 
 __all__ = [
     "ARMATURE",
@@ -62,7 +62,7 @@ _DOUBLINGS = 3  # of lanes
 LANES = 1 << _DOUBLINGS
 THETA = 0.5  # of a step, where its forces act: exact to second order
 _SLID = 0.1  # [s] for which drives are taken to have moved before a roll-out begins
-_NEWTON = 60  # steps, of which three or four are usual
+_NEWTON = 60  # steps, of which three or four are typical
 _CLOSE = 1e-12  # of the speed, relative to 1 + its size
 
 # kinds of sensitivities
@@ -217,7 +217,7 @@ def _hold_on(work, n, at, terms, step):
             for k in range(spans[i, 0], spans[i, 2]):
                 if codes[k, 2] == BRISTLES:
                     before = get(work, memory + 5 * int(shapes[k, 3]), lane)
-                    z, z_u, _ = taken_up(shapes[k], before, speed, THETA * step[lane])
+                    z, z_u, _ = deflection(shapes[k], before, speed, THETA * step[lane])
                     f += values[k] * z
                     f_u += values[k] * z_u
             put(work, grip + i, lane, f)
@@ -281,7 +281,7 @@ def _centre(work, n, at, step, tree, bodies, zeros, speeds, a):
 def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, tree):
     """Advance the sensitivities S of q and v, shape (2n, P), over a step that is solved."""
     q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip = at
-    T_q, T_v, S, own, change, by_hold, by_memory = sweeps
+    T_q, T_v, S, own, change, by_hold, by_state = sweeps
     codes, shapes, values, spans = terms
     kinds, sums, directions = columns
     P = len(sums) - 1
@@ -359,15 +359,15 @@ def _remember(work, n, at, terms, step):
                 z = memory + 5 * int(shapes[k, 3])
                 for lane in range(LANES):
                     speed, before = get(work, u + i, lane), get(work, z, lane)
-                    acts, _, share = taken_up(shapes[k], before, speed, THETA * step[lane])
-                    after, by_speed, kept = taken_up(shapes[k], before, speed, step[lane])
+                    acts, _, share = deflection(shapes[k], before, speed, THETA * step[lane])
+                    after, by_speed, kept = deflection(shapes[k], before, speed, step[lane])
                     put(work, z, lane, after)
                     put(work, z + 1, lane, acts)
                     put3(work, z + 2, lane, (share, by_speed, kept))
 
 
 @compiled
-def _slide(work, n, at, by_memory, kinds, sums, terms):
+def _slide(work, n, at, by_state, kinds, sums, terms):
     """Write z where roll-outs begin, and how it changes with the speed v there.
 
     It is that of long sliding, but for joints that take longer than ``_SLID`` to go their way.
@@ -384,21 +384,21 @@ def _slide(work, n, at, by_memory, kinds, sums, terms):
                 put(work, memory + 5 * slot, lane, z)
                 for p in range(P):
                     if kinds[sums[p], 0] == SPEED and kinds[sums[p], 1] == i:
-                        put(work, by_memory + slot * P + p, lane, by_speed)
+                        put(work, by_state + slot * P + p, lane, by_speed)
 
 
 @compiled
 def _recall(work, n, at, sweeps, terms, p, P, is_after):
     """Add to one column what memories make of their past; after the step, advance theirs."""
     loss, memory = at[11], at[13]
-    own, change, by_memory = sweeps[3], sweeps[4], sweeps[6]
+    own, change, by_state = sweeps[3], sweeps[4], sweeps[6]
     codes, shapes, values, spans = terms
     for i in range(n):
         for k in range(spans[i, 0], spans[i, 2]):
             if codes[k, 2] != BRISTLES:
                 continue
             slot = int(shapes[k, 3])
-            z, Z = memory + 5 * slot, by_memory + slot * P + p
+            z, Z = memory + 5 * slot, by_state + slot * P + p
             for lane in range(LANES):
                 x = get(work, Z, lane)
                 if is_after:
@@ -519,7 +519,7 @@ def _begin(work, n, at, sweeps, columns, terms, gravity, start, out_S):
 
 @compiled
 def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, corrects):
-    """Roll out a block of lanes; return the first step that had no solution, -1 if all had.
+    """Simulate a block of lanes; return the first step that had no solution, -1 if all had.
 
     Args:
         tree: The n joints, in the order of their bodies.
@@ -546,9 +546,9 @@ def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, cor
     by_hold, held = S + 2 * n * P, S + 3 * n * P if len(ticks) else -1
     memories = (codes[:, 2] == BRISTLES).sum()
     grip = S + (3 * P + 1) * n
-    memory, by_memory = grip + 2 * n if memories else -1, grip + 2 * n + 5 * memories
+    memory, by_state = grip + 2 * n if memories else -1, grip + 2 * n + 5 * memories
     at = (q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip)
-    sweeps = (T_q, T_v, S, own, change, by_hold, by_memory)
+    sweeps = (T_q, T_v, S, own, change, by_hold, by_state)
     work.numbers[:] = 0.0
     _begin(work, n, at, sweeps, columns, terms, tree.gravity, start, out_S)
     for k in range(len(steps)):

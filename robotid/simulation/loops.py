@@ -1,7 +1,7 @@
 """Roll-outs: what a robot does on command, its drives closing their loops, beside its logs.
 
 A robot with a fixed base falls into parts that the base alone joins, as the legs of a quadruped;
-each is rolled out by itself. Windows of logs go side by side in the lanes of the compiled code.
+each is simulated by itself. Windows of logs go side by side in the lanes of the compiled code.
 """
 
 import math
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from robotid.simulation.loop_lanes import Course
 
 __all__ = [
+    "ClosedLoopRobot",
     "Column",
-    "LoopedRobot",
     "Loops",
     "RollOut",
     "Window",
@@ -42,7 +42,7 @@ __all__ = [
 #: Kind, joint and index of what a roll-out is differentiated by; see ``loop_lanes``.
 Column: TypeAlias = tuple[int, int, int]
 
-_GAP = 3.0  # median steps: across a longer one nothing is rolled out
+_GAP = 3.0  # median steps: across a longer one nothing is simulated
 _AROUND = 0.03  # [s] about the first sample, whose slope is the speed a roll-out starts with
 _FEWEST = 2  # samples on each side for it
 _SHORT = 0.5  # of a window: a rest of that size joins the window before it
@@ -121,7 +121,7 @@ def open_loops(model: RobotModel, pi: Array) -> Loops:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A stretch of a log of commands that is rolled out from what was measured where it begins.
+    """A segment of a log of commands that is simulated from what was measured where it begins.
 
     Attributes:
         log: The log, with commands.
@@ -168,12 +168,12 @@ class Window:
 
 
 def cut_windows(log: Log, length: float, lead: float) -> tuple[Window, ...]:
-    """Return the windows of a log, stretch by stretch between its gaps.
+    """Return the windows of a log, segment by segment between its gaps.
 
     Args:
         log: The log, with commands.
-        length: Their length [s]; infinite for whole stretches.
-        lead: How long before what counts a roll-out begins, where the stretch has that [s].
+        length: Their length [s]; infinite for whole segments.
+        lead: How long before what counts a roll-out begins, where the segment has that [s].
     """
     steps = np.diff(log.t)
     dt = float(np.median(steps))
@@ -222,8 +222,8 @@ class _Part:
     tree: Tree
 
 
-class LoopedRobot:
-    """A robot whose drives close their loops, to be rolled out."""
+class ClosedLoopRobot:
+    """A robot whose drives close their loops, to be simulated."""
 
     def __init__(self, model: RobotModel, *, step: float = 2e-3, corrects: bool = False) -> None:
         """Flatten a robot.
@@ -240,11 +240,11 @@ class LoopedRobot:
         if model.free_flyer or model.layout.couplings or model.mimic == "coupled":
             raise SettingsError(
                 f"{model.name}: a floating base, drives that turn with several joints and coupled "
-                "mimic joints cannot be rolled out; fix the base, leave out [[coupling]], and set "
+                "mimic joints cannot be simulated; fix the base, leave out [[coupling]], and set "
                 "mimic = 'independent'"
             )
         if (why := why_not(model)) is not None:
-            raise SettingsError(f"{model.name} cannot be rolled out: {why}")
+            raise SettingsError(f"{model.name} cannot be simulated: {why}")
         self.model, self.step, self.corrects = model, step, corrects
         self._parts = _parts(flatten(model))
 
@@ -360,8 +360,8 @@ class LoopedRobot:
         coded = [lanes.coded_term(every_term[k]) for k in places]
         codes = np.array([code for code, _ in coded], dtype=np.int64).reshape(-1, 5)
         shapes = np.array([numbers for _, numbers in coded]).reshape(-1, 11)
-        remembers = codes[:, 2] == BRISTLES
-        shapes[remembers, 3] = np.arange(remembers.sum())
+        has_state = codes[:, 2] == BRISTLES
+        shapes[has_state, 3] = np.arange(has_state.sum())
         drives = np.column_stack(
             [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)] + [affine]
         )
@@ -374,7 +374,7 @@ class LoopedRobot:
             part.tree, loops.zero[own], loops.bodies[part.bodies], drives,
             lanes.Terms(codes, shapes, loops.values[places], spans),
             lanes.Columns(columns, sums, along), course, lanes.Motion(q, v, S),
-            lanes.work_of(n, len(numbers), int(remembers.sum())), self.corrects,
+            lanes.work_of(n, len(numbers), int(has_state.sum())), self.corrects,
         )  # fmt: skip
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
             raise NotConvergedError(

@@ -79,7 +79,7 @@ class RobotPlant:
         self._share = self.ratios / np.sum(self.ratios**2, axis=1, keepdims=True).clip(min=1e-300)
         self._simple, self._groups = _grouped(model, pi)
         self.n_states = sum(g.states.stop - g.states.start for g in self._groups)
-        self.is_loaded = any(_bears_load(g.term) for g in self._groups)
+        self.is_loaded = any(_is_loaded(g.term) for g in self._groups)
         G, A = model.velocity_map, self.armature
         # joints that are Pinocchio's own, each with a rotor of its own: its ABA does it all
         self._is_plain = np.array_equal(G, np.eye(len(G))) and np.array_equal(
@@ -142,7 +142,7 @@ class RobotPlant:
             term = group.term
             if z is not None and isinstance(term, Bristles):
                 rest[group.drives] += group.theta * z[group.states]
-            elif _bears_load(term):
+            elif _is_loaded(term):
                 loaded[group.drives] += group.torque(angle, w)
             elif term.follows_direction:
                 along[group.drives] += group.torque(angle, w)
@@ -291,8 +291,8 @@ def _grouped(model: RobotModel, pi: Array) -> tuple[Array, tuple[_Group, ...]]:
     return simple, tuple(groups)
 
 
-def _bears_load(term: DriveTerm) -> bool:
-    return isinstance(term, MemorylessTerm) and term.bears_load
+def _is_loaded(term: DriveTerm) -> bool:
+    return isinstance(term, MemorylessTerm) and term.is_loaded
 
 
 def rk4(

@@ -1,4 +1,4 @@
-"""What sensors make of how a robot moved: noise, steps, lateness, jitter, samples that are lost."""
+"""What sensors make of how a robot moved: noise, steps, delay, jitter, samples that are lost."""
 
 from typing import TYPE_CHECKING
 
@@ -23,7 +23,7 @@ def measure(
     joints: tuple[str, ...],
     rng: np.random.Generator,
     *,
-    lateness: Array | float = 0.0,
+    delay: Array | float = 0.0,
 ) -> Log:
     """Return what sensors log of a robot's motion.
 
@@ -35,7 +35,7 @@ def measure(
         sensors: What is logged, and what is wrong with it.
         joints: Names of the n joints.
         rng: Source of noise, jitter and losses.
-        lateness: How late each torque is by its drive, beside the sensors, shape (n,) [s].
+        delay: How late each torque is by its drive, beside the sensors, shape (n,) [s].
 
     Raises:
         DataError: If fewer than two samples are left.
@@ -47,7 +47,7 @@ def measure(
 
     noise, step, n = sensors.noise, sensors.step, len(joints)
     v = _late(run.t, run.v, np.full(n, sensors.velocity_delay))
-    tau = _late(run.t, run.tau, sensors.torque_delay + lateness * np.ones(n))
+    tau = _late(run.t, run.tau, sensors.torque_delay + delay * np.ones(n))
     share = of(noise.tau, "noise.tau") * np.sqrt(np.mean(tau**2, axis=0))
     level = np.hypot(share, of(noise.torque, "noise.torque"))
     q = _noisy(run.q, of(noise.q, "noise.q"), rng)

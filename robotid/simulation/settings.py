@@ -213,8 +213,8 @@ class Sensors(Settings):
     )
     noise: Noise = setting(Noise(), "white noise")
     step: Steps = setting(Steps(), "resolution; readings are rounded to it, noise included")
-    torque_delay: float = setting(0.0, "lateness of logged torques [s]", within=NOT_NEGATIVE)
-    velocity_delay: float = setting(0.0, "lateness of logged velocities [s]", within=NOT_NEGATIVE)
+    torque_delay: float = setting(0.0, "delay of logged torques [s]", within=NOT_NEGATIVE)
+    velocity_delay: float = setting(0.0, "delay of logged velocities [s]", within=NOT_NEGATIVE)
     jitter: float = setting(
         0.0,
         "standard deviation of the time stamps about the times of the samples [s]",

@@ -13,7 +13,7 @@ from robotid.simulation.settings import Truth
 
 __all__ = ["another_robot", "draw_parameters", "perturbed_bodies"]
 
-_USUAL_EFFORT = 50.0  # [N m or N] of a joint whose drive has the terms' usual values
+_USUAL_EFFORT = 50.0  # [N m or N] of a joint whose drive has the terms' typical values
 _IMPOSSIBLE = -1e-9  # smallest eigenvalue of a body's pseudo-inertia, of the largest
 
 
@@ -38,7 +38,7 @@ def draw_parameters(model: RobotModel, settings: Truth, rng: np.random.Generator
     for i, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
         drawn = rng.uniform(*term.usual)
         own = [x / _USUAL_EFFORT for j, _ in layout.drives[d].ratios if (x := effort[j]) > 0]
-        is_share = isinstance(term, MemorylessTerm) and term.bears_load
+        is_share = isinstance(term, MemorylessTerm) and term.is_loaded
         size = 1.0 if is_share or term.is_measured else min([1.0, *own])
         pi[i] = usual * size * drawn
     for name, value in settings.values.items():

@@ -99,7 +99,7 @@ _BODY = f"""\
 <section id="events" hidden><h2>Events</h2><ul id="marks"></ul></section>
 <div id="switches"></div>
 <p id="residuals" class="quiet"><span id="arcs">Arcs: measured torque from its tick at zero, 270°
-is a joint's largest; the inner one is predicted, unless the joint stands still.
+is a joint's largest; the inner one is predicted, unless the joint is at rest.
 </span>Colour: residual, <span class="ramp"></span> from 0 to <span id="most"></span>.</p>
 <div id="plots"></div>
 </aside>"""

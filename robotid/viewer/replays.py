@@ -31,10 +31,10 @@ _KEYS = 500_000  # numbers of a motion: about 3 MB
 _POINTS = 1_000_000  # numbers of all plots: about 6 MB
 _BINS = 480  # columns of the heat strip
 _PLOT_RATE = 50.0  # [Hz] points of a plot per second
-_SEEN = 100  # poses that the camera is aimed by
+_DATA_RANGE = 100  # poses that the camera is aimed by
 _CELLS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # [m] of the grid, 40 by 40
 _GAP = 0.25  # [s] a longer time without samples is a gap ...
-_TIMES = 5.0  # ... if it is so many times the usual one
+_TIMES = 5.0  # ... if it is so many times the typical one
 
 
 @dataclass(frozen=True, eq=False)
@@ -424,7 +424,7 @@ def _view(model: RobotModel, corners: Sequence[Array], motions: Sequence[Array])
     data = model.pin_model.createData()
     points, lowest, first = [], np.inf, int(model.free_flyer)  # without the world's own corner
     for q in motions:
-        rows = np.unique(np.linspace(0, len(q) - 1, _SEEN).astype(int))
+        rows = np.unique(np.linspace(0, len(q) - 1, _DATA_RANGE).astype(int))
         for configuration in model.configurations(q[rows]):
             pin.forwardKinematics(model.pin_model, data, configuration)
             base = configuration[:3] if model.free_flyer else np.zeros(3)

@@ -1,4 +1,4 @@
-"""Stretches of a motion whose torque no model of the robot explains: contacts, loads, faults."""
+"""Segments of a motion whose torque no model of the robot explains: contacts, loads, faults."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ __all__ = ["Unexplained", "find_unexplained", "residual_levels"]
 _WINDOW = 0.2  # [s] over which a residual is averaged
 _TIMES = 6.0  # a mean residual so many times its median ...
 _SHARE = 0.3  # ... and above this share of the joint's torque is unexplained
-_APART = 1.0  # [s] stretches closer than this are one
+_APART = 1.0  # [s] segments closer than this are one
 _SHORTEST = 0.05  # [s] what is shorter is a spike
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """A stretch of unexplained torque.
+    """A segment of unexplained torque.
 
     Attributes:
         start: When it begins [s].
@@ -48,7 +48,7 @@ def find_unexplained(
         joints: Names of the n joints.
 
     Returns:
-        The stretches, in order of time.
+        The segments, in order of time.
     """
     if len(t) < 2:
         return ()
@@ -75,10 +75,10 @@ def find_unexplained(
 
 
 def residual_levels(edges: Array, t: Array, residual: Array) -> Array:
-    """Return the root mean square of each joint's residual within each stretch of time.
+    """Return the root mean square of each joint's residual within each segment of time.
 
     Args:
-        edges: Where the stretches begin, and the last one's end, shape (B + 1,) [s].
+        edges: Where the segments begin, and the last one's end, shape (B + 1,) [s].
         t: Times, shape (N,) [s].
         residual: Measured less predicted torque, shape (N, n), NaN where none is predicted.
 

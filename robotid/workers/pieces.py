@@ -1,6 +1,6 @@
 """Pieces of long logs, and what a worker does with one, in whichever process or machine it runs.
 
-A piece is a fixed stretch of rows of one log, whatever the number of workers: what it comes down
+A piece is a fixed segment of rows of one log, whatever the number of workers: what it comes down
 to never depends on who reduces it, nor on what else is reduced beside it.
 """
 
@@ -32,7 +32,7 @@ class Workload(Protocol):
 
 
 class Piece(Workload):
-    """A stretch of a log that is reduced by itself. Pieces can be pickled, and are small."""
+    """A segment of a log that is reduced by itself. Pieces can be pickled, and are small."""
 
     @abstractmethod
     def reduce(self, *, threads: int | None = None) -> Reduction:

@@ -154,7 +154,7 @@ def test_torques_that_are_not_of_the_loop_are_named():
         found = identify_loops(
             robot.model, [own], [], loop, settings(torques=True, step=4e-3), chooses=False
         )
-        return {f.where: f for f in found.findings if f.code == "torque_missed"}
+        return {f.where: f for f in found.findings if f.code == "torque_mismatch"}
 
     before = missed(log.tau * [1.0, 0.02], gains)
     assert set(before) == {"joint_2"}, "not the other, whose torque is its loop's"

@@ -14,7 +14,7 @@ from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot, cut_windows, open_loops
+from robotid.simulation.loops import ClosedLoopRobot, cut_windows, open_loops
 
 SIGNALS = SignalSettings(cutoff=30.0)
 DRIVEN = LoopSettings(kind="torque")
@@ -74,7 +74,7 @@ def test_the_true_robot_does_under_its_torque_what_mujocos_does(arm):
     robot, rng = arm[0], np.random.default_rng(8)
     log = driven_log(robot.model, torque_log(robot, rng, duration=4.0, rate=500.0), SIGNALS)
     loops = open_loops(robot.model, true_parameters(robot))
-    run = run_open_loop(LoopedRobot(robot.model, step=1e-3), loops, log)
+    run = run_open_loop(ClosedLoopRobot(robot.model, step=1e-3), loops, log)
     # its friction is soft over 1e-2 rad/s, ours over 1e-4
     assert (run.rmse < 3e-3).all()
     assert (run.rmse < 0.05 * run.spread).all()

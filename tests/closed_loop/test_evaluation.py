@@ -12,7 +12,7 @@ from robotid.closed_loop.settings import LoopSettings
 from robotid.logs.data import Log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot, cut_windows
+from robotid.simulation.loops import ClosedLoopRobot, cut_windows
 
 
 def run(joints, rmse, spread, moves, n=50, **baselines):
@@ -71,7 +71,7 @@ def test_errors_are_of_samples_in_windows_and_the_spread_is_about_the_mean(tmp_p
     q_ref = 3.0 + 0.2 * np.sin(5 * t)[:, None]
     q = q_ref + 0.02 * rng.standard_normal(q_ref.shape)
     log = Log(t, q, 0 * q, ("j",), q_ref=q_ref, has_torque=False)
-    robot = LoopedRobot(rail, step=2e-3)
+    robot = ClosedLoopRobot(rail, step=2e-3)
     loops = stated_loops(rail, LoopSettings(kp=300.0, kd=40.0))
     soft = replace(loops, kp=np.array([50.0]))
     found = run_open_loop(robot, loops, log, {"urdf": soft}, horizons=(0.1, 0.5, 9.0))

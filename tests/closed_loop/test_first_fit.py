@@ -10,13 +10,13 @@ from robotid.closed_loop import fit
 from robotid.closed_loop.settings import LoopSettings
 
 
-class Seen(Exception):
+class DataRange(Exception):
     """What was fitted first, and how."""
 
 
 @dataclass
 class Simulator:
-    unknowns: tuple
+    free_parameters: tuple
     windows: tuple
     prior: np.ndarray
 
@@ -26,23 +26,23 @@ class Estimator:
     rounds: int
 
     def fit(self, simulator):
-        raise Seen(simulator, self.rounds)
+        raise DataRange(simulator, self.rounds)
 
 
 @pytest.mark.parametrize("kind", ["pd", "torque"])
 def test_the_first_fit_is_of_drives_alone_with_the_bodies_of_the_urdf(monkeypatch, kind):
-    unknowns = tuple(
+    free_parameters = tuple(
         SimpleNamespace(name=name, what=what)
         for name, what in (("m", "body"), ("kp", "kp"), ("mcx", "body"), ("coulomb", "term"))
     )
-    simulator = Simulator(unknowns, ("first", "second", "third"), np.zeros(4))
-    begun = SimpleNamespace(simulator=simulator, estimator=Estimator(rounds=9))
-    named = {"pd": "_begun_by_commands", "torque": "_begun_by_torque"}
-    monkeypatch.setattr(fit, named[kind], lambda *_: begun)
+    simulator = Simulator(free_parameters, ("first", "second", "third"), np.zeros(4))
+    initialised = SimpleNamespace(simulator=simulator, estimator=Estimator(rounds=9))
+    named = {"pd": "_initialise_from_commands", "torque": "_initialise_from_torque"}
+    monkeypatch.setattr(fit, named[kind], lambda *_: initialised)
     monkeypatch.setattr(fit, "_check_settings", lambda *_: None)
     monkeypatch.setattr(fit, "_few", lambda windows: windows[::2])
-    with pytest.raises(Seen) as caught:
+    with pytest.raises(DataRange) as caught:
         fit.fit_loops(None, [], LoopSettings(kind=kind), None)
     first, rounds = caught.value.args
-    assert [unknown.name for unknown in first.unknowns] == ["kp", "coulomb"]
+    assert [unknown.name for unknown in first.free_parameters] == ["kp", "coulomb"]
     assert (first.windows, rounds) == (("first", "third"), 1)

@@ -22,7 +22,7 @@ from robotid.judgement.positions import judge_positions
 from robotid.logs.data import Log
 from robotid.report.document import write_report
 from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Presliding, Viscous
-from robotid.simulation.loops import LoopedRobot, cut_windows
+from robotid.simulation.loops import ClosedLoopRobot, cut_windows
 
 NOISE = 1e-3  # [rad]: with less, that MuJoCo's friction is a little soft shows beside the errors
 SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=2e-3)
@@ -229,7 +229,7 @@ def test_a_joint_that_is_told_to_stand_is_not_evaluated(leg, found):
     verdict = judged([stands])
     assert [verdict.joints[joint].status for joint in joints] == ["good", "good", "not evaluated"]
     assert verdict.status == "usable"
-    assert verdict.reasons == (f"{joints[2]}: commanded to stand still in all logs: not evaluated",)
+    assert verdict.reasons == (f"{joints[2]}: commanded to are at rest in all logs: not evaluated",)
     assert judged([stands, run]).status == "good"
     nobody = replace(run, log=replace(still, q_ref=np.tile(still.q_ref[0], (len(still.t), 1))))
     assert judged([nobody]).status == "not evaluated"
@@ -261,7 +261,7 @@ def test_of_many_scales_that_suit_the_positions_the_urdfs_is_taken():
     log, truth = recorded(robot, rng, duration=3.0, rate=250.0, step=2e-4)
     settings, loop = replace(COARSE, bodies=0.1), LoopSettings(delays="group")
     fitted = fit_loops(robot.model, [log], loop, settings, chooses=False)
-    gains = [unknown.what == "kp" for unknown in fitted.simulator.unknowns]
+    gains = [unknown.what == "kp" for unknown in fitted.simulator.free_parameters]
     exact = np.array([truth[name] for name in np.array(fitted.estimate.names)[gains]])
     np.testing.assert_allclose(fitted.estimate.theta[gains], exact, rtol=0.02)
     assert (fitted.estimate.std_error[gains] > 0.1 * exact).all(), "others would do, too"
@@ -343,7 +343,7 @@ def test_friction_by_position_is_found_where_it_is_and_nowhere_else(leg):
         values=np.array([0.1, 0.2, 0.0, 0.1, 0.2, 0.0, 0.1, 0.25, 0.0, 0.5, 1.0]),
     )  # fmt: skip
     told = Log(t, q_ref, np.zeros_like(q_ref), model.joints, q_ref=q_ref, has_torque=False)
-    [out] = LoopedRobot(model, step=5e-4).roll_out(loops, cut_windows(told, np.inf, 0.0))
+    [out] = ClosedLoopRobot(model, step=5e-4).roll_out(loops, cut_windows(told, np.inf, 0.0))
     log = replace(told, q=out.q + 3e-4 * rng.standard_normal(out.q.shape))
     found = identify_loops(model, [log], [], stated(robot), COARSE)
     chosen = {(t.joint, t.terms) for t in found.fit.tried if t.is_chosen}
@@ -373,7 +373,7 @@ def test_friction_with_a_stated_way_is_recovered(tmp_path, rng):
         terms=((Viscous(), way),), values=np.array([5.0, 8.0]),
     )  # fmt: skip
     told = Log(t, q_ref, 0 * q_ref, ("j",), q_ref=q_ref, has_torque=False)
-    [out] = LoopedRobot(model, step=5e-4).roll_out(loops, cut_windows(told, np.inf, 0.0))
+    [out] = ClosedLoopRobot(model, step=5e-4).roll_out(loops, cut_windows(told, np.inf, 0.0))
     log = replace(told, q=out.q + 1e-4 * rng.standard_normal(out.q.shape))
     found = identify_loops(model, [log], [], loop, SETTINGS, chooses=False)
     values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))

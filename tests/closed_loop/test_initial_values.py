@@ -1,4 +1,4 @@
-"""Where a fit begins: usual sizes, first loops and unknowns, by their equations."""
+"""Where a fit begins: typical sizes, first loops and unknowns, by their equations."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -10,12 +10,12 @@ from helpers.paths import URDF
 
 from robotid.closed_loop.fit import stated_loops
 from robotid.closed_loop.initial_values import (
-    drive_unknowns,
     first_loops,
+    free_drive_parameters,
     is_stated,
     likeness,
-    usual_sizes,
-    usual_sizes_of_torques,
+    typical_sizes,
+    typical_sizes_of_torques,
 )
 from robotid.closed_loop.second_order import SecondOrder
 from robotid.closed_loop.settings import LoopSettings
@@ -59,7 +59,7 @@ def inertia_of(model, windows):
 def test_usual_sizes_are_measured_by_known_gains_or_by_the_bodies(planar, logged):
     bodies = inertia_of(planar, logged)
     plain = plain_model(planar, [3 * bodies[0], 0.4], [60.0, 1.0])
-    found = usual_sizes(
+    found = typical_sizes(
         SimpleNamespace(model=planar), plain, logged, np.array([True, False]), np.array([2.0, 0.0])
     )
     np.testing.assert_allclose(found.bodies, bodies)
@@ -74,7 +74,7 @@ def test_usual_sizes_are_measured_by_known_gains_or_by_the_bodies(planar, logged
     assert asked[0] < taken
     np.testing.assert_allclose(found.largest, scale * asked)
     quick = replace(plain, loops=replace(plain.loops, kp=np.array([600.0, 1.0])))
-    own = usual_sizes(
+    own = typical_sizes(
         SimpleNamespace(model=planar), quick, logged, np.array([True, False]), np.array([2.0, 0.0])
     )
     np.testing.assert_allclose(own.largest, scale * [taken, asked[1]])
@@ -88,7 +88,7 @@ def test_usual_sizes_of_torques_are_those_of_rows_and_motors(planar, logged):
     armature = np.array([0.3, 0.7])
     for joint, x in zip(planar.joints, armature, strict=True):
         pi[names.index(f"{joint}.armature")] = x
-    found = usual_sizes_of_torques(planar, pi, armature, logged)
+    found = typical_sizes_of_torques(planar, pi, armature, logged)
     bodies = inertia_of(planar, logged)
     np.testing.assert_allclose(found.bodies, bodies)
     np.testing.assert_allclose(found.inertia, bodies + armature)
@@ -101,7 +101,7 @@ def test_usual_sizes_of_torques_are_those_of_rows_and_motors(planar, logged):
 def test_first_loops_and_unknowns_begin_with_usual_sizes(planar, logged):
     bodies = inertia_of(planar, logged)
     plain = plain_model(planar, [3 * bodies[0], 0.4], [60.0, 1.0])
-    usual = usual_sizes(
+    usual = typical_sizes(
         SimpleNamespace(model=planar), plain, logged, np.array([True, False]), np.zeros(2)
     )
     loop = LoopSettings(kp={planar.joints[0]: 60.0}, delays="one")
@@ -120,7 +120,7 @@ def test_first_loops_and_unknowns_begin_with_usual_sizes(planar, logged):
         {"viscous": 0.4, "coulomb": 0.3, "offset": 0.0},
         {"viscous": pytest.approx(0.8 * s), "coulomb": pytest.approx(0.6 * s), "offset": 0.0},
     ]
-    found = drive_unknowns(
+    found = free_drive_parameters(
         planar, loop, ["both", "both"], first, usual, tells_kd=True,
         finds_limit=np.array([False, True]),
     )  # fmt: skip
@@ -143,7 +143,7 @@ def test_first_loops_and_unknowns_begin_with_usual_sizes(planar, logged):
     for name, (joints, *figures) in wanted.items():
         assert table[name][0] == joints, name
         assert table[name][1:] == pytest.approx(tuple(figures)), name
-    bare = drive_unknowns(
+    bare = free_drive_parameters(
         planar, LoopSettings(kp=1.0, kd=1.0, delay=0.0), ["a", "b"], first, usual, tells_kd=False,
         finds_limit=np.zeros(2, dtype=bool),
     )  # fmt: skip

@@ -13,7 +13,7 @@ from robotid.closed_loop.findings import loop_findings
 from robotid.closed_loop.initial_values import _speed
 from robotid.closed_loop.result import LoopIdentification, logged_motion
 from robotid.closed_loop.zeros import Encoders
-from robotid.fitting.bands import REACH
+from robotid.fitting.bands import QUANTILE
 from robotid.logs.data import Log
 from robotid.simulation.loops import cut_windows
 
@@ -35,13 +35,13 @@ def test_intervals_reach_as_far_as_those_of_what_they_follow_from(found):
     assert found.estimate.names == NAMES
     freedom = np.array([5.0, 4.0, 3.0, 8.0, 12.0])
     own = of(found, details={**found.estimate.details, "freedom": freedom})
-    reach = dict(zip(found.model.layout.names, own.standard_reach, strict=True))
+    reach = dict(zip(found.model.layout.names, own.standard_quantile, strict=True))
     stated = dict(zip(NAMES, scipy.stats.t.ppf(0.975, freedom), strict=True))
-    assert reach == pytest.approx({name: stated.get(name, REACH) for name in reach}, rel=1e-6)
+    assert reach == pytest.approx({name: stated.get(name, QUANTILE) for name in reach}, rel=1e-6)
     sums = found.mapping.K != 0.0
     assert sums.sum(axis=1).max() > 1, "a base parameter sums several"
-    for row, base in zip(sums, own.base_reach, strict=True):
-        assert base == own.standard_reach[row].max()
+    for row, base in zip(sums, own.base_quantile, strict=True):
+        assert base == own.standard_quantile[row].max()
 
 
 def test_errors_of_sums_are_those_of_their_parameters(found):
@@ -77,9 +77,9 @@ def test_what_the_data_hardly_shrink_is_undetermined(found):
     np.testing.assert_allclose(other.shrunk, share)
     assert other.undetermined == ("turn.armature", "rail.viscous")
     simulator = found.fit.simulator
-    body = replace(simulator.unknowns[1], what="body")
-    unknowns = (simulator.unknowns[0], body, *simulator.unknowns[2:])
-    fit = replace(other.fit, simulator=replace(simulator, unknowns=unknowns))
+    body = replace(simulator.free_parameters[1], what="body")
+    free_parameters = (simulator.free_parameters[0], body, *simulator.free_parameters[2:])
+    fit = replace(other.fit, simulator=replace(simulator, free_parameters=free_parameters))
     assert replace(other, fit=fit).undetermined == ("rail.viscous",), "bodies have a prior"
 
 
@@ -127,13 +127,13 @@ def test_encoders_are_told_with_the_figures_of_their_own_joint(found):
     turned = {"gain": [0.0, 0.31], "sign": [1.0, -1.0], "next_zero": [0.4, -0.25]}
     every = told(**turned, margin=[0.5, 2.1], explained=[0.62, 0.9])
     assert {code: f.where for code, f in every.items()} == {
-        "encoder": "turn", "encoder_kept": "rail",
+        "encoder": "turn", "encoder_uncorrected": "rail",
     }  # fmt: skip
     said = every["encoder"].message
     assert "turn: its encoder counts the other way, and reads 0" in said
     assert "explains 31 % of what holds" in said
     assert "the next best, -0.25 rad, counted the other way, leaves 210 % more" in said
-    kept = every["encoder_kept"].message
+    kept = every["encoder_uncorrected"].message
     assert "explains 62 % of what slowly holds" in kept
     assert "the next best, +0.4 rad leaves 50 % more" in kept
 

@@ -61,11 +61,11 @@ def test_terms_are_offered_in_the_size_of_motion_and_torque():
     model = SimpleNamespace(joints=("wide", "narrow", "still"))
     simulator = SimpleNamespace(robot=SimpleNamespace(model=model), windows=windows)
     offered = candidates(simulator, np.array([8.0, 3.0, 1.0]))
-    assert [[u.name for u in unknowns] for unknowns in offered] == [
+    assert [[u.name for u in free_parameters] for free_parameters in offered] == [
         ["wide.stribeck"], ["wide.load"], ["wide.coulomb_q1", "wide.coulomb_q2"],
         ["narrow.stribeck"], ["narrow.load"],
     ]  # fmt: skip
-    found = {u.name: u for unknowns in offered for u in unknowns}
+    found = {u.name: u for free_parameters in offered for u in free_parameters}
     for name, amplitude, rate in (("wide", 0.5, 1.0), ("narrow", 0.02, 2.0)):
         rms = amplitude * 2 * np.pi * rate / np.sqrt(2)
         assert found[f"{name}.stribeck"].term.speed == pytest.approx(0.3 * rms, rel=0.01)

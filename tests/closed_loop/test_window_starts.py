@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 from helpers.mujoco_plant import multisine, plant
 
-from robotid.closed_loop.unknowns import LoopSimulator, Unknown
+from robotid.closed_loop.free_parameters import FreeParameter, LoopSimulator
 from robotid.export.commanded import loops_of
 from robotid.logs.data import Log
-from robotid.simulation.loops import LoopedRobot, cut_windows
+from robotid.simulation.loops import ClosedLoopRobot, cut_windows
 
 NOISE = 3e-4  # [rad]
 
@@ -21,10 +21,10 @@ def simulator(rng):
     t = np.arange(750) / 250.0
     q_ref = multisine(t, arm.middle, arm.reach, rng)
     log = Log(t, q_ref, 0 * q_ref, arm.model.joints, q_ref=q_ref, has_torque=False)
-    robot, loops = LoopedRobot(arm.model, step=4e-3), loops_of(arm.model, pi, arm.drives)
+    robot, loops = ClosedLoopRobot(arm.model, step=4e-3), loops_of(arm.model, pi, arm.drives)
     [out] = robot.roll_out(loops, cut_windows(log, np.inf, 0.0))
     noisy = replace(log, q=out.q + NOISE * rng.standard_normal(out.q.shape))
-    unknown = Unknown("delay", "delay", (0, 1), 0.006, 0.1)
+    unknown = FreeParameter("delay", "delay", (0, 1), 0.006, 0.1)
     windows = cut_windows(noisy, 1.0, 0.0)
     truth = np.array([[out.q[w.begin], out.v[w.begin]] for w in windows])
     return LoopSimulator(robot, windows, loops, (unknown,)), truth
@@ -32,7 +32,7 @@ def simulator(rng):
 
 def test_starts_that_fit_are_nearer_to_the_truth_than_those_measured(rng):
     measured, truth = simulator(rng)
-    better = measured.begun_better(measured.prior)
+    better = measured.with_better_start(measured.prior)
     before, after = (np.array([w.start for w in one.windows]) - truth for one in (measured, better))
     assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
     left = np.concatenate([r.e for r in better.residuals(measured.prior, with_slopes=False)])

@@ -5,14 +5,14 @@ import pytest
 from helpers.mujoco_plant import plant, recorded
 
 from robotid.closed_loop.fit import stated_loops
+from robotid.closed_loop.free_parameters import LoopSimulator, free_body_parameters
 from robotid.closed_loop.identify import identify_loops
 from robotid.closed_loop.settings import LoopSettings
-from robotid.closed_loop.unknowns import LoopSimulator, body_unknowns
 from robotid.closed_loop.zeros import CLEAR, find_encoders, parallel_axes
 from robotid.fitting.settings import SimulationSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot
+from robotid.simulation.loops import ClosedLoopRobot
 
 AWAY = 0.5  # [rad] of the thigh's zero from the URDF's
 SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=4e-3)
@@ -65,10 +65,10 @@ def test_a_zero_is_found_to_the_grid_and_then_by_the_fit(moved):
     assert said.evidence["zero"] == pytest.approx(AWAY, abs=0.03)
     assert f"leaves {100 * said.evidence['margin']:.0f} % more" in said.message
     assert said.evidence["next_zero"] == 0.0, "that of the URDF"
-    [kept] = [f for f in found.findings if f.code == "encoder_kept"]
+    [kept] = [f for f in found.findings if f.code == "encoder_uncorrected"]
     assert kept.where == "FL_hip_joint"
     assert f"explains {100 * kept.evidence['explained']:.0f} %" in kept.message
-    [open_] = [f for f in found.findings if f.code == "encoder_open"]
+    [open_] = [f for f in found.findings if f.code == "encoder_undetermined"]
     assert open_.where == "FL_calf_joint"
     [mirror] = [f for f in found.findings if f.code == "mirror_image"]
     assert mirror.where == "FL_thigh_joint, FL_calf_joint"
@@ -94,10 +94,12 @@ def test_an_encoder_that_counts_the_other_way_is_turned(leg):
 def test_torques_tell_the_gains_that_positions_leave_open():
     rng = np.random.default_rng(3)
     robot = plant("planar", rng)
-    looped = LoopedRobot(robot.model)
-    unknowns = tuple(body_unknowns(looped, 0.1))
-    simulator = LoopSimulator(looped, (), stated_loops(robot.model, LoopSettings()), unknowns)
-    lighter = [np.log(0.7) / 2 if u.name.endswith("mass") else 0.0 for u in unknowns]
+    looped = ClosedLoopRobot(robot.model)
+    free_parameters = tuple(free_body_parameters(looped, 0.1))
+    simulator = LoopSimulator(
+        looped, (), stated_loops(robot.model, LoopSettings()), free_parameters
+    )
+    lighter = [np.log(0.7) / 2 if u.name.endswith("mass") else 0.0 for u in free_parameters]
     # by the URDF's masses positions take the scale, which the torques then have to move
     robot = replace(robot, bodies=simulator.loops(np.array(lighter)).bodies.reshape(-1))
     log, truth = recorded(robot, rng, duration=3.4, rate=250.0, noise=1e-4, torque=0.5, step=1e-4)

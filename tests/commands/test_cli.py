@@ -71,7 +71,7 @@ def test_result_json_has_the_promised_shape(identified, logs):
         "condition": pytest.approx(result["structure"]["condition"]),
         "poorly_excited": False,
         "undetermined": [],
-        "not_told_apart": [],
+        "indistinguishable": [],
     }
     assert len(result["base_parameters"]) == 58
     assert set(result["base_parameters"][0]) == {

@@ -110,7 +110,7 @@ def test_help_shows_the_flags_that_do_something(command, without):
     command.add_flags(parser)
     shown = " ".join(parser.format_help().split())
     assert not [flag for flag in without if flag in shown]
-    assert "auto: what held-out stretches of the fitted logs ask for" in shown
+    assert "auto: what held-out segments of the fitted logs ask for" in shown
     assert all(family in shown for family in FAMILIES)
 
 

@@ -40,7 +40,7 @@ def test_the_error_of_a_robot_at_rest_carries_what_the_doctor_found(arm, rng, tm
     with pytest.raises(DataError, match="0 torque rows") as caught:
         run_job(job, tmp_path / "out")
     notes = caught.value.__notes__
-    assert any("static_joint" in note and "joint_2 stands still" in note for note in notes)
+    assert any("static_joint" in note and "joint_2 is at rest" in note for note in notes)
     out = ["--out", str(tmp_path / "out")]
     assert main(["identify", arm.tree.path, str(tmp_path / "rest.csv"), *out]) == 1
     lines = capsys.readouterr().err.splitlines()
@@ -172,8 +172,8 @@ def test_a_mass_beyond_a_factor_of_three_is_no_urdf_but_where_it_is_ignored(
     assert main(command) == 1
     result = json.loads(capsys.readouterr().out)
     assert "urdf" not in result["outputs"]
-    (alarm,) = result["verdict"]["alarms"]
-    before, after, _ = result["witness"]["masses"]
+    (alarm,) = result["verdict"]["log_errors"]
+    before, after, _ = result["scale_check"]["masses"]
     assert before == pytest.approx(11.9)
     said = f"weigh {after:.4g} kg together, the URDF's 11.9 kg; wanted within a factor of 3"
     assert said in alarm
@@ -203,14 +203,14 @@ def test_python_says_what_the_command_line_says(arm, logs, tmp_path, delay):
     named = [replace(log, path=name) for log, name in ((run, "run.csv"), (kept, "kept.csv"))]
     logs = {"logs": named[:1], "validation": named[1:], "estimator": "wls"}
     python = identify(arm, **logs).verdict
-    assert {doubt.code for doubt in python.doubts} == ({"torque_delay"} if delay else set())
+    assert {doubt.code for doubt in python.warnings} == ({"torque_delay"} if delay else set())
     assert python.status == shell.status
-    assert python.doubts == shell.doubts
+    assert python.warnings == shell.warnings
     if not delay:
         return
     blind = identify(arm, **logs, doctor=False)
     known = identify(arm, **logs, ignore=["torque_delay"])
-    assert "torque_delay" not in {doubt.code for doubt in (*blind.doubts, *known.doubts)}
+    assert "torque_delay" not in {doubt.code for doubt in (*blind.warnings, *known.warnings)}
     assert known.findings != blind.findings
     with pytest.raises(SettingsError, match="ignore names 'late'"):
         identify(arm, named[:1], ignore=["late"])

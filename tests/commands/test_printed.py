@@ -230,7 +230,7 @@ METRICS = {
 WORSE = METRICS["slide"] | {"relative_error_pct": 150.0}
 LEAST = {"one": {"relative_error_pct": 1.1}, "slide": {"relative_error_pct": 99.0}}
 VERDICT = {
-    "status": "poor", "reasons": ["slide: worse"], "alarms": [], "doubts": [],
+    "status": "poor", "reasons": ["slide: worse"], "log_errors": [], "warnings": [],
     "per_joint": {
         "one": {"status": "good", "reasons": []},
         "slide": {"status": "poor", "reasons": ["slide: worse"]},
@@ -240,15 +240,15 @@ VERDICT = {
 
 def test_identify(shown):
     tried = [
-        {"held_out_error_pct": 9.0, "is_taken": True, "families": []},
-        {"held_out_error_pct": 7.0, "is_taken": True, "families": ["tanh"]},
-        {"held_out_error_pct": 5.0, "is_taken": True, "families": ["tanh", "load"]},
-        {"held_out_error_pct": 4.0, "is_taken": False, "families": ["load"]},
+        {"held_out_error_pct": 9.0, "is_selected": True, "families": []},
+        {"held_out_error_pct": 7.0, "is_selected": True, "families": ["tanh"]},
+        {"held_out_error_pct": 5.0, "is_selected": True, "families": ["tanh", "load"]},
+        {"held_out_error_pct": 4.0, "is_selected": False, "families": ["load"]},
     ]
     content = {
         "robot": "arm", "joints": ["one", "slide"],
         "structure": {"base": 12, "base_inertial": 8, "condition": 45.67},
-        "witness": {"masses": [11.9, 10.234, 0.1]},
+        "scale_check": {"masses": [11.9, 10.234, 0.1]},
         "inputs": [
             {"role": "urdf", "path": "x/arm.urdf"},
             {"role": "identification", "path": "x/fit.csv", "start": 0.5, "end": 9.75},
@@ -454,7 +454,7 @@ def test_compare(shown):
     errors = [{"joint": "one", "relative_error_pct": [1.23, 4.56]},
               {"joint": "two", "relative_error_pct": [None, 78.9]}]  # fmt: skip
     content = {
-        "results": [result, other], "remarks": ["they differ"], "fitted_alike": False,
+        "results": [result, other], "notes": ["they differ"], "fitted_alike": False,
         "validation": [{"name": "keep.csv", "start": 1.0, "end": 2.5, "per_joint": errors}],
         "fitted": errors[::-1],
         "base_parameters": [

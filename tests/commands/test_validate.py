@@ -92,7 +92,7 @@ def test_the_same_motion_measured_again_is_no_new_one(here, rng):
     tau = first.tau + 0.01 * NOISE * rng.standard_normal(first.tau.shape)
     found = verdict(folder, replace(first, tau=tau))
     assert found["status"] == "usable"
-    assert [doubt["code"] for doubt in found["doubts"]] == ["repeated_motion"]
+    assert [doubt["code"] for doubt in found["warnings"]] == ["repeated_motion"]
 
 
 def test_faults_of_the_new_log_lead_its_verdict(here):
@@ -118,24 +118,24 @@ def test_an_alarm_of_the_result_stays_one_whatever_the_new_log(here):
     folder, _, other = here
     path = folder / "out" / "result.json"
     result = json.loads(path.read_text())
-    result["verdict"]["alarms"] = ["torque columns are exchanged"]
+    result["verdict"]["log_errors"] = ["torque columns are exchanged"]
     path.write_text(json.dumps(result))
     found = verdict(folder, other)
     assert found["status"] == "poor"
     assert found["reasons"][0] == "torque columns are exchanged"
-    assert found["alarms"] == ["torque columns are exchanged"]
+    assert found["log_errors"] == ["torque columns are exchanged"]
 
 
 def test_a_doubt_about_the_old_validation_is_not_one_about_the_new(here):
     folder, _, other = here
     path = folder / "out" / "result.json"
     result = json.loads(path.read_text())
-    result["verdict"]["doubts"] = [
+    result["verdict"]["warnings"] = [
         {"code": code, "joint": "", "message": code} for code in ("repeated_motion", "clipped")
     ]
     path.write_text(json.dumps(result))
     found = verdict(folder, other)
-    assert [doubt["code"] for doubt in found["doubts"]] == ["clipped"]
+    assert [doubt["code"] for doubt in found["warnings"]] == ["clipped"]
     assert found["status"] == "usable"
 
 
@@ -177,7 +177,7 @@ def test_what_the_result_ignores_is_no_doubt(here, rng):
     result["settings"]["doctor"] = {"ignore": ["repeated_motion"]}
     path.write_text(json.dumps(result))
     tau = first.tau + 0.01 * NOISE * rng.standard_normal(first.tau.shape)
-    assert verdict(folder, replace(first, tau=tau))["doubts"] == []
+    assert verdict(folder, replace(first, tau=tau))["warnings"] == []
 
 
 def test_a_fault_of_the_second_of_two_new_logs_is_one_of_the_verdict(here, monkeypatch):
@@ -202,14 +202,16 @@ def test_a_fault_of_the_second_of_two_new_logs_is_one_of_the_verdict(here, monke
     logs = [folder / f"{name}.csv" for name in halves]
     found = validate_result(folder / "out" / "result.json", logs)
     assert found["verdict"]["status"] == "poor"
-    assert any("dq_joint_2 is 0.5 times d(q)/dt" in words for words in found["verdict"]["alarms"])
+    assert any(
+        "dq_joint_2 is 0.5 times d(q)/dt" in words for words in found["verdict"]["log_errors"]
+    )
     names = ["sound.csv 0-4.99 s", "spoilt.csv 5-9.99 s"]
     predictions, determined = judged["predictions"], judged["determined"]
     assert list(predictions.validation) == list(predictions.hidden) == names
     stated = json.loads((folder / "out" / "result.json").read_text())
     assert determined.undetermined == stated["structure"]["undetermined"]
     assert determined.is_poorly_excited is stated["structure"]["poorly_excited"]
-    assert judged["witness"].to_dict() == stated["witness"]
+    assert judged["scale_check"].to_dict() == stated["scale_check"]
     assert predictions.refitted == []
     assert predictions.joints == ("joint_1", "joint_2")
 

@@ -1,36 +1,36 @@
-"""How a residual follows a quantity, against sums over rows, bins and stretches one by one."""
+"""How a residual follows a quantity, against sums over rows, bins and segments one by one."""
 
 import numpy as np
 import pytest
 
 from robotid.diagnosis.dependence import FEWEST, even_bins, follow
-from robotid.diagnosis.selection import chance
+from robotid.diagnosis.selection import p_value
 
-B, K, SIZE = 4, 7, 33  # bins, stretches, rows of each
+B, K, SIZE = 4, 7, 33  # bins, segments, rows of each
 
 
 @pytest.fixture
 def rows(rng):
-    """Values, residuals, bins and stretches; two stretches have a bin of their own alone."""
+    """Values, residuals, bins and segments; two segments have a bin of their own alone."""
     x = rng.uniform(-1.0, 1.0, K * SIZE)
     bins = np.minimum(((x + 1.0) / 0.6).astype(int), B - 1)
-    stretches = 3 * np.repeat(np.arange(K), SIZE)  # numbers with gaps
-    first = stretches < 6
+    segments = 3 * np.repeat(np.arange(K), SIZE)  # numbers with gaps
+    first = segments < 6
     bins[(bins == B - 1) & ~first] = B - 2
-    r = 0.7 * x + 0.4 + rng.standard_normal(K)[stretches // 3] + 0.1 * rng.standard_normal(len(x))
-    return x, r, bins, stretches
+    r = 0.7 * x + 0.4 + rng.standard_normal(K)[segments // 3] + 0.1 * rng.standard_normal(len(x))
+    return x, r, bins, segments
 
 
 def test_means_and_errors_are_those_of_bins_of_clusters(rows):
-    x, r, bins, stretches = rows
-    found = follow("speed", "rad/s", x, r, bins, stretches)
+    x, r, bins, segments = rows
+    found = follow("speed", "rad/s", x, r, bins, segments)
     assert (found.name, found.unit) == ("speed", "rad/s")
     for b in range(B):
         own = bins == b
         assert found.centres[b] == pytest.approx(x[own].mean())
         assert found.means[b] == pytest.approx(r[own].mean())
-        sums = [np.sum((r - r[own].mean())[own & (stretches == k)]) for k in np.unique(stretches)]
-        there = sum((own & (stretches == k)).any() for k in np.unique(stretches))
+        sums = [np.sum((r - r[own].mean())[own & (segments == k)]) for k in np.unique(segments)]
+        there = sum((own & (segments == k)).any() for k in np.unique(segments))
         if there < 3:
             assert np.isnan(found.errors[b])
         else:
@@ -40,39 +40,39 @@ def test_means_and_errors_are_those_of_bins_of_clusters(rows):
 
 
 def test_the_share_is_of_stretches_that_the_means_do_not_know(rows):
-    x, r, bins, stretches = rows
+    x, r, bins, segments = rows
     before, after = [], []
-    for k in np.unique(stretches):
-        out, rest = stretches == k, stretches != k
+    for k in np.unique(segments):
+        out, rest = segments == k, segments != k
         plain = r[rest].mean()
         means = [
             r[rest & (bins == b)].mean() if (rest & (bins == b)).any() else plain for b in range(B)
         ]
         before.append(np.sum((r[out] - plain) ** 2))
         after.append(np.sum((r[out] - np.array(means)[bins[out]]) ** 2))
-    found = follow("speed", "rad/s", x, r, bins, stretches)
+    found = follow("speed", "rad/s", x, r, bins, segments)
     assert found.share == pytest.approx(1.0 - sum(after) / sum(before))
-    assert found.chance == pytest.approx(chance(np.array(before), np.array(after), K))
+    assert found.p_value == pytest.approx(p_value(np.array(before), np.array(after), K))
     # a constant is compared with none
-    constant = follow("constant", "", x, r, np.zeros(len(r), dtype=int), stretches)
-    left = sum(np.sum((r[stretches == k] - r[stretches != k].mean()) ** 2) for k in stretches[::33])
+    constant = follow("constant", "", x, r, np.zeros(len(r), dtype=int), segments)
+    left = sum(np.sum((r[segments == k] - r[segments != k].mean()) ** 2) for k in segments[::33])
     assert constant.share == pytest.approx(1.0 - left / np.sum(r**2))
 
 
 def test_few_stretches_show_means_but_no_share(rows):
-    x, r, bins, stretches = rows
-    few = stretches < 3 * (FEWEST - 1)
-    found = follow("speed", "rad/s", x[few], r[few], bins[few], stretches[few])
-    assert (found.share, found.chance, found.is_sure) == (None, 1.0, False)
+    x, r, bins, segments = rows
+    few = segments < 3 * (FEWEST - 1)
+    found = follow("speed", "rad/s", x[few], r[few], bins[few], segments[few])
+    assert (found.share, found.p_value, found.is_sure) == (None, 1.0, False)
     assert np.isfinite(found.errors[:3]).all()
     none = follow("speed", "rad/s", x, r, bins, None)
-    np.testing.assert_allclose(none.means, follow("speed", "", x, r, bins, stretches).means)
+    np.testing.assert_allclose(none.means, follow("speed", "", x, r, bins, segments).means)
     assert np.isnan(none.errors).all()
 
 
 def test_it_is_off_most_where_the_mean_is_most_errors_from_zero(rows):
-    x, r, bins, stretches = rows
-    found = follow("speed", "rad/s", x, r, bins, stretches)
+    x, r, bins, segments = rows
+    found = follow("speed", "rad/s", x, r, bins, segments)
     ratio = np.abs(found.means[:3]) / found.errors[:3]
     assert found.where == found.centres[np.argmax(ratio)]
     mean, error = found.at(np.array([found.centres[0], 0.5 * sum(found.centres[:2]), -9.0, 9.0]))

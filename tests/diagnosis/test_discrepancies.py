@@ -167,7 +167,7 @@ def test_what_is_found_is_said_of_the_result_and_doubts_it(model):
     said = [(f.code, f.where) for f in result.findings if f.severity == "warning"]
     assert {("spring", "elbow_joint"), ("position_offset", "elbow_joint")} <= set(said)
     assert [(m.joint, m.term.code) for m in result.misfits] == [("elbow_joint", "spring")]
-    assert {"spring", "position_offset"} <= {doubt.code for doubt in result.doubts}
+    assert {"spring", "position_offset"} <= {doubt.code for doubt in result.warnings}
 
 
 def test_columns_beside_the_base_parameters_are_refitted_with_them(model, rng):

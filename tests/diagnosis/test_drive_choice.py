@@ -41,7 +41,7 @@ from robotid.robot.drives import FAMILIES, DriveMotion, Harmonic, LoadFriction, 
 from robotid.robot.families import AUTO, wanted_families
 
 found_in, fitted_in = (partial(f, estimator="wls") for f in (helper.found_in, helper.fitted_in))
-SEED, REACH = 3, 1.5  # of the motion: the elbow turns more than half a turn
+SEED, QUANTILE = 3, 1.5  # of the motion: the elbow turns more than half a turn
 SURE = 2.6  # standard errors, of a few hundred figures that are looked at
 SEEN = {"q": (-1.58, 1.80), "v": (0.03, 1.53)}  # of the elbow in this motion
 # Shapes, parameters, and what else the elbow has: sizes of some 2 N m beside 7 N m of torque.
@@ -82,7 +82,7 @@ def cases(plain):
             terms = FAMILIES[name].make(SEEN, *sizes)
             own = {f"{ELBOW}.{t.name}": x for t, x in zip(terms, values, strict=True)}
             true, pi = driven(plain, {ELBOW: terms}, own)
-            made[name] = (true, pi, driven_log(true, pi, SEED, reach=REACH))
+            made[name] = (true, pi, driven_log(true, pi, SEED, reach=QUANTILE))
         return made[name]
 
     return case
@@ -135,12 +135,12 @@ def test_the_family_is_chosen_on_its_joint_and_nothing_on_others(plain, cases, n
     (family,) = chosen(found)[ELBOW]
     assert family in ALIKE.get(name, {name})
     (choice,) = (choice for choice in found.drives if choice.families)
-    taken = [x for x in choice.tried if x.is_taken]
+    taken = [x for x in choice.tried if x.is_selected]
     assert [x.families for x in taken] == [(), (family,)]
     assert choice.families == (family,)
     plain_error, error = (x.held_out_error_pct for x in taken)
     assert error < 0.7 * plain_error
-    assert taken[1].chance < 0.015
+    assert taken[1].p_value < 0.015
     # noise is 1 % of the torque; shapes of the grid leave more than those of the fit
     assert error == pytest.approx(1.0, abs=0.5)
     assert found.metrics().per_joint[ELBOW].relative_error_pct == pytest.approx(1.0, rel=0.15)
@@ -151,14 +151,14 @@ def test_a_shape_between_the_sizes_of_the_grid_needs_no_second_family(plain):
     speed = low * (high / low) ** (3.5 / 5)  # of 6 sizes
     terms = [Stribeck(speed=speed)]
     true, pi = driven(plain, {ELBOW: terms}, {f"{ELBOW}.stribeck": 6.0})
-    found = fitted_in(plain, [driven_log(true, pi, SEED, reach=REACH)], estimator="wls")
+    found = fitted_in(plain, [driven_log(true, pi, SEED, reach=QUANTILE)], estimator="wls")
     assert chosen(found) == {ELBOW: ("stribeck",)}
 
 
 def test_a_robot_of_viscous_and_coulomb_friction_gets_no_more(plain):
     true, pi = driven(plain, {}, {})
     for seed in range(2):
-        found = fitted_in(plain, [driven_log(true, pi, seed, reach=REACH, noise=0.02)])
+        found = fitted_in(plain, [driven_log(true, pi, seed, reach=QUANTILE, noise=0.02)])
         assert [c.joint for c in found.drives] == list(JOINTS)
         assert chosen(found) == {}
         assert found.model.layout == plain.layout
@@ -169,20 +169,20 @@ def rising(plain):
     """Friction that sets in over most of the speeds: a hook of Stribeck's fits nearly as well."""
     terms = [Tanh(speed=0.6 * SEEN["v"][1])]
     true, pi = driven(plain, {ELBOW: terms}, {f"{ELBOW}.tanh": 14.0})
-    return helper.found_in(plain, [driven_log(true, pi, SEED, reach=REACH, noise=0.03)])
+    return helper.found_in(plain, [driven_log(true, pi, SEED, reach=QUANTILE, noise=0.03)])
 
 
 def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
     assert chosen(rising) == {ELBOW: ("tanh",)}
     (choice,) = (c for c in rising.drives if c.families)
     last = {x.families[-1]: x for x in choice.tried if len(x.families) == 1}
-    assert last["tanh"].is_taken
-    assert not last["stribeck"].is_taken
+    assert last["tanh"].is_selected
+    assert not last["stribeck"].is_selected
     # within 2 % of the squared residual
     first = choice.tried[0].held_out_error_pct
     shares = [(last[name].held_out_error_pct / first) ** 2 for name in ("tanh", "stribeck")]
     assert abs(shares[0] - shares[1]) < 0.02
-    assert last["stribeck"].chance < 0.015
+    assert last["stribeck"].p_value < 0.015
     assert not any(shape.is_at_bound for shape in choice.shapes)
     stated = helper.found_in(plain, rising_logs(rising), friction={ELBOW: "stribeck", "*": "none"})
     (other,) = (c for c in stated.drives if c.families)
@@ -264,7 +264,7 @@ def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
     assert anew.torque == pytest.approx(factor**2 * alone.torque)
     weighed = np.where(np.arange(len(sample.joints)) == j, factor, 1.0)
     W, r = sample.W * weighed[:, None], sample.r * weighed
-    wanted = Normal.of(W, r, sample.stretches, sample.fitted)
+    wanted = Normal.of(W, r, sample.segments, sample.fitted)
     np.testing.assert_allclose(anew.normal.A, wanted.A, atol=1e-9 * np.abs(wanted.A).max())
     np.testing.assert_allclose(anew.normal.B, wanted.B, atol=1e-9 * np.abs(wanted.B).max())
 
@@ -277,13 +277,13 @@ def test_a_counterbalance_that_is_known_is_in_the_model_before_others_are_tried(
     choices = {c.joint: c for c in choose_drives(fit, wanted, first)}
     assert choices[ELBOW].families == ("harmonics1", "load")
     assert choices[ELBOW].tried[0].families == ("harmonics1",)
-    assert choices[ELBOW].tried[0].is_taken
+    assert choices[ELBOW].tried[0].is_selected
     assert choices[LIFT].families == ()
     # what explains far more of the same kind replaces it
     fit = fitted_in(plain, [cases("harmonics4")[2]], friction="none")
     choices = {c.joint: c for c in choose_drives(fit, wanted, first)}
     assert choices[ELBOW].families == ("harmonics4",)
-    assert [x.families for x in choices[ELBOW].tried if x.is_taken] == [
+    assert [x.families for x in choices[ELBOW].tried if x.is_selected] == [
         ("harmonics1",), ("harmonics4",)
     ]  # fmt: skip
     fixed = choose_drives(fit, {**wanted, ELBOW: ("load",)}, first)
@@ -335,7 +335,7 @@ def test_a_shape_beyond_its_bounds_is_named(plain):
     sizes = FAMILIES["tanh"].shapes[0].within(SEEN)
     (term,) = FAMILIES["tanh"].make(SEEN, 1.8 * sizes[1])
     true, pi = driven(plain, {ELBOW: [term]}, {f"{ELBOW}.tanh": 12.0})
-    log = driven_log(true, pi, SEED, reach=REACH)
+    log = driven_log(true, pi, SEED, reach=QUANTILE)
     found = found_in(plain, [log], friction={ELBOW: "tanh", "*": "none"})
     ((shape,),) = (choice.shapes for choice in found.drives)
     assert shape.is_at_bound
@@ -348,33 +348,33 @@ def test_a_shape_beyond_its_bounds_is_named(plain):
 def test_validation_beyond_what_was_seen_is_named_and_has_no_say(plain, cases):
     true, pi, log = cases("stribeck")
     alone = found_in(plain, [log])
-    fast = driven_log(true, pi, 8, reach=REACH, speed=1.8)
+    fast = driven_log(true, pi, 8, reach=QUANTILE, speed=1.8)
     found = found_in(plain, [log], validation=[fast])
     assert chosen(found) == chosen(alone) == {ELBOW: ("stribeck",)}
     assert [c.tried for c in found.drives] == [c.tried for c in alone.drives]
     np.testing.assert_array_equal(found.standard, alone.standard)
     assert [c.shapes for c in found.drives] == [c.shapes for c in alone.drives]
-    (said,) = [f for f in found.findings if f.code == "beyond_seen"]
+    (said,) = [f for f in found.findings if f.code == "beyond_range"]
     top = max(abs(log.v[:, 1]))
     share = 100 * np.mean(np.abs(fast.v[:, 1])[np.abs(fast.v[:, 1]) > 0.02] > top)
     assert said.where == ELBOW
     assert said.evidence["share_pct"] == pytest.approx(share, abs=1.0)
     assert f"have speeds beyond 0 to {top:.3g}" in said.message
-    slow = driven_log(true, pi, SEED, reach=REACH, speed=0.7)
+    slow = driven_log(true, pi, SEED, reach=QUANTILE, speed=0.7)
     again = found_in(plain, [log], validation=[slow])
-    assert not any(f.code == "beyond_seen" for f in again.findings)
+    assert not any(f.code == "beyond_range" for f in again.findings)
 
 
 def test_a_joint_that_moves_in_one_of_several_logs_is_judged_by_that(plain, cases):
     true, pi, _ = cases("stribeck")
-    logs = [driven_log(true, pi, seed, reach=REACH, still=still)
+    logs = [driven_log(true, pi, seed, reach=QUANTILE, still=still)
             for seed, still in ((4, (1,)), (SEED, (0,)), (5, (1,)))]  # fmt: skip
     found = helper.found_in(plain, logs)
     assert chosen(found) == {ELBOW: ("stribeck",)}
     k = list(found.model.layout.names).index(f"{ELBOW}.stribeck")
     assert abs(found.standard[k] - 3.0) < 3.0 * found.standard_error[k]
     assert found.standard_error[k] < 0.3
-    still = [driven_log(true, pi, seed, reach=REACH, still=(1,)) for seed in (4, 5)]
+    still = [driven_log(true, pi, seed, reach=QUANTILE, still=(1,)) for seed in (4, 5)]
     found = helper.found_in(plain, still)
     assert ELBOW not in {choice.joint for choice in found.drives}
     assert chosen(found) == {}
@@ -405,7 +405,7 @@ def test_friction_is_stated_for_all_joints_or_for_some():
 @pytest.mark.parametrize("estimator", ["wls", "consistent"])
 def test_the_load_of_the_gears_is_that_of_the_bodies_found(plain, estimator, tmp_path):
     true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": 0.35})
-    log = driven_log(true, pi, SEED, reach=REACH)
+    log = driven_log(true, pi, SEED, reach=QUANTILE)
     found = fitted_in(plain, [log], friction={"*": "load"}, estimator=estimator)
     np.testing.assert_array_equal(found.model.reference, found.standard)
     motion = process(log, EXACT)
@@ -467,7 +467,7 @@ def test_a_robot_with_terms_of_its_own_can_be_sent_to_workers():
 @pytest.mark.parametrize("load", [-0.05, 0.7])
 def test_friction_that_would_be_negative_or_hold_any_load_is_none(plain, load):
     true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": load})
-    found = fitted_in(plain, [driven_log(true, pi, SEED, reach=REACH)])
+    found = fitted_in(plain, [driven_log(true, pi, SEED, reach=QUANTILE)])
     assert "load" not in chosen(found).get(ELBOW, ())
     assert ("load",) not in {x.families for x in found.drives[1].tried}
 
@@ -479,10 +479,10 @@ def test_what_is_nearly_chosen_widens_the_intervals_it_would_move(plain):
     coulomb = pi[list(true.layout.names).index(f"{ELBOW}.coulomb")]
     seen = 0
     for seed in range(3):
-        log = driven_log(true, pi, seed, reach=REACH, noise=0.06)
+        log = driven_log(true, pi, seed, reach=QUANTILE, noise=0.06)
         found = found_in(plain, [log], estimator="wls")
         (choice,) = (c for c in found.drives if c.joint == ELBOW)
-        assert all(x.chance < 0.015 for x in choice.tried if x.is_taken and x.families)
+        assert all(x.p_value < 0.015 for x in choice.tried if x.is_selected and x.families)
         if choice.families or [t.name for t in choice.doubted] != ["load"]:
             continue
         seen += 1

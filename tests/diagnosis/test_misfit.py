@@ -35,7 +35,7 @@ from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude, identify
 from robotid.judgement.findings import fit_findings
-from robotid.judgement.verdict import doubts_of
+from robotid.judgement.verdict import warnings_of
 from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -114,7 +114,7 @@ def test_nothing_is_named_where_nothing_is_missing(clean):
 )
 def test_the_size_holds_the_truth(ur5, effect, joint, size, unit):
     (found,) = misfits(fitted(ur5, logs_of(ur5, 2, effect, joint), estimator=FIT))
-    if size is None:  # 0.3 of the usual torque per radian
+    if size is None:  # 0.3 of the RMS torque per radian
         t, q, v, load = np.zeros((4, 1))
         log, clean = (log_with(ur5, 2, e, joint, noise=0.0) for e in (effect, None))
         usual = np.sqrt(np.mean(clean.tau[:, joint] ** 2))
@@ -139,14 +139,14 @@ def test_the_size_of_several_columns_is_their_torque(ur5):
 
 def test_a_size_without_a_unit_is_that_of_the_torque_beside_base_parameters(rng):
     """Of two columns found after another one; its error by finite differences."""
-    count, fitted = 80, 60  # the last two stretches are validation
+    count, fitted = 80, 60  # the last two segments are validation
     weight = rng.uniform(0.5, 2.0, (count, 2))
     W, r = rng.standard_normal((count, 2, 3)), rng.standard_normal((count, 2))
-    stretches = tuple(slice(k, k + 10) for k in range(0, count, 10))
+    segments = tuple(slice(k, k + 10) for k in range(0, count, 10))
     sample = Sample(
         joints=("a", "b"), slides=np.array([False, True]), motions=(), recordings=(), at=(),
-        taken=(), weight=weight, torque=np.ones(2), stretches=stretches, rows=fitted,
-        W=W, r=r, independent=np.arange(3), U=np.eye(3), normal=Normal.of(W, r, stretches, 6),
+        taken=(), weight=weight, torque=np.ones(2), segments=segments, rows=fitted,
+        W=W, r=r, independent=np.arange(3), U=np.eye(3), normal=Normal.of(W, r, segments, 6),
     )  # fmt: skip
     Z = rng.standard_normal((count, 3)) + r[:, [1]]
     whole = Trials(sample.of_joint(1), Z[:, None]).whole
@@ -298,7 +298,7 @@ def test_columns_join_the_regressor_and_base_parameters_are_refitted(ur5):
     for trial, left_out in ((trials.whole, None), (trials.apart, 3)):
         rows = np.arange(len(sample.r)) < sample.rows
         if left_out is not None:
-            rows[sample.stretches[left_out]] = False
+            rows[sample.segments[left_out]] = False
         columns = np.zeros((*sample.r.shape, 2))
         columns[:, j] = sample.weight[:, [j]] * Z
         X = np.concatenate([sample.W, columns], axis=2)
@@ -311,7 +311,7 @@ def test_columns_join_the_regressor_and_base_parameters_are_refitted(ur5):
         found = trial.parameters([0, 1])
         found = found if left_out is None else found[left_out]
         np.testing.assert_allclose(found, theta[b:], rtol=1e-6)
-        k = sample.stretches[left_out or 0]
+        k = sample.segments[left_out or 0]
         squares = np.sum((sample.r[k, j] - X[k, j] @ theta) ** 2)
         assert trial.left([0, 1])[left_out or 0] == pytest.approx(squares, rel=1e-6)
 
@@ -321,7 +321,7 @@ def test_a_misfit_reaches_the_verdict_unless_the_torque_is_explained_well(ur5):
         Finding("friction_shape", severity, LIFT, "", {"share_pct": 90, "error_pct": error})
         for severity, error in (("warning", 5.1), ("warning", 4.9), ("note", 20.0))
     )
-    (doubt,) = doubts_of([large, small, note], ur5.joints)
+    (doubt,) = warnings_of([large, small, note], ur5.joints)
     assert (doubt.code, doubt.joint) == ("friction_shape", LIFT)
     assert doubt.message == (
         "friction of another shape than viscous and Coulomb would explain 90 % of the squared "
@@ -371,7 +371,7 @@ def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(ur5):
     assert kept == [2, 3]
     assert (term.severity, term.evidence["replaces"]) == ("warning", 2.0)
     assert "It explains urdf_mismatch, unexplained_torque, and" in term.message
-    assert [doubt.joint for doubt in doubts_of([term], ur5.joints)] == [LIFT]
+    assert [doubt.joint for doubt in warnings_of([term], ur5.joints)] == [LIFT]
     assert said("position_offset", 90.0)[0] == [2, 3]
     assert said("load_friction", 90.0)[0] == [0, 2, 3]
     assert said("spring", 40.0) == ([0, 1, 2, 3], Finding(

@@ -20,7 +20,7 @@ from robotid.fitting.open_terms import open_torques
 from robotid.regressor.torque import trajectory_regressor
 from robotid.robot.drives import LoadFriction, Stribeck
 
-REACH = 1.5
+QUANTILE = 1.5
 PLAIN = "viscous+coulomb"
 
 
@@ -34,14 +34,14 @@ def loaded(plain):
     """A robot whose elbow has load friction, its parameters by name, and its log."""
     true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": 0.1})
     names = dict(zip(true.layout.names, pi, strict=True))
-    return names, driven_log(true, pi, 3, reach=REACH)
+    return names, driven_log(true, pi, 3, reach=QUANTILE)
 
 
 @pytest.fixture(scope="module")
 def hooked(plain):
     true, pi = driven(plain, {ELBOW: [Stribeck(speed=0.1)]}, {f"{ELBOW}.stribeck": 3.0})
     names = dict(zip(true.layout.names, pi, strict=True))
-    return names, driven_log(true, pi, 3, reach=REACH)
+    return names, driven_log(true, pi, 3, reach=QUANTILE)
 
 
 @pytest.fixture(scope="module")
@@ -234,7 +234,9 @@ def test_shapes_are_settled_once_none_of_them_moves_by_a_fifth_of_its_error(
 
 def test_a_clean_robot_has_the_errors_of_its_noise(plain):
     true, pi = driven(plain, {}, {})
-    found = found_in(plain, [driven_log(true, pi, 3, reach=REACH)], friction=PLAIN, estimator="wls")
+    found = found_in(
+        plain, [driven_log(true, pi, 3, reach=QUANTILE)], friction=PLAIN, estimator="wls"
+    )
     assert find_misfits(take_sample(found)) == found.misfits == ()
     np.testing.assert_allclose(found.base_error, found.wls.std_error)
     assert choose_drives(found, dict.fromkeys(found.model.joints, ())) == ()

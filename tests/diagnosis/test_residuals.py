@@ -29,7 +29,7 @@ def test_autocorrelation_is_the_mean_of_products_of_used_pairs(rng):
     segment = np.repeat([0, 1, 2], [50, 30, 40])
     r = autocorrelation(x, used, segment, 60)
     np.testing.assert_allclose(r, brute_force(x, used, segment, 60), atol=1e-10)
-    assert np.isnan(r[55:]).all()  # longer than every stretch
+    assert np.isnan(r[55:]).all()  # longer than every segment
 
 
 def test_no_correlation_exceeds_1_where_few_pairs_are_far_apart():

@@ -10,8 +10,8 @@ from robotid.diagnosis.sample import (
     Sample,
     Trials,
     _is_steady,
+    _segments,
     _spread_rows,
-    _stretches,
     _usual_size,
 )
 from robotid.logs.data import Trajectory
@@ -22,16 +22,16 @@ N, JOINTS, BASE, FITTED, STRETCHES = 90, 2, 3, 7, 9
 
 @pytest.fixture
 def sample(rng):
-    """Seven stretches of fitted logs and two of validation, each of ten samples."""
+    """Seven segments of fitted logs and two of validation, each of ten samples."""
     weight = rng.uniform(0.5, 2.0, (N, JOINTS))
     weight[3] = 0.0  # a row that is left out
     W = weight[:, :, None] * rng.standard_normal((N, JOINTS, BASE))
     r = weight * rng.standard_normal((N, JOINTS))
-    stretches = tuple(slice(k, k + 10) for k in range(0, N, 10))
-    normal = Normal.of(W, r, stretches, FITTED)
+    segments = tuple(slice(k, k + 10) for k in range(0, N, 10))
+    normal = Normal.of(W, r, segments, FITTED)
     return Sample(
         joints=("a", "b"), slides=np.zeros(2, dtype=bool), motions=(), recordings=(), at=(),
-        taken=(), weight=weight, torque=np.ones(2), stretches=stretches, rows=10 * FITTED,
+        taken=(), weight=weight, torque=np.ones(2), segments=segments, rows=10 * FITTED,
         W=W, r=r, independent=np.arange(BASE), U=np.eye(BASE), normal=normal,
     )  # fmt: skip
 
@@ -64,9 +64,9 @@ def test_columns_on_all_joints_have_the_scatter_of_the_scores_of_stretches(sampl
     scores = np.array([E[20 * s : 20 * s + 20].T @ e[20 * s : 20 * s + 20] for s in range(FITTED)])
     wanted = FITTED / (FITTED - 1) * inverse @ scores.T @ scores @ inverse
     np.testing.assert_allclose(covariance, wanted, rtol=1e-7)
-    # each stretch of fitted logs is left out in turn, those of validation always
+    # each segment of fitted logs is left out in turn, those of validation always
     left, none = apart.left(which), apart.left([])
-    for s, rows in enumerate(sample.stretches):
+    for s, rows in enumerate(sample.segments):
         used = np.ones(N, dtype=bool)
         used[10 * FITTED :] = False
         used[rows] = False
@@ -95,7 +95,7 @@ def test_columns_beside_are_as_free_as_what_is_left(sample, rng):
     columns = sample.weight[:, :, None] * Z
     spread = 1e3 * np.linalg.norm(sample.r) / np.linalg.norm(columns)
     np.testing.assert_allclose(beside.W, np.concatenate([sample.W, spread * columns], axis=2))
-    for k, rows in enumerate(sample.stretches):
+    for k, rows in enumerate(sample.segments):
         W = beside.W[rows].reshape(-1, BASE + 1)
         np.testing.assert_allclose(beside.normal.A[k], W.T @ W)
         np.testing.assert_allclose(beside.normal.B[k], W.T @ sample.r[rows].ravel())
@@ -108,7 +108,7 @@ def test_columns_beside_are_as_free_as_what_is_left(sample, rng):
 def test_stretches_have_ten_independent_rows_and_are_sixteen_of_each_kind_at_most(
     fitted, kept, independent, counts
 ):
-    found = _stretches(fitted, kept, independent)
+    found = _segments(fitted, kept, independent)
     assert len(found) == sum(counts)
     assert [part.start for part in found[1:]] == [part.stop for part in found[:-1]]
     assert (found[0].start, found[-1].stop) == (0, fitted + kept)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from robotid.diagnosis.selection import Round, Rule, chance, select
+from robotid.diagnosis.selection import Round, Rule, p_value, select
 
-RULE = Rule(most=3, share=0.05, chance=0.01, alike=0.02)
+RULE = Rule(most=3, share=0.05, p_value=0.01, alike=0.02)
 
 
 def round_of(rng, fitted=10, **shares):
@@ -28,12 +28,12 @@ def test_chance_is_students(rng):
     def wanted(gain):
         return scipy.stats.ttest_1samp(gain, 0.0, alternative="greater").pvalue
 
-    assert chance(before, after, 16) == pytest.approx(wanted(gain))
+    assert p_value(before, after, 16) == pytest.approx(wanted(gain))
     surer = min(wanted(gain), wanted(gain[:9]))  # of fitted logs, or of all
-    assert chance(before, after, 9) == pytest.approx(surer)
+    assert p_value(before, after, 9) == pytest.approx(surer)
     still = np.append(before, np.zeros(8)), np.append(after, np.zeros(8))
-    assert chance(*still, 24) == pytest.approx(wanted(gain))  # at rest a segment does not count
-    assert chance(before[:2], after[:2], 2) == 1.0
+    assert p_value(*still, 24) == pytest.approx(wanted(gain))  # at rest a segment does not count
+    assert p_value(before[:2], after[:2], 2) == 1.0
 
 
 def test_the_simplest_of_those_that_explain_alike_is_found(rng):
@@ -52,11 +52,11 @@ def test_what_is_too_small_or_by_chance_is_not_found(rng):
     assert this.best(RULE) == "some"
     assert this.best(replace(RULE, share=0.25)) is None
     assert replace(this, least=0.3 * this.whole).best(RULE) is None
-    p = this.chance("some")
-    assert this.best(replace(RULE, chance=0.5 * p)) is None
-    assert this.best(replace(RULE, chance=2.0 * p), tried=lambda option: 1) == "some"
-    assert this.best(replace(RULE, chance=2.0 * p), tried=lambda option: 3) is None
-    assert this.best(replace(RULE, chance=None)) == "some"
+    p = this.p_value("some")
+    assert this.best(replace(RULE, p_value=0.5 * p)) is None
+    assert this.best(replace(RULE, p_value=2.0 * p), tried=lambda option: 1) == "some"
+    assert this.best(replace(RULE, p_value=2.0 * p), tried=lambda option: 3) is None
+    assert this.best(replace(RULE, p_value=None)) == "some"
 
 
 def test_validation_has_no_part_in_the_share(rng):
@@ -85,4 +85,4 @@ def test_options_are_alike_within_a_share_of_the_residual_not_of_the_gain():
     before = np.full(10, 2.0)
     left = {name: before * (1.0 - share) for name, share in (("a", 0.3), ("b", 0.281), ("c", 0.27))}
     this = Round(before, left, 10, 20.0)
-    assert this.alike(replace(RULE, chance=None)) == ["a", "b"]
+    assert this.alike(replace(RULE, p_value=None)) == ["a", "b"]

@@ -168,12 +168,12 @@ def test_a_joint_is_judged_on_what_was_kept_apart(identified):
         assert torque.fitted.rows.recordings == tuple(e.recording.name for e in identified.fitted)
 
 
-def torque(residual, v, q, load, *, stretches=16):
+def torque(residual, v, q, load, *, segments=16):
     """A joint whose residual is known; its friction is 10 N m."""
     N = len(residual)
     rows = Rows(
         ("log",), np.arange(N) / 100, np.zeros(N, int), np.zeros(N, int),
-        None if stretches is None else np.arange(N) * stretches // N,
+        None if segments is None else np.arange(N) * segments // N,
     )  # fmt: skip
     friction = 10 * np.sign(v)
     quantities = {
@@ -259,15 +259,15 @@ def _bins(found, name):
 
 
 def test_noise_of_any_colour_follows_nothing():
-    rng, alarms, tried, shares = np.random.default_rng(0), 0, 0, []
+    rng, log_errors, tried, shares = np.random.default_rng(0), 0, 0, []
     for trial in range(60):
         v, q, load = motion(rng)
         noise = coloured(rng, (len(v),), (0, 5, 20)[trial % 3])
         found = torque(noise, v, q, load)
-        alarms += sum(d.is_sure for d in found.follows)
+        log_errors += sum(d.is_sure for d in found.follows)
         tried += len(found.follows)
         shares.append([d.share for d in found.follows])
-    assert alarms <= 1, f"{alarms} of {tried}"
+    assert log_errors <= 1, f"{log_errors} of {tried}"
     assert (np.mean(shares, axis=0) < 0).all(), "what was fitted to noise predicts no other noise"
     assert "nothing explains it: 90 % of its square is as quick as noise" in found.sentence
 
@@ -279,13 +279,13 @@ def test_errors_of_bins_hold_the_scatter_of_correlated_noise():
         found = torque(coloured(rng, (len(v),), 10), v, q, load)
         (speed,) = (d for d in found.follows if d.name == "speed")
         z.append(speed.means / speed.errors)
-    # unbiased means: their scatter over the error is Student's of some stretches
+    # unbiased means: their scatter over the error is Student's of some segments
     assert 0.85 < np.sqrt(np.nanmean(np.square(z))) < 1.35
 
 
 def test_too_short_a_recording_says_so(rng):
     v, q, load = motion(rng, 300)
-    found = torque(rng.standard_normal(300), v, q, load, stretches=None)
+    found = torque(rng.standard_normal(300), v, q, load, segments=None)
     assert all(d.share is None for d in found.follows if d.name != "time")
     assert "too little was recorded" in found.sentence
 

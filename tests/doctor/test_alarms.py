@@ -44,7 +44,7 @@ def test_a_late_torque_of_a_short_log_is_found_and_what_it_takes_away_is_said(ur
     (found,) = [f for f in diagnose(ur5, [log], [], SIGNALS) if f.code == "torque_delay"]
     assert found.severity == "warning"
     assert found.evidence["delay"] == pytest.approx(0.03, abs=3 * found.evidence["std_error"])
-    # of stretches that the delay was not found in, whose friction physics leaves too
+    # of segments that the delay was not found in, whose friction physics leaves too
     assert found.evidence["gain"] > 0.3
 
 

@@ -99,7 +99,7 @@ def test_the_longest_run_of_repeated_rows_is_one_in_motion():
 
 @pytest.fixture(scope="module")
 def slider():
-    """A joint that slides and one that turns."""
+    """A prismatic joint and one that turns."""
     return RobotModel.from_urdf(
         example_urdf("tiago.urdf"), joints=["torso_lift_joint", "arm_1_joint"]
     )

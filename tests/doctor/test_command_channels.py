@@ -155,8 +155,8 @@ def test_a_base_that_moves_is_named():
         return 0.05 * np.column_stack([0 * t, q[:, 0] + q[:, 2], 0 * t])
 
     loose = found(record(told, [Servo()] * 3, couple=give))
-    assert list(loose) == ["gives_way"]
-    finding = loose["gives_way"]
+    assert list(loose) == ["moved_by_others"]
+    finding = loose["moved_by_others"]
     assert (finding.severity, finding.where) == ("warning", "log: joint_1")
     assert finding.evidence["share"] > 0.95
     assert finding.evidence["size"] == pytest.approx(0.011, rel=0.3)
@@ -174,8 +174,8 @@ def test_joints_that_are_told_the_same_are_named_in_groups():
 
     codes = [f for f in check_commands(record(commands, [Servo()] * 5)) if f.severity != "note"]
     assert [(f.code, f.severity, f.where) for f in codes] == [
-        ("commands_alike", "warning", "log: joint_0, joint_1"),
-        ("commands_alike", "warning", "log: joint_2, joint_3"),
+        ("proportional_commands", "warning", "log: joint_0, joint_1"),
+        ("proportional_commands", "warning", "log: joint_2, joint_3"),
     ]
     assert codes[0].evidence == {"correlation": pytest.approx(1.0), "joints": 2.0}
 
@@ -196,7 +196,7 @@ def test_a_command_that_the_drive_had_before_is_an_error(log, early):
     late = replace(
         log.window(1.0, 19.0), q_ref=log.window(1.0 - rows / 200, 19.0 - rows / 200).q_ref
     )
-    errors = [f for f in check_commands(late) if f.code == "late_command"]
+    errors = [f for f in check_commands(late) if f.code == "delayed_command"]
     assert {(f.severity, f.where) for f in errors} == {
         ("error", "log: joint_0"),
         ("error", "log: joint_1"),
@@ -209,10 +209,10 @@ def test_a_command_that_the_drive_had_before_is_an_error(log, early):
 
 def test_a_command_that_is_held_is_noted():
     held = found(record(chirps([0.3, 0.3], 8.0), GOOD, hold=4))
-    assert list(held) == ["held_command"]
-    assert held["held_command"].severity == "note"
-    assert held["held_command"].evidence == {"rows": 4.0, "period": pytest.approx(0.02)}
-    assert "50 times a second in the mean, and held for 20 ms" in held["held_command"].message
+    assert list(held) == ["repeated_command"]
+    assert held["repeated_command"].severity == "note"
+    assert held["repeated_command"].evidence == {"rows": 4.0, "period": pytest.approx(0.02)}
+    assert "50 times a second in the mean, and held for 20 ms" in held["repeated_command"].message
 
 
 # --- recordings -----------------------------------------------------------------------------------
@@ -220,15 +220,15 @@ def test_a_command_that_is_held_is_noted():
 #: Findings above a note of each recording: go2's joints are all told one chirp; so101's jaw runs
 #: at 1.1 rad/s at most, its lift and elbow have a dead band, and slow motions show no delay.
 RECORDED = {
-    "go2/chirp": {"commands_alike"},
-    "so101/chirp_sweep": {"commands_alike", "saturated"},
+    "go2/chirp": {"proportional_commands"},
+    "so101/chirp_sweep": {"proportional_commands", "saturated"},
     "so101/friction_gravity": {"slow_command"},
     "so101/large_amplitude": {"slow_command"},
     "so101/multisine": {"slow_command"},
     "so101/prbs_excitation": {"saturated"},
-    "so101/static_holding": {"commands_alike"},
+    "so101/static_holding": {"proportional_commands"},
     "so101/step_response": {"small_command"},
-    "so101/workspace_sweep": {"slow_command", "gives_way"},
+    "so101/workspace_sweep": {"slow_command", "moved_by_others"},
 }
 
 
@@ -241,7 +241,7 @@ def test_recordings_show_what_is_wrong_with_them(name):
     loud = {f.code: f for f in check_commands(log) if f.severity != "note"}
     assert set(loud) == RECORDED[name]
     if name == "go2/chirp":
-        alike = loud["commands_alike"]
+        alike = loud["proportional_commands"]
         assert all(joint in alike.message for joint in joints)
         assert alike.evidence["joints"] == 12
     sizes = [note for note in log.notes if "loadsize" in note]

@@ -24,7 +24,7 @@ from robotid.commands.logs import examine
 from robotid.doctor.diagnosis import check_logs, diagnose, findings_to_dict
 from robotid.exceptions import SettingsError
 from robotid.findings import Finding
-from robotid.judgement.verdict import alarming, check_ignored
+from robotid.judgement.verdict import blocking, check_ignored
 from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
@@ -283,8 +283,8 @@ def test_an_unknown_code_to_ignore_is_wrong_use(wrong_sign, tmp_path, capsys):
 def test_only_errors_alarm_and_only_those_that_are_not_ignored():
     gap = Finding("gap", "warning", "a.csv", "a gap")
     sign = Finding("torque_sign", "error", "a.csv", "opposite sign")
-    assert alarming([gap, sign], []) == (sign,)
-    assert alarming([gap, sign], ["torque_sign"]) == ()
+    assert blocking([gap, sign], []) == (sign,)
+    assert blocking([gap, sign], ["torque_sign"]) == ()
 
 
 def test_findings_change_no_data(ur5, short):

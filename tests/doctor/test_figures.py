@@ -60,7 +60,7 @@ def test_a_held_torque_is_late_by_half_of_what_it_is_held_less_a_row(rows):
     held = np.arange(2000) // rows * rows
     tau = 5.0 * log_of().q
     tau[:, 1] = tau[held, 1]
-    found = one(check_torque_channels(log_of(tau=tau)), "held_torque")
+    found = one(check_torque_channels(log_of(tau=tau)), "repeated_torque")
     own = (np.arange(2000) - held)[: 2000 // rows * rows]  # rows since each was new
     late = own.mean() * 0.01
     assert found.where == "run.csv: b"
@@ -166,7 +166,7 @@ def test_held_commands_are_told_with_their_period():
     log = log_of(q_ref=log_of().q[held])
     [found] = _held(log, [_Loop(log, j) for j in range(2)])
     assert found.evidence == {"rows": 5.0, "period": pytest.approx(0.05)}
-    assert "of a, b is renewed every 5 rows, 20 times a second in the mean" in found.message
+    assert "of a, b is updated every 5 rows, 20 times a second in the mean" in found.message
     assert "held for 50 ms" in found.message
     assert "or 25 ms are taken for the drive's own delay" in found.message
 

@@ -34,7 +34,7 @@ def motions(planar):
 
 
 def joined(first, second):
-    """Return the rows of two motions as stretches of one."""
+    """Return the rows of two motions as segments of one."""
     later = second.t - second.t[0] + first.t[-1] + 5.0
     arrays = {k: np.vstack([getattr(first, k), getattr(second, k)]) for k in ("q", "v", "a", "tau")}
     segment = np.repeat([0, 1], [len(first.t), len(second.t)])
@@ -45,7 +45,7 @@ def joined(first, second):
 def test_the_share_that_repeats_is_that_of_the_log_that_has_most_of_it(motions):
     first, second, other = motions
     kept = joined(first.part(100, 600), other)
-    # rows that go on for a second, 400 of the first stretch and 500 of the second, and move in it
+    # rows that go on for a second, 400 of the first segment and 500 of the second, and move in it
     moved = [np.abs(part[100:] - part[:-100]) / np.ptp(kept.q, axis=0) > 0.04
              for part in np.split(kept.q, [500])]  # fmt: skip
     old, new = (part.any(axis=1).sum() for part in moved)

@@ -172,7 +172,7 @@ def test_a_rounded_angle_that_robotid_can_leave_out_is_a_note(tmp_path):
     rounded = inspected(tmp_path, tilted)
     (finding,) = found(rounded, "rounded_rpy")
     assert (finding["joint"], finding["severity"]) == ("elbow", "note")
-    assert found(rounded, "faint_parameters") == []  # they are the same parameters
+    assert found(rounded, "weak_parameters") == []  # they are the same parameters
     exact = inspected(tmp_path, (tilted[0], tilted[1].replace("3.1416", repr(math.pi))))
     assert found(exact, "rounded_rpy") == []
     assert rounded.structure.base == exact.structure.base
@@ -351,9 +351,9 @@ def test_a_chain_whose_last_joints_are_hardly_felt_is_named(tmp_path):
     links = "".join(LONG.format(k, k - 1, math.pi / 2 * (k % 2)) for k in range(1, 61))
     (tmp_path / "long.urdf").write_text(f'<robot name="long"><link name="l0"/>{links}</robot>')
     inspection = inspect_urdf(tmp_path / "long.urdf")
-    (finding,) = found(inspection, "faint_parameters")
+    (finding,) = found(inspection, "weak_parameters")
     assert inspection.structure.base_inertial == 7 * 60 - 8
-    faint, base = finding["evidence"]["faint"], inspection.structure.base
-    assert faint > 0
-    assert f"{faint:.0f} parameters load the joints less than 1e-4 as much" in finding["message"]
+    weak, base = finding["evidence"]["faint"], inspection.structure.base
+    assert weak > 0
+    assert f"{weak:.0f} parameters load the joints less than 1e-4 as much" in finding["message"]
     assert f"left out of the {base} base parameters" in finding["message"]

@@ -63,7 +63,9 @@ def test_a_sum_that_alone_is_measured_is_named_as_such():
     known = determine(["x.coulomb", "x.offset", "y.m"], np.diag([9.0, 0, 9])[:, [0, 0, 2]], 5 * ONE)
     assert known.rank == 2
     assert known.undetermined == ("x.coulomb", "x.offset")
-    assert known.in_words() == ("of x.coulomb and x.offset only x.coulomb + x.offset is determined")
+    assert known.described() == (
+        "of x.coulomb and x.offset only x.coulomb + x.offset is determined"
+    )
     ((group,),) = [known.to_list()]
     assert group["determined"][0]["terms"] == pytest.approx({"x.coulomb": 1.0, "x.offset": 1.0})
 
@@ -119,13 +121,13 @@ def test_words_of_groups_say_how_many_sums_are_determined():
     found = known(a, one, two, b, three, four)
     assert found.merged == (one, two, three, four, Group(("x", "y", "z"), ()))
     nothing = "of x, y and z nothing is determined"
-    assert found.in_words() == f"{one}; {two}; 2 more such groups; {nothing}"
-    assert known(one, two, three).in_words() == f"{one}; {two}; 1 more such group"
-    assert known(two, a).in_words() == f"{two}; of x nothing is determined"
+    assert found.described() == f"{one}; {two}; 2 more such groups; {nothing}"
+    assert known(one, two, three).described() == f"{one}; {two}; 1 more such group"
+    assert known(two, a).described() == f"{two}; of x nothing is determined"
     assert found.rank == 5
     assert found.undetermined == names[:-1]
     assert known().merged == ()
-    assert known().in_words() == ""
+    assert known().described() == ""
     error = RankDeficientError(3, ("x",), 9)
     assert known().refusal(error) is error
     said = found.refusal(error)
@@ -202,7 +204,7 @@ def test_a_joint_that_turns_one_way_leaves_friction_and_offset_a_sum(pan):
     known = pan.determination
     assert known.undetermined == ("shoulder_pan_joint.coulomb", "shoulder_pan_joint.offset")
     assert known.rank == 57
-    assert known.in_words() == (
+    assert known.described() == (
         "of shoulder_pan_joint.coulomb and shoulder_pan_joint.offset only "
         "shoulder_pan_joint.coulomb + shoulder_pan_joint.offset is determined"
     )
@@ -221,7 +223,7 @@ def test_doctor_result_report_and_refusal_say_the_same(ur5, case, request):
     structure = build_result(found, {})["structure"]
     assert structure["rank"] == known.rank
     assert structure["undetermined"] == list(known.undetermined)
-    sums = [entry for group in structure["not_told_apart"] for entry in group["determined"]]
+    sums = [entry for group in structure["indistinguishable"] for entry in group["determined"]]
     html = open_section(found).replace("<wbr>", "")
     assert f"The data determine {known.rank} of 58 base parameters" in html
     for entry in sums:
@@ -235,14 +237,14 @@ def test_doctor_result_report_and_refusal_say_the_same(ur5, case, request):
         identify(ur5, [log], signals=EXACT, estimator="wls")
     assert caught.value.rank == known.rank
     assert caught.value.undetermined == known.undetermined
-    assert known.in_words() in str(caught.value)
+    assert known.described() in str(caught.value)
 
     motion = process(log, resolve(log, EXACT))
     mapping = structural_mapping(ur5)
     (finding,) = check_excitation(ur5, mapping, [motion], EXACT, "run.csv")
     assert finding.severity == "warning"
     assert finding.evidence["rank"] == known.rank
-    assert known.in_words() in finding.message
+    assert known.described() in finding.message
     assert "nothing needs doing" not in finding.message
 
 
@@ -293,7 +295,7 @@ def test_a_pinned_link_is_not_listed(ur5, wrist):
     log = wrist.fitted[0].recording.log
     settings = replace(wrist.estimator, constraints={"pinned": ["wrist_3_link"]})
     found = identify(ur5, [log], signals=EXACT, estimator=settings)
-    own = found.mapping.in_words([f"wrist_3_link.{term}" for term in ("mcx", "Ixy", "Ixz", "Iyz")])
+    own = found.mapping.described([f"wrist_3_link.{term}" for term in ("mcx", "Ixy", "Ixz", "Iyz")])
     assert len(own["alone"]) == 4
     assert not set(own["alone"]) & set(found.determination.undetermined)
     assert set(own["alone"]) & set(wrist.determination.undetermined)

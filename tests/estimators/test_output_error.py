@@ -184,7 +184,7 @@ def test_slopes_that_are_far_too_small_never_settle(rng):
 
 
 def test_correlated_noise_does_not_make_plain_squares_sure(rng):
-    """Their errors come from the scatter of stretches, five times those of white noise here."""
+    """Their errors come from the scatter of segments, five times those of white noise here."""
     found = OutputError(whitens=False).fit(lagging(rng), START)
     assert found.details["inflation"] > 2
 
@@ -424,6 +424,6 @@ def test_it_is_an_estimator_that_reads_a_simulator_and_begins_with_its_prior(rng
     assert isinstance(estimator, Estimator)
     assert estimator.reads == "simulator"
     near = replace(lag, prior=1.1 * TRUTH, prior_std=np.full(3, np.inf))
-    found, begun = estimator.fit(near), estimator.fit(near, near.prior)
-    np.testing.assert_array_equal(found.theta, begun.theta)
+    found, initialised = estimator.fit(near), estimator.fit(near, near.prior)
+    np.testing.assert_array_equal(found.theta, initialised.theta)
     assert not np.array_equal(found.theta, estimator.fit(near, START).theta), "to the last bit"

@@ -11,8 +11,8 @@ NOISE = np.array([0.2, 0.05])
 NAMES = ("a", "b", "c")
 
 
-def stretches(rng, beta, hold):
-    """Return the factors of 12 stretches of 60 rows of two joints, noise of so many rows alike."""
+def segments(rng, beta, hold):
+    """Return the factors of 12 segments of 60 rows of two joints, noise of so many rows alike."""
     found = []
     for _ in range(12):
         triangles = []
@@ -28,9 +28,9 @@ def stretches(rng, beta, hold):
 def test_errors_that_count_what_changes_with_time_are_no_smaller_than_those_of_alike_rows(
     rng, hold
 ):
-    loaded = stretches(rng, np.add(BETA, [0.0, 0.0, CHANGE]), hold)
+    loaded = segments(rng, np.add(BETA, [0.0, 0.0, CHANGE]), hold)
     runs = TwoRuns(
-        stretches(rng, BETA, hold), loaded, np.eye(3)[:, 2:], np.zeros(3), np.zeros(4),
+        segments(rng, BETA, hold), loaded, np.eye(3)[:, 2:], np.zeros(3), np.zeros(4),
         1e-6 * np.eye(4), 1.0, np.empty(0, dtype=int),
     )  # fmt: skip
     theta, covariance = runs.alike()
@@ -45,7 +45,7 @@ def test_errors_that_count_what_changes_with_time_are_no_smaller_than_those_of_a
 
 
 def of_rows(W, tau, count):
-    """Return the factors of so many stretches of rows W (n, N, c) and torques (n, N)."""
+    """Return the factors of so many segments of rows W (n, N, c) and torques (n, N)."""
     columns, rows = (np.arange(W.shape[2]),) * len(W), np.full(len(W), W.shape[1] // count)
     whole = np.concatenate([W, tau[:, :, None]], axis=2)
     return tuple(
@@ -85,7 +85,7 @@ def test_both_runs_are_one_fit_with_the_prior_by_the_noise_of_each_joint(rng, sh
     theta = np.linalg.solve(H, pull)
     np.testing.assert_allclose(found.theta, theta, rtol=1e-9)
     np.testing.assert_allclose(found.covariance, np.linalg.inv(H), rtol=1e-8, atol=1e-12)
-    assert np.isinf(found.freedom).all()  # eight stretches show no scatter
+    assert np.isinf(found.freedom).all()  # eight segments show no scatter
     left = sum(np.sum((y - X @ theta) ** 2, axis=1) for X, y in zip(A, b, strict=True))
     torque = np.sum(tau**2, axis=(0, 2))
     np.testing.assert_allclose(found.unexplained, np.sqrt(left / torque), rtol=1e-9)
@@ -107,11 +107,11 @@ def test_errors_are_those_of_rows_that_last_as_long_as_their_noise(rng, hold):
     ratio = np.diag(found.covariance) / np.diag(alike)
     assert (ratio >= 1.0 - 1e-12).all()
     assert np.median(ratio) == pytest.approx(hold, rel=0.6)
-    assert ((found.freedom > 2.0) & (found.freedom < 20.0)).all()  # of 20 stretches
+    assert ((found.freedom > 2.0) & (found.freedom < 20.0)).all()  # of 20 segments
 
 
 def test_freedom_is_that_of_the_scatter_whose_error_is_larger(rng):
-    """The first parameter differs from joint to joint, the third from stretch to stretch."""
+    """The first parameter differs from joint to joint, the third from segment to segment."""
     n, N, count = 6, 240, 12
     W = rng.standard_normal((2, n, N, 3))
     beta = np.tile(BETA, (2, n, N, 1))
@@ -122,13 +122,13 @@ def test_freedom_is_that_of_the_scatter_whose_error_is_larger(rng):
         of_rows(W[0], tau[0], count), of_rows(W[1], tau[1], count), np.eye(3)[:, 1:2], np.zeros(3),
         np.zeros(4), 1e-6 * np.eye(4), 1.0, np.empty(0, dtype=int),
     )  # fmt: skip
-    found, stretches = runs.compare(), runs.compare(by_joint=False)
-    grown = np.diag(found.covariance) > 1.01 * np.diag(stretches.covariance)
+    found, segments = runs.compare(), runs.compare(by_joint=False)
+    grown = np.diag(found.covariance) > 1.01 * np.diag(segments.covariance)
     assert grown[[0, 2]].tolist() == [True, False]
-    assert (found.freedom[grown] != stretches.freedom[grown]).all()
+    assert (found.freedom[grown] != segments.freedom[grown]).all()
     assert (found.freedom[grown] < 12.0).all()  # of 12 parts, not of 24
-    np.testing.assert_array_equal(found.freedom[~grown], stretches.freedom[~grown])
-    assert stretches.freedom[0] > 12.0
+    np.testing.assert_array_equal(found.freedom[~grown], segments.freedom[~grown])
+    assert segments.freedom[0] > 12.0
 
 
 def scattered(parts, theta, bread):

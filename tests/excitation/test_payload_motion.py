@@ -73,9 +73,9 @@ def test_the_fewest_joints_before_the_link_move_and_the_others_rest(designer, fo
     # an axis shows nothing of mass on it; two that meet turn about one point
     fewer = dict.fromkeys(found.fewer)
     assert list(fewer) == [WRIST[-1:], WRIST[-2:]]
-    assert found.fewer[WRIST[-2:]].in_words() == "of tool0.m nothing is determined"
+    assert found.fewer[WRIST[-2:]].described() == "of tool0.m nothing is determined"
     assert "With wrist_2_joint, wrist_3_joint alone, of tool0.m nothing is" in " ".join(
-        found.in_words()
+        found.described()
     )
 
 
@@ -111,7 +111,7 @@ def test_standard_errors_are_those_of_both_runs_fitted_at_once(designer, found):
     error = np.sqrt(np.diag(np.linalg.inv(information))[-10:]) / size[-10:]
     np.testing.assert_allclose(found.std_error, error, rtol=0.05)
     mass, centre, inertia = error[0], error[1:4].max(), error[4:].max()
-    [said] = [x for x in found.in_words() if x.startswith("Standard errors")]
+    [said] = [x for x in found.described() if x.startswith("Standard errors")]
     numbers = [float(x) for x in re.findall(r" ([\d.e-]+) kg", said)]
     np.testing.assert_allclose(numbers, [mass, centre, inertia], rtol=0.12)  # of two digits
 
@@ -121,7 +121,7 @@ def test_a_motion_of_stated_joints_says_what_it_leaves_open(designer):
     assert few.moving == WRIST[-1:]
     assert few.determination.rank == 3
     assert not few.fewer
-    words = " ".join(few.in_words())
+    words = " ".join(few.described())
     assert "It leaves open: of tool0.m, tool0.mcz, " in words
     assert "Standard errors" not in words
 

@@ -25,7 +25,7 @@ from robotid.export.result import load_result
 from robotid.logs.data import Log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot, cut_windows
+from robotid.simulation.loops import ClosedLoopRobot, cut_windows
 
 RATE = 200.0  # [Hz] of the commands
 CHIRP = Path(os.environ.get("ROBOTID_DATA", "/none")) / "commands" / "go2" / "chirp.parquet"
@@ -187,7 +187,7 @@ def test_a_result_with_a_clock_follows_by_it_and_its_export_says_so(result, tmp_
     at_once, by_clock = (load_result(at).follow_commands(log) for at in (folder, held))
     model, pi = load_result(held).identified
     loops = loops_of(model, pi, load_result(held).commanded, 100.0)
-    (out,) = LoopedRobot(model).roll_out(loops, cut_windows(log, np.inf, 0.0))
+    (out,) = ClosedLoopRobot(model).roll_out(loops, cut_windows(log, np.inf, 0.0))
     np.testing.assert_array_equal(by_clock, out.q)
     assert np.abs(by_clock - at_once).max() > 3e-4
     for at, says in ((held, True), (folder, False)):
@@ -243,7 +243,7 @@ def test_mujoco_rolls_out_what_our_own_roll_out_does():
     for drive in leg.drives:
         for term in ("armature", "viscous", "coulomb", "offset"):
             pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
-    robot = LoopedRobot(leg.model, step=1e-3)
+    robot = ClosedLoopRobot(leg.model, step=1e-3)
     (found,) = robot.roll_out(loops_of(leg.model, pi, leg.drives), cut_windows(log, np.inf, 0.0))
     assert np.abs(found.q - log.q).max() < 3e-4
     assert np.abs(log.q - log.q_ref).max() > 0.05

@@ -46,7 +46,7 @@ def test_what_was_stated_has_no_error_and_what_was_found_has_its_own(found, entr
 
 def test_each_joint_has_the_error_of_its_own_unknown():
     names = [("a", "revolute"), ("b", "prismatic"), ("c", "revolute")]
-    unknowns = [("kp", (1,)), ("kp", (2,)), ("delay", (0, 2)), ("zero", (1,))]
+    free_parameters = [("kp", (1,)), ("kp", (2,)), ("delay", (0, 2)), ("zero", (1,))]
     estimate = SimpleNamespace(
         std_error=np.array([1.0, 2.0, 3.0, 4.0]), reach=np.array([2.1, 2.2, 2.3, 2.4])
     )
@@ -58,7 +58,9 @@ def test_each_joint_has_the_error_of_its_own_unknown():
         loops=SimpleNamespace(**{what: np.array(x) for what, x in values.items()}),
         estimate=estimate,
         simulator=SimpleNamespace(
-            unknowns=[SimpleNamespace(what=what, joints=joints) for what, joints in unknowns]
+            free_parameters=[
+                SimpleNamespace(what=what, joints=joints) for what, joints in free_parameters
+            ]
         ),
     )
     joints = [SimpleNamespace(name=name, type=kind) for name, kind in names]

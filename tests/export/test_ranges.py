@@ -80,8 +80,8 @@ def test_widths_are_those_of_draws_from_the_covariance(identified):
     w, x, y, z = found["principal_axes"]
     R = Rotation.from_quat([x, y, z, w]).as_matrix()
     second = np.einsum("ak,nab,bk->nk", R, about, R)
-    drawn, reach = {"mass": {"": J[:, 3, 3]}}, identified.standard_reach[part].max()
-    assert reach > 1.98  # few stretches: Student's quantile
+    drawn, reach = {"mass": {"": J[:, 3, 3]}}, identified.standard_quantile[part].max()
+    assert reach > 1.98  # few segments: Student's quantile
     drawn["com"] = dict(zip(AXES, c.T, strict=True))
     drawn["second_moments"] = dict(zip(AXES, second.T, strict=True))
     sums = second.sum(axis=1, keepdims=True) - second
@@ -232,7 +232,7 @@ def test_projected_friction_is_as_wide_as_draws_of_what_it_replaces(ur5):
     reach[own] = 2.0, 2.1, 2.6, 2.2
     found = SimpleNamespace(
         model=model, standard=pi, moments=moments, standard_covariance=covariance,
-        standard_reach=reach,
+        standard_quantile=reach,
     )  # fmt: skip
     ranges = projected_ranges(found)["projected_drives"][elbow]
     simple = ("viscous", "coulomb", "offset")

@@ -37,7 +37,7 @@ def test_the_head_says_what_was_identified_and_how(result, identified):
     ]
     assert result["uncertainty"] == {
         "method": identified.errors.method,
-        "stretches": identified.errors.stretches,
+        "segments": identified.errors.segments,
         "inflation": identified.errors.inflation,
     }
     assert result["verdict"]["status"] == identified.verdict.status
@@ -53,7 +53,7 @@ def test_the_structure_counts_parameters(result, identified):
         "condition": pytest.approx(identified.wls.condition),
         "undetermined": list(identified.determination.undetermined),
         "poorly_excited": identified.wls.condition > 1e3,
-        "not_told_apart": identified.determination.to_list(),
+        "indistinguishable": identified.determination.to_list(),
     }
 
 
@@ -114,7 +114,7 @@ def test_standard_and_drive_parameters_have_value_error_prior_and_source(result,
             "std_error": None
             if entry["at_bound"]
             else pytest.approx(np.sqrt(identified.standard_covariance[i, i])),
-            "reach": None if entry["at_bound"] else identified.standard_reach[i],
+            "reach": None if entry["at_bound"] else identified.standard_quantile[i],
             "interval_95": [None, None]
             if entry["at_bound"]
             else list(identified.standard_interval[i]),
@@ -183,7 +183,7 @@ def test_the_band_is_that_of_each_joint(result, identified):
         assert row["of_parameters"] == pytest.approx(own, rel=1e-6)
         if len(band.samples) == len(residual):
             held = 100 * np.mean(np.abs(residual[used]) <= half[used])
-            assert row["held_pct"] == pytest.approx(held, abs=0.2)
+            assert row["coverage_pct"] == pytest.approx(held, abs=0.2)
         assert row["of_parameters"] < row["half_width"]
 
 

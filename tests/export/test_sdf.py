@@ -117,7 +117,7 @@ def test_limits_friction_mimic_and_what_is_not_stated(tmp_path):
         for key in ("lower", "upper", "effort", "velocity"):
             assert float(axis.findtext(f"limit/{key}")) == getattr(limits, key)
         assert float(axis.findtext("dynamics/friction")) == values[f"{limits.name}.coulomb"]
-    # links on fixed joints are frames but for the root, which stands still
+    # links on fixed joints are frames but for the root, which is at rest
     fixed = [joint.get("name") for joint in top.iter("joint") if joint.get("type") == "fixed"]
     assert fixed == ["world_to_panda_link0"]
     (mimic,) = top.iter("mimic")

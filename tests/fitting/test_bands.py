@@ -14,7 +14,7 @@ from robotid.fitting.bands import (
     friction_curve,
     recording_bands,
     torque_band,
-    usual_friction,
+    typical_friction,
 )
 from robotid.fitting.open_terms import OpenTerm
 from robotid.fitting.settings import EstimatorSettings
@@ -116,12 +116,12 @@ def test_intervals_hold_the_truth(found):
 def test_result_json_states_bands_intervals_and_method(found):
     identification, _ = found
     result = build_result(identification, {})
-    assert result["uncertainty"]["stretches"] in (47, 48)
+    assert result["uncertainty"]["segments"] in (47, 48)
     assert 0.5 < result["uncertainty"]["inflation"] < 2
     band = result["validation"][0]["band"]["elbow_joint"]
     assert band["half_width"] == pytest.approx(1.96 * 1.0, rel=0.15)
     assert 0 < band["of_parameters"] < band["half_width"]
-    assert 91 < band["held_pct"] < 99
+    assert 91 < band["coverage_pct"] < 99
     low, high = result["base_parameters"][0]["interval_95"]
     assert low < result["base_parameters"][0]["value"] < high
 
@@ -182,7 +182,7 @@ def test_usual_friction_of_a_coupled_drive_is_over_the_rows_that_all_of_its_join
         for x in "qv"
     )
     assert 10 < len(q) < 40
-    curve = usual_friction(found, "pair")
+    curve = typical_friction(found, "pair")
     side = np.linspace(np.abs(v).min(), np.abs(v).max(), 20)
     np.testing.assert_allclose(curve.v, [*-side[::-1], *side], rtol=1e-12)
     names = [f"pair.{x}" for x in ("viscous", "coulomb", "coulomb_q1")]
@@ -195,7 +195,7 @@ def test_usual_friction_of_a_coupled_drive_is_over_the_rows_that_all_of_its_join
     np.testing.assert_array_equal(curve.half_width, 1.96 * curve.std)
     assert curve.load == 0.0
     # of stated speeds and position
-    asked = usual_friction(found, "pair", [0.7, -0.2], q=1.1, load=3.0)
+    asked = typical_friction(found, "pair", [0.7, -0.2], q=1.1, load=3.0)
     X = np.array([[0.7, 1.0, 0.8], [-0.2, -1.0, -0.8]])
     np.testing.assert_allclose(asked.torque, X @ found.standard[k], rtol=1e-12)
     assert asked.load == 3.0

@@ -1,4 +1,4 @@
-"""Stretches that logs in memory are cut into."""
+"""Segments that logs in memory are cut into."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from robotid.regressor.base_parameters import structural_mapping
 
 
 @pytest.mark.parametrize(
-    ("cutoff", "sizes", "stretches"),
+    ("cutoff", "sizes", "segments"),
     [
         (None, (1200,), [25] * 48),
         (None, (1200, 600), [50] * 24 + [25] * 24),  # 48 of both logs together
@@ -20,13 +20,13 @@ from robotid.regressor.base_parameters import structural_mapping
     ],
 )
 def test_all_logs_together_have_48_stretches_of_ten_correlation_times_or_more(
-    rng, cutoff, sizes, stretches
+    rng, cutoff, sizes, segments
 ):
     model, signals = arm(), SignalSettings(cutoff=cutoff, trim=0.0, min_velocity=0.0)
     logs = [hold_log(model, exact_log(model, truth(model), rng, samples=n), signals) for n in sizes]
     recordings = Recordings(model, structural_mapping(model), logs)
     found = recordings.reduce()
-    assert [reduction.samples for reduction in found] == stretches
+    assert [reduction.samples for reduction in found] == segments
     whole = recordings.reduce(is_cut=False)
     assert [reduction.samples for reduction in whole] == list(sizes)
     squares = sum(reduction.factors.torque_squares() for reduction in found)

@@ -114,13 +114,13 @@ def test_outliers_are_named_with_time_joint_and_torque(model, logs):
 
 
 def test_a_row_is_an_outlier_by_the_residual_and_the_torque_of_its_own_joint(model):
-    """From 12 times the usual residual and a tenth of the torque on, in each log by itself."""
+    """From 12 times the typical residual and a tenth of the torque on, in each log by itself."""
     t, torque = np.arange(400) / 100, np.array([100.0, 10.0, 1.0])
     usual = 1.4826 * np.array([0.2, 0.1, 0.002])  # standard deviations by the median size
     off = {  # by log, joint and row, in N m
         (0, 0): {50: 9.0},  # less than a tenth
         (0, 2): {50: 0.11, 60: -0.15, 200: 0.13, 350: 0.3},
-        (1, 1): {20: 1.7, 120: 1.9},  # 11.5 and 12.8 usual residuals
+        (1, 1): {20: 1.7, 120: 1.9},  # 11.5 and 12.8 typical residuals
         (1, 0): {300: -11.0},
     }
     evaluations = []

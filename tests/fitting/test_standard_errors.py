@@ -8,7 +8,7 @@ from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import OLS, WLS
-from robotid.estimators.stretches import quantile, scatter
+from robotid.estimators.segments import quantile, scatter
 from robotid.exceptions import DataError
 from robotid.fitting.standard_errors import (
     about_prior,
@@ -41,16 +41,16 @@ def noise(rng, colour):
     return SIGMA * coloured
 
 
-def stretches(W, tau):
-    """Return the factors of each stretch, of all by one call."""
+def segments(W, tau):
+    """Return the factors of each segment, of all by one call."""
     rows = np.concatenate([W, tau[:, :, None]], axis=2).reshape(STRETCHES, -1, JOINTS, 5)
-    triangles = np.linalg.qr(rows.transpose(0, 2, 1, 3), mode="r")  # (STRETCHES, JOINTS, 5, 5)
+    triangles = np.linalg.qr(rows.transpose(0, 2, 1, 3), mode="r")  # (Segments, JOINTS, 5, 5)
     every, counts = (np.arange(4),) * JOINTS, np.full(JOINTS, N // STRETCHES)
     return [Factors(tuple(own), every, counts, tuple("abcd")) for own in triangles]
 
 
 def estimate(W, tau):
-    parts = stretches(W, tau)
+    parts = segments(W, tau)
     whole = merge(parts)
     rough = WLS().fit(whole)
     return measured_errors(rough, parts, whole, 1.0, np.eye(4), rough.sigma)
@@ -72,7 +72,7 @@ def test_standard_errors_are_the_scatter_of_many_recordings(W, colour):
     assert 0.92 < np.mean(held) < 0.98
 
 
-@pytest.mark.parametrize(("samples", "basis"), [(1600, "16 stretches"), (800, "filter's band")])
+@pytest.mark.parametrize(("samples", "basis"), [(1600, "16 segments"), (800, "filter's band")])
 def test_behind_the_filter_errors_are_the_scatter_and_those_of_independent_rows_are_not(
     samples, basis
 ):
@@ -132,7 +132,7 @@ def test_one_parameter_is_the_closed_form_of_cr2(rng):
 
 
 def test_scores_scatter_as_the_matrices_of_their_rows_say(W):
-    """Of two joints and four columns, one of which a single stretch has nearly alone."""
+    """Of two joints and four columns, one of which a single segment has nearly alone."""
     W = W.copy()
     W[:60, :, 2] *= 30.0
     tau = W @ TRUTH + 2.0 * noise(np.random.default_rng(8), 0.9)
@@ -154,7 +154,7 @@ def test_scores_scatter_as_the_matrices_of_their_rows_say(W):
         expected += np.trace(H @ shown)
         alone += R.T @ (np.eye(len(H)) - shown) @ R
         a.append(A @ R @ B)
-    found = scatter(stretches(W, tau), theta, sigma, B)
+    found = scatter(segments(W, tau), theta, sigma, B)
     assert found.inflation == pytest.approx(left / expected)
     assert found.inflation > 3.0
     np.testing.assert_allclose(found.meat, meat + left / expected * alone, rtol=1e-6)
@@ -170,7 +170,7 @@ def test_scores_scatter_as_the_matrices_of_their_rows_say(W):
 def test_a_direction_of_one_stretch_alone_gets_the_scatter_of_the_others(W):
     alone = W.copy()
     alone[:, :, 1] = 0.0
-    alone[60:120, :, 1] = W[60:120, :, 1]  # the second of 40 stretches
+    alone[60:120, :, 1] = W[60:120, :, 1]  # the second of 40 segments
     rng = np.random.default_rng(3)
     ratio = []
     for _ in range(40):
@@ -180,14 +180,14 @@ def test_a_direction_of_one_stretch_alone_gets_the_scatter_of_the_others(W):
 
 
 def test_few_stretches_keep_the_band_of_the_filter(W):
-    parts = stretches(W, W @ TRUTH + noise(np.random.default_rng(0), 0.0))[:11]
+    parts = segments(W, W @ TRUTH + noise(np.random.default_rng(0), 0.0))[:11]
     whole = merge(parts)
     rough = WLS(independent_share=0.2).fit(whole)
     found, basis = measured_errors(rough, parts, whole, 0.2, np.eye(4), rough.sigma)
     np.testing.assert_array_equal(found.covariance, rough.covariance)
     assert basis.inflation == pytest.approx(5.0)
-    assert "only 11 stretches" in basis.method
-    with pytest.raises(DataError, match="11 stretches"):
+    assert "only 11 segments" in basis.method
+    with pytest.raises(DataError, match="11 segments"):
         scatter(parts, rough.theta, rough.sigma, rough.covariance)
 
 
@@ -198,7 +198,7 @@ def test_quantiles_are_students():
 
 
 def test_a_filter_that_forgets_keeps_its_own_covariance_grown_by_the_inflation(W):
-    parts = stretches(W, W @ TRUTH + noise(np.random.default_rng(4), 0.9))
+    parts = segments(W, W @ TRUTH + noise(np.random.default_rng(4), 0.9))
     whole = merge(parts)
     share = 0.25  # the covariance of the fit takes a quarter of the rows to be independent
     own = WLS(independent_share=share).fit(whole)
@@ -210,7 +210,7 @@ def test_a_filter_that_forgets_keeps_its_own_covariance_grown_by_the_inflation(W
 
 
 def test_a_gradient_method_ends_beside_the_minimum_and_says_so(W):
-    parts = stretches(W, W @ TRUTH + noise(np.random.default_rng(5), 0.0))
+    parts = segments(W, W @ TRUTH + noise(np.random.default_rng(5), 0.0))
     wls = WLS().fit(merge(parts))
     away = np.array([0.1, 0.0, -0.2, 0.3])
     rough = replace(wls, theta=wls.theta + away, covariance=np.zeros((4, 4)))
@@ -224,7 +224,7 @@ def test_the_prior_makes_the_sandwich_of_its_formula(W):
     # B (K^T M K + L) B with B = (K^T H K + L)^-1, computed from the rows themselves
     rng, share = np.random.default_rng(6), 0.25
     tau = W @ TRUTH + noise(rng, 0.0)
-    parts = stretches(W, tau)
+    parts = segments(W, tau)
     whole, K = merge(parts), np.hstack([np.eye(4), rng.standard_normal((4, 2))])
     wls = WLS().fit(whole)
     L = np.diag(np.arange(1.0, 7.0))
@@ -252,7 +252,7 @@ def test_a_prior_that_pulls_more_than_it_is_sure_widens_by_its_own_part(rng, pul
 
 def test_what_is_scattered_beside_the_rows_adds_to_the_meat(W):
     """Of a filter, of least squares and of a fit with a prior."""
-    parts = stretches(W, W @ TRUTH + noise(np.random.default_rng(7), 0.0))
+    parts = segments(W, W @ TRUTH + noise(np.random.default_rng(7), 0.0))
     whole, share, more = merge(parts), 0.25, np.diag([3.0, 1.0, 0.0, 2.0])
     wls = WLS(independent_share=share).fit(whole)
     for is_filter, bread in ((True, share * wls.covariance), (False, share * wls.covariance)):
@@ -277,7 +277,7 @@ def test_what_is_scattered_beside_the_rows_adds_to_the_meat(W):
 
 
 def test_standard_parameters_are_the_prior_moved_by_the_least_to_the_base_parameters(W, rng):
-    wls = WLS().fit(merge(stretches(W, W @ TRUTH + noise(rng, 0.0))))
+    wls = WLS().fit(merge(segments(W, W @ TRUTH + noise(rng, 0.0))))
     K, spread = np.hstack([np.eye(4), rng.standard_normal((4, 2))]), np.arange(1.0, 7.0)
     mapping = BaseMapping(K, np.arange(4), tuple("abcdef"), np.ones(6))
     prior, before = rng.standard_normal(6), np.diag(spread**2)

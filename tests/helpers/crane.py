@@ -12,7 +12,7 @@ from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
 from robotid.robot.drives import Viscous
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot, cut_windows
+from robotid.simulation.loops import ClosedLoopRobot, cut_windows
 
 INERTIAL = """<inertial><mass value="2"/><origin xyz="0.1 0 0"/>
 <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>"""
@@ -41,7 +41,7 @@ def identified_crane(folder):
         t = start + np.arange(round(1.5 * rate)) / rate
         q_ref = multisine(t - start, np.zeros(2), np.array([0.2, 0.5]), rng)
         told = Log(t, q_ref, 0 * q_ref, model.joints, q_ref=q_ref, has_torque=False)
-        [out] = LoopedRobot(model, step=1e-3).roll_out(loops, cut_windows(told, np.inf, 0.0))
+        [out] = ClosedLoopRobot(model, step=1e-3).roll_out(loops, cut_windows(told, np.inf, 0.0))
         logs.append(replace(told, q=out.q + 3e-4 * rng.standard_normal(out.q.shape)))
     settings = SimulationSettings(window=0.75, lead=0.2, bodies=0.0, step=4e-3)
     return identify_loops(model, logs[:2], logs[2:], LOOP, settings, chooses=False)

@@ -56,7 +56,7 @@ def driven_log(
         seed: Of motion and noise.
         duration: Length [s].
         rate: Rate [Hz].
-        noise: Of each torque, share of its usual size.
+        noise: Of each torque, share of its typical size.
         reach: Times how far a random motion goes.
         speed: Times how fast it is.
         still: Numbers of joints that stand.

@@ -176,7 +176,7 @@ def _configuration(model, q):
     return out
 
 
-REACH = {"swing": (0.2, 1.1), "lift": (-0.2, 0.8), "reach": (0.05, 0.18), "roll": (0.4, 1.9)}
+QUANTILE = {"swing": (0.2, 1.1), "lift": (-0.2, 0.8), "reach": (0.05, 0.18), "roll": (0.4, 1.9)}
 NOISE = {"swing": 0.9, "lift": 0.7, "reach": 1.3, "roll": 0.09}  # [N m or N]
 
 
@@ -185,7 +185,7 @@ def motion(joints, seed, t, speed=1.0):
     rng = np.random.default_rng(seed)
     q, v, a = (np.zeros((len(t), len(joints))) for _ in range(3))
     for j, name in enumerate(joints):
-        centre, most = REACH[name]
+        centre, most = QUANTILE[name]
         w = 2 * np.pi * speed * (np.array([0.11, 0.23, 0.41, 0.67]) + rng.uniform(-0.03, 0.03, 4))
         size = most * np.array([0.45, 0.3, 0.15, 0.1]) * rng.uniform(0.8, 1.1, 4)
         phase = rng.uniform(0, 2 * np.pi, 4)

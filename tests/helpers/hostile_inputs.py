@@ -94,7 +94,7 @@ def identify_from(write, suffix, example, folder):
     result = out / "result.json"
     if obey(*words) == 1 and result.exists():  # judged to be wrong: said, and no URDF
         said = json.loads(result.read_text(encoding="utf-8"))
-        assert said["verdict"]["alarms"], "refused without a word"
+        assert said["verdict"]["log_errors"], "refused without a word"
         assert "urdf" not in said["outputs"]
         assert {Path(name).name for name in files_in(out)} == {"report.html", "result.json"}
     elif not result.exists():

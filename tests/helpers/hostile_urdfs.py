@@ -51,20 +51,20 @@ def run_urdf(case: HostileUrdf, folder: Path) -> None:
         found = json.dumps(inspect_urdf(path, free_flyer=free_flyer).to_dict(), allow_nan=False)
         assert len(found) < 50 * LONGEST
     with contextlib.suppress(RobotIdError):
-        model = in_words(RobotModel.from_urdf, path, **case.options)
-        in_words(structural_mapping, model)
+        model = described(RobotModel.from_urdf, path, **case.options)
+        described(structural_mapping, model)
         pi = model.standard_parameters()
         assert np.isfinite(pi).all()
-        in_words(body_boxes, model)
+        described(body_boxes, model)
         for shape in ("box", "hull"):
             with contextlib.suppress(RobotIdError):
-                in_words(geometry_half_spaces, model, shape)
-        in_words(check_mass_matrix, model, pi, poses=10)
-        in_words(robot_scene, model)
-        in_words(write_urdf, model, pi, folder / "new.urdf", dynamics=True)
+                described(geometry_half_spaces, model, shape)
+        described(check_mass_matrix, model, pi, poses=10)
+        described(robot_scene, model)
+        described(write_urdf, model, pi, folder / "new.urdf", dynamics=True)
 
 
-def in_words(function, *arguments, **options):
+def described(function, *arguments, **options):
     """Return what a function returns; its errors are short."""
     try:
         return function(*arguments, **options)

@@ -13,10 +13,10 @@ from robotid.simulation.motions import random_fourier
 
 @dataclass(frozen=True)
 class Effect:
-    """What a drive adds to the torque, in sizes of the joint's usual torque."""
+    """What a drive adds to the torque, in sizes of the joint's typical torque."""
 
     code: str
-    torque: object  # function of time, position, speed, rigid torque and usual torque
+    torque: object  # function of time, position, speed, rigid torque and typical torque
 
 
 def _stribeck(t, q, v, load, usual):
@@ -111,7 +111,7 @@ def log_with(
         joint: Which joint.
         duration: Length [s].
         rate: Rate [Hz].
-        noise: Of each torque, share of its usual size.
+        noise: Of each torque, share of its typical size.
         memory: Correlation time of that noise [samples].
         coupling: Ratios of a drive that turns with several joints, or None.
         part: Which of several logs.

@@ -64,7 +64,7 @@ class Plant:
 
 
 def plant(name, rng, **changes):
-    """Return one of these robots with drives drawn about their usual values.
+    """Return one of these robots with drives drawn about their typical values.
 
     Args:
         name: Which one.
@@ -238,7 +238,7 @@ def torque_log(
         fine: Commands per second of the loop [Hz].
         noise: Standard deviation of the encoders [rad].
         torque: Standard deviation of the logged torques [N m].
-        relative: The same over their usual size [-].
+        relative: The same over their typical size [-].
     """
     t = np.arange(round(duration * fine)) / fine
     q_ref = multisine(t, plant.middle, plant.reach, rng)

@@ -29,7 +29,7 @@ def record(commands, servos, *, rate=200.0, duration=20.0, seed=0, couple=None, 
     """Return the log of servos that are told commands(t), shape (N, n).
 
     The force of Coulomb friction is implicit, so joints stick; couple(t, q) shifts what encoders
-    see, as a base that moves; a command is renewed every so many rows.
+    see, as a base that moves; a command is updated every so many rows.
     """
     rng = np.random.default_rng(seed)
     t = np.arange(round(duration / STEP)) * STEP
@@ -152,11 +152,15 @@ def faulty_logs(rng):
         "sweeps of few encoder steps": ("small_command", told(0.006 * small), of(quantum=0.0015)),
         "a third of the speed that is needed": ("saturated", told(), weak),
         "two joints told the same": (
-            "commands_alike", lambda t: told()(t)[:, [0, 0, 2]] * [1, -0.6, 1], servos,
+            "proportional_commands", lambda t: told()(t)[:, [0, 0, 2]] * [1, -0.6, 1], servos,
         ),
     }  # fmt: skip
     for name, (code, commands, driven) in logs.items():
         yield name, code, record(commands, driven)
-    yield "base that moves", "gives_way", record(still, servos, couple=give)
+    yield "base that moves", "moved_by_others", record(still, servos, couple=give)
     yield "five rows per period", "slow_sampling", record(told(), servos, rate=5 * max(widths))
-    yield "command logged 0.3 s late", "late_command", replace(good.window(1.0, 19.0), q_ref=late)
+    yield (
+        "command logged 0.3 s late",
+        "delayed_command",
+        replace(good.window(1.0, 19.0), q_ref=late),
+    )

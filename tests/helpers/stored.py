@@ -339,7 +339,7 @@ def differences(stored, found, at="", *, times=1.0, room=0.0):
         stored: As the file has it.
         found: As it is now.
         at: Where they stand.
-        times: How often the usual tolerance is allowed.
+        times: How often the typical tolerance is allowed.
         room: What may differ whatever the size.
     """
     if isinstance(stored, dict) and isinstance(found, dict):

@@ -37,7 +37,7 @@ def noisy_job(tmp_path_factory):
         urdf=Path(model.tree.path),
         joints=model.joints,
         signals=SignalSettings(cutoff=10.0),
-        terms=DRIVE_TERMS,  # of a log in pieces, what else there is is judged by three stretches
+        terms=DRIVE_TERMS,  # of a log in pieces, what else there is is judged by three segments
         identification=(LogEntry(paths[0]),),
         validation=(LogEntry(paths[1]), LogEntry(paths[1], 2.0, 9.0)),
         report=False,
@@ -76,8 +76,8 @@ def compare(job, folder, *, held=HELD, rtol=1e-9, fit_rtol=1e-5):
 def check_errors(one, other):
     """Check that standard errors agree as well as each of them is known.
 
-    They are the scatter of stretches, which pieces cut elsewhere. One that rests on f degrees of
-    freedom, fewer than the stretches and the redrawn fits, is itself known to 1 / sqrt(2 f): so
+    They are the scatter of segments, which pieces cut elsewhere. One that depends on f degrees of
+    freedom, fewer than the segments and the redrawn fits, is itself known to 1 / sqrt(2 f): so
     far, with the f of both, may their logarithms differ. Of 60 normal values one is beyond 4
     standard deviations in one case of 260. Standard parameters have no f of their own.
     """
@@ -132,7 +132,7 @@ def test_a_job_in_pieces_ends_where_it_ends_in_memory(noisy_job, tmp_path):
 
 def test_a_real_recording_in_pieces_ends_where_it_ends_in_memory(recordings, tmp_path, monkeypatch):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    # of a log in pieces, what drives lack is judged by the stretches at hand: here 1 s of 5 s
+    # of a log in pieces, what drives lack is judged by the segments at hand: here 1 s of 5 s
     monkeypatch.setattr(
         "robotid.identification.pipeline.explain_residual", lambda _, sample: ((), ())
     )
@@ -239,4 +239,4 @@ def test_a_long_log_without_motion_long_enough_is_refused_as_in_memory(
             run_job(replace(job, rows_in_memory=held), tmp_path)
         messages.append(str(found.value))
     assert messages[0] == messages[1]
-    assert "none of its 1 uninterrupted stretches is long enough" in messages[0]
+    assert "none of its 1 uninterrupted segments is long enough" in messages[0]

@@ -13,7 +13,7 @@ from helpers.synthetic import exact_log, truth
 from scipy.stats import t as t_of
 
 from robotid.commands.job import LogEntry, read_job
-from robotid.estimators.stretches import quantile
+from robotid.estimators.segments import quantile
 from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.identification.payload_fit import (
     Gain,
@@ -345,7 +345,7 @@ def test_the_load_of_a_ur10e_and_what_it_says_of_its_gains(recordings, monkeypat
     logs = [job.read(LogEntry(file), model) for file in files]
     found = with_known_friction(model, logs[:1], logs[1:], links=["tool0"], signals=job.signals)
     payload = found["tool0"]
-    # what joints say of it differs more than stretches show: gains are not known to 1 %
+    # what joints say of it differs more than segments show: gains are not known to 1 %
     assert 2.8 < payload.mass_interval[0] < 3.0 < payload.mass < 3.1
     assert 3.1 < payload.mass_interval[1] < 3.3
     currents = [replace(log, tau=log.tau / stated) for log in logs]

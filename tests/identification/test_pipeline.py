@@ -124,7 +124,7 @@ def test_no_log_and_too_few_rows_are_refused(ur5, rng):
 
 
 def test_a_recording_that_was_fitted_does_not_show_what_repeats(rng):
-    """Of recordings kept apart, those that hold fitted rows do not count."""
+    """Of validation recordings, those that hold fitted rows do not count."""
     arm = RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
     logs = [
         replace(exact_log(arm, truth(arm), rng, samples=300, noise=0.1), path=f"/logs/{name}.csv")
@@ -140,7 +140,7 @@ def test_a_recording_that_was_fitted_does_not_show_what_repeats(rng):
         recordings = Recordings(arm, mapping, own, beside)
         found = conclude(recordings, choice, guesses, friction="none")
         assert found.validation[1].is_refitted == (beside[1] is own[0])
-        assert ("repeated_motion" in {doubt.code for doubt in found.doubts}) == is_doubted
+        assert ("repeated_motion" in {doubt.code for doubt in found.warnings}) == is_doubted
 
 
 def test_a_fit_that_fails_says_what_the_doctor_warned_of(ur5, rng):
@@ -187,7 +187,7 @@ def test_noise_levels_that_settle_slowly_on_few_rows_do_not_stop_it(ur5, monkeyp
     monkeypatch.setattr(batch, "_MAX_ITERATIONS", 40)
     found = fit(ur5, [log], estimator="wls")
     assert "after 40 iterations, where they still change by" in found.estimate.message
-    assert found.errors.stretches < 12
+    assert found.errors.segments < 12
     monkeypatch.setattr(batch, "_MAX_ITERATIONS", 20)
     with pytest.raises(NotConvergedError, match=r"still change by 3\.\de-04 after 20 iterations"):
         fit(ur5, [log], estimator="wls")

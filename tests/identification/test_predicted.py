@@ -14,7 +14,7 @@ from robotid.exceptions import DataError
 from robotid.export.ranges import parameter_ranges
 from robotid.export.result import load_result
 from robotid.export.urdf import read_sidecar
-from robotid.fitting.bands import REACH, friction_curve
+from robotid.fitting.bands import QUANTILE, friction_curve
 from robotid.fitting.settings import EstimatorSettings
 from robotid.regressor.friction_projection import project_friction
 from robotid.regressor.memory import drive_motion_along
@@ -75,7 +75,7 @@ def test_a_friction_curve_is_that_of_the_speeds_fitted_under_the_usual_load(foun
     Fv, Fc, off, mu = (value[f"{ELBOW}.{x}"] for x in ("viscous", "coulomb", "offset", "load"))
     torque = Fv * curve.v + (Fc + mu * curve.load) * np.sign(curve.v) + off
     np.testing.assert_allclose(curve.torque, torque, rtol=1e-9)
-    np.testing.assert_allclose(curve.half_width, REACH * curve.std)
+    np.testing.assert_allclose(curve.half_width, QUANTILE * curve.std)
     asked = found.friction(ELBOW, [0.5, 1.0], load=2.0)
     own = friction_curve(found, ELBOW, np.array([0.5, 1.0]), load=2.0)
     np.testing.assert_array_equal(asked.torque, own.torque)
@@ -204,7 +204,7 @@ def test_urdf_dynamics_and_ranges_have_the_projected_friction(found, loaded, tmp
     ).drives
     C = found.standard_covariance[np.ix_(projected.own, projected.own)]
     for row, (term, value) in zip(projected.transfer, projected.values.items(), strict=True):
-        half = found.standard_reach[list(projected.own)].max() * np.sqrt(row @ C @ row)
+        half = found.standard_quantile[list(projected.own)].max() * np.sqrt(row @ C @ row)
         assert ranges[ELBOW][term]["nominal"] == pytest.approx(value)
         assert ranges[ELBOW][term]["high"] == pytest.approx(value + half)
     assert set(ranges[ELBOW]) == {"viscous", "coulomb", "offset"}

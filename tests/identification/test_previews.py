@@ -104,7 +104,7 @@ def test_what_is_expected_is_what_identify_then_reports(ur5, motion, found):
     assert ahead.expected.mapping.base_names == found.mapping.base_names
     ratio = ahead.base_error / found.wls.std_error
     assert np.median(ratio) == pytest.approx(1.0, abs=0.1)
-    assert np.quantile(ratio, 0.1) > 0.65  # 18 stretches of one run tell an error to 17 %
+    assert np.quantile(ratio, 0.1) > 0.65  # 18 segments of one run tell an error to 17 %
     assert np.quantile(ratio, 0.9) < 1.6
     # behind the filter the noise leaves what the fit leaves
     np.testing.assert_allclose(ahead.expected.estimate.sigma, found.wls.sigma, rtol=0.15)
@@ -300,7 +300,7 @@ def test_a_run_before_adds_what_it_said_and_its_noise(ur5, motion, found):
     ahead = preview(ur5, [log], given=found, estimator="wls")
     assert set(ahead.noise.origins) == {"found"}
     density = np.sqrt(ahead.noise.density(0.0) * RATE)
-    np.testing.assert_allclose(density, STD, rtol=0.35)  # 48 stretches
+    np.testing.assert_allclose(density, STD, rtol=0.35)  # 48 segments
     np.testing.assert_allclose(ahead.before, found.wls.std_error, rtol=0.1)
     # as much again: the errors fall by about a root of 2
     assert np.median(ahead.gain) == pytest.approx(np.sqrt(2.0), abs=0.1)
@@ -313,7 +313,7 @@ def test_a_run_before_adds_what_it_said_and_its_noise(ur5, motion, found):
 
 def test_a_short_run_before_counts_by_the_band_of_its_filter(ur5, recorded):
     short = identify(ur5, [recorded.window(0.0, 3.0)], friction="none", estimator="consistent")
-    assert short.errors.stretches < 12
+    assert short.errors.segments < 12
     ahead = preview(ur5, [recorded], given=short)
     assert (ahead.base_error <= ahead.before * 1.001).all()
 

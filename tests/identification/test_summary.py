@@ -129,7 +129,9 @@ def test_joints_worse_than_a_constant_are_marked_wherever_they_stand():
 
 def test_friction_is_said_from_the_first_step_to_the_last_that_was_taken():
     steps = [(20.0, True), (9.0, False), (8.04, True), (5.06, True), (3.0, False)]
-    tried = [{"held_out_error_pct": error, "is_taken": is_taken} for error, is_taken in steps]
+    tried = [
+        {"held_out_error_pct": error, "is_selected": is_selected} for error, is_selected in steps
+    ]
     joints = {
         "a": {"families": ["tanh", "load"], "tried": tried},
         "b": {"families": [], "tried": tried[:2]},

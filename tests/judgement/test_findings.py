@@ -95,11 +95,11 @@ def test_five_outliers_are_named_and_the_others_counted():
 
     few, many = said(5, False), said(7, True)
     assert few.startswith("5 places of the fitted logs are not explained: j0 at 0.000 s of run.csv")
-    assert few.endswith("j4 at 5.000 s of run.csv: 14 against -8 predicted, 36 times its usual "
+    assert few.endswith("j4 at 5.000 s of run.csv: 14 against -8 predicted, 36 times its typical "
                         "residual; look at the recording there, cut it out, or set robust = "
                         "'tukey' in [estimator]")  # fmt: skip
     assert "j5" not in many
-    assert many.endswith("36 times its usual residual; and 2 more; they were weighted down")
+    assert many.endswith("36 times its typical residual; and 2 more; they were weighted down")
 
 
 def test_the_parameter_that_terms_make_least_sure_is_named_from_tenfold_on():
@@ -174,7 +174,7 @@ def test_bounds_that_bind_are_a_warning_where_data_or_masses_contradict_a_stated
         bounds = SimpleNamespace(mass={"one": [0.1, 2.0]}, com={"two": []})
         fit.estimator = SimpleNamespace(bounds=bounds)
         found = consistency_findings(fit)
-        assert all(f.code == "bound_binds" for f in found)
+        assert all(f.code == "active_bound" for f in found)
         return [(f.severity, f.where, f.message) for f in found]
 
     fine = "the URDF's values lie beyond them, and the torque is explained as well as without"
@@ -260,7 +260,7 @@ def test_the_share_of_a_validation_log_beyond_what_friction_was_fitted_to_is_sai
         return found
 
     places, speeds = said(term, other, loose)
-    assert (places.code, places.where, places.evidence) == ("beyond_seen", "b", {"share_pct": 4.0})
+    assert (places.code, places.where, places.evidence) == ("beyond_range", "b", {"share_pct": 4.0})
     assert places.message.startswith(
         "b: 4 % of the rows of run.csv 0-2 s have positions beyond -0.5 to 0.8, which the fit has "
         "seen; stribeck, position stays there as it was"

@@ -113,7 +113,7 @@ def test_a_parameter_without_a_standard_error_has_no_interval_and_no_reach(monke
         ),
         sources=("data", "mixed", "bound"), at_bound=np.array([False, False, True]),
         standard=np.array([2.5, 0.5, 0.0]), prior=np.array([3.0, 0.0, 0.0]),
-        standard_error=np.array([0.25, 0.125, inf]), standard_reach=np.array([2.0, 2.5, 1.96]),
+        standard_error=np.array([0.25, 0.125, inf]), standard_quantile=np.array([2.0, 2.5, 1.96]),
         standard_interval=np.array([[2.0, 3.0], [0.1875, 0.8125], [-inf, inf]]),
     )  # fmt: skip
     keys = ("name", "value", "std_error", "reach", "interval_95", "unit", "prior", "source",

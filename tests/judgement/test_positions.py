@@ -57,19 +57,19 @@ def test_what_no_log_tests_is_not_evaluated():
     assert fitted.reasons[0].endswith("no validation log given")
     still = judged({"a": 2.0})
     assert (still.status, statuses(still)) == ("usable", {"a": "good", "b": "not evaluated"})
-    assert still.reasons == ("b: commanded to stand still in all logs: not evaluated",)
+    assert still.reasons == ("b: commanded to are at rest in all logs: not evaluated",)
     assert judged({}).status == "not evaluated"
 
 
 def test_faults_and_cautions_come_first_and_the_scale_last():
     errors = {"a": 2.0, "b": 2.0}
-    unsettled = judged(errors, is_settled=False, scale="the scale rests on kp")
+    unsettled = judged(errors, is_settled=False, scale="the scale depends on kp")
     assert unsettled.status == "usable"
-    assert unsettled.reasons == ("the fit has not settled", "the scale rests on kp")
-    assert judged(errors, scale="the scale rests on kp").status == "good"
+    assert unsettled.reasons == ("the fit has not settled", "the scale depends on kp")
+    assert judged(errors, scale="the scale depends on kp").status == "good"
     doubtful = judged(errors, is_settled=False, cautions=["at its bound"])
     assert doubtful.reasons == ("at its bound", "the fit has not settled")
-    wrong = judged({"a": 2.0, "b": 9.0}, alarms=["the clock jumps"], cautions=["at its bound"])
+    wrong = judged({"a": 2.0, "b": 9.0}, log_errors=["the clock jumps"], cautions=["at its bound"])
     assert wrong.status == "poor"
-    assert wrong.alarms == ("the clock jumps",)
+    assert wrong.log_errors == ("the clock jumps",)
     assert [reason[:5] for reason in wrong.reasons] == ["the c", "at it", "b: si"]

@@ -12,8 +12,15 @@ from robotid.fitting.metrics import JointMetrics, Metrics
 from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
 from robotid.judgement.evidence import Determined, Predictions, is_beaten
-from robotid.judgement.verdict import Doubt, alarming, doubts_of, is_outvoted, judge, refuted
-from robotid.judgement.witness import Witness
+from robotid.judgement.scale_check import ScaleCheck
+from robotid.judgement.verdict import (
+    VerdictWarning,
+    blocking,
+    is_downweighted,
+    judge,
+    rejected,
+    warnings_of,
+)
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
 
@@ -30,9 +37,17 @@ def joint(error, *, urdf=100.0, constant=True, **others):
     return JointMetrics(1.0, "N m", error, r2, 100, {"urdf": urdf} | others, constant)
 
 
-def judged(fit, validation, *, joints=(), refitted=(), alarms=(), doubts=(), witness=None, **open):
+def judged(
+    fit, validation, *, joints=(), refitted=(), log_errors=(), warnings=(), scale_check=None, **open
+):
     predictions = Predictions(fit, validation, joints, refitted)
-    return judge(predictions, Determined(**open), alarms=alarms, doubts=doubts, witness=witness)
+    return judge(
+        predictions,
+        Determined(**open),
+        log_errors=log_errors,
+        warnings=warnings,
+        scale_check=scale_check,
+    )
 
 
 def verdict(validation, fitted=None, **open):
@@ -67,7 +82,7 @@ def test_worse_than_a_constant_is_said_first():
 def test_alarms_come_before_everything_and_constants_before_the_rest():
     joints = {"a": joint(60.0), "b": joint(40.0, constant=False)}
     logs = {"val.csv": Metrics(joints, 1.0)}
-    found = judged(Metrics({}, 1.0), logs, alarms=["torque of c swapped"])
+    found = judged(Metrics({}, 1.0), logs, log_errors=["torque of c swapped"])
     assert found.status == "poor"
     assert found.reasons[0] == "torque of c swapped"
     assert found.reasons[1].startswith("b: worse than a constant")
@@ -96,7 +111,7 @@ def test_each_joint_has_a_verdict_of_its_own():
     }  # fmt: skip
     assert found["a"].reasons[0].startswith("predicted within 4.0 %")
     assert found["c"].reasons[0].startswith("c: worse than a constant torque on val.csv: 40.0 %")
-    assert found["d"].reasons == ("it does not move in any kept recording",)
+    assert found["d"].reasons == ("it does not move in any validation recording",)
 
 
 def test_the_worst_of_several_recordings_decides_on_a_joint():
@@ -149,21 +164,21 @@ def test_a_result_that_is_validated_later_knows_only_what_was_kept():
 def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
     fit = {name: joint(3.0) for name in "abc"}
     logs = {"val.csv": Metrics({"a": joint(4.0), "b": joint(4.0), "c": joint(60.0)}, 1.0)}
-    doubts = [Doubt("clipped", name, "it is clipped") for name in "bc"]
-    found = judged(Metrics(fit, 1.0), logs, doubts=doubts)
+    warnings = [VerdictWarning("clipped", name, "it is clipped") for name in "bc"]
+    found = judged(Metrics(fit, 1.0), logs, warnings=warnings)
     assert {name: v.status for name, v in found.joints.items()} == {
         "a": "good", "b": "usable", "c": "poor",
     }  # fmt: skip
     assert found.joints["b"].reasons == ("b: it is clipped (clipped)",)
     assert "b, c: it is clipped (clipped)" in found.reasons
     assert found.status == "poor"
-    whole = [Doubt("urdf_mismatch", "", "run.csv: masses do not fit")]
+    whole = [VerdictWarning("urdf_mismatch", "", "run.csv: masses do not fit")]
     logs = {"val.csv": Metrics({name: joint(4.0) for name in "abc"}, 1.0)}
-    found = judged(Metrics(fit, 1.0), logs, doubts=whole)
+    found = judged(Metrics(fit, 1.0), logs, warnings=whole)
     assert found.status == "usable"
     assert found.reasons == ("run.csv: masses do not fit (urdf_mismatch)",)
     assert {v.status for v in found.joints.values()} == {"usable"}
-    assert found.to_dict()["doubts"] == [
+    assert found.to_dict()["warnings"] == [
         {"code": "urdf_mismatch", "joint": "", "message": "run.csv: masses do not fit"}
     ]
 
@@ -202,10 +217,10 @@ def test_each_threshold_lies_where_it_is_stated(error, fitted, status):
 
 def test_an_alarm_alone_makes_a_good_prediction_poor():
     kept = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
-    found = judged(Metrics({"a": joint(3.0)}, 1.0), kept, alarms=["late"])
+    found = judged(Metrics({"a": joint(3.0)}, 1.0), kept, log_errors=["late"])
     assert found.status == "poor"
     assert found.reasons == ("late",)
-    assert found.to_dict()["alarms"] == ["late"]
+    assert found.to_dict()["log_errors"] == ["late"]
 
 
 def test_an_error_equal_to_the_urdfs_is_not_worse_than_it():
@@ -218,7 +233,7 @@ def test_an_error_equal_to_the_urdfs_is_not_worse_than_it():
     [("run.csv: b", ["b"]), ("b", ["b"]), ("run.csv: a, c", ["a", "c"]), ("run.csv", [""])],
 )
 def test_a_doubt_is_about_the_joints_that_the_finding_names(where, joints):
-    found = doubts_of([finding("unexplained_torque", where)], JOINTS)
+    found = warnings_of([finding("unexplained_torque", where)], JOINTS)
     assert [doubt.joint for doubt in found] == joints
     assert found[0].message.startswith("run.csv: much" if joints == [""] else "much of the torque")
 
@@ -232,46 +247,48 @@ def test_notes_errors_and_harmless_warnings_raise_no_doubt():
         finding("constraint_costs", "a", error_pct=1.9, wls_error_pct=1.0),
         finding("constraint_costs", "b", error_pct=0.9, wls_error_pct=1e-3),
     ]
-    assert doubts_of(harmless, JOINTS) == ()
+    assert warnings_of(harmless, JOINTS) == ()
 
 
 def test_what_several_logs_show_is_said_once():
-    found = doubts_of([finding("clipped", f"{log}: a") for log in ("one", "two")], JOINTS)
-    assert found == (Doubt("clipped", "a", "the torque is clipped at a limit"),)
+    found = warnings_of([finding("clipped", f"{log}: a") for log in ("one", "two")], JOINTS)
+    assert found == (VerdictWarning("clipped", "a", "the torque is clipped at a limit"),)
 
 
 def test_figures_are_stated():
-    (late,) = doubts_of([finding("torque_delay", "run.csv", delay=0.0562)], JOINTS)
+    (late,) = warnings_of([finding("torque_delay", "run.csv", delay=0.0562)], JOINTS)
     assert late.message == "run.csv: the torque is +0.056 s (+ late, - early) against the position"
-    (costs,) = doubts_of([finding("constraint_costs", "a", error_pct=4.0, wls_error_pct=1)], JOINTS)
+    (costs,) = warnings_of(
+        [finding("constraint_costs", "a", error_pct=4.0, wls_error_pct=1)], JOINTS
+    )
     assert costs.message.startswith("4.0 % of the torque is missed where it was fitted, 1.0 %")
 
 
 def test_a_repeated_motion_matters_if_no_other_motion_was_kept_apart():
     repeated = [finding("repeated_motion", "one.csv")]
-    assert doubts_of(repeated, JOINTS, ["one.csv", "two.csv"]) == ()
-    assert doubts_of(repeated, JOINTS) == ()
-    (doubt,) = doubts_of(repeated, JOINTS, ["one.csv"])
+    assert warnings_of(repeated, JOINTS, ["one.csv", "two.csv"]) == ()
+    assert warnings_of(repeated, JOINTS) == ()
+    (doubt,) = warnings_of(repeated, JOINTS, ["one.csv"])
     assert "no prediction was tested" in doubt.message
 
 
 def test_a_robust_loss_excuses_jumps_of_the_torque_and_what_they_cause():
     jump = finding("spikes", "run.csv: tau_a", "error")
-    assert is_outvoted(jump)
-    assert not is_outvoted(finding("spikes", "run.csv: q_a", "error"))
+    assert is_downweighted(jump)
+    assert not is_downweighted(finding("spikes", "run.csv: q_a", "error"))
     found = [jump, finding("unexplained_torque", "run.csv: a")]
-    assert doubts_of(found, JOINTS, is_robust=True) == ()
-    assert [doubt.joint for doubt in doubts_of(found, JOINTS)] == ["a"]
+    assert warnings_of(found, JOINTS, is_robust=True) == ()
+    assert [doubt.joint for doubt in warnings_of(found, JOINTS)] == ["a"]
     other = [jump, finding("unexplained_torque", "run.csv: b")]
-    assert [doubt.joint for doubt in doubts_of(other, JOINTS, is_robust=True)] == ["b"]
+    assert [doubt.joint for doubt in warnings_of(other, JOINTS, is_robust=True)] == ["b"]
 
 
 def test_only_a_robust_loss_outvotes_jumps_and_ignored_errors_are_no_alarm():
     jump, other = finding("spikes", "run.csv: tau_a", "error"), finding("late", "x", "error")
     found = [jump, other, finding("clipped", "x")]
-    assert alarming(found, ()) == (jump, other)
-    assert alarming(found, (), is_robust=True) == (other,)
-    assert alarming(found, ["late"]) == (jump,)
+    assert blocking(found, ()) == (jump, other)
+    assert blocking(found, (), is_robust=True) == (other,)
+    assert blocking(found, ["late"]) == (jump,)
 
 
 def test_many_open_parameters_are_counted_and_the_first_eight_named():
@@ -298,15 +315,15 @@ def kept_logs(**errors):
 def test_a_hypothesis_is_refuted_by_the_worst_of_all_logs_of_its_joints():
     logs = kept_logs(one=(6.0, 2.0), two=(1.0, 3.0))
     guesses = [finding("unexplained_torque", f"run.csv: {where}") for where in ("a", "b", "a, b")]
-    found = refuted([*guesses, finding("urdf_mismatch", "run.csv")], logs, Witness())
+    found = rejected([*guesses, finding("urdf_mismatch", "run.csv")], logs, ScaleCheck())
     assert [f.severity for f in found] == ["warning", "note", "warning", "warning"]
     assert found[1].message == (
         "what was found; but the result predicts unseen motion within 3.0 %"
     )
     repeated = finding("repeated_motion", "one")
-    assert refuted([repeated, guesses[1]], logs, Witness())[1].severity == "warning"
+    assert rejected([repeated, guesses[1]], logs, ScaleCheck())[1].severity == "warning"
     alike = finding("unexplained_torque", "all joints")
-    assert refuted([alike], kept_logs(one=(1.0, 1.0)), Witness())[0].severity == "warning"
+    assert rejected([alike], kept_logs(one=(1.0, 1.0)), ScaleCheck())[0].severity == "warning"
 
 
 @pytest.mark.parametrize(
@@ -314,9 +331,11 @@ def test_a_hypothesis_is_refuted_by_the_worst_of_all_logs_of_its_joints():
     [((1.9, 0.6), "note"), ((1.0, 2.1), "warning"), ((0.4, 1.0), "warning")],
 )
 def test_a_current_is_refuted_by_the_gravity_of_every_joint(gravity, severity):
-    logs, witness = kept_logs(one=(1.0, 1.0)), Witness(dict(zip("ab", gravity, strict=True)))
+    logs, scale_check = kept_logs(one=(1.0, 1.0)), ScaleCheck(dict(zip("ab", gravity, strict=True)))
     for kind in ("warning", "error"):
-        (found,) = refuted([finding("current_for_torque", "run.csv: a, b", kind)], logs, witness)
+        (found,) = rejected(
+            [finding("current_for_torque", "run.csv: a, b", kind)], logs, scale_check
+        )
         assert found.severity == (severity if severity == "note" else kind)
 
 
@@ -326,7 +345,7 @@ def test_a_current_is_refuted_by_the_gravity_of_every_joint(gravity, severity):
 )
 def test_gravity_that_was_compensated_is_refuted_by_gravity(scale, factor, severity):
     guess = finding("gravity_compensated", "run.csv")
-    (found,) = refuted([guess], kept_logs(one=(1.0, 1.0)), Witness(scale=scale, factor=factor))
+    (found,) = rejected([guess], kept_logs(one=(1.0, 1.0)), ScaleCheck(scale=scale, factor=factor))
     assert found.severity == severity
 
 
@@ -376,16 +395,16 @@ def test_a_stated_bound_that_binds_makes_it_usable(run):
     far = {"com": {"forearm_link": [[1, 1, 1], [1.2, 1.2, 1.2]]}}
     _, result, again = run(constraints=far)
     assert result["verdict"]["status"] == again["status"] == "usable"
-    bound = "centre_of_mass forearm_link: the data, or the masses that it leaves, speak against"
+    bound = "centre_of_mass forearm_link: the data, or the masses that it leaves, contradict"
     assert bound in str(result["verdict"])
-    (finding,) = [f for f in result["warnings"] if f["code"] == "bound_binds"]
+    (finding,) = [f for f in result["warnings"] if f["code"] == "active_bound"]
     assert "the data push against them at shoulder_lift_joint," in finding["message"]
 
 
 def test_a_stated_bound_that_only_the_urdf_minds_is_a_note(ur5):
     found = found_of(ur5, constraints={"total_mass": [10.0, 17.0]})
-    (finding,) = [f for f in found.findings if f.code == "bound_binds"]
-    assert found.doubts == ()
+    (finding,) = [f for f in found.findings if f.code == "active_bound"]
+    assert found.warnings == ()
     assert finding.severity == "note"
     assert "the torque is explained as well as without" in finding.message
     assert found.verdict.status == "good"
@@ -408,7 +427,7 @@ def test_a_wrong_total_mass_makes_the_joints_usable_that_it_costs(run, ur5):
     assert "physics and data disagree" in lift["reasons"][-1]
     assert again["per_joint"]["shoulder_lift_joint"]["status"] == "usable"
     found = found_of(ur5, constraints={"total_mass": 5.0}, ignore=["constraint_costs"])
-    assert "constraint_costs" not in {doubt.code for doubt in found.doubts}
+    assert "constraint_costs" not in {doubt.code for doubt in found.warnings}
 
 
 def test_spikes_in_torques_do_not_condemn_a_robust_fit(ur5):
@@ -420,10 +439,10 @@ def test_spikes_in_torques_do_not_condemn_a_robust_fit(ur5):
 
     plain = found_of(ur5, spoil)
     assert "jumps by up to" in plain.verdict.reasons[0]
-    assert plain.alarms
+    assert plain.log_errors
     robust = found_of(ur5, spoil, robust="tukey")
     assert robust.verdict.status == "good", robust.verdict.reasons
-    assert robust.doubts == robust.alarms == ()
+    assert robust.warnings == robust.log_errors == ()
 
 
 def test_what_noise_hides_of_a_rich_motion_is_said_and_does_not_condemn():
@@ -458,9 +477,9 @@ def test_a_twentieth_and_a_third_of_a_percent_must_be_missed_more(error, driven,
 
 
 def refuted_code(code, error, gravity=None, where="run.csv", more=()):
-    witness = Witness(gravity=gravity or {}, gravity_error=gravity or {})
+    scale_check = ScaleCheck(gravity=gravity or {}, gravity_error=gravity or {})
     kept = {"val.csv": Metrics({"a": joint(error), "b": joint(1.0)}, 1.0)}
-    return refuted([finding(code, where), *more], kept, witness)[0].severity
+    return rejected([finding(code, where), *more], kept, scale_check)[0].severity
 
 
 def test_a_prediction_of_unseen_motion_refutes_hypotheses_on_masses_and_units():
@@ -477,8 +496,8 @@ def test_a_prediction_of_unseen_motion_refutes_hypotheses_on_masses_and_units():
     no_gravity = finding("gravity_compensated", "run.csv", "error")
     kept = {"val.csv": Metrics({"a": joint(1.0)}, 1.0)}
     for factor, severity in ((1.3, "note"), (0.2, "error")):
-        witness = Witness(scale=factor, factor=factor)
-        assert refuted([no_gravity], kept, witness)[0].severity == severity
+        scale_check = ScaleCheck(scale=factor, factor=factor)
+        assert rejected([no_gravity], kept, scale_check)[0].severity == severity
     seen = [finding("repeated_motion", "val.csv")]
     assert refuted_code("urdf_mismatch", 1.0, more=seen) == "warning"
 
@@ -486,34 +505,49 @@ def test_a_prediction_of_unseen_motion_refutes_hypotheses_on_masses_and_units():
 @pytest.mark.parametrize("errors", [(9.0, 1.0), (1.0, 9.0)])
 def test_the_worst_of_several_recordings_refutes_no_hypothesis(errors):
     kept = {f"{k}.csv": Metrics({"a": joint(x)}, 1.0) for k, x in enumerate(errors)}
-    mismatch, witness = finding("urdf_mismatch", "run.csv"), Witness(gravity={}, gravity_error={})
-    assert refuted([mismatch], kept, witness)[0].severity == "warning"
+    mismatch, scale_check = (
+        finding("urdf_mismatch", "run.csv"),
+        ScaleCheck(gravity={}, gravity_error={}),
+    )
+    assert rejected([mismatch], kept, scale_check)[0].severity == "warning"
     few = {name: Metrics({"a": joint(x / 2)}, 1.0) for name, x in zip(kept, errors, strict=True)}
-    [note] = refuted([mismatch], few, witness)
+    [note] = rejected([mismatch], few, scale_check)
     assert note.message.endswith("but the result predicts unseen motion within 4.5 %")
 
 
 @pytest.mark.parametrize(
-    ("witness", "status", "said"),
+    ("scale_check", "status", "said"),
     [
-        (Witness(scale=0.97, factor=0.97, masses=(10.0, 10.2, 0.0)), "good", "agree within"),
-        (Witness(scale=0.8, factor=0.8, masses=(10.0, 9.0, 0.0)), "good", "could not be checked"),
-        (Witness(scale=0.6, factor=0.6, masses=(10.0, 9.0, 0.0)), "usable", "rests on the sensors"),
+        (ScaleCheck(scale=0.97, factor=0.97, masses=(10.0, 10.2, 0.0)), "good", "agree within"),
         (
-            Witness(scale=0.8, factor=0.8, unexplained=(0.01, 0.1), masses=(10.0, 9.0, 0.0)),
+            ScaleCheck(scale=0.8, factor=0.8, masses=(10.0, 9.0, 0.0)),
+            "good",
+            "could not be checked",
+        ),
+        (
+            ScaleCheck(scale=0.6, factor=0.6, masses=(10.0, 9.0, 0.0)),
+            "usable",
+            "depends on the sensors",
+        ),
+        (
+            ScaleCheck(scale=0.8, factor=0.8, unexplained=(0.01, 0.1), masses=(10.0, 9.0, 0.0)),
             "usable",
             "All joints alike are off by 0.80",
         ),
-        (Witness(scale=1.0, factor=1.0, masses=(10.0, 15.0, 0.0)), "usable", "15 kg against"),
-        (Witness(scale=1.0, factor=1.4, masses=(10.0, 15.0, 5.0)), "good", "agree within"),
-        (Witness(scale=0.6, factor=0.6, masses=(10.0, 9.0, 0.0), is_stated=True), "good", "stated"),
+        (ScaleCheck(scale=1.0, factor=1.0, masses=(10.0, 15.0, 0.0)), "usable", "15 kg against"),
+        (ScaleCheck(scale=1.0, factor=1.4, masses=(10.0, 15.0, 5.0)), "good", "agree within"),
+        (
+            ScaleCheck(scale=0.6, factor=0.6, masses=(10.0, 9.0, 0.0), is_stated=True),
+            "good",
+            "stated",
+        ),
     ],
 )
-def test_good_needs_a_witness_or_says_that_there_is_none(witness, status, said):
+def test_good_needs_a_witness_or_says_that_there_is_none(scale_check, status, said):
     found = judged(
         Metrics({"a": joint(3.0)}, 1.0),
         {"val.csv": Metrics({"a": joint(4.0)}, 1.0)},
-        witness=witness,
+        scale_check=scale_check,
     )
     assert found.status == status
     assert said in found.reasons[-1]

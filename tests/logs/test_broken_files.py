@@ -171,7 +171,7 @@ def test_a_few_rows_have_no_lag_and_no_trajectory(rows, tmp_path):
     log = log_of(T[:rows], Q[:rows])
     assert velocity_lag(log) == 0.0
     write_log(log, tmp_path / "run.csv")
-    with pytest.raises(DataError, match="none of its 1 uninterrupted stretches is long enough"):
+    with pytest.raises(DataError, match="none of its 1 uninterrupted segments is long enough"):
         process(read_log(tmp_path / "run.csv", ["a"]), SignalSettings())
 
 

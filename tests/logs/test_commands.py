@@ -186,7 +186,7 @@ def test_a_half_command_names_the_joints():
     assert str(error.value) == (
         "log has commanded positions, but none of elbow: no column 'qref_elbow'; found: "
         "qref_shoulder. Record or rename what is missing, pass columns={'qref_<joint>': ...}, or "
-        "lock joints that stood still"
+        "lock joints that was at rest"
     )
     with pytest.raises(DataError) as error:
         read_log(frame(qref_elbow=None, qref_shoulder=None), JOINTS, needs="commands")

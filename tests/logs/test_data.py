@@ -217,7 +217,7 @@ def test_some_samples_of_a_trajectory_cannot_be_changed_either_and_keep_nothing_
             with pytest.raises(ValueError, match="read-only"):
                 found[0] = 1
     assert (whole.part(7, 20).rate, whole.every(9).rate) == (100.0, None)
-    other = whole.with_memory(None)
+    other = whole.with_states(None)
     assert (other.memory, other.derived, whole.memory is memory) == (None, whole.derived, True)
 
 
@@ -385,7 +385,7 @@ def test_a_log_and_a_trajectory_are_one_line():
     segment = np.repeat([0, 1], [100, 101])
     motion = Trajectory(t=t, q=x, v=x, a=x, tau=x, joints=("a", "b"), rate=50.0, segment=segment)
     assert repr(motion) == (
-        "<Trajectory: 201 samples of 2 joints (a, b) over 2 s at 50 Hz, in 2 stretches>"
+        "<Trajectory: 201 samples of 2 joints (a, b) over 2 s at 50 Hz, in 2 segments>"
     )
 
 

@@ -235,7 +235,7 @@ def test_a_log_is_taken_by_the_names_of_its_joints(ur5, rng):
     np.testing.assert_array_equal(back.tau, log.tau)
     with refused(
         "log has the joints elbow_joint, but not wrist_1_joint, which the model has; record them, "
-        "or if they stood still, lock them where they stood: RobotModel.from_urdf(..., "
+        "or if they was at rest, lock them where they stood: RobotModel.from_urdf(..., "
         "locked={'wrist_1_joint': 0.0})"
     ):
         read_logs(log.select(["elbow_joint"]), ["elbow_joint", "wrist_1_joint"])

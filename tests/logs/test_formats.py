@@ -449,7 +449,7 @@ def test_joints_may_have_other_names_in_the_file(tmp_path):
     np.testing.assert_array_equal(read_log(path, ("M1", "M2"), source=swapped).q, log.q[:, ::-1])
     with refused(
         "run.csv has no column 'q_M3'; position columns found: q_M1, q_M2. Rename it, or "
-        "pass columns={'q_elbow': ...}; if 'elbow' stood still, leave it out of joints and lock it "
+        "pass columns={'q_elbow': ...}; if 'elbow' was at rest, leave it out of joints and lock it "
         "where it stood, as with --joints shoulder --lock elbow=0; in Python "
         "RobotModel.from_urdf(..., locked={'elbow': 0})"
     ):

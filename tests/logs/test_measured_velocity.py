@@ -78,7 +78,7 @@ def test_stretches_between_gaps_count_by_their_rows_and_the_shortest_not():
     for found, own in zip([common, *single], [summed.sum(axis=0), *summed], strict=True):
         k = int(np.argmin(own))
         square, slope, _ = np.polyfit([-1, 0, 1], own[k - 1 : k + 2], 2)
-        # the grid of a stretch may lack its last row
+        # the grid of a segment may lack its last row
         assert found == pytest.approx((k - 31 - slope / (2 * square)) * step, abs=2e-4)
     assert 0.027 < common < 0.06
 

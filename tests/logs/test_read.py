@@ -136,7 +136,7 @@ def test_missing_column_is_named_with_those_of_its_kind(run):
     with refused(
         f"{path.name} has no column 'tau_elbow'; torque or current columns found: "
         "tau_shoulder. Rename it, or pass columns={'tau_elbow': ...}; "
-        "if 'elbow' stood still, leave it out of joints and lock it where it stood, as with "
+        "if 'elbow' was at rest, leave it out of joints and lock it where it stood, as with "
         "--joints shoulder --lock elbow=0; in Python RobotModel.from_urdf(..., "
         "locked={'elbow': 0})"
     ):
@@ -144,7 +144,7 @@ def test_missing_column_is_named_with_those_of_its_kind(run):
     path = run({k: v for k, v in make_table().items() if not k.startswith("q_")})
     with refused(
         f"{path.name} has no column 'q_shoulder'; position columns found: none. Rename it, or pass "
-        "columns={'q_shoulder': ...}; if 'shoulder' stood still, leave it out of joints and lock it"
+        "columns={'q_shoulder': ...}; if 'shoulder' was at rest, leave it out of joints and lock it"
     ):
         read_log(path, JOINTS)
 
@@ -154,7 +154,7 @@ def test_misspelt_column_is_suggested(run):
     with refused(
         f"{path.name} has no column 'q_elbow'; position columns found: q_shoulder, q_elbow2. "
         "Did you mean 'q_elbow2'? Rename it, or pass columns={'q_elbow': 'q_elbow2'}; "
-        "if 'elbow' stood still, leave it out of joints and lock it where it stood, as with "
+        "if 'elbow' was at rest, leave it out of joints and lock it where it stood, as with "
         "--joints shoulder --lock elbow=0; in Python RobotModel.from_urdf(..., "
         "locked={'elbow': 0})"
     ):
@@ -169,7 +169,7 @@ def test_the_column_of_another_joint_is_not_suggested(run):
     with refused(
         f"{path.name} has no column 'tau_joint_2'; torque or current columns found: "
         "tau_joint_1. Rename it, or pass columns={'tau_joint_2': ...}; "
-        "if 'joint_2' stood still, leave it out of joints and lock it where it stood, as with "
+        "if 'joint_2' was at rest, leave it out of joints and lock it where it stood, as with "
         "--joints joint_1 --lock joint_2=0; in Python RobotModel.from_urdf(..., "
         "locked={'joint_2': 0})"
     ):
@@ -276,7 +276,7 @@ def test_joints_without_gain_and_those_without_torque_are_all_named_at_once(run)
     with refused(
         f"{path.name}: joints a, b have currents but no gain; give it in N m/A: "
         "gains={'a': ..., ...} (job file table [torque], key gains; CLI --gain a=... --gain "
-        "b=...). There is no torque of finger either; if they stood still, lock them where they "
+        "b=...). There is no torque of finger either; if they was at rest, lock them where they "
         "stood, as with --lock finger=0"
     ):
         read_log(path, ("a", "b", "c", "finger"))

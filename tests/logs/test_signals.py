@@ -142,17 +142,17 @@ def test_what_is_stated_to_be_late_is_moved_back(rate):
     np.testing.assert_allclose(out.q[:, 0], np.sin(w * out.t), atol=1e-6)
 
 
-@pytest.mark.parametrize(("pause", "stretches"), [(0.024, 1), (0.026, 2), (1.0, 2)])
-def test_a_step_longer_than_two_and_a_half_others_is_a_gap(pause, stretches):
+@pytest.mark.parametrize(("pause", "segments"), [(0.024, 1), (0.026, 2), (1.0, 2)])
+def test_a_step_longer_than_two_and_a_half_others_is_a_gap(pause, segments):
     t = np.arange(400) * 0.01
     t[200:] += pause - 0.01
     out = process(sine_log(t), SignalSettings(cutoff=None, rate=100.0))
-    assert len(np.unique(out.segment)) == stretches
-    # 0.2 s are cut off at each end of each stretch
+    assert len(np.unique(out.segment)) == segments
+    # 0.2 s are cut off at each end of each segment
     assert out.t[0] == pytest.approx(0.2)
     assert out.t[-1] == pytest.approx(t[-1] - 0.2, abs=0.02)
     inside = (out.t > t[199] - 0.195) & (out.t < t[200] + 0.195)
-    assert inside.any() == (stretches == 1)
+    assert inside.any() == (segments == 1)
 
 
 def test_full_turns_are_taken_out_of_free_joints_only():
@@ -203,7 +203,7 @@ def test_a_log_without_velocity_cannot_use_it():
 
 
 def test_a_log_too_short_for_its_trim_is_refused():
-    with pytest.raises(DataError, match="none of its 1 uninterrupted stretches is long enough"):
+    with pytest.raises(DataError, match="none of its 1 uninterrupted segments is long enough"):
         process(sine_log(np.arange(0, 0.3, 0.01)), SignalSettings(trim=0.2))
 
 

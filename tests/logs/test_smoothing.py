@@ -1,4 +1,4 @@
-"""A stretch smoothed part by part is as smooth as the whole."""
+"""A segment smoothed part by part is as smooth as the whole."""
 
 from itertools import pairwise
 
@@ -9,7 +9,7 @@ from scipy.signal import butter
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process, resolve
-from robotid.logs.smoothing import SPLINE, Stretch, _Grid, filter_reach, process_stretches
+from robotid.logs.smoothing import SPLINE, Segment, _Grid, filter_reach, process_segments
 
 RATE = 200.0  # [Hz]
 PART = 700  # rows
@@ -38,13 +38,13 @@ def in_parts(log, settings):
     settings = resolve(log, settings)
     cuts = np.flatnonzero(np.diff(log.t) > settings.max_gap) + 1
     edges = [0, *cuts.tolist(), len(log.t)]
-    stretches = [
-        Stretch(i, j, float(log.t[i]), float(log.t[j - 1]), k)
+    segments = [
+        Segment(i, j, float(log.t[i]), float(log.t[j - 1]), k)
         for k, (i, j) in enumerate(pairwise(edges))
     ]
     for start in range(0, len(log.t), PART):
         stop = min(start + PART, len(log.t))
-        mine = [s for s in stretches if s.first < stop and s.stop > start]
+        mine = [s for s in segments if s.first < stop and s.stop > start]
         reach = filter_reach(settings)
         before = int(np.searchsorted(log.t, log.t[start] - reach)) - SPLINE
         after = int(np.searchsorted(log.t, log.t[stop - 1] + reach)) + SPLINE
@@ -55,7 +55,7 @@ def in_parts(log, settings):
             v=log.v[rows], a=log.a[rows],
         )  # fmt: skip
         own = slice(start, stop)
-        yield process_stretches(part, mine, settings, first=low, own=own, speeds=SPEEDS)
+        yield process_segments(part, mine, settings, first=low, own=own, speeds=SPEEDS)
 
 
 CASES = {
@@ -131,8 +131,8 @@ def test_a_filter_reaches_until_nothing_is_left_of_its_slowest_pole(order, cutof
 
 
 def test_points_of_a_grid_are_numbered_from_its_start():
-    stretch = Stretch(first=3, stop=904, start=1234.5, end=1243.5, number=2)
-    grid = _Grid.of(stretch, SignalSettings(rate=30.0, cutoff=5.0))
+    segment = Segment(first=3, stop=904, start=1234.5, end=1243.5, number=2)
+    grid = _Grid.of(segment, SignalSettings(rate=30.0, cutoff=5.0))
     # 100 rows a second are decimated after the filter: every third of 90 points a second
     assert (grid.keep_every, grid.count) == (3, 811)
     assert grid.rate == pytest.approx(90.0)
@@ -145,7 +145,7 @@ def test_points_of_a_grid_are_numbered_from_its_start():
             k,
             k + 1,
         ]
-    coarse = _Grid.of(stretch, SignalSettings(rate=30.0, cutoff=None))
+    coarse = _Grid.of(segment, SignalSettings(rate=30.0, cutoff=None))
     assert (coarse.keep_every, coarse.count, coarse.rate) == (1, 271, pytest.approx(30.0))
-    rows = _Grid.of(stretch, SignalSettings(rate=None, cutoff=None))
+    rows = _Grid.of(segment, SignalSettings(rate=None, cutoff=None))
     assert (rows.step, rows.count, rows.start, rows.last) == (None, 901, 1234.5, 1243.5)

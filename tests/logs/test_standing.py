@@ -1,4 +1,4 @@
-"""Stands count once, slow stretches once each, and what is fast is left out."""
+"""Stands count once, slow segments once each, and what is fast is left out."""
 
 import numpy as np
 
@@ -67,7 +67,7 @@ def test_fast_moves_between_poses_are_left_out_with_what_is_beside_them():
 
 
 def test_speeds_are_0_on_both_sides_of_where_a_joint_turns_round_or_sets_out():
-    row = np.arange(200)  # eight stretches of 25 rows
+    row = np.arange(200)  # eight segments of 25 rows
     turning = 0.03 * 0.01 * np.minimum(row, 199 - row)  # between the fourth and the fifth
     leaving = 0.04 * 0.01 * np.maximum(row - 49, 0)  # between the second and the third
     for sign in (1.0, -1.0):
@@ -94,7 +94,7 @@ def test_the_slope_of_a_short_stretch_counts_as_far_as_it_goes():
 
 def test_stretches_on_both_sides_of_a_jump_of_the_speed_are_left_out():
     """One joint jumps by 0.15 rad/s in a quarter of a second, which is 0.6 rad/s^2, above 0.3."""
-    row = np.arange(200)  # eight stretches of 25 rows
+    row = np.arange(200)  # eight segments of 25 rows
     for jump, kept in ((0.15, [0, 1, 2, 5, 6, 7]), (0.05, list(range(8)))):
         for sign in (1.0, -1.0):
             speed = np.where(row < 100, 0.1, 0.1 + jump)

@@ -37,7 +37,7 @@ def lines():
 def torque(lines):
     tau, predicted = lines
     series = (
-        Series("measured", tau, "text", is_faint=True),
+        Series("measured", tau, "text", is_weak=True),
         Series("identified", predicted, "predicted", half=np.full(len(T), 4.0)),
     )
     spans = ((float(T[2000]), float(T[2500])),)

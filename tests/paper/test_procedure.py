@@ -282,7 +282,7 @@ def test_noise_is_the_same_for_the_same_seed():
 
 
 def test_noise_makes_the_smallest_samples_dangerous_and_eps2_leaves_them_out():
-    # at rest on the program Psi is all noise, and (24) divides by its square
+    # at depend on the program Psi is all noise, and (24) divides by its square
     bare, guarded = (
         run(P4, settings=short(2, eps2=eps2), influences=noise(1)).relative_error(P4)[-1, 0]
         for eps2 in (1e-12, 1.0)

@@ -137,7 +137,7 @@ def test_words_tell_what_stands_alone_in_sums_or_never():
     W = np.random.default_rng(0).standard_normal((40, 3))
     columns = np.column_stack([W[:, 0], W[:, 1], W[:, 0] * 2, np.zeros(40), W[:, 2]])
     mapping = base_mapping(columns, ("l.m", "l.mcx", "l.Ixx", "l.Iyy", "l.Izz"))
-    found = mapping.in_words(("l.m", "l.mcx", "l.Ixx", "l.Iyy", "l.Izz"))
+    found = mapping.described(("l.m", "l.mcx", "l.Ixx", "l.Iyy", "l.Izz"))
     assert found == {
         "alone": ("l.mcx", "l.Izz"),
         "in sums": ("l.m", "l.Ixx"),

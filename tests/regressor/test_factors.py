@@ -12,10 +12,10 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import (
     Reduction,
     compress,
-    compress_stretches,
+    compress_segments,
     gather,
     join,
-    join_stretches,
+    join_segments,
     merge,
 )
 from robotid.regressor.problem import Problem, concatenate
@@ -184,10 +184,10 @@ def test_stretches_merge_into_the_factors_of_the_whole(ur5, rng):
     motion = Trajectory(t, q, v, a, tau, ur5.joints, 100.0, np.zeros(250, dtype=int))
     weight = rng.integers(0, 2, (250, 6)).astype(float)
     problem = build_problem(ur5, motion, weight).select(np.arange(3, 40))
-    stretches = compress_stretches(concatenate([problem, problem]), 100)
-    assert len(stretches) == 6
-    np.testing.assert_array_equal(stretches[1].rows, (weight[100:200] > 0).sum(axis=0))
-    whole, merged = compress(problem), merge(stretches[3:])
+    segments = compress_segments(concatenate([problem, problem]), 100)
+    assert len(segments) == 6
+    np.testing.assert_array_equal(segments[1].rows, (weight[100:200] > 0).sum(axis=0))
+    whole, merged = compress(problem), merge(segments[3:])
     np.testing.assert_array_equal(merged.rows, whole.rows)
     for a, b in zip(merged.R, whole.R, strict=True):
         np.testing.assert_allclose(gram(a), gram(b), rtol=1e-11, atol=1e-9)
@@ -195,7 +195,7 @@ def test_stretches_merge_into_the_factors_of_the_whole(ur5, rng):
 
 def test_stretches_need_rows_that_can_be_cut(rng):
     with pytest.raises(DataError, match="cannot be cut"):
-        compress_stretches(make(rng)[0], 10)
+        compress_segments(make(rng)[0], 10)
 
 
 def tree_support(kind):
@@ -286,9 +286,9 @@ def test_neighbours_are_joined_to_few_stretches(ur5, rng):
     edges = np.linspace(0, 12, 11)
     ends = np.nextafter(edges[1:], 0)
     parts = [reduction(ur5, log.window(*x))[0] for x in zip(edges[:-1], ends, strict=True)]
-    found = join_stretches(iter(parts), len(parts), 4)
+    found = join_segments(iter(parts), len(parts), 4)
     assert [x.samples for x in found] == [180, 180, 180, 60]
-    again = join_stretches(iter(parts), len(parts), 64)
+    again = join_segments(iter(parts), len(parts), 64)
     assert [x.samples for x in again] == [60] * 10
     for x in (found, again):
         np.testing.assert_allclose(join(x).squares, join(parts).squares, rtol=1e-13)
@@ -371,7 +371,7 @@ def test_pieces_are_joined_to_stretches_of_one_length(rng, count, most, lengths)
     for k in range(count):
         problem, *_ = make(rng, samples=10 + k)
         pieces.append(Reduction(compress(problem), np.full((3, 3), 10.0**k), 10 + k))
-    found = join_stretches(iter(pieces), count, most)
+    found = join_segments(iter(pieces), count, most)
     edges = np.cumsum([0, *lengths])
     for own, i, j in zip(found, edges[:-1], edges[1:], strict=True):
         assert own.samples == sum(10 + k for k in range(i, j))

@@ -1,4 +1,4 @@
-"""How drives move along a trajectory: stretch by stretch, under the load of the bodies."""
+"""How drives move along a trajectory: segment by segment, under the load of the bodies."""
 
 import numpy as np
 import pinocchio as pin
@@ -6,7 +6,7 @@ import pytest
 from helpers.robots import motion
 
 from robotid.logs.data import Trajectory
-from robotid.regressor.memory import _rate, bears_load, drive_motion_along, remember
+from robotid.regressor.memory import _rate, drive_motion_along, is_loaded, remember
 from robotid.regressor.prediction import rigid_parts
 from robotid.robot.drives import Lag, LoadFriction, Presliding
 from robotid.robot.examples import example_urdf
@@ -90,7 +90,7 @@ def test_the_parts_of_a_rigid_torque_are_gravity_inertia_and_speed(rng):
 )
 def test_bristles_alone_remember_the_same_whatever_the_bodies_weigh(ur5, rng, term, is_loaded):
     model = ur5.with_terms({ur5.joints[1]: (term,)})
-    assert bears_load(model) is is_loaded
+    assert is_loaded(model) is is_loaded
     trajectory, pi = motion(model, rng, 50), model.standard_parameters()
     light, heavy = (remember(model.with_reference(x * pi), trajectory).memory for x in (1.0, 2.0))
     assert np.array_equal(light, heavy) is not is_loaded
@@ -98,7 +98,7 @@ def test_bristles_alone_remember_the_same_whatever_the_bodies_weigh(ur5, rng, te
 
 def test_one_drive_that_bears_a_load_is_enough(ur5):
     first, second, third = ur5.joints[:3]
-    assert not bears_load(ur5)
-    assert not bears_load(ur5.with_terms({first: (Presliding(),), second: (Presliding(),)}))
+    assert not is_loaded(ur5)
+    assert not is_loaded(ur5.with_terms({first: (Presliding(),), second: (Presliding(),)}))
     own = {first: (Presliding(),), second: (Lag(),), third: (Presliding(),)}
-    assert bears_load(ur5.with_terms(own))
+    assert is_loaded(ur5.with_terms(own))

@@ -18,12 +18,12 @@ from robotid.robot.model import RobotModel
 SAMPLES = 300  # more than two blocks
 
 
-def blocks(model, trajectory, weight, part, stretch=90):
+def blocks(model, trajectory, weight, part, segment=90):
     """Return the rows of some samples, row of the robot by row, of every block."""
     (source,) = build_problem(model, trajectory, weight, compiled=False).sources
-    found = [list(map(np.copy, block)) for block in source.blocks(*part, stretch)]
+    found = [list(map(np.copy, block)) for block in source.blocks(*part, segment)]
     ends = np.cumsum([len(block[0]) for block in found]).tolist()
-    assert {*range(stretch, part[1] - part[0], stretch)} < {*ends}  # no block has two stretches
+    assert {*range(segment, part[1] - part[0], segment)} < {*ends}  # no block has two segments
     return [np.concatenate(own) for own in zip(*found, strict=True)]
 
 

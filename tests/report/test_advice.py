@@ -15,7 +15,7 @@ from robotid.diagnosis.misfit import Misfit
 from robotid.diagnosis.misfit_findings import misfit_findings, setting_of
 from robotid.findings import Finding
 from robotid.fitting.joint_motion import JointMotion
-from robotid.judgement.verdict import DOUBTFUL
+from robotid.judgement.verdict import WARNING_CODES
 from robotid.report.advice import Origin, next_steps
 from robotid.robot.examples import example_urdf
 
@@ -247,7 +247,7 @@ def test_a_setting_is_a_line_of_the_job_file_or_a_flag(identified, code, evidenc
     )
 
 
-@pytest.mark.parametrize("code", sorted({*DOUBTFUL, "payload"} - {"total_mass"}))
+@pytest.mark.parametrize("code", sorted({*WARNING_CODES, "payload"} - {"total_mass"}))
 def test_whatever_leaves_a_result_in_doubt_has_a_step(identified, code):
     """Findings whose remedy is no setting are said again in their own words."""
     calm = {step.words for step in next_steps(told(identified), JOB)}

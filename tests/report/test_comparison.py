@@ -73,7 +73,7 @@ def test_differences_are_in_combined_standard_errors(folder):
 def test_errors_of_the_same_recording_stand_side_by_side(folder):
     a, b = (read_result(folder / f"{name}.json") for name in "ab")
     found = compare_results([folder / "a.json", folder / "b.json"])
-    assert found["remarks"] == []
+    assert found["notes"] == []
     assert found["fitted_alike"]
     (entry,) = found["validation"]
     for joint in entry["per_joint"]:
@@ -94,8 +94,8 @@ def test_another_recording_is_not_compared(changed):
 
     found = changed(other_log)
     assert found["validation"] == []
-    assert "A was validated on second.csv, which not every result was" in found["remarks"][0]
-    assert "no validation recording is common to all results" in found["remarks"][-1]
+    assert "A was validated on second.csv, which not every result was" in found["notes"][0]
+    assert "no validation recording is common to all results" in found["notes"][-1]
     assert [row["in"] for row in found["inputs"]][:2] == [[True, False], [False, True]]
 
 
@@ -108,8 +108,8 @@ def test_another_filter_is_said(changed):
     def smoother(result):
         result["inputs"][-1]["signals"]["cutoff"] = 3.0
 
-    (remark,) = changed(smoother)["remarks"]
-    assert remark.startswith("second.csv was prepared in other ways (cutoff 8 | 3)")
+    (note,) = changed(smoother)["notes"]
+    assert note.startswith("second.csv was prepared in other ways (cutoff 8 | 3)")
 
 
 def test_each_common_recording_is_compared_by_its_own_signals_and_rows(folder, tmp_path):
@@ -121,23 +121,23 @@ def test_each_common_recording_is_compared_by_its_own_signals_and_rows(folder, t
         result["validation"].insert(0, result["validation"][0] | {"log": "more.csv"})
     paths = [tmp_path / f"{name}.json" for name in "ab"]
 
-    def remarks():
+    def notes():
         for path, result in zip(paths, results, strict=True):
             write_json(result, path)
-        return compare_results(paths)["remarks"]
+        return compare_results(paths)["notes"]
 
-    assert remarks() == []
+    assert notes() == []
     last = results[1]["inputs"][-1]
     rows = last["rows_used"]
     last["rows_used"] = 77
     last["signals"] = last["signals"] | {"cutoff": 3.0}
-    (remark,) = remarks()
+    (note,) = notes()
     said = f"second.csv was prepared in other ways (cutoff 8 | 3; rows {rows} | 77)"
-    assert remark.startswith(said)
+    assert note.startswith(said)
     results[1]["inputs"][-2]["signals"] = {"cutoff": 4.5}
-    first, second = remarks()
+    first, second = notes()
     assert first.startswith("more.csv was prepared in other ways (cutoff 5 | 4.5)")
-    assert second == remark
+    assert second == note
 
 
 def test_other_fitted_recordings_and_versions_are_said(changed):
@@ -179,9 +179,9 @@ def test_a_third_result_is_compared_with_the_first_and_with_what_all_have(folder
     assert found["fitted_alike"]
     (entry,) = found["validation"]
     assert all(len(joint["rmse"]) == 3 for joint in entry["per_joint"])
-    (remark,) = found["remarks"]
+    (note,) = found["notes"]
     rows = a["inputs"][-1]["rows_used"]
-    assert f"second.csv was prepared in other ways (rows {rows} | {rows} | 77)" in remark
+    assert f"second.csv was prepared in other ways (rows {rows} | {rows} | 77)" in note
 
     found = compared(lambda result: result["inputs"][1].update(sha256="1" * 64))
     assert not found["fitted_alike"]
@@ -190,7 +190,7 @@ def test_a_third_result_is_compared_with_the_first_and_with_what_all_have(folder
     ]  # fmt: skip
     found = compared(lambda result: result["inputs"][-1].update(sha256="0" * 64))
     assert found["validation"] == []
-    assert [remark[:15] for remark in found["remarks"]] == [
+    assert [note[:15] for note in found["notes"]] == [
         *(f"{label} was validated"[:15] for label in "ABC"), "no validation r",
     ]  # fmt: skip
 
@@ -314,8 +314,8 @@ def test_versions_that_differ_stand_on_the_page(folder, tmp_path):
     assert tables(html)["Versions that differ"].rows == [["numpy", np.__version__, "1.26.0"]]
     files = tables(html)["Files read, those that differ first"].rows
     assert [row[1:3] for row in files] == [["yes", "no"], ["no", "yes"], *[["yes", "yes"]] * 2]
-    for remark in content["remarks"]:
-        assert f"<li>{remark.replace(chr(39), '&#x27;')}</li>" in html
+    for note in content["notes"]:
+        assert f"<li>{note.replace(chr(39), '&#x27;')}</li>" in html
 
 
 def test_names_of_files_cannot_inject_markup(folder, tmp_path):
@@ -349,8 +349,8 @@ def test_results_and_logs_of_one_name_are_told_apart_by_the_shortest_path(folder
         write_json(own, place)
     found = compare_results(places)
     assert [x["name"] for x in found["results"]] == ["monday/out", "tuesday/out", "wls"]
-    assert "A was validated on a, which not every result was" in found["remarks"][0]
-    assert "B was validated on b, which" in found["remarks"][1]
+    assert "A was validated on a, which not every result was" in found["notes"][0]
+    assert "B was validated on b, which" in found["notes"][1]
     write_comparison(places, tmp_path / "c.html")
     html = (tmp_path / "c.html").read_text(encoding="utf-8")
     for label, name in zip("ABC", ("monday/out", "tuesday/out", "wls"), strict=True):

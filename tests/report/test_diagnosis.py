@@ -11,7 +11,7 @@ from robotid.fitting.information import information
 from robotid.identification.pictures import residual_charts
 from robotid.pages.charts import Chart, Series
 from robotid.report.diagnosis import _choice, _correlations, _residual_figures, information_section
-from robotid.report.errors import _remarks
+from robotid.report.errors import _notes
 from robotid.report.torques import _beside
 
 
@@ -57,10 +57,12 @@ def test_a_correlation_that_turns_negative_has_not_fallen(identified, monkeypatc
 
 def test_what_was_tried_of_a_joint_stands_with_error_chance_and_shape():
     tried = [
-        SimpleNamespace(families=(), held_out_error_pct=4.5678, chance=None, is_taken=False),
-        SimpleNamespace(families=("tanh",), held_out_error_pct=3.4, chance=2e-4, is_taken=False),
+        SimpleNamespace(families=(), held_out_error_pct=4.5678, p_value=None, is_selected=False),
         SimpleNamespace(
-            families=("tanh", "load"), held_out_error_pct=2.25, chance=0.031, is_taken=True
+            families=("tanh",), held_out_error_pct=3.4, p_value=2e-4, is_selected=False
+        ),
+        SimpleNamespace(
+            families=("tanh", "load"), held_out_error_pct=2.25, p_value=0.031, is_selected=True
         ),
     ]
     shapes = [
@@ -74,7 +76,7 @@ def test_what_was_tried_of_a_joint_stands_with_error_chance_and_shape():
     ((caption, table),) = tables(html).items()
     assert caption == said
     assert f"<summary>{said}</summary>" in html
-    assert table.headers == ["terms", "held-out error %", "chance", ""]
+    assert table.headers == ["terms", "held-out error %", "p_value", ""]
     assert table.rows == [
         ["viscous and Coulomb", "4.57", "", ""], ["tanh", "3.40", "2.0e−04", ""],
         ["tanh + load", "2.25", "3.1e−02", "taken"],
@@ -103,11 +105,11 @@ def test_all_strong_correlations_are_counted_and_the_strongest_listed():
 
 
 def test_what_a_verdict_is_read_beside_is_in_percent_and_times():
-    witness = SimpleNamespace(
+    scale_check = SimpleNamespace(
         friction={"one": 0.256, "two": 0.044}, masses=(10.126, 12.374, 0.1),
         gravity={"one": 1.049, "two": 0.951},
     )  # fmt: skip
-    assert _beside(SimpleNamespace(witness=witness)) == (
+    assert _beside(SimpleNamespace(scale_check=scale_check)) == (
         "Total mass 10.13 -> 12.37 kg. Gravity torque over the URDF's: one 1.05, two 0.95. "
         "Friction as a share of the torque: one 26 %, two 4 %."
     )
@@ -124,4 +126,4 @@ def test_what_a_verdict_is_read_beside_is_in_percent_and_times():
 def test_a_joint_is_remarked_where_a_simpler_prediction_is_better(error, urdf, better, wanted):
     own = {"better_than_constant": better, "relative_error_pct": error}
     own["urdf_relative_error_pct"] = urdf
-    assert _remarks(own) == wanted
+    assert _notes(own) == wanted

@@ -193,7 +193,7 @@ def test_samples_and_rows_are_those_of_the_fitted_logs_together(report, identifi
     assert f"{sum(counts)} of {every} determined by motion, in part or whole" in said
     before, after = (pi[:60:10].sum() for pi in (identified.prior, identified.standard))
     assert f"Total mass {before:.2f} -> {after:.2f} kg. Gravity torque over the URDF's: " in said
-    shares = [f"{x} {100 * share:.0f} %" for x, share in identified.witness.friction.items()]
+    shares = [f"{x} {100 * share:.0f} %" for x, share in identified.scale_check.friction.items()]
     assert len(shares) > 1
     assert f"Friction as a share of the torque: {', '.join(shares[:-1])}" in said
     assert f"{shares[-1]}. " in said

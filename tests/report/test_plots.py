@@ -14,7 +14,7 @@ from helpers.pages import chart, percent
 
 from robotid.diagnosis.residuals import autocorrelation, spectrum
 from robotid.fitting.information import information
-from robotid.identification.pictures import REACH, torque_charts
+from robotid.identification.pictures import QUANTILE, torque_charts
 from robotid.report import torques as torques_module
 from robotid.report.torques import torques_section
 from robotid.robot.parameters import INERTIAL_TERMS
@@ -211,7 +211,7 @@ def test_the_shares_of_the_data_are_said_in_the_mean_and_of_the_weakest(identifi
 
 
 def test_captions_say_error_and_how_much_the_band_holds(identified, report):
-    """Of each joint in the recording that was kept apart, by hand."""
+    """Of each joint in the validation recording, by hand."""
     (kept,) = identified.validation
     motion, band = kept.recording.trajectory, identified.band(kept)
     residual = np.abs(motion.tau - kept.torques["estimate"])[band.samples]
@@ -248,7 +248,7 @@ def test_each_recording_has_its_own_band_error_and_share_of_the_points(identifie
         evaluation, name = fitted[k], joints[j]
         band, motion = identified.band(evaluation), evaluation.recording.trajectory
         used = evaluation.recording.mask[:, j].astype(bool)
-        half = REACH * np.interp(np.arange(len(motion.t)), band.samples, band.total[:, j])
+        half = QUANTILE * np.interp(np.arange(len(motion.t)), band.samples, band.total[:, j])
         (series,) = [series for series in upper.series if series.half is not None]
         np.testing.assert_allclose(series.half[np.isfinite(series.half)], half)
         residual = motion.tau[used, j] - evaluation.torques["estimate"][used, j]

@@ -236,14 +236,19 @@ def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content
 
 
 def test_proportional_commands_leave_no_claim_that_all_is_determined():
-    alike = {"code": "commands_alike", "severity": "warning", "where": "log: all", "message": "x"}
+    alike = {
+        "code": "proportional_commands",
+        "severity": "warning",
+        "where": "log: all",
+        "message": "x",
+    }
     content = {"structure": {"undetermined": []}, "warnings": []}
     content["simulation"] = {"controller": {"kind": "torque"}}
     claim = "The logs determine all that was to be found"
     assert claim in _undetermined(content)
     text = _undetermined({**content, "warnings": [alike]})
     assert claim not in text
-    assert "some commands are proportional (commands_alike: log: all)" in text
+    assert "some commands are proportional (proportional_commands: log: all)" in text
 
 
 def test_findings_and_commands_are_shown(page):

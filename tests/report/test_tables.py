@@ -244,7 +244,7 @@ def test_the_notes_on_consistency_state_every_figure_with_its_unit(identified):
     assert said == (
         ", armatures included, is positive definite at 97.3 % of 321 random poses (smallest "
         "eigenvalue -0.0123). The distance from the URDF's values is measured by the divergence of "
-        "the pseudo-inertias (entropic); its weight is 0.0234, chosen by predicting stretches of "
+        "the pseudo-inertias (entropic); its weight is 0.0234, chosen by predicting segments of "
         "the fitted logs from the others. Constraints that bind: a, b. Extents that the data "
         "contradict: c. Kept at the URDF's values: d, e. Second opinion of SCS: solved; torques "
         "differ by 0.12 %. Gap of log-Cholesky to the cone programme, per start: 1.0e-09, 2.5e-08."
@@ -291,7 +291,7 @@ def test_what_is_open_is_named(report, shown, identified):
     title = "Standard parameters that remain as the URDF has them, or nearly"
     assert said.endswith(f"{title} {', '.join(kept)}")
     for row in shown["What any motion can show of each body"].rows:
-        kinds = identified.mapping.in_words([f"{row[0]}.{term}" for term in INERTIAL_TERMS])
+        kinds = identified.mapping.described([f"{row[0]}.{term}" for term in INERTIAL_TERMS])
         names = [[n.rsplit(".", 1)[1] for n in kinds[k]] for k in ("alone", "in sums", "never")]
         assert row[1:] == [", ".join(part) or "–" for part in names]
 

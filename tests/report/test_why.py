@@ -137,10 +137,10 @@ def test_charts_over_time_share_the_cursor_of_the_torques(report):
 
 def test_captions_say_what_a_quantity_explains_and_power_what_is_done(torques):
     torque = replace(torques["elbow_joint"])
-    dependence = replace(torque.follows[2], share=0.413, chance=1e-5)
+    dependence = replace(torque.follows[2], share=0.413, p_value=1e-5)
     for change, said in (
         ({}, "<strong>explains 41.3 % of its variance</strong>"),
-        ({"chance": 0.01}, "explains 41.3 %, perhaps by chance"),
+        ({"p_value": 0.01}, "explains 41.3 %, perhaps by chance"),
         ({"share": 0.05}, "explains nothing"),
         ({"share": None}, "too little was recorded to tell"),
     ):

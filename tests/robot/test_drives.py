@@ -86,7 +86,7 @@ def model(term):
         path, joints=JOINTS, terms=(term.name,) if is_common else (), couplings=couplings,
         own_terms={} if is_common else {drive: (term,) for drive in drives},
     )  # fmt: skip
-    return model.with_reference(truth(model)) if term.remembers else model
+    return model.with_reference(truth(model)) if term.has_state else model
 
 
 def states(rng, samples=70):
@@ -138,7 +138,7 @@ def test_the_column_of_each_term_is_what_its_equation_says(model, term, rng):
     Y = joint_torque_regressor(model, x.q, x.v, x.a).reshape(70, 3, -1)[:, :, drive_part(model)]
     ratios = R[: len(model.layout.drives)]
     load = np.zeros((70, 3))
-    if term.remembers:
+    if term.has_state:
         bodies = model.with_terms({})
         Y_I = joint_torque_regressor(bodies, x.q, x.v, x.a)[:, : model.layout.n_inertial]
         load = (Y_I @ model.reference[: model.layout.n_inertial]).reshape(70, 3)
@@ -303,7 +303,7 @@ def test_a_guarded_term_stays_as_it_was_at_the_end_of_what_was_seen():
 
 
 def reversing(rng, samples=4000):
-    """Return a joint that goes to and fro, with the stretch begun anew half way."""
+    """Return a joint that goes to and fro, with the segment begun anew half way."""
     t = np.arange(samples) / 500
     q = 0.4 * np.sin(2 * t) + 0.1 * np.sin(7.3 * t + 0.4)
     v = 0.8 * np.cos(2 * t) + 0.73 * np.cos(7.3 * t + 0.4)

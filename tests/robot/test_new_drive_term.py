@@ -17,7 +17,7 @@ from robotid.robot.drive_term import Family, MemorylessTerm, Shape
 from robotid.robot.drives import FAMILIES, TERM_CLASSES
 from robotid.robot.families import term_from_dict
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot, cut_windows, open_loops
+from robotid.simulation.loops import ClosedLoopRobot, cut_windows, open_loops
 from robotid.simulation.plant import RobotPlant, rk4
 
 JOINT = "joint_1"
@@ -100,7 +100,7 @@ def test_a_new_term_is_rolled_out_with_its_sensitivity(bend):
         x = np.where(pi == SIZE, size, pi)
         loops = open_loops(bend.true, x)
         place = loops.place(0, bend.term)
-        robot = LoopedRobot(bend.true, step=1e-3)
+        robot = ClosedLoopRobot(bend.true, step=1e-3)
         kind = robot.kinds["term"]
         (out,) = robot.roll_out(loops, cut_windows(log, np.inf, 0.0), [(kind, 0, place)])
         return out.q, out.slopes[0][2][:, :, 0]

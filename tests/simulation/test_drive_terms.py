@@ -28,7 +28,7 @@ from robotid.robot.drives import (
     Tanh,
 )
 from robotid.robot.model import RobotModel
-from robotid.simulation.law_lanes import coded_term, slid, taken_up, term, turned
+from robotid.simulation.law_lanes import coded_term, deflection, slid, term, turned
 from robotid.simulation.plant import RobotPlant
 
 OWN = (
@@ -120,11 +120,11 @@ def test_what_bristles_take_up_is_one_in_regressor_plant_and_roll_out(own, v):
     np.testing.assert_allclose(plant.friction_torque(friction, speeds, 0 * q), long, atol=1e-12)
     rate, end = plant.taking_up(speeds)
     x, z, span = np.array(x), 0.3, 0.01
-    after, by_speed, by_before = taken_up(x, z, v, span)
+    after, by_speed, by_before = deflection(x, z, v, span)
     assert after == pytest.approx(end[0] + (z - end[0]) * np.exp(-rate[0] * span), rel=1e-12)
-    faster, slower = (taken_up(x, z, w, span)[0] for w in (v + H, v - H))
+    faster, slower = (deflection(x, z, w, span)[0] for w in (v + H, v - H))
     assert by_speed == pytest.approx((faster - slower) / (2 * H), rel=1e-6)
-    more, less = (taken_up(x, y, v, span)[0] for y in (z + H, z - H))
+    more, less = (deflection(x, y, v, span)[0] for y in (z + H, z - H))
     assert by_before == pytest.approx((more - less) / (2 * H), rel=1e-6)
     (_, by_v), h = slid(x, v, 0.1), 1e-7
     slope = (slid(x, v + h, 0.1)[0] - slid(x, v - h, 0.1)[0]) / (2 * h)

@@ -36,7 +36,7 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 from robotid.simulation.course_lanes import divide_rows
-from robotid.simulation.loops import LoopedRobot, Loops, Window, cut_windows
+from robotid.simulation.loops import ClosedLoopRobot, Loops, Window, cut_windows
 
 RATE = 500.0  # [Hz]
 LEGS = (*LEG, *(name.replace("FL", "FR") for name in LEG))
@@ -101,7 +101,7 @@ def commanded(model, duration=0.4, reach=0.3, seed=0, t=None):
 
 
 def rolled(model, loops, log, step=2e-3):
-    [out] = LoopedRobot(model, step=step).roll_out(loops, cut_windows(log, np.inf, 0.0))
+    [out] = ClosedLoopRobot(model, step=step).roll_out(loops, cut_windows(log, np.inf, 0.0))
     return out
 
 
@@ -163,7 +163,7 @@ def test_steps_that_are_solved_once_more_are_exact_to_second_order(planar):
     window = [Window(log, 0, 0, len(log.t))]
 
     def moved(step, corrects):
-        return LoopedRobot(planar, step=step, corrects=corrects).roll_out(loops, window)[0].q
+        return ClosedLoopRobot(planar, step=step, corrects=corrects).roll_out(loops, window)[0].q
 
     exact = moved(1e-5, True)
     wrong = {c: [np.abs(moved(h, c) - exact).max() for h in (1e-3, 5e-4)] for c in (True, False)}
@@ -216,13 +216,13 @@ def test_friction_is_taken_up_as_its_equation_says(tmp_path, term, rate):
         y = solve_ivp(change, span, y, "Radau", args=(r, seen), **limits).y[:, -1]
     window = Window(log, 0, 0, 200, given=np.array([[0.0], [-0.3]]))
     errors = [
-        np.abs(LoopedRobot(model, step=step).roll_out(rail, [window])[0].q[:, 0] - exact).max()
+        np.abs(ClosedLoopRobot(model, step=step).roll_out(rail, [window])[0].q[:, 0] - exact).max()
         for step in (1e-3, 2.5e-4)
     ]
     assert errors[1] < 2e-6
     assert errors[1] < errors[0] / 3
     without = replace(rail, terms=((Viscous(), Coulomb()),))
-    [out] = LoopedRobot(model, step=2.5e-4).roll_out(without, [window])
+    [out] = ClosedLoopRobot(model, step=2.5e-4).roll_out(without, [window])
     assert np.abs(out.q[:, 0] - exact).max() > 1e-3
 
 
@@ -243,9 +243,9 @@ def differences(model, loops, log, change, h):
 )
 def test_sensitivities_are_those_of_differences(request, name, rate, terms):
     model = request.getfixturevalue(name)
-    robot, log = LoopedRobot(model), commanded(model, 0.12)
+    robot, log = ClosedLoopRobot(model), commanded(model, 0.12)
     size = 1.0 if name == "legs" else 30.0
-    n, kinds = len(model.joints), LoopedRobot(model).kinds
+    n, kinds = len(model.joints), ClosedLoopRobot(model).kinds
     values = VALUES if terms is TERMS else (0.1, 0.05, 0.1, 0.15, 0.1)
     values = size * np.array([*values[:-1], values[-1] / size])
     loops = loops_of(
@@ -342,13 +342,15 @@ def test_a_held_loop_has_the_closed_form_of_its_ticks(tmp_path, rate, begin):
     log = Log(t, np.zeros((150, 1)), np.zeros((150, 1)), ("j",), q_ref=np.full((150, 1), 0.3))
     window = Window(log, begin, begin, 150, given=np.array([[0.1], [-0.4]]))
     exact = held_slider(t, (0.1, -0.4), 0.3, rate, begin, **(body | {"mass": 2.5}), viscous=0.0)
-    [out] = LoopedRobot(model).roll_out(rail, [window])
+    [out] = ClosedLoopRobot(model).roll_out(rail, [window])
     np.testing.assert_allclose(out.q[:, 0], exact, atol=1e-12)
     assert abs(exact[-1] - 0.3) < 0.07 < abs(exact[10] - 0.3), "it follows"
     damped = held_slider(t, (0.1, -0.4), 0.3, rate, begin, **(body | {"mass": 2.5}), viscous=20.0)
-    [out] = LoopedRobot(model, step=2e-4).roll_out(replace(rail, values=np.array([20.0])), [window])
+    [out] = ClosedLoopRobot(model, step=2e-4).roll_out(
+        replace(rail, values=np.array([20.0])), [window]
+    )
     np.testing.assert_allclose(out.q[:, 0], damped, atol=1e-7)
-    [free] = LoopedRobot(model).roll_out(replace(rail, rate=None), [window])
+    [free] = ClosedLoopRobot(model).roll_out(replace(rail, rate=None), [window])
     assert np.abs(free.q[:, 0] - exact).max() > 3e-4
 
 
@@ -367,7 +369,7 @@ def test_mujoco_moves_a_held_leg_alike():
     found = {}
     for limit, ticks in ((2.0, rate), (2.0, None), (np.inf, rate)):
         own = replace(loops, limit=np.full(3, limit), rate=ticks)
-        [out] = LoopedRobot(leg.model, step=2.5e-4).roll_out(own, [window])
+        [out] = ClosedLoopRobot(leg.model, step=2.5e-4).roll_out(own, [window])
         found[limit, ticks] = np.abs(out.q - q).max()
     assert found.pop((2.0, rate)) < 2e-5
     assert min(found.values()) > 5e-3, "hold and limit act"
@@ -467,7 +469,7 @@ def test_a_window_begins_with_the_slope_of_what_was_measured(planar):
 
 @pytest.mark.parametrize("rate", [None, 330.0])
 def test_sensitivities_by_the_start_are_those_of_differences(legs, rate):
-    robot, n = LoopedRobot(legs), len(legs.joints)
+    robot, n = ClosedLoopRobot(legs), len(legs.joints)
     loops = loops_of(legs, LASTING, (0.1, 0.05, 0.1, 0.15, 0.1), rate=rate)
     [window] = cut_windows(commanded(legs, 0.2), np.inf, 0.0)
     columns = [(robot.kinds[what], j, 0) for what in ("start", "speed") for j in range(n)]
@@ -491,7 +493,7 @@ def test_sensitivities_by_the_start_are_those_of_differences(legs, rate):
 
 def test_lanes_know_nothing_of_each_other(legs):
     log = commanded(legs, 0.5)
-    robot, windows = LoopedRobot(legs), cut_windows(log, 0.042, 0.01)
+    robot, windows = ClosedLoopRobot(legs), cut_windows(log, 0.042, 0.01)
     assert len(windows) > 8, "more than a block of lanes"
     column = [(robot.kinds["kp"], 4, 0)]
     together = robot.roll_out(loops_of(legs), windows, column)
@@ -513,8 +515,8 @@ def test_lanes_know_nothing_of_each_other(legs):
 )
 def test_robots_that_cannot_be_rolled_out_are_named(options):
     model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), **options)
-    with pytest.raises(SettingsError, match=r"a floating base.*cannot be rolled out; fix the base"):
-        LoopedRobot(model)
+    with pytest.raises(SettingsError, match=r"a floating base.*cannot be simulated; fix the base"):
+        ClosedLoopRobot(model)
 
 
 def test_a_late_torque_has_no_place_and_is_told_why(planar):
@@ -544,7 +546,7 @@ def test_ticks_between_rows_take_the_commands_of_their_own_half_row(planar):
     """Two ticks a row, a quarter of a row late: beside a log that has a row for each tick."""
     log = commanded(planar, 0.2)
     loops = loops_of(planar, kp=60.0, rate=2 * RATE, delay=np.full(2, 0.25 / RATE))
-    [late] = LoopedRobot(planar, step=1e-3).roll_out(loops, cut_windows(log, np.inf, 0.0))
+    [late] = ClosedLoopRobot(planar, step=1e-3).roll_out(loops, cut_windows(log, np.inf, 0.0))
     N = len(log.t)
 
     def told(x):  # of a tick at a row, the half row about it; of one between rows, the last row
@@ -554,7 +556,7 @@ def test_ticks_between_rows_take_the_commands_of_their_own_half_row(planar):
     names = {name: told(getattr(log, name)) for name in ("q_ref", "v_ref", "tau_ref")}
     q = np.tile(log.q[:1], (2 * N - 1, 1))
     fine = Log(np.arange(2 * N - 1) / (2 * RATE), q, 0 * q, log.joints, has_torque=False, **names)
-    [same] = LoopedRobot(planar, step=1e-3).roll_out(
+    [same] = ClosedLoopRobot(planar, step=1e-3).roll_out(
         replace(loops, delay=np.zeros(2)), cut_windows(fine, np.inf, 0.0)
     )
     np.testing.assert_allclose(late.q, same.q[::2], atol=1e-12)

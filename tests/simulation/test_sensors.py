@@ -57,9 +57,7 @@ def test_what_is_late_shows_what_was(run):
     np.testing.assert_allclose(log.tau[5:], run.tau[:-5], atol=1e-9)
     np.testing.assert_allclose(log.v[2:], run.v[:-2], atol=1e-9)
     np.testing.assert_array_equal(log.q, run.q)
-    drive = measure(
-        run, Sensors(), JOINTS, np.random.default_rng(0), lateness=np.array([0.0, 0.02])
-    )
+    drive = measure(run, Sensors(), JOINTS, np.random.default_rng(0), delay=np.array([0.0, 0.02]))
     np.testing.assert_allclose(drive.tau[10:, 1], run.tau[:-10, 1], atol=1e-9)
     np.testing.assert_array_equal(drive.tau[:, 0], run.tau[:, 0])
 

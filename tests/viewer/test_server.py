@@ -139,7 +139,7 @@ def test_a_tracker_tells_motion_torque_parameters_and_changes(panda, words, tmp_
     delay = [m["t"] - m["at"] for m in ready]
     assert np.median(delay) == pytest.approx(content["delay"], abs=0.01)
     assert len(ready[-1]["theta"]) == len(content["base_parameters"])
-    # what is predicted is what was measured, but for noise; nothing is where a joint stands still
+    # what is predicted is what was measured, but for noise; nothing is where a joint is at rest
     late = [m for m in ready if 5.0 < m["t"] - log.t[0] < 9.5]
     tau, predicted = (np.array([m[key] for m in late], dtype=float) for key in ("tau", "predicted"))
     known = np.isfinite(predicted)

@@ -295,10 +295,10 @@ def least_squares(
         x = x + reach * y
     if _SOLVED not in statuses:
         raise _failure(name, statuses[0], cone)
-    return ConeSolution(x, iterations, f"{name}: {_in_words(statuses)}")
+    return ConeSolution(x, iterations, f"{name}: {_described(statuses)}")
 
 
-def _in_words(statuses: Sequence[str]) -> str:
+def _described(statuses: Sequence[str]) -> str:
     """Return how a solution and its refinements ended, the last of which may be less exact."""
     first = _SOLVED if statuses[0] == _SOLVED else f"first {statuses[0]}"
     count = len(statuses) - 1

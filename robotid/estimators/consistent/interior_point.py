@@ -37,7 +37,7 @@ _EYE = np.arange(_SIZE)
 _BASIS = pseudo_inertia_basis().reshape(_ENTRIES, _SIZE * _SIZE)  # J = sum_k pi_k B_k
 _TO_PARAMETERS = np.linalg.inv(svec(pseudo_inertia_basis()))  # pi = svec(J) @ .
 _UNITS = unsvec(np.eye(_ENTRIES).reshape(-1))  # (10, 4, 4), whose svec are unit vectors
-_MOST = 100  # steps; 8 to 20 are usual
+_MOST = 100  # steps; 8 to 20 are typical
 _BACK = 0.995  # share of the way to the boundary that a step goes at most
 _FIRST = 1e-2  # t at the start, over what the prior's torque misses by, per eigenvalue
 _WARM = 0.1  # mu at a start near the minimum, over the weight

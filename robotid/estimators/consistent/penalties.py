@@ -43,7 +43,7 @@ class WeightChoice:
     Attributes:
         weight: The weight [-].
         how: "cv" or "evidence".
-        curve: Pairs of weight and score, ascending: prediction error of held-out stretches over
+        curve: Pairs of weight and score, ascending: prediction error of held-out segments over
             the noise level ("cv"), or minus the log evidence; smaller is better.
         plausible: The weight with the largest log evidence [-].
     """

@@ -45,18 +45,18 @@ class Segments:
 
     @classmethod
     def of(
-        cls, fit: Consistent, stretches: Sequence[Factors], sigma: Array | None = None
+        cls, fit: Consistent, segments: Sequence[Factors], sigma: Array | None = None
     ) -> "Segments":
         """Return segments with the noise level that a fit to all of them shows.
 
         Args:
             fit: The fit, whose constraints do not matter.
-            stretches: Factors of contiguous stretches of the fitted data.
+            segments: Factors of contiguous segments of the fitted data.
             sigma: The noise level, if it is known.
         """
-        whole = merge(stretches)
+        whole = merge(segments)
         level = fit.noise(whole) if sigma is None else sigma
-        return cls(tuple(stretches), level, fit.rows(whole, level), fit.independent_share)
+        return cls(tuple(segments), level, fit.rows(whole, level), fit.independent_share)
 
     @cached_property
     def others(self) -> Array:
@@ -175,7 +175,7 @@ def held_out_errors(
     """
     if len(segments.kept) < 2:
         raise DataError(
-            f"the prior's weight cannot be chosen from {len(segments.kept)} stretch; fit longer "
+            f"the prior's weight cannot be chosen from {len(segments.kept)} segment; fit longer "
             "logs, or use prior_weight = 'evidence'"
         )
     fits = fit.programme.minimise_each(segments.others, weight, is_exact=False, starts=starts)

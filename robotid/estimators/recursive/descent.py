@@ -121,7 +121,7 @@ class Descent(RecursiveEstimator[DescentState]):
         steps = state.steps + 1
         if np.vdot(Psi, Psi) <= self.eps2:
             return replace(state, steps=steps, skipped=state.skipped + 1)
-        # all rows at once is the usual case, and a slice is cheap
+        # all rows at once is the typical case, and a slice is cheap
         used = slice(None) if len(rows) == len(sigma) else np.flatnonzero(sample.weight)
         x = self._moved(state.x, Psi, Psi @ state.x - tau, used, sample)
         newest = _AVERAGE / (steps + _AVERAGE - 1)

@@ -36,7 +36,7 @@ class Filter(RecursiveEstimator[StateT]):
 
     @abstractmethod
     def _rows_of(self, state: StateT) -> int:
-        """Return the number of rows that a state rests on."""
+        """Return the number of rows that a state depends on."""
 
     def fit(self, data: Problem) -> Estimate:
         require_samples(data)

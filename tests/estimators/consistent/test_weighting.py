@@ -23,7 +23,7 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.factors import compress, compress_stretches, gather, merge
+from robotid.regressor.factors import compress, compress_segments, gather, merge
 from robotid.regressor.torque import build_problem
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -37,7 +37,7 @@ def case(ur5, rng):
 
 
 def cut(problem, count):
-    return compress_stretches(problem, -(-problem.sources[0].samples // count))
+    return compress_segments(problem, -(-problem.sources[0].samples // count))
 
 
 def test_neighbours_are_gathered_in_order(case):
@@ -86,17 +86,17 @@ def test_the_evidence_finds_the_spread_that_parameters_were_drawn_with(case):
 
 def test_the_held_out_errors_are_those_of_a_loop_by_hand(case):
     fit, problem = case
-    stretches = cut(problem, 3)
+    segments = cut(problem, 3)
     total, count = np.zeros(6), 0
     for k in range(3):
-        others = [s for i, s in enumerate(stretches) if i != k]
+        others = [s for i, s in enumerate(segments) if i != k]
         rows = fit.rows(merge(others), NOISE)
         pi = fit.programme.minimise(rows, 2.0).x
         W, tau, _ = (np.concatenate(x) for x in zip(*problem.blocks(), strict=True))
         part = slice(200 * 6 * k, 200 * 6 * (k + 1))
         residual = (tau - W @ (fit.K @ pi))[part].reshape(-1, 6) / NOISE
         total, count = total + (residual**2).sum(axis=0), count + len(residual)
-    squares, _ = held_out_errors(fit, Segments.of(fit, stretches, NOISE), 2.0)
+    squares, _ = held_out_errors(fit, Segments.of(fit, segments, NOISE), 2.0)
     error = np.sqrt(squares.sum(axis=0))
     # it is computed to the solver's tolerance only
     np.testing.assert_allclose(error, np.sqrt(total / count), rtol=2e-4)
@@ -174,12 +174,12 @@ def test_a_joint_at_rest_is_left_out_of_the_choice(case, monkeypatch):
 
 def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
     fit, problem = case
-    stretches = cut(problem, 4)
+    segments = cut(problem, 4)
     true = fit.fit(compress(problem)).theta
     wrong = true + 30.0 * fit.prior_std
     for how in ("cv", "evidence"):
         good, bad = (
-            choose_weight(fit, Segments.of(fit, stretches), how).weight
+            choose_weight(fit, Segments.of(fit, segments), how).weight
             for fit in (replace(fit, prior=true), replace(fit, prior=wrong))
         )
         assert good == 100.0
@@ -188,10 +188,10 @@ def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
 
 def test_the_information_of_all_segments_but_one_counts_the_share_that_is_independent(case):
     fit, problem = case
-    fit, stretches = replace(fit, independent_share=0.25), cut(problem, 3)
-    segments = Segments.of(fit, stretches, NOISE)
+    fit, segments = replace(fit, independent_share=0.25), cut(problem, 3)
+    segments = Segments.of(fit, segments, NOISE)
     for k, rows in enumerate(segments.others):
-        others = fit.rows(merge([s for i, s in enumerate(stretches) if i != k]), NOISE)
+        others = fit.rows(merge([s for i, s in enumerate(segments) if i != k]), NOISE)
         np.testing.assert_allclose(rows.T @ rows, others.T @ others, rtol=1e-9, atol=1e-6)
 
 
@@ -214,7 +214,7 @@ def test_the_noise_level_is_that_of_the_whole_regressor(case):
 
 def test_one_stretch_is_too_few(case):
     fit, problem = case
-    with pytest.raises(DataError, match="cannot be chosen from 1 stretch"):
+    with pytest.raises(DataError, match="cannot be chosen from 1 segment"):
         choose_weight(fit, Segments.of(fit, [compress(problem)]), "cv")
 
 
@@ -275,12 +275,12 @@ def test_the_noise_level_of_few_rows_is_right_on_average(ur5, rng):
 
 
 def test_a_sum_of_errors_is_as_good_within_two_standard_errors_of_pairs(rng):
-    best, chance = rng.uniform(1.0, 9.0, 16), rng.standard_normal(16)
-    chance *= 0.3 / chance.std(ddof=1)
-    chance -= chance.mean()
+    best, p_value = rng.uniform(1.0, 9.0, 16), rng.standard_normal(16)
+    p_value *= 0.3 / p_value.std(ddof=1)
+    p_value -= p_value.mean()
     for times, is_as_good in ((-5.0, True), (1.95, True), (2.05, False)):
         # a sum of 16 differences scatters by 4 times what each does
-        parts = best + chance + times * 4.0 * 0.3 / 16
+        parts = best + p_value + times * 4.0 * 0.3 / 16
         assert _is_as_good(parts, best) is is_as_good
     assert not _is_as_good(best[:0], best[:0])
 
@@ -308,15 +308,15 @@ class Boxed:
 
 
 @pytest.mark.parametrize(
-    ("ratio", "chance", "named"),
+    ("ratio", "p_value", "named"),
     [(1.015, 0.0, ()), (1.025, 0.0, ("a", "c")), (1.025, 0.2, ()), (0.9, 0.0, ())],
 )
 def test_an_extent_is_contradicted_by_four_errors_two_percent_and_two_errors_of_pairs(
-    monkeypatch, ratio, chance, named
+    monkeypatch, ratio, p_value, named
 ):
     constraints = SimpleNamespace(extent=("a", "b", "c"), without_extent=lambda _: "free")
     fit = Boxed(constraints, np.array([-8.1, -7.9, -2.1]))  # four times 2, 2 and 0.5
-    swing = chance * np.tile([1.0, -1.0], 4)
+    swing = p_value * np.tile([1.0, -1.0], 4)
 
     def held_out(fit, segments, weight, starts=None):
         left = np.ones((8, 1)) if fit.constraints == "free" else ratio + swing[:, None]

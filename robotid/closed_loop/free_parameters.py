@@ -16,9 +16,9 @@ from robotid.regressor.prediction import predict
 from robotid.robot.drives import DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
-from robotid.simulation.loops import Column, LoopedRobot, Loops, RollOut, Window
+from robotid.simulation.loops import ClosedLoopRobot, Column, Loops, RollOut, Window
 
-__all__ = ["LoopSimulator", "TorqueRows", "Unknown", "body_unknowns", "with_terms"]
+__all__ = ["FreeParameter", "LoopSimulator", "TorqueRows", "free_body_parameters", "with_terms"]
 
 _STARTS = 2  # steps towards better starts of windows ...
 _SHARES = (1.0, 0.3, 0.1)  # ... of which these are tried
@@ -29,7 +29,7 @@ _ENTRIES = ((3, 3), (0, 3), (1, 3), (2, 3))
 
 
 @dataclass(frozen=True, eq=False)
-class Unknown:
+class FreeParameter:
     """One number that is to be found, of one joint or of several that share it.
 
     Attributes:
@@ -54,7 +54,7 @@ class Unknown:
     coordinate: int = 0
 
 
-def body_unknowns(robot: LoopedRobot, spread: float) -> list[Unknown]:
+def free_body_parameters(robot: ClosedLoopRobot, spread: float) -> list[FreeParameter]:
     """Return how bodies may differ from the URDF's, four coordinates each, 0 before any data.
 
     J' = U T T' U' with U U' the URDF's pseudo-inertia and T the unit matrix but for its last
@@ -78,7 +78,7 @@ def body_unknowns(robot: LoopedRobot, spread: float) -> list[Unknown]:
             continue  # a massless frame, or a body that the URDF makes impossible: it stays
         name = model.layout.bodies[body]
         found += [
-            Unknown(f"{name}.{what}", "body", (joint,), 0.0, spread, coordinate=k)
+            FreeParameter(f"{name}.{what}", "body", (joint,), 0.0, spread, coordinate=k)
             for k, what in enumerate(("mass", "cx", "cy", "cz"))
         ]
     return found
@@ -107,7 +107,7 @@ class LoopSimulator:
         robot: The robot.
         windows: Windows of its logs.
         base: All that is known; unknowns stand over it.
-        unknowns: What is to be found.
+        free_parameters: What is to be found.
         torque: Rows of measured torques along what was measured, if they weigh.
         velocities: Whether measured velocities are compared beside the positions.
         error: What is compared: "output", positions, and torques of the drives if they are to be;
@@ -119,31 +119,31 @@ class LoopSimulator:
             ``robot``. None: its own are.
     """
 
-    robot: LoopedRobot
+    robot: ClosedLoopRobot
     windows: tuple[Window, ...]
     base: Loops
-    unknowns: tuple[Unknown, ...]
+    free_parameters: tuple[FreeParameter, ...]
     torque: "TorqueRows | None" = None
     velocities: bool = False
     error: str = "output"
     behind: Array | None = None
-    fine: LoopedRobot | None = None
+    fine: ClosedLoopRobot | None = None
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        return tuple(unknown.name for unknown in self.unknowns)
+        return tuple(unknown.name for unknown in self.free_parameters)
 
     @cached_property
     def prior(self) -> Array:
-        return np.array([unknown.prior for unknown in self.unknowns])
+        return np.array([unknown.prior for unknown in self.free_parameters])
 
     @cached_property
     def prior_std(self) -> Array:
-        return np.array([unknown.spread for unknown in self.unknowns])
+        return np.array([unknown.spread for unknown in self.free_parameters])
 
     @cached_property
     def lowest(self) -> Array:
-        return np.array([unknown.lowest for unknown in self.unknowns])
+        return np.array([unknown.lowest for unknown in self.free_parameters])
 
     def loops(self, theta: Array) -> Loops:
         """Return bodies, drives and loops with the unknowns at some values.
@@ -156,7 +156,7 @@ class LoopSimulator:
             name: getattr(base, name).copy()
             for name in ("armature", "kp", "kd", "limit", "delay", "zero", "values")
         }
-        for unknown, value in zip(self.unknowns, theta, strict=True):
+        for unknown, value in zip(self.free_parameters, theta, strict=True):
             if unknown.term is not None:
                 places = [base.place(j, unknown.term) for j in unknown.joints]
                 changed["values"][places] = value
@@ -176,7 +176,7 @@ class LoopSimulator:
         """
         return self.robot.roll_out(self.loops(theta), self.windows if windows is None else windows)
 
-    def begun_better(self, theta: Array) -> "LoopSimulator":
+    def with_better_start(self, theta: Array) -> "LoopSimulator":
         """Return the same with windows whose starts fit best: measured ones have noise.
 
         Friction may hold for long what is wrong at the start, so that a lead is not enough.
@@ -195,15 +195,15 @@ class LoopSimulator:
             sigma = np.maximum(np.sqrt(np.mean(errors**2, axis=0)), 1e-12)
             best = [float(np.sum((_error(out) / sigma) ** 2)) for out in outs]
             changes = [_better_start(out, sigma) for out in outs]
-            begun = list(zip(windows, changes, strict=True))
-            tries = [[w.start + share * x for w, x in begun] for share in _SHARES]
+            initialised = list(zip(windows, changes, strict=True))
+            tries = [[w.start + share * x for w, x in initialised] for share in _SHARES]
             tries.append([np.stack([w.around, np.zeros(n)]) for w in windows])  # at rest
             for starts in tries:
                 tried = [replace(w, given=x) for w, x in zip(windows, starts, strict=True)]
                 try:
                     outs = (self.fine or self.robot).roll_out(loops, tried)
                 except NotConvergedError:
-                    continue  # these starts cannot be rolled out; others can
+                    continue  # these starts cannot be simulated; others can
                 for k, out in enumerate(outs):
                     cost = float(np.sum((_error(out) / sigma) ** 2))
                     if cost < best[k]:
@@ -223,7 +223,7 @@ class LoopSimulator:
         pi, slopes = self.standard(self.torque.model, theta)
         return R[:, :-1] @ (K @ slopes), R[:, -1] - R[:, :-1] @ (K @ pi)
 
-    def missed_torque(self, theta: Array) -> Array:
+    def torque_mismatch(self, theta: Array) -> Array:
         """Return how much of the torques roll-outs miss, root mean squares, shape (n,) [-].
 
         It is measured by the logged torque or by that of the roll-outs, whichever is larger.
@@ -261,7 +261,7 @@ class LoopSimulator:
         slopes = np.zeros((len(pi), len(theta)))
         changes = iter(self._bodies(theta)[1])
         body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
-        for k, unknown in enumerate(self.unknowns):
+        for k, unknown in enumerate(self.free_parameters):
             if unknown.what == "body":
                 first = 10 * body_of[unknown.joints[0]]
                 slopes[first : first + 10, k] = next(changes)
@@ -356,7 +356,7 @@ class LoopSimulator:
         self, out: RollOut, error: Array, loops: Loops, columns: list[tuple[int, Column]]
     ) -> Iterator[Residual]:
         """Yield the errors of a roll-out's parts, with all that they change with."""
-        n, unknowns = len(loops.kp), len(self.unknowns)
+        n, free_parameters = len(loops.kp), len(self.free_parameters)
         torques = None if self.behind is None else drive_torques(out, loops, self.behind)
         for joints, places, slopes in out.slopes:
             k = len(joints)
@@ -368,7 +368,7 @@ class LoopSimulator:
                 parts.append(torques.slopes(joints, by, slopes, self.robot.kinds))
             slopes = np.concatenate(parts, axis=1)
             outputs = np.concatenate([joints + n * i for i in range(len(parts))])
-            own = places[places < unknowns]  # and behind them starts
+            own = places[places < free_parameters]  # and behind them starts
             by_start = slopes[:, :, len(own) :]
             yield Residual(error[:, outputs], slopes[:, :, : len(own)], outputs, own, by_start)
 
@@ -398,7 +398,7 @@ class LoopSimulator:
     def _columns(self, loops: Loops) -> list[tuple[int, Column]]:
         """Return what to differentiate by, each column with the number of its unknown."""
         kinds, columns, body = self.robot.kinds, [], 0
-        for k, unknown in enumerate(self.unknowns):
+        for k, unknown in enumerate(self.free_parameters):
             for j in unknown.joints:
                 index = 0
                 if unknown.term is not None:
@@ -414,7 +414,7 @@ class LoopSimulator:
         roots = np.zeros((len(self.base.bodies), 4, 4))
         J = pseudo_inertia(self.base.bodies.reshape(-1))
         body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
-        for body in {body_of[u.joints[0]] for u in self.unknowns if u.what == "body"}:
+        for body in {body_of[u.joints[0]] for u in self.free_parameters if u.what == "body"}:
             roots[body] = np.linalg.cholesky(J[body, ::-1, ::-1])[::-1, ::-1]
         return roots
 
@@ -423,17 +423,17 @@ class LoopSimulator:
         bodies, directions = self.base.bodies.copy(), []
         body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
         by_body: dict[int, list[int]] = {}
-        for k, unknown in enumerate(self.unknowns):
+        for k, unknown in enumerate(self.free_parameters):
             if unknown.what == "body":
                 by_body.setdefault(body_of[unknown.joints[0]], []).append(k)
         for body, places in by_body.items():
             U, T = self._roots[body], np.eye(4)
             for k in places:
-                row, column = _ENTRIES[self.unknowns[k].coordinate]
+                row, column = _ENTRIES[self.free_parameters[k].coordinate]
                 T[row, column] = np.exp(theta[k]) if row == column else theta[k]
             bodies[body] = inertial_from_pseudo_inertia(U @ T @ T.T @ U.T)
             for k in places:
-                row, column = _ENTRIES[self.unknowns[k].coordinate]
+                row, column = _ENTRIES[self.free_parameters[k].coordinate]
                 change = np.zeros((4, 4))
                 change[row, column] = T[row, column] if row == column else 1.0
                 half = U @ change @ T.T @ U.T
@@ -469,7 +469,7 @@ def _has(model: RobotModel, joint: str) -> list[object]:
 def _better_start(out: RollOut, sigma: Array) -> Array:
     """Return by how much position and speed at the start are off, to first order, shape (2, n).
 
-    They are near what was measured: within some errors of position, and the usual speed.
+    They are near what was measured: within some errors of position, and the typical speed.
     """
     log = out.window.log
     speed = np.sqrt(np.mean((np.diff(log.q, axis=0) / np.diff(log.t)[:, None]) ** 2, axis=0))

@@ -1,7 +1,7 @@
-"""How much the scores of stretches scatter: errors of least squares on coloured noise.
+"""How much the scores of segments scatter: errors of least squares on coloured noise.
 
-The score of a stretch, W_s^T (tau_s - W_s theta), scatters as the noise makes it, whatever its
-colour, if the stretch is longer than the correlation.
+The score of a segment, W_s^T (tau_s - W_s theta), scatters as the noise makes it, whatever its
+colour, if the segment is longer than the correlation.
 """
 
 from collections.abc import Sequence
@@ -14,22 +14,22 @@ from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.regressor.factors import Factors
 
-__all__ = ["FEWEST_STRETCHES", "Scatter", "at_least", "quantile", "sandwich", "scatter"]
+__all__ = ["FEWEST_SEGMENTS", "Scatter", "at_least", "quantile", "sandwich", "scatter"]
 
-#: Fewer stretches do not show how much their scores scatter.
-FEWEST_STRETCHES = 12
-_OWN = 0.95  # leverage above which a stretch fits a direction alone, and shows no scatter in it
+#: Fewer segments do not show how much their scores scatter.
+FEWEST_SEGMENTS = 12
+_OWN = 0.95  # leverage above which a segment fits a direction alone, and shows no scatter in it
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """How much the scores of s stretches scatter about zero, over c parameters."""
+    """How much the scores of s segments scatter about zero, over c parameters."""
 
-    meat: Array  # (c, c), covariance of the score W^T S^-1 (tau - W theta) of all stretches
+    meat: Array  # (c, c), covariance of the score W^T S^-1 (tau - W theta) of all segments
     bread: Array  # (c, c), covariance of the parameters if rows were independent
     inflation: float  # mean ratio of the scatter to that of independent rows [-]
     factors: (
-        Array  # (s, c, c), factors of the weighted rows of each stretch, along its eigenvectors
+        Array  # (s, c, c), factors of the weighted rows of each segment, along its eigenvectors
     )
     adjusted: Array  # (s, c, c), the same behind the correction for their leverage
 
@@ -50,43 +50,43 @@ class Scatter:
         back = np.einsum("sij,sil->lsj", R, loads, optimize=True)  # R_s^T a_s
         freedom = np.empty(len(bread))
         for k, Z in enumerate(back):
-            # of independent noise: covariances of the stretches' contributions to the parameter
+            # of independent noise: covariances of the segments' contributions to the parameter
             gram = np.diag((loads[:, :, k] ** 2).sum(axis=1)) - Z @ bread @ Z.T
             freedom[k] = np.trace(gram) ** 2 / max(float((gram**2).sum()), 1e-300)
         return np.maximum(freedom, 1.0)
 
 
-def scatter(stretches: Sequence[Factors], theta: Array, sigma: Array, bread: Array) -> Scatter:
-    """Return how much the scores of stretches scatter.
+def scatter(segments: Sequence[Factors], theta: Array, sigma: Array, bread: Array) -> Scatter:
+    """Return how much the scores of segments scatter.
 
-    The residual of a stretch that had a say in the fit is smaller than its noise; it is enlarged
+    The residual of a segment that had a say in the fit is smaller than its noise; it is enlarged
     by (I - leverage)^-1/2, which is exact for independent rows (known as CR2). Directions that one
-    stretch alone determines show nothing; they get the mean scatter of all others.
+    segment alone determines show nothing; they get the mean scatter of all others.
 
     Args:
-        stretches: Factors of contiguous stretches, at least 12, each longer than the correlation of
+        segments: Factors of contiguous segments, at least 12, each longer than the correlation of
             the residuals.
         theta: Estimate, shape (c,).
         sigma: Noise level per joint that weighted the rows, shape (n,) [N m or N].
         bread: Covariance of the parameters if rows were independent, shape (c, c).
 
     Raises:
-        DataError: If there are fewer than 12 stretches.
+        DataError: If there are fewer than 12 segments.
 
     References:
         Bell, McCaffrey (2002), as above; Liang, Zeger (1986), Longitudinal data analysis using
         generalized linear models.
     """
-    if len(stretches) < FEWEST_STRETCHES:
+    if len(segments) < FEWEST_SEGMENTS:
         raise DataError(
-            f"{len(stretches)} stretches do not show how much their scores scatter; wanted at "
-            f"least {FEWEST_STRETCHES}: fit longer logs"
+            f"{len(segments)} segments do not show how much their scores scatter; wanted at "
+            f"least {FEWEST_SEGMENTS}: fit longer logs"
         )
     c = len(theta)
     meat, alone, along_squares, expected = np.zeros((c, c)), np.zeros((c, c)), 0.0, 0.0
-    turned, adjusted = np.empty((2, len(stretches), c, c))
-    for k, stretch in enumerate(stretches):  # those of all together are far larger than a cache
-        weighted = stretch.weighted(sigma)
+    turned, adjusted = np.empty((2, len(segments), c, c))
+    for k, segment in enumerate(segments):  # those of all together are far larger than a cache
+        weighted = segment.weighted(sigma)
         R, u = weighted[:c, :c], weighted[:c, c] - weighted[:c, :c] @ theta
         leverage, V = np.linalg.eigh(R @ bread @ R.T)
         kept = np.clip(1.0 - leverage, 0.0, 1.0)  # share of its own noise that a residual shows

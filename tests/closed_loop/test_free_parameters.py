@@ -7,14 +7,14 @@ from helpers.mujoco_plant import multisine, plant, recorded
 
 from robotid.closed_loop.drive_torques import drive_torques, find_gains, measured_motion
 from robotid.closed_loop.fit import stated_loops
+from robotid.closed_loop.free_parameters import FreeParameter, LoopSimulator, free_body_parameters
 from robotid.closed_loop.settings import LoopSettings
-from robotid.closed_loop.unknowns import LoopSimulator, Unknown, body_unknowns
 from robotid.estimators.output_error import OutputError
 from robotid.export.commanded import loops_of
 from robotid.logs.data import Log
 from robotid.robot.drives import Coulomb, Viscous
 from robotid.robot.parameters import pseudo_inertia
-from robotid.simulation.loops import LoopedRobot, RollOut, Window, cut_windows
+from robotid.simulation.loops import ClosedLoopRobot, RollOut, Window, cut_windows
 
 
 @pytest.fixture(scope="module")
@@ -23,38 +23,40 @@ def simulator():
     rng = np.random.default_rng(0)
     robot = plant("leg", rng)
     log, _ = recorded(robot, rng, duration=0.5, torque=0.1, speed=0.01)
-    looped = LoopedRobot(robot.model)
+    looped = ClosedLoopRobot(robot.model)
     base = replace(
         stated_loops(robot.model, LoopSettings(kp=20.0, kd=1.5)),
         armature=np.full(3, 0.02), terms=((Viscous(), Coulomb()),) * 3,
         values=np.tile([0.1, 0.2], 3), delay=np.full(3, 0.0047),
     )  # fmt: skip
-    unknowns = (
-        Unknown("calf.coulomb", "term", (2,), 0.2, 1.0, 0.0, term=Coulomb()),
-        Unknown("upper.armature", "armature", (0, 1), 0.02, 1.0, 0.0),
-        Unknown("upper.viscous", "term", (0, 1), 0.1, 1.0, 0.0, term=Viscous()),
-        Unknown("delay", "delay", (0, 1, 2), 0.0047, 0.1, 0.0),
-        *body_unknowns(looped, 0.1),
-        Unknown("hip.kp", "kp", (0,), 20.0, 100.0, 1.0),
+    free_parameters = (
+        FreeParameter("calf.coulomb", "term", (2,), 0.2, 1.0, 0.0, term=Coulomb()),
+        FreeParameter("upper.armature", "armature", (0, 1), 0.02, 1.0, 0.0),
+        FreeParameter("upper.viscous", "term", (0, 1), 0.1, 1.0, 0.0, term=Viscous()),
+        FreeParameter("delay", "delay", (0, 1, 2), 0.0047, 0.1, 0.0),
+        *free_body_parameters(looped, 0.1),
+        FreeParameter("hip.kp", "kp", (0,), 20.0, 100.0, 1.0),
     )
-    return LoopSimulator(looped, cut_windows(log, 0.25, 0.0), base, unknowns)
+    return LoopSimulator(looped, cut_windows(log, 0.25, 0.0), base, free_parameters)
 
 
 def limited(simulator):
     """The same with a largest torque, which is unknown as gains and zeros are."""
     limit = np.array([np.inf, 0.3, 0.3])
-    unknowns = (
-        Unknown("lower.limit", "limit", (1, 2), 0.3, 3.0, 0.1),
-        Unknown("lower.kd", "kd", (1, 2), 1.5, 1.0, 0.0),
-        Unknown("calf.zero", "zero", (2,), 0.0, 0.3),
+    free_parameters = (
+        FreeParameter("lower.limit", "limit", (1, 2), 0.3, 3.0, 0.1),
+        FreeParameter("lower.kd", "kd", (1, 2), 1.5, 1.0, 0.0),
+        FreeParameter("calf.zero", "zero", (2,), 0.0, 0.3),
     )
     base = replace(simulator.base, limit=limit)
-    return replace(simulator, base=base, unknowns=simulator.unknowns + unknowns)
+    return replace(
+        simulator, base=base, free_parameters=simulator.free_parameters + free_parameters
+    )
 
 
 def off(simulator, rng):
     """Parameters whose bodies are not the URDF's."""
-    is_body = np.array([u.what == "body" for u in simulator.unknowns])
+    is_body = np.array([u.what == "body" for u in simulator.free_parameters])
     return simulator.prior + np.where(is_body, 0.05 * rng.standard_normal(len(is_body)), 0.0)
 
 
@@ -112,7 +114,7 @@ def test_unknowns_stand_over_what_is_known(simulator):
 
 
 def test_every_value_is_a_body_that_can_be(simulator, rng):
-    is_body = np.array([u.what == "body" for u in simulator.unknowns])
+    is_body = np.array([u.what == "body" for u in simulator.free_parameters])
     for _ in range(20):
         theta = np.where(is_body, rng.standard_normal(len(is_body)), simulator.prior)
         bodies = simulator.loops(theta).bodies
@@ -120,7 +122,7 @@ def test_every_value_is_a_body_that_can_be(simulator, rng):
     theta = simulator.prior.copy()
     k = simulator.names.index(next(n for n in simulator.names if n.endswith(".mass")))
     theta[k] = 0.1  # mass changes by exp(2 m)
-    body = simulator.robot.joint_of_body.index(simulator.unknowns[k].joints[0])
+    body = simulator.robot.joint_of_body.index(simulator.free_parameters[k].joints[0])
     ratio = simulator.loops(theta).bodies[body, 0] / simulator.base.bodies[body, 0]
     assert ratio == pytest.approx(np.exp(0.2), rel=1e-9)
 
@@ -162,7 +164,7 @@ def test_direct_slopes_are_those_of_inverse_dynamics_along_the_roll_out(simulato
         own = one.slopes[:, :, names.index("calf.coulomb")]
         np.testing.assert_array_equal(own, np.sign(out.v) * [0, 0, 1])
         assert not one.slopes[:, :, [names.index("delay"), names.index("hip.kp")]].any()
-        for k, unknown in enumerate(simulator.unknowns):
+        for k, unknown in enumerate(simulator.free_parameters):
             if unknown.what != "body":
                 continue
             ends = []
@@ -194,22 +196,24 @@ def stiff(error, highest=1.5):
     t = np.arange(1000) / 500.0
     q_ref = multisine(t, arm.middle, arm.reach, rng, highest=highest)
     told = Log(t, q_ref, 0 * q_ref, arm.model.joints, q_ref=q_ref, has_torque=False)
-    robot, loops = LoopedRobot(arm.model), truth_of(arm)
+    robot, loops = ClosedLoopRobot(arm.model), truth_of(arm)
     [out] = robot.roll_out(loops, cut_windows(told, np.inf, 0.0))
     tau = drive_torques(out, loops, behind).given
-    log, unknowns = replace(told, q=out.q, tau=tau, has_torque=True), []
+    log, free_parameters = replace(told, q=out.q, tau=tau, has_torque=True), []
     for j in range(2):
         J = loops.armature[j]
-        unknowns.append(Unknown(f"{j}.armature", "armature", (j,), J, 1e6, 0.0))
+        free_parameters.append(FreeParameter(f"{j}.armature", "armature", (j,), J, 1e6, 0.0))
         for term in loops.terms[j]:
             value, name = loops.values[loops.place(j, term)], f"{j}.{term.name}"
-            unknowns.append(Unknown(name, "term", (j,), value, 1e6, term=term))
+            free_parameters.append(FreeParameter(name, "term", (j,), value, 1e6, term=term))
     windows = [
         replace(w, given=np.stack([out.q[w.begin], out.v[w.begin]]))
         for w in cut_windows(log, 0.5, 0.0)
     ]
     told_by = None if error == "output" else behind
-    return LoopSimulator(robot, tuple(windows), loops, tuple(unknowns), error=error, behind=told_by)
+    return LoopSimulator(
+        robot, tuple(windows), loops, tuple(free_parameters), error=error, behind=told_by
+    )
 
 
 @pytest.mark.parametrize("error", ["output", "input", "direct"])
@@ -243,7 +247,7 @@ def with_torques(outs, tau):
 
 def test_the_row_whose_command_a_torque_follows_is_found(told):
     arm, loops, log = told
-    outs = LoopedRobot(arm.model).roll_out(loops, cut_windows(log, np.inf, 0.0))
+    outs = ClosedLoopRobot(arm.model).roll_out(loops, cut_windows(log, np.inf, 0.0))
     known, unknown = np.zeros((2, 2), dtype=bool), np.array([[False, True], [True, False]])
     for is_open in (known, unknown):
         behind, found = find_gains(outs, loops, is_open, knows_delay=True, is_whole=False)
@@ -295,7 +299,7 @@ def test_torques_are_missed_over_all_windows_by_the_larger_of_logged_and_given(s
         given = np.concatenate([drive_torques(out, loops, behind).given for out in outs])
         logged = np.concatenate([w.log.tau[w.counted] for w in windows])
         rms = [np.sqrt(np.mean(x**2, axis=0)) for x in (logged - given, logged, given)]
-        np.testing.assert_allclose(sim.missed_torque(theta), rms[0] / np.maximum(*rms[1:]))
+        np.testing.assert_allclose(sim.torque_mismatch(theta), rms[0] / np.maximum(*rms[1:]))
 
 
 def test_what_drives_give_follows_commands_whole_or_broken_rows_late():

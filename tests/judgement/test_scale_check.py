@@ -10,7 +10,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement.findings import fit_findings
-from robotid.judgement.witness import Witness, call_witness
+from robotid.judgement.scale_check import ScaleCheck, check_scale
 from robotid.logs.settings import SignalSettings
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0, velocity="measured")
@@ -37,37 +37,37 @@ def alike(ur5):
 
 def test_a_robot_like_its_urdf_is_good_and_its_urdf_bears_witness(alike):
     found = alike
-    assert found.witness.factor == pytest.approx(1.0, abs=0.01)
-    for joint, ratio in found.witness.gravity.items():
-        assert ratio == pytest.approx(1.0, abs=5 * found.witness.gravity_error[joint] + 1e-3)
-    assert found.witness.agrees
+    assert found.scale_check.factor == pytest.approx(1.0, abs=0.01)
+    for joint, ratio in found.scale_check.gravity.items():
+        assert ratio == pytest.approx(1.0, abs=5 * found.scale_check.gravity_error[joint] + 1e-3)
+    assert found.scale_check.agrees
     assert found.verdict.status == "good"
     assert "agree within 5 %" in found.verdict.reasons[-1]
 
 
 def test_torques_of_another_gain_are_told_from_other_masses_and_never_good(ur5):
     found = found_of(ur5, near_urdf(ur5, 0.8))
-    assert found.witness.factor == pytest.approx(0.8, abs=0.01)
-    assert found.witness.has_one_factor
+    assert found.scale_check.factor == pytest.approx(0.8, abs=0.01)
+    assert found.scale_check.has_one_factor
     assert found.verdict.status == "usable"
     (reason,) = [r for r in found.verdict.reasons if "could not be checked" in r]
     assert "All joints alike are off by 0.80" in reason
     found = found_of(ur5, near_urdf(ur5, 0.8), total_mass=[10.0, 20.0])
     assert found.verdict.status == "good"
-    assert "rests on the mass that was stated" in found.verdict.reasons[-1]
+    assert "depends on the mass that was stated" in found.verdict.reasons[-1]
 
 
 def test_a_load_in_the_hand_is_no_other_scale(ur5):
     found = found_of(ur5, truth(ur5))  # links 10 to 30 % off, and 1.2 kg in the hand
-    assert found.witness.factor > 1.2
-    assert found.witness.masses[2] == pytest.approx(1.2, abs=0.4)
-    assert not found.witness.has_one_factor
+    assert found.scale_check.factor > 1.2
+    assert found.scale_check.masses[2] == pytest.approx(1.2, abs=0.4)
+    assert not found.scale_check.has_one_factor
     assert found.verdict.status == "good", found.verdict.reasons
     assert "could not be checked" in found.verdict.reasons[-1]
 
 
 def test_a_load_that_is_left_out_is_said_with_its_mass_and_both_figures():
-    loaded = Witness(scale=1.01, factor=1.37, masses=(20.0, 24.9, 4.7), unexplained=(0.2, 0.01))
+    loaded = ScaleCheck(scale=1.01, factor=1.37, masses=(20.0, 24.9, 4.7), unexplained=(0.2, 0.01))
     assert loaded.agrees
     message = loaded.message
     assert "only beside a load of +4.7 kg on the last link" in message
@@ -82,20 +82,24 @@ def test_a_load_that_is_left_out_is_said_with_its_mass_and_both_figures():
 )
 def test_a_load_without_mass_confirms_no_scale(factor, mass, is_against):
     """Only a load with a mass of its own may be left out of gravity and total mass."""
-    witness = Witness(scale=1.01, factor=factor, masses=(20.0, mass, 0.0), unexplained=(0.2, 0.01))
-    assert not witness.agrees
-    assert witness.is_against is is_against
-    assert "could not be checked" in witness.message
-    assert f"gravity torque {factor:.2f} x the URDF's, total mass {mass:.4g} kg" in witness.message
-    assert replace(witness, factor=1.05 - 1e-9, masses=(20.0, 20.8, 0.0)).agrees
-    assert replace(witness, factor=1.05 + 1e-9, masses=(20.0, 20.8, 0.7)).agrees
+    scale_check = ScaleCheck(
+        scale=1.01, factor=factor, masses=(20.0, mass, 0.0), unexplained=(0.2, 0.01)
+    )
+    assert not scale_check.agrees
+    assert scale_check.is_against is is_against
+    assert "could not be checked" in scale_check.message
+    assert (
+        f"gravity torque {factor:.2f} x the URDF's, total mass {mass:.4g} kg" in scale_check.message
+    )
+    assert replace(scale_check, factor=1.05 - 1e-9, masses=(20.0, 20.8, 0.0)).agrees
+    assert replace(scale_check, factor=1.05 + 1e-9, masses=(20.0, 20.8, 0.7)).agrees
 
 
 def test_without_gravity_nothing_bears_witness(ur5):
     model = ur5.from_urdf(ur5.tree.path, gravity=(0.0, 0.0, 0.0))
     found = found_of(model, near_urdf(model))
-    assert found.witness.scale is None
-    assert not found.witness.agrees
+    assert found.scale_check.scale is None
+    assert not found.scale_check.agrees
     assert "gravity loads no joint" in found.verdict.reasons[-1]
 
 
@@ -108,8 +112,8 @@ def test_friction_stands_beside_it_as_a_share_of_the_torque(ur5, alike):
     )
     v, tau = e.recording.trajectory.v[:, 5], e.recording.trajectory.tau[:, 5]
     share = np.linalg.norm(viscous * v + coulomb * np.sign(v)) / np.linalg.norm(tau)
-    assert found.witness.friction["wrist_3_joint"] == pytest.approx(share, rel=1e-9)
-    json.dumps(found.witness.to_dict(), allow_nan=False)
+    assert found.scale_check.friction["wrist_3_joint"] == pytest.approx(share, rel=1e-9)
+    json.dumps(found.scale_check.to_dict(), allow_nan=False)
 
 
 def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is_its_own(
@@ -165,11 +169,11 @@ def test_a_result_that_its_prior_holds_back_bears_no_witness(ur5, rng):
     log = exact_log(ur5, pi, rng, samples=1000, noise=0.5)
     kept = EstimatorSettings(prior_weight=1e9, draws=0)
     held = identify(ur5, [log], estimator=kept)
-    assert held.witness.factor == pytest.approx(1.0, abs=0.05)  # it stays at the URDF
-    assert not held.witness.follows
-    assert not held.witness.agrees
+    assert held.scale_check.factor == pytest.approx(1.0, abs=0.05)  # it stays at the URDF
+    assert not held.scale_check.follows
+    assert not held.scale_check.agrees
     free = identify(ur5, [log], estimator=EstimatorSettings(draws=0))
-    assert free.witness.follows
+    assert free.scale_check.follows
 
 
 def test_its_figures_are_those_of_pinocchios_gravity_over_the_poses_of_all_logs():
@@ -178,7 +182,7 @@ def test_its_figures_are_those_of_pinocchios_gravity_over_the_poses_of_all_logs(
     pi[:size].reshape(-1, 10)[-1] *= 1.3
     logs = [exact_log(model, pi, rng, samples=n, noise=0.5) for n in (170, 130)]
     found = fit(model, logs, signals=EXACT, estimator=EstimatorSettings(draws=0))
-    witness = call_witness(found)
+    scale_check = check_scale(found)
 
     def gravity(values):
         bodies = model.with_parameters(values).pin_model
@@ -193,23 +197,25 @@ def test_its_figures_are_those_of_pinocchios_gravity_over_the_poses_of_all_logs(
 
     u, g = gravity(found.prior), gravity(found.standard)
     ratio = np.sum(u * g, axis=0) / np.sum(u * u, axis=0)
-    assert witness.factor == pytest.approx(np.sum(u * g) / np.sum(u * u), rel=1e-6)
-    rest = np.linalg.norm(g - witness.factor * u) / np.linalg.norm(g)
+    assert scale_check.factor == pytest.approx(np.sum(u * g) / np.sum(u * u), rel=1e-6)
+    rest = np.linalg.norm(g - scale_check.factor * u) / np.linalg.norm(g)
     weights = np.einsum("nj,njk->jk", u, columns(slice(0, size))) / np.sum(u * u, axis=0)[:, None]
     C = found.standard_covariance[:size, :size]
     error = np.sqrt(np.einsum("jk,kl,jl->j", weights, C, weights))
     known = {j: (x, e) for j, x, e in zip(model.joints, ratio, error, strict=True) if e < 0.1}
     assert 0 < len(known) < 3
-    assert witness.gravity == {j: pytest.approx(x, rel=1e-6) for j, (x, _) in known.items()}
-    assert witness.gravity_error == {j: pytest.approx(e, rel=1e-4) for j, (_, e) in known.items()}
+    assert scale_check.gravity == {j: pytest.approx(x, rel=1e-6) for j, (x, _) in known.items()}
+    assert scale_check.gravity_error == {
+        j: pytest.approx(e, rel=1e-4) for j, (_, e) in known.items()
+    }
     P = columns(slice(size - 10, size - 6)).reshape(-1, 4)
     both = np.linalg.lstsq(np.column_stack([u.ravel(), P]), g.ravel())[0]
-    assert witness.scale == pytest.approx(both[0], rel=1e-6)
+    assert scale_check.scale == pytest.approx(both[0], rel=1e-6)
     payload = np.linalg.lstsq(P, (g - u).ravel())[0]
     left = np.linalg.norm((g - u).ravel() - P @ payload) / np.linalg.norm(g)
-    assert witness.unexplained == pytest.approx((rest, left), rel=1e-4)
+    assert scale_check.unexplained == pytest.approx((rest, left), rel=1e-4)
     masses = (found.prior[:size:10].sum(), found.standard[:size:10].sum(), max(both[1], 0.0))
-    assert witness.masses == pytest.approx(masses, rel=1e-5)
+    assert scale_check.masses == pytest.approx(masses, rel=1e-5)
     # friction of both logs
     k = [
         [model.layout.names.index(f"{j}.{t}") for j in model.joints] for t in ("viscous", "coulomb")
@@ -217,4 +223,4 @@ def test_its_figures_are_those_of_pinocchios_gravity_over_the_poses_of_all_logs(
     v, tau = (np.vstack([getattr(log, x) for log in logs]) for x in ("v", "tau"))
     torque = found.standard[k[0]] * v + found.standard[k[1]] * np.sign(v)
     share = np.linalg.norm(torque, axis=0) / np.linalg.norm(tau, axis=0)
-    np.testing.assert_allclose(list(witness.friction.values()), share, rtol=1e-9)
+    np.testing.assert_allclose(list(scale_check.friction.values()), share, rtol=1e-9)

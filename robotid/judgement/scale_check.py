@@ -14,21 +14,21 @@ from robotid.fitting.result import Fit
 from robotid.regressor.prediction import predict
 from robotid.regressor.torque import joint_torque_regressor
 
-__all__ = ["Witness", "call_witness"]
+__all__ = ["ScaleCheck", "check_scale"]
 
 _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque that a joint must hold to be compared
 _KNOWN = 0.1  # standard error of a ratio that says something
 _AGREES = 0.05  # farther from 1 than this, gravity and total mass bear no witness
 _HELD_BACK = 1.5  # a residual over that of weighted least squares beyond this is the prior's doing
-_ANOTHER = 0.35  # ... and farther than this, they speak against it
+_ANOTHER = 0.35  # ... and farther than this, they contradict it
 _OFF = 0.1  # a factor of all torques at least so far from 1 is told from one of single masses,
 _CLEARLY = 4.0  # if it is so many times what it leaves unexplained of gravity
 _BETTER = 0.5  # and leaves less than this share of what a payload leaves
 
 
 @dataclass(frozen=True)
-class Witness:
+class ScaleCheck:
     """The identified gravity and masses against the URDF's.
 
     Attributes:
@@ -85,9 +85,9 @@ class Witness:
     def message(self) -> str:
         """What was confirmed, or what could not be checked and what to do."""
         if self.is_stated:
-            return f"the scale rests on the mass that was stated: {self.figures}"
+            return f"the scale depends on the mass that was stated: {self.figures}"
         if self.agrees:
-            rests = "the scale of the torques rests on the URDF's gravity and total mass, which"
+            rests = "the scale of the torques depends on the URDF's gravity and total mass, which"
             if self._off_whole <= _AGREES:
                 return f"{rests} agree within 5 %: {self.figures}"
             before, after, payload = self.masses
@@ -106,7 +106,7 @@ class Witness:
         elif odd := [f"{j} {x:.2f}" for j, x in self.gravity.items() if abs(x - 1.0) > _ANOTHER]:
             hint = f" Gravity over the URDF's by joint: {listed(odd)}."
         return (
-            "the scale of torques, angles and time could not be checked, it rests on the sensors "
+            "the scale of torques, angles and time could not be checked, it depends on the sensors "
             f"alone: {self.figures}.{hint} Weigh the robot and state total_mass"
         )
 
@@ -136,7 +136,7 @@ class Witness:
         return asdict(self) | lists | {"agrees": self.agrees, "message": self.message}
 
 
-def call_witness(found: Fit) -> Witness:
+def check_scale(found: Fit) -> ScaleCheck:
     """Return gravity and masses of a result against the URDF's.
 
     With g_u and g the gravity torques of the URDF and of the result over the fitted poses, a
@@ -153,7 +153,7 @@ def call_witness(found: Fit) -> Witness:
     rubbing = _friction(found)
     errors = [found.metrics(name).per_joint for name in ("estimate", "wls")]
     follows = all(errors[0][j].rmse <= _HELD_BACK * free.rmse for j, free in errors[1].items())
-    plain = Witness(
+    plain = ScaleCheck(
         masses=(before, after, 0.0), is_stated=is_stated, friction=rubbing, follows=follows
     )
     q = np.vstack([e.recording.trajectory.q for e in found.fitted])
