@@ -64,9 +64,7 @@ def main():
 
 
 def real_recordings(names):
-    print(
-        "| validation recording of | joint | RMSE, viscous and Coulomb | RMSE, auto | ratio | chosen |"
-    )
+    print("| validation of | joint | RMSE, viscous and Coulomb | RMSE, auto | ratio | chosen |")
     print("|---|---|---|---|---|---|")
     for name in names:
         job = read_job(JOBS / f"{name}.toml")

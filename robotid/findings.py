@@ -5,7 +5,34 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-__all__ = ["Cause", "Finding", "by_severity", "grouped", "listed", "log_finding", "toml_key"]
+__all__ = [
+    "FORMER_CODES",
+    "Cause",
+    "Finding",
+    "by_severity",
+    "current_code",
+    "grouped",
+    "listed",
+    "log_finding",
+    "toml_key",
+]
+
+#: Codes that had other names before version 0.2, and what they are now.
+FORMER_CODES: Mapping[str, str] = {
+    "beyond_seen": "beyond_range",
+    "bound_binds": "active_bound",
+    "commands_alike": "proportional_commands",
+    "encoder_kept": "encoder_uncorrected",
+    "encoder_open": "encoder_undetermined",
+    "faint_parameters": "weak_parameters",
+    "gives_way": "moved_by_others",
+    "held_command": "repeated_command",
+    "held_torque": "repeated_torque",
+    "late_command": "delayed_command",
+    "told_together": "correlated_terms",
+    "torque_missed": "torque_mismatch",
+    "unlike_velocity": "velocity_mismatch",
+}
 
 _RANK = {"error": 0, "warning": 1, "note": 2}
 _NUMBER = r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w|\.\w)"
@@ -74,6 +101,15 @@ def log_finding(
     where = f"{log}: {part}" if part else log
     figures = {name: float(value) for name, value in evidence.items()}
     return Finding(code, severity, where, f"{log}: {message}", figures)
+
+
+def current_code(code: str) -> str:
+    """Return the code that a finding has now, of a code that may be a former one.
+
+    Args:
+        code: The code.
+    """
+    return FORMER_CODES.get(code, code)
 
 
 def listed(names: Iterable[object], limit: int | None = None) -> str:

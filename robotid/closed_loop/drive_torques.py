@@ -54,8 +54,8 @@ class DriveTorques:
 
         Args:
             joints: Which, shape (k,).
-            columns: What they are by: columns as of ``ClosedLoopRobot.roll_out``, each with the place,
-                of c, of its sensitivity.
+            columns: What they are by: columns as of ``ClosedLoopRobot.roll_out``, each with the
+                place, of c, of its sensitivity.
             motion: Derivatives of their positions and then speeds, shape (N, 2k, c).
             kinds: Numbers of the columns' kinds.
         """

@@ -222,13 +222,13 @@ def _initialise_from_commands(
     plain = fit_second_order(robot, windows, stated, finds_delay=loop.delay is None)
     groups = groups_of(loop, model.joints, likeness(model))
     top = _largest_speeds(model, loop, logs)
-    usual = typical_sizes(robot, plain, windows, has_gain, top)
+    typical = typical_sizes(robot, plain, windows, has_gain, top)
     finds_limit = (top > 0.0) | (loop.limit == "find")
-    base = first_loops(model, stated, plain, usual, finds_limit)
+    base = first_loops(model, stated, plain, typical, finds_limit)
     # positions alone tell the sum of kd and viscous friction
     tells_kd = weighs or all(log.v_ref is not None for log in logs)
     free_parameters = free_drive_parameters(
-        model, loop, groups, base, usual, tells_kd=tells_kd, finds_limit=finds_limit
+        model, loop, groups, base, typical, tells_kd=tells_kd, finds_limit=finds_limit
     )
     free_parameters += free_zeros(model, encoders) if loop.zeros == "find" else []
     free_parameters += free_body_parameters(robot, settings.bodies) if settings.bodies else []
@@ -242,7 +242,7 @@ def _initialise_from_commands(
     if weighs and behind is None:
         rows = torque_rows(identified_rows(with_terms(model, base), logs, signals))
         simulator = replace(simulator, torque=rows)
-    return _Initial(simulator, estimator, usual.torque, encoders, plain)
+    return _Initial(simulator, estimator, typical.torque, encoders, plain)
 
 
 def _initialise_from_torque(
@@ -265,11 +265,11 @@ def _initialise_from_torque(
     robot = ClosedLoopRobot(model, step=settings.step)
     length, lead = settings.window or DRIFTS, settings.lead or 0.0
     windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
-    usual = typical_sizes_of_torques(model, found.standard, base.armature, windows)
+    typical = typical_sizes_of_torques(model, found.standard, base.armature, windows)
     groups = groups_of(loop, model.joints, range(len(model.joints)))
     none = np.zeros(len(groups), dtype=bool)
     free_parameters = free_drive_parameters(
-        model, loop, groups, base, usual, tells_kd=False, finds_limit=none
+        model, loop, groups, base, typical, tells_kd=False, finds_limit=none
     )
     free_parameters += free_body_parameters(robot, settings.bodies) if settings.bodies else []
     simulator = LoopSimulator(
@@ -280,7 +280,7 @@ def _initialise_from_torque(
         simulator = replace(simulator, torque=torque_rows(found, _BOTH))
     estimator = OutputError(whitens=settings.whiten, frees=True, progress=progress)
     encoders = same_encoders(model)
-    return _Initial(simulator, estimator, usual.torque, encoders, linear=found)
+    return _Initial(simulator, estimator, typical.torque, encoders, linear=found)
 
 
 def refine_steps(

@@ -110,8 +110,8 @@ def _inertia(model: RobotModel, pi: Array, windows: Sequence[Window]) -> Array:
     """Return the typical inertia that each joint moves, shape (n,)."""
     q = np.concatenate([w.log.q[w.counted] for w in windows])
     M = joint_mass_matrices(model, pi, q[:: max(1, len(q) // _POSES)])
-    usual: Array = np.median(np.diagonal(M, axis1=1, axis2=2), axis=0)
-    return usual
+    typical: Array = np.median(np.diagonal(M, axis1=1, axis2=2), axis=0)
+    return typical
 
 
 def _speed(windows: Sequence[Window]) -> Array:
@@ -127,7 +127,7 @@ def _period(window: Window) -> float:
 
 
 def first_loops(
-    model: RobotModel, stated: Loops, plain: SecondOrder, usual: TypicalSizes, finds_limit: Array
+    model: RobotModel, stated: Loops, plain: SecondOrder, typical: TypicalSizes, finds_limit: Array
 ) -> Loops:
     """Return the loops that the fit begins with.
 
@@ -138,8 +138,8 @@ def first_loops(
         typical: Typical sizes.
         finds_limit: Joints whose limit is to be found, shape (n,), bool.
     """
-    friction = {name: plain.friction(name) * usual.scale for name in ("viscous", "coulomb")}
-    none = np.zeros(len(usual.scale))
+    friction = {name: plain.friction(name) * typical.scale for name in ("viscous", "coulomb")}
+    none = np.zeros(len(typical.scale))
     terms = tuple(
         tuple(
             term
@@ -151,10 +151,10 @@ def first_loops(
     values = [friction.get(t.name, none)[j] for j, own in enumerate(terms) for t in own]
     return replace(
         stated,
-        kp=stated.kp * usual.scale,
-        armature=np.maximum(usual.inertia - usual.bodies, _LEAST * usual.inertia),
+        kp=stated.kp * typical.scale,
+        armature=np.maximum(typical.inertia - typical.bodies, _LEAST * typical.inertia),
         delay=plain.loops.delay,
-        limit=np.where(finds_limit, usual.largest, stated.limit),
+        limit=np.where(finds_limit, typical.largest, stated.limit),
         terms=terms,
         values=np.array(values),
     )
@@ -165,7 +165,7 @@ def free_drive_parameters(
     loop: LoopSettings,
     groups: Sequence[str],
     base: Loops,
-    usual: TypicalSizes,
+    typical: TypicalSizes,
     *,
     tells_kd: bool,
     finds_limit: Array,
@@ -199,10 +199,10 @@ def free_drive_parameters(
         "delay": ~is_stated(loop.delay, model) & is_closed,
     }
     spread = {
-        "armature": usual.inertia,
+        "armature": typical.inertia,
         "kp": base.kp / _WIDE,
-        "kd": usual.torque / usual.speed,
-        "limit": usual.torque,
+        "kd": typical.torque / typical.speed,
+        "limit": typical.torque,
         "delay": np.full(len(groups), _SLOWEST / _WIDE),
     }
     found = []
@@ -220,16 +220,16 @@ def free_drive_parameters(
             # what wears and what leans differ from drive to drive, grease and motor do not
             for owners in [having] if isinstance(term, Viscous) else [[j] for j in having]:
                 name = group if len(owners) > 1 else model.joints[owners[0]]
-                found.append(_term(name, term, owners, base, usual))
+                found.append(_term(name, term, owners, base, typical))
     return found
 
 
 def _term(
-    owner: str, term: DriveTerm, joints: Sequence[int], base: Loops, usual: TypicalSizes
+    owner: str, term: DriveTerm, joints: Sequence[int], base: Loops, typical: TypicalSizes
 ) -> FreeParameter:
     """Return the unknown of a term of one joint, or of several that share it."""
     begin = float(np.median([base.values[base.place(j, term)] for j in joints]))
-    size = usual.torque / (usual.speed if isinstance(term, Viscous) else 1.0)
+    size = typical.torque / (typical.speed if isinstance(term, Viscous) else 1.0)
     wide = _WIDE * float(np.median(size[list(joints)]))
     lowest = 0.0 if term.is_nonnegative else -np.inf
     return FreeParameter(

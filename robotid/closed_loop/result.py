@@ -90,14 +90,16 @@ class LoopIdentification(Identified):
         The quantile is that of the unknown, of those it follows from, whose standard error has the
         fewest degrees of freedom.
         """
-        own = np.where(self._slopes != 0.0, self.estimate.reach, QUANTILE)
-        reach: Array = own.max(axis=1, initial=QUANTILE)
-        return reach
+        own = np.where(self._slopes != 0.0, self.estimate.quantile, QUANTILE)
+        quantile: Array = own.max(axis=1, initial=QUANTILE)
+        return quantile
 
     @property
     def base_quantile(self) -> Array:
-        reach: Array = np.where(self.mapping.K != 0.0, self.standard_quantile, QUANTILE).max(axis=1)
-        return reach
+        quantile: Array = np.where(self.mapping.K != 0.0, self.standard_quantile, QUANTILE).max(
+            axis=1
+        )
+        return quantile
 
     @property
     def at_bound(self) -> Array:

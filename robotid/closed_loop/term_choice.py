@@ -66,9 +66,9 @@ def candidates(simulator: LoopSimulator, torque: Array) -> list[tuple[FreeParame
         low, high, speed = q[:, j].min(), q[:, j].max(), float(np.sqrt(np.mean(v[:, j] ** 2)))
         if speed <= 0.0:
             continue
-        seen, half = {"q": (float(low), float(high)), "v": ANYWHERE}, (high - low) / 2
+        data_range, half = {"q": (float(low), float(high)), "v": ANYWHERE}, (high - low) / 2
         for family in map(FAMILIES.__getitem__, _OFFERED):
-            terms = family.make(seen, *[_SLOW * speed for _ in family.shapes])
+            terms = family.make(data_range, *[_SLOW * speed for _ in family.shapes])
             if half <= _WIDE and any(term.guards == "q" for term in terms):
                 continue
             free_parameters = []

@@ -45,7 +45,7 @@ class _Drive:
     slides: bool
     motions: tuple[DriveMotion, ...]  # of each recording, all its rows
     taken: tuple[Array, ...]  # rows of each recording in the sample
-    seen: DataRange
+    data_range: DataRange
     largest: float  # of its torques there, by their size [N m or N]
     plain: Mapping[str, Array]  # what of x is each of its plain parameters, U^T x, by name
     known: dict[DriveTerm, Array] = field(default_factory=dict)  # columns of terms, (N,)
@@ -90,14 +90,14 @@ def choose_drives(
         if not used[:, j].any() or (names is not None and not names):
             continue
         own = tuple(motion.of(j) for motion in motions)
-        seen = _seen(own, sample.taken, used[:, j])
+        data_range = _seen(own, sample.taken, used[:, j])
         plain = {
             name: sample.U[:, k]
             for k, name in enumerate(fit.mapping.base_names)
             if name.startswith(f"{joint}.")
         }
         largest = float(np.abs(torques[:, j]).max())
-        drive = _Drive(bool(sample.slides[j]), own, sample.taken, seen, largest, plain)
+        drive = _Drive(bool(sample.slides[j]), own, sample.taken, data_range, largest, plain)
         first = [own for own in [(balanced or {}).get(joint)] if own is not None]
         alone = sample.of_joint(j)
         chosen = _auto(alone, drive, first) if names is None else _fixed(alone, drive, names)
@@ -119,8 +119,8 @@ def _seen(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Array) -
 def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[tuple[Family, list[float]]]:
     """Yield families with every shape on their grid."""
     for family in families:
-        turns = (drive.seen["q"][1] - drive.seen["q"][0]) / _TURN
-        bounds = [shape.within(drive.seen) for shape in family.shapes]
+        turns = (drive.data_range["q"][1] - drive.data_range["q"][0]) / _TURN
+        bounds = [shape.within(drive.data_range) for shape in family.shapes]
         if family.needs and (drive.slides or turns < family.needs):
             continue
         if not all(0.0 < low < high for low, high in bounds):  # it hardly moved
@@ -147,7 +147,7 @@ class _Options:
 
     @classmethod
     def of(cls, sample: Sample, drive: _Drive, own: list[tuple[Family, list[float]]]) -> "_Options":
-        terms = [family.make(drive.seen, *sizes) for family, sizes in own]
+        terms = [family.make(drive.data_range, *sizes) for family, sizes in own]
         ends = np.cumsum([len(those) for those in terms]).tolist()
         place = [list(range(e - len(those), e)) for those, e in zip(terms, ends, strict=True)]
         flat = [term for those in terms for term in those]
@@ -193,7 +193,7 @@ def _reach(drive: _Drive, term: DriveTerm) -> float:
     """
     if term.guards != "v" or not isinstance(term, MemorylessTerm):
         return _NOTHING
-    v = np.linspace(*drive.seen["v"], 50)
+    v = np.linspace(*drive.data_range["v"], 50)
     return float(np.abs(term.amplitude(np.zeros_like(v), v)).max()) + _NOTHING
 
 
@@ -402,7 +402,7 @@ def _found(
         ),
         shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
         sizes=tuple(tuple(own) for _, own in refined),
-        seen=drive.seen,
+        data_range=drive.data_range,
         grown=_grown(anew, drive, refined),
     )
 
@@ -461,12 +461,12 @@ def _terms(
     drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
 ) -> tuple[DriveTerm, ...]:
     """Return the terms of families with their shapes."""
-    return tuple(term for family, own in chosen for term in family.make(drive.seen, *own))
+    return tuple(term for family, own in chosen for term in family.make(drive.data_range, *own))
 
 
 def _log_bounds(drive: _Drive, families: Sequence[Family]) -> Array:
     """Return logarithms of where each shape is sought, shape (k, 2)."""
-    bounds = [shape.within(drive.seen) for family in families for shape in family.shapes]
+    bounds = [shape.within(drive.data_range) for family in families for shape in family.shapes]
     logs: Array = np.log(np.reshape(bounds, (-1, 2)))
     return logs
 

@@ -86,7 +86,7 @@ class Estimate:
         return errors
 
     @property
-    def reach(self) -> Array:
+    def quantile(self) -> Array:
         """How many standard errors a 95 % interval reaches, by Student's quantile, shape (c,).
 
         ``details`` has the degrees of freedom, ``freedom``, of errors from a scatter.

@@ -135,5 +135,5 @@ def quantile(freedom: Array) -> Array:
     Args:
         freedom: Degrees of freedom of each standard error, in Student's distribution, shape (c,).
     """
-    reach: Array = scipy.special.stdtrit(freedom, 0.975)
-    return reach
+    quantiles: Array = scipy.special.stdtrit(freedom, 0.975)
+    return quantiles

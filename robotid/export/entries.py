@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robotid._files import finite, source_entry
+from robotid.export.former_keys import with_former_keys
 from robotid.export.ranges import parameter_ranges
 from robotid.fitting.bands import QUANTILE, typical_friction
 from robotid.fitting.drives import DriveChoice
@@ -83,7 +84,7 @@ def build_result(
     }
     if found.has_urdf:
         common["ranges"] = parameter_ranges(found) | own.pop("ranges", {})
-    return common | own
+    return with_former_keys(common | own)
 
 
 def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -80,9 +80,9 @@ def _loop_parameters(found: LoopIdentification) -> list[dict[str, Any]]:
         return []
     loops, estimate = found.fit.loops, found.fit.estimate
     errors = {
-        (unknown.what, j): (float(error), float(reach))
-        for unknown, error, reach in zip(
-            found.fit.simulator.free_parameters, estimate.std_error, estimate.reach, strict=True
+        (unknown.what, j): (float(error), float(quantile))
+        for unknown, error, quantile in zip(
+            found.fit.simulator.free_parameters, estimate.std_error, estimate.quantile, strict=True
         )
         for j in unknown.joints
     }
@@ -96,10 +96,10 @@ def _loop_parameters(found: LoopIdentification) -> list[dict[str, Any]]:
         for what, unit in units.items():
             value = float(getattr(loops, what)[j])
             if math.isfinite(value):
-                error, reach = errors.get((what, j), (None, None))
+                error, quantile = errors.get((what, j), (None, None))
                 entries.append(
                     {"name": f"{joint.name}.{what}", "value": value, "std_error": error,
-                     "reach": reach,
+                     "quantile": quantile,
                      "unit": unit, "source": "stated" if error is None else "data"}
                 )  # fmt: skip
     return entries

@@ -113,18 +113,18 @@ def parameter_ranges(found: Identified) -> dict[str, Any]:
     """
     layout, sources = found.model.layout, found.sources
     errors, covariance = found.standard_error, found.standard_covariance
-    reach = found.standard_quantile
+    quantile = found.standard_quantile
     drives: dict[str, dict[str, Any]] = {drive.name: {} for drive in layout.drives}
     for k, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
         name, least = layout.drives[d].name, 0.0 if term.is_nonnegative else -math.inf
         source = "bound" if found.at_bound[k] else sources[k]
         drives[name][layout.names[k].removeprefix(f"{name}.")] = _range(
-            found.standard[k], errors[k], source, least=least, reach=float(reach[k])
+            found.standard[k], errors[k], source, least=least, quantile=float(quantile[k])
         ) | {"unit": layout.units[k]}
     return {
         "robot": found.model.name,
         "confidence": 0.95,
-        "bodies": body_ranges(found.model, found.standard, covariance, sources, reach),
+        "bodies": body_ranges(found.model, found.standard, covariance, sources, quantile),
         "drives": drives,
         **projected_ranges(found),
         "undetermined": list(found.undetermined),
@@ -132,7 +132,7 @@ def parameter_ranges(found: Identified) -> dict[str, Any]:
 
 
 def body_ranges(
-    model: RobotModel, standard: Array, covariance: Array, sources: Sequence[str], reach: Array
+    model: RobotModel, standard: Array, covariance: Array, sources: Sequence[str], quantile: Array
 ) -> dict[str, dict[str, Any]]:
     """Return the ranges of links, without ends where a link was not identified.
 
@@ -141,7 +141,7 @@ def body_ranges(
         standard: Standard parameters, shape (p,), SI units.
         covariance: Of them, shape (p, p); 0 of what was not identified.
         sources: What determined each.
-        reach: How many standard errors the interval of each reaches, shape (p,).
+        quantile: How many standard errors the interval of each reaches, shape (p,).
 
     Raises:
         ModelError: If a link or a drive would be physically impossible.
@@ -150,7 +150,7 @@ def body_ranges(
     for i, body in enumerate(model.layout.bodies):
         part = slice(10 * i, 10 * i + 10)
         bodies[body] = _body(
-            own[body], covariance[part, part], sources[part], float(reach[part].max())
+            own[body], covariance[part, part], sources[part], float(quantile[part].max())
         )
     return bodies
 
@@ -170,10 +170,14 @@ def projected_ranges(found: Identified) -> dict[str, Any]:
     for drive in drives:
         C = found.standard_covariance[np.ix_(drive.own, drive.own)]
         errors = np.sqrt(np.maximum(np.diag(drive.transfer @ C @ drive.transfer.T), 0.0))
-        reach = float(found.standard_quantile[list(drive.own)].max())
+        quantile = float(found.standard_quantile[list(drive.own)].max())
         ranges[drive.name] = {
             term: _range(
-                value, error, "data", reach=reach, least=0.0 if term in _NOT_NEGATIVE else -math.inf
+                value,
+                error,
+                "data",
+                quantile=quantile,
+                least=0.0 if term in _NOT_NEGATIVE else -math.inf,
             )
             for (term, value), error in zip(drive.values.items(), errors, strict=True)
             if error > 0
@@ -199,7 +203,7 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
             math.inf if error is None else error,
             source_of(entry),
             is_positive=term == "kp",
-            reach=entry.get("reach") or QUANTILE,
+            quantile=entry.get("quantile") or QUANTILE,
             least=0.0 if term in _NOT_NEGATIVE else -math.inf,
         )
         drives.setdefault(drive, {})[term] = ends | {"unit": entry["unit"]}
@@ -236,7 +240,7 @@ def ranges_text(ranges: Mapping[str, Any]) -> str:
     return yaml_text(ranges, head)
 
 
-def _body(pi: Array, covariance: Array, sources: Sequence[str], reach: float) -> dict[str, Any]:
+def _body(pi: Array, covariance: Array, sources: Sequence[str], quantile: float) -> dict[str, Any]:
     """Return the ranges of a link of ten parameters, shape (10,), with covariance (10, 10)."""
     m, c = pi[0], pi[1:4] / pi[0]
     moments, V = principal_moments(pi)
@@ -253,7 +257,7 @@ def _body(pi: Array, covariance: Array, sources: Sequence[str], reach: float) ->
     origins += [_joint_source(sources)] * 6
     x, y, z, w = Rotation.from_matrix(V).as_quat()
     mass, *rest = (
-        _range(value, error, origin, is_positive=not 1 <= k <= 3, reach=reach)
+        _range(value, error, origin, is_positive=not 1 <= k <= 3, quantile=quantile)
         for k, (value, error, origin) in enumerate(zip(values, errors, origins, strict=True))
     )
     return {
@@ -287,10 +291,10 @@ def _range(
     *,
     is_positive: bool = False,
     least: float = -math.inf,
-    reach: float = QUANTILE,
+    quantile: float = QUANTILE,
 ) -> dict[str, Any]:
     """Return the range of a figure; without ends if its standard error is not known."""
-    nominal, half = float(value), reach * float(error)
+    nominal, half = float(value), quantile * float(error)
     if not math.isfinite(half):
         return {"nominal": nominal, "source": source}
     low = nominal * math.exp(-half / nominal) if is_positive else max(nominal - half, least)

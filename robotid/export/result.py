@@ -20,6 +20,7 @@ from robotid.export.commanded import (
     loops_of,
 )
 from robotid.export.entries import SCHEMA_VERSION
+from robotid.export.former_keys import from_former_keys
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.urdf import load_identified, terms_from_facts
 from robotid.findings import listed
@@ -66,7 +67,7 @@ _SHAPE = {
     "inputs": [{"role": TEXT, "path": TEXT, "sha256": (str, type(None))}],
     "outputs": {"urdf?": FILE, "sidecar?": FILE},
     "structure": {"base": NUMBER, "undetermined": [TEXT]},
-    "witness?": {
+    "scale_check?": {
         **{key: {...: NUMBER} for key in ("gravity", "gravity_error", "friction")},
         **{key: [NUMBER] for key in ("unexplained", "masses")},
         "scale": MAYBE,
@@ -90,8 +91,8 @@ _SHAPE = {
         "status": _STATUS,
         "reasons": [TEXT],
         "per_joint?": {...: {"status": _STATUS, "reasons": [TEXT]}},
-        "alarms?": [TEXT],
-        "doubts?": [{field.name: TEXT for field in dataclasses.fields(VerdictWarning)}],
+        "log_errors?": [TEXT],
+        "warnings?": [{field.name: TEXT for field in dataclasses.fields(VerdictWarning)}],
     },
 }
 
@@ -304,6 +305,8 @@ def read_result(path: str | Path) -> dict[str, Any]:
         DataError: If it is missing, no JSON, or not of the schema of a result.
     """
     name, result = Path(path).name, read_json(path, "result")
+    if isinstance(result, dict):
+        result = from_former_keys(result)
     version = result.get("schema_version") if isinstance(result, dict) else None
     if version != SCHEMA_VERSION or "verdict" not in result:
         raise DataError(

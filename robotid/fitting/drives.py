@@ -62,7 +62,7 @@ class DriveChoice:
         shapes: The shapes that were found.
         shape_covariance: Their covariance, row by row.
         sizes: Shapes of each family.
-        seen: Ranges of position "q" and of the size of speed "v" that the fit has seen.
+        data_range: Ranges of position "q" and of the size of speed "v" that the fit has seen.
         grown: How many times larger the terms make the standard errors of the drive's armature,
             viscous and Coulomb friction and offset, by name.
         doubted: Terms that held-out segments favour, but not beyond chance: they were not taken,
@@ -76,7 +76,7 @@ class DriveChoice:
     shapes: tuple[FoundShape, ...] = ()
     shape_covariance: tuple[tuple[float, ...], ...] = ()
     sizes: tuple[tuple[float, ...], ...] = ()
-    seen: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    data_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     grown: Mapping[str, float] = field(default_factory=dict)
     doubted: tuple[DriveTerm, ...] = ()
 
@@ -85,7 +85,7 @@ class DriveChoice:
         return {
             "families": list(self.families),
             "shapes": [asdict(shape) for shape in self.shapes],
-            "seen": {key: list(pair) for key, pair in self.seen.items()},
+            "data_range": {key: list(pair) for key, pair in self.data_range.items()},
             "tried": [{**asdict(step), "families": list(step.families)} for step in self.tried],
         }
 
@@ -98,14 +98,14 @@ class DriveChoice:
         """
         flat = np.array([size for own in self.sizes for size in own])
         families = [FAMILIES[name] for name in self.families]
-        bounds = np.array([s.within(self.seen) for family in families for s in family.shapes])
+        bounds = np.array([s.within(self.data_range) for family in families for s in family.shapes])
         near = np.clip(flat + step, flat / _FARTHEST, flat * _FARTHEST)
         sizes = np.clip(near, *bounds.T)
         chosen = with_shapes(families, sizes)
         shapes = zip(self.shapes, sizes, np.sqrt(np.diag(covariance)), strict=True)
         return replace(
             self,
-            terms=tuple(t for family, own in chosen for t in family.make(self.seen, *own)),
+            terms=tuple(t for family, own in chosen for t in family.make(self.data_range, *own)),
             shapes=tuple(
                 replace(shape, value=float(size), std_error=float(error))
                 for shape, size, error in shapes
@@ -126,7 +126,9 @@ class DriveChoice:
         at, k = flat[which]
         sizes[at][k] *= 1.0 + share
         every = zip(self.families, sizes, strict=True)
-        return tuple(term for name, own in every for term in FAMILIES[name].make(self.seen, *own))
+        return tuple(
+            term for name, own in every for term in FAMILIES[name].make(self.data_range, *own)
+        )
 
 
 def with_shapes(families: Sequence[Family], flat: Array) -> list[tuple[Family, list[float]]]:

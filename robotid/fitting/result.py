@@ -189,13 +189,13 @@ class Fit(Identified, Solution):
         The quantile is that of the base parameter, of those it is part of, whose standard error has
         the fewest degrees of freedom.
         """
-        own = np.where(self.mapping.K != 0.0, self.errors.reach[:, None], QUANTILE)  # (b, p)
-        reach: Array = own.max(axis=0)
-        return reach
+        own = np.where(self.mapping.K != 0.0, self.errors.quantile[:, None], QUANTILE)  # (b, p)
+        quantile: Array = own.max(axis=0)
+        return quantile
 
     @property
     def base_quantile(self) -> Array:
-        return self.errors.reach
+        return self.errors.quantile
 
     @property
     def undetermined(self) -> tuple[str, ...]:

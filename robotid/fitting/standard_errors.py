@@ -51,7 +51,7 @@ class StandardErrors:
     unbounded: Array | None = None
 
     @property
-    def reach(self) -> Array:
+    def quantile(self) -> Array:
         """Standard errors that a 95 % interval of each base parameter reaches, shape (b,)."""
         return quantile(self.freedom)
 

@@ -23,7 +23,7 @@ from robotid.exceptions import (
     RankDeficientError,
     SettingsError,
 )
-from robotid.findings import Finding
+from robotid.findings import Finding, current_code
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.fit import fit_recordings, rough_choice, solve_recordings
 from robotid.fitting.recordings import Recordings
@@ -180,7 +180,8 @@ def conclude(
     heads = [log.head for log in (*recordings.fitted, *recordings.kept)]
     findings = [*log_findings(heads), *impossible_inertials(model), *beside]
     findings += unwritten(fit, log_errors)
-    counted = [finding for finding in findings if finding.code not in ignore]
+    ignored = {current_code(code) for code in ignore}
+    counted = [finding for finding in findings if finding.code not in ignored]
     names = [Path(e.recording.log.path).name for e in fit.validation if not e.is_refitted]
     return replace(
         result,

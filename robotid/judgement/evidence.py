@@ -19,9 +19,7 @@ POOR = 50.0
 BEATEN = 1.05
 
 _TIE = 0.3  # [%] ... and, of the URDF with fitted drives, by this share of the torque
-_OPTIMISM = (
-    2.0  # an error this many times the fitted one on validation recordings shows over-fitting
-)
+_OPTIMISM = 2.0  # an error this many times the fitted one on validation logs shows over-fitting
 _NAMED = 8  # parameters that a reason names
 
 

@@ -154,12 +154,12 @@ def _drive_findings(fit: Fit) -> list[Finding]:
                     "bends; record slower and faster motion of this joint to tell"
                 )
                 findings.append(Finding("shape_at_bound", "note", choice.joint, message))
-        guards = {term.guards for term in choice.terms if np.isfinite(term.seen).all()} - {""}
+        guards = {term.guards for term in choice.terms if np.isfinite(term.data_range).all()} - {""}
         j = model.joints.index(choice.joint)
         for evaluation in fit.validation:
             motion, mask = evaluation.recording.trajectory, evaluation.recording.mask
             for key in sorted(guards):
-                x, (low, high) = getattr(motion, key)[mask[:, j], j], choice.seen[key]
+                x, (low, high) = getattr(motion, key)[mask[:, j], j], choice.data_range[key]
                 x, low = (np.abs(x), 0.0) if key == "v" else (x, low)
                 share = float(np.mean((x < low) | (x > high))) if len(x) else 0.0
                 if share > _BEYOND:

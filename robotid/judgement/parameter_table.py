@@ -47,14 +47,14 @@ def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dic
         found: What was identified.
     """
     layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
-    errors, ends, reach = found.standard_error, found.standard_interval, found.standard_quantile
+    errors, ends, quantile = found.standard_error, found.standard_interval, found.standard_quantile
     pairs = correlated_parameters(found)
     entries = [
         {
             "name": name,
             "value": float(found.standard[i]),
             "std_error": finite(errors[i]),
-            "reach": float(reach[i]) if math.isfinite(errors[i]) else None,
+            "quantile": float(quantile[i]) if math.isfinite(errors[i]) else None,
             "interval_95": [finite(end) for end in ends[i]],
             "unit": layout.units[i],
             "prior": float(found.prior[i]),

@@ -1,6 +1,7 @@
 """How far to trust a result: findings with reasons, and a verdict that never passes the unknown."""
 
 import difflib
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from robotid._settings import require_kind
 from robotid.doctor.diagnosis import CODES
 from robotid.exceptions import SettingsError
-from robotid.findings import Finding, listed
+from robotid.findings import Finding, current_code, listed
 from robotid.fitting.metrics import Metrics
 from robotid.judgement.evidence import Determined, Predictions, error_of
 from robotid.judgement.scale_check import ScaleCheck
@@ -29,6 +30,8 @@ __all__ = [
     "rejected",
     "warnings_of",
 ]
+
+_LOGGER = logging.getLogger("robotid")
 
 _REJECTED = 5.0  # [%] a hypothesis on columns or masses is rejected by a prediction so good
 _SCALED = 2.0  # a gravity within this factor of the URDF's contradicts another unit of the torque
@@ -52,7 +55,7 @@ _WORDS = {
     "density": "its mass makes {density:.2g} kg/m^3 of the box around its geometry",
     "gravity": "the direction of gravity may be stated wrongly",
     "gravity_compensated": "the torque may be logged without gravity",
-    "repeated_torque": "the torque is held for {rows:.0f} rows at a time, so it is late and stepped",
+    "repeated_torque": "the torque is repeated over {rows:.0f} rows: delayed and stepped",
     "gyration": "its mass lies {gyration:.2g} m from its centre on average, its geometry ends at "
     "{farthest:.2g} m: no body can be so",
     "joint_origin": "the joint seems to lie elsewhere than the URDF has it",
@@ -293,8 +296,11 @@ def check_ignored(ignore: Sequence[str]) -> None:
     """
     known = sorted({*CODES, *WARNING_CODES, *_OF_RESULTS})
     require_kind(ignore, (list, tuple, set, frozenset), "ignore", "a list of codes")
-    for code in ignore:
-        require_kind(code, str, "a code in ignore", "the code of a finding")
+    for stated in ignore:
+        require_kind(stated, str, "a code in ignore", "the code of a finding")
+        code = current_code(stated)
+        if code != stated:
+            _LOGGER.warning("doctor: ignore names %r, which is %r since 0.2", stated, code)
         if code not in known:
             near = difflib.get_close_matches(code, known, n=1)
             hint = f". Did you mean {near[0]!r}?" if near else ""
@@ -313,7 +319,8 @@ def blocking(
         ignore: Codes of errors that the user knows better.
         is_robust: Whether a robust loss was set, which outvotes jumps of the torque.
     """
-    errors = (f for f in findings if f.severity == "error" and f.code not in ignore)
+    known = {current_code(code) for code in ignore}
+    errors = (f for f in findings if f.severity == "error" and f.code not in known)
     return tuple(f for f in errors if not (is_robust and is_downweighted(f)))
 
 
@@ -323,9 +330,9 @@ def rejected(
     """Return findings, hypotheses that a prediction of unseen motion contradicts as notes.
 
     That masses or the direction of gravity are not as stated, or that no physics explains a
-    torque, is rejected where the result predicts these torques of every validation recording within 5 %;
-    another unit of the torque, or an error that it holds no gravity, if gravity as identified is
-    also within a factor of two of the URDF's there.
+    torque, is rejected where the result predicts these torques of every validation recording
+    within 5 %; another unit of the torque, or a torque without gravity, if gravity as identified
+    is also within a factor of two of the URDF's there.
 
     Args:
         findings: What was found.

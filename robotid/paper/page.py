@@ -52,7 +52,7 @@ def _summary(content: Mapping[str, Any]) -> str:
     beside = np.degrees(np.max(np.abs(content["settings"]["start_beside_program_rad"])))
     gains = [content["on_program"][n]["relative_error"][-1] / error for n, error in last.items()]
     start = (
-        f"<p>These errors depend on where the robot starts, {beside:.3g} degree beside its program: "
+        f"<p>These errors depend on where the robot starts, {beside:.3g} degree off its program: "
         "its controller then swings it in, which excites what the program alone does not. From the "
         f"program itself the same {count} iterations leave an error {min(gains):.2g} to "
         f"{max(gains):.2g} times as large.</p>\n"

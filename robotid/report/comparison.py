@@ -238,8 +238,9 @@ def _friction_curves(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any
     """
     found = []
     for joint in dict.fromkeys(joint for result in results for joint in result["joints"]):
-        stated = [result.get("friction", {}).get(joint, {}).get("seen", {}) for result in results]
-        fastest = max((seen["v"][1] for seen in stated if "v" in seen), default=0.0)
+        frictions = [result.get("friction", {}).get(joint, {}) for result in results]
+        ranges = [friction.get("data_range", {}) for friction in frictions]
+        fastest = max((own["v"][1] for own in ranges if "v" in own), default=0.0)
         v = fastest * np.arange(-_SPEEDS, _SPEEDS + 1) / _SPEEDS
         curves = [_friction_curve(result, joint, v) for result in results]
         if not (fastest > 0 and any(torque is not None for torque, _ in curves)):

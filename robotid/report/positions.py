@@ -309,8 +309,8 @@ def _undetermined(content: Mapping[str, Any]) -> str:
         names = escape(listed([f["where"] for f in alike]))
         parts.append(
             "<p>Every parameter has a standard error by this model, but some commands are "
-            f"proportional (proportional_commands: {names}): effects of one joint on another are not "
-            "distinguishable from its own.</p>\n"
+            f"proportional (proportional_commands: {names}): effects of one joint on another "
+            "are not distinguishable from its own.</p>\n"
         )
     else:
         parts.append("<p>The logs determine all that was to be found.</p>\n")

@@ -95,7 +95,7 @@ class DriveTerm(ABC):
     """One term of a drive's torque, linear in its parameter.
 
     Attributes:
-        seen: From where to where the fit has seen what ``guards`` names: q, or the size of v.
+        data_range: From where to where the fit has seen what ``guards`` names: q, or the size of v.
 
     Class attributes:
         label: Its name in parameters, as ``"elbow.viscous"``.
@@ -117,7 +117,7 @@ class DriveTerm(ABC):
         rising: Names of numbers that increase in this order.
     """
 
-    seen: tuple[float, float] = ANYWHERE
+    data_range: tuple[float, float] = ANYWHERE
 
     label: ClassVar[str] = ""
     units: ClassVar[tuple[str, str]] = ("N m", "N")
@@ -139,9 +139,11 @@ class DriveTerm(ABC):
 
     def __post_init__(self) -> None:
         kind = type(self).__name__
-        if not (len(self.seen) == 2 and self.seen[0] <= self.seen[1]):
-            raise SettingsError(f"{kind}: seen is {self.seen!r}, wanted (lowest, highest)")
-        shape = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "seen"}
+        if not (len(self.data_range) == 2 and self.data_range[0] <= self.data_range[1]):
+            raise SettingsError(
+                f"{kind}: data_range is {self.data_range!r}, wanted (lowest, highest)"
+            )
+        shape = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "data_range"}
         for key, value in shape.items():
             low, high = self.ends.get(key, _ENDS)
             if not isinstance(value, bool) and not (is_number(value) and low <= value <= high):
@@ -165,8 +167,8 @@ class DriveTerm(ABC):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the term as plain values, which ``term_from_dict`` reads."""
-        shape = {key: value for key, value in asdict(self).items() if key != "seen"}
-        guard = {} if self.seen == ANYWHERE else {"seen": list(self.seen)}
+        shape = {key: value for key, value in asdict(self).items() if key != "data_range"}
+        guard = {} if self.data_range == ANYWHERE else {"data_range": list(self.data_range)}
         return {"term": type(self).__name__, **shape, **guard}
 
 
@@ -218,8 +220,8 @@ class MemorylessTerm(DriveTerm):
     @property
     def ranges(self) -> tuple[float, float, float]:
         """The largest size of v and the range of q beyond which it stays as it is."""
-        fastest = self.seen[1] if self.guards == "v" else np.inf
-        return (fastest, *(self.seen if self.guards == "q" else ANYWHERE))
+        fastest = self.data_range[1] if self.guards == "v" else np.inf
+        return (fastest, *(self.data_range if self.guards == "q" else ANYWHERE))
 
     def amplitude(self, q: Array, v: Array) -> Array:
         """Return a(v) b(q), within the range seen: the column of positive direction and load 1.
@@ -270,16 +272,16 @@ class Shape:
     bounds: tuple[float, float]
     of: str = ""
 
-    def within(self, seen: DataRange) -> tuple[float, float]:
+    def within(self, data_range: DataRange) -> tuple[float, float]:
         """Return the bounds in the shape's own unit.
 
         Args:
-            seen: Ranges of position "q" and of the size of speed "v" that the fit has seen.
+            data_range: Ranges of position "q" and of the size of speed "v" that the fit has seen.
         """
         low, high = self.bounds
         if not self.of:
             return low, high
-        first, last = seen[self.of]
+        first, last = data_range[self.of]
         scale = last if self.of == "v" else last - first
         return low * scale, high * scale
 

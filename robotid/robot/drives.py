@@ -169,7 +169,7 @@ class Stribeck(MemorylessTerm):
     @property
     def slowest(self) -> float:
         """The speed below which no data show how it goes on to 0."""
-        return self.seen[0]
+        return self.data_range[0]
 
     @staticmethod
     def speed_law(w: Array, speed: float, slowest: float) -> Slope:
@@ -500,29 +500,29 @@ _KNOTS = 4  # of a piecewise-linear curve of friction
 _TABLE = 8  # entries of a tabulated spring
 
 
-def _curve(seen: DataRange) -> tuple[DriveTerm, ...]:
+def _curve(data_range: DataRange) -> tuple[DriveTerm, ...]:
     """Return the rises of a monotone curve over the speeds seen, closer together at low speed."""
-    knots = seen["v"][1] * np.linspace(0.0, 1.0, _KNOTS + 1) ** 2
+    knots = data_range["v"][1] * np.linspace(0.0, 1.0, _KNOTS + 1) ** 2
     return tuple(
         Ramp(number=k, low=a, high=b) for k, (a, b) in enumerate(pairwise(knots.tolist()), start=1)
     )
 
 
-def _table(seen: DataRange) -> tuple[DriveTerm, ...]:
+def _table(data_range: DataRange) -> tuple[DriveTerm, ...]:
     """Return the entries of a tabulated spring but the middle one, which is the offset's."""
-    knots = np.linspace(*seen["q"], _TABLE + 1).tolist()
+    knots = np.linspace(*data_range["q"], _TABLE + 1).tolist()
     step = knots[1] - knots[0]
     return tuple(
-        Hat(seen=seen["q"], number=k, at=x, before=x - step, after=x + step)
+        Hat(data_range=data_range["q"], number=k, at=x, before=x - step, after=x + step)
         for k, x in enumerate(knots, start=1)
         if k != _TABLE // 2 + 1
     )
 
 
 def _harmonics(highest: int) -> Callable[[DataRange], tuple[DriveTerm, ...]]:
-    def make(seen: DataRange) -> tuple[DriveTerm, ...]:
+    def make(data_range: DataRange) -> tuple[DriveTerm, ...]:
         return tuple(
-            Harmonic(seen=seen["q"], order=float(k), is_sine=is_sine)
+            Harmonic(data_range=data_range["q"], order=float(k), is_sine=is_sine)
             for k in range(1, highest + 1)
             for is_sine in (False, True)
         )
@@ -535,9 +535,11 @@ def _once_a_turn() -> tuple[DriveTerm, ...]:
     return (Harmonic(), Harmonic(is_sine=True))
 
 
-def _by_position(seen: DataRange) -> tuple[DriveTerm, ...]:
-    centre = 0.5 * (seen["q"][0] + seen["q"][1])
-    return tuple(PositionCoulomb(seen=seen["q"], order=k, centre=centre) for k in (1, 2))
+def _by_position(data_range: DataRange) -> tuple[DriveTerm, ...]:
+    centre = 0.5 * (data_range["q"][0] + data_range["q"][1])
+    return tuple(
+        PositionCoulomb(data_range=data_range["q"], order=k, centre=centre) for k in (1, 2)
+    )
 
 
 _OTHER = "friction that is not viscous and Coulomb"
@@ -546,22 +548,22 @@ _SLOW = "raise min_velocity to leave the slow rows out"
 FAMILIES: dict[str, Family] = {
     family.name: family
     for family in (
-        Family("load", "friction that grows with the load", lambda seen: (LoadFriction(),),
+        Family("load", "friction that grows with the load", lambda data_range: (LoadFriction(),),
                is_automatic=True, code="load_friction", has_size=True),
         Family("stribeck", f"{_OTHER} but rises towards standstill (Stribeck)",
-               lambda seen, speed: (Stribeck(seen=seen["v"], speed=speed),), (_SPEED,),
+               lambda own, speed: (Stribeck(data_range=own["v"], speed=speed),), (_SPEED,),
                is_automatic=True, code="friction_shape", tested=((0.05,), (0.2,)),
                advice=f"{_SLOW[0].upper()}{_SLOW[1:]}"),
         Family("tanh", f"{_OTHER} but sets in with speed, or a drive that sticks",
-               lambda seen, speed: (Tanh(seen=seen["v"], speed=speed),), (_RISE,),
+               lambda data_range, speed: (Tanh(data_range=data_range["v"], speed=speed),), (_RISE,),
                is_automatic=True, code="friction_shape", tested=((0.03,), (0.15,)),
                advice=f"Set friction_band, or {_SLOW}", is_imitated=True),
         Family("presliding", "friction that is taken up after each reversal",
-               lambda seen, way: (Presliding(displacement=way),), (_WAY,), is_automatic=True),
+               lambda data_range, way: (Presliding(displacement=way),), (_WAY,), is_automatic=True),
         Family("lag", "a torque that comes late (a delay, an elastic gear)",
-               lambda seen: (Lag(),), is_automatic=True),
+               lambda data_range: (Lag(),), is_automatic=True),
         Family(COUNTERBALANCE, "a torque that repeats once a turn, as a counterbalance's",
-               lambda seen: _once_a_turn(), needs=0.1),
+               lambda data_range: _once_a_turn(), needs=0.1),
         Family("harmonics2", "a spring or counterbalance that follows the joint's position",
                _harmonics(2), needs=0.5, is_automatic=True, code="spring",
                instead=(COUNTERBALANCE, "spring")),
@@ -569,22 +571,22 @@ FAMILIES: dict[str, Family] = {
                "a torque that repeats with the joint's position (cogging, an eccentric gear)",
                _harmonics(4), needs=0.5, is_automatic=True, code="position_periodic"),
         Family("asymmetric", "viscous friction that differs by direction",
-               lambda seen: (Asymmetric(),), is_automatic=True, code="friction_shape",
+               lambda data_range: (Asymmetric(),), is_automatic=True, code="friction_shape",
                has_size=True),
         Family("power", f"{_OTHER} but bends with speed, as |v|^(1/3) does",
-               lambda seen, exponent: (Power(seen=seen["v"], exponent=exponent),),
+               lambda data_range, exponent: (Power(data_range=data_range["v"], exponent=exponent),),
                (Shape("exponent", ("-", "-"), (0.1, 0.9)),), code="friction_shape",
                tested=((1.0 / 3.0,),)),
         Family("cubic", f"{_OTHER} but bends with speed, as v^3 does",
-               lambda seen: (Cubic(seen=seen["v"]),), code="friction_shape"),
+               lambda data_range: (Cubic(data_range=data_range["v"]),), code="friction_shape"),
         Family("curve", "friction by a monotone curve over speed", _curve),
         Family("lugre", "presliding with a hook at low speed",
-               lambda seen, way, speed, excess: (
+               lambda data_range, way, speed, excess: (
                    LuGre(displacement=way, speed=speed, excess=excess),
                ),
                (_WAY, _SPEED, Shape("excess", ("-", "-"), (0.01, 3.0)))),
         Family("position", "Coulomb friction that depends on the position", _by_position),
-        Family("spring", "a spring on the joint", lambda seen: (Spring(seen=seen["q"]),),
+        Family("spring", "a spring on the joint", lambda own: (Spring(data_range=own["q"]),),
                code="spring", has_size=True),
         Family("spring_table", "a spring of any curve", _table),
     )

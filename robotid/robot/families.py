@@ -60,7 +60,7 @@ def drive_line(joint: str, *entries: str | DriveTerm) -> str:
 def _toml_entry(entry: str | DriveTerm) -> str:
     if isinstance(entry, str):
         return json.dumps(entry)
-    table = {key: value for key, value in entry.to_dict().items() if key != "seen"}
+    table = {key: value for key, value in entry.to_dict().items() if key != "data_range"}
     return "{ " + ", ".join(f"{key} = {json.dumps(x)}" for key, x in table.items()) + " }"
 
 
@@ -121,7 +121,8 @@ def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:
         raise SettingsError(f"term is {table.get('term')!r}, wanted one of {listed(TERM_CLASSES)}")
     known = {field.name: field.default for field in fields(kind)}
     values: dict[str, Any] = {}
-    for key, value in table.items():
+    for stated, value in table.items():
+        key = _FORMER_FIELDS.get(stated, stated)
         if key == "term":
             continue
         if key not in known:
@@ -130,11 +131,14 @@ def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:
     return kind(**values)
 
 
+_FORMER_FIELDS = {"seen": "data_range"}  # names before version 0.2
+
+
 def _read_field(kind: type[DriveTerm], key: str, value: object, default: object) -> object:
-    if key == "seen":
+    if key == "data_range":
         if isinstance(value, Sequence) and len(value) == 2 and all(map(is_number, value)):
             return (float(value[0]), float(value[1]))
-        raise SettingsError(f"{kind.__name__}: seen is {value!r}, wanted [lowest, highest]")
+        raise SettingsError(f"{kind.__name__}: data_range is {value!r}, wanted [lowest, highest]")
     is_flag = isinstance(default, bool)
     if is_flag is not isinstance(value, bool) or not (is_flag or is_number(value)):
         wanted = "true or false" if is_flag else "a finite number"

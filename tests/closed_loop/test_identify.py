@@ -153,7 +153,7 @@ def test_it_is_an_identification_as_others_are(found, tmp_path):
     known = zip(estimate.names, estimate.theta, estimate.std_error, estimate.reach, strict=True)
     for key, value, error, reach in known:
         own = entries[key]
-        assert (own["value"], own["reach"]) == (value, reach)
+        assert (own["value"], own["quantile"]) == (value, reach)
         assert own["std_error"] == pytest.approx(error, rel=1e-6)
         if key in layout.names:
             ends = [value - reach * error, value + reach * error]

@@ -77,6 +77,6 @@ def test_terms_are_offered_in_the_size_of_motion_and_torque():
     for order in (1, 2):
         term = found[f"wide.coulomb_q{order}"].term
         assert (term.order, term.centre) == (order, pytest.approx(0.2, abs=1e-3))
-        assert term.seen == pytest.approx((-0.3, 0.7), abs=1e-3)
+        assert term.data_range == pytest.approx((-0.3, 0.7), abs=1e-3)
     lowest = {name: u.lowest for name, u in found.items()}
     assert lowest == {n: 0.0 if n.endswith("load") else -np.inf for n in found}

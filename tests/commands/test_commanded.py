@@ -78,13 +78,13 @@ def test_drives_of_a_real_leg_are_as_large_as_they_can_be(result):
         assert 0.002 < values[f"{joint}.armature"]["value"] < 0.2
         assert 0.0 <= values[f"{joint}.coulomb"]["value"] < 2.0
         assert values[f"{joint}.kp"] == {
-            "name": f"{joint}.kp", "value": 20.0, "std_error": None, "reach": None,
+            "name": f"{joint}.kp", "value": 20.0, "std_error": None, "quantile": None,
             "unit": "N m/rad", "source": "stated",
         }  # fmt: skip
         assert values[f"{joint}.kd"]["std_error"] is None
         assert 0.0 < values[f"{joint}.delay"]["value"] < 0.03
         assert values[f"{joint}.delay"]["std_error"] < 0.01
-        assert 1.96 <= values[f"{joint}.delay"]["reach"] < 2.3
+        assert 1.96 <= values[f"{joint}.delay"]["quantile"] < 2.3
 
 
 def test_the_kept_window_is_followed_better_than_by_the_command(result):

@@ -224,7 +224,7 @@ def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
     alone = sample.of_joint(j)
     family = FAMILIES["stribeck"]
     grown = drive_choice._grown(alone, drive, [(family, [speed])])
-    Z = [drive.columns([Stribeck(speed=speed * x, seen=SEEN["v"])]) for x in (1.0, 1.001)]
+    Z = [drive.columns([Stribeck(speed=speed * x, data_range=SEEN["v"])]) for x in (1.0, 1.001)]
     theta = 3.0  # about: it scales the derivative's column only
     b = sample.W.shape[-1]
     columns = np.zeros((*sample.r.shape, 2))
@@ -454,7 +454,7 @@ def test_logs_in_files_choose_as_in_memory(plain, cases, tmp_path, workers):
 
 
 def test_a_robot_with_terms_of_its_own_can_be_sent_to_workers():
-    own = {ELBOW: [LoadFriction(), Stribeck(speed=0.2, seen=(0.1, 1.0))]}
+    own = {ELBOW: [LoadFriction(), Stribeck(speed=0.2, data_range=(0.1, 1.0))]}
     true, pi = driven(arm(), own, {})
     log = driven_log(true, pi, 1, duration=3.0)
     sent = pickle.loads(pickle.dumps(true))

@@ -173,7 +173,7 @@ def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked, fits):
     sure = {}
     for size in (shape.value - shape.std_error, shape.value, shape.value + shape.std_error):
         (term,) = choice.terms
-        own = Stribeck(speed=size, seen=term.seen)
+        own = Stribeck(speed=size, data_range=term.data_range)
         model = plain.with_terms({ELBOW: [own]})
         sure[size] = found_in(model, [log], friction="none", estimator="wls")
     low, middle, high = sure.values()

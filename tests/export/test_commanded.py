@@ -389,7 +389,7 @@ def test_ranges_have_gains_delays_and_friction(result, tmp_path, capsys):
         {"name": f"j.{term}", "value": 1.0, "std_error": 1.0, "unit": "-"}
         for term in ("kp", "kd", "zero", "offset")
     ]
-    entries += [{**entry, "name": "j.bias", "reach": 2.5} for entry in entries[-1:]]
+    entries += [{**entry, "name": "j.bias", "quantile": 2.5} for entry in entries[-1:]]
     content = load_result(folder).content | {"drive_parameters": entries}
     lows = {term: ends["low"] for term, ends in stated_ranges(content)["drives"]["j"].items()}
     wanted = {"kp": np.exp(-1.96), "kd": 0.0, "zero": -0.96, "offset": -0.96, "bias": -1.5}

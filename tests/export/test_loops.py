@@ -34,7 +34,7 @@ def test_what_was_stated_has_no_error_and_what_was_found_has_its_own(found, entr
             wanted.append({
                 "name": f"{joint}.{what}", "value": getattr(loops, what)[j],
                 "std_error": estimate.std_error[k] if is_found else None,
-                "reach": estimate.reach[k] if is_found else None,
+                "quantile": estimate.quantile[k] if is_found else None,
                 "unit": unit[j], "source": "data" if is_found else "stated",
             })  # fmt: skip
     assert entries["loop_parameters"] == wanted
@@ -48,7 +48,7 @@ def test_each_joint_has_the_error_of_its_own_unknown():
     names = [("a", "revolute"), ("b", "prismatic"), ("c", "revolute")]
     free_parameters = [("kp", (1,)), ("kp", (2,)), ("delay", (0, 2)), ("zero", (1,))]
     estimate = SimpleNamespace(
-        std_error=np.array([1.0, 2.0, 3.0, 4.0]), reach=np.array([2.1, 2.2, 2.3, 2.4])
+        std_error=np.array([1.0, 2.0, 3.0, 4.0]), quantile=np.array([2.1, 2.2, 2.3, 2.4])
     )
     values = {
         "kp": [10.0, 20.0, 30.0], "kd": [1.0, 2.0, 3.0], "delay": [0.1, 0.2, 0.3],
@@ -81,7 +81,7 @@ def test_each_joint_has_the_error_of_its_own_unknown():
                 continue
             error, reach = errors.get(name, (None, None))
             assert shown[name] == {
-                "name": name, "value": values[what][j], "std_error": error, "reach": reach,
+                "name": name, "value": values[what][j], "std_error": error, "quantile": reach,
                 "unit": unit, "source": "data" if name in errors else "stated",
             }  # fmt: skip
     assert _loop_parameters(SimpleNamespace(loop=SimpleNamespace(kind="torque"))) == []

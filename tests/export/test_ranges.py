@@ -181,7 +181,7 @@ def test_ends_of_loop_parameters_are_as_far_as_each_reaches():
         "robot": "arm",
         "structure": {"undetermined": ["x"]},
         "drive_parameters": [
-            {"name": name, "value": value, "std_error": error, "reach": reach, "unit": name[-3:]}
+            {"name": name, "value": value, "std_error": error, "quantile": reach, "unit": name[-3:]}
             | others
             for name, value, error, reach, others in entries
         ],
@@ -216,7 +216,7 @@ def test_ends_of_loop_parameters_are_as_far_as_each_reaches():
 def test_projected_friction_is_as_wide_as_draws_of_what_it_replaces(ur5):
     """Of terms whose intervals reach differently far, the farthest."""
     elbow, rng = "elbow_joint", np.random.default_rng(3)
-    model = ur5.with_terms({elbow: (Stribeck(seen=(0.05, 2.0), speed=0.3),)})
+    model = ur5.with_terms({elbow: (Stribeck(data_range=(0.05, 2.0), speed=0.3),)})
     names, pi = list(model.layout.names), model.standard_parameters()
     own = [names.index(f"{elbow}.{term}") for term in ("viscous", "coulomb", "stribeck", "offset")]
     pi[own] = 3.0, 9.0, 2.0, 0.4

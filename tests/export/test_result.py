@@ -13,6 +13,7 @@ from helpers.figures import figures
 from robotid import __version__
 from robotid.exceptions import DataError, ModelError
 from robotid.export.entries import _curve, _expected_torque, build_result, recording_metrics
+from robotid.export.former_keys import from_former_keys
 from robotid.export.result import read_result, stated_parameters
 from robotid.findings import Finding
 from robotid.robot.parameters import INERTIAL_TERMS
@@ -23,7 +24,8 @@ FINDINGS = [Finding("late", "warning", "a.csv", "late by 4 ms"), Finding("b", "n
 @pytest.fixture(scope="module")
 def result(identified):
     settings = {"estimator": {"name": "consistent"}}
-    return build_result(replace(identified, findings=FINDINGS), settings, {"report": "report.html"})
+    found = replace(identified, findings=FINDINGS)
+    return from_former_keys(build_result(found, settings, {"report": "report.html"}))
 
 
 def test_the_head_says_what_was_identified_and_how(result, identified):
@@ -75,7 +77,7 @@ def finite(value, rel=1e-6):
 def test_base_parameters_have_values_errors_and_intervals(result, identified):
     mapping = identified.mapping
     beta = mapping.K @ identified.standard
-    half = identified.errors.reach * identified.base_error
+    half = identified.errors.quantile * identified.base_error
     assert len({entry["std_error"] for entry in result["base_parameters"]}) == len(beta)
     for k, entry in enumerate(result["base_parameters"]):
         assert entry == {
@@ -114,7 +116,7 @@ def test_standard_and_drive_parameters_have_value_error_prior_and_source(result,
             "std_error": None
             if entry["at_bound"]
             else pytest.approx(np.sqrt(identified.standard_covariance[i, i])),
-            "reach": None if entry["at_bound"] else identified.standard_quantile[i],
+            "quantile": None if entry["at_bound"] else identified.standard_quantile[i],
             "interval_95": [None, None]
             if entry["at_bound"]
             else list(identified.standard_interval[i]),

@@ -18,7 +18,9 @@ _STATED = ("kp", "kd")  # by the job
 
 def by_position(slope, curve, low, high):
     """Return terms and parameters of Coulomb friction that depends on the position."""
-    terms = [PositionCoulomb(seen=(low, high), order=k, centre=0.5 * (low + high)) for k in (1, 2)]
+    terms = [
+        PositionCoulomb(data_range=(low, high), order=k, centre=0.5 * (low + high)) for k in (1, 2)
+    ]
     return terms, (slope, curve)
 
 
@@ -41,7 +43,7 @@ def _moments(model, pi):
     q, way = np.zeros((count, len(model.joints))), (np.arange(count) + 0.5) / count
     for j, joint in enumerate(model.joints):
         for term in model.layout.own.get(joint, ())[:1]:
-            q[:, j] = term.seen[0] + way * (term.seen[1] - term.seen[0])
+            q[:, j] = term.data_range[0] + way * (term.data_range[1] - term.data_range[0])
     still, first = np.zeros_like(q), np.zeros(count, dtype=int)
     runs = [
         Trajectory(np.arange(count) / 100.0, q, still + v, still, still, model.joints, None, first)

@@ -359,7 +359,7 @@ def drive_terms(draw):
     for key in NEEDS[name]:
         term[key] = draw(plain if draw(rarely) else MILD[float])
     if draw(rarely):
-        term["seen"] = draw(st.sampled_from([[0.0, 1.0], [1.0, 0.0], [1.0], ["x"], {}]))
+        term["data_range"] = draw(st.sampled_from([[0.0, 1.0], [1.0, 0.0], [1.0], ["x"], {}]))
     return term
 
 

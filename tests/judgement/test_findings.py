@@ -238,9 +238,9 @@ def test_the_share_of_a_validation_log_beyond_what_friction_was_fitted_to_is_sai
     mask = np.zeros((120, 2), dtype=bool)
     mask[:100, 1] = True
     v[100:, 1] = q[100:, 1] = 5.0
-    term = SimpleNamespace(guards="v", seen=(0.1, 1.0))
-    other = SimpleNamespace(guards="q", seen=(-0.5, 0.8))
-    loose = SimpleNamespace(guards="q", seen=(-np.inf, np.inf))
+    term = SimpleNamespace(guards="v", data_range=(0.1, 1.0))
+    other = SimpleNamespace(guards="q", data_range=(-0.5, 0.8))
+    loose = SimpleNamespace(guards="q", data_range=(-np.inf, np.inf))
     shape = SimpleNamespace(name="stribeck.speed", value=0.0123, unit="rad/s", is_at_bound=True)
 
     def said(*terms):

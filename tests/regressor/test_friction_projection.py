@@ -26,8 +26,8 @@ from robotid.robot.parameters import Coupling
 LIFT, ELBOW, WRIST = "shoulder_lift_joint", "elbow_joint", "wrist_1_joint"
 OWN = {
     LIFT: (LoadFriction(),),
-    ELBOW: (Stribeck(seen=(0.05, 2.0), speed=0.3), Asymmetric()),
-    WRIST: (Harmonic(seen=(-3.0, 3.0), order=2.0),),
+    ELBOW: (Stribeck(data_range=(0.05, 2.0), speed=0.3), Asymmetric()),
+    WRIST: (Harmonic(data_range=(-3.0, 3.0), order=2.0),),
 }
 VALUES = {
     f"{LIFT}.load": 0.08, f"{LIFT}.coulomb": 3.0, f"{LIFT}.viscous": 4.0,
@@ -186,7 +186,7 @@ def test_moments_of_a_drive_of_several_joints_are_of_rows_that_all_of_them_use()
     joints = ["shoulder_lift_joint", "elbow_joint", "wrist_1_joint"]
     model = RobotModel.from_urdf(
         example_urdf("ur5_robot.urdf"), joints=joints, couplings=(Coupling("motor", ratios),),
-        own_terms={"motor": (Harmonic(seen=(-9.0, 9.0), order=2.0),)},
+        own_terms={"motor": (Harmonic(data_range=(-9.0, 9.0), order=2.0),)},
     )  # fmt: skip
     rng, recordings, rows = np.random.default_rng(3), [], []
     for count in (90, 31):

@@ -360,7 +360,7 @@ def test_results_and_logs_of_one_name_are_told_apart_by_the_shortest_path(folder
 
 def test_friction_curves_are_those_of_the_identified_drives(identified, tmp_path):
     """The curve from result.json alone is the library's own, terms with shapes included."""
-    term = Stribeck(seen=(0.05, 1.5), speed=0.2)
+    term = Stribeck(data_range=(0.05, 1.5), speed=0.2)
     joint, other = "elbow_joint", "wrist_1_joint"
     model = identified.model.with_terms({joint: (term, LoadFriction())})
     pi, old = (
@@ -371,7 +371,7 @@ def test_friction_curves_are_those_of_the_identified_drives(identified, tmp_path
     pi[:] = [old.get(name, own.get(name, 0.0)) for name in model.layout.names]
     result = build_result(identified, {"estimator": {"name": "consistent"}})
     seen = {"q": [-1.0, 1.0], "v": [0.05, 1.5]}
-    result["friction"] = {name: {"seen": seen} for name in model.joints}
+    result["friction"] = {name: {"data_range": seen} for name in model.joints}
     write_json(result, tmp_path / "a.json")
     b = copy.deepcopy(result)
     b["own_terms"] = model.options["own_terms"]
@@ -488,7 +488,7 @@ def test_friction_is_compared_up_to_the_fastest_speed_of_any_result():
         values = {"one.viscous": viscous, "one.coulomb": coulomb, "two.viscous": other}
         return {
             "joints": ["two", "one"],
-            "friction": {joint: {"seen": {"v": [0.1, fastest]}} for joint in ("one", "two")},
+            "friction": {joint: {"data_range": {"v": [0.1, fastest]}} for joint in ("one", "two")},
             "drive_parameters": [{"name": k, "value": x} for k, x in values.items()],
             "identification": {"per_joint": {"one": {"unit": "N m"}, "two": {"unit": "N"}}},
         }
@@ -515,7 +515,7 @@ def test_friction_differs_by_a_share_of_the_most_in_either_direction():
         return {
             "joints": ["joint_1"],
             "own_terms": facts,
-            "friction": {"joint_1": {"seen": {"v": [0.1, 4.0]}}},
+            "friction": {"joint_1": {"data_range": {"v": [0.1, 4.0]}}},
             "drive_parameters": [{"name": k, "value": x} for k, x in values.items()],
             "identification": {"per_joint": {}},
         }

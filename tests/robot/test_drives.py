@@ -62,10 +62,10 @@ JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")
 MOTOR = Coupling("motor", (("elbow_joint", 1.0), ("wrist_1_joint", -0.5)))
 R = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, -0.5]])  # drives over joints
 OWN = [
-    Asymmetric(), LoadFriction(), Cubic(seen=(0.0, 3.0)), Stribeck(speed=0.3), Tanh(speed=0.2),
-    Power(exponent=0.4), Ramp(low=0.1, high=0.7), Harmonic(order=2.0, is_sine=True),
-    PositionCoulomb(order=2, centre=0.3), Presliding(displacement=0.05),
-    LuGre(displacement=0.05, speed=0.3, excess=0.6), Spring(seen=(-1.0, 2.0)),
+    Asymmetric(), LoadFriction(), Cubic(data_range=(0.0, 3.0)), Stribeck(speed=0.3),
+    Tanh(speed=0.2), Power(exponent=0.4), Ramp(low=0.1, high=0.7),
+    Harmonic(order=2.0, is_sine=True), PositionCoulomb(order=2, centre=0.3), Presliding(displacement=0.05),
+    LuGre(displacement=0.05, speed=0.3, excess=0.6), Spring(data_range=(-1.0, 2.0)),
     Hat(at=0.4, before=-0.3, after=0.9), Counterbalance(arm=0.2, base=0.6, angle=0.4, rest=0.3),
     Lag(),
 ]  # fmt: skip
@@ -294,11 +294,11 @@ def test_a_guarded_term_stays_as_it_was_at_the_end_of_what_was_seen():
     v = np.array([-9.0, -1.0, 0.5, 2.0, 9.0])
     motion = DriveMotion(v, v, v, np.sign(v), v, v)
     np.testing.assert_allclose(
-        Cubic(seen=(0.0, 1.5)).column(motion), [-(1.5**3), -1.0, 0.125, 1.5**3, 1.5**3]
+        Cubic(data_range=(0.0, 1.5)).column(motion), [-(1.5**3), -1.0, 0.125, 1.5**3, 1.5**3]
     )
-    hook = Stribeck(seen=(0.8, 2.0), speed=0.5).column(motion)
+    hook = Stribeck(data_range=(0.8, 2.0), speed=0.5).column(motion)
     np.testing.assert_allclose(hook, np.exp(-2 * np.array([2, 1, 0.8, 2, 2])) * np.sign(v))
-    wave = Harmonic(seen=(-1.0, 2.0), order=3.0).column(motion)
+    wave = Harmonic(data_range=(-1.0, 2.0), order=3.0).column(motion)
     np.testing.assert_allclose(wave, np.cos(3 * np.array([-1.0, -1.0, 0.5, 2.0, 2.0])))
 
 
@@ -399,10 +399,10 @@ def test_terms_are_read_back_from_plain_values(term):
     ("table", "message"),
     [
         ({"term": "Stribek"}, "term is 'Stribek', wanted one of .*Stribeck"),
-        ({"term": "Stribeck", "sped": 1.0}, "Stribeck has no 'sped'; it has seen, speed"),
+        ({"term": "Stribeck", "sped": 1.0}, "Stribeck has no 'sped'; it has data_range, speed"),
         ({"term": "Stribeck", "speed": "x"}, "speed is 'x', wanted a finite number"),
         ({"term": "Harmonic", "is_sine": 1}, "is_sine is 1, wanted true or false"),
-        ({"term": "Cubic", "seen": [1.0]}, "seen is .1.0., wanted .lowest, highest."),
+        ({"term": "Cubic", "data_range": [1.0]}, "data_range is .1.0., wanted .lowest, highest."),
     ],
 )
 def test_a_term_that_cannot_be_read_is_refused(table, message):
@@ -418,13 +418,13 @@ def test_families_make_terms_of_the_range_seen(family):
     assert len({term.name for term in terms}) == len(terms) >= 1
     for term in terms:
         assert term_from_dict(term.to_dict()) == term
-        assert not term.guards or term.seen in (seen[term.guards], (-np.inf, np.inf))
+        assert not term.guards or term.data_range in (seen[term.guards], (-np.inf, np.inf))
     for shape, size in zip(family.shapes, sizes, strict=True):
         assert {getattr(term, shape.name) for term in terms} == {size}
 
 
 def test_a_hook_that_only_slow_motion_shows_is_a_base_parameter():
-    own = {joint: [Stribeck(speed=0.02, seen=(0.03, 0.4))] for joint in JOINTS}
+    own = {joint: [Stribeck(speed=0.02, data_range=(0.03, 0.4))] for joint in JOINTS}
     model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=JOINTS, own_terms=own)
     assert {f"{joint}.stribeck" for joint in JOINTS} <= set(structural_mapping(model).base_names)
 
@@ -453,8 +453,11 @@ def test_what_drives_remember_is_of_the_model_not_of_what_was_remembered_before(
         (lambda: Ramp(low=0.5, high=0.5), "Ramp: low = 0.5, high = 0.5, wanted each larger than"),
         (lambda: Hat(before=0.0, at=0.5, after=0.2), "before = 0, at = 0.5, after = 0.2, wanted"),
         (lambda: Counterbalance(arm=0.0), "Counterbalance: arm is 0.0, wanted 1e-09"),
-        (lambda: Cubic(seen=(1.0, 0.0)), r"Cubic: seen is \(1.0, 0.0\), wanted \(lowest, highest"),
-        (lambda: Spring(seen=(np.nan, 1.0)), "Spring: seen is"),
+        (
+            lambda: Cubic(data_range=(1.0, 0.0)),
+            r"Cubic: data_range is \(1.0, 0.0\), wanted \(lowest, highest",
+        ),
+        (lambda: Spring(data_range=(np.nan, 1.0)), "Spring: data_range is"),
     ],
 )
 def test_a_shape_that_divides_by_zero_is_refused(make, words):

@@ -22,7 +22,7 @@ def test_a_family_is_advised_a_tenth_beyond_the_turns_that_it_needs():
 
 
 def test_the_line_of_a_drive_is_read_back_as_it_was():
-    wave = Harmonic(seen=(-1.0, 2.0), order=3.0, is_sine=True)
+    wave = Harmonic(data_range=(-1.0, 2.0), order=3.0, is_sine=True)
     [(joint, entries)] = tomllib.loads(drive_line("a joint", wave, "load", Spring())).items()
     assert joint == "a joint"
     assert entries[1] == "load"

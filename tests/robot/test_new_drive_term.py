@@ -44,13 +44,13 @@ class Bend(MemorylessTerm):
 def bend(monkeypatch):
     """The term with its family in the catalogue, a robot that has it, and its parameters."""
     family = Family(
-        "bend", "friction that bends", lambda seen, speed: (Bend(seen=seen["v"], speed=speed),),
+        "bend", "friction that bends", lambda own, speed: (Bend(data_range=own["v"], speed=speed),),
         (Shape("speed", ("rad/s", "m/s"), (0.01, 0.5), "v"),), is_automatic=True,
     )  # fmt: skip
     monkeypatch.setitem(TERM_CLASSES, "Bend", Bend)
     monkeypatch.setitem(FAMILIES, "bend", family)
     plain = RobotModel.from_urdf(URDF / "planar_2r.urdf")
-    term = Bend(seen=(0.0, 30.0), speed=SPEED)
+    term = Bend(data_range=(0.0, 30.0), speed=SPEED)
     true, pi = driven(plain, {JOINT: (term,)}, {TRUE: SIZE})
     return SimpleNamespace(plain=plain, true=true, pi=pi, term=term)
 

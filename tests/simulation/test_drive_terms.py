@@ -32,10 +32,11 @@ from robotid.simulation.law_lanes import coded_term, deflection, slid, term, tur
 from robotid.simulation.plant import RobotPlant
 
 OWN = (
-    Asymmetric(), LoadFriction(), Cubic(seen=(0.0, 1.5)), Stribeck(speed=0.3, seen=(0.2, 1.5)),
-    Tanh(speed=0.4, seen=(0.0, 1.5)), Power(exponent=0.4), Ramp(low=0.1, high=0.9),
+    Asymmetric(), LoadFriction(), Cubic(data_range=(0.0, 1.5)),
+    Stribeck(speed=0.3, data_range=(0.2, 1.5)), Tanh(speed=0.4, data_range=(0.0, 1.5)),
+    Power(exponent=0.4), Ramp(low=0.1, high=0.9),
     Harmonic(order=2.0), Harmonic(order=3.0, is_sine=True), PositionCoulomb(order=0),
-    PositionCoulomb(order=2, centre=0.3, seen=(-0.6, 0.9)), Spring(seen=(-0.6, 0.9)),
+    PositionCoulomb(order=2, centre=0.3, data_range=(-0.6, 0.9)), Spring(data_range=(-0.6, 0.9)),
     Hat(at=0.4, before=-0.3, after=0.9), Counterbalance(arm=0.2, base=0.6, angle=0.4, rest=0.3),
 )  # fmt: skip
 MEMORYLESS = (*(t for t in TERMS.values() if not t.is_inertia), *OWN)
