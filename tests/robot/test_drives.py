@@ -64,7 +64,8 @@ R = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, -0.5]])  # drives over j
 OWN = [
     Asymmetric(), LoadFriction(), Cubic(data_range=(0.0, 3.0)), Stribeck(speed=0.3),
     Tanh(speed=0.2), Power(exponent=0.4), Ramp(low=0.1, high=0.7),
-    Harmonic(order=2.0, is_sine=True), PositionCoulomb(order=2, centre=0.3), Presliding(displacement=0.05),
+    Harmonic(order=2.0, is_sine=True), PositionCoulomb(order=2, centre=0.3),
+    Presliding(displacement=0.05),
     LuGre(displacement=0.05, speed=0.3, excess=0.6), Spring(data_range=(-1.0, 2.0)),
     Hat(at=0.4, before=-0.3, after=0.9), Counterbalance(arm=0.2, base=0.6, angle=0.4, rest=0.3),
     Lag(),
