@@ -21,8 +21,6 @@ _OPEN = 1e-2  # a parameter with a larger share in an undetermined direction is 
 _FLOOR = 1e-9  # smallest noise level, as a share of the torque: noise-free data have none
 _TOLERANCE = 1e-8  # relative change of the noise levels at which WLS has converged
 _MAX_ITERATIONS = 200
-_REMEMBERED = 3  # steps by which the next one is extrapolated, ...
-_FARTHEST = 10.0  # ... by this factor at most
 _SETTLED = 1e-5  # ... and at which it is good enough after so many iterations
 _TLS_ITERATIONS = 100
 _TLS_TOLERANCE = 1e-12  # change of the torque, relative to all of it
@@ -83,21 +81,19 @@ class WLS(BatchEstimator):
     def _fit(self, factors: Factors) -> Estimate:
         start = solve_factor(factors, np.ones(len(factors.rows)), self.prior)
         sigma = _noise(factors, start.theta, factors.leverages(start.covariance))
-        levels: list[tuple[Array, Array]] = []  # logarithms before and after each step
         for iteration in range(1, _MAX_ITERATIONS + 1):
             solution = solve_factor(factors, sigma, self.prior)
             spent = factors.leverages(solution.covariance) / sigma**2
             updated = _noise(factors, solution.theta, spent)
             change = np.max(np.abs(updated - sigma) / sigma)
+            sigma = updated
             is_last = iteration == _MAX_ITERATIONS
             if change < (_SETTLED if is_last else _TOLERANCE):
-                sigma, covariance = updated, solution.covariance / self.independent_share
+                covariance = solution.covariance / self.independent_share
                 message = f"noise levels settled after {iteration} iterations"
                 if is_last:
                     message += f", where they still change by {change:.1e}"
                 return solution.estimate(factors.names, covariance, sigma, iteration, message)
-            levels = [*levels[-_REMEMBERED:], (np.log(sigma), np.log(updated))]
-            sigma = np.exp(_ahead(*map(np.array, zip(*levels, strict=True))))
         raise NotConvergedError(
             f"the noise levels of WLS still change by {change:.1e} after {_MAX_ITERATIONS} "
             f"iterations with {int(factors.rows.sum())} rows for {len(factors.names)} parameters; "
@@ -261,24 +257,6 @@ def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solutio
     step = V @ ((U[:, :rank].T @ (d - A @ start)) / s[:rank])
     basis = V / s[:rank] / scale[:, None]
     return Solution(start + step / scale, basis @ basis.T, rank, X, undetermined)
-
-
-def _ahead(x: Array, g: Array) -> Array:
-    """Return a point nearer than g_k to where g(x) = x, by the last steps from x_i to g_i = g(x_i).
-
-    Args:
-        x: Logarithms of the noise levels, shape (k, n).
-        g: What the iteration makes of them, shape (k, n).
-
-    References:
-        Anderson (1965), Iterative procedures for nonlinear integral equations; Walker, Ni (2011),
-        Anderson acceleration for fixed-point iterations.
-    """
-    left = g - x
-    share = np.linalg.lstsq(np.diff(left, axis=0).T, left[-1], rcond=None)[0]
-    farthest = np.log(_FARTHEST)
-    ahead: Array = g[-1] - np.clip(share @ np.diff(g, axis=0), -farthest, farthest)
-    return ahead
 
 
 def _noise(factors: Factors, theta: Array, spent: Array) -> Array:
