@@ -7,6 +7,7 @@ import re
 import runpy
 import subprocess
 import sys
+import textwrap
 import tomllib
 
 import numpy as np
@@ -30,10 +31,18 @@ from write_tables import BLOCK, PAGES, digest
 MACHINE = r"Python \d+\.\d+.*(x86_64|aarch64|arm64)"
 
 
+def blocks_of(name, language):
+    """Return the blocks of a page in one language, those in lists moved to the margin."""
+    found = re.findall(
+        rf"^ *```{language}\n(.*?)^ *```$", (DOCS / name).read_text(), re.DOTALL | re.MULTILINE
+    )
+    assert found
+    return [textwrap.dedent(block) for block in found]
+
+
 def run(name):
     """Run the Python blocks of a page one after the other, in one namespace."""
-    blocks = re.findall(r"```python\n(.*?)```", (DOCS / name).read_text(), re.DOTALL)
-    assert blocks
+    blocks = blocks_of(name, "python")
     namespace = {}
     for block in blocks:
         exec(compile(block, name, "exec"), namespace)
@@ -212,6 +221,7 @@ def test_no_page_is_left_out_of_the_site():
     config = (ROOT / ".mkdocs.yml").read_text()
     listed = set(re.findall(r"- (?:[\w ]+: )?([\w/]+\.md)", config))
     written = {f"reference/commands/{name}.md" for name in COMMANDS}  # as the site is built
+    written.add("tutorials/first_steps.md")  # of the notebook
     assert {page.relative_to(DOCS).as_posix() for page in pages()} | written == listed
 
 
