@@ -17,7 +17,7 @@ NOTEBOOK = Path(__file__).parent / "tutorials" / "first_steps.ipynb"
 OUTPUTS = Path(__file__).parents[1] / "build" / "notebook"
 _PAGE = """<!doctype html><meta charset="utf-8"><style>
 :root {{ color-scheme: light dark; font: 14px system-ui, sans-serif }}
-body {{ margin: 0 }} iframe {{ width: 100%; border: 0 }}
+body {{ margin: 0 }} body > :not(iframe) {{ margin-left: 8px }} iframe {{ width: 100%; border: 0 }}
 table {{ border-collapse: collapse }} td, th {{ padding: 2px 8px; text-align: right }}
 </style>{}"""
 
@@ -38,7 +38,7 @@ def page():
         if (OUTPUTS / f"{name}.html").exists():
             parts.append(
                 f'<iframe src="first_steps/{name}.html" title="Output of {name}" loading="lazy" '
-                f'style="width:100%;height:26rem;border:1px solid #8884"></iframe>'
+                f'style="width:100%;height:24rem;border:1px solid #8884"></iframe>'
             )
     link = "Download [the notebook](first_steps.ipynb) to run it yourself."
     return "\n\n".join([parts[0], link, *parts[1:]]) + "\n"
