@@ -255,5 +255,8 @@ def test_the_site_builds_and_documents_the_public_names(tmp_path):
     assert run.returncode == 0, run.stderr
     shown = set(re.findall(r'id="robotid\.(\w+)"', (tmp_path / "reference/api.html").read_text()))
     assert set(robotid.__all__) - {"__version__"} <= shown
+    assert "plot_friction" in (tmp_path / "tutorials/first_steps.html").read_text()
+    links = (tmp_path / "tutorials/first_arm.html").read_text()
+    assert 'href="first_steps.html"' in links, "the page of the notebook, not its file"
     home = (tmp_path / "index.html").read_text()
     assert "fonts." not in home, "the site is read without a network"
