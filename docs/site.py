@@ -6,6 +6,7 @@
 
 import argparse
 import json
+import re
 import shutil
 import sys
 from importlib import import_module
@@ -40,7 +41,8 @@ def on_page_markdown(markdown, page, **_):
     if page.file.src_uri == "gallery.md":
         return markdown + "\n".join(map(gallery_entry, entries.values()))
     if page.file.src_uri == "index.md" and "demo" in entries:
-        return markdown.replace("<!-- demo -->", frames("demo"))
+        pictures = re.compile("<!-- demo -->.*?<!-- end of demo -->", re.DOTALL)
+        return pictures.sub(frames("demo"), markdown)
     return markdown
 
 
@@ -80,7 +82,7 @@ def command_page(name):
     for group in parser._action_groups:
         actions = [a for a in group._group_actions if a.dest != "help"]
         if actions:
-            parts += [f"## {title_of(group.title)}\n", "| | |\n|---|---|", *map(row, actions), ""]
+            parts += [f"## {title_of(group.title)}\n", *map(definition, actions)]
     return "\n".join(parts)
 
 
@@ -94,13 +96,11 @@ def shown(metavar):
     return " ".join(metavar) if isinstance(metavar, tuple) else metavar
 
 
-def row(action):
-    """Return the line of an argument or a flag."""
+def definition(action):
+    """Return an argument or a flag, with its help below."""
     values = ""
     if action.nargs != 0:
         choices = "|".join(map(str, action.choices or ()))
         values = shown(action.metavar or choices or action.dest.upper())
-    name = ", ".join(action.option_strings)
-    words = (action.help or "") % {"default": action.default} if action.help else ""
-    cell = f"{name} {values}".strip().replace("|", "\\|")
-    return f"| `{cell}` | {words.replace('|', chr(92) + '|').replace('<', '&lt;')} |"
+    words = (action.help or "").replace("%%", "%").replace("<", "&lt;") or "See above."
+    return f"`{' '.join([*action.option_strings, values]).strip()}`\n:   {words}\n"
