@@ -34,7 +34,7 @@ PAGES = {
     "recursive": "how_to/online.md",
     "replay": "how_to/replay.md",
     "verdict": "evidence/verdicts.md",
-    "preview": "how_to/record.md",
+    "preview": "how_to/preview.md",
     "excitation": "evidence/excitation.md",
     "designs": "evidence/excitation.md",
     "motions": "evidence/excitation.md",

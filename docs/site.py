@@ -1,12 +1,14 @@
-"""Hooks of the site: one page for each command, and the gallery where one was built.
+"""Hooks of the site: a page for each command, the notebook, and the gallery where one was built.
 
-``mkdocs build -f .mkdocs.yml`` calls them. ``python docs/gallery.py`` builds the gallery.
+``mkdocs build -f .mkdocs.yml`` calls them. ``python docs/gallery.py`` builds the gallery,
+``python docs/notebook.py`` the outputs of the notebook.
 """
 
 import argparse
 import json
 import re
 import shutil
+import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -14,19 +16,25 @@ from mkdocs.structure.files import File
 
 from robotid.cli import COMMANDS
 
+sys.path.append(str(Path(__file__).parent))
+import notebook
+
 GALLERY = Path(__file__).parents[1] / "build" / "gallery"
 
 
 def on_files(files, config):
-    """Add the pages of the commands."""
+    """Add the pages of the commands, and that of the notebook."""
+    files.append(File.generated(config, "tutorials/first_steps.md", content=notebook.page()))
     for name in COMMANDS:
-        page = command_page(name)
-        files.append(File.generated(config, f"reference/commands/{name}.md", content=page))
+        text = command_page(name)
+        files.append(File.generated(config, f"reference/commands/{name}.md", content=text))
     return files
 
 
 def on_page_markdown(markdown, page, **_):
-    """Fill in the gallery, and the demo on the landing page."""
+    """Fill in the gallery and the demo on the landing page; link the notebook's page."""
+    if page.file.src_uri != "tutorials/first_steps.md":
+        markdown = markdown.replace("first_steps.ipynb)", "first_steps.md)")
     entries = {}
     if (GALLERY / "entries.json").exists():
         entries = {e["name"]: e for e in json.loads((GALLERY / "entries.json").read_text())}
@@ -39,9 +47,10 @@ def on_page_markdown(markdown, page, **_):
 
 
 def on_post_build(config):
-    """Copy the reports and replays of the gallery."""
-    if GALLERY.exists():
-        shutil.copytree(GALLERY, Path(config["site_dir"]) / "gallery", dirs_exist_ok=True)
+    """Copy the reports and replays of the gallery, and the outputs of the notebook."""
+    for made, folder in ((GALLERY, "gallery"), (notebook.OUTPUTS, "tutorials/first_steps")):
+        if made.exists():
+            shutil.copytree(made, Path(config["site_dir"]) / folder, dirs_exist_ok=True)
 
 
 def gallery_entry(entry):

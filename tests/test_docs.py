@@ -7,6 +7,7 @@ import re
 import runpy
 import subprocess
 import sys
+import textwrap
 import tomllib
 
 import numpy as np
@@ -33,10 +34,18 @@ from write_tables import BLOCK, PAGES, digest
 MACHINE = r"Python \d+\.\d+.*(x86_64|aarch64|arm64)"
 
 
+def blocks_of(name, language):
+    """Return the blocks of a page in one language, those in lists moved to the margin."""
+    found = re.findall(
+        rf"^ *```{language}\n(.*?)^ *```$", (DOCS / name).read_text(), re.DOTALL | re.MULTILINE
+    )
+    assert found
+    return [textwrap.dedent(block) for block in found]
+
+
 def run(name):
     """Run the Python blocks of a page one after the other, in one namespace."""
-    blocks = re.findall(r"```python\n(.*?)```", (DOCS / name).read_text(), re.DOTALL)
-    assert blocks
+    blocks = blocks_of(name, "python")
     namespace = {}
     for block in blocks:
         exec(compile(block, name, "exec"), namespace)
@@ -299,6 +308,7 @@ def test_no_page_is_left_out_of_the_site():
     config = (ROOT / ".mkdocs.yml").read_text()
     listed = set(re.findall(r"- (?:[\w ]+: )?([\w/]+\.md)", config))
     written = {f"reference/commands/{name}.md" for name in COMMANDS}  # as the site is built
+    written.add("tutorials/first_steps.md")  # of the notebook
     assert {page.relative_to(DOCS).as_posix() for page in pages()} | written == listed
 
 
@@ -334,5 +344,8 @@ def test_the_site_builds_and_documents_the_public_names(tmp_path):
     shown = [name for page in pages for name in re.findall(r'id="robotid\.(\w+)"', page)]
     assert set(robotid.__all__) - {"__version__"} <= set(shown)
     assert len(shown) == len(set(shown)), "a name is documented twice"
+    assert "plot_friction" in (tmp_path / "tutorials/first_steps.html").read_text()
+    links = (tmp_path / "tutorials/first_arm.html").read_text()
+    assert 'href="first_steps.html"' in links, "the page of the notebook, not its file"
     home = (tmp_path / "index.html").read_text()
     assert "fonts." not in home, "the site is read without a network"
