@@ -27,7 +27,7 @@ START = """# Job file
 A job file is TOML: `robotid identify job.toml`. Only `urdf` and one `[[identification]]` are needed; every other key has
 the default below. A misspelt key is an error that names the nearest right one. Paths are relative to the job file, and
 `$NAME` in them is filled in from the environment. This page is written by `python docs/write_reference.py` from the settings
-in the code; `result.json` holds the same keys under `settings`. `robotid schema > job.schema.json` writes them as a JSON
+in the code, and so is that on [estimators and controllers](job_estimators.md); `result.json` holds the same keys under `settings`. `robotid schema > job.schema.json` writes them as a JSON
 schema: with `#:schema job.schema.json` in its first line, editors that know TOML complete and check a job file. Shells complete commands and flags after
 `eval "$(register-python-argcomplete robotid)"`.
 
@@ -88,8 +88,28 @@ TABLES = {
 }
 
 
+ESTIMATION = """# Job file: estimators
+
+The tables of a [job file](job_file.md) that choose the estimator, its constraints, and the controller of closed-loop identification.
+This page is written by `python docs/write_reference.py` from the settings in the code.
+"""
+
+
+def pages():
+    """Return the texts of the pages, by file name."""
+    first, *sections = job_file().split("\n## ")
+    there = [x for x in sections if x.startswith(("`[estimator", "`[controller]"))]
+    here = [x for x in sections if x not in there]
+    texts = {
+        "job_file.md": [first, *here],
+        "job_estimators.md": [ESTIMATION, *there],
+        "plant.md": [plant()],
+    }
+    return {name: "\n## ".join(parts).rstrip() + "\n" for name, parts in texts.items()}
+
+
 def job_file():
-    """Return the text of the page on job files."""
+    """Return the text on job files, with a section for each table."""
     own = {
         key.at or field.name: (field, key)
         for field, key in keys(Job)
@@ -199,5 +219,5 @@ def default_of(field):
 
 
 if __name__ == "__main__":
-    (REFERENCE / "job_file.md").write_text(job_file(), encoding="utf-8")
-    (REFERENCE / "plant.md").write_text(plant(), encoding="utf-8")
+    for name, text in pages().items():
+        (REFERENCE / name).write_text(text, encoding="utf-8")
