@@ -150,7 +150,7 @@ def test_it_is_an_identification_as_others_are(found, tmp_path):
     content = build_result(found, {"estimator": {"name": "simulation"}})
     entries = {entry["name"]: entry for entry in content["drive_parameters"]}
     share = dict(zip(estimate.names, found.shrunk, strict=True))
-    known = zip(estimate.names, estimate.theta, estimate.std_error, estimate.reach, strict=True)
+    known = zip(estimate.names, estimate.theta, estimate.std_error, estimate.quantile, strict=True)
     for key, value, error, reach in known:
         own = entries[key]
         assert (own["value"], own["quantile"]) == (value, reach)

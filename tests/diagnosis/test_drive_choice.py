@@ -247,7 +247,10 @@ def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
         assert (shape.name, shape.unit) == ("stribeck.speed", unit)
     anew = drive_choice._weighed_anew(alone, drive, [(family, [shape.value])])
     Z = np.hstack(
-        [drive.columns([Stribeck(speed=shape.value + x, seen=SEEN["v"])]) for x in (0.0, 1e-6)]
+        [
+            drive.columns([Stribeck(speed=shape.value + x, data_range=SEEN["v"])])
+            for x in (0.0, 1e-6)
+        ]
     )
     Z[:, 1] -= Z[:, 0]
     size = drive_choice.Trials(anew, Z[:, None, :1], 1e-10).whole.parameters([0])[0]

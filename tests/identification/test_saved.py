@@ -50,7 +50,6 @@ def saved(found, tmp_path_factory):
 
 
 def test_the_files_are_those_of_the_command_line_and_hold_what_was_found(saved, found):
-    content = json.loads(saved.read_text())
     assert {path.name for path in saved.parent.iterdir()} == {
         "result.json",
         "report.html",
@@ -59,7 +58,7 @@ def test_the_files_are_those_of_the_command_line_and_hold_what_was_found(saved, 
     }
     loaded = robotid.load_result(saved.parent)
     np.testing.assert_allclose(loaded.parameters, found.standard, rtol=1e-9, atol=1e-12)
-    assert content["verdict"] == found.verdict.to_dict()
+    assert loaded.verdict == found.verdict.to_dict()
 
 
 def test_the_settings_are_a_job_that_finds_the_same_again(saved, found, logs, tmp_path):

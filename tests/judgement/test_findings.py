@@ -246,7 +246,7 @@ def test_the_share_of_a_validation_log_beyond_what_friction_was_fitted_to_is_sai
     def said(*terms):
         choice = SimpleNamespace(
             joint="b", shapes=[shape, SimpleNamespace(is_at_bound=False)], terms=terms,
-            seen={"v": (0.1, 1.0), "q": (-0.5, 0.8)}, families=("stribeck", "position"),
+            data_range={"v": (0.1, 1.0), "q": (-0.5, 0.8)}, families=("stribeck", "position"),
         )  # fmt: skip
         motion = SimpleNamespace(v=v, q=q)
         recording = SimpleNamespace(trajectory=motion, mask=mask, name="run.csv 0-2 s")

@@ -344,4 +344,4 @@ def test_the_summary_says_what_the_start_beside_the_program_does(html, content):
     last = {name: content["models"][name]["relative_error"][-1] for name in MODELS}
     gains = [content["on_program"][n]["relative_error"][-1] / last[n] for n in MODELS]
     assert f"leave an error {min(gains):.2g} to {max(gains):.2g} times as large" in html
-    assert "starts, 1 degree beside its program" in html
+    assert "starts, 1 degree off its program" in html

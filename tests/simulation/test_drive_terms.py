@@ -72,7 +72,8 @@ def compiled_term(own, q, v):
 
 def test_every_registered_term_is_walked_over():
     walked = {type(own) for own in (*MEMORYLESS, *LASTING)}
-    assert registered() - walked == {MemorylessTerm, Bristles, Armature, Lag}
+    own = {kind for kind in registered() if kind.__module__.startswith("robotid.")}
+    assert own - walked == {MemorylessTerm, Bristles, Armature, Lag}
 
 
 @pytest.mark.parametrize("own", MEMORYLESS, ids=lambda own: own.name)

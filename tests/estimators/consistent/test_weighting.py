@@ -189,8 +189,7 @@ def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
 def test_the_information_of_all_segments_but_one_counts_the_share_that_is_independent(case):
     fit, problem = case
     fit, segments = replace(fit, independent_share=0.25), cut(problem, 3)
-    segments = Segments.of(fit, segments, NOISE)
-    for k, rows in enumerate(segments.others):
+    for k, rows in enumerate(Segments.of(fit, segments, NOISE).others):
         others = fit.rows(merge([s for i, s in enumerate(segments) if i != k]), NOISE)
         np.testing.assert_allclose(rows.T @ rows, others.T @ others, rtol=1e-9, atol=1e-6)
 
