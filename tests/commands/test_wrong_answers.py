@@ -55,7 +55,7 @@ class Workplace:
 
     def identified(self, log, validation=None, **settings):
         """Run a job; return the identification and result.json."""
-        kept = [self.write(validation, "kept.csv")] if validation is not None else []
+        kept = [self.write(validation, "second.csv")] if validation is not None else []
         table = {
             "urdf": str(URDF),
             "identification": [{"log": str(log)}],
@@ -256,7 +256,7 @@ def pooled_figure(here):
     torques = result["validation"][0]["per_joint"]
     assert sum(m["relative_error_pct"] < 15 for m in torques.values()) == 5
     assert result["verdict"]["per_joint"]["wrist_3_joint"]["status"] == "poor"
-    reason = re.sub(r" on kept.csv.*", " on kept.csv", result["verdict"]["reasons"][0])
+    reason = re.sub(r" on second.csv.*", " on second.csv", result["verdict"]["reasons"][0])
     return f"{reason} (verdict: poor, and so for that joint)"
 
 
@@ -273,7 +273,7 @@ CASES = {
     "a misspelt setting": misspelt_setting,
     "an unknown joint name": unknown_joint,
     "a joint that is not identified": inactive_joint,
-    "a continuous joint that turns over": continuous_joint,
+    "a continuous joint over several revolutions": continuous_joint,
     "a mesh that is missing": missing_mesh,
     "no filter wanted": filter_off,
     "five outliers of 1000 N m": outliers,

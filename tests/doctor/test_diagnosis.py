@@ -125,14 +125,14 @@ def test_where_names_the_joint_and_the_evidence_says_how_much(spoilt):
 
 
 def test_delays_are_measured_and_corrected_only_on_request(spoilt):
-    job, findings = spoilt("torque 30 ms late")
+    job, findings = spoilt("torque delayed by 30 ms")
     (found,) = [f for f in findings if f.code == "torque_delay"]
     delay, error = found.evidence["delay"], found.evidence["std_error"]
     # 5 ms: unmodelled friction near a change of direction imitates a few
     assert abs(delay - 0.03) < max(3 * error, 0.005)
     stated = replace(job, signals=SignalSettings(torque_delay=0.03))
     assert "torque_delay" not in loud(examine(stated))
-    job, findings = spoilt("velocity 30 ms late")
+    job, findings = spoilt("velocity delayed by 30 ms")
     (found,) = [f for f in findings if f.code == "velocity_delay"]
     assert found.evidence["delay"] == pytest.approx(0.03, abs=0.001)
     stated = replace(job, signals=SignalSettings(velocity_delay=0.03))

@@ -151,7 +151,7 @@ def faulty_logs(rng):
         "sweeps within backlash": ("small_command", told(0.01 * small), of(play=0.02, quantum=0.0)),
         "sweeps of few encoder steps": ("small_command", told(0.006 * small), of(quantum=0.0015)),
         "a third of the speed that is needed": ("saturated", told(), weak),
-        "two joints told the same": (
+        "two joints commanded alike": (
             "proportional_commands", lambda t: told()(t)[:, [0, 0, 2]] * [1, -0.6, 1], servos,
         ),
     }  # fmt: skip
@@ -160,7 +160,7 @@ def faulty_logs(rng):
     yield "base that moves", "moved_by_others", record(still, servos, couple=give)
     yield "five rows per period", "slow_sampling", record(told(), servos, rate=5 * max(widths))
     yield (
-        "command logged 0.3 s late",
+        "command logged with a delay of 0.3 s",
         "delayed_command",
         replace(good.window(1.0, 19.0), q_ref=late),
     )
