@@ -42,7 +42,11 @@ class DriveTorques:
         return limited
 
     def slopes(
-        self, joints: Array, columns: Sequence[Column], motion: Array, kinds: Mapping[str, int]
+        self,
+        joints: Array,
+        columns: Sequence[tuple[int, Column]],
+        motion: Array,
+        kinds: Mapping[str, int],
     ) -> Array:
         """Return the derivatives of what some drives give, shape (N, k, c).
 
@@ -50,7 +54,8 @@ class DriveTorques:
 
         Args:
             joints: Which, shape (k,).
-            columns: What they are by, c columns as of ``ClosedLoopRobot.roll_out``.
+            columns: What they are by: columns as of ``ClosedLoopRobot.roll_out``, each with the
+                place, of c, of its sensitivity.
             motion: Derivatives of their positions and then speeds, shape (N, 2k, c).
             kinds: Numbers of the columns' kinds.
         """
@@ -60,11 +65,11 @@ class DriveTorques:
         )
         own = {kinds["kp"]: self.reach, kinds["kd"]: self.rate}
         at_limit = (np.abs(self.asked) >= loops.limit)[:, joints]
-        for c, (kind, joint, _) in enumerate(columns):
+        for c, (kind, joint, _) in columns:
             if kind in own:
                 change[:, joints == joint, c] += own[kind][:, [joint]]
         change[at_limit] = 0.0
-        for c, (kind, joint, _) in enumerate(columns):
+        for c, (kind, joint, _) in columns:
             if kind == kinds["limit"]:
                 side = np.sign(self.asked[:, [joint]])
                 change[:, joints == joint, c] += at_limit[:, joints == joint] * side

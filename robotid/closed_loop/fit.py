@@ -133,6 +133,7 @@ def fit_loops(
     theta = simulator.prior.copy()
     theta[drives] = replace(estimator, rounds=1).fit(few).theta
     simulator = replace(simulator, error=settings.error)
+    is_plain = settings.error == "output" and initialised.linear is None
     for left in reversed(range(_STARTS)):
         simulator = simulator.with_better_start(theta)
         if simulator.behind is not None:
@@ -140,7 +141,9 @@ def fit_loops(
             gains, is_last = (simulator.loops(theta), _open_gains(loop, model)), left == 0
             behind, _ = find_gains(outs, *gains, knows_delay=True, is_whole=not is_last)
             simulator = replace(simulator, behind=behind)
-        estimate = estimator.fit(simulator, theta, exact=simulator.exact)
+        # starts that are not yet the best deserve no more than one round
+        rounds = 1 if left and is_plain else estimator.rounds
+        estimate = replace(estimator, rounds=rounds).fit(simulator, theta, exact=simulator.exact)
         theta = estimator.joint_step(simulator, estimate.theta)
         if initialised.linear is not None and simulator.torque is not None:
             estimator = replace(estimator, inflation=_BOTH * estimate.details["inflation"])

@@ -282,7 +282,7 @@ class LoopSimulator:
         Args:
             theta: Values of the unknowns, shape (c,).
             with_slopes: Whether derivatives are wanted.
-            with_starts: Whether those by the starts of windows are, without the others.
+            with_starts: Whether those by the starts of windows are.
 
         Raises:
             NotConvergedError: If a step has no solution.
@@ -292,7 +292,9 @@ class LoopSimulator:
             identification of robot dynamics, IEEE TCST 21(2): DIDIM.
         """
         loops, (_, directions) = self.loops(theta), self._bodies(theta)
-        columns, owners = self._columns(loops) if with_slopes else ([], np.array([], dtype=int))
+        columns = self._columns(loops) if with_slopes else []
+        if with_starts:
+            columns += [(len(theta) + k, column) for k, column in enumerate(self._starts())]
         rolls = (with_slopes or with_starts) and self.error != "direct"
         if not rolls or self.fine is not None:
             outs = (self.fine or self.robot).roll_out(loops, self.windows)
@@ -300,15 +302,16 @@ class LoopSimulator:
             ways = self.robot.roll_out(
                 loops,
                 self.windows,
-                [*columns, *self._starts()],
+                [column for _, column in columns],
                 directions,
+                owners=[owner for owner, _ in columns],
                 with_speeds=self.velocities or self.behind is not None,
             )
             errors = [self._error(out, loops) for out in (ways if self.fine is None else outs)]
             return [
                 part
                 for out, error in zip(ways, errors, strict=True)
-                for part in self._parts(out, error, loops, columns, owners)
+                for part in self._parts(out, error, loops, columns)
             ]
         everything, none = np.arange(self._outputs), np.array([], dtype=int)
         if not with_slopes:
@@ -350,31 +353,24 @@ class LoopSimulator:
         return error
 
     def _parts(
-        self, out: RollOut, error: Array, loops: Loops, columns: list[Column], owners: Array
+        self, out: RollOut, error: Array, loops: Loops, columns: list[tuple[int, Column]]
     ) -> Iterator[Residual]:
         """Yield the errors of a roll-out's parts, with all that they change with."""
-        wanted, n = [*columns, *self._starts()], len(loops.kp)
+        n, free_parameters = len(loops.kp), len(self.free_parameters)
         torques = None if self.behind is None else drive_torques(out, loops, self.behind)
         for joints, places, slopes in out.slopes:
             k = len(joints)
             parts = [slopes[:, :k]] if self.error == "output" else []
             parts += [slopes[:, k:]] if self.velocities else []
             if torques is not None:
-                by = [wanted[p] for p in places]
+                place = {int(owner): c for c, owner in enumerate(places)}
+                by = [(place[owner], own) for owner, own in columns if owner in place]
                 parts.append(torques.slopes(joints, by, slopes, self.robot.kinds))
             slopes = np.concatenate(parts, axis=1)
             outputs = np.concatenate([joints + n * i for i in range(len(parts))])
-            is_start = places >= len(columns)
-            by_start, slopes = slopes[:, :, is_start], slopes[:, :, ~is_start]
-            owner = owners[places[~is_start]]
-            own = np.unique(owner)
-            if len(own) < len(owner):  # a column of each joint that shares it
-                shared = np.zeros((len(owner), len(own)))
-                shared[np.arange(len(owner)), np.searchsorted(own, owner)] = 1.0
-                slopes = slopes @ shared
-            else:
-                slopes = slopes[:, :, np.argsort(owner)]
-            yield Residual(error[:, outputs], slopes, outputs, own, by_start)
+            own = places[places < free_parameters]  # and behind them starts
+            by_start = slopes[:, :, len(own) :]
+            yield Residual(error[:, outputs], slopes[:, :, : len(own)], outputs, own, by_start)
 
     def _inverse_dynamics(self, outs: Sequence[RollOut], theta: Array) -> list[Array]:
         """Return Y(q, v, a) d pi along roll-outs, window by window, shape (N, n, c)."""
@@ -399,10 +395,9 @@ class LoopSimulator:
         kinds, n = self.robot.kinds, len(self.base.kp)
         return [(kinds[what], j, 0) for what in ("start", "speed") for j in range(n)]
 
-    def _columns(self, loops: Loops) -> tuple[list[Column], Array]:
-        """Return what to differentiate by, and the unknown that each column is of."""
-        kinds = self.robot.kinds
-        columns, owners, body = [], [], 0
+    def _columns(self, loops: Loops) -> list[tuple[int, Column]]:
+        """Return what to differentiate by, each column with the number of its unknown."""
+        kinds, columns, body = self.robot.kinds, [], 0
         for k, unknown in enumerate(self.free_parameters):
             for j in unknown.joints:
                 index = 0
@@ -410,9 +405,8 @@ class LoopSimulator:
                     index = loops.place(j, unknown.term)
                 elif unknown.what == "body":
                     index, body = body, body + 1
-                columns.append((kinds[unknown.what], j, index))
-                owners.append(k)
-        return columns, np.array(owners, dtype=int)
+                columns.append((k, (kinds[unknown.what], j, index)))
+        return columns
 
     @cached_property
     def _roots(self) -> Array:

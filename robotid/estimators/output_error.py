@@ -48,8 +48,8 @@ class Residual:
         slopes: Derivatives of the simulated output, shape (N, k, c'); None if not asked for.
         joints: Which joints, shape (k,).
         columns: Which parameters, shape (c',).
-        by_start: Derivatives by where the window's own simulation starts, shape (N, k, s); None if
-            that is known.
+        by_start: Derivatives by where the window's own simulation starts, shape (N, k, s); None or
+            of s = 0 if that is known, or they were not asked for.
     """
 
     e: Array
@@ -87,7 +87,7 @@ class Simulator(Protocol):
         Args:
             theta: Parameters, shape (c,).
             with_slopes: Whether derivatives are wanted.
-            with_starts: Whether those by the starts of windows are, without the others.
+            with_starts: Whether those by the starts of windows are.
 
         Raises:
             NotConvergedError: If it cannot be simulated with these parameters.
@@ -178,16 +178,17 @@ class OutputError(Estimator[Simulator]):
         """
         simulator, begin = data, data.prior if start is None else start
         theta = np.maximum(np.array(begin, dtype=float), simulator.lowest)
-        weights, rounds, count, converged = self.weights(simulator, theta), 0, 0, False
+        found = self._left(simulator, theta)
+        weights, rounds, count, converged = self._weigh(found), 0, 0, False
         for rounds in range(1, self.rounds + 1):
             close = _ROUGH if rounds == 1 else _CLOSE
-            theta, steps, converged = self._descend(
-                simulator, weights, theta, close, is_exact=exact is None
+            theta, found, steps, converged = self._descend(
+                simulator, weights, theta, found, close, is_exact=exact is None
             )
             count += steps
             if exact is not None and not converged:
                 break  # what its steps leave, other weights would leave, too
-            before, weights = weights, self.weights(simulator, theta)
+            before, weights = weights, self._weigh(found)
             change = np.abs(weights.sigma / before.sigma - 1.0).max()
             if rounds > 1 and converged and max(change, _rho_change(before, weights)) < _SETTLED:
                 break
@@ -204,11 +205,16 @@ class OutputError(Estimator[Simulator]):
             simulator: What simulates.
             theta: Parameters, shape (c,).
         """
-        found = simulator.residuals(theta, with_slopes=False, with_starts=self.frees)
-        return self._weigh([replace(r, e=_freed(r)) for r in found] if self.frees else found)
+        return self._weigh(self._left(simulator, theta))
 
-    def _weigh(self, found: Sequence[Residual]) -> "_Weights":
-        """Return correlation and level of residuals."""
+    def _left(self, simulator: Simulator, theta: Array) -> Sequence[Residual]:
+        """Return residuals without derivatives, but for those that free starts need."""
+        return simulator.residuals(theta, with_slopes=False, with_starts=self.frees)
+
+    def _weigh(self, found: Sequence[Residual], *, frees: bool | None = None) -> "_Weights":
+        """Return correlation and level of residuals; of what better starts would leave."""
+        if self.frees if frees is None else frees:
+            found = [replace(r, e=_freed(r)) for r in found]
         n = 1 + max(int(r.joints.max()) for r in found)
         rho, sigma = np.zeros(n), np.ones(n)
         most = np.full(n, _MOST_RHO) if self.most is None else self.most
@@ -222,12 +228,10 @@ class OutputError(Estimator[Simulator]):
             sigma[j] = max(level, 1e-12) * np.sqrt(self.inflation)
         return _Weights(rho, sigma)
 
-    def _cost(self, simulator: Simulator, weights: _Weights, theta: Array) -> float:
-        """Return the cost; infinite where it cannot be simulated."""
-        try:
-            found = simulator.residuals(theta, with_slopes=False, with_starts=self.frees)
-        except NotConvergedError:
-            return np.inf  # a step that leads there is too long
+    def _cost(
+        self, simulator: Simulator, weights: _Weights, theta: Array, found: Sequence[Residual]
+    ) -> float:
+        """Return the cost of parameters that leave the residuals found."""
         cost = 0.0
         for r in found:
             b = weights.whiten(r.e, r.joints).reshape(-1)
@@ -257,8 +261,8 @@ class OutputError(Estimator[Simulator]):
             simulator: What simulates, from starts that suit the estimate.
             estimate: As of ``fit``, with exact derivatives.
         """
-        found = simulator.residuals(estimate.theta, with_slopes=True)
-        weights = self._weigh([replace(r, e=_freed(r)) for r in found])
+        found = simulator.residuals(estimate.theta, with_slopes=True, with_starts=True)
+        weights = self._weigh(found, frees=True)
         how = {key: getattr(estimate, key) for key in ("converged", "n_iter", "message")}
         return self._estimate(simulator, weights, estimate.theta, how, found=found)
 
@@ -304,12 +308,16 @@ class OutputError(Estimator[Simulator]):
         simulator: Simulator,
         weights: _Weights,
         theta: Array,
+        found: Sequence[Residual],
         close: float,
         *,
         is_exact: bool,
-    ) -> tuple[Array, int, bool]:
-        """Minimise with given weights; return where it ends, its steps, and whether it settled."""
-        damping, cost = _CAUTIOUS, self._cost(simulator, weights, theta)
+    ) -> tuple[Array, Sequence[Residual], int, bool]:
+        """Minimise with given weights from parameters that leave the residuals found.
+
+        Return where it ends, what is left there, its steps, and whether it settled.
+        """
+        damping, cost = _CAUTIOUS, self._cost(simulator, weights, theta, found)
         if not np.isfinite(cost):
             raise NotConvergedError(
                 "the loop cannot be simulated with the parameters that the fit begins with; state "
@@ -322,18 +330,25 @@ class OutputError(Estimator[Simulator]):
             H, g = self.normal(simulator, weights, theta, frees=self.frees)
             while True:
                 trial = _bounded_step(H, g, theta, simulator.lowest, damping)
-                new = self._cost(simulator, weights, trial)
+                left, new = found, np.inf
+                try:
+                    left = self._left(simulator, trial)
+                    new = self._cost(simulator, weights, trial, left)
+                except NotConvergedError:
+                    pass  # a step that leads there is too long
                 if new < highest * cost or damping > _TOO_STIFF:
                     break
+                if is_exact and float(g @ (trial - theta)) < close * cost:
+                    break  # not even the linearised problem promises more
                 damping *= 6.0
             if not new < highest * cost:
-                return theta, step, True  # no step lowers it: it is the minimum to rounding
+                return theta, found, step, True  # no step lowers it that would matter
             is_near = float(g @ (trial - theta)) < _NEAR
-            decrease, theta, cost = (cost - new) / cost, trial, new
+            decrease, theta, found, cost = (cost - new) / cost, trial, left, new
             damping = max(damping / 6.0, 1e-9)
             if decrease < close if is_exact else is_near:
-                return theta, step, True
-        return theta, self.steps, False
+                return theta, found, step, True
+        return theta, found, self.steps, False
 
     def _estimate(
         self,
@@ -351,7 +366,7 @@ class OutputError(Estimator[Simulator]):
         """
         moves = found is not None
         if found is None:
-            found = simulator.residuals(theta, with_slopes=True)
+            found = simulator.residuals(theta, with_slopes=True, with_starts=True)
         parts = list(_whitened(found, weights, frees=True))
         rows = sum(r.e.size for r in found)
         if rows < len(theta):
@@ -438,7 +453,8 @@ def linearised(
         theta: Parameters, shape (c,).
         frees: Whether what the start of a window could do is taken out of its rows.
     """
-    yield from _whitened(simulator.residuals(theta, with_slopes=True), weights, frees=frees)
+    found = simulator.residuals(theta, with_slopes=True, with_starts=frees)
+    yield from _whitened(found, weights, frees=frees)
 
 
 def _whitened(

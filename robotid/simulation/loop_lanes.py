@@ -90,11 +90,14 @@ class Columns(NamedTuple):
     """What roll-outs are differentiated by.
 
     Attributes:
-        kinds: Kind, joint and index of each sensitivity, shape (P, 3), int.
+        kinds: Kind, joint and index of each column, shape (C, 3), int.
+        sums: Column with which each of the P sensitivities begins, which is the sum of its columns,
+            and their number, shape (P + 1,), int.
         directions: Changes of a body's ten parameters, shape (D, 10).
     """
 
     kinds: Array
+    sums: Array
     directions: Array
 
 
@@ -261,15 +264,16 @@ def _advance(work, n, at, step):
 
 
 @compiled
-def _centre(work, n, at, step, tree, bodies, zeros, a):
-    """Write M and h of the middle of the step, where the speeds of a solution lead to."""
-    q, u, middle, h, M = at[0], at[2], at[3], at[4], at[5]
+def _centre(work, n, at, step, tree, bodies, zeros, speeds, a):
+    """Write M and h of the middle of the step, where some speeds lead to."""
+    q, middle, h, M = at[0], at[3], at[4], at[5]
     for i in range(n):
         for lane in range(LANES):
-            ahead = THETA * step[lane] * get(work, u + i, lane)
+            ahead = THETA * step[lane] * get(work, speeds + i, lane)
             put(work, middle + i, lane, get(work, q + i, lane) + ahead)
+            put(work, a + i, lane, 0.0)
         place(work, (i + 1) * BODY, tree.joints[i], middle + i, zeros[i])
-    inverse_dynamics(work, tree, bodies, u, a, h)
+    inverse_dynamics(work, tree, bodies, speeds, a, h)
     mass_matrix(work, tree, bodies, M)
 
 
@@ -279,43 +283,28 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, tree)
     q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip = at
     T_q, T_v, S, own, change, by_hold, by_state = sweeps
     codes, shapes, values, spans = terms
-    kinds, directions = columns
-    P = len(kinds)
+    kinds, sums, directions = columns
+    P = len(sums) - 1
     _combine(work, n, at, sweeps, drives, step)
     for p in range(P):
-        kind, j, index = kinds[p, 0], kinds[p, 1], kinds[p, 2]
         for i in range(n):
             for lane in range(LANES):
                 put(work, own + i, lane, 0.0)
-        if kind == INERTIAL:
-            inertial_column(work, tree, directions[index], j, own)
-        elif kind == ZERO:  # what position does but for gain and friction
-            for i in range(n):
+        for c in range(sums[p], sums[p + 1]):
+            kind, j, index = kinds[c, 0], kinds[c, 1], kinds[c, 2]
+            if kind == INERTIAL:
+                inertial_column(work, tree, directions[index], j, own)
+            elif kind == ZERO:  # what position does but for gain and friction
+                for i in range(n):
+                    for lane in range(LANES):
+                        x = get(work, T_q + i * n + j, lane)
+                        put(work, own + i, lane, get(work, own + i, lane) + x)
                 for lane in range(LANES):
-                    put(work, own + i, lane, get(work, T_q + i * n + j, lane))
-            for lane in range(LANES):
-                kp = get(work, gains + j, lane) * drives[j, 1]
-                x = (get(work, by_q + j, lane) + kp) / get(work, loss + j, lane)
-                put(work, own + j, lane, get(work, own + j, lane) - x)
-        else:
-            kp, kd = drives[j, 1], drives[j, 2]
-            for lane in range(LANES):
-                span, speed, x = THETA * step[lane], get(work, u + j, lane), 0.0
-                if kind == ARMATURE:
-                    x = (speed - get(work, v + j, lane)) / span
-                elif kind == TERM and codes[index, 2] == BRISTLES:
-                    x = get(work, memory + 5 * int(shapes[index, 3]) + 1, lane)
-                elif kind == TERM:
-                    angle, (s, s_u) = get(work, middle + j, lane), turned(speed)
-                    x, _, _ = term(codes, shapes, index, angle, speed, s, s_u)
-                    x *= abs(get(work, load + j, lane)) if codes[index, 2] == LOADED else 1.0
-                elif held < 0:
-                    reach = command[j, 0, lane] - get(work, q + j, lane) - span * speed
-                    slip = command[j, 2, lane] - speed
-                    torque, is_on = loop_torque(drives[j], reach, slip, command[j, 3, lane])
-                    late = kp * command[j, 1, lane] + kd * command[j, 4, lane] + command[j, 5, lane]
-                    x = -_by_loop(kind, is_on, reach, slip, late, torque)
-                put(work, own + j, lane, x / get(work, loss + j, lane))
+                    kp = get(work, gains + j, lane) * drives[j, 1]
+                    x = (get(work, by_q + j, lane) + kp) / get(work, loss + j, lane)
+                    put(work, own + j, lane, get(work, own + j, lane) - x)
+            elif kind != START and kind != SPEED:
+                _drive_column(work, at, drives, terms, step, command, kinds[c], own)
         if held >= 0:
             for i in range(n):
                 for lane in range(LANES):
@@ -326,6 +315,34 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, tree)
         _advance_column(work, n, at, sweeps, step, p, P)
         if memory >= 0:
             _recall(work, n, at, sweeps, terms, p, P, True)
+
+
+@compiled
+def _drive_column(work, at, drives, terms, step, command, column, own):
+    """Add what a parameter of a drive changes in its row of a step's equation."""
+    q, v, u, middle, load, loss, held, memory = (
+        at[0], at[1], at[2], at[3], at[10], at[11], at[12], at[13]
+    )  # fmt: skip
+    codes, shapes = terms.codes, terms.shapes
+    kind, j, index = column
+    kp, kd = drives[j, 1], drives[j, 2]
+    for lane in range(LANES):
+        span, speed, x = THETA * step[lane], get(work, u + j, lane), 0.0
+        if kind == ARMATURE:
+            x = (speed - get(work, v + j, lane)) / span
+        elif kind == TERM and codes[index, 2] == BRISTLES:
+            x = get(work, memory + 5 * int(shapes[index, 3]) + 1, lane)
+        elif kind == TERM:
+            angle, (s, s_u) = get(work, middle + j, lane), turned(speed)
+            x, _, _ = term(codes, shapes, index, angle, speed, s, s_u)
+            x *= abs(get(work, load + j, lane)) if codes[index, 2] == LOADED else 1.0
+        elif held < 0:
+            reach = command[j, 0, lane] - get(work, q + j, lane) - span * speed
+            slip = command[j, 2, lane] - speed
+            torque, is_on = loop_torque(drives[j], reach, slip, command[j, 3, lane])
+            late = kp * command[j, 1, lane] + kd * command[j, 4, lane] + command[j, 5, lane]
+            x = -_by_loop(kind, is_on, reach, slip, late, torque)
+        put(work, own + j, lane, get(work, own + j, lane) + x / get(work, loss + j, lane))
 
 
 @compiled
@@ -350,7 +367,7 @@ def _remember(work, n, at, terms, step):
 
 
 @compiled
-def _slide(work, n, at, by_state, columns, terms):
+def _slide(work, n, at, by_state, kinds, sums, terms):
     """Write z where roll-outs begin, and how it changes with the speed v there.
 
     It is that of long sliding, but for joints that take longer than ``_SLID`` to go their way.
@@ -361,12 +378,12 @@ def _slide(work, n, at, by_state, columns, terms):
         for k in range(spans[i, 0], spans[i, 2]):
             if codes[k, 2] != BRISTLES:
                 continue
-            slot, P = int(shapes[k, 3]), len(columns)
+            slot, P = int(shapes[k, 3]), len(sums) - 1
             for lane in range(LANES):
                 z, by_speed = slid(shapes[k], get(work, v + i, lane), _SLID)
                 put(work, memory + 5 * slot, lane, z)
                 for p in range(P):
-                    if columns[p, 0] == SPEED and columns[p, 1] == i:
+                    if kinds[sums[p], 0] == SPEED and kinds[sums[p], 1] == i:
                         put(work, by_state + slot * P + p, lane, by_speed)
 
 
@@ -408,7 +425,8 @@ def _by_loop(kind, is_on, reach, slip, late, torque):
 def _hold(work, n, at, sweeps, columns, drives, command, is_tick):
     """Write torques, and their sensitivities, of the lanes whose controllers have a tick."""
     q, v, held = at[0], at[1], at[12]
-    S, by_hold, P = sweeps[2], sweeps[5], len(columns)
+    kinds, sums = columns.kinds, columns.sums
+    S, by_hold, P = sweeps[2], sweeps[5], len(sums) - 1
     for i in range(n):
         kp, kd = drives[i, 1], drives[i, 2]
         for lane in range(LANES):
@@ -422,8 +440,9 @@ def _hold(work, n, at, sweeps, columns, drives, command, is_tick):
             for p in range(P):
                 x = kp * get(work, S + i * P + p, lane) + kd * get(work, S + (n + i) * P + p, lane)
                 own = 0.0
-                if columns[p, 1] == i:
-                    own = _by_loop(columns[p, 0], is_on, reach, slip, late, torque)
+                for c in range(sums[p], sums[p + 1]):
+                    if kinds[c, 1] == i:
+                        own += _by_loop(kinds[c, 0], is_on, reach, slip, late, torque)
                 put(work, by_hold + i * P + p, lane, own - is_on * x)
 
 
@@ -476,9 +495,10 @@ def _advance_column(work, n, at, sweeps, step, p, P):
 
 
 @compiled
-def _begin(work, n, at, sweeps, kinds, terms, gravity, start, out_S):
+def _begin(work, n, at, sweeps, columns, terms, gravity, start, out_S):
     """Write where roll-outs begin, and how that changes with itself."""
-    q, v, u, S, P = at[0], at[1], at[2], sweeps[2], len(kinds)
+    q, v, u, S = at[0], at[1], at[2], sweeps[2]
+    kinds, sums, P = columns.kinds, columns.sums, len(columns.sums) - 1
     for lane in range(LANES):
         for k in range(3):
             put(work, ACCELERATION + k, lane, -gravity[k])
@@ -487,13 +507,14 @@ def _begin(work, n, at, sweeps, kinds, terms, gravity, start, out_S):
             put(work, v + i, lane, start[1, i, lane])
             put(work, u + i, lane, start[1, i, lane])
         for p in range(P):
-            if kinds[p, 0] == START or kinds[p, 0] == SPEED:
-                row = kinds[p, 1] + (n if kinds[p, 0] == SPEED else 0)
+            kind, joint = kinds[sums[p], 0], kinds[sums[p], 1]
+            if kind in (START, SPEED):  # of one joint alone
+                row = joint + (n if kind == SPEED else 0)
                 put(work, S + row * P + p, lane, 1.0)
                 if row < out_S.shape[1]:
                     out_S[0, row, p, lane] = 1.0
     if at[13] >= 0:
-        _slide(work, n, at, sweeps[6], kinds, terms)
+        _slide(work, n, at, sweeps[6], kinds, sums, terms)
 
 
 @compiled
@@ -515,8 +536,8 @@ def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, cor
     """
     command, steps, ticks, every, start = course
     out_q, out_v, out_S = out
-    codes, kinds = terms.codes, columns.kinds
-    n, P = len(tree.parents), len(kinds)
+    codes = terms.codes
+    n, P = len(tree.parents), len(columns.sums) - 1
     q = (n + 1) * BODY
     v, u, middle, h, a = q + n, q + 2 * n, q + 3 * n, q + 4 * n, q + 5 * n
     G, by_q, gains, own, change = a + n, a + 2 * n, a + 3 * n, a + 4 * n, a + 5 * n
@@ -529,23 +550,16 @@ def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, cor
     at = (q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip)
     sweeps = (T_q, T_v, S, own, change, by_hold, by_state)
     work.numbers[:] = 0.0
-    _begin(work, n, at, sweeps, kinds, terms, tree.gravity, start, out_S)
+    _begin(work, n, at, sweeps, columns, terms, tree.gravity, start, out_S)
     for k in range(len(steps)):
         step = steps[k]
         if held >= 0 and ticks[k].any():
-            _hold(work, n, at, sweeps, kinds, drives, command[k], ticks[k])
-        for i in range(n):
-            for lane in range(LANES):
-                ahead = THETA * step[lane] * get(work, v + i, lane)
-                put(work, middle + i, lane, get(work, q + i, lane) + ahead)
-                put(work, a + i, lane, 0.0)
-            place(work, (i + 1) * BODY, tree.joints[i], middle + i, zeros[i])
-        inverse_dynamics(work, tree, bodies, v, a, h)
-        mass_matrix(work, tree, bodies, M)
+            _hold(work, n, at, sweeps, columns, drives, command[k], ticks[k])
+        _centre(work, n, at, step, tree, bodies, zeros, v, a)
         if not _newton(work, n, at, drives, terms, step, command[k]):
             return k
         if corrects:
-            _centre(work, n, at, step, tree, bodies, zeros, a)
+            _centre(work, n, at, step, tree, bodies, zeros, u, a)
             if not _newton(work, n, at, drives, terms, step, command[k]):
                 return k
         if memory >= 0:

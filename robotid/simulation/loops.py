@@ -202,9 +202,9 @@ class RollOut:
         window: Which one.
         q: Positions of the samples that count, shape (N, n) [rad or m].
         v: Speeds, likewise.
-        slopes: For each part of the robot its joints, shape (k,), the columns that move them, shape
-            (c,), and the derivatives of their positions, shape (N, k, c); where those of speeds
-            were asked for, they follow, shape (N, 2k, c).
+        slopes: For each part of the robot its joints, shape (k,), the sensitivities that move them,
+            by number in order, shape (c,), and the derivatives of their positions, shape (N, k, c);
+            where those of speeds were asked for, they follow, shape (N, 2k, c).
     """
 
     window: Window
@@ -287,6 +287,7 @@ class ClosedLoopRobot:
         columns: Sequence[Column] = (),
         directions: Array | None = None,
         *,
+        owners: Sequence[int] | None = None,
         with_speeds: bool = False,
     ) -> list[RollOut]:
         """Return what windows come out as.
@@ -296,12 +297,16 @@ class ClosedLoopRobot:
             windows: The windows.
             columns: What to differentiate by: kind, joint, and index of a term or a direction.
             directions: Changes of a body's ten parameters, shape (D, 10).
+            owners: Number of the sensitivity that each column belongs to, as of a parameter that
+                joints share: the sum of its columns. Each column is its own if None; starts are.
             with_speeds: Whether speeds are differentiated, too.
 
         Raises:
             NotConvergedError: If a step has no solution, as where friction falls below 0.
         """
         wanted = np.array(columns, dtype=np.int64).reshape(-1, 3)
+        numbers = np.arange(len(wanted)) if owners is None else np.array(owners, dtype=np.int64)
+        wanted = np.column_stack([wanted, numbers])[np.argsort(numbers, kind="stable")]
         along = np.zeros((0, 10)) if directions is None else np.array(directions, order="C")
         lanes = _lanes()
         blocks = [windows[k : k + lanes.LANES] for k in range(0, len(windows), lanes.LANES)]
@@ -319,12 +324,12 @@ class ClosedLoopRobot:
                 kept = slice(window.first - window.begin, window.stop - window.begin)
                 q, v = np.empty((2, kept.stop - kept.start, n))
                 slopes = []
-                for part, (columns_of, q_part, v_part, S) in parts:
+                for part, (numbers_of, q_part, v_part, S) in parts:
                     q[:, part.joints], v[:, part.joints] = (
                         q_part[kept, :, lane],
                         v_part[kept, :, lane],
                     )
-                    slopes.append((part.joints, columns_of, S[kept, :, :, lane]))
+                    slopes.append((part.joints, numbers_of, S[kept, :, :, lane]))
                 found.append(RollOut(window, q, v, tuple(slopes) if len(wanted) else ()))
         return found
 
@@ -337,11 +342,16 @@ class ClosedLoopRobot:
         along: Array,
         outputs: int,
     ) -> tuple[Array, Array, Array, Array]:
-        """Return columns, positions, speeds and derivatives of one part in a block of windows."""
+        """Return sensitivities, positions, speeds and derivatives of a part in a block of windows.
+
+        Columns that are wanted are rows of kind, joint, index and number of the sensitivity.
+        """
         lanes = _lanes()
         own, n = part.joints, len(part.joints)
-        columns_of = np.flatnonzero(np.isin(wanted[:, 1], own))
-        columns = wanted[columns_of]
+        columns = wanted[np.isin(wanted[:, 1], own)]
+        numbers, first = np.unique(columns[:, 3], return_index=True)
+        sums = np.append(first, len(columns)).astype(np.int64)
+        columns = np.ascontiguousarray(columns[:, :3])
         columns[:, 1] = [np.flatnonzero(own == j)[0] for j in columns[:, 1]]
         places, spans, affine = _arranged(loops, own)
         is_term = columns[:, 0] == lanes.TERM
@@ -358,20 +368,20 @@ class ClosedLoopRobot:
         course = self._course(part, windows, loops)
         samples = len(course.steps) // course.every + 1
         q, v = np.zeros((2, samples, n, lanes.LANES))
-        S = np.zeros((samples, outputs * n, len(columns), lanes.LANES))
+        S = np.zeros((samples, outputs * n, len(numbers), lanes.LANES))
         q[0], v[0] = course.start
         failed = lanes.roll_out(
             part.tree, loops.zero[own], loops.bodies[part.bodies], drives,
             lanes.Terms(codes, shapes, loops.values[places], spans),
-            lanes.Columns(columns, along), course, lanes.Motion(q, v, S),
-            lanes.work_of(n, len(columns), int(has_state.sum())), self.corrects,
+            lanes.Columns(columns, sums, along), course, lanes.Motion(q, v, S),
+            lanes.work_of(n, len(numbers), int(has_state.sum())), self.corrects,
         )  # fmt: skip
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
             raise NotConvergedError(
                 self._why_not(own, loops, windows[0].start[0]),
                 f"step {failed % len(course.steps) + 1} of {len(course.steps)}",
             )
-        return columns_of, q, v, S
+        return numbers, q, v, S
 
     def _why_not(self, joints: Array, loops: Loops, q: Array) -> str:
         """Return why a part with these joints, which begins at q, has no roll-out."""
