@@ -150,13 +150,13 @@ def test_it_is_an_identification_as_others_are(found, tmp_path):
     content = build_result(found, {"estimator": {"name": "simulation"}})
     entries = {entry["name"]: entry for entry in content["drive_parameters"]}
     share = dict(zip(estimate.names, found.shrunk, strict=True))
-    known = zip(estimate.names, estimate.theta, estimate.std_error, estimate.reach, strict=True)
-    for key, value, error, reach in known:
+    known = zip(estimate.names, estimate.theta, estimate.std_error, estimate.quantile, strict=True)
+    for key, value, error, quantile in known:
         own = entries[key]
-        assert (own["value"], own["quantile"]) == (value, reach)
+        assert (own["value"], own["quantile"]) == (value, quantile)
         assert own["std_error"] == pytest.approx(error, rel=1e-6)
         if key in layout.names:
-            ends = [value - reach * error, value + reach * error]
+            ends = [value - quantile * error, value + quantile * error]
             assert own["interval_95"] == pytest.approx(ends, rel=1e-6)
             assert own["source"] == ("data" if share[key] < 0.3 else "mixed")
             i = layout.names.index(key)
