@@ -94,13 +94,13 @@ def _settled_delay(finding: Finding, found: LoopIdentification) -> Finding:
     how = (
         "[controller] states it"
         if not errors
-        else f"the fit determines it to +- {1e3 * error:.2g} ms, as far as gains and bodies of "
-        "the model are right"
+        else f"the fit determines it to +- {1e3 * error:.2g} ms, provided that gains and bodies "
+        "of the model are right"
     )
     message = (
-        f"the command has no frequencies above {finding.evidence['frequency']:.2g} Hz, which is "
-        "below the bandwidth of the loop: the response of one joint alone does not determine its "
-        f"delay, but {how}. To determine it independently, command a chirp beyond the bandwidth "
+        f"the command has power only up to {finding.evidence['frequency']:.2g} Hz, below the "
+        "bandwidth of the loop: the response of a single joint does not determine its delay, but "
+        f"{how}. To determine it independently of the model, command a chirp beyond the bandwidth "
         "of the loop, or steps"
     )
     evidence = {**finding.evidence, "std_error": error}
@@ -298,7 +298,7 @@ def _undetermined_encoders(
             "mirror_image",
             "note",
             names,
-            f"{names} have parallel axes: with all their signs reversed, gravity acts almost "
-            "alike, so that it does not determine their common sign. Check the direction of "
-            "rotation of one of them",
+            f"{names} have parallel axes: with all their signs reversed, the gravity torques are "
+            "almost the same, so that gravity does not determine their common sign. Check the "
+            "direction of rotation of one of them",
         )

@@ -48,7 +48,7 @@ __all__ = ["STAGES", "Fitted", "fit_loops", "stated_loops"]
 #: The stages of a job's fit, from reading logs to writing files.
 STAGES = (
     "reading logs", "fitting torques", "trying second-order models", "fitting loops",
-    "trying friction", "testing", "writing",
+    "trying friction terms", "testing", "writing",
 )  # fmt: skip
 
 
@@ -149,7 +149,7 @@ def fit_loops(
             estimator = replace(estimator, inflation=_BOTH * estimate.details["inflation"])
     tried: list[Tried] = []
     for _ in range(_PASSES if chooses else 0):
-        report_stage(progress, "trying friction", STAGES)
+        report_stage(progress, "trying friction terms", STAGES)
         offered = [
             set_
             for set_ in candidates(simulator, initialised.torque)

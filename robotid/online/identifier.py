@@ -195,7 +195,9 @@ class OnlineIdentifier:
     def _check(self, t: float, *arrays: Array) -> None:
         n = len(self.model.joints)
         if any(np.shape(x) != (n,) for x in arrays):
-            raise DataError(f"q, v, a, tau: {[np.shape(x) for x in arrays]}, wanted ({n},) each")
+            raise DataError(
+                f"q, v, a and tau have shapes {[np.shape(x) for x in arrays]}, wanted ({n},) each"
+            )
         if not (np.isfinite(t) and all(np.isfinite(x).all() for x in arrays)):
             raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
         if t <= self._now:

@@ -112,7 +112,9 @@ class Checkpoint:
             self._require_same(json.loads(text))
             return
         if stated.is_file():
-            _log.warning("%s has an unfinished run. It is replaced, without --resume", self.folder)
+            _log.warning(
+                "%s has an unfinished run. It is replaced, since --resume is not set", self.folder
+            )
         elif resume:
             _log.warning("%s does not exist: no run to resume, a new one starts", self.folder)
         for old in self.folder.iterdir():
