@@ -95,7 +95,7 @@ def run_open_loop(
     lag_error = log.q_ref - log.q
     moved = [w.log.q[w.counted] - w.start[0] for w in windows]
     steady = [
-        own - np.outer(w.log.t[w.counted] - w.log.t[w.begin], w.start[1])
+        own - np.outer(w.log.t[w.counted] - w.log.t[w.start_row], w.start[1])
         for own, w in zip(moved, windows, strict=True)
     ]
     baselines: dict[str, Array | None] = dict.fromkeys(_DRIVEN if is_driven else _COMMANDED)

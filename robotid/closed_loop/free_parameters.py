@@ -188,7 +188,7 @@ class LoopSimulator:
             NotConvergedError: If a step has no solution.
         """
         n, loops, columns = len(self.base.kp), self.loops(theta), self._starts()
-        windows = [replace(window, first=window.begin) for window in self.windows]
+        windows = [replace(window, first=window.start_row) for window in self.windows]
         for _ in range(_STARTS):
             outs = self.robot.roll_out(loops, windows, columns)
             errors = np.concatenate([_error(out) for out in outs])

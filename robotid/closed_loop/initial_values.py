@@ -29,9 +29,9 @@ __all__ = [
 
 _WIDE = 10.0  # prior spread of drive parameters over their typical size: a weak prior
 _SHARE = 0.5  # initial share of the bodies in a joint's inertia, where its gain is unknown
-_SLOWEST = 0.1  # prior spread of a delay [s]
-_TURN = 0.3  # prior spread of an encoder's zero about its first estimate [rad or m]
-_LIGHTEST = 0.3  # smallest body inertia over the largest: small joints, too, have geared motors
+_DELAY_SPREAD = 0.1  # prior spread of a delay [s]
+_ZERO_SPREAD = 0.3  # prior spread of an encoder's zero about its first estimate [rad or m]
+_SMALLEST_BODY = 0.3  # smallest body inertia over the largest: small joints have gears, too
 _POSES = 50  # number of poses at which the inertia of the bodies is computed
 _LEAST = 0.05  # smallest initial armature and lower bound of a gain, over the typical size
 _LIMITED = 0.8  # initial torque limit over the largest torque without a limit
@@ -80,7 +80,7 @@ def typical_sizes(
     model = robot.model
     q = np.concatenate([w.log.q[w.counted] for w in windows])
     bodies = _inertia(model, model.standard_parameters(), windows)
-    measure = np.maximum(bodies, _LIGHTEST * bodies.max()) / _SHARE
+    measure = np.maximum(bodies, _SMALLEST_BODY * bodies.max()) / _SHARE
     scale = np.where(has_gain, 1.0, measure / plain.inertia)
     inertia = np.maximum(
         plain.inertia * scale, bodies
@@ -206,7 +206,7 @@ def free_drive_parameters(
         "kp": base.kp / _WIDE,
         "kd": typical.torque / typical.speed,
         "limit": typical.torque,
-        "delay": np.full(len(groups), _SLOWEST / _WIDE),
+        "delay": np.full(len(groups), _DELAY_SPREAD / _WIDE),
     }
     found = []
     for what, is_free in free.items():
@@ -248,7 +248,9 @@ def free_zeros(model: RobotModel, encoders: Encoders) -> list[FreeParameter]:
         encoders: Signs and zeros of the encoders: the initial values.
     """
     return [
-        FreeParameter(f"{model.joints[j]}.zero", "zero", (int(j),), float(encoders.zero[j]), _TURN)
+        FreeParameter(
+            f"{model.joints[j]}.zero", "zero", (int(j),), float(encoders.zero[j]), _ZERO_SPREAD
+        )
         for j in np.flatnonzero(encoders.gain > 0)
     ]
 

@@ -28,7 +28,7 @@ CLEAR = 0.2
 #: Signs and zeros that are tried.
 _TRIALS = np.array([(s, z) for s in (1.0, -1.0) for z in np.deg2rad(np.arange(-180, 180, 15))])
 _SAMPLES = 400  # of all logs together
-_SWEEPS = 4  # largest number of passes over the joints
+_PASSES = 4  # largest number of passes over the joints
 _SLOW, _FAST = 0.4, 4.0  # cut-offs of the slow motion and of the sign of friction [Hz]
 _PAD = 9  # rows by which the filter extends both ends
 _PERIODS = 30  # smallest number of cut-off periods in all logs together
@@ -136,7 +136,7 @@ def _descend(
     N, n = motion.q.shape
     sign, zero, gain = np.ones(n), np.zeros(n), np.zeros(n)
     cost, costs = motion.cost(model, sign, zero), np.full((n, len(_TRIALS)), np.inf)
-    for _ in range(_SWEEPS):
+    for _ in range(_PASSES):
         moved = False
         for j in revolute:
             for k, (s, z) in enumerate(_TRIALS):

@@ -68,7 +68,7 @@ __all__ = [
 _DOUBLINGS = 3  # of lanes
 LANES = 1 << _DOUBLINGS
 THETA = 0.5  # instant of the forces, relative to the step: exact to second order
-_SLID = 0.1  # assumed time of motion before the simulation, for initial deflections [s]
+_MOVED_BEFORE = 0.1  # assumed time of motion before the simulation, for initial deflections [s]
 _NEWTON = 60  # largest number of steps; three or four are typical
 _CLOSE = 1e-12  # of the speed, relative to 1 + its size
 
@@ -377,7 +377,7 @@ def _advance_bristles(work, n, at, terms, step):
 def _initialise_bristles(work, n, at, by_state, kinds, sums, terms):
     """Write the initial z and its derivative by the initial speed v.
 
-    It is that of steady sliding, unless the joint needs more than ``_SLID`` for its displacement.
+    It is that of steady sliding, unless the joint needs more than ``_MOVED_BEFORE`` for it.
     """
     v, bristles = at[1], at[13]
     codes, shapes, values, spans = terms
@@ -387,7 +387,7 @@ def _initialise_bristles(work, n, at, by_state, kinds, sums, terms):
                 continue
             slot, P = int(shapes[k, 3]), len(sums) - 1
             for lane in range(LANES):
-                z, by_speed = initial_deflection(shapes[k], get(work, v + i, lane), _SLID)
+                z, by_speed = initial_deflection(shapes[k], get(work, v + i, lane), _MOVED_BEFORE)
                 put(work, bristles + 5 * slot, lane, z)
                 for p in range(P):
                     if kinds[sums[p], 0] == SPEED and kinds[sums[p], 1] == i:

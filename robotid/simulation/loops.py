@@ -126,14 +126,14 @@ class Window:
 
     Attributes:
         log: The log, with commands.
-        begin: First simulated sample.
+        start_row: First simulated sample.
         first: First counted sample; before it, the error of the initial state decays.
         stop: Sample after the last one.
         given: Initial position and speed, shape (2, n); the measured ones if None.
     """
 
     log: Log
-    begin: int
+    start_row: int
     first: int
     stop: int
     given: Array | None = None
@@ -154,14 +154,14 @@ class Window:
         """The samples about the first one."""
         dt = float(np.median(np.diff(self.log.t)))
         wide = max(_FEWEST, round(_AROUND / dt))
-        return slice(max(self.begin - wide, 0), min(self.begin + wide + 1, len(self.log.t)))
+        return slice(max(self.start_row - wide, 0), min(self.start_row + wide + 1, len(self.log.t)))
 
     @cached_property
     def start(self) -> Array:
         """Initial position and speed, shape (2, n)."""
         if self.given is not None:
             return self.given
-        t, q, k = self.log.t, self.log.q, self.begin
+        t, q, k = self.log.t, self.log.q, self.start_row
         near = self._near
         along, order = t[near] - t[k], min(2, len(t[near]) - 1)
         fit = np.polynomial.polynomial.polyfit(along, q[near], order)
@@ -324,7 +324,7 @@ class ClosedLoopRobot:
         for b, block in enumerate(blocks):
             parts = list(zip(self._parts, done[b * each : (b + 1) * each], strict=True))
             for lane, window in enumerate(block):
-                counted = slice(window.first - window.begin, window.stop - window.begin)
+                counted = slice(window.first - window.start_row, window.stop - window.start_row)
                 q, v = np.empty((2, counted.stop - counted.start, n))
                 slopes = []
                 for part, (numbers_of, q_part, v_part, S) in parts:
@@ -414,7 +414,7 @@ class ClosedLoopRobot:
         from robotid.simulation.course_lanes import average_command  # imports Numba
 
         lanes = _lanes()
-        samples = max(window.stop - window.begin for window in windows)
+        samples = max(window.stop - window.start_row for window in windows)
         grids = [_Grid.of(window, samples, loops.rate) for window in windows]
         every = max(grid.least_steps(self.step, loops.rate) for grid in grids)
         size, n = (samples - 1) * every, len(part.joints)
@@ -457,7 +457,7 @@ class _Grid:
     @classmethod
     def of(cls, window: Window, samples: int, rate: float | None) -> "_Grid":
         """Return the grid of a window, continued with the log's median step."""
-        t = window.log.t[window.begin : window.stop]
+        t = window.log.t[window.start_row : window.stop]
         dt = float(np.median(np.diff(window.log.t)))
         stamps = np.concatenate([t, t[-1] + dt * np.arange(1, samples - len(t) + 1)])
         if rate is None:

@@ -236,16 +236,16 @@ class RobotPlant:
     def _loaded(self, q: Array, free: Array, a: Array, coefficient: Array) -> Array:
         """Return the acceleration consistent with load-dependent friction, by iteration."""
         D = self.mass_matrix(q)
-        lost = np.linalg.solve(D, self.ratios.T * coefficient)  # acceleration per load, (n, d)
+        per_load = np.linalg.solve(D, self.ratios.T * coefficient)  # acceleration per load, (n, d)
         bare = self._share @ (free - self.armature @ a)  # load of the drives without it
-        slope = self._share @ (self.ratios.T * coefficient - self.armature @ lost)
+        slope = self._share @ (self.ratios.T * coefficient - self.armature @ per_load)
         load = bare
         if not np.isfinite(bare).all():  # the state has diverged
             return a
         for _ in range(_ITERATIONS):
             before, load = load, bare - slope @ np.abs(load)
             if np.abs(load - before).max() <= _SETTLED * (1.0 + np.abs(load).max()):
-                settled: Array = a - lost @ np.abs(load)
+                settled: Array = a - per_load @ np.abs(load)
                 return settled
         raise NotConvergedError(
             f"load-dependent friction does not converge in {_ITERATIONS} steps: its parameters are "

@@ -207,7 +207,7 @@ def stiff(error, highest=1.5):
             value, name = loops.values[loops.place(j, term)], f"{j}.{term.name}"
             free_parameters.append(FreeParameter(name, "term", (j,), value, 1e6, term=term))
     windows = [
-        replace(w, given=np.stack([out.q[w.begin], out.v[w.begin]]))
+        replace(w, given=np.stack([out.q[w.start_row], out.v[w.start_row]]))
         for w in cut_windows(log, 0.5, 0.0)
     ]
     told_by = None if error == "output" else lag

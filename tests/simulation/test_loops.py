@@ -444,9 +444,9 @@ def test_windows_cover_each_sample_once_and_cross_no_gap(planar):
         counted = np.concatenate([np.arange(len(t))[w.counted] for w in windows])
         np.testing.assert_array_equal(counted, np.arange(len(t)))
         for w in windows:
-            assert np.diff(t[w.begin : w.stop]).max() < 1.5 / RATE
+            assert np.diff(t[w.start_row : w.stop]).max() < 1.5 / RATE
             edge = max(e for e in (0, 60, 361) if e <= w.first)
-            assert w.begin == max(edge, w.first - round(lead * RATE))
+            assert w.start_row == max(edge, w.first - round(lead * RATE))
     sizes = [w.stop - w.first for w in cut_windows(log, 0.11, 0.0)]
     assert sizes == [60, *5 * [55], 26, 2] or sizes == [60, *4 * [55], 81, 2]
 
