@@ -193,8 +193,8 @@ def _soft_loop(left: float) -> Iterator[Finding]:
             "warning",
             "fit",
             f"a step of error = 'direct' leaves {100 * left:.0f} % of the residual that it should "
-            "remove, wanted at most 50 %: it neglects that the motion changes with the parameters, "
-            "and this loop is soft. Set error = 'input'",
+            f"remove, wanted at most {100 * _SOFT:.0f} %: it neglects that the motion changes with "
+            "the parameters, and this loop is soft. Set error = 'input'",
             {"left": left},
         )
 

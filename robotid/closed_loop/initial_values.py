@@ -82,9 +82,8 @@ def typical_sizes(
     bodies = _inertia(model, model.standard_parameters(), windows)
     measure = np.maximum(bodies, _SMALLEST_BODY * bodies.max()) / _SHARE
     scale = np.where(has_gain, 1.0, measure / plain.inertia)
-    inertia = np.maximum(
-        plain.inertia * scale, bodies
-    )  # friction may hide it in a second-order model
+    # friction may hide the inertia in a second-order model
+    inertia = np.maximum(plain.inertia * scale, bodies)
     error = np.concatenate([w.log.q_ref[w.counted] for w in windows]) - q  # type: ignore[index]
     unlimited = _LIMITED * plain.loops.kp * np.abs(error).max(axis=0)
     friction = plain.friction("viscous") * top + plain.friction("coulomb")
