@@ -1,4 +1,4 @@
-"""What drives give along a motion, what changes it, and the gains that logged torques tell."""
+"""Torques of drives along a motion, their derivatives, and gains fitted to logged torques."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,34 +11,34 @@ from robotid.simulation.loops import Column, Loops, RollOut, Window
 
 __all__ = ["DriveTorques", "drive_torques", "find_gains", "measured_motion"]
 
-_AROUND = (0, -1, 1)  # rows about the delay, that a torque's command may be behind it
-_LATEST = 0.1  # [s] that a command may be behind the torque
-_CLEAR = 9.0  # variances of a row, by which a delay between two rows must be better
-_NEAR = 0.15  # of a row: nearer to a whole one it is that
-_SMOOTH = 0.02  # [s] about each sample, whose slope is its speed
-_FREE = 0.95  # of the largest torque, below which a drive is not at its limit
+_AROUND = (0, -1, 1)  # lags that are tried about the known delay [samples]
+_LATEST = 0.1  # largest lag that is tried [s]
+_CLEAR = 9.0  # improvement that a fractional lag needs [variances of one row]
+_NEAR = 0.15  # distance from a whole lag below which the lag is whole [samples]
+_SMOOTH = 0.02  # half-width of the differentiating filter [s]
+_FREE = 0.95  # torque relative to the limit, below which the drive is not saturated
 
 
 @dataclass(frozen=True, eq=False)
 class DriveTorques:
-    """Torques of drives at the samples of a roll-out that count; arrays of shape (N, n).
+    """Torques of drives at the counted samples of a roll-out; arrays of shape (N, n).
 
     Attributes:
-        asked: kp reach + kd rate + tau_ref [N m or N].
-        reach: q_ref - q [rad or m].
-        rate: v_ref - v [rad/s or m/s].
-        loops: The loops; no drive gives more than its limit.
+        unlimited: kp position_error + kd speed_error + tau_ref [N m or N].
+        position_error: q_ref - q [rad or m].
+        speed_error: v_ref - v [rad/s or m/s].
+        loops: The loops, with the torque limits.
     """
 
-    asked: Array
-    reach: Array
-    rate: Array
+    unlimited: Array
+    position_error: Array
+    speed_error: Array
     loops: Loops
 
     @property
-    def given(self) -> Array:
-        """The torque that is given [N m or N]."""
-        limited: Array = np.clip(self.asked, -self.loops.limit, self.loops.limit)
+    def limited(self) -> Array:
+        """The torque within the limits of the drives [N m or N]."""
+        limited: Array = np.clip(self.unlimited, -self.loops.limit, self.loops.limit)
         return limited
 
     def slopes(
@@ -48,46 +48,46 @@ class DriveTorques:
         motion: Array,
         kinds: Mapping[str, int],
     ) -> Array:
-        """Return the derivatives of what some drives give, shape (N, k, c).
+        """Return the derivatives of the torques of some drives, shape (N, k, c).
 
-        The command of a row is held, so a delay changes the motion alone.
+        The command is constant over a row, so a delay changes only the motion.
 
         Args:
-            joints: Which, shape (k,).
-            columns: What they are by: columns as of ``ClosedLoopRobot.roll_out``, each with the
-                place, of c, of its sensitivity.
-            motion: Derivatives of their positions and then speeds, shape (N, 2k, c).
+            joints: The joints of the drives, shape (k,).
+            columns: The parameters: columns as in ``ClosedLoopRobot.roll_out``, each with the
+                index, of c, of its sensitivity.
+            motion: Derivatives of their positions, then of their speeds, shape (N, 2k, c).
             kinds: Numbers of the columns' kinds.
         """
         k, loops = len(joints), self.loops
         change: Array = (
             -loops.kp[joints, None] * motion[:, :k] - loops.kd[joints, None] * motion[:, k:]
         )
-        own = {kinds["kp"]: self.reach, kinds["kd"]: self.rate}
-        at_limit = (np.abs(self.asked) >= loops.limit)[:, joints]
+        own = {kinds["kp"]: self.position_error, kinds["kd"]: self.speed_error}
+        at_limit = (np.abs(self.unlimited) >= loops.limit)[:, joints]
         for c, (kind, joint, _) in columns:
             if kind in own:
                 change[:, joints == joint, c] += own[kind][:, [joint]]
         change[at_limit] = 0.0
         for c, (kind, joint, _) in columns:
             if kind == kinds["limit"]:
-                side = np.sign(self.asked[:, [joint]])
+                side = np.sign(self.unlimited[:, [joint]])
                 change[:, joints == joint, c] += at_limit[:, joints == joint] * side
         return change
 
 
-def drive_torques(out: RollOut, loops: Loops, behind: Array) -> DriveTorques:
-    """Return what the drives give along a roll-out.
+def drive_torques(out: RollOut, loops: Loops, lag: Array) -> DriveTorques:
+    """Return the torques of the drives along a roll-out.
 
     Args:
         out: The roll-out.
         loops: The loops that it was simulated with.
-        behind: How many rows the command that a torque follows is behind it, shape (n,); between
-            two rows it is their mean, by how near they are.
+        lag: Lag of each torque after its command, shape (n,) [samples]; a fractional lag
+            interpolates between two samples of the command.
     """
     log, rows = out.window.log, np.arange(out.window.first, out.window.stop)
-    sent = rows[:, None] - np.ceil(behind).astype(int)  # the first one was held before
-    later = np.ceil(behind) - behind
+    sent = rows[:, None] - np.ceil(lag).astype(int)  # before the log: its first command
+    later = np.ceil(lag) - lag
     q_ref, v_ref, tau_ref = (
         np.zeros(out.q.shape)
         if x is None
@@ -97,12 +97,13 @@ def drive_torques(out: RollOut, loops: Loops, behind: Array) -> DriveTorques:
         )
         for x in (log.q_ref, log.v_ref, log.tau_ref)
     )
-    reach, rate = q_ref - out.q, v_ref - out.v
-    return DriveTorques(loops.kp * reach + loops.kd * rate + tau_ref, reach, rate, loops)
+    error, speed_error = q_ref - out.q, v_ref - out.v
+    unlimited = loops.kp * error + loops.kd * speed_error + tau_ref
+    return DriveTorques(unlimited, error, speed_error, loops)
 
 
 def measured_motion(window: Window) -> RollOut:
-    """Return a window's measured motion as if it had come out of a roll-out.
+    """Return a window's measured motion in the form of a roll-out.
 
     Args:
         window: The window.
@@ -115,58 +116,61 @@ def measured_motion(window: Window) -> RollOut:
 
 
 def find_gains(
-    outs: Sequence[RollOut], loops: Loops, is_open: Array, *, knows_delay: bool, is_whole: bool
+    outs: Sequence[RollOut], loops: Loops, is_free: Array, *, knows_delay: bool, is_whole: bool
 ) -> tuple[Array, Loops]:
-    """Return how far measured torques are behind, and the loops with the gains that they tell.
+    """Return the lag of measured torques, and the loops with gains fitted to these torques.
 
-    A held command jumps from row to row, and with it the torque of a stiff loop; which of the rows
-    about the delay it is, the torques themselves tell; or that they lie between two rows, as means
-    over a row do, where they tell it clearly. Gains that would be negative stay.
+    A command that is constant over a row jumps between rows, and with it the torque of a stiff
+    loop. The lag of least squared error is taken; a fractional one, as of torques averaged over a
+    row, only where the improvement is significant. Gains whose estimate is negative do not change.
 
     Args:
         outs: Motion in windows with measured torques.
         loops: The loops, as far as they are known.
-        is_open: Whether gains of position and of speed are yet to be found, shape (2, n), bool.
-        knows_delay: Whether the loops' delay is known but for a row.
-        is_whole: Whether torques follow whole rows, until motion and gains are better known.
+        is_free: Whether gains of position and of speed are fitted, shape (2, n), bool.
+        knows_delay: Whether the loops' delay is known to within one row.
+        is_whole: Whether lags are whole, as long as motion and gains are inaccurate.
 
     Returns:
-        How many rows the command that each torque follows is behind it, shape (n,); and the loops.
+        Lag of each torque after its command, shape (n,) [samples]; and the loops.
     """
     dt = float(np.median(np.diff(outs[0].window.log.t)))
     delayed = np.ceil(loops.delay / dt - 1e-6)
     around = _AROUND if knows_delay else range(-int(delayed.min()), 1 + round(_LATEST / dt))
     tries = np.array([np.maximum(delayed + rows, 0.0) for rows in around])
-    costs = np.array([_told(outs, loops, is_open, behind)[0] for behind in tries])
-    behind, least = tries[np.argmin(costs, axis=0), np.arange(len(delayed))], costs.min(axis=0)
-    rows, whole = sum(len(out.q) for out in outs), behind.copy()
-    for side in () if is_whole else (-1.0, 1.0):  # towards the next row they are a parabola
+    costs = np.array([_fit_gains(outs, loops, is_free, lag)[0] for lag in tries])
+    lag, least = tries[np.argmin(costs, axis=0), np.arange(len(delayed))], costs.min(axis=0)
+    rows, whole = sum(len(out.q) for out in outs), lag.copy()
+    for side in () if is_whole else (-1.0, 1.0):  # the cost is a parabola towards the next row
         half, next_ = (
-            _told(outs, loops, is_open, np.maximum(whole + side * x, 0.0))[0] for x in (0.5, 1.0)
+            _fit_gains(outs, loops, is_free, np.maximum(whole + side * x, 0.0))[0]
+            for x in (0.5, 1.0)
         )
         bend, slope = 2 * (least + next_ - 2 * half), 4 * half - 3 * least - next_
         share = np.clip(-slope / np.maximum(2 * bend, 1e-300), 0.0, 1.0)
         gain = -(slope + bend * share) * share
         is_between = (gain > _CLEAR * least / rows) & (share > _NEAR)
-        behind = np.where(is_between, whole + side * share, behind)
-    gains = _told(outs, loops, is_open, behind)[1]
+        lag = np.where(is_between, whole + side * share, lag)
+    gains = _fit_gains(outs, loops, is_free, lag)[1]
     kp, kd = np.where(gains > 0, gains, [loops.kp, loops.kd])
-    return behind, replace(loops, kp=kp, kd=kd)
+    return lag, replace(loops, kp=kp, kd=kd)
 
 
-def _told(
-    outs: Sequence[RollOut], loops: Loops, is_open: Array, behind: Array
+def _fit_gains(
+    outs: Sequence[RollOut], loops: Loops, is_free: Array, lag: Array
 ) -> tuple[Array, Array]:
-    """Return the squares that torques leave, (n,), and the gains that leave least, (2, n)."""
-    found = [drive_torques(out, loops, behind) for out in outs]
-    asked, reach, rate = (
-        np.concatenate([getattr(own, name) for own in found]) for name in ("asked", "reach", "rate")
+    """Return the squared torque residuals, (n,), and the gains of least squares, (2, n)."""
+    found = [drive_torques(out, loops, lag) for out in outs]
+    unlimited, error, speed_error = (
+        np.concatenate([getattr(own, name) for own in found])
+        for name in ("unlimited", "position_error", "speed_error")
     )
     tau = np.concatenate([out.window.log.tau[out.window.counted] for out in outs])
-    squares, gains = np.zeros(len(behind)), np.stack([loops.kp, loops.kd])
-    for j, is_own in enumerate(is_open.T):
+    squares, gains = np.zeros(len(lag)), np.stack([loops.kp, loops.kd])
+    for j, is_own in enumerate(is_free.T):
         free = np.abs(tau[:, j]) < _FREE * loops.limit[j]
-        A, b = np.column_stack([reach[free, j], rate[free, j]])[:, is_own], (tau - asked)[free, j]
+        A = np.column_stack([error[free, j], speed_error[free, j]])[:, is_own]
+        b = (tau - unlimited)[free, j]
         more = np.linalg.lstsq(A, b, rcond=None)[0] if is_own.any() else np.zeros(0)
         gains[is_own, j] += more
         squares[j] = np.sum((b - A @ more) ** 2)

@@ -1,8 +1,8 @@
-"""Robots that the torque of a log drives: what they hear, and what the linear half finds first.
+"""Robots driven by the logged torque: their input, and their linear identification.
 
-Where the torque itself is logged, no command is needed to roll a robot out: the logged torque
-drives it, open loop, from where the log was (output error of a plant in open loop). It drifts, for
-nothing brings it back, so that windows are short and their starts are found.
+With a logged torque, a simulation needs no command: the torque drives the robot in open loop from
+the measured state (output error of a plant in open loop). Without feedback the simulation drifts,
+so that windows are short and their initial states are fitted.
 """
 
 from collections.abc import Sequence
@@ -23,23 +23,23 @@ __all__ = ["driven_log", "identified_rows", "torque_rows"]
 
 
 def driven_log(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
-    """Return a log whose fed-forward torque is the one that was measured.
+    """Return a log whose feed-forward torque is the measured one.
 
-    What is fed forward holds from one row to the next: there it is the mean of the two rows, so
-    that it is not half a row late. The command is the measured position, which no gain multiplies.
+    The feed-forward torque is constant between two rows: the mean of the two, which avoids a delay
+    of half a row. The command is the measured position; its gain is 0.
 
     Args:
         model: The robot.
         log: The log, of its joints in its order.
-        signals: How late its torque is.
+        signals: Signal settings, with the delay of the torque.
 
     Raises:
         DataError: If the log has no torque, or a joint with limits jumps by a full turn.
     """
     if not log.has_torque:
         raise DataError(
-            f"{log.name} has no torque, which drives the robot where [controller] has kind = "
-            "'torque'; record columns tau_ of each joint, or set kind = 'pd' for a log of commands"
+            f"{log.name} has no torque, which [controller] kind = 'torque' needs as the input. "
+            "Record columns tau_ of each joint, or set kind = 'pd' for a log of commands"
         )
     free = np.array([joint.turns_freely for joint in model.limits])
     log = unwrap(log, free)
@@ -53,24 +53,24 @@ def driven_log(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
 def identified_rows(
     model: RobotModel, logs: Sequence[Log], signals: SignalSettings | None
 ) -> Identification:
-    """Return what the torques of logs tell by themselves, with the model's own friction.
+    """Return the identification from the torques of logs alone, with the model's friction terms.
 
     Args:
         model: The robot.
         logs: The logs, with torques.
-        signals: How they become trajectories.
+        signals: Processing of the logs into trajectories.
     """
     return identify(model, logs, signals=signals, friction="none", doctor=False)
 
 
 def torque_rows(found: Identification, inflation: float = 1.0) -> TorqueRows:
-    """Return what an identification's rows come down to.
+    """Return an identification's rows reduced to a triangular factor.
 
-    Their weight is that of rows as independent as the scatter of segments shows them to be.
+    The weights include the variance inflation by correlated rows, from the scatter of segments.
 
     Args:
         found: The identification.
-        inflation: By how much larger their variance counts beside.
+        inflation: Further factor of their variance.
     """
     weight = found.wls.sigma * np.sqrt(inflation * max(found.errors.inflation, 1.0))
     return TorqueRows(found.model, found.factors.weighted(weight), found.mapping.K)

@@ -1,4 +1,4 @@
-"""How far an open loop runs from what was measured, and how far plainer models run."""
+"""Errors of simulated positions against validation logs, with simpler models as baselines."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,32 +14,32 @@ from robotid.simulation.loops import ClosedLoopRobot, Loops, cut_windows
 
 __all__ = ["DRIFTS", "HORIZONS", "OpenLoop", "position_metrics", "position_units", "run_open_loop"]
 
-#: How long an open loop runs before it is put back to what was measured [s].
+#: Horizons after which a simulation restarts from the measured state [s].
 HORIZONS = (0.1, 0.5, 2.0)
-#: After this time what a logged torque drives is put back to the log: nothing else brings it back.
+#: Horizon of simulations driven by the logged torque: without feedback they drift.
 DRIFTS = 0.5  # [s]
-_COMMANDED = ("command", "urdf", "second_order")  # baselines of what follows commands ...
-_DRIVEN = (*_COMMANDED, "rows", "steady")  # ... and of what a torque drives
+_COMMANDED = ("command", "urdf", "second_order")  # baselines of simulations driven by commands ...
+_DRIVEN = (*_COMMANDED, "rows", "steady")  # ... and of those driven by the logged torque
 
 
 @dataclass(frozen=True, eq=False)
 class OpenLoop:
-    """A log beside open loops on its commands; errors are root mean squares of shape (n,).
+    """A log and its simulation from the commands alone; errors are RMS values of shape (n,).
 
-    What the logged torque drives is put back to the log every ``DRIFTS``.
+    A simulation driven by the logged torque restarts from the log every ``DRIFTS``.
 
     Attributes:
         log: The log.
-        q: Positions of the identified robot, started once, shape (N, n) [rad or m]; NaN of a
-            sample that stands alone between gaps.
-        rmse: Its error.
-        baselines: Those of plainer models, by name, None of one that is not known or runs away:
-            "command", taken for the position; "urdf", with the stated gains, or with drives fitted
-            to the torques; "second_order", the plain model, joint by joint. Where the torque drives
-            it also "rows", what the rows of torque determine by themselves, and "steady", going on
-            at the speed of the start.
+        q: Simulated positions of the identified robot, started once, shape (N, n) [rad or m]; NaN
+            at a single sample between gaps.
+        rmse: Error of the simulated positions.
+        baselines: Errors of simpler models, by name; None if unknown or unstable. "command": the
+            command as the position; "urdf": the URDF with the stated gains, or with drives fitted
+            to the torques; "second_order": a second-order model of each joint. With the logged
+            torque as input also "rows": the estimate from the torque rows alone, and "steady": the
+            initial speed held constant.
         horizons: Error over short horizons, by their length [s].
-        spread: Size of the motion about its mean, or about where it was put back.
+        spread: RMS motion about its mean, or about the last restart.
     """
 
     log: Log
@@ -51,17 +51,17 @@ class OpenLoop:
 
     @property
     def name(self) -> str:
-        """Name of the log's file and the window of it, as ``run3.parquet 5-7.4 s``."""
+        """Name of the log's file with its time range, as ``run3.parquet 5-7.4 s``."""
         return f"{self.log.name} {self.log.t[0]:.4g}-{self.log.t[-1]:.4g} s"
 
     @property
     def is_driven(self) -> bool:
-        """Whether the logged torque drives the robot, which no loop is closed on."""
+        """Whether the logged torque drives the robot, without a closed loop."""
         return "steady" in self.baselines
 
     @property
     def moves(self) -> Array:
-        """Which joints the log moves, shape (n,), bool: else errors are no share of a motion."""
+        """Which joints the log moves, shape (n,), bool; only these have a relative error."""
         if self.is_driven or self.log.q_ref is None:
             return np.ones(len(self.rmse), dtype=bool)
         return np.asarray(np.ptp(self.log.q_ref, axis=0) > 0)
@@ -75,14 +75,14 @@ def run_open_loop(
     *,
     horizons: Sequence[float] = HORIZONS,
 ) -> OpenLoop:
-    """Return how far open loops run from a log.
+    """Simulate a log from its commands alone and return the position errors.
 
     Args:
         robot: The robot.
-        loops: Its loops as they were identified; without gains, the logged torque drives it.
-        log: The log, with commands, in the URDF's sense of the joints.
-        others: Plainer models, by name of the baseline: "urdf", "second_order", "rows".
-        horizons: How long open loops run, beside the whole log, before they are put back [s].
+        loops: Its identified loops; without gains, the logged torque drives it.
+        log: The log, with commands, with the joint signs of the URDF.
+        others: Simpler models, by name of the baseline: "urdf", "second_order", "rows".
+        horizons: Further horizons after which the simulation restarts from the log [s].
 
     Raises:
         NotConvergedError: If the identified robot cannot be simulated.
@@ -92,15 +92,15 @@ def run_open_loop(
     windows = cut_windows(log, length, 0.0)
     for out in robot.roll_out(loops, windows):
         q[out.window.counted] = out.q
-    told = log.q_ref - log.q
+    lag_error = log.q_ref - log.q
     moved = [w.log.q[w.counted] - w.start[0] for w in windows]
     steady = [
-        own - np.outer(w.log.t[w.counted] - w.log.t[w.begin], w.start[1])
+        own - np.outer(w.log.t[w.counted] - w.log.t[w.start_row], w.start[1])
         for own, w in zip(moved, windows, strict=True)
     ]
     baselines: dict[str, Array | None] = dict.fromkeys(_DRIVEN if is_driven else _COMMANDED)
     baselines |= {key: _error(robot, plain, log, length) for key, plain in (others or {}).items()}
-    own = {"steady": np.concatenate(steady)} if is_driven else {"command": told}
+    own = {"steady": np.concatenate(steady)} if is_driven else {"command": lag_error}
     baselines |= {key: _size(e) for key, e in own.items()}
     return OpenLoop(
         log=log,
@@ -119,15 +119,15 @@ def run_open_loop(
 def position_metrics(
     model: RobotModel, runs: Sequence[OpenLoop], *, moving: bool = False
 ) -> Metrics:
-    """Return the metrics of simulated positions, all logs together.
+    """Return the metrics of simulated positions over all logs.
 
-    Relative errors are those of the motion, 100 rmse / spread; a log counts as much as another.
+    Relative errors are 100 rmse / spread of the motion; all logs have equal weight.
 
     Args:
         model: The robot.
-        runs: Open loops beside logs.
-        moving: Whether, of each joint, only the logs count that move it; one that none moves is
-            missing.
+        runs: The simulations of the logs.
+        moving: Whether only the logs that move a joint count for it; the metrics then lack a joint
+            that no log moves.
     """
     found: dict[str, JointMetrics] = {}
     units = position_units(model)
@@ -177,9 +177,9 @@ def _size(e: Array) -> Array:
 
 
 def _error(robot: ClosedLoopRobot, loops: Loops, log: Log, length: float) -> Array | None:
-    """Return the error of loops put back to the log every so often; None if they run away."""
+    """Return the error of simulations restarted every ``length`` seconds; None if unstable."""
     try:
         outs = robot.roll_out(loops, cut_windows(log, length, 0.0))
     except NotConvergedError:
-        return None  # a baseline that has no roll-out is said to have none
+        return None  # a baseline that cannot be simulated has no error
     return _size(np.concatenate([o.window.log.q[o.window.counted] - o.q for o in outs]))

@@ -1,4 +1,4 @@
-"""What a user should know of a fit by simulation: scale, bounds, delays, gains, encoders."""
+"""Findings of a closed-loop identification: scale, bounds, delays, gains, limits, encoders."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -11,34 +11,34 @@ from robotid.findings import Finding, by_severity, listed
 
 __all__ = ["loop_findings"]
 
-_SOFT = 0.5  # of what a step should correct: a loop that leaves more is soft
-_MISSED = 0.5  # of a torque, that a loop which gives it does not miss
-_MOVED = 0.2  # of a standard error, that halving the steps may move a parameter
-_KNOWN = 0.1  # of the range of delays that one joint's response leaves: a smaller error settles it
-_NAMED = 8  # parameters that a sentence names
+_SOFT = 0.5  # share of the residual that remains after a step; a larger one shows a soft loop
+_MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
+_CHANGE = 0.2  # largest change of a parameter by halving the steps [standard errors]
+_KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
+_NAMED = 8  # largest number of parameters that a sentence names
 
 
 def loop_findings(found: LoopIdentification, examined: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Return what a user should know of logs and fit, the gravest first.
+    """Return the findings of logs and fit, the most severe first.
 
     Args:
-        found: What was identified.
-        examined: What the doctor found in the logs.
+        found: The identification.
+        examined: The doctor's findings of the logs.
     """
     settled = [_settled_delay(finding, found) for finding in examined]
     return by_severity([*settled, *_of_fit(found)])
 
 
 def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
-    """Yield what the user should know of the fit."""
+    """Yield the findings of the fit."""
     estimate = found.estimate
     if not estimate.converged:
         yield Finding(
             "not_settled",
             "warning",
             "fit",
-            f"the fit has not settled after {estimate.n_iter} steps: its parameters may still "
-            "move; state what you know of the loop in [controller], or use shorter windows",
+            f"the fit has not converged after {estimate.n_iter} steps: its parameters may still "
+            "change. State the known gains and delays in [controller], or use shorter windows",
         )
     yield from _soft_loop(estimate.details["left"])
     if not found.has_gains and not found.fit.simulator.knows_torques:
@@ -46,9 +46,10 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
             "scale",
             "warning",
             "controller",
-            "commands and positions tell gains, friction and inertia up to one factor; it rests "
-            "on the masses of the URDF and on gravity. What is sure are ratios, as kp over "
-            "armature; state kp in [controller], or log a torque, to tell them apart",
+            "commands and positions determine gains, friction and inertia up to a common factor; "
+            "here the masses of the URDF and gravity determine it. Ratios such as kp / armature "
+            "do not depend on it. To determine the factor, state kp in [controller] or log a "
+            "torque",
         )
     yield from _torque_mismatches(found)
     if found.is_scaled_by_gain:
@@ -58,7 +59,9 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
     yield from _at_bound(estimate.details["at_bound"])
     for together in found.correlated:
         names = listed(together, _NAMED)
-        message = f"{names} are strongly correlated: their ratios are known better than they are"
+        message = (
+            f"{names} are strongly correlated: their ratios are more accurate than their values"
+        )
         yield Finding("correlated_terms", "note", names, message)
     if found.undetermined:
         names = listed(found.undetermined, _NAMED)
@@ -66,8 +69,8 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
             "undetermined",
             "warning",
             names,
-            f"the logs say nothing of {names}: they keep what was assumed; command a motion that "
-            "needs them",
+            f"the logs do not determine {names}: the prior values remain. Command a motion that "
+            "depends on these parameters",
         )
     yield from _limits_found(found)
     yield from _encoder_findings(found)
@@ -75,51 +78,56 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
 
 
 def _settled_delay(finding: Finding, found: LoopIdentification) -> Finding:
-    """Return a finding of the logs; "slow_command" as a note where the delay is known after all."""
+    """Return a finding of the logs; "slow_command" is a note if the fit determines the delay."""
     if finding.code != "slow_command":
         return finding
     estimate, free_parameters = found.estimate, found.fit.simulator.free_parameters
     errors = [
         float(error)
-        for unknown, error in zip(free_parameters, estimate.std_error, strict=True)
-        if unknown.what == "delay"
+        for free, error in zip(free_parameters, estimate.std_error, strict=True)
+        if free.what == "delay"
     ]
     span = finding.evidence["longest"] - finding.evidence["shortest"]
     error = max(errors, default=0.0)
     if error > _KNOWN * span:
         return finding
-    how = "it is stated" if not errors else f"the fit finds it to +- {1e3 * error:.2g} ms"
+    how = (
+        "[controller] states it"
+        if not errors
+        else f"the fit determines it to +- {1e3 * error:.2g} ms, provided that gains and bodies "
+        "of the model are right"
+    )
     message = (
-        f"the command ends below the bandwidth of the loop, up to "
-        f"{finding.evidence['frequency']:.2g} Hz: the response of one joint does not show its "
-        f"delay, but {how} with the gains and bodies of the model, and is as good as these. A "
-        "chirp beyond the bandwidth of the loop, or steps, would show it by itself"
+        f"the command has power only up to {finding.evidence['frequency']:.2g} Hz, below the "
+        "bandwidth of the loop: the response of a single joint does not determine its delay, but "
+        f"{how}. To determine it independently of the model, command a chirp beyond the bandwidth "
+        "of the loop, or steps"
     )
     evidence = {**finding.evidence, "std_error": error}
     return replace(finding, severity="note", message=message, evidence=evidence)
 
 
 def _coarse_steps(details: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield that smaller steps of the integration would still move the estimate, if they would."""
+    """Yield a finding if smaller steps of the integration would still change the estimate."""
     halving = float(details.get("halving", 0.0))
     if halving > 1.0:
         yield Finding(
             "coarse_steps",
             "warning",
             "fit",
-            f"halving the steps of {1e3 * details['step']:.2g} ms moves a parameter by "
-            f"{halving:.1f} standard errors, wanted at most {_MOVED}; this is counted in the "
-            "standard errors. Set a smaller step under [estimator]",
+            f"halving the steps of {1e3 * details['step']:.2g} ms changes a parameter by "
+            f"{halving:.1f} standard errors, wanted at most {_CHANGE}; the standard errors include "
+            "this. Set a smaller step in [estimator]",
             {"halving": halving},
         )
 
 
 def _gains_contradicted(found: LoopIdentification) -> Iterator[Finding]:
-    """Yield that bodies or logged torques show other gains than those that were stated."""
+    """Yield a finding if bodies or logged torques indicate gains other than those stated."""
     scale, joints = found.fit.scale, found.model.joints
     if scale is None or not scale.is_wrong:
         return
-    shows = "the logged torques" if found.fit.simulator.knows_torques else "weight and inertia"
+    source = "the logged torques" if found.fit.simulator.knows_torques else "weight and inertia"
     factor, error = 1.0 + scale.common, scale.common_error
     kp = zip(joints, (factor * found.fit.loops.kp).tolist(), strict=True)
     agreeing = listed([f"{joint} = {value:.3g}" for joint, value in kp], _NAMED)
@@ -127,105 +135,105 @@ def _gains_contradicted(found: LoopIdentification) -> Iterator[Finding]:
         "gains_contradicted",
         "warning",
         "controller",
-        f"{shows} show gains of {factor:.2f} +- {error:.2g} times those stated, wanted 1: "
-        f"kp would agree with {agreeing}, kd likewise. Compare kp and kd in [controller] with "
-        "those of the drives (units, gear), or the masses of the URDF; all drive parameters scale "
-        "with them",
+        f"{source} indicate gains of {factor:.2f} +- {error:.2g} times those stated, wanted 1. "
+        f"Consistent values of kp: {agreeing}; kd likewise. Compare kp and kd in [controller] "
+        "with those of the drives (units, gear ratio), and the masses of the URDF with the robot; "
+        "all drive parameters scale with the gains",
         {"scale": factor, "std_error": error},
     )
 
 
 def _at_bound(names: Sequence[str]) -> Iterator[Finding]:
-    """Yield which parameters came out as 0."""
+    """Yield which parameters are estimated as 0."""
     at_zero = [name for name in names if name.rpartition(".")[2] not in ("kp", "limit")]
     if at_zero:
         yield Finding(
             "at_bound",
             "warning",
             listed(at_zero, _NAMED),
-            f"{listed(at_zero, _NAMED)} came out as 0, the smallest possible value: the motion "
-            "shows none, or a stated gain or delay is wrong; leave the delay out of [controller], "
-            "so that it is found, and compare the stated gains with those of the drive",
+            f"{listed(at_zero, _NAMED)}: the estimate is 0, the lower bound. The motion does not "
+            "excite it, or a stated gain or delay is wrong. Leave the delay out of [controller], "
+            "so that it is fitted, and compare the stated gains with those of the drive",
         )
     if any(name.endswith("delay") for name in at_zero):
         yield Finding(
             "no_delay",
             "warning",
             "delay",
-            "the delay came out as 0: commands and positions may not be of one clock, or the "
-            "motion is too slow to show it; command a faster one",
+            "the estimated delay is 0: commands and positions may have different clocks, or the "
+            "motion is too slow to determine the delay. Command a faster motion",
         )
 
 
 def _limits_found(found: LoopIdentification) -> Iterator[Finding]:
-    """Yield the largest torques that were found."""
+    """Yield the estimated torque limits of the drives."""
     estimate = found.estimate
-    for unknown, value, error in zip(
+    for free, value, error in zip(
         found.fit.simulator.free_parameters, estimate.theta, estimate.std_error, strict=True
     ):
-        if unknown.what == "limit":
-            joint = found.model.limits[unknown.joints[0]]
+        if free.what == "limit":
+            joint = found.model.limits[free.joints[0]]
             unit = "N" if joint.type == "prismatic" else "N m"
             yield Finding(
                 "limit",
                 "note",
                 joint.name,
-                f"{joint.name}: its drive gives at most {value:.3g} +- {error:.2g} {unit}, beyond "
-                "which it no longer follows its command; if you know its limit, state it in "
-                "[controller]",
+                f"{joint.name}: the torque limit of the drive is estimated as {value:.3g} +- "
+                f"{error:.2g} {unit}; at the limit the joint does not follow its command. If you "
+                "know the limit, state it in [controller]",
                 {"limit": float(value), "std_error": float(error)},
             )
 
 
 def _soft_loop(left: float) -> Iterator[Finding]:
-    """Yield that the direct method's steps leave much of what they should correct, if they do."""
+    """Yield a finding if a step of the direct method leaves much of the residual."""
     if left > _SOFT:
         yield Finding(
             "soft_loop",
             "warning",
             "fit",
-            f"a step of error = 'direct' leaves {100 * left:.0f} % of what it should correct, "
-            "because it neglects how the motion changes; errors are large in a loop as soft as "
-            "this. Set error = 'input'",
+            f"a step of error = 'direct' leaves {100 * left:.0f} % of the residual that it should "
+            f"remove, wanted at most {100 * _SOFT:.0f} %: it neglects that the motion changes with "
+            "the parameters, and this loop is soft. Set error = 'input'",
             {"left": left},
         )
 
 
 def _torque_mismatches(found: LoopIdentification) -> Iterator[Finding]:
-    """Yield which logged torques are not those of the loops, though they weigh."""
+    """Yield which logged torques differ from those of the loops, where the fit uses them."""
     simulator = found.fit.simulator
-    if simulator.behind is None:
+    if simulator.lag is None:
         return
-    missed = simulator.torque_mismatch(found.estimate.theta)
-    for joint, share in zip(found.model.joints, missed.tolist(), strict=True):
-        if share > _MISSED:
+    mismatch = simulator.torque_mismatch(found.estimate.theta)
+    for joint, share in zip(found.model.joints, mismatch.tolist(), strict=True):
+        if share > _MISMATCH:
             yield Finding(
                 "torque_mismatch",
                 "warning",
                 joint,
-                f"{joint}: its loop and the logged torque, by which gains and friction are scaled, "
-                f"differ by {100 * share:.0f} % of the larger (root mean squares); see whether the "
-                "column is this joint's, in N m behind the gear and of this controller, or set "
-                "torques = false",
+                f"{joint}: the torque of its loop and the logged torque differ by "
+                f"{100 * share:.0f} % of the larger (RMS); gains and friction are scaled by the "
+                "logged one. Check that the column belongs to this joint and this controller, and "
+                "is the joint torque in N m, or set torques = false",
                 {"missed_pct": 100 * share},
             )
 
 
 def _friction_found(tried: Tried) -> Finding:
-    """Return what is said of terms that other windows confirmed."""
+    """Return the finding of friction terms that cross-validation confirmed."""
     return Finding(
         "friction_found",
         "note",
         tried.joint,
-        f"{tried.joint}: {' and '.join(tried.terms)} lowers the squared error of windows that it "
-        f"was not fitted to by {100 * tried.gain:.0f} %",
+        f"{tried.joint}: {' and '.join(tried.terms)} lowers the squared error of held-out windows "
+        f"by {100 * tried.gain:.0f} %",
         {"gain_pct": 100 * tried.gain},
     )
 
 
 def _encoder_findings(found: LoopIdentification) -> Iterator[Finding]:
-    """Yield zero and sense of each encoder beside the URDF's, and what speaks for them."""
-    encoders, open_ = found.fit.encoders, []
+    """Yield zero and sign of each encoder relative to the URDF, with the evidence for them."""
+    encoders, undetermined = found.fit.encoders, []
     if found.loop.zeros != "find":
         return
     for j, joint in enumerate(found.model.joints):
@@ -235,20 +243,20 @@ def _encoder_findings(found: LoopIdentification) -> Iterator[Finding]:
             "explained": float(encoders.explained[j]), "margin": margin,
             "next_zero": float(encoders.next_zero[j]), "next_sign": float(encoders.next_sign[j]),
         }  # fmt: skip
-        other = ", counted the other way," if encoders.next_sign[j] != encoders.sign[j] else ""
-        beside = (
-            f"the next best, {encoders.next_zero[j]:+.2g} rad{other} leaves {100 * margin:.0f} % "
-            "more of the squared error of the loops"
+        other = " and the other sign," if encoders.next_sign[j] != encoders.sign[j] else ""
+        next_best = (
+            f"The next best, {encoders.next_zero[j]:+.2g} rad{other} leaves {100 * margin:.0f} % "
+            "more squared position error"
         )
         if encoders.gain[j] > 0:
-            sense = "counts the other way, and " if encoders.sign[j] < 0 else ""
+            sense = "has the opposite sign and " if encoders.sign[j] < 0 else ""
             yield Finding(
                 "encoder",
                 "warning",
                 joint,
-                f"{joint}: its encoder {sense}reads 0 where the URDF is at {zero:+.3g} rad; by "
-                f"gravity this explains {100 * encoders.gain[j]:.0f} % of what holds the loop off "
-                f"its command; {beside}. Calibrate it, or state the zero in the URDF",
+                f"{joint}: its encoder {sense}reads 0 where the URDF has {zero:+.3g} rad. With "
+                f"gravity this explains {100 * encoders.gain[j]:.0f} % of the squared position "
+                f"error. {next_best}. Calibrate the encoder, or change the zero in the URDF",
                 evidence,
             )
         elif margin > CLEAR:
@@ -256,29 +264,32 @@ def _encoder_findings(found: LoopIdentification) -> Iterator[Finding]:
                 "encoder_uncorrected",
                 "note",
                 joint,
-                f"{joint}: its encoder has zero and sense of the URDF, by gravity, which explains "
-                f"{100 * encoders.explained[j]:.0f} % of what slowly holds it off its command; "
-                f"{beside}",
+                f"{joint}: its encoder has the zero and sign of the URDF. Gravity explains "
+                f"{100 * encoders.explained[j]:.0f} % of the slow part of the squared position "
+                f"error. {next_best}",
                 evidence,
             )
         else:
-            open_.append(joint)
-    yield from _untold_encoders(found, open_)
+            undetermined.append(joint)
+    yield from _undetermined_encoders(found, undetermined)
 
 
-def _untold_encoders(found: LoopIdentification, open_: Sequence[str]) -> Iterator[Finding]:
-    """Yield which zeros and senses gravity leaves open: those of joints, and those of chains."""
-    if open_:
-        margins = [found.fit.encoders.margin[found.model.joints.index(j)] for j in open_]
+def _undetermined_encoders(
+    found: LoopIdentification, undetermined: Sequence[str]
+) -> Iterator[Finding]:
+    """Yield which encoder zeros and signs gravity does not determine, of joints and of chains."""
+    if undetermined:
+        margins = [found.fit.encoders.margin[found.model.joints.index(j)] for j in undetermined]
         margin = max(0.0, *margins)
-        names = listed(open_, _NAMED)
+        names = listed(undetermined, _NAMED)
         yield Finding(
             "encoder_undetermined",
             "note",
             names,
-            f"gravity does not tell zero and sense of {names}: they move little, or bear so "
-            f"little that others leave {100 * margin:.0f} % more of the squared error of the loops "
-            "at most. They are taken to be the URDF's; compare them at a known pose",
+            f"gravity does not determine the encoder zeros and signs of {names}: the joints move "
+            "little or gravity hardly loads them, and another zero or sign leaves at most "
+            f"{100 * margin:.0f} % more squared position error. The URDF's values are assumed; "
+            "check them at a known pose",
             {"margin": float(margin)},
         )
     for chain in parallel_axes(found.model):
@@ -287,6 +298,7 @@ def _untold_encoders(found: LoopIdentification, open_: Sequence[str]) -> Iterato
             "mirror_image",
             "note",
             names,
-            f"{names} turn about parallel axes: gravity hardly tells them from their mirror image, "
-            "all of them counted the other way. Look which way one of them turns",
+            f"{names} have parallel axes: with all their signs reversed, the gravity torques are "
+            "almost the same, so that gravity does not determine their common sign. Check the "
+            "direction of rotation of one of them",
         )

@@ -1,4 +1,4 @@
-"""From logs of commands and positions to drives, loops and bodies: the stages of the fit."""
+"""The stages of a closed-loop identification: initial values, fit, friction terms, step size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -45,38 +45,38 @@ from robotid.simulation.settings import by_joint
 
 __all__ = ["STAGES", "Fitted", "fit_loops", "stated_loops"]
 
-#: What the fit of a job does, from files to files.
+#: The stages of a job's fit, from reading logs to writing files.
 STAGES = (
-    "reading logs", "fitting torques", "trying plain loops", "fitting loops", "trying friction",
-    "testing", "writing",
+    "reading logs", "fitting torques", "trying second-order models", "fitting loops",
+    "trying friction terms", "testing", "writing",
 )  # fmt: skip
 
 
 _NAMES = {"output": "output error", "input": "input error", "direct": "direct input error"}
-_WHITE = 2.0  # whitening ends at so many times the rate at which a loop follows
-_FEW = 12  # windows that are fitted first, of many
-_STARTS = 3  # fits with better starts of the windows
-_WINDOW, _LEAD = 2.5, 0.6  # [s] of what follows commands, if not stated
-_BOTH = 2.0  # one torque's noise is in its rows and in what it drives: each counts by half
-_MOVED = 0.2  # of a standard error, that halving the steps may move a parameter
-_FINEST = 16.0  # times smaller steps at most
-_SETTLING = 4  # steps of parameters and starts of windows together, at most ...
-_RAISED = 1e-2  # ... none of which raises the logarithm of what remains by more than that
+_WHITE = 2.0  # cut-off of the whitening, relative to 1 / time constant of the loop
+_FEW = 12  # number of windows of the first fit
+_STARTS = 3  # number of fits with improved initial states of the windows
+_WINDOW, _LEAD = 2.5, 0.6  # default window and lead of closed-loop simulations [s]
+_BOTH = 2.0  # variance factor: the noise of a torque is in its rows and in the simulation it drives
+_CHANGE = 0.2  # largest change of a parameter by halving the steps [standard errors]
+_FINEST = 16.0  # largest reduction of the step
+_SETTLING = 4  # largest number of steps of parameters and initial states together
+_RAISED = 1e-2  # largest increase of the mean log residual in such a step
 _PASSES = 2  # of choosing terms and fitting again
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """What the fit found.
+    """Result of the fit.
 
     Attributes:
-        simulator: The robot with its unknowns, and the windows.
-        estimate: The unknowns' values.
-        plain: The plain model, joint by joint; None where the logged torque drives the robot.
-        encoders: How encoders stand to the URDF's joints.
-        tried: Which terms were tried, and what they gained.
-        linear: What the rows of torque tell by themselves, where the torque drives the robot.
-        scale: What bodies and torques show of stated gains; None where gains are found.
+        simulator: The robot with its free parameters, and the windows.
+        estimate: The estimate of the free parameters.
+        plain: The second-order model of each joint; None where the logged torque drives the robot.
+        encoders: Zeros and signs of the encoders relative to the URDF's joints.
+        tried: The friction terms that were tried, with their gains.
+        linear: The identification from the torque rows alone, where the torque drives the robot.
+        scale: Scale of the stated gains by bodies and torques; None where gains are fitted.
     """
 
     simulator: LoopSimulator
@@ -89,7 +89,7 @@ class Fitted:
 
     @property
     def loops(self) -> Loops:
-        """Bodies, drives and loops as they were found."""
+        """Bodies, drives and loops at the estimate."""
         return self.simulator.loops(self.estimate.theta)
 
 
@@ -106,25 +106,25 @@ def fit_loops(
     """Fit drives, loops and bodies to logs of commands and positions.
 
     Args:
-        model: The robot; its drive terms are those that are found.
+        model: The robot; its drive terms are the fitted ones.
         logs: The logs, of its joints in its order, with commands.
         loop: What is known of the loops.
         settings: Windows, spread of bodies, whitening.
-        signals: How the torques of logs become rows.
+        signals: Processing of the logs' torques into rows.
         chooses: Whether further friction terms are tried.
-        progress: Told of the stages.
+        progress: Called with the stages.
 
     Raises:
-        DataError: If a log lacks what is to be compared.
-        NotConvergedError: If nothing that is tried can be simulated.
+        DataError: If a log lacks a signal that is compared.
+        NotConvergedError: If no trial can be simulated.
         SettingsError: If a setting does not fit the robot.
     """
     _check_settings(model, logs, loop, settings)
-    begin = _initialise_from_torque if loop.kind == "torque" else _initialise_from_commands
-    initialised = begin(model, logs, loop, settings, signals, progress)
+    initialise = _initialise_from_torque if loop.kind == "torque" else _initialise_from_commands
+    initialised = initialise(model, logs, loop, settings, signals, progress)
     simulator, estimator = initialised.simulator, initialised.estimator
-    # the URDF's bodies first: with bodies that change, too, many scales suit nearly as well
-    drives = [k for k, unknown in enumerate(simulator.free_parameters) if unknown.what != "body"]
+    # first with the URDF's bodies: with free bodies, many scales have nearly the same residual
+    drives = [k for k, free in enumerate(simulator.free_parameters) if free.what != "body"]
     few = replace(
         simulator,
         windows=_few(simulator.windows),
@@ -136,12 +136,12 @@ def fit_loops(
     is_plain = settings.error == "output" and initialised.linear is None
     for left in reversed(range(_STARTS)):
         simulator = simulator.with_better_start(theta)
-        if simulator.behind is not None:
+        if simulator.lag is not None:
             outs = simulator.roll_out(theta, _few(simulator.windows))
-            gains, is_last = (simulator.loops(theta), _open_gains(loop, model)), left == 0
-            behind, _ = find_gains(outs, *gains, knows_delay=True, is_whole=not is_last)
-            simulator = replace(simulator, behind=behind)
-        # starts that are not yet the best deserve no more than one round
+            gains, is_last = (simulator.loops(theta), _free_gains(loop, model)), left == 0
+            lag, _ = find_gains(outs, *gains, knows_delay=True, is_whole=not is_last)
+            simulator = replace(simulator, lag=lag)
+        # one round is enough while the initial states still change
         rounds = 1 if left and is_plain else estimator.rounds
         estimate = replace(estimator, rounds=rounds).fit(simulator, theta, exact=simulator.exact)
         theta = estimator.joint_step(simulator, estimate.theta)
@@ -149,7 +149,7 @@ def fit_loops(
             estimator = replace(estimator, inflation=_BOTH * estimate.details["inflation"])
     tried: list[Tried] = []
     for _ in range(_PASSES if chooses else 0):
-        report_stage(progress, "trying friction", STAGES)
+        report_stage(progress, "trying friction terms", STAGES)
         offered = [
             set_
             for set_ in candidates(simulator, initialised.torque)
@@ -158,11 +158,11 @@ def fit_loops(
         wide, theta = _with(simulator, estimate.theta, offered)
         found = choose(wide, theta, offered, replace(estimator, inflation=1.0))
         tried = [*(t for t in tried if t.is_chosen), *found]
-        taken = [set_ for set_, t in zip(offered, found, strict=True) if t.is_chosen]
-        if not taken:
+        chosen = [set_ for set_, t in zip(offered, found, strict=True) if t.is_chosen]
+        if not chosen:
             break
         report_stage(progress, "fitting loops", STAGES)
-        simulator, theta = _with(simulator, estimate.theta, taken)
+        simulator, theta = _with(simulator, estimate.theta, chosen)
         if simulator.torque is not None:
             own = with_terms(model, simulator.base)
             rows = torque_rows(identified_rows(own, logs, signals), initialised.share)
@@ -173,24 +173,24 @@ def fit_loops(
         simulator, estimate = refine_steps(simulator, estimator, estimate)
         if is_stated(loop.kp, model).all() and simulator.error == "output":
             scale = gain_scale(simulator, estimator, estimate)
-    chosen = (initialised.encoders, tuple(tried), initialised.linear, scale)
-    return Fitted(simulator, estimate, initialised.plain, *chosen)
+    others = (initialised.encoders, tuple(tried), initialised.linear, scale)
+    return Fitted(simulator, estimate, initialised.plain, *others)
 
 
 @dataclass(frozen=True, eq=False)
 class _Initial:
-    """What a fit begins with."""
+    """The initial values of a fit."""
 
     simulator: LoopSimulator
     estimator: OutputError
-    torque: Array  # typical ones, shape (n,) [N m or N]
+    torque: Array  # typical torques, shape (n,) [N m or N]
     encoders: Encoders
     plain: SecondOrder | None = None
     linear: Identification | None = None
 
     @property
     def share(self) -> float:
-        """How often each row of torque is counted, in rows and roll-outs."""
+        """Factor of the variance of torque rows: 2 where roll-outs use the same torques."""
         return 1.0 if self.linear is None else _BOTH
 
 
@@ -202,33 +202,33 @@ def _initialise_from_commands(
     signals: SignalSettings | None,
     progress: ProgressCallback,
 ) -> _Initial:
-    """Return loops on commands, begun with a plain loop of each joint."""
+    """Return closed loops on commands, initialised with a second-order model of each joint."""
     robot = ClosedLoopRobot(model, step=settings.step)
     encoders = find_encoders(model, logs) if loop.zeros == "find" else same_encoders(model)
     logs = [log.turned(encoders.sign) for log in logs]
     length, lead = settings.window or _WINDOW, _LEAD if settings.lead is None else settings.lead
     windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
     stated = replace(stated_loops(model, loop), zero=encoders.zero)
-    weighs = settings.torques and all(log.has_torque for log in logs)
-    has_gain, behind = is_stated(loop.kp, model), None
-    if weighs and loop.rate is None:
-        is_open = _open_gains(loop, model)
+    uses_torques = settings.torques and all(log.has_torque for log in logs)
+    has_gain, lag = is_stated(loop.kp, model), None
+    if uses_torques and loop.rate is None:
+        is_free = _free_gains(loop, model)
         moved = [measured_motion(window) for window in _few(windows)]
-        behind, told = find_gains(
-            moved, stated, is_open, knows_delay=loop.delay is not None, is_whole=True
+        lag, found = find_gains(
+            moved, stated, is_free, knows_delay=loop.delay is not None, is_whole=True
         )
-        has_gain, stated = has_gain | (told.kp != stated.kp), told
-    report_stage(progress, "trying plain loops", STAGES)
+        has_gain, stated = has_gain | (found.kp != stated.kp), found
+    report_stage(progress, "trying second-order models", STAGES)
     plain = fit_second_order(robot, windows, stated, finds_delay=loop.delay is None)
     groups = groups_of(loop, model.joints, likeness(model))
     top = _largest_speeds(model, loop, logs)
     typical = typical_sizes(robot, plain, windows, has_gain, top)
     finds_limit = (top > 0.0) | (loop.limit == "find")
     base = first_loops(model, stated, plain, typical, finds_limit)
-    # positions alone tell the sum of kd and viscous friction
-    tells_kd = weighs or all(log.v_ref is not None for log in logs)
+    # positions alone determine only the sum of kd and viscous friction
+    finds_kd = uses_torques or all(log.v_ref is not None for log in logs)
     free_parameters = free_drive_parameters(
-        model, loop, groups, base, typical, tells_kd=tells_kd, finds_limit=finds_limit
+        model, loop, groups, base, typical, finds_kd=finds_kd, finds_limit=finds_limit
     )
     free_parameters += free_zeros(model, encoders) if loop.zeros == "find" else []
     free_parameters += free_body_parameters(robot, settings.bodies) if settings.bodies else []
@@ -236,10 +236,10 @@ def _initialise_from_commands(
     most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 3)  # positions, speeds, torques
     estimator = OutputError(_NAMES[settings.error], settings.whiten, most, progress=progress)
     simulator = LoopSimulator(
-        robot, windows, base, tuple(free_parameters), velocities=settings.velocities, behind=behind
+        robot, windows, base, tuple(free_parameters), velocities=settings.velocities, lag=lag
     )
     report_stage(progress, "fitting loops", STAGES)
-    if weighs and behind is None:
+    if uses_torques and lag is None:
         rows = torque_rows(identified_rows(with_terms(model, base), logs, signals))
         simulator = replace(simulator, torque=rows)
     return _Initial(simulator, estimator, typical.torque, encoders, plain)
@@ -253,9 +253,10 @@ def _initialise_from_torque(
     signals: SignalSettings | None,
     progress: ProgressCallback,
 ) -> _Initial:
-    """Return a robot that the logged torque drives, begun with what its rows tell by themselves.
+    """Return a robot driven by the logged torque, initialised from the torque rows alone.
 
-    Where these rows weigh, bodies change about what they tell; else about the URDF's, or stay.
+    Where the fit uses these rows, the prior of the bodies is their estimate from the rows; else
+    that of the URDF.
     """
     report_stage(progress, "fitting torques", STAGES)
     found = identified_rows(model, logs, signals)
@@ -269,7 +270,7 @@ def _initialise_from_torque(
     groups = groups_of(loop, model.joints, range(len(model.joints)))
     none = np.zeros(len(groups), dtype=bool)
     free_parameters = free_drive_parameters(
-        model, loop, groups, base, typical, tells_kd=False, finds_limit=none
+        model, loop, groups, base, typical, finds_kd=False, finds_limit=none
     )
     free_parameters += free_body_parameters(robot, settings.bodies) if settings.bodies else []
     simulator = LoopSimulator(
@@ -286,14 +287,14 @@ def _initialise_from_torque(
 def refine_steps(
     simulator: LoopSimulator, estimator: OutputError, estimate: Estimate
 ) -> tuple[LoopSimulator, Estimate]:
-    """Fit roll-outs of smaller steps, where halving the step moves the estimate.
+    """Fit roll-outs of smaller steps, where halving the step changes the estimate.
 
-    Steps are halved until this moves no parameter by more than 0.2 standard errors. Derivatives
-    stay those of the larger steps: they do not move where the fit ends. What halving the last step
-    still moves counts in the covariance; as many steps as that follow would move as much again.
+    Steps are halved until this changes no parameter by more than 0.2 standard errors. Derivatives
+    stay those of the larger steps: they do not change the minimum. The change by the last halving
+    is added to the covariance, since all further halvings together would change as much again.
 
     Args:
-        simulator: What simulates.
+        simulator: The simulator.
         estimator: The estimator.
         estimate: The estimate at the steps of ``simulator``.
 
@@ -308,7 +309,7 @@ def refine_steps(
         half = replace(simulator, fine=ClosedLoopRobot(model, step=0.5 * step, corrects=True))
         change, error = estimator.moved(now, half, theta)
         share = float(np.max(np.abs(change) / np.maximum(error, 1e-300), initial=0.0))
-        if share <= _MOVED or 0.5 * step < finest:
+        if share <= _CHANGE or 0.5 * step < finest:
             break
         step, now = 0.5 * step, half
     now, estimate = _settled(now, estimator, estimate)
@@ -320,16 +321,17 @@ def refine_steps(
 def _settled(
     simulator: LoopSimulator, estimator: OutputError, estimate: Estimate
 ) -> tuple[LoopSimulator, Estimate]:
-    """Return the estimate beside which the starts of windows fit best, and these windows.
+    """Return the estimate with the best initial states of the windows, and these windows.
 
-    Starts and steps of both together take turns until a step moves no parameter by more than 0.2
-    standard errors. Where such a step raises what remains, as it may from far away, or where
-    derivatives are not exact, it is a fit from the best starts.
+    Fits of the initial states and joint steps of states and parameters alternate, until a step
+    changes no parameter by more than 0.2 standard errors. If such a step raises the residual, as it
+    may far from the minimum, or derivatives are not exact, the parameters are fitted from the best
+    initial states.
 
     Args:
-        simulator: What simulates.
+        simulator: The simulator.
         estimator: The estimator.
-        estimate: The estimate of earlier starts, or of larger steps.
+        estimate: The estimate with earlier initial states, or larger steps.
     """
     if simulator.exact is not None:
         simulator = simulator.with_better_start(estimate.theta)
@@ -344,7 +346,7 @@ def _settled(
             return simulator, estimator.fit(simulator, first)
         change = np.abs(found.theta - estimate.theta)
         simulator, estimate = initialised, found
-        if (change <= _MOVED * found.std_error).all():
+        if (change <= _CHANGE * found.std_error).all():
             break
     return simulator, estimate
 
@@ -352,67 +354,70 @@ def _settled(
 def _check_settings(
     model: RobotModel, logs: Sequence[Log], loop: LoopSettings, settings: SimulationSettings
 ) -> None:
-    """Refuse logs without what is to be compared, and unknown loops where they must be known."""
+    """Refuse logs without a compared signal, and free loop parameters where none may be free."""
     error = f"estimator: error = {settings.error!r}"
     for log in logs:
         if settings.velocities and (log.v is None or not is_trustworthy(log)):
-            found = "none" if log.v is None else "late or coarse ones, or not its positions' own"
+            found = (
+                "has no velocities"
+                if log.v is None
+                else "has velocities that are delayed, coarse, or inconsistent with the positions"
+            )
             raise DataError(
-                f"estimator: velocities is true, but {log.name} has {found}; record columns dq_ "
-                "of each joint, or leave velocities out"
+                f"estimator: velocities is true, but {log.name} {found}. Record columns dq_ of "
+                "each joint, or leave velocities out"
             )
         if settings.error != "output" and not log.has_torque:
             raise DataError(
-                f"{error} compares torques, but {log.name} has none; record columns tau_ of each "
-                "joint, or set error = 'output'"
+                f"{error} compares torques, but {log.name} has no torques. Record columns tau_ of "
+                "each joint, or set error = 'output'"
             )
     if settings.error != "output" and loop.kind == "torque":
         raise SettingsError(
-            f"{error} compares torques with those of a loop, but [controller] has kind = 'torque', "
-            "where the logged one drives; leave error out, or state the loop, kind = 'pd'"
+            f"{error} compares logged torques with those of a controller, but [controller] has "
+            "kind = 'torque', without a controller. Leave error out, or state the controller with "
+            "kind = 'pd'"
         )
     if settings.error != "output" and loop.rate is not None:
         raise SettingsError(
-            f"{error} takes torques that follow at once, but [controller] has rate = "
-            f"{loop.rate:g}, at which they are held; leave rate out, or set error = 'output'"
+            f"{error} needs a controller in continuous time, but [controller] has rate = "
+            f"{loop.rate:g} (zero-order hold). Leave rate out, or set error = 'output'"
         )
     if settings.error != "direct":
         return
-    unknown = [
-        key for key in ("kp", "kd", "delay") if not is_stated(getattr(loop, key), model).all()
-    ]
+    free = [key for key in ("kp", "kd", "delay") if not is_stated(getattr(loop, key), model).all()]
     finds_limit = loop.limit == "find" or bool(_largest_speeds(model, loop, logs).any())
-    unknown += ["limit"] * finds_limit + ["zeros"] * (loop.zeros == "find")
-    if unknown:
+    free += ["limit"] * finds_limit + ["zeros"] * (loop.zeros == "find")
+    if free:
         raise SettingsError(
-            f"{error} needs a controller that is known, whose {listed(unknown)} would be found; "
-            "state them of each joint in [controller] (delay = 0 if there is none), or set "
+            f"{error} needs a known controller, but {listed(free)} would be fitted. State "
+            "values for every joint in [controller] (delay = 0 if there is none), or set "
             "error = 'input'"
         )
 
 
 def _largest_speeds(model: RobotModel, loop: LoopSettings, logs: Sequence[Log]) -> Array:
-    """Return the largest speed of joints that run at it, and whose limit is not stated; or 0."""
+    """Return the speed of joints that run at their largest speed without a stated limit; else 0."""
     speed = np.zeros(len(model.joints))
     for log in logs:
         found = largest_speeds(log)
         speed = np.maximum(speed, [found.get(joint, 0.0) for joint in model.joints])
-    is_open = ~is_stated(None if loop.limit == "find" else loop.limit, model)
-    return np.where(is_open, speed, 0.0)
+    is_free = ~is_stated(None if loop.limit == "find" else loop.limit, model)
+    return np.where(is_free, speed, 0.0)
 
 
 def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
-    """Return what is stated of loops, with the URDF's bodies; a gain of the position counts as 1.
+    """Return the loops as stated, with the URDF's bodies; kp is 1 where it is not stated.
 
     Args:
         model: The robot.
         loop: What is known of the loops.
 
     Raises:
-        SettingsError: If a joint is named that is not there.
+        SettingsError: If the robot lacks a named joint.
     """
     n, joints = len(model.joints), model.joints
-    limit = None if isinstance(loop.limit, str) else loop.limit  # it is to be found
+    limit = None if isinstance(loop.limit, str) else loop.limit  # "find": fitted
     bodies = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)
     return Loops(
         bodies=bodies,
@@ -433,21 +438,21 @@ def _few(windows: Sequence[Window]) -> tuple[Window, ...]:
     return tuple(windows[:: max(1, len(windows) // _FEW)])
 
 
-def _open_gains(loop: LoopSettings, model: RobotModel) -> Array:
-    """Return for which joints gains of position and of speed are to be found, (2, n), bool."""
+def _free_gains(loop: LoopSettings, model: RobotModel) -> Array:
+    """Return for which joints position and speed gains are fitted, shape (2, n), bool."""
     return ~np.stack([is_stated(gain, model) for gain in (loop.kp, loop.kd)])
 
 
 def _with(
     simulator: LoopSimulator, theta: Array, sets: Sequence[tuple[FreeParameter, ...]]
 ) -> tuple[LoopSimulator, Array]:
-    """Return the simulator with further terms, which are 0, and its parameters."""
-    further = [unknown for free_parameters in sets for unknown in free_parameters]
+    """Return the simulator with further terms at 0, and its parameters."""
+    further = [free for free_parameters in sets for free in free_parameters]
     loops = simulator.base
     terms = [list(own) for own in loops.terms]
-    for unknown in further:
-        if unknown.term is not None:
-            terms[unknown.joints[0]].append(unknown.term)
+    for free in further:
+        if free.term is not None:
+            terms[free.joints[0]].append(free.term)
     values = [
         loops.values[loops.place(j, term)] if term in loops.terms[j] else 0.0
         for j, own in enumerate(terms)

@@ -1,4 +1,4 @@
-"""What is unknown of drives, loops and bodies, and the simulator that an estimator asks."""
+"""Free parameters of drives, loops and bodies, and the simulator that an estimator calls."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -20,27 +20,27 @@ from robotid.simulation.loops import ClosedLoopRobot, Column, Loops, RollOut, Wi
 
 __all__ = ["FreeParameter", "LoopSimulator", "TorqueRows", "free_body_parameters", "with_terms"]
 
-_STARTS = 2  # steps towards better starts of windows ...
-_SHARES = (1.0, 0.3, 0.1)  # ... of which these are tried
-_NEAR = 3.0  # errors of position, that a start may be from where it was measured
-_POSSIBLE = 1e-9  # smallest eigenvalue of a pseudo-inertia, relative, from which a body can change
-#: Entries of the triangle that a body changes by: the logarithm of its mass' root, and its centre.
+_STARTS = 2  # steps of the initial states of windows
+_SHARES = (1.0, 0.3, 0.1)  # step lengths that are tried
+_NEAR = 3.0  # prior of an initial position about the measured one [RMS position errors]
+_POSSIBLE = 1e-9  # smallest relative eigenvalue of the pseudo-inertia of a body that may change
+#: Entries of a body's triangle: the logarithm of the root of its mass, and its centre.
 _ENTRIES = ((3, 3), (0, 3), (1, 3), (2, 3))
 
 
 @dataclass(frozen=True, eq=False)
 class FreeParameter:
-    """One number that is to be found, of one joint or of several that share it.
+    """A free parameter of one joint, or of several joints that share it.
 
     Attributes:
-        name: As ``"elbow.armature"``; of several joints, ``"calf.armature"``.
+        name: Such as ``"elbow.armature"``; of several joints, ``"calf.armature"``.
         what: "armature", "kp", "kd", "limit", "delay", "zero", "term", or "body": a coordinate of
-            how a body differs from the URDF's.
-        joints: Rows of the joints.
-        prior: What it is before any data.
-        spread: How far from that it may plausibly be; inf where nothing is known.
-        lowest: Smallest value that it may have.
-        term: The term of friction.
+            the difference between a body and the URDF's.
+        joints: Indices of the joints.
+        prior: Prior value.
+        spread: Prior standard deviation; inf without a prior.
+        lowest: Lower bound.
+        term: The friction term.
         coordinate: Number of a body's coordinate, 0 to 3.
     """
 
@@ -55,16 +55,16 @@ class FreeParameter:
 
 
 def free_body_parameters(robot: ClosedLoopRobot, spread: float) -> list[FreeParameter]:
-    """Return how bodies may differ from the URDF's, four coordinates each, 0 before any data.
+    """Return free parameters of bodies relative to the URDF, four each, with prior 0.
 
-    J' = U T T' U' with U U' the URDF's pseudo-inertia and T the unit matrix but for its last
-    column, (c, exp m): mass and centre of mass change, and the moments with them, the shape about
-    the centre stays. Every value is a body that can be.
+    J' = U T T' U' with U U' the URDF's pseudo-inertia, and T the unit matrix except its last
+    column, (c, exp m). Mass, centre of mass and the moments about the joint change; the
+    distribution about the centre does not. Every value is a physically consistent body.
 
     Args:
         robot: The robot.
-        spread: Plausible size of each coordinate [-]; 0.1 is some 20 % of the mass, and a centre
-            of mass off by a tenth of the radius of gyration.
+        spread: Prior standard deviation of each coordinate [-]; 0.1 is about 20 % of the mass, and
+            a tenth of the radius of gyration for the centre of mass.
 
     References:
         Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14).
@@ -75,7 +75,7 @@ def free_body_parameters(robot: ClosedLoopRobot, spread: float) -> list[FreePara
     found = []
     for body, joint in enumerate(robot.joint_of_body):
         if values[body, 0] <= _POSSIBLE * values[body, -1]:
-            continue  # a massless frame, or a body that the URDF makes impossible: it stays
+            continue  # a massless frame or an inconsistent body of the URDF stays fixed
         name = model.layout.bodies[body]
         found += [
             FreeParameter(f"{name}.{what}", "body", (joint,), 0.0, spread, coordinate=k)
@@ -86,10 +86,10 @@ def free_body_parameters(robot: ClosedLoopRobot, spread: float) -> list[FreePara
 
 @dataclass(frozen=True, eq=False)
 class TorqueRows:
-    """What logs of torques come down to: R [K pi, 1] is their residual, weighted to unit noise.
+    """Torque rows of logs, reduced: R [K pi, 1] is their residual, weighted to unit noise.
 
     Attributes:
-        model: The robot, whose standard parameters pi are.
+        model: The robot with the standard parameters pi.
         R: Triangular factor, shape (b + 1, b + 1).
         K: Base parameters of standard ones, shape (b, p).
     """
@@ -101,22 +101,22 @@ class TorqueRows:
 
 @dataclass(frozen=True, eq=False)
 class LoopSimulator:
-    """A looped robot with unknowns, beside windows of logs: what an estimator asks.
+    """A robot in closed loop with free parameters and windows of logs, for an estimator.
 
     Attributes:
         robot: The robot.
         windows: Windows of its logs.
-        base: All that is known; unknowns stand over it.
-        free_parameters: What is to be found.
-        torque: Rows of measured torques along what was measured, if they weigh.
-        velocities: Whether measured velocities are compared beside the positions.
-        error: What is compared: "output", positions, and torques of the drives if they are to be;
-            "input", these torques alone; "direct", the same, whose derivatives neglect that the
-            motion changes.
-        behind: How many rows the command that a torque follows is behind it, shape (n,), as of
-            ``drive_torques``; None if no torques of roll-outs are compared.
-        fine: The robot at smaller steps, whose roll-outs are compared; derivatives stay those of
-            ``robot``. None: its own are.
+        base: Values of the loops; the free parameters replace theirs.
+        free_parameters: The free parameters.
+        torque: Rows of measured torques along the measured motion; None if not used.
+        velocities: Whether measured velocities are compared in addition to positions.
+        error: The compared signals. "output": positions, and torques of the drives if ``lag`` is
+            given; "input": only these torques; "direct": the same, with derivatives that neglect
+            the change of the motion.
+        lag: Lag of each torque after its command, shape (n,) [samples], as in ``drive_torques``;
+            None if torques of roll-outs are not compared.
+        fine: The robot with smaller steps, whose roll-outs are compared; derivatives are those of
+            ``robot``. None: ``robot`` itself.
     """
 
     robot: ClosedLoopRobot
@@ -126,50 +126,50 @@ class LoopSimulator:
     torque: "TorqueRows | None" = None
     velocities: bool = False
     error: str = "output"
-    behind: Array | None = None
+    lag: Array | None = None
     fine: ClosedLoopRobot | None = None
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        return tuple(unknown.name for unknown in self.free_parameters)
+        return tuple(free.name for free in self.free_parameters)
 
     @cached_property
     def prior(self) -> Array:
-        return np.array([unknown.prior for unknown in self.free_parameters])
+        return np.array([free.prior for free in self.free_parameters])
 
     @cached_property
     def prior_std(self) -> Array:
-        return np.array([unknown.spread for unknown in self.free_parameters])
+        return np.array([free.spread for free in self.free_parameters])
 
     @cached_property
     def lowest(self) -> Array:
-        return np.array([unknown.lowest for unknown in self.free_parameters])
+        return np.array([free.lowest for free in self.free_parameters])
 
     def loops(self, theta: Array) -> Loops:
-        """Return bodies, drives and loops with the unknowns at some values.
+        """Return bodies, drives and loops at given values of the free parameters.
 
         Args:
-            theta: Their values, shape (c,).
+            theta: Values of the free parameters, shape (c,).
         """
         base = self.base
         changed = {
             name: getattr(base, name).copy()
             for name in ("armature", "kp", "kd", "limit", "delay", "zero", "values")
         }
-        for unknown, value in zip(self.free_parameters, theta, strict=True):
-            if unknown.term is not None:
-                places = [base.place(j, unknown.term) for j in unknown.joints]
+        for free, value in zip(self.free_parameters, theta, strict=True):
+            if free.term is not None:
+                places = [base.place(j, free.term) for j in free.joints]
                 changed["values"][places] = value
-            elif unknown.what != "body":
-                changed[unknown.what][list(unknown.joints)] = value
+            elif free.what != "body":
+                changed[free.what][list(free.joints)] = value
         return replace(base, bodies=self._bodies(theta)[0], **changed)
 
     def roll_out(self, theta: Array, windows: Sequence[Window] | None = None) -> list[RollOut]:
-        """Return what windows come out as.
+        """Return the roll-outs of windows.
 
         Args:
-            theta: Values of the unknowns, shape (c,).
-            windows: Which windows; all if None.
+            theta: Values of the free parameters, shape (c,).
+            windows: The windows; all if None.
 
         Raises:
             NotConvergedError: If a step has no solution.
@@ -177,18 +177,18 @@ class LoopSimulator:
         return self.robot.roll_out(self.loops(theta), self.windows if windows is None else windows)
 
     def with_better_start(self, theta: Array) -> "LoopSimulator":
-        """Return the same with windows whose starts fit best: measured ones have noise.
+        """Return the simulator with fitted initial states: measured ones have noise.
 
-        Friction may hold for long what is wrong at the start, so that a lead is not enough.
+        With friction an initial error may persist, so that a lead before the window is not enough.
 
         Args:
-            theta: Values of the unknowns, shape (c,).
+            theta: Values of the free parameters, shape (c,).
 
         Raises:
             NotConvergedError: If a step has no solution.
         """
         n, loops, columns = len(self.base.kp), self.loops(theta), self._starts()
-        windows = [replace(window, first=window.begin) for window in self.windows]
+        windows = [replace(window, first=window.start_row) for window in self.windows]
         for _ in range(_STARTS):
             outs = self.robot.roll_out(loops, windows, columns)
             errors = np.concatenate([_error(out) for out in outs])
@@ -208,14 +208,14 @@ class LoopSimulator:
                     cost = float(np.sum((_error(out) / sigma) ** 2))
                     if cost < best[k]:
                         best[k], windows[k] = cost, tried[k]
-        kept = zip(self.windows, windows, strict=True)
-        return replace(self, windows=tuple(replace(w, given=new.start) for w, new in kept))
+        both = zip(self.windows, windows, strict=True)
+        return replace(self, windows=tuple(replace(w, given=new.start) for w, new in both))
 
     def rows(self, theta: Array) -> tuple[Array, Array]:
-        """Return what measured torques leave, and what lowers it; see ``Simulator``.
+        """Return the derivatives and residuals of the torque rows; see ``Simulator``.
 
         Args:
-            theta: Values of the unknowns, shape (c,).
+            theta: Values of the free parameters, shape (c,).
         """
         if self.torque is None:
             return np.zeros((0, len(theta))), np.zeros(0)
@@ -224,29 +224,29 @@ class LoopSimulator:
         return R[:, :-1] @ (K @ slopes), R[:, -1] - R[:, :-1] @ (K @ pi)
 
     def torque_mismatch(self, theta: Array) -> Array:
-        """Return how much of the torques roll-outs miss, root mean squares, shape (n,) [-].
+        """Return the relative RMS error of the torques of roll-outs, shape (n,) [-].
 
-        It is measured by the logged torque or by that of the roll-outs, whichever is larger.
+        It is relative to the logged torque or that of the roll-outs, whichever is larger.
 
         Args:
-            theta: Values of the unknowns, shape (c,).
+            theta: Values of the free parameters, shape (c,).
 
         Raises:
             NotConvergedError: If a step has no solution.
         """
         torques = replace(self, error="input").residuals(theta, with_slopes=False)
-        missed = np.concatenate([part.e for part in torques])
+        error = np.concatenate([part.e for part in torques])
         logged = np.concatenate([w.log.tau[w.counted] for w in self.windows])
-        size = np.maximum(np.mean(logged**2, axis=0), np.mean((logged - missed) ** 2, axis=0))
-        share: Array = np.sqrt(np.mean(missed**2, axis=0) / np.maximum(size, 1e-300))
+        size = np.maximum(np.mean(logged**2, axis=0), np.mean((logged - error) ** 2, axis=0))
+        share: Array = np.sqrt(np.mean(error**2, axis=0) / np.maximum(size, 1e-300))
         return share
 
     def standard(self, model: RobotModel, theta: Array) -> tuple[Array, Array]:
         """Return a robot's standard parameters, shape (p,), and their derivatives, shape (p, c).
 
         Args:
-            model: The robot, with the terms of the loops; 0 of those that they lack.
-            theta: Values of the unknowns, shape (c,).
+            model: The robot, with the terms of the loops; a term that the loops lack is 0.
+            theta: Values of the free parameters, shape (c,).
         """
         layout, loops = model.layout, self.loops(theta)
         place, pi = {}, np.zeros(len(layout.names))
@@ -261,13 +261,13 @@ class LoopSimulator:
         slopes = np.zeros((len(pi), len(theta)))
         changes = iter(self._bodies(theta)[1])
         body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
-        for k, unknown in enumerate(self.free_parameters):
-            if unknown.what == "body":
-                first = 10 * body_of[unknown.joints[0]]
+        for k, free in enumerate(self.free_parameters):
+            if free.what == "body":
+                first = 10 * body_of[free.joints[0]]
                 slopes[first : first + 10, k] = next(changes)
                 continue
-            for j in unknown.joints:
-                row = place.get((j, unknown.term or unknown.what))
+            for j in free.joints:
+                row = place.get((j, free.term or free.what))
                 if row is not None:
                     slopes[row, k] = 1.0
         return pi, slopes
@@ -275,14 +275,14 @@ class LoopSimulator:
     def residuals(
         self, theta: Array, *, with_slopes: bool, with_starts: bool = False
     ) -> list[Residual]:
-        """Return what is measured less what comes out, window by window; see ``Simulator``.
+        """Return measured minus simulated outputs, window by window; see ``Simulator``.
 
-        Of ``error`` "direct", derivatives are those of inverse dynamics along the roll-out.
+        With ``error`` "direct", derivatives are those of inverse dynamics along the roll-out.
 
         Args:
-            theta: Values of the unknowns, shape (c,).
-            with_slopes: Whether derivatives are wanted.
-            with_starts: Whether those by the starts of windows are.
+            theta: Values of the free parameters, shape (c,).
+            with_slopes: Whether derivatives are returned.
+            with_starts: Whether derivatives with respect to initial states are.
 
         Raises:
             NotConvergedError: If a step has no solution.
@@ -299,18 +299,18 @@ class LoopSimulator:
         if not rolls or self.fine is not None:
             outs = (self.fine or self.robot).roll_out(loops, self.windows)
         if rolls:
-            ways = self.robot.roll_out(
+            coarse = self.robot.roll_out(
                 loops,
                 self.windows,
                 [column for _, column in columns],
                 directions,
                 owners=[owner for owner, _ in columns],
-                with_speeds=self.velocities or self.behind is not None,
+                with_speeds=self.velocities or self.lag is not None,
             )
-            errors = [self._error(out, loops) for out in (ways if self.fine is None else outs)]
+            errors = [self._error(out, loops) for out in (coarse if self.fine is None else outs)]
             return [
                 part
-                for out, error in zip(ways, errors, strict=True)
+                for out, error in zip(coarse, errors, strict=True)
                 for part in self._parts(out, error, loops, columns)
             ]
         everything, none = np.arange(self._outputs), np.array([], dtype=int)
@@ -325,39 +325,39 @@ class LoopSimulator:
 
     @property
     def exact(self) -> "LoopSimulator | None":
-        """The same with exact derivatives, if its own neglect that the motion changes."""
+        """The simulator with exact derivatives, if its own neglect the change of the motion."""
         return replace(self, error="input") if self.error == "direct" else None
 
     @property
     def knows_torques(self) -> bool:
-        """Whether measured torques weigh, along what was measured or along roll-outs."""
-        return self.torque is not None or self.behind is not None
+        """Whether measured torques are fitted, along the measured motion or along roll-outs."""
+        return self.torque is not None or self.lag is not None
 
     @property
     def _outputs(self) -> int:
-        """How many outputs are compared: positions, speeds beside them, torques, in this order."""
-        beside = self.velocities + (self.behind is not None) if self.error == "output" else 0
-        return len(self.base.kp) * (1 + beside)
+        """Number of compared outputs: positions, speeds, torques, in this order."""
+        further = self.velocities + (self.lag is not None) if self.error == "output" else 0
+        return len(self.base.kp) * (1 + further)
 
     def _error(self, out: RollOut, loops: Loops) -> Array:
-        """Return what is measured less what comes out, shape (N, outputs)."""
+        """Return measured minus simulated outputs, shape (N, outputs)."""
         counted, parts = out.window.counted, []
         if self.error == "output":
             parts.append(_error(out))
             if self.velocities:
                 parts.append(out.window.log.v[counted] - out.v)  # type: ignore[index]
-        if self.behind is not None:
-            given = drive_torques(out, loops, self.behind).given
-            parts.append(out.window.log.tau[counted] - given)
+        if self.lag is not None:
+            simulated = drive_torques(out, loops, self.lag).limited
+            parts.append(out.window.log.tau[counted] - simulated)
         error: Array = np.hstack(parts)
         return error
 
     def _parts(
         self, out: RollOut, error: Array, loops: Loops, columns: list[tuple[int, Column]]
     ) -> Iterator[Residual]:
-        """Yield the errors of a roll-out's parts, with all that they change with."""
+        """Yield the residuals of a roll-out's parts with their derivatives."""
         n, free_parameters = len(loops.kp), len(self.free_parameters)
-        torques = None if self.behind is None else drive_torques(out, loops, self.behind)
+        torques = None if self.lag is None else drive_torques(out, loops, self.lag)
         for joints, places, slopes in out.slopes:
             k = len(joints)
             parts = [slopes[:, :k]] if self.error == "output" else []
@@ -368,13 +368,13 @@ class LoopSimulator:
                 parts.append(torques.slopes(joints, by, slopes, self.robot.kinds))
             slopes = np.concatenate(parts, axis=1)
             outputs = np.concatenate([joints + n * i for i in range(len(parts))])
-            own = places[places < free_parameters]  # and behind them starts
+            own = places[places < free_parameters]  # initial states follow
             by_start = slopes[:, :, len(own) :]
             yield Residual(error[:, outputs], slopes[:, :, : len(own)], outputs, own, by_start)
 
     def _inverse_dynamics(self, outs: Sequence[RollOut], theta: Array) -> list[Array]:
         """Return Y(q, v, a) d pi along roll-outs, window by window, shape (N, n, c)."""
-        model, (_, slopes) = self._described, self.standard(self._described, theta)
+        model, (_, slopes) = self._full_model, self.standard(self._full_model, theta)
         found = []
         for out in outs:
             t = out.window.log.t[out.window.counted]
@@ -386,31 +386,31 @@ class LoopSimulator:
         return found
 
     @cached_property
-    def _described(self) -> RobotModel:
+    def _full_model(self) -> RobotModel:
         """The robot with the terms of its loops."""
         return with_terms(self.robot.model, self.base)
 
     def _starts(self) -> list[Column]:
-        """Return the columns of positions and speeds where windows begin."""
+        """Return the columns of the initial positions and speeds of windows."""
         kinds, n = self.robot.kinds, len(self.base.kp)
         return [(kinds[what], j, 0) for what in ("start", "speed") for j in range(n)]
 
     def _columns(self, loops: Loops) -> list[tuple[int, Column]]:
-        """Return what to differentiate by, each column with the number of its unknown."""
+        """Return the columns of the sensitivities, each with the index of its free parameter."""
         kinds, columns, body = self.robot.kinds, [], 0
-        for k, unknown in enumerate(self.free_parameters):
-            for j in unknown.joints:
+        for k, free in enumerate(self.free_parameters):
+            for j in free.joints:
                 index = 0
-                if unknown.term is not None:
-                    index = loops.place(j, unknown.term)
-                elif unknown.what == "body":
+                if free.term is not None:
+                    index = loops.place(j, free.term)
+                elif free.what == "body":
                     index, body = body, body + 1
-                columns.append((k, (kinds[unknown.what], j, index)))
+                columns.append((k, (kinds[free.what], j, index)))
         return columns
 
     @cached_property
     def _roots(self) -> Array:
-        """A root U of each body's pseudo-inertia that is unknown, an upper triangle, (n, 4, 4)."""
+        """Upper triangular root U of the pseudo-inertia of each free body, shape (n, 4, 4)."""
         roots = np.zeros((len(self.base.bodies), 4, 4))
         J = pseudo_inertia(self.base.bodies.reshape(-1))
         body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
@@ -419,13 +419,13 @@ class LoopSimulator:
         return roots
 
     def _bodies(self, theta: Array) -> tuple[Array, Array]:
-        """Return the bodies, (n, 10), and how each coordinate changes its body, (D, 10)."""
+        """Return the bodies, (n, 10), and their derivatives by each coordinate, (D, 10)."""
         bodies, directions = self.base.bodies.copy(), []
         body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
         by_body: dict[int, list[int]] = {}
-        for k, unknown in enumerate(self.free_parameters):
-            if unknown.what == "body":
-                by_body.setdefault(body_of[unknown.joints[0]], []).append(k)
+        for k, free in enumerate(self.free_parameters):
+            if free.what == "body":
+                by_body.setdefault(body_of[free.joints[0]], []).append(k)
         for body, places in by_body.items():
             U, T = self._roots[body], np.eye(4)
             for k in places:
@@ -442,7 +442,7 @@ class LoopSimulator:
 
 
 def with_terms(model: RobotModel, loops: Loops) -> RobotModel:
-    """Return the model with the terms of loops that it has not yet.
+    """Return the model extended by the terms of loops that it lacks.
 
     Args:
         model: The robot.
@@ -467,19 +467,19 @@ def _has(model: RobotModel, joint: str) -> list[object]:
 
 
 def _better_start(out: RollOut, sigma: Array) -> Array:
-    """Return by how much position and speed at the start are off, to first order, shape (2, n).
+    """Return the first-order correction of the initial position and speed, shape (2, n).
 
-    They are near what was measured: within some errors of position, and the typical speed.
+    The prior is the measured state, within some position errors and the typical speed.
     """
     log = out.window.log
     speed = np.sqrt(np.mean((np.diff(log.q, axis=0) / np.diff(log.t)[:, None]) ** 2, axis=0))
-    usual = np.maximum(np.concatenate([_NEAR * sigma, speed]), 1e-9)
+    spread = np.maximum(np.concatenate([_NEAR * sigma, speed]), 1e-9)
     change = np.zeros(2 * len(sigma))
     for joints, places, slopes in out.slopes:
         b = (_error(out)[:, joints] / sigma[joints]).reshape(-1)
-        A = (slopes / sigma[joints, None]).reshape(b.size, -1) * usual[places]
+        A = (slopes / sigma[joints, None]).reshape(b.size, -1) * spread[places]
         A, b = np.vstack([A, np.eye(len(places))]), np.concatenate([b, np.zeros(len(places))])
-        change[places] = usual[places] * np.linalg.lstsq(A, b, rcond=None)[0]
+        change[places] = spread[places] * np.linalg.lstsq(A, b, rcond=None)[0]
     return change.reshape(2, -1)
 
 

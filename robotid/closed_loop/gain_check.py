@@ -1,4 +1,4 @@
-"""Whether bodies and torques agree with the gains that were stated: the scale that they show."""
+"""Consistency of the stated gains with bodies and torques: the scale that these indicate."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -14,19 +14,19 @@ from robotid.estimators.output_error import OutputError
 __all__ = ["GainScale", "gain_scale"]
 
 _GAINS = ("kp", "kd")
-_DIFFERS = 3.0  # standard errors, from which a scale is another ...
-_LARGE = 0.05  # ... if it is off by this share, too: friction that the model lacks shows as less
+_DIFFERS = 3.0  # smallest significant difference of a scale [standard errors]
+_LARGE = 0.05  # smallest relevant difference of a scale; missing friction terms cause smaller ones
 
 
 @dataclass(frozen=True, eq=False)
 class GainScale:
-    """By how much gains would have to be larger to agree with bodies and torques, 0 if they do.
+    """Relative change of the gains that makes them consistent with bodies and torques.
 
     Attributes:
-        change: Of each joint's gains by itself, shape (n,) [-].
-        error: Their standard errors, shape (n,); inf where nothing shows them.
-        common: Of all gains by one factor [-].
-        common_error: Its standard error.
+        change: Relative change of each joint's gains, shape (n,) [-].
+        error: Standard errors of ``change``, shape (n,); inf where it is not identifiable.
+        common: Relative change of all gains by one factor [-].
+        common_error: Standard error of ``common``.
     """
 
     change: Array
@@ -36,9 +36,9 @@ class GainScale:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether one factor of all gains is not 1, and every joint by itself shows it.
+        """Whether the common factor of all gains is not 1, and every joint is consistent with it.
 
-        Where joints show different ones, the model lacks something else: no gain is concluded.
+        Different factors indicate another model error, so that the gains are not questioned.
         """
         agree = np.abs(self.change - self.common) <= _DIFFERS * np.hypot(
             self.error, self.common_error
@@ -48,25 +48,25 @@ class GainScale:
 
 
 def gain_scale(simulator: LoopSimulator, estimator: OutputError, estimate: Estimate) -> GainScale:
-    """Return the scale of the stated gains that bodies, and torques if they weigh, would show.
+    """Return the scale of the stated gains that bodies, and fitted torques, indicate.
 
-    All drive parameters scale with the gains; the bodies' weight and inertia do not, as far as they
-    are known. It is to first order: one step of all parameters beside the gains.
+    All drive parameters scale with the gains; weight and inertia of the bodies do not, within their
+    prior. The scale is of first order: one Gauss-Newton step of gains and all free parameters.
 
     Args:
-        simulator: What was fitted, with stated gains.
-        estimator: How residuals weigh.
+        simulator: The fitted simulator, with stated gains.
+        estimator: The estimator, with the weights of residuals.
         estimate: The estimate.
 
     Raises:
-        NotConvergedError: If it cannot be simulated.
+        NotConvergedError: If the robot cannot be simulated.
     """
     n, c = len(simulator.base.kp), len(estimate.theta)
     gains = tuple(_gains(simulator))
     wide = replace(simulator, free_parameters=(*simulator.free_parameters, *gains))
     theta = np.concatenate([estimate.theta, [gain.prior for gain in gains]])
     H, g = estimator.normal(wide, estimator.weights(wide, theta), theta, frees=True)
-    T = np.zeros((len(theta), c + n))  # parameters of the scales of joints
+    T = np.zeros((len(theta), c + n))  # from free parameters and joint scales to all parameters
     T[:c, :c] = np.eye(c)
     for k, gain in enumerate(gains, start=c):
         T[k, c + gain.joints[0]] = gain.prior
@@ -81,21 +81,21 @@ def gain_scale(simulator: LoopSimulator, estimator: OutputError, estimate: Estim
 
 
 def _gains(simulator: LoopSimulator) -> Iterator[FreeParameter]:
-    """Yield the gains of all joints as unknowns, of which nothing else is known."""
+    """Yield the gains of all joints as free parameters without a prior."""
     for what in _GAINS:
-        if any(unknown.what == what for unknown in simulator.free_parameters):
-            continue  # it is found, and follows the other one by itself
+        if any(free.what == what for free in simulator.free_parameters):
+            continue  # it is fitted, so that it scales with the other one
         for j, value in enumerate(getattr(simulator.base, what).tolist()):
             joint = simulator.robot.model.joints[j]
             yield FreeParameter(f"{joint}.{what} as stated", what, (j,), value, np.inf)
 
 
 def _last(H: Array, g: Array, n: int) -> tuple[Array, Array]:
-    """Return the last n unknowns of H x = g and their errors, inf of what H leaves open."""
+    """Return the last n entries of x, H x = g, and their errors; inf where H is singular."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
     values, V = scipy.linalg.eigh(H * np.outer(scale, scale))
-    kept = values > 1e-12 * values[-1]
-    inverse = (V[:, kept] / values[kept]) @ V[:, kept].T
+    regular = values > 1e-12 * values[-1]
+    inverse = (V[:, regular] / values[regular]) @ V[:, regular].T
     x, variance = scale * (inverse @ (scale * g)), np.diag(inverse) * scale**2
-    is_open = (V[:, ~kept] ** 2).sum(axis=1) > 1e-6
-    return x[-n:], np.where(is_open, np.inf, np.sqrt(variance))[-n:]
+    is_singular = (V[:, ~regular] ** 2).sum(axis=1) > 1e-6
+    return x[-n:], np.where(is_singular, np.inf, np.sqrt(variance))[-n:]

@@ -1,4 +1,4 @@
-"""identify_loops(): from a model and logs of commands to drives, loops, bodies and trust."""
+"""identify_loops(): closed-loop identification of drives, loops and bodies from command logs."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,7 +29,7 @@ __all__ = ["identify_loops", "with_gravity"]
 def identify_loops(
     model: RobotModel,
     logs: Sequence[Log],
-    kept: Sequence[Log],
+    validation: Sequence[Log],
     loop: LoopSettings,
     settings: SimulationSettings,
     *,
@@ -45,35 +45,39 @@ def identify_loops(
         model: The robot.
         logs: Logs to fit, of its joints in its order, with commands, or with torques if these
             drive the robot.
-        kept: Validation Logs.
+        validation: Validation logs.
         loop: What is known of the loops.
-        settings: The estimator's.
-        signals: How torques become rows, and how late they are.
-        chooses: Whether further friction is tried.
-        examined: What the doctor found in the logs.
-        ignore: Codes of its errors that you know better.
-        progress: Told of the stages.
+        settings: Settings of the estimator.
+        signals: Processing of the torques into rows, and their delay.
+        chooses: Whether further friction terms are tried.
+        examined: The doctor's findings of the logs.
+        ignore: Codes of its errors to ignore.
+        progress: Called with the stages.
 
     Raises:
-        DataError: If there is no log, or one has no commands.
+        DataError: If no log is given, or one has no commands.
         MissingDependencyError: If Numba is not installed.
         NotConvergedError: If it cannot be simulated.
         SettingsError: If a setting does not fit the robot.
     """
     if not logs:
-        raise DataError("no log was given; at least one is needed to identify anything")
-    told = signals or SignalSettings()
+        raise DataError("no log was given. An identification needs at least one log")
+    used = signals or SignalSettings()
     if loop.kind == "torque":
-        logs, kept = ([driven_log(model, log, told) for log in part] for part in (logs, kept))
-    for log in (*logs, *kept):
+        logs, validation = (
+            [driven_log(model, log, used) for log in part] for part in (logs, validation)
+        )
+    for log in (*logs, *validation):
         if log.q_ref is None:
             raise DataError(
-                f"{log.name} has no commands, which the estimator 'simulation' follows; record "
-                "columns qref_ of each joint, or have its torque drive the robot: [controller] "
+                f"{log.name} has no commands, which the estimator 'simulation' needs. Record "
+                "columns qref_ of each joint, or simulate from the logged torque: [controller] "
                 "kind = 'torque'"
             )
     if loop.gravity_compensation:
-        logs, kept = ([with_gravity(model, log) for log in part] for part in (logs, kept))
+        logs, validation = (
+            [with_gravity(model, log) for log in part] for part in (logs, validation)
+        )
     fitted = fit_loops(
         model, logs, loop, settings, signals=signals, chooses=chooses, progress=progress
     )
@@ -87,21 +91,21 @@ def identify_loops(
             )
             for log in part
         ]
-        for part in (logs, kept)
+        for part in (logs, validation)
     ]  # fmt: skip
     found = identified_loops(model, loop, settings, fitted, *map(tuple, runs))
     found = replace(
         found,
         log_errors=tuple(finding.message for finding in blocking(examined, ignore)),
-        asked=Asked(told, ignore=tuple(ignore)),
+        asked=Asked(used, ignore=tuple(ignore)),
     )
     return replace(found, findings=loop_findings(found, examined))
 
 
 def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, Loops]:
-    """Return plainer models by name, as ``run_open_loop`` takes them.
+    """Return simpler models by name, for ``run_open_loop``.
 
-    With the stated gains the URDF has no friction, and rotors that weigh nothing.
+    The URDF with the stated gains has no friction and no rotor inertia.
     """
     if fitted.linear is not None:
         driven, found = fitted.linear.urdf_with_drives, fitted.linear.standard
@@ -115,10 +119,10 @@ def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, 
 
 
 def with_gravity(model: RobotModel, log: Log) -> Log:
-    """Return a log whose fed-forward torque has that of gravity by the URDF, as measured.
+    """Return a log with the URDF's gravity torque at the measured position added to tau_ref.
 
     Args:
-        model: The robot as its URDF says.
+        model: The robot of the URDF.
         log: The log, of its joints in its order, with commands.
     """
     torque = predict_instants(model, model.standard_parameters(), log.q)

@@ -1,4 +1,4 @@
-"""Where the unknowns of loops and drives begin, and how far from there they may be."""
+"""Initial values and prior spreads of the free parameters of loops and drives."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,27 +27,28 @@ __all__ = [
     "typical_sizes_of_torques",
 ]
 
-_WIDE = 10.0  # spreads of drives are so many times their typical size: they bind nothing
-_SHARE = 0.5  # of the loop's inertia by which gains are unknown, that bodies have to begin with
-_SLOWEST = 0.1  # [s] spread of a delay
-_TURN = 0.3  # [rad or m] spread of an encoder's zero about where it was found
-_LIGHTEST = 0.3  # of the largest such inertia: small joints have a motor behind a gear, too
-_POSES = 50  # that the bodies' inertia is looked at in
-_LEAST = 0.05  # of a typical size, that an inertia begins with, or a gain keeps
-_LIMITED = 0.8  # of the largest torque that was asked for, that a limit begins with
+_WIDE = 10.0  # prior spread of drive parameters over their typical size: a weak prior
+_SHARE = 0.5  # initial share of the bodies in a joint's inertia, where its gain is unknown
+_DELAY_SPREAD = 0.1  # prior spread of a delay [s]
+_ZERO_SPREAD = 0.3  # prior spread of an encoder's zero about its first estimate [rad or m]
+_SMALLEST_BODY = 0.3  # smallest body inertia over the largest: small joints have gears, too
+_POSES = 50  # number of poses at which the inertia of the bodies is computed
+_LEAST = 0.05  # smallest initial armature and lower bound of a gain, over the typical size
+_LIMITED = 0.8  # initial torque limit over the largest torque without a limit
 
 
 @dataclass(frozen=True, eq=False)
 class TypicalSizes:
-    """Typical sizes, joint by joint: where unknowns begin, and how far from there they may be.
+    """Typical sizes of each joint, for initial values and prior spreads; arrays of shape (n,).
 
     Attributes:
-        inertia: Of the whole loop, shape (n,) [kg m^2 or kg].
-        bodies: Of the URDF's bodies in it, likewise.
-        torque: Torques, shape (n,) [N m or N].
-        largest: Torques that the loop asked for, somewhat less, likewise.
-        speed: Speeds, shape (n,) [rad/s or m/s].
-        scale: Torques over those of the plain model, shape (n,) [-].
+        inertia: Inertia of joint and rotor [kg m^2 or kg].
+        bodies: Part of the URDF's bodies in it [kg m^2 or kg].
+        torque: Torque [N m or N].
+        largest: Initial torque limit: somewhat less than the largest torque without a limit
+            [N m or N].
+        speed: Speed [rad/s or m/s].
+        scale: Torque relative to that of the second-order model [-].
     """
 
     inertia: Array
@@ -65,34 +66,35 @@ def typical_sizes(
     has_gain: Array,
     top: Array,
 ) -> TypicalSizes:
-    """Return typical sizes; where a gain is unknown, the bodies' inertia measures all torques.
+    """Return typical sizes; where a gain is unknown, the inertia of bodies scales all torques.
 
-    A joint at its largest speed, ``top`` if more than 0, gives what friction takes there.
+    At its largest speed, ``top`` if more than 0, the limit of a drive is the friction torque.
 
     Args:
         robot: The robot, which can be simulated.
-        plain: A plain loop of each joint.
+        plain: Second-order model of each joint.
         windows: Windows of the logs.
-        has_gain: Joints whose gain is known, shape (n,), bool.
-        top: Speeds of joints that run at their largest, else 0, shape (n,) [rad/s or m/s].
+        has_gain: Whether the gain of a joint is known, shape (n,), bool.
+        top: Speeds of joints that run at their largest speed, else 0, shape (n,) [rad/s or m/s].
     """
     model = robot.model
     q = np.concatenate([w.log.q[w.counted] for w in windows])
     bodies = _inertia(model, model.standard_parameters(), windows)
-    measure = np.maximum(bodies, _LIGHTEST * bodies.max()) / _SHARE
+    measure = np.maximum(bodies, _SMALLEST_BODY * bodies.max()) / _SHARE
     scale = np.where(has_gain, 1.0, measure / plain.inertia)
-    inertia = np.maximum(plain.inertia * scale, bodies)  # friction may hide it from a plain loop
+    # friction may hide the inertia in a second-order model
+    inertia = np.maximum(plain.inertia * scale, bodies)
     error = np.concatenate([w.log.q_ref[w.counted] for w in windows]) - q  # type: ignore[index]
-    asked = _LIMITED * plain.loops.kp * np.abs(error).max(axis=0)
-    taken = plain.friction("viscous") * top + plain.friction("coulomb")
-    largest = scale * np.where(top > 0.0, np.minimum(taken, asked), asked)
+    unlimited = _LIMITED * plain.loops.kp * np.abs(error).max(axis=0)
+    friction = plain.friction("viscous") * top + plain.friction("coulomb")
+    largest = scale * np.where(top > 0.0, np.minimum(friction, unlimited), unlimited)
     return TypicalSizes(inertia, bodies, plain.torque * scale, largest, _speed(windows), scale)
 
 
 def typical_sizes_of_torques(
     model: RobotModel, pi: Array, armature: Array, windows: Sequence[Window]
 ) -> TypicalSizes:
-    """Return typical sizes where torques are logged and no loop is closed.
+    """Return typical sizes from logged torques, without a closed loop.
 
     Args:
         model: The robot.
@@ -107,7 +109,7 @@ def typical_sizes_of_torques(
 
 
 def _inertia(model: RobotModel, pi: Array, windows: Sequence[Window]) -> Array:
-    """Return the typical inertia that each joint moves, shape (n,)."""
+    """Return the typical diagonal of the joint-space mass matrix, shape (n,)."""
     q = np.concatenate([w.log.q[w.counted] for w in windows])
     M = joint_mass_matrices(model, pi, q[:: max(1, len(q) // _POSES)])
     typical: Array = np.median(np.diagonal(M, axis1=1, axis2=2), axis=0)
@@ -129,14 +131,14 @@ def _period(window: Window) -> float:
 def first_loops(
     model: RobotModel, stated: Loops, plain: SecondOrder, typical: TypicalSizes, finds_limit: Array
 ) -> Loops:
-    """Return the loops that the fit begins with.
+    """Return the initial loops of the fit.
 
     Args:
         model: The robot.
-        stated: What is stated of the loops.
-        plain: A plain loop of each joint.
+        stated: The loops as stated.
+        plain: Second-order model of each joint.
         typical: Typical sizes.
-        finds_limit: Joints whose limit is to be found, shape (n,), bool.
+        finds_limit: Whether the limit of a joint is fitted, shape (n,), bool.
     """
     friction = {name: plain.friction(name) * typical.scale for name in ("viscous", "coulomb")}
     none = np.zeros(len(typical.scale))
@@ -167,34 +169,34 @@ def free_drive_parameters(
     base: Loops,
     typical: TypicalSizes,
     *,
-    tells_kd: bool,
+    finds_kd: bool,
     finds_limit: Array,
 ) -> list[FreeParameter]:
-    """Return what is unknown of drives and loops, beginning with what the loops have.
+    """Return the free parameters of drives and loops, with initial values from ``base``.
 
     Args:
         model: The robot.
         loop: What is known of the loops.
         groups: Name of the group of each joint.
-        base: The loops that the fit begins with.
+        base: The initial loops.
         typical: Typical sizes.
-        tells_kd: Whether the logs can show gains of the speed.
-        finds_limit: Joints whose limit is to be found, shape (n,), bool.
+        finds_kd: Whether the logs determine the gains of the speed.
+        finds_limit: Whether the limit of a joint is fitted, shape (n,), bool.
     """
     members: dict[str, list[int]] = {}
     for j, group in enumerate(groups):
         members.setdefault(group, []).append(j)
     is_closed = np.full(len(groups), loop.kind != "torque")
-    # a limit is a setting of each drive, a delay mostly the bus's and the controller's
+    # each drive has its own limit; delays are mostly those of the bus and the controller
     sharing: dict[str, dict[str, list[int]]] = {
         "limit": {joint: [j] for j, joint in enumerate(model.joints)}
     }
     if loop.delays == "one":
         sharing["delay"] = {"robot": [*range(len(groups))]}
-    open_ = {
+    free = {
         "armature": np.full(len(groups), "armature" in model.layout.terms),
         "kp": ~is_stated(loop.kp, model) & is_closed,
-        "kd": ~is_stated(loop.kd, model) & tells_kd,
+        "kd": ~is_stated(loop.kd, model) & finds_kd,
         "limit": finds_limit,
         "delay": ~is_stated(loop.delay, model) & is_closed,
     }
@@ -203,21 +205,21 @@ def free_drive_parameters(
         "kp": base.kp / _WIDE,
         "kd": typical.torque / typical.speed,
         "limit": typical.torque,
-        "delay": np.full(len(groups), _SLOWEST / _WIDE),
+        "delay": np.full(len(groups), _DELAY_SPREAD / _WIDE),
     }
     found = []
-    for what, is_open in open_.items():
+    for what, is_free in free.items():
         for name, joints in sharing.get(what, members).items():
-            own = tuple(j for j in joints if is_open[j])
+            own = tuple(j for j in joints if is_free[j])
             if own:
-                begin = float(np.median(getattr(base, what)[list(own)]))
+                initial = float(np.median(getattr(base, what)[list(own)]))
                 wide = _WIDE * float(np.median(spread[what][list(own)]))
-                lowest = _LEAST * begin if what in ("kp", "limit") else 0.0
-                found.append(FreeParameter(f"{name}.{what}", what, own, begin, wide, lowest))
+                lowest = _LEAST * initial if what in ("kp", "limit") else 0.0
+                found.append(FreeParameter(f"{name}.{what}", what, own, initial, wide, lowest))
     for group, joints in members.items():
         for term in {t: None for j in joints for t in base.terms[j]}:
             having = [j for j in joints if term in base.terms[j]]
-            # what wears and what leans differ from drive to drive, grease and motor do not
+            # Coulomb friction and offset depend on wear and load, viscous friction on the type
             for owners in [having] if isinstance(term, Viscous) else [[j] for j in having]:
                 name = group if len(owners) > 1 else model.joints[owners[0]]
                 found.append(_term(name, term, owners, base, typical))
@@ -227,31 +229,33 @@ def free_drive_parameters(
 def _term(
     owner: str, term: DriveTerm, joints: Sequence[int], base: Loops, typical: TypicalSizes
 ) -> FreeParameter:
-    """Return the unknown of a term of one joint, or of several that share it."""
-    begin = float(np.median([base.values[base.place(j, term)] for j in joints]))
+    """Return the free parameter of a term of one joint, or of several that share it."""
+    initial = float(np.median([base.values[base.place(j, term)] for j in joints]))
     size = typical.torque / (typical.speed if isinstance(term, Viscous) else 1.0)
     wide = _WIDE * float(np.median(size[list(joints)]))
     lowest = 0.0 if term.is_nonnegative else -np.inf
     return FreeParameter(
-        f"{owner}.{term.name}", "term", tuple(joints), begin, wide, lowest, term=term
+        f"{owner}.{term.name}", "term", tuple(joints), initial, wide, lowest, term=term
     )
 
 
 def free_zeros(model: RobotModel, encoders: Encoders) -> list[FreeParameter]:
-    """Return the zeros of encoders that are not the URDF's, near where they were found.
+    """Return free parameters for the encoder zeros that differ from the URDF's.
 
     Args:
         model: The robot.
-        encoders: Signs and zeros of the encoders.
+        encoders: Signs and zeros of the encoders: the initial values.
     """
     return [
-        FreeParameter(f"{model.joints[j]}.zero", "zero", (int(j),), float(encoders.zero[j]), _TURN)
+        FreeParameter(
+            f"{model.joints[j]}.zero", "zero", (int(j),), float(encoders.zero[j]), _ZERO_SPREAD
+        )
         for j in np.flatnonzero(encoders.gain > 0)
     ]
 
 
 def likeness(model: RobotModel) -> list[tuple[object, ...]]:
-    """Return what makes joints alike: their limits, and mass and moments of their bodies.
+    """Return the properties in which equal joints agree: limits, mass and moments of the body.
 
     Args:
         model: The robot.
@@ -266,7 +270,7 @@ def likeness(model: RobotModel) -> list[tuple[object, ...]]:
 
 
 def is_stated(value: PerJoint | str | None, model: RobotModel) -> Array:
-    """Return for which joints a number is stated, shape (n,), bool.
+    """Return whether a number is stated for each joint, shape (n,), bool.
 
     Args:
         value: A number, or numbers by joint.

@@ -1,4 +1,4 @@
-"""What is identified from commands and positions, or from roll-outs of logged torques."""
+"""Results of identification by simulation, from commands and positions or logged torques."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -29,30 +29,30 @@ from robotid.robot.parameters import pseudo_inertia
 
 __all__ = ["STATED_SCALE", "LoopIdentification", "identified_loops", "logged_motion"]
 
-#: What positions and stated gains leave open.
+#: The limit of an identification from positions and stated gains.
 STATED_SCALE = (
-    "positions do not show the scale: all drive and inertial parameters scale with kp as stated "
-    "(kp stated 20 % too large makes all 20 % too large); log a torque to test it"
+    "positions do not determine the scale: all drive and inertial parameters scale with kp as "
+    "stated (kp stated 20 % too large makes all 20 % too large). Log a torque to check the scale"
 )
-_CAUTIONS = ("at_bound", "coarse_steps", "gains_contradicted")  # keep a result from being good
-_GAP = 3.0  # median steps: across a longer one no speed is computed
-_MOVING = 0.05  # of a joint's largest speed, below which differences of positions are noise
+_CAUTIONS = ("at_bound", "coarse_steps", "gains_contradicted")  # with these no result is good
+_GAP = 3.0  # step in time above which no speed is computed [median steps]
+_MOVING = 0.05  # smallest speed above the noise, relative to the largest speed of a joint
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoopIdentification(Identified):
-    """Everything that an identification by simulation found.
+    """Result of an identification by simulation.
 
     Attributes:
-        loop: What was stated of the loops.
+        loop: What is known of the loops.
         estimator: The estimator's settings.
         fit: The fit.
-        fitted: The fitted logs, with the positions simulated for them.
-        validation: The same of the validation logs.
-        findings: What the user should know.
-        log_errors: Faults of the logs that make the result wrong, as the doctor found them.
+        fitted: The fitted logs, with their simulated positions.
+        validation: The validation logs, with their simulated positions.
+        findings: Findings of logs and fit.
+        log_errors: Errors in the logs that invalidate the result, found by the doctor.
         report: File of the report, if one was written with the result.
-        asked: Signals and findings to ignore, as they were asked for.
+        asked: Signal settings and ignored findings of the request.
     """
 
     loop: LoopSettings
@@ -70,25 +70,25 @@ class LoopIdentification(Identified):
 
     @property
     def estimate(self) -> Estimate:
-        """What the estimator returned: the unknowns of loops, drives and bodies."""
+        """The estimate of the free parameters of loops, drives and bodies."""
         return self.fit.estimate
 
     @cached_property
     def _slopes(self) -> Array:
-        """Standard parameters by unknowns, shape (p, c)."""
+        """Derivatives of the standard parameters by the free ones, shape (p, c)."""
         return self.fit.simulator.standard(self.model, self.estimate.theta)[1]
 
     @property
     def standard_error(self) -> Array:
-        """Standard errors of the standard parameters, shape (p,); inf of what was not fitted."""
+        """Standard errors of the standard parameters, shape (p,); inf of those not fitted."""
         return _errors(self.standard_covariance)
 
     @cached_property
     def standard_quantile(self) -> Array:
-        """How many standard errors the 95 % interval of each standard parameter reaches, (p,).
+        """Half-width of the 95 % interval of each standard parameter [standard errors], (p,).
 
-        The quantile is that of the unknown, of those it follows from, whose standard error has the
-        fewest degrees of freedom.
+        Of the free parameters that determine it, the one whose standard error has the fewest
+        degrees of freedom gives the quantile.
         """
         own = np.where(self._slopes != 0.0, self.estimate.quantile, QUANTILE)
         quantile: Array = own.max(axis=1, initial=QUANTILE)
@@ -107,13 +107,13 @@ class LoopIdentification(Identified):
 
     @cached_property
     def shrunk(self) -> Array:
-        """How far the data shrink what each unknown may be, shape (c,): 1 not at all [-]."""
+        """Standard error of each free parameter over its prior spread, shape (c,) [-]."""
         share: Array = self.estimate.std_error / self.fit.simulator.prior_std
         return share
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """What determined each standard parameter; "mixed" of bodies, and of drives that share."""
+        """Source of each standard parameter; "mixed" for bodies and shared drive parameters."""
         own = dict(zip(self.fit.simulator.names, self.shrunk.tolist(), strict=True))
         share = np.array([own.get(name, np.nan) for name in self.model.layout.names])
         is_prior = np.isinf(self.standard_error) | ((share > FROM_PRIOR) & ~self.at_bound)
@@ -121,16 +121,16 @@ class LoopIdentification(Identified):
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Unknowns that the logs say nothing of, bodies left out."""
+        """Free parameters that the logs do not determine, without those of bodies."""
         return tuple(
-            unknown.name
-            for unknown, share in zip(self.fit.simulator.free_parameters, self.shrunk, strict=True)
-            if share > FROM_PRIOR and unknown.what != "body"
+            free.name
+            for free, share in zip(self.fit.simulator.free_parameters, self.shrunk, strict=True)
+            if share > FROM_PRIOR and free.what != "body"
         )
 
     @property
     def correlated(self) -> tuple[tuple[str, ...], ...]:
-        """Sets of unknowns of loops that are strongly correlated: their ratios are known."""
+        """Sets of strongly correlated free parameters of loops and drives."""
         free_parameters, C = self.fit.simulator.free_parameters, self.estimate.covariance
         own = [k for k, u in enumerate(free_parameters) if u.what != "body" and C[k, k] > 0]
         return tuple(
@@ -139,7 +139,7 @@ class LoopIdentification(Identified):
 
     @property
     def moments(self) -> dict[str, DriveMoments]:
-        """What projects the friction of drives on simpler terms, from positions of fitted logs."""
+        """Moments that project the friction of drives on simpler terms, from the fitted logs."""
         model = self.model.with_reference(self.standard)
         motions = [logged_motion(run.log) for run in self.fitted] if model.layout.own else []
         moving = [np.abs(m.v) > _MOVING * np.abs(m.v).max(axis=0) for m in motions]
@@ -147,23 +147,23 @@ class LoopIdentification(Identified):
 
     @property
     def is_consistent(self) -> bool:
-        """Whether every body can be."""
+        """Whether every body is physically consistent."""
         bodies = pseudo_inertia(self.standard[: self.model.layout.n_inertial])
         return bool((np.linalg.eigvalsh(bodies) >= 0).all())
 
     @property
     def has_urdf(self) -> bool:
-        """Whether a URDF is written of it: always, for its roll-outs show what is wrong."""
+        """Whether a URDF is written: always, since its simulation shows remaining errors."""
         return True
 
     @property
     def has_gains(self) -> bool:
-        """Whether the gains of the position were stated, of every joint."""
-        return not any(unknown.what == "kp" for unknown in self.fit.simulator.free_parameters)
+        """Whether the position gain of every joint was stated."""
+        return not any(free.what == "kp" for free in self.fit.simulator.free_parameters)
 
     @property
     def is_scaled_by_gain(self) -> bool:
-        """Whether stated gains alone set the scale: no torque was logged that shows it."""
+        """Whether only the stated gains determine the scale: no torque was fitted."""
         simulator = self.fit.simulator
         return self.loop.kind != "torque" and self.has_gains and not simulator.knows_torques
 
@@ -173,7 +173,7 @@ class LoopIdentification(Identified):
 
     @cached_property
     def verdict(self) -> Verdict:
-        """How far to trust it."""
+        """The verdict on the result."""
         return judge_positions(
             position_metrics(self.model, self.validation or self.fitted, moving=True),
             self.model.joints,
@@ -193,15 +193,15 @@ def identified_loops(
     fitted: tuple[OpenLoop, ...],
     validation: tuple[OpenLoop, ...],
 ) -> LoopIdentification:
-    """Return what a fit identified, before anything is concluded of it.
+    """Return the result of a fit, without findings.
 
     Args:
-        model: The robot as its URDF and job say.
-        loop: What was stated of the loops.
+        model: The robot of URDF and job.
+        loop: What is known of the loops.
         estimator: The estimator's settings.
         fit: The fit.
-        fitted: The fitted logs, with the positions simulated for them.
-        validation: The same of the validation logs.
+        fitted: The fitted logs, with their simulated positions.
+        validation: The validation logs, with their simulated positions.
     """
     model = with_terms(model, fit.loops)
     standard, slopes = fit.simulator.standard(model, fit.estimate.theta)
@@ -223,13 +223,13 @@ def identified_loops(
 
 
 def _errors(covariance: Array) -> Array:
-    """Return standard errors, inf of what has no variance."""
+    """Return standard errors; inf of entries without a variance."""
     variance = np.diag(covariance)
     return np.where(variance > 0.0, np.sqrt(np.maximum(variance, 0.0)), np.inf)
 
 
 def logged_motion(log: Log) -> Trajectory:
-    """Return the motion of a log of commands: positions, and their differences over time.
+    """Return the motion of a log of commands: positions and their numerical derivatives.
 
     Args:
         log: The log, of N samples; accelerations and torques of its motion are 0.

@@ -1,7 +1,7 @@
-"""The plain model of a commanded joint: by itself, of second order, with Coulomb friction.
+"""The second-order model of each commanded joint, decoupled, with Coulomb friction.
 
-Every joint alone: J a + d v + Fc sign(v) + c = kp (q_ref(t - delay) - q) + kd (v_ref - v). It is
-what a fit with bodies begins with, and what it has to beat.
+J a + d v + Fc sign(v) + c = kp (q_ref(t - delay) - q) + kd (v_ref - v). It gives the initial values
+of the fit with bodies, and is its baseline.
 """
 
 from dataclasses import dataclass, replace
@@ -18,26 +18,26 @@ from robotid.simulation.loops import ClosedLoopRobot, Loops, Window
 
 __all__ = ["SecondOrder", "fit_second_order"]
 
-_FREQUENCIES = (6.0, 12.0, 24.0, 48.0, 96.0)  # [rad/s] of the loop, that are tried
-_DAMPINGS = (0.5, 1.5)  # of critical
-_FRICTIONS = (0.05, 0.5)  # of the loop's typical torque
-_DELAYS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08)  # [s]
-_TRIED = 8  # windows that the tries look at ...
-_FITTED = 16  # ... and the fit
-_SHOWS = 1e-3  # of the inertia of the fastest loop: below it, none is told
-_LEAST = 1e-6  # of the typical inertia, that a joint must have
+_FREQUENCIES = (6.0, 12.0, 24.0, 48.0, 96.0)  # natural frequencies that are tried [rad/s]
+_DAMPINGS = (0.5, 1.5)  # damping ratios that are tried
+_FRICTIONS = (0.05, 0.5)  # Coulomb friction that is tried, over the typical torque
+_DELAYS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08)  # delays that are tried [s]
+_TRIED = 8  # number of windows of the grid search
+_FITTED = 16  # number of windows of the fit
+_SHOWS = 1e-3  # smallest identifiable inertia, over that of the fastest loop
+_LEAST = 1e-6  # lower bound of the inertia, over its initial value
 _TERMS = (TERMS["viscous"], TERMS["coulomb"], TERMS["offset"])
 _STEPS = 12  # of the fit
 
 
 @dataclass(frozen=True, eq=False)
 class SecondOrder:
-    """The plain model of every joint; arrays of shape (n,).
+    """The second-order model of every joint; arrays of shape (n,).
 
     Attributes:
-        simulator: What it simulates with.
+        simulator: Its simulator.
         theta: Its parameters.
-        loops: The same as loops without bodies.
+        loops: The parameters as loops without bodies.
         torque: Typical torque of the loop, kp rms(q_ref - q) [N m or N].
     """
 
@@ -48,23 +48,23 @@ class SecondOrder:
 
     @property
     def inertia(self) -> Array:
-        """Inertia J of each joint [kg m^2 or kg]; that of the fastest loop where none shows."""
+        """Inertia J of each joint [kg m^2 or kg]; that of the fastest loop if not identifiable."""
         fastest: Array = self.loops.kp / _FREQUENCIES[-1] ** 2
         return np.where(self.loops.armature > _SHOWS * fastest, self.loops.armature, fastest)
 
     @property
     def time_constant(self) -> Array:
-        """How fast each joint follows [s]: the slower of its damping and its swing."""
+        """Time constant of each joint [s]: of its damping or its oscillation, the longer."""
         loops = self.loops
         damped = (loops.kd + self.friction("viscous")) / loops.kp
         slow: Array = np.maximum(damped, np.sqrt(loops.armature / loops.kp))
         return slow
 
     def friction(self, name: str) -> Array:
-        """Return "viscous", "coulomb" or "offset" of each joint.
+        """Return the values of one friction term, shape (n,).
 
         Args:
-            name: Which one.
+            name: Name of the term: "viscous", "coulomb" or "offset".
         """
         which = [term.name for term in _TERMS].index(name)
         found: Array = self.loops.values[which :: len(_TERMS)]
@@ -74,17 +74,16 @@ class SecondOrder:
 def fit_second_order(
     robot: ClosedLoopRobot, windows: tuple[Window, ...], stated: Loops, *, finds_delay: bool
 ) -> SecondOrder:
-    """Fit the plain model to windows: a coarse grid of every joint, then least squares.
+    """Fit the second-order model to windows: a coarse grid for every joint, then least squares.
 
     Args:
-        robot: The robot, whose bodies are left out.
+        robot: The robot; its bodies are not used.
         windows: Windows of its logs.
-        stated: Gains and delay, as far as they are known; a gain of the position that is not
-            counts as 1.
-        finds_delay: Whether the delay is found, joint by joint.
+        stated: Gains and delay, as far as they are known; kp is 1 where it is not.
+        finds_delay: Whether the delay of each joint is fitted.
 
     Raises:
-        NotConvergedError: If nothing that is tried can be simulated.
+        NotConvergedError: If no trial can be simulated.
     """
     n = len(stated.kp)
     error = np.concatenate([w.log.q_ref[w.counted] - w.log.q[w.counted] for w in windows])  # type: ignore[index]
@@ -108,7 +107,7 @@ def fit_second_order(
 def _free_parameters(
     robot: ClosedLoopRobot, start: Loops, torque: Array, finds_delay: bool
 ) -> tuple[FreeParameter, ...]:
-    """Return inertia, friction, offset and delay of each joint as unknowns that begin there."""
+    """Return inertia, friction, offset and delay of each joint as free parameters."""
     found = []
     for j, joint in enumerate(robot.model.joints):
         J = start.armature[j]
@@ -133,7 +132,7 @@ def _coarse(
     torque: Array,
     finds_delay: bool,
 ) -> Loops:
-    """Return the best of a grid, joint by joint: none moves another without bodies."""
+    """Return the best of a grid for each joint: without bodies the joints are decoupled."""
     n = len(bare.kp)
     best, found = np.full(n, np.inf), bare
     delays = np.array(_DELAYS) if finds_delay else np.zeros(1)
@@ -143,15 +142,16 @@ def _coarse(
         J = bare.kp / w**2
         viscous = np.maximum(2 * z * w * J - bare.kd, 0.0)
         values = np.column_stack([viscous, f * torque, np.zeros(n)]).reshape(-1)
-        late = np.full(n, delay) if finds_delay else bare.delay
-        trial = replace(bare, armature=J, values=values, delay=late)
+        delays_ = np.full(n, delay) if finds_delay else bare.delay
+        trial = replace(bare, armature=J, values=values, delay=delays_)
         best, found = _better(robot, windows, trial, best, found)
     for delay in delays if finds_delay else ():
         best, found = _better(robot, windows, replace(found, delay=np.full(n, delay)), best, found)
     if not np.isfinite(best).all():
-        rate = "" if bare.rate is None else f" and a rate other than {bare.rate:g} Hz, or none,"
+        rate = "" if bare.rate is None else f", and another rate than {bare.rate:g} Hz or none,"
         raise NotConvergedError(
-            f"no plain loop that was tried can be simulated; state gains{rate} in [controller]",
+            "no second-order model of the joints that was tried can be simulated. State the "
+            f"gains{rate} in [controller]",
             "no start",
         )
     return found
@@ -160,11 +160,11 @@ def _coarse(
 def _better(
     robot: ClosedLoopRobot, windows: tuple[Window, ...], trial: Loops, best: Array, found: Loops
 ) -> tuple[Array, Loops]:
-    """Return the squares and loops of the joints, those of the trial where it is better."""
+    """Return the squared errors and loops of the joints: those of the trial where it is better."""
     try:
         outs = robot.roll_out(trial, windows)
     except NotConvergedError:
-        return best, found  # this try cannot be simulated; others can
+        return best, found  # this trial cannot be simulated; others can
     cost = sum(((out.window.log.q[out.window.counted] - out.q) ** 2).sum(axis=0) for out in outs)
     better = cost < best
     k = len(_TERMS)

@@ -1,4 +1,4 @@
-"""The loop of the drives as a job states it: what is known of it, and what is to be found."""
+"""Settings of the drives' closed loop in a job file: its known and its fitted parameters."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -13,7 +13,7 @@ from robotid.simulation.settings import DELAY, GAIN, LEVEL, PerJoint
 __all__ = ["LoopSettings", "groups_of"]
 
 _CLOCK = Range("1 to 2e4 Hz", lambda x: 1.0 <= x <= 2e4)
-#: What a loop has that a logged torque has not.
+#: Settings that do not apply where the logged torque drives the robot.
 _OF_LOOPS = ("kp", "kd", "limit", "delay", "delays", "rate", "gravity_compensation", "zeros")
 
 
@@ -21,53 +21,54 @@ _OF_LOOPS = ("kp", "kd", "limit", "delay", "delays", "rate", "gravity_compensati
 class LoopSettings(Settings):
     """The controller of logs with commands, torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref.
 
-    With kind "torque" no loop is closed: the logged torque itself drives the robot.
+    With kind "torque" there is no closed loop: the logged torque drives the robot.
     """
 
     _table: ClassVar[str] = "controller"
 
     kind: str = setting(
-        "pd", "how the loop is closed: by gains, on the commands of the log; or 'torque', not at "
-        "all: the torque of the log drives the robot, which then needs no commands",
+        "pd", "input of the simulation: 'pd', a PD controller with the commands of the log; "
+        "'torque', the logged torque without a controller, where no commands are needed",
         among=("pd", "torque"),
     )  # fmt: skip
     kp: PerJoint | None = setting(
-        None, "gain of the position [N m/rad or N/m], for all joints or by joint; found if not "
-        "stated, measured by the bodies' gravity and inertia", **GAIN,
+        None, "position gain [N m/rad or N/m], for all joints or by joint; fitted if not stated, "
+        "relative to gravity and inertia of the bodies", **GAIN,
     )  # fmt: skip
     kd: PerJoint | None = setting(
-        None, "gain of the speed [N m s/rad or N s/m], likewise; counted as viscous friction, with "
-        "which it is one, if not stated", **LEVEL,
+        None, "speed gain [N m s/rad or N s/m], for all joints or by joint; if not stated, it is "
+        "part of the viscous friction, unless the logs have speed commands or torques", **LEVEL,
     )  # fmt: skip
     limit: PerJoint | str | None = setting(
         None,
-        "largest torque of the drive [N m or N], likewise; found of joints that run at one largest "
-        "speed whatever their error if not stated, of every joint if 'find'",
+        "torque limit of the drive [N m or N], for all joints or by joint; if not stated, it is "
+        "fitted for joints that reach a constant largest speed; 'find': fitted for every joint",
         reads=(int, float, dict, str),
         within=GAIN["within"],
         among=("find",),
     )
     delay: PerJoint | None = setting(
-        None, "how late the command acts [s], likewise; found if not stated", **DELAY
+        None, "delay of the command [s], for all joints or by joint; fitted if not stated", **DELAY
     )
     delays: str = setting(
-        "one", "whether the robot has one delay that is found, that of bus and controller, or each "
-        "group its own", among=("one", "group"),
+        "one", "the fitted delays: 'one' for the robot (bus and controller), or one per 'group'",
+        among=("one", "group"),
     )  # fmt: skip
     rate: float | None = setting(
-        None, "how often a second a controller with a clock reads position and speed, to hold its "
-        "torque until the next time [Hz]; none if not stated: it follows at once", within=_CLOCK,
+        None, "sampling rate of a discrete-time controller, which holds its torque until the next "
+        "sample [Hz]; if not stated, the controller is in continuous time", within=_CLOCK,
     )  # fmt: skip
     gravity_compensation: bool = setting(
-        False, "whether the controller adds the torque of gravity by the URDF"
+        False, "whether the controller adds the gravity torque of the URDF"
     )
     groups: Mapping[str, Sequence[str]] = setting(
-        {}, "joints with equal drives, by a name for each group, which share gains, armature and "
-        "viscous friction; joints that are alike in the URDF if not stated",
+        {}, "joints with equal drives, by name of the group; they share gains, armature and "
+        "viscous friction. If not stated, joints that are equal in the URDF form a group",
         reads=Entries(dict, (list,)),
     )  # fmt: skip
     zeros: str = setting(
-        "urdf", "zero and sign of the encoders: as the URDF has them, or found, from gravity",
+        "urdf", "zero and sign of the encoders: 'urdf', those of the URDF; 'find', fitted from "
+        "gravity",
         among=("urdf", "find"),
     )  # fmt: skip
 
@@ -77,11 +78,15 @@ class LoopSettings(Settings):
             return
         for each in fields(self):
             if each.name in _OF_LOOPS and getattr(self, each.name) != each.default:
-                how = " A late torque: [signals] torque_delay." if each.name == "delay" else ""
+                how = (
+                    " The delay of a logged torque is [signals] torque_delay."
+                    if each.name == "delay"
+                    else ""
+                )
                 raise SettingsError(
                     f"[controller] {each.name} is {getattr(self, each.name)!r}, but with kind = "
-                    "'torque' the torque of the log drives the robot and no loop is closed; "
-                    f"leave {each.name} out, or set kind = 'pd'.{how}"
+                    "'torque' the logged torque drives the robot, without a controller. Leave "
+                    f"{each.name} out, or set kind = 'pd'.{how}"
                 )
 
 
@@ -89,12 +94,12 @@ def groups_of(settings: LoopSettings, joints: Sequence[str], alike: Sequence[Any
     """Return the group of each joint.
 
     Args:
-        settings: The stated groups; none: joints that are alike form one.
+        settings: The stated groups; if none, equal joints form a group.
         joints: Names of the n joints.
-        alike: What two joints of a group have in common, n entries.
+        alike: Properties in which joints of a group agree, n entries.
 
     Raises:
-        SettingsError: If a group names a joint that is not there, or one twice.
+        SettingsError: If a group names an unknown joint, or two groups name the same joint.
     """
     found: dict[str, str] = {}
     for group, members in settings.groups.items():
@@ -105,8 +110,8 @@ def groups_of(settings: LoopSettings, joints: Sequence[str], alike: Sequence[Any
         for joint in members:
             if joint not in joints:
                 raise SettingsError(
-                    f"controller: groups.{group} has {joint!r}, which is not among the joints that "
-                    f"move: {listed(joints)}{suggestion(joint, joints)}"
+                    f"controller: groups.{group} has {joint!r}, which is not a moving joint: "
+                    f"{listed(joints)}{suggestion(joint, joints)}"
                 )
             if joint in found:
                 raise SettingsError(
@@ -125,7 +130,7 @@ def groups_of(settings: LoopSettings, joints: Sequence[str], alike: Sequence[Any
 
 
 def _common(name: str, joints: Sequence[str], named: Sequence[str]) -> str:
-    """Return a name for a group: the words that the names of its joints share, or its first."""
+    """Return the name of a group: the words common to its joints' names, or its first joint."""
     members = [joint for joint, first in zip(joints, named, strict=True) if first == name]
     shared = [word for word in members[0].split("_") if all(word in m.split("_") for m in members)]
     shared = [word for word in shared if word != "joint"]

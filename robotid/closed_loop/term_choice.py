@@ -1,7 +1,7 @@
-"""Which terms a drive has beside viscous and Coulomb friction: those that other windows confirm.
+"""Choice of friction terms beyond viscous and Coulomb friction, by cross-validation of windows.
 
-The residual is linear in a term that is not there yet, to first order. So one roll-out with the
-slopes of all candidates tells, for any of them, what a fit to some windows would make of others.
+To first order, the residual is linear in a candidate term. So one roll-out with the sensitivities
+of all candidates gives the residual of held-out windows after a fit to the other windows.
 """
 
 import logging
@@ -20,26 +20,26 @@ from robotid.robot.drives import FAMILIES, LoadFriction, PositionCoulomb
 
 __all__ = ["Tried", "candidates", "choose"]
 
-_OFFERED = ("stribeck", "load", "position")  # families beside viscous and Coulomb friction
-# Of a joint's squared residual in other windows, whose noise level is 1 a row: bench_commands.py
+_OFFERED = ("stribeck", "load", "position")  # candidate families
+# share: of a joint's squared residual in held-out windows, with unit noise; bench_commands.py
 _RULE = Rule(most=len(_OFFERED), share=0.02, p_value=None, alike=0.0)
 _FOLDS = 6
-_FEWEST = 2  # windows: one is judged by what others were fitted to
-_SLOW = 0.3  # of a joint's typical speed, over which Stribeck's hook fades
-_WIDE = 0.05  # [rad or m] of motion from which friction can depend on the position
+_FEWEST = 2  # smallest number of windows for a cross-validation
+_SLOW = 0.3  # Stribeck speed of candidates, over the typical speed of the joint
+_WIDE = 0.05  # smallest half-range of a position-dependent candidate [rad or m]
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Tried:
-    """One candidate of a joint.
+    """A candidate of a joint that was tried.
 
     Attributes:
         joint: The joint.
         terms: Names of its terms.
-        gain: Share of the joint's squared residual in other windows that it takes away [-].
-        is_chosen: Whether it is taken.
+        gain: Reduction of the joint's squared residual in held-out windows [-].
+        is_chosen: Whether it is chosen.
     """
 
     joint: str
@@ -49,11 +49,11 @@ class Tried:
 
 
 def candidates(simulator: LoopSimulator, torque: Array) -> list[tuple[FreeParameter, ...]]:
-    """Return what friction each joint may have beside viscous and Coulomb's.
+    """Return the candidate friction terms of each joint.
 
     Args:
-        simulator: The fit without them.
-        torque: Typical torque of each joint, shape (n,), that sizes their spread [N m or N].
+        simulator: The fitted simulator without them.
+        torque: Typical torque of each joint, for the prior spreads, shape (n,) [N m or N].
     """
     model = simulator.robot.model
     q = np.concatenate([w.log.q[w.counted] for w in simulator.windows])
@@ -90,34 +90,34 @@ def choose(
     offered: Sequence[tuple[FreeParameter, ...]],
     estimator: OutputError,
 ) -> list[Tried]:
-    """Return which candidates lower the residual of windows that they were not fitted to.
+    """Return which candidates lower the residual of held-out windows.
 
-    Candidates are taken one after the other, the best of each joint in a pass.
+    Selection is greedy: each pass adds the best candidate of each joint.
 
     Args:
-        simulator: The fit with all that is offered among its unknowns, at 0.
-        theta: Its parameters, shape (c,).
+        simulator: The simulator with all candidates among its free parameters, at 0.
+        theta: Values of its free parameters, shape (c,).
         offered: The candidates.
-        estimator: How residuals weigh.
+        estimator: The estimator, with the weights of residuals.
     """
     joints = simulator.robot.model.joints
     if len(simulator.windows) < _FEWEST:
         _log.warning(
-            "further friction is not tried: the logs have %d window to fit, wanted at least %d, to "
-            "judge by one what another was fitted to; record longer, or shorten window in "
+            "further friction terms are not tried: the logs have %d window to fit, and "
+            "cross-validation needs at least %d. Record a longer log, or set a shorter window in "
             "[estimator]",
             len(simulator.windows), _FEWEST,
         )  # fmt: skip
     place = {name: k for k, name in enumerate(simulator.names)}
-    sets = [[place[unknown.name] for unknown in free_parameters] for free_parameters in offered]
+    sets = [[place[free.name] for free in free_parameters] for free_parameters in offered]
     folds = _folds(simulator, theta, estimator)
-    rows = sum(fold.rows for fold in folds)  # of one joint, whose noise level is 1
-    spare = {k for places in sets for k in places}
-    columns = [k for k in range(len(theta)) if k not in spare]
-    open_sets, chosen = set(range(len(sets))), set[int]()
+    rows = sum(fold.rows for fold in folds)  # of one joint, with unit noise
+    candidate_columns = {k for places in sets for k in places}
+    columns = [k for k in range(len(theta)) if k not in candidate_columns]
+    remaining, chosen = set(range(len(sets))), set[int]()
     gains: dict[int, float] = {}
-    while open_sets:
-        removed = _gains(folds, columns, {s: sets[s] for s in open_sets})
+    while remaining:
+        removed = _gains(folds, columns, {s: sets[s] for s in remaining})
         rounds = _by_joint(offered, removed, rows)
         gains |= {s: this.share(s) for this in rounds for s in this.left}
         best = [s for this in rounds for s in [this.best(_RULE)] if s is not None]
@@ -126,11 +126,11 @@ def choose(
         for s in sorted(best, key=lambda s: -gains[s]):
             columns += sets[s]
         chosen |= set(best)
-        open_sets -= chosen
+        remaining -= chosen
     return [
         Tried(
             joints[free_parameters[0].joints[0]],
-            tuple(unknown.term.name for unknown in free_parameters if unknown.term is not None),
+            tuple(free.term.name for free in free_parameters if free.term is not None),
             gains[s],
             s in chosen,
         )
@@ -141,7 +141,7 @@ def choose(
 def _by_joint(
     offered: Sequence[tuple[FreeParameter, ...]], removed: Mapping[int, Array], rows: int
 ) -> list[Round[int]]:
-    """Return the round of each joint's candidates, by what they remove from each fold."""
+    """Return the selection round of each joint's candidates, by their gain in each fold."""
     joints: dict[int, dict[int, Array]] = {}
     for s, gain in removed.items():
         joints.setdefault(offered[s][0].joints[0], {})[s] = -gain
@@ -151,7 +151,7 @@ def _by_joint(
 
 @dataclass(frozen=True, eq=False)
 class _Fold:
-    """The linearised problem of some windows: A'A, A'b and b'b, and rows of one joint."""
+    """The normal equations of some windows, A'A and A'b, and the number of rows of one joint."""
 
     H: Array  # (c, c)
     g: Array  # (c,)
@@ -159,7 +159,7 @@ class _Fold:
 
 
 def _folds(simulator: LoopSimulator, theta: Array, estimator: OutputError) -> list[_Fold]:
-    """Return the problem cut into folds of windows, the prior shared among them."""
+    """Return the problem split into folds of windows, with the prior split equally."""
     count = min(_FOLDS, len(simulator.windows))
     known = 1.0 / simulator.prior_std**2 / count
     H = np.tile(np.diag(known), (count, 1, 1))
@@ -178,10 +178,10 @@ def _folds(simulator: LoopSimulator, theta: Array, estimator: OutputError) -> li
 def _gains(
     folds: Sequence[_Fold], columns: list[int], sets: dict[int, list[int]]
 ) -> dict[int, Array]:
-    """Return by how much each set of further columns lowers the squares of each fold left out.
+    """Return by how much each set of further columns lowers the squares of each held-out fold.
 
-    0 of all if the other folds leave a parameter open, as those of short logs: then nothing shows
-    what a term gains where it was not fitted.
+    All are 0 if the other folds do not determine a parameter, as with short logs: then there is no
+    cross-validation.
     """
     gains = {s: np.zeros(len(folds)) for s in sets}
     H, g = sum(fold.H for fold in folds), sum(fold.g for fold in folds)

@@ -1,10 +1,10 @@
-"""Where encoders have their zeros, and which way they count: what gravity says of it.
+"""Encoder zeros and signs relative to the URDF, identified from gravity.
 
-A servo's position loop is held off its command by the torque of its load, q_ref - q = tau / kp +
-friction. So the error of the loops, regressed on the URDF's torques, tells at which angles and in
-which sense the URDF's joints stand where the encoders read what they do. What is slow tells it: in
-fast motion lags outweigh gravity, and friction, on either side in turn, has a mean of none.
-Joints with parallel axes cannot be told from their mirror image: gravity holds both off alike.
+The load causes a position error of a servo's loop, q_ref - q = tau / kp + friction. A regression of
+the position errors on the URDF's torques therefore determines zero and sign of each encoder. It
+uses the slow motion: in fast motion lags are larger than the effect of gravity, and friction, which
+acts in both directions, averages to zero. The common sign of joints with parallel axes is not
+identifiable: the position errors by gravity are the same with all signs reversed.
 """
 
 from collections.abc import Sequence
@@ -21,35 +21,35 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["CLEAR", "Encoders", "find_encoders", "parallel_axes", "same_encoders"]
 
-#: Squared error that another zero or sense must leave, over the best's, less 1: the URDF's for the
-#: best to be taken, the next best for it to be known.
+#: Smallest relative increase of the squared error: by the URDF's zero and sign, for the best ones
+#: to replace them; by the next best ones, for the best ones to be identified.
 CLEAR = 0.2
 
-#: Senses and zeros that are tried.
+#: Signs and zeros that are tried.
 _TRIALS = np.array([(s, z) for s in (1.0, -1.0) for z in np.deg2rad(np.arange(-180, 180, 15))])
 _SAMPLES = 400  # of all logs together
-_SWEEPS = 4  # over the joints, until none moves any more
-_SLOW, _FAST = 0.4, 4.0  # [Hz] of the motion that is looked at, and of its friction's sense
-_PAD = 9  # rows by which both ends are continued
-_PERIODS = 30  # of the slowest motion that all logs together should have
-_RANGE = 0.4  # [rad] of slow motion that shows how a torque turns; over less it is a straight line
-_SAME = 1.0 - 1e-6  # cosine of axes that are parallel
-_NEXT = np.deg2rad(15.5)  # of the best, within which a zero is no other
-_STILL = 0.02  # [rad/s or m/s] over which friction turns
+_PASSES = 4  # largest number of passes over the joints
+_SLOW, _FAST = 0.4, 4.0  # cut-offs of the slow motion and of the sign of friction [Hz]
+_PAD = 9  # rows by which the filter extends both ends
+_PERIODS = 30  # smallest number of cut-off periods in all logs together
+_RANGE = 0.4  # smallest range of a joint whose zero is identified [rad]
+_SAME = 1.0 - 1e-6  # smallest cosine of parallel axes
+_NEXT = np.deg2rad(15.5)  # zeros nearer to the best are not the next best [rad]
+_STILL = 0.02  # speed over which friction reverses [rad/s or m/s]
 
 
 @dataclass(frozen=True, eq=False)
 class Encoders:
-    """How encoders stand to the URDF's joints, q_urdf = sign q + zero; arrays of shape (n,).
+    """Encoder zeros and signs relative to the URDF, q_urdf = sign q + zero; arrays of shape (n,).
 
     Attributes:
-        sign: 1, or -1 of an encoder that counts the other way.
+        sign: 1, or -1 of an encoder with the opposite sign.
         zero: Position of the URDF where the encoder reads 0 [rad or m].
-        gain: Share of the loops' squared error that leaving the URDF's zero and sense explains.
-        explained: Share of the joint's own squared error that gravity explains.
-        margin: Squared error of the next best zero or sense, beyond the best's neighbours, over
-            that of the best, less 1; 0 of a prismatic joint, or hardly moves.
-        next_sign, next_zero: That next best.
+        gain: Reduction of the squared position error by a zero and sign other than the URDF's [-].
+        explained: Share of the joint's own squared position error that gravity explains [-].
+        margin: Relative increase of the squared error by the next best zero or sign, outside the
+            neighbourhood of the best [-]; 0 of prismatic joints and of joints that hardly move.
+        next_sign, next_zero: The next best sign and zero.
     """
 
     sign: Array
@@ -62,7 +62,7 @@ class Encoders:
 
 
 def same_encoders(model: RobotModel) -> Encoders:
-    """Return encoders with the URDF's zeros and senses.
+    """Return encoders with the URDF's zeros and signs.
 
     Args:
         model: The robot.
@@ -75,7 +75,7 @@ def same_encoders(model: RobotModel) -> Encoders:
 
 
 def parallel_axes(model: RobotModel) -> list[tuple[str, ...]]:
-    """Return the joints of each chain that turn about parallel axes, one after the other.
+    """Return the successive joints of each chain that have parallel axes.
 
     Args:
         model: The robot.
@@ -84,8 +84,8 @@ def parallel_axes(model: RobotModel) -> list[tuple[str, ...]]:
     joined: dict[int, list[int]] = {}
     for body in range(len(tree.parents)):
         above, placement = int(tree.parents[body]), tree.joints[body]
-        turn = placement[36:39]
-        in_parent = (placement[:9] + placement[9:18]).reshape(3, 3).T @ turn  # it stays there
+        axis = placement[36:39]
+        in_parent = (placement[:9] + placement[9:18]).reshape(3, 3).T @ axis  # constant there
         parallel = above >= 0 and abs(float(in_parent @ tree.joints[above][36:39])) > _SAME
         joined[body] = joined[above] if parallel else []
         joined[body].append(int(tree.leaders[body]))
@@ -94,7 +94,7 @@ def parallel_axes(model: RobotModel) -> list[tuple[str, ...]]:
 
 
 def find_encoders(model: RobotModel, logs: Sequence[Log]) -> Encoders:
-    """Find zeros and senses of encoders from how gravity holds loops off their commands.
+    """Find zeros and signs of encoders from the position errors that gravity causes.
 
     Args:
         model: The robot.
@@ -105,40 +105,40 @@ def find_encoders(model: RobotModel, logs: Sequence[Log]) -> Encoders:
     samples = [_smooth(log, max(_SAMPLES // len(logs), 50), cutoff) for log in logs]
     motion = _Motion(*(np.concatenate(parts) for parts in zip(*samples, strict=True)))
     n = len(model.joints)
-    turns = np.flatnonzero(
+    revolute = np.flatnonzero(
         np.array([joint.type != "prismatic" for joint in model.limits])
         & (np.ptp(motion.q, axis=0) > _RANGE)
     )
-    free = [*turns]
+    free = [*revolute]
     while True:
-        sign, zero, gain, cost, costs = _descend(model, motion, turns, free)
+        sign, zero, gain, cost, costs = _descend(model, motion, revolute, free)
         margin, next_sign, next_zero = np.zeros(n), sign.copy(), zero.copy()
-        for j in turns:
+        for j in revolute:
             away = (_TRIALS[:, 0] != sign[j]) | (np.cos(_TRIALS[:, 1] - zero[j]) < np.cos(_NEXT))
             k = int(np.argmin(np.where(away, costs[j], np.inf)))
             margin[j] = np.expm1((costs[j, k] - cost) / len(motion.q))
             next_sign[j], next_zero[j] = _TRIALS[k]
-        open_ = [j for j in free if gain[j] > 0 and margin[j] < CLEAR]
-        if not open_:
+        ambiguous = [j for j in free if gain[j] > 0 and margin[j] < CLEAR]
+        if not ambiguous:
             break
-        free = [j for j in free if j not in open_]  # what others do as well stays the URDF's
+        free = [j for j in free if j not in ambiguous]  # these have the URDF's values
     left, without = motion.left(model, sign, zero)
     return Encoders(sign, zero, gain, 1.0 - left / without, margin, next_sign, next_zero)
 
 
 def _descend(
-    model: RobotModel, motion: "_Motion", turns: Array, free: Sequence[int]
+    model: RobotModel, motion: "_Motion", revolute: Array, free: Sequence[int]
 ) -> tuple[Array, Array, Array, float, Array]:
-    """Return sign, zero and gain of the best zeros of joints that are free, and the costs.
+    """Return the best sign and zero of each free joint, the gain, and the costs.
 
-    The last two are the cost, and that of each trial of each revolute joint.
+    The last two are the least cost, and the cost of each trial of each revolute joint.
     """
     N, n = motion.q.shape
     sign, zero, gain = np.ones(n), np.zeros(n), np.zeros(n)
     cost, costs = motion.cost(model, sign, zero), np.full((n, len(_TRIALS)), np.inf)
-    for _ in range(_SWEEPS):
+    for _ in range(_PASSES):
         moved = False
-        for j in turns:
+        for j in revolute:
             for k, (s, z) in enumerate(_TRIALS):
                 trial_sign, trial_zero = sign.copy(), zero.copy()
                 trial_sign[j], trial_zero[j] = s, z
@@ -153,7 +153,7 @@ def _descend(
 
 
 def _smooth(log: Log, count: int, cutoff: float) -> tuple[Array, ...]:
-    """Return the slow motion at some samples of a log: the arrays of ``_Motion``."""
+    """Return the slow motion at samples of a log: the arrays of ``_Motion``."""
     dt = float(np.median(np.diff(log.t)))
 
     def low_pass(x: Array, below: float) -> Array:
@@ -175,24 +175,26 @@ class _Motion:
     q: Array
     v: Array
     a: Array
-    error: Array  # of the loops
-    sense: Array  # of friction
+    error: Array  # q_ref - q
+    direction: Array  # of friction
 
     def cost(self, model: RobotModel, sign: Array, zero: Array) -> float:
-        """Return N times the log of what torques, friction and a constant leave of the errors."""
+        """Return N times the summed log of the squared residuals of the position errors."""
         left = np.maximum(self.left(model, sign, zero)[0], 1e-300)
         return len(self.q) * float(np.log(left).sum())
 
     def left(self, model: RobotModel, sign: Array, zero: Array) -> tuple[Array, Array]:
-        """Return the squares left of each joint's errors, with its torque and without, (n,).
+        """Return squared residuals of each joint's errors, with its torque and without, (n,).
 
-        A joint whose loop would give way to the load does not count the load.
+        The torque is left out where its coefficient, the compliance of the loop, is negative.
         """
         q, v, a = (sign * x for x in (self.q, self.v, self.a))
         torque = predict_instants(model, model.standard_parameters(), q + zero, v, a)
         left, without = np.empty((2, len(sign)))
         for j, own in enumerate(sign):
-            plain = np.column_stack([np.ones(len(q)), self.v[:, j], self.sense[:, j], self.a[:, j]])
+            plain = np.column_stack(
+                [np.ones(len(q)), self.v[:, j], self.direction[:, j], self.a[:, j]]
+            )
             _, without[j] = _fit(plain, self.error[:, j])
             x, left[j] = _fit(np.column_stack([own * torque[:, j], plain]), self.error[:, j])
             if x[0] < 0:

@@ -1,3 +1,3 @@
-"""Identification while the robot moves."""
+"""Online identification."""
 
 __all__: list[str] = []

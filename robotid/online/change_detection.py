@@ -1,4 +1,4 @@
-"""What a stream of innovations says: the noise, whether a filter has converged, a step change."""
+"""Noise level, convergence and change detection from innovations."""
 
 from dataclasses import dataclass
 
@@ -9,17 +9,17 @@ from robotid._typing import Array
 
 __all__ = ["ChangeDetector", "Innovations", "Payload", "load_spread", "payload_of"]
 
-_LARGEST = 25.0  # a single innovation counts for no more than five standard deviations
-_FIRST_NOISE = 0.1  # noise before any is measured, as a share of each row's torque
-_SMALLEST_NOISE = 1e-4  # ... and the least it may become
-_PSEUDO = 20.0  # samples that the first noise counts for
-_CLIP = 9.0  # squared innovation, in variances, from which it does not add to the noise
-_SURE = 0.25  # variance of the prediction over the noise's below which the filter has converged
+_LARGEST = 25.0  # largest squared innovation in the evidence [variances]
+_FIRST_NOISE = 0.1  # initial noise level, relative to the RMS torque of each row
+_SMALLEST_NOISE = 1e-4  # smallest noise level, relative to the RMS torque of each row
+_PSEUDO = 20.0  # weight of the initial noise level [samples]
+_CLIP = 9.0  # largest squared innovation in the noise level [variances]
+_CONVERGED = 0.25  # variance of the prediction over that of the noise, below which it has converged
 
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """A load on the last body.
+    """A payload on the last body.
 
     Attributes:
         parameters: Its ten inertial parameters in the body's frame, shape (10,).
@@ -45,12 +45,12 @@ class ChangeDetector:
 
     With the squared innovation d_j^2 in units of its variance, the evidence is
     g_j <- max(0, g_j + share (min(d_j^2, 25) - drift)), and a change is flagged when one g_j
-    reaches the threshold. A change began when that g_j last left 0.
+    reaches the threshold. The onset of the change is the time at which that g_j last left 0.
 
     Args:
         n: Number of rows.
         threshold: Evidence at which a change is flagged [-].
-        drift: Mean of d_j^2 that is no evidence; 1 is that of noise alone [-].
+        drift: Mean of d_j^2 without a change; 1 for noise alone [-].
 
     References:
         Page (1954), Continuous Inspection Schemes.
@@ -59,46 +59,46 @@ class ChangeDetector:
     def __init__(self, n: int, threshold: float, drift: float) -> None:
         self.threshold, self.drift = threshold, drift
         self.evidence = np.zeros(n)
-        self._began = np.full(n, np.nan)
+        self._onset = np.full(n, np.nan)
 
     def push(self, t: float, squares: Array, share: float) -> float | None:
-        """Take one sample; return when the change began if one is flagged now [s], else None.
+        """Process one sample; return the onset of a change flagged now [s], else None.
 
         Args:
             t: Its time [s].
-            squares: Squared innovations in variances, shape (n,); 0 for rows that say nothing.
-            share: How much of an independent sample it is [-].
+            squares: Squared innovations in variances, shape (n,); 0 for rows that are not used.
+            share: Its weight relative to an independent sample [-].
         """
         evidence = self.evidence + share * (np.minimum(squares, _LARGEST) - self.drift)
         evidence[squares == 0.0] = self.evidence[squares == 0.0]
         starts = (self.evidence <= 0.0) & (evidence > 0.0)
-        self._began[starts] = t
+        self._onset[starts] = t
         self.evidence = np.maximum(evidence, 0.0)
         j = int(np.argmax(self.evidence))
         if self.evidence[j] < self.threshold:
             return None
         self.evidence = np.zeros(len(evidence))
-        return float(self._began[j])
+        return float(self._onset[j])
 
 
 class Innovations:
-    """Learns the noise of each row, and judges convergence and change by it.
+    """Noise level of each row, and convergence and change relative to it.
 
-    The mean of innovation times residual is the variance of the noise, however uncertain the
-    parameters are. No model is exact: for the detection of changes, ``model_error`` of each row's
-    torque is added to its noise.
+    The mean of innovation times residual is the variance of the noise, at any uncertainty of the
+    parameters. For the detection of changes, ``model_error`` times each row's torque is added to
+    its noise, since no model is exact.
 
     Args:
-        rms: Root mean square torque of each row, shape (n,) [N m or N].
+        rms: RMS torque of each row, shape (n,) [N m or N].
         dt: Time between two samples [s].
         memory: Time over which noise and torque are averaged [s].
-        model_error: Share of the torque that the model may miss without a change [-].
-        detector: What flags changes.
+        model_error: Error of the model without a change, relative to the torque [-].
+        detector: Detector of changes.
 
     Attributes:
         variance: Noise variance of each row, shape (n,) [(N m)^2 or N^2].
-        doubt: Recent variance of the prediction, from the parameters' uncertainty, over that of
-            the noise, shape (n,); inf before any.
+        ratio: Mean variance of the prediction, from the parameters' uncertainty, over that of the
+            noise, shape (n,); inf before the first sample.
     """
 
     def __init__(
@@ -106,16 +106,16 @@ class Innovations:
     ) -> None:
         self._floor = (_SMALLEST_NOISE * np.maximum(rms, 1e-3 * rms.max())) ** 2 + 1e-300
         self.variance = np.maximum((_FIRST_NOISE * rms) ** 2, self._floor)
-        self.doubt = np.full(len(rms), np.inf)
+        self.ratio = np.full(len(rms), np.inf)
         self._torque = rms**2
         self._dt, self._memory, self._model_error = dt, memory / dt, model_error
-        self._seen = np.full(len(rms), _PSEUDO)
+        self._samples = np.full(len(rms), _PSEUDO)
         self._detector = detector
 
     @property
     def is_converged(self) -> bool:
         """Whether the parameters' uncertainty adds less than half a noise level to each row."""
-        return bool((self.doubt < _SURE).all())
+        return bool((self.ratio < _CONVERGED).all())
 
     def push(
         self,
@@ -123,47 +123,48 @@ class Innovations:
         tau: Array,
         e: Array,
         residual: Array,
-        doubt: Array,
+        uncertainty: Array,
         used: Array,
         share: float,
     ) -> float | None:
-        """Take one sample; return when a change began if one is flagged now [s], else None.
+        """Process one sample; return the onset of a change flagged now [s], else None.
 
         Args:
             t: Its time [s].
             tau: Torque, shape (n,) [N m or N].
             e: Innovation tau - Y theta before the update, shape (n,) [N m or N].
-            residual: The same after the update, shape (n,) [N m or N].
-            doubt: Variance of the prediction from the parameters, shape (n,) [(N m)^2 or N^2].
-            used: Which rows count, shape (n,), bool.
-            share: How much of an independent sample it is [-].
+            residual: tau - Y theta after the update, shape (n,) [N m or N].
+            uncertainty: Variance of the prediction by that of the parameters, shape (n,)
+                [(N m)^2 or N^2].
+            used: Which rows are used, shape (n,), bool.
+            share: Its weight relative to an independent sample [-].
         """
-        expected = doubt + self.variance + self._model_error**2 * self._torque
-        # before it has converged, an innovation says nothing about change
-        evidence = np.where(used & (self.doubt < _SURE), e**2 / expected, 0.0)
-        self._learn(tau, e * residual, doubt, used)
+        expected = uncertainty + self.variance + self._model_error**2 * self._torque
+        # before convergence, innovations do not indicate a change
+        evidence = np.where(used & (self.ratio < _CONVERGED), e**2 / expected, 0.0)
+        self._update_noise(tau, e * residual, uncertainty, used)
         return self._detector.push(t, evidence, share)
 
     def forget_convergence(self) -> None:
-        """Start judging convergence anew, after the covariance was re-opened."""
-        self.doubt = np.full(len(self.doubt), np.inf)
+        """Reset the convergence, after the covariance was increased."""
+        self.ratio = np.full(len(self.ratio), np.inf)
 
-    def _learn(self, tau: Array, product: Array, doubt: Array, used: Array) -> None:
-        """Average noise and torque over the memory, the doubt over a second."""
-        bounded = np.clip(product, 0.0, _CLIP * (doubt + self.variance))
-        ratio = doubt / self.variance
-        self._seen = np.minimum(self._seen + used, self._memory)
-        pace = used / self._seen
-        self._torque = self._torque + pace * (tau**2 - self._torque)
-        self.variance = np.maximum(self.variance + pace * (bounded - self.variance), self._floor)
-        known = np.isfinite(self.doubt)
-        averaged = np.where(known, self.doubt, ratio)
+    def _update_noise(self, tau: Array, product: Array, uncertainty: Array, used: Array) -> None:
+        """Average noise and torque over the memory, and the variance ratio over one second."""
+        bounded = np.clip(product, 0.0, _CLIP * (uncertainty + self.variance))
+        ratio = uncertainty / self.variance
+        self._samples = np.minimum(self._samples + used, self._memory)
+        gain = used / self._samples
+        self._torque = self._torque + gain * (tau**2 - self._torque)
+        self.variance = np.maximum(self.variance + gain * (bounded - self.variance), self._floor)
+        known = np.isfinite(self.ratio)
+        averaged = np.where(known, self.ratio, ratio)
         averaged += min(1.0, self._dt) * (ratio - averaged)
-        self.doubt = np.where(used, averaged, self.doubt)
+        self.ratio = np.where(used, averaged, self.ratio)
 
 
 def payload_of(difference: Array, covariance: Array, columns: Array, spread: Array) -> Payload:
-    """Return the load that explains a difference of the base parameters.
+    """Return the payload that explains a difference of the base parameters.
 
     Minimises (d - K_L phi)^T C^-1 (d - K_L phi) + |phi / spread|^2.
 
@@ -171,7 +172,7 @@ def payload_of(difference: Array, covariance: Array, columns: Array, spread: Arr
         difference: Change d of the base parameters, shape (b,).
         covariance: Its covariance C, shape (b, b).
         columns: Columns K_L of the base mapping that belong to the body, shape (b, 10).
-        spread: How large each parameter of a load may be, shape (10,).
+        spread: Prior standard deviation of each parameter of the payload, shape (10,).
     """
     scale = np.sqrt(np.diag(covariance))
     L = scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
@@ -184,10 +185,10 @@ def payload_of(difference: Array, covariance: Array, columns: Array, spread: Arr
 
 
 def load_spread(spread: Array) -> Array:
-    """Return how large each parameter of a load may be, (10,): a mean link's mass, twice its size.
+    """Return the prior standard deviations of a payload, (10,): a mean link's mass, twice its size.
 
     Args:
-        spread: How far the inertial parameters of all bodies may be wrong, shape (10 bodies,).
+        spread: Prior standard deviations of all bodies' parameters, shape (10 bodies,).
     """
     by_body = spread.reshape(-1, 10)
     mass = max(float(by_body[:, 0].mean()), float(by_body[-1, 0]))

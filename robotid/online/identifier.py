@@ -1,4 +1,4 @@
-"""Identification while the robot moves: sample in, estimate at any moment out."""
+"""Online identification: samples as input, an estimate at any time as output."""
 
 from collections import deque
 from dataclasses import replace
@@ -29,34 +29,34 @@ from robotid.robot.prior import prior_spread
 
 __all__ = ["OnlineIdentifier"]
 
-_TAKEN = {1: ("q", "tau"), 3: ("q", "v", "a", "tau")}  # arrays, by how many follow t and q
-_OVERSAMPLED = 12.0  # filtered samples per period of the cut-off that reach the estimator
-_KEPT_EVERY = 0.1  # [s] between the states that a change may go back to
-_KEPT = 30  # ... and how many of them there are
-_REOPENED = 0.1  # share of its prior spread that everything may have changed by
+_ARRAYS = {1: ("q", "tau"), 3: ("q", "v", "a", "tau")}  # by the number of arrays after t and q
+_OVERSAMPLED = 12.0  # estimator updates per period of the cut-off
+_STORED_EVERY = 0.1  # time between stored states, for the reset after a change [s]
+_STORED = 30  # number of stored states
+_REOPENED = 0.1  # change of every parameter after a change, relative to its prior spread
 
 
 class OnlineIdentifier:
-    """Identifies a robot sample by sample, and follows a step change.
+    """Identifies a robot sample by sample, with detection of step changes.
 
-    A Kalman filter with parameters that walk slowly sees the regressor of each filtered instant.
-    The noise level of each joint is the running mean of innovation times residual. When the
-    innovations of a joint stay too large (CUSUM), a change is flagged and the covariance re-opened:
-    for what a load on the last body may add, and a little for everything else.
+    A Kalman filter with a slow random walk of the parameters processes the regressor of each
+    filtered instant. The noise level of each joint is the running mean of innovation times
+    residual. When the innovations of a joint remain too large (CUSUM), a change is flagged and the
+    covariance is increased: by that of a payload on the last body, and slightly for all parameters.
 
     Args:
         model: The robot, with a fixed base.
         settings: The settings; the defaults if None.
 
     Attributes:
-        delay: How far the estimate lies behind the newest sample if ``update(t, q, tau)`` is
-            used [s]; 0 with ``update(t, q, v, a, tau)``.
+        delay: Delay of the estimate after the newest sample [s] with ``update(t, q, tau)``; 0 with
+            ``update(t, q, v, a, tau)``.
         changes: The changes flagged so far.
         names: Names of the base parameters.
 
     Raises:
-        DataError: If the base floats or the model is static; later, by ``reading``, ``compared``
-            and ``estimate``, until the robot has moved enough for a first estimate.
+        DataError: If the base floats or the model is static; from ``reading``, ``compared`` and
+            ``estimate``, before the end of the warm-up.
         SettingsError: If the cut-off is not below half the rate.
     """
 
@@ -64,23 +64,23 @@ class OnlineIdentifier:
         require_kind(model, RobotModel, "model", "a robotid.RobotModel")
         require_kind(settings, (OnlineSettings, type(None)), "settings", "an OnlineSettings")
         if model.is_static:
-            raise DataError("an online identification needs a model with dynamics = 'full'")
+            raise DataError("the model is static. An online identification needs dynamics = 'full'")
         self.model, self.settings = model, settings or OnlineSettings()
         s = self.settings
         self.mapping = structural_mapping(model)
         self.names = self.mapping.base_names
         self.changes: tuple[Change, ...] = ()
         n = len(model.joints)
-        turns = np.array([joint.turns_freely for joint in model.limits])
-        self._signals = LiveSignals(n, s.rate, s.cutoff, s.order, turns)
+        is_continuous = np.array([joint.turns_freely for joint in model.limits])
+        self._signals = LiveSignals(n, s.rate, s.cutoff, s.order, is_continuous)
         self.delay = self._signals.delay
         self._every = max(1, int(s.rate / (_OVERSAMPLED * s.cutoff)))
         self._pace()
         self._regressor = InstantRegressor(model, self.mapping.independent)
         self._skipped, self._t, self._now = 0, -np.inf, -np.inf
-        self._early: list[Instant] = []
+        self._warmup: list[Instant] = []
         self._kalman: Kalman | None = None
-        self._recent: deque[tuple[float, KalmanState]] = deque(maxlen=_KEPT)
+        self._recent: deque[tuple[float, KalmanState]] = deque(maxlen=_STORED)
 
     @overload
     def update(self, t: float, q: Array, tau: Array, /) -> None: ...
@@ -89,7 +89,7 @@ class OnlineIdentifier:
     def update(self, t: float, q: Array, v: Array, a: Array, tau: Array, /) -> None: ...
 
     def update(self, t: float, q: Array, *rest: Array) -> None:
-        """Take one sample: ``update(t, q, tau)``, or ``update(t, q, v, a, tau)`` if smooth.
+        """Process one sample: ``update(t, q, tau)``, or ``update(t, q, v, a, tau)`` if smooth.
 
         Args:
             t: Time stamp [s].
@@ -98,9 +98,9 @@ class OnlineIdentifier:
 
         Raises:
             DataError: If a number is not finite, a shape is wrong or time does not increase; the
-                sample is then as if it had never been given.
+                state does not change then.
         """
-        names = _TAKEN.get(len(rest))
+        names = _ARRAYS.get(len(rest))
         if names is None:
             raise DataError(
                 f"update takes (t, q, tau) or (t, q, v, a, tau), found {2 + len(rest)} values"
@@ -115,7 +115,7 @@ class OnlineIdentifier:
                     self._take(instant, t)
         else:
             self._check(t, *arrays)
-            if self.delay:  # nothing is filtered here, and nothing left out
+            if self.delay:  # no filter, and every sample is used
                 self.delay, self._every = 0.0, 1
                 self._pace()
             q, v, a, tau = arrays
@@ -124,12 +124,12 @@ class OnlineIdentifier:
 
     @property
     def is_ready(self) -> bool:
-        """Whether there is an estimate: the warm-up has seen enough motion."""
+        """Whether there is an estimate: the warm-up is over."""
         return self._kalman is not None
 
     @property
     def reading(self) -> Reading:
-        """What is known now."""
+        """The current estimate with its uncertainty."""
         self._require_ready()
         variance = np.maximum(np.diag(self._state.P), 0.0)
         left = np.minimum(variance / self._prior_variance, 1.0)
@@ -144,29 +144,29 @@ class OnlineIdentifier:
 
     @property
     def compared(self) -> tuple[Array, Array]:
-        """Torque at the reading's moment and what the estimate makes of it, shape (n,) each.
+        """Measured and predicted torque at the time of the reading, shape (n,) each.
 
-        The latter is NaN where a joint is at rest: its friction has no sign.
+        The prediction is NaN where a joint is at rest, since its friction has no sign.
         """
         self._require_ready()
         return self._compared
 
     @property
     def estimate(self) -> Estimate:
-        """The estimate as the batch estimators return it."""
+        """The estimate in the form of the batch estimators."""
         kalman = self._require_ready()
-        told, sigma = self._innovations.is_converged, np.sqrt(self._innovations.variance)
+        sigma = np.sqrt(self._innovations.variance)
         estimate = kalman.estimate(self._state, self.names)
-        return replace(estimate, converged=told, sigma=sigma)
+        return replace(estimate, converged=self._innovations.is_converged, sigma=sigma)
 
     def payload(self, index: int = -1) -> Payload:
-        """Return the load on the last body that explains what a change has changed by now.
+        """Return the payload on the last body that explains a change of the parameters.
 
         Args:
-            index: Which of ``changes``.
+            index: Index of the change in ``changes``.
 
         Raises:
-            DataError: If there has been no such change.
+            DataError: If there is no such change.
         """
         if not -len(self.changes) <= index < len(self.changes):
             raise DataError(f"there is no change {index}: {len(self.changes)} were flagged")
@@ -181,43 +181,46 @@ class OnlineIdentifier:
     def _require_ready(self) -> Kalman:
         if self._kalman is None:
             raise DataError(
-                f"no estimate yet: the robot has moved for {len(self._early) * self._dt:.2f} s of "
-                f"the {self.settings.warmup:g} s of the warm-up"
+                "no estimate yet: the robot has moved for "
+                f"{len(self._warmup) * self._dt:.2f} s, and the warm-up needs "
+                f"{self.settings.warmup:g} s of motion"
             )
         return self._kalman
 
     def _pace(self) -> None:
-        self._dt = self._every / self.settings.rate  # [s] between two steps of the estimator
-        # rows behind a filter are not independent
+        self._dt = self._every / self.settings.rate  # time between updates of the estimator [s]
+        # filtered rows are correlated
         self._share = min(1.0, 2.0 * self.settings.cutoff * self._dt)
 
     def _check(self, t: float, *arrays: Array) -> None:
         n = len(self.model.joints)
         if any(np.shape(x) != (n,) for x in arrays):
-            raise DataError(f"q, v, a, tau: {[np.shape(x) for x in arrays]}, wanted ({n},) each")
+            raise DataError(
+                f"q, v, a and tau have shapes {[np.shape(x) for x in arrays]}, wanted ({n},) each"
+            )
         if not (np.isfinite(t) and all(np.isfinite(x).all() for x in arrays)):
             raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
         if t <= self._now:
             raise DataError(f"t must increase, but {t:.6g} s follows {self._now:.6g} s")
 
     def _take(self, instant: Instant, now: float) -> None:
-        """Give one instant to the estimator; before the warm-up is over, keep it."""
+        """Process one instant; store it before the end of the warm-up."""
         if self._kalman is not None:
             self._step(instant, now)
             return
         v = instant[2]
         speeds = self.model.layout.drive_speeds[: len(v)]
         if (np.abs(v) >= self.settings.min_velocity * speeds).any():
-            self._early.append(instant)
-        if len(self._early) * self._dt >= self.settings.warmup:
+            self._warmup.append(instant)
+        if len(self._warmup) * self._dt >= self.settings.warmup:
             self._start()
 
     def _start(self) -> None:
-        """Set the filter up from what has been seen so far, and let it see that."""
-        t, q, v, a, tau = (np.array(x) for x in zip(*self._early, strict=True))
+        """Initialise the filter from the instants of the warm-up, then process these."""
+        t, q, v, a, tau = (np.array(x) for x in zip(*self._warmup, strict=True))
         joints, segment = self.model.joints, np.zeros(len(t), dtype=int)
-        seen = Trajectory(t, q, v, a, tau, joints, 1.0 / self._dt, segment)
-        spread = prior_spread(self.model, seen.squares, len(seen.t))
+        motion = Trajectory(t, q, v, a, tau, joints, 1.0 / self._dt, segment)
+        spread = prior_spread(self.model, motion.squares, len(motion.t))
         beta = self.mapping.to_base(self.model.standard_parameters())
         KS = self.mapping.K * spread
         C = KS @ KS.T
@@ -232,10 +235,10 @@ class OnlineIdentifier:
         detector = ChangeDetector(len(joints), s.threshold, s.drift)
         self._innovations = Innovations(rms, self._dt, s.noise_memory, s.model_error, detector)
         walk = s.walk * np.sqrt(self._dt)
-        # noise levels change as they are learnt, so they come with the weights of the rows
+        # noise levels are estimated online, so the weights of the rows include them
         self._kalman = Kalman(np.ones(len(joints)), beta, C, walk, None, self._share)
         self._state: KalmanState = self._kalman.init(len(beta))
-        early, self._early = self._early, []
+        early, self._warmup = self._warmup, []
         for instant in early:
             self._step(instant, instant[0] + self.delay)
 
@@ -245,19 +248,19 @@ class OnlineIdentifier:
         used = sure_rows(self.model.layout, v[None], self.settings.min_velocity)[0]
         Y = self._regressor(q, v, a)
         e = tau - Y @ self._state.theta
-        doubt = np.einsum("ij,ij->i", Y @ self._state.P, Y)  # variance of the prediction
+        uncertainty = np.einsum("ij,ij->i", Y @ self._state.P, Y)  # variance of the prediction
         state = kalman.update(self._state, Sample(Y, tau, used / self._innovations.variance))
-        self._remember(t)
+        self._store(t)
         self._state, self._t = state, t
         residual = tau - Y @ state.theta
         self._compared = tau, np.where(used, tau - residual, np.nan)
-        onset = self._innovations.push(t, tau, e, residual, doubt, used, self._share)
+        onset = self._innovations.push(t, tau, e, residual, uncertainty, used, self._share)
         if onset is not None:
             self._reopen(now, onset)
 
     def _reopen(self, now: float, onset: float) -> None:
-        """Go back to what was known before the change, and make the covariance wide again."""
-        # the filter smears a step over its delay, and what it let in has bent the estimate
+        """Restore the state before the change, and increase the covariance."""
+        # the filter spreads a step over its delay, which biases the estimate before the onset
         start = onset - self.delay
         clean = [state for t, state in self._recent if t <= start]
         before = clean[-1] if clean else self._recent[0][1]
@@ -266,7 +269,7 @@ class OnlineIdentifier:
         self._recent.clear()
         self._innovations.forget_convergence()
 
-    def _remember(self, t: float) -> None:
-        """Keep a state of every tenth of a second, to go back to."""
-        if not self._recent or t >= self._recent[-1][0] + _KEPT_EVERY:
+    def _store(self, t: float) -> None:
+        """Store the state every tenth of a second."""
+        if not self._recent or t >= self._recent[-1][0] + _STORED_EVERY:
             self._recent.append((t, self._state))

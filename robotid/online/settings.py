@@ -1,4 +1,4 @@
-"""How an online identification runs, and what it tells."""
+"""Settings and results of an online identification."""
 
 from dataclasses import dataclass
 
@@ -10,25 +10,25 @@ __all__ = ["Change", "OnlineSettings", "Reading"]
 
 @dataclass(frozen=True)
 class OnlineSettings(Settings):
-    """How an online identification runs."""
+    """Settings of an online identification."""
 
-    rate: float = setting(200.0, "rate of the samples, about [Hz]", within=POSITIVE)
+    rate: float = setting(200.0, "approximate rate of the samples [Hz]", within=POSITIVE)
     cutoff: float = setting(8.0, "cut-off of the causal filter [Hz]", within=POSITIVE)
     order: int = setting(4, "order of the filter, even")
     min_velocity: float = setting(
         0.02,
-        "speed below which a joint's row is left out while Coulomb friction is identified "
-        "[rad/s]; of a prismatic joint as of ``SignalSettings``",
+        "speed below which a joint's row is not used if Coulomb friction is identified [rad/s]; "
+        "for prismatic joints as in ``SignalSettings``",
         within=NOT_NEGATIVE,
     )
     warmup: float = setting(
         1.0,
-        "time of motion that scales the drive terms before the first estimate [s]",
+        "time of motion before the first estimate, which scales the drive terms [s]",
         within=POSITIVE,
     )
     walk: float = setting(
         1e-4,
-        "random walk of the parameters, as a share of their prior spread per square root of a "
+        "random walk of the parameters, relative to their prior spread, per square root of a "
         "second [s^-1/2]",
         within=NOT_NEGATIVE,
     )
@@ -40,29 +40,29 @@ class OnlineSettings(Settings):
     )
     drift: float = setting(
         4.0,
-        "squared innovation, in variances, that is no evidence of a change [-]",
+        "mean squared innovation without a change, in variances [-]",
         within=POSITIVE,
     )
     model_error: float = setting(
         0.05,
-        "share of each joint's torque that the model may miss without a change [-]",
+        "error of the model without a change, relative to each joint's torque [-]",
         within=NOT_NEGATIVE,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """What is known at one moment.
+    """The estimate at one time.
 
     Attributes:
-        t: The moment that it refers to: the newest sample's, less the delay [s].
+        t: The time of the estimate: that of the newest sample minus the delay [s].
         theta: Base parameters, shape (b,).
         std_error: Their standard errors, shape (b,).
         sigma: Noise level of each joint, shape (n,) [N m or N].
-        excitation: Share of the parameters' prior variance that the motion so far has removed, mean
-            over the parameters, 0 to 1.
+        excitation: Reduction of the parameters' prior variance by the motion so far, mean over the
+            parameters, 0 to 1.
         converged: Whether the parameters' uncertainty adds less than half a noise level to the
-            torque that they predict.
+            predicted torque.
     """
 
     t: float
@@ -78,8 +78,8 @@ class Change:
     """A step change of the parameters.
 
     Attributes:
-        flagged: When it was flagged, on the clock of the samples [s].
-        onset: When it happened, by the evidence [s].
+        flagged: Time at which it was flagged, on the clock of the samples [s].
+        onset: Estimated time of the change [s].
         theta: Base parameters before it, shape (b,).
         covariance: Their covariance, shape (b, b).
     """

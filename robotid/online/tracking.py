@@ -1,4 +1,4 @@
-"""An online identification over a recorded log, as if it came in live."""
+"""Online identification over a recorded log, sample by sample."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ __all__ = ["Observer", "Track", "track"]
 
 Observer = Callable[[int, OnlineIdentifier], None]
 
-_ROWS = 20.0  # [Hz] rows of the history per second
+_ROWS = 20.0  # rate of the rows of the history [Hz]
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +25,11 @@ class Track:
 
     Attributes:
         identifier: The identifier after the last sample.
-        t: Time stamps of the newest sample, shape (N,) [s].
+        t: Times of the newest sample, shape (N,) [s].
         theta: Base parameters, shape (N, b).
         std_error: Their standard errors, shape (N, b).
-        excitation: Share of the prior variance removed, shape (N,).
-        converged: Whether the estimate had converged, shape (N,), bool.
+        excitation: Reduction of the prior variance, shape (N,) [-].
+        converged: Whether the estimate has converged, shape (N,), bool.
     """
 
     identifier: OnlineIdentifier
@@ -40,7 +40,7 @@ class Track:
     converged: Array
 
     def columns(self) -> dict[str, Array]:
-        """Return the history by column, (N,) each: time, base parameters, standard errors."""
+        """Return the columns of the history, (N,) each: time, base parameters, standard errors."""
         table = {"time": self.t}
         for i, name in enumerate(self.identifier.names):
             table[name] = self.theta[:, i]
@@ -51,13 +51,13 @@ class Track:
 def track(
     model: RobotModel, log: Log, settings: OnlineSettings, *, observer: Observer | None = None
 ) -> Track:
-    """Give a log to an online identifier, sample by sample.
+    """Run an online identification over a log, sample by sample.
 
     Args:
         model: The robot, with a fixed base.
         log: The log, of the model's joints in its order; its q and tau are used.
-        settings: How the identification runs.
-        observer: Called after each sample with its row of the log and the identifier.
+        settings: Settings of the online identification.
+        observer: Called after each sample with the index of its row and the identifier.
 
     Raises:
         DataError: If the log is too short for a first estimate, or the base floats.
@@ -77,7 +77,7 @@ def track(
     if not readings:
         raise DataError(
             f"{log.path or 'log'}: the robot moves for less than the warm-up of "
-            f"{settings.warmup:g} s, so there is no estimate; give a longer log with motion"
+            f"{settings.warmup:g} s, so there is no estimate. Use a longer log with motion"
         )
     keys = ("theta", "std_error", "excitation", "converged")
     history = {key: np.array([getattr(reading, key) for reading in readings]) for key in keys}

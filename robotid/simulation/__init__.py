@@ -1,3 +1,3 @@
-"""Plants, controllers, motions, and the logs that they give."""
+"""Simulation: plants, controllers, motions, sensors and closed loops."""
 
 __all__: list[str] = []

@@ -1,4 +1,4 @@
-"""The simulated robot: a plant that a controller makes follow a motion, and the log of it."""
+"""The simulated robot: a plant with a controller that tracks a motion, and its log."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -30,15 +30,15 @@ from robotid.simulation.truth import another_robot
 
 __all__ = ["Noise", "Run", "another_robot", "carried", "delay", "follow", "simulate"]
 
-_LONGEST_STEP = 2.5e-3  # [s] of the integration, whatever the rate of the log
-_ELASTIC_STEP = 0.3  # of 1 / w of the fastest elastic gear
-_SHORTEST_STEP = 1e-6  # [s] of the integration; a stiffer gear is refused
-_MOST = 2e7  # steps of a simulation, half an hour's work ...
+_LONGEST_STEP = 2.5e-3  # largest step of the integration, at any rate of the log [s]
+_ELASTIC_STEP = 0.3  # largest step, relative to 1 / w of the fastest elastic gear
+_SHORTEST_STEP = 1e-6  # smallest step of the integration; a stiffer gear is refused [s]
+_MOST = 2e7  # largest number of steps of a simulation: half an hour ...
 _MOST_EACH = 100_000  # ... and between two samples
-_CHUNK = 1024  # steps that a motion is evaluated for at once
-_LEAST_INERTIA = 0.02  # [kg m^2 or kg] that PD gains are reckoned with, at least
+_CHUNK = 1024  # number of steps for which a motion is evaluated together
+_LEAST_INERTIA = 0.02  # smallest inertia in the computation of PD gains [kg m^2 or kg]
 
-# ROS34PW2, a Rosenbrock W-method: order 3 whatever matrix damps it, L-stable
+# ROS34PW2, a Rosenbrock W-method: order 3 for any Jacobian approximation, L-stable
 _GAMMA = 4.3586652150845900e-01
 _ALPHA = np.zeros((4, 4))
 _ALPHA[1, 0] = 8.7173304301691801e-01
@@ -49,20 +49,20 @@ _BELOW[1, 0] = -8.7173304301691801e-01
 _BELOW[2, :2] = -9.0338057013044082e-01, 5.4180672388095326e-02
 _BELOW[3, :3] = 2.4212380706095346e-01, -1.2232505839045147e00, 5.4526025533510214e-01
 _WEIGHTS = np.array([*_BELOW[3, :2], 1.5452602553351020e00, _GAMMA])
-_STAGES = _ALPHA.sum(axis=1)  # when each stage is, in steps
+_STAGES = _ALPHA.sum(axis=1)  # times of the stages [steps]
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """How a robot moved, exactly; arrays of shape (N, n)."""
+    """The exact motion of a robot; arrays of shape (N, n)."""
 
     t: Array  # shape (N,) [s]
     q: Array  # [rad or m]
     v: Array  # [rad/s or m/s]
     a: Array  # [rad/s^2 or m/s^2]
     tau: Array  # [N m or N]
-    reference: Array  # position that was wanted [rad or m]
-    saturated: Array  # share of the time that each drive gave its most, shape (n,) [-]
+    reference: Array  # reference position [rad or m]
+    saturated: Array  # share of the time at the torque limit of each drive, shape (n,) [-]
 
 
 def simulate(
@@ -76,18 +76,18 @@ def simulate(
     noise: Noise | None = None,
     settings: Simulation | None = None,
 ) -> Log:
-    """Return what the sensors of a simulated robot log as it follows a motion.
+    """Return the log of a simulated robot that tracks a motion.
 
     Args:
-        model: The robot as the controller believes it to be, with a fixed base.
+        model: The controller's model of the robot, with a fixed base.
         pi: The true standard parameters, shape (p,), drive terms included.
         motion: The motion to track.
         rate: Sample rate of the log [Hz].
         duration: Length of the log [s].
         rng: Source of the noise.
-        noise: Sensor noise, in the place of that of the settings.
+        noise: Sensor noise, instead of that of the settings.
         settings: Controller, actuators, sensors and payload; if None, the URDF's inverse dynamics
-            and PD without limits, and sensors without faults.
+            and PD without limits, and ideal sensors.
 
     Raises:
         DataError: If the base floats, or the simulation diverges.
@@ -109,20 +109,20 @@ def follow(
     settings: Simulation,
     progress: ProgressCallback = ignore_progress,
 ) -> Run:
-    """Return how a robot moves as it follows a motion, before any sensor.
+    """Return the exact motion of a robot that tracks a motion.
 
-    The plant is that of ``RobotPlant`` with the parameters pi. An elastic gear has the motor angle
-    th and gives tau = k dead(th - q) + d (w - v); rotor and friction are then on the motor's side.
-    It is integrated by a Rosenbrock W-method of order 3, which stays stable where friction holds.
+    The plant is ``RobotPlant`` with the parameters pi. An elastic gear has the motor angle th and
+    the torque tau = k dead(th - q) + d (w - v); rotor and friction are then on the motor's side.
+    The integrator is a Rosenbrock W-method of order 3, which is stable with stiction.
 
     Args:
-        model: As of ``simulate``.
-        pi: As of ``simulate``.
-        motion: As of ``simulate``.
-        rate: As of ``simulate``.
-        duration: As of ``simulate``.
-        settings: Controller, actuators and payload, and the side of elastic gears that is seen.
-        progress: Told of the seconds that are done.
+        model: The controller's model of the robot, with a fixed base.
+        pi: The true standard parameters, shape (p,), drive terms included.
+        motion: The motion to track.
+        rate: Sample rate of the run [Hz].
+        duration: Length of the run [s].
+        settings: Controller, actuators and payload, and the measured side of elastic gears.
+        progress: Called with the number of simulated seconds.
 
     Raises:
         DataError: If the base floats, or the simulation diverges.
@@ -143,8 +143,8 @@ def follow(
     _check_size(len(t), steps)
     h = 1.0 / rate / steps
     loop, *later = loops if deflection > 0 else loops[1:]
-    seen = np.empty((len(t), 4, len(model.joints)))
-    reference, limited = np.empty_like(seen[:, 0]), np.zeros(len(model.joints))
+    measured = np.empty((len(t), 4, len(model.joints)))
+    reference, limited = np.empty_like(measured[:, 0]), np.zeros(len(model.joints))
     y: Array | None = None
     for k, wanted in enumerate(_wanted(loop.controller, motion, len(t), steps, h)):
         if later and t[k] >= deflection - 1e-9 / rate:
@@ -152,12 +152,12 @@ def follow(
         y = loop.start(*wanted[0, 0, :3]) if y is None else y
         F = loop.friction(y)
         f = loop.rate(y, wanted[0, 0], F)
-        seen[k], reference[k] = loop.seen(y, f, wanted[0, 0]), wanted[0, 0, 0]
+        measured[k], reference[k] = loop.measured(y, f, wanted[0, 0]), wanted[0, 0, 0]
         limited += loop.is_limited(y, wanted[0, 0])
-        if not np.isfinite(seen[k]).all():
+        if not np.isfinite(measured[k]).all():
             raise DataError(
-                f"the simulation diverged at t = {t[k]:.3f} s; slow the motion down, or lower the "
-                "controller's gains or bandwidth"
+                f"the simulation diverged at t = {t[k]:.3f} s. Use a slower motion, or lower gains "
+                "or bandwidth of the controller"
             )
         if k % 1000 == 0:
             progress("simulating", round(t[k]), round(t[-1]), "s")
@@ -166,52 +166,52 @@ def follow(
                 F = F if i == 0 else loop.friction(y)
                 f = f if i == 0 else loop.rate(y, stages[0], F)
                 y = _advance(loop, y, stages, h, F, f)
-    q, v, a, tau = seen.transpose(1, 0, 2)
+    q, v, a, tau = measured.transpose(1, 0, 2)
     return Run(t, q, v, a, tau, reference, limited / len(t))
 
 
 def _check_size(samples: float, steps: int) -> None:
-    """Refuse simulations of more steps than a computer makes in an hour."""
+    """Refuse simulations with too many steps for an hour of computation."""
     if samples * steps > _MOST or steps > _MOST_EACH:
         raise SettingsError(
             f"the simulation has {samples:.3g} samples of {steps} steps each, wanted at most "
-            f"{_MOST:.0e} steps in all and {_MOST_EACH:.0e} each: lower its rate or its duration "
-            "(the motion has no gap?), or gains, bandwidth and stiffness"
+            f"{_MOST:.0e} steps in total and {_MOST_EACH:.0e} per sample. Lower the rate or the "
+            "duration (check the motion for gaps), or gains, bandwidth and stiffness"
         )
 
 
 def _wanted(
     controller: "_Torque", motion: Motion, samples: int, steps: int, h: float
 ) -> Iterator[Array]:
-    """Yield q, v, a and torque fed forward of each sample's steps and stages, (steps, 4, 4, n)."""
-    several = max(1, _CHUNK // steps)  # samples at once
+    """Yield q, v, a and feed-forward torque of each sample, (steps, stages, 4, n)."""
+    several = max(1, _CHUNK // steps)  # samples together
     for first in range(0, samples, several):
         count = min(several, samples - first)
-        begins = h * np.arange(steps * first, steps * (first + count))
-        times = (begins[:, None] + _STAGES * h).reshape(-1)
+        starts = h * np.arange(steps * first, steps * (first + count))
+        times = (starts[:, None] + _STAGES * h).reshape(-1)
         q, v, a = motion.evaluate(times)
-        grid = np.stack([q, v, a, controller.ahead(q, v, a)], axis=1)
+        grid = np.stack([q, v, a, controller.feedforward(q, v, a)], axis=1)
         yield from grid.reshape(count, steps, len(_STAGES), 4, -1)
 
 
 def carried(model: RobotModel, pi: Array, payload: Payload) -> Array:
-    """Return the parameters of a robot that carries a payload, shape (p,).
+    """Return the parameters of a robot with a payload, shape (p,).
 
     Args:
         model: The robot.
-        pi: Its parameters without it, shape (p,).
+        pi: Its parameters without the payload, shape (p,).
         payload: The payload.
 
     Raises:
         ModelError: If the URDF has no such link.
-        SettingsError: If there can be no such payload, or its link is fixed to the world.
+        SettingsError: If the payload is physically inconsistent, or its link is fixed to the world.
     """
     if payload.mass == 0.0:
         return pi
     link = payload.link or model.layout.bodies[-1]
     body, transfer = link_transfer(model, link)
     if body < 0:
-        raise SettingsError(f"payload: link {link!r} is fixed to the world; name one that moves")
+        raise SettingsError(f"payload: link {link!r} is fixed to the world. Name a moving link")
     m, c = payload.mass, np.array(payload.com)
     xx, xy, yy, xz, yz, zz = payload.inertia
     central = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -220,8 +220,8 @@ def carried(model: RobotModel, pi: Array, payload: Payload) -> Array:
     own = np.array([m, *(m * c), xx, xy, yy, xz, yz, zz])
     if np.linalg.eigvalsh(pseudo_inertia(own)[0])[0] < -1e-9 * m:
         raise SettingsError(
-            f"payload: inertia is {list(payload.inertia)}, which no body has: each moment about an "
-            "axis is at most the sum of the other two, and none is negative"
+            f"payload: inertia is {list(payload.inertia)}, which is physically inconsistent. Each "
+            "principal moment must be 0 or more, and at most the sum of the other two"
         )
     found = pi.copy()
     found[10 * body : 10 * body + 10] += transfer @ own
@@ -231,7 +231,7 @@ def carried(model: RobotModel, pi: Array, payload: Payload) -> Array:
 def _perfect(
     model: RobotModel, pi: Array, loaded: Array, motion: Motion, t: Array, deflection: float
 ) -> Run:
-    """Return the run of a robot that follows exactly, by inverse dynamics."""
+    """Return the run of a robot that tracks exactly, by inverse dynamics."""
     q, v, a = motion.evaluate(t)
     none = np.zeros_like(q)
     segment = np.zeros(len(t), dtype=int)
@@ -245,37 +245,37 @@ def _perfect(
 
 
 def delay(model: RobotModel, pi: Array, settings: Simulation) -> Array:
-    """Return how late the terms of the drives make each logged torque, shape (n,) [s].
+    """Return the delay of each logged torque by the terms of the drives, shape (n,) [s].
 
     Args:
         model: The robot.
         pi: Its true standard parameters, shape (p,).
-        settings: Those of the run; the torques of a perfect one are late already.
+        settings: Settings of the run; with a perfect controller the torques include the delay.
 
     Raises:
-        SettingsError: If a drive that turns with several joints is late.
+        SettingsError: If a drive that couples several joints has a delay.
     """
-    late = np.zeros(len(model.joints))
-    if settings.controller.kind == "perfect":  # whose inverse dynamics have it
-        return late
+    delays = np.zeros(len(model.joints))
+    if settings.controller.kind == "perfect":  # its inverse dynamics include the delay
+        return delays
     drives = pi[model.layout.n_inertial :]
     for (d, term), value in zip(model.layout.drive_parameters, drives, strict=True):
         if isinstance(term, Lag) and value:
             drive = model.layout.drives[d]
             if drive in model.layout.couplings or value < 0:
                 raise SettingsError(
-                    f"{drive.name}.lag is {value:g} s, wanted 0 or more of a joint's own drive: a "
-                    "torque that several joints share is late in none of them alone"
+                    f"{drive.name}.lag is {value:g} s, wanted 0 or more, and of a drive of one "
+                    "joint: a torque that several joints share has no delay of one joint"
                 )
-            late[d] += value
-    return late
+            delays[d] += value
+    return delays
 
 
 class _Loop:
     """The true robot and its controller as dy/dt = f(y, reference).
 
-    y has q and v of the joints, th and w of the motors if gears are elastic, then what presliding
-    has taken up.
+    y has q and v of the joints, th and w of the motors if gears are elastic, then the bristle
+    deflections of presliding.
     """
 
     def __init__(self, model: RobotModel, pi: Array, settings: Simulation) -> None:
@@ -289,12 +289,12 @@ class _Loop:
         self.longest_step = self._longest_step()
 
     def start(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the state that follows a motion from its start, gears wound up, friction slid."""
+        """Return the initial state of a motion: gears under load, friction in steady sliding."""
         moving = [q, v]
         if self.gear is not None:
             load = self.plant.bodies_torque(q, v, a)
             moving += [q + self.gear.twist(load), v]
-        _, deflection = self.plant.taking_up(v)
+        _, deflection = self.plant.bristle_rate(v)
         return np.concatenate([*moving, deflection])
 
     def friction(self, y: Array) -> Friction:
@@ -303,7 +303,7 @@ class _Loop:
         return self.plant.friction(motor, w, z)
 
     def rate(self, y: Array, wanted: Array, F: Friction) -> Array:
-        """Return dy/dt; wanted are q, v, a and the torque fed forward, shape (4, n)."""
+        """Return dy/dt; ``wanted`` has q, v, a and the feed-forward torque, shape (4, n)."""
         q, v, motor, w, z = self._parts(y)
         u = self.torque(motor, w, wanted)
         if self.gear is None:
@@ -314,25 +314,25 @@ class _Loop:
             spun = self.gear.rotors @ (u - load - self.plant.friction_torque(F, w, load))
             moved = [v, a, w, spun]
         if len(z):
-            r, end = self.plant.taking_up(w)
+            r, end = self.plant.bristle_rate(w)
             moved.append(r * (end - z))
         return np.concatenate(moved)
 
     def torque(self, q: Array, v: Array, wanted: Array) -> Array:
-        """Return what the drives give."""
+        """Return the torques of the drives."""
         u = self.controller.of(q, v, *wanted)
         return np.clip(u, -self.limit, self.limit) if self.has_limits else u
 
     def is_limited(self, y: Array, wanted: Array) -> Array | bool:
-        """Return which drives give their most, shape (n,), bool."""
+        """Return which drives are at their torque limit, shape (n,), bool."""
         if not self.has_limits:
             return False
         _, _, motor, w, _ = self._parts(y)
         limited: Array = np.abs(self.torque(motor, w, wanted)) >= self.limit
         return limited
 
-    def seen(self, y: Array, f: Array, wanted: Array) -> Array:
-        """Return q, v, a and tau where the sensors are, shape (4, n)."""
+    def measured(self, y: Array, f: Array, wanted: Array) -> Array:
+        """Return q, v, a and tau on the side of the sensors, shape (4, n)."""
         q, v, motor, w, _ = self._parts(y)
         n = self.n
         if self.gear is None or not self.is_at_motor:
@@ -343,9 +343,9 @@ class _Loop:
         return np.stack([motor, w, f[3 * n : 4 * n], self.torque(motor, w, wanted)])
 
     def damped(self, y: Array, h: float, F: Friction) -> Callable[[Array, Array], Array]:
-        """Return (f, s) -> (1 - g h J)^-1 (f + h J s), J being that of friction, g the method's.
+        """Return (f, s) -> (1 - g h J)^-1 (f + h J s), with g of the method and J of friction.
 
-        Friction falls to 0 with the speed along the chord of F(w), presliding at its rate.
+        J uses the chord of friction over speed, F(w) / w, and the rate of presliding.
         """
         q, v, motor, w, z = self._parts(y)
         load = np.zeros(self.n)
@@ -356,7 +356,7 @@ class _Loop:
                 if self.gear is None
                 else self.gear.torque(q, v, motor, w)
             )
-        r, _ = self.plant.taking_up(w) if len(z) else (z, z)
+        r, _ = self.plant.bristle_rate(w) if len(z) else (z, z)
         B = h * self.plant.chord(F, w, load)  # (n, n)
         inertia = self.plant.mass_matrix(q) if self.gear is None else self.plant.armature
         inverse = np.linalg.inv(inertia + _GAMMA * B)
@@ -373,22 +373,23 @@ class _Loop:
         return solve
 
     def _parts(self, y: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """Return q and v of the joints, those of the drives, and the states of presliding."""
+        """Return q and v of the joints, q and v of the drives, and the bristle deflections."""
         n = self.n
         if self.gear is None:
             return y[:n], y[n : 2 * n], y[:n], y[n : 2 * n], y[2 * n :]
         return y[:n], y[n : 2 * n], y[2 * n : 3 * n], y[3 * n : 4 * n], y[4 * n :]
 
     def _longest_step(self) -> float:
-        """Return the step that resolves all of it [s]."""
+        """Return the largest step that resolves the dynamics [s]."""
         if self.gear is None:
             return _LONGEST_STEP
         w = self.gear.fastest(self.plant.mass_matrix(np.zeros(self.n)) - self.plant.armature)
         step = min(_LONGEST_STEP, _ELASTIC_STEP / w)
         if step < _SHORTEST_STEP:
             raise SettingsError(
-                f"actuator: the elastic gears swing at {w / (2 * np.pi):.3g} Hz, too fast to "
-                "simulate; lower stiffness or damping, or leave them out for rigid gears"
+                f"actuator: the natural frequency of the elastic gears is {w / (2 * np.pi):.3g} "
+                "Hz, too high to simulate. Lower stiffness or damping, or leave them out for rigid "
+                "gears"
             )
         return step
 
@@ -399,7 +400,7 @@ def _advance(loop: _Loop, y: Array, wanted: Array, h: float, F: Friction, f: Arr
     Args:
         loop: The robot.
         y: The state.
-        wanted: Of each stage as of ``_Loop.rate``, shape (4, 4, n).
+        wanted: Reference of each stage as in ``_Loop.rate``, shape (4, 4, n).
         h: The step [s].
         F: Friction of the state.
         f: Rate of the state.
@@ -415,7 +416,7 @@ def _advance(loop: _Loop, y: Array, wanted: Array, h: float, F: Friction, f: Arr
 
 
 class _Gear:
-    """Springs with play between motors and joints."""
+    """Springs with backlash between motors and joints."""
 
     def __init__(self, plant: RobotPlant, actuator: Actuator) -> None:
         joints = plant.model.joints
@@ -425,37 +426,37 @@ class _Gear:
         if np.isinf(self.k).any():
             joint = joints[int(np.argmax(np.isinf(self.k)))]
             raise SettingsError(
-                f"actuator: stiffness is not stated for {joint!r}; state it for every joint"
+                f"actuator: stiffness is not stated for {joint!r}. State it for every joint"
             )
         if np.linalg.eigvalsh(plant.armature)[0] <= 0.0:
             least = joints[int(np.argmin(plant.armature.diagonal()))]
             raise SettingsError(
-                f"the motor of {least!r} has no armature, which an elastic gear needs; state it in "
-                f'[truth.values], as "{least}.armature" = 0.1 [kg m^2]'
+                f"the motor of {least!r} has no armature, which an elastic gear needs. State it in "
+                f'[truth.values], for example "{least}.armature" = 0.1 [kg m^2]'
             )
         self.rotors = np.linalg.inv(plant.armature)
 
     def torque(self, q: Array, v: Array, motor: Array, w: Array) -> Array:
-        """Return what the gears give to the joints, shape (n,)."""
+        """Return the torques of the gears on the joints, shape (n,)."""
         twist = motor - q
-        wound = twist - np.clip(twist, -self.play, self.play)
-        is_held = np.abs(twist) >= self.play
-        tau: Array = self.k * wound + self.d * (w - v) * is_held
+        deflection = twist - np.clip(twist, -self.play, self.play)
+        is_engaged = np.abs(twist) >= self.play
+        tau: Array = self.k * deflection + self.d * (w - v) * is_engaged
         return tau
 
     def twist(self, tau: Array) -> Array:
-        """Return the angle of the motor before the joint that gives a torque at rest."""
-        before: Array = tau / self.k + self.play * np.sign(tau)
-        return before
+        """Return the angle of the motor relative to the joint for a torque at rest."""
+        twist: Array = tau / self.k + self.play * np.sign(tau)
+        return twist
 
     def fastest(self, bodies: Array) -> float:
-        """Return the largest rate of the gears, of swinging or of damping [1/s]."""
-        lightest = self.rotors.diagonal() + np.linalg.inv(bodies).diagonal()
-        return float(np.max(np.maximum(np.sqrt(self.k * lightest), self.d * lightest)))
+        """Return the largest natural frequency or damping rate of the gears [1/s]."""
+        inverse = self.rotors.diagonal() + np.linalg.inv(bodies).diagonal()
+        return float(np.max(np.maximum(np.sqrt(self.k * inverse), self.d * inverse)))
 
 
 class _Torque:
-    """The controller: it knows the bodies of the URDF, its gains suit the true mass matrix."""
+    """The controller, with the bodies of the URDF and gains for the true mass matrix."""
 
     def __init__(self, model: RobotModel, settings: Controller, mass: Array) -> None:
         self.kind, self.w = settings.kind, settings.bandwidth
@@ -465,26 +466,28 @@ class _Torque:
             by_joint(x, model.joints, f"controller: {name}", np.nan)
             for name, x in (("kp", settings.kp), ("kd", settings.kd))
         ]
-        usual = inertia * self.w**2, 2 * inertia * self.w
-        self.kp, self.kd = (np.where(np.isnan(x), y, x) for x, y in zip(stated, usual, strict=True))
+        default = inertia * self.w**2, 2 * inertia * self.w
+        self.kp, self.kd = (
+            np.where(np.isnan(x), y, x) for x, y in zip(stated, default, strict=True)
+        )
 
-    def ahead(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the torque that is fed forward along a motion, shape (N, n)."""
+    def feedforward(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the feed-forward torque along a motion, shape (N, n)."""
         if self.kind != "feedforward":
             return np.zeros_like(q)
         return np.stack([self.nominal.bodies_torque(*one) for one in zip(q, v, a, strict=True)])
 
-    def of(self, q: Array, v: Array, q_r: Array, v_r: Array, a_r: Array, ahead: Array) -> Array:
-        """Return the torque that is asked of the drives, shape (n,)."""
+    def of(self, q: Array, v: Array, q_r: Array, v_r: Array, a_r: Array, forward: Array) -> Array:
+        """Return the torque command of the drives, shape (n,)."""
         if self.kind == "computed_torque":
             w = self.w
             return self.nominal.bodies_torque(q, v, a_r + w**2 * (q_r - q) + 2 * w * (v_r - v))
-        u: Array = ahead + self.kp * (q_r - q) + self.kd * (v_r - v)
+        u: Array = forward + self.kp * (q_r - q) + self.kd * (v_r - v)
         return u
 
 
 def _limits(model: RobotModel, actuator: Actuator) -> Array:
-    """Return the most that each drive gives, shape (n,) [N m or N]; infinite without a limit."""
+    """Return the torque limit of each drive, shape (n,) [N m or N]; infinite without a limit."""
     stated = by_joint(actuator.limits, model.joints, "actuator: limits", np.nan)
     share = actuator.effort
     urdf = [share * j.effort if share and j.effort > 0 else np.inf for j in model.limits]

@@ -1,6 +1,6 @@
-"""What loops are told on average over each step, and where their steps begin, in Numba.
+"""Commands averaged over each step, and the division of rows into steps, in Numba.
 
-Imported only where a loop is simulated.
+Imported only for closed-loop simulations.
 """
 
 import numpy as np
@@ -12,44 +12,44 @@ __all__ = ["average_command", "divide_rows"]
 
 @compiled
 def average_command(stamps, values, times, delay, mean, change):
-    """Write what a drive is told on average over each step, and how that changes with the delay.
+    """Write the mean command over each step, and its derivative by the delay.
 
     Args:
-        stamps: When each value is sent, shape (N,) [s]; it holds until the next.
-        values: Shape (N,).
-        times: Where the steps begin and end, shape (K + 1,) [s].
-        delay: How much later it acts [s].
+        stamps: Times of the values, shape (N,) [s]; each is constant until the next.
+        values: Values of the command, shape (N,).
+        times: Ends of the steps, shape (K + 1,) [s].
+        delay: Delay of the command [s].
         mean: Shape (K,); written.
         change: Derivative of the mean by the delay, shape (K,); written.
     """
     last, i = len(stamps) - 1, 0
-    begin = times[0] - delay
-    while i < last and stamps[i + 1] <= begin:
+    start = times[0] - delay
+    while i < last and stamps[i + 1] <= start:
         i += 1
     for k in range(len(mean)):
-        end, before, at, total = times[k + 1] - delay, values[i], begin, 0.0
+        end, before, at, total = times[k + 1] - delay, values[i], start, 0.0
         while i < last and stamps[i + 1] <= end:
             total += values[i] * (stamps[i + 1] - at) if stamps[i + 1] > at else 0.0
             at = max(at, stamps[i + 1])
             i += 1
         total += values[i] * (end - at)
-        mean[k] = total / (end - begin)
-        change[k] = (before - values[i]) / (end - begin)
-        begin = end
+        mean[k] = total / (end - start)
+        change[k] = (before - values[i]) / (end - start)
+        start = end
 
 
 @compiled
 def divide_rows(stamps, ticks, times, is_tick):
-    """Write where steps begin and end, as many from each row to the next, none across a tick.
+    """Write the ends of the steps: an equal number in each row, and none across a tick.
 
-    Ticks divide a row; the longest steps are halved, then cut in three and so on, until there are
-    as many as in other rows.
+    Ticks divide a row. The longest steps are divided further, into two, three and so on, until the
+    row has the required number.
 
     Args:
-        stamps: Of the rows, shape (N,) [s].
-        ticks: Those after the first row, ascending; one at a row is its stamp [s].
+        stamps: Times of the rows, shape (N,) [s].
+        ticks: Ticks after the first row, ascending; a tick at a row has the time of the row [s].
         times: Shape ((N - 1) every + 1,); written.
-        is_tick: Whether a step begins at a tick, or is the first, shape ((N - 1) every,); written.
+        is_tick: Whether a step starts at a tick, or is the first, shape ((N - 1) every,); written.
     """
     every, i = len(is_tick) // (len(stamps) - 1), 0
     edges, shares = np.empty(every + 1), np.empty(every, np.int64)

@@ -1,7 +1,7 @@
-"""Laws of drives for roll-outs, with their derivatives, in Numba: friction, and position control.
+"""Laws of drives in closed-loop simulations, with derivatives, in Numba: friction and control.
 
-Imported only where a loop is simulated. The laws are those of the terms of ``drives``, compiled
-one by one: what is compiled here calls a law by its address.
+Imported only for closed-loop simulations. The laws are those of the terms of ``drives``, compiled
+one by one; the code here calls a law by its address.
 """
 
 import math
@@ -12,25 +12,26 @@ from robotid.regressor.lanes import applied, compiled, pointed
 from robotid.robot.drive_term import BRISTLES, PLAIN, DriveTerm, Law, MemorylessTerm
 from robotid.robot.drives import Bristles
 
-__all__ = ["coded_term", "deflection", "loop_torque", "slid", "term", "turned"]
+__all__ = ["coded_term", "deflection", "direction", "initial_deflection", "loop_torque", "term"]
 
-_SIGN = 1e-5  # [rad/s or m/s]: the speed over which friction turns
+_SIGN = 1e-5  # speed over which friction reverses [rad/s or m/s]
 
 _bristles = compiled(Bristles.law)
 _pointed = cache(pointed)
 
 
 def coded_term(term: DriveTerm) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """Return what ``term`` and ``deflection`` take of a term: its codes, five, and numbers, eleven.
+    """Return a term for ``term`` and ``deflection``: five codes and eleven numbers.
 
-    Codes are the addresses of its laws of speed and position, 0 of none, its kind, and how many
-    numbers shape the one and the other. Numbers are four of each, and the ranges.
+    The codes are the addresses of its laws of speed and position (0 without one), its kind, and the
+    number of shape parameters of each law. The numbers are four shape parameters of each law, and
+    the ranges.
 
     Args:
         term: The term.
 
     Raises:
-        SettingsError: If roll-outs have no such term.
+        SettingsError: If the simulation has no such term.
     """
     if isinstance(term, Bristles):
         return (0, 0, BRISTLES, 0, 0), (*term.numbers, *[0.0] * 8)
@@ -40,9 +41,9 @@ def coded_term(term: DriveTerm) -> tuple[tuple[int, ...], tuple[float, ...]]:
         shapes = *a, *[0.0] * (4 - len(a)), *b, *[0.0] * (4 - len(b))
         return (*laws, term.kind, len(a), len(b)), (*shapes, *term.ranges)
     raise SettingsError(
-        f"the term {type(term).__name__} has no place in roll-outs: it delays the measured torque, "
-        "and in a roll-out the commands are late; leave it out, and set delay in [controller] or "
-        "have it identified"
+        f"the term {type(term).__name__} is not possible in a closed-loop simulation: it delays "
+        "the measured torque, whereas the simulation delays the commands. Leave the term out, and "
+        "set delay in [controller] or leave delay out, so that it is fitted"
     )
 
 
@@ -52,7 +53,7 @@ def _address(law: Law | None, shapes: int) -> int:
 
 @compiled
 def _law(address, shapes, z, x0, x1, x2, x3):
-    """Return a law of a speed or position and of as many numbers as shape it, and its slope."""
+    """Return the value of a law of a speed or position with its shape parameters, and its slope."""
     if shapes == 0:
         return applied(address, (z,))
     if shapes == 1:
@@ -66,14 +67,14 @@ def _law(address, shapes, z, x0, x1, x2, x3):
 
 @compiled
 def term(codes, shapes, k, q, u, s, s_u):
-    """Return what a term's parameter multiplies, and its derivatives by speed and position.
+    """Return the regressor of a term, and its derivatives by speed and position.
 
-    ``s`` and ``s_u`` are of ``turned``; the load of the gear is left out.
+    ``s`` and ``s_u`` are of ``direction``; the joint load torque is left out.
     """
     by_speed, by_position, kind = codes[k, 0], codes[k, 1], codes[k, 2]
     x, a, a_u, b, b_q = shapes[k], 1.0, 0.0, 1.0, 0.0
     if by_speed:
-        w = min(max(u, -x[8]), x[8])  # beyond what was seen it stays as it is
+        w = min(max(u, -x[8]), x[8])  # constant outside the range of the data
         a, a_u = _law(by_speed, codes[k, 3], w, x[0], x[1], x[2], x[3])
         a_u = a_u if w == u else 0.0
     if by_position:
@@ -86,40 +87,40 @@ def term(codes, shapes, k, q, u, s, s_u):
 
 
 @compiled
-def turned(u, over=_SIGN):
-    """Return the direction of friction, which turns over a speed, and its derivative."""
+def direction(u, over=_SIGN):
+    """Return the direction of friction, which reverses over a small speed, and its derivative."""
     root = math.sqrt(u * u + over * over)
     return u / root, over * over / (root * root * root)
 
 
 @compiled
 def deflection(x, before, u, span):
-    """Return z after a time at the speed u, and its derivatives by u and by z before."""
-    g, g_u, kept = _bristles(x, span * u, u)
-    s = 1.0 if u > 0.0 or (u == 0.0 and before < 0.0) else -1.0  # at rest, of the stiffer side
-    kept_u = -kept * s * span / (x[0] * g) * (1.0 - u * g_u / g)
-    z_u = s * g_u * (1.0 - kept) + (before - s * g) * kept_u
-    return s * g + (before - s * g) * kept, z_u, kept
+    """Return the deflection z after a time at speed u, and its derivatives by u and z before."""
+    g, g_u, decay = _bristles(x, span * u, u)
+    s = 1.0 if u > 0.0 or (u == 0.0 and before < 0.0) else -1.0  # at rest: the stiffer side
+    decay_u = -decay * s * span / (x[0] * g) * (1.0 - u * g_u / g)
+    z_u = s * g_u * (1.0 - decay) + (before - s * g) * decay_u
+    return s * g + (before - s * g) * decay, z_u, decay
 
 
 @compiled
-def slid(x, v, time):
-    """Return z of a drive that has moved for a time, and its derivative by the speed v.
+def initial_deflection(x, v, time):
+    """Return the deflection z of a drive that has moved for a time, and its derivative by speed.
 
-    It is that of long sliding, but of one that takes longer to go its way.
+    It is that of steady sliding, unless the drive needs more time for its displacement.
     """
     g, g_v, _ = _bristles(x, 0.0, v)
-    s, s_v = turned(v, x[0] / time)
+    s, s_v = direction(v, x[0] / time)
     return s * g, s_v * g + s * g_v
 
 
 @compiled
-def loop_torque(drive, reach, slip, forward):
-    """Return the torque that a loop commands, and 1 where its limit leaves it free, else 0.
+def loop_torque(drive, error, speed_error, forward):
+    """Return the torque that a loop commands, and 1 below its limit, else 0.
 
-    ``drive`` holds armature, kp, kd and largest torque; ``reach`` and ``slip`` are the errors of
-    position and speed, ``forward`` is the torque commanded beside them.
+    ``drive`` has armature, kp, kd and torque limit; ``error`` and ``speed_error`` are the errors of
+    position and speed, ``forward`` is the feed-forward torque.
     """
-    asked, limit = drive[1] * reach + drive[2] * slip + forward, drive[3]
-    is_free = abs(asked) < limit
-    return asked if is_free else math.copysign(limit, asked), 1.0 if is_free else 0.0
+    unlimited, limit = drive[1] * error + drive[2] * speed_error + forward, drive[3]
+    is_free = abs(unlimited) < limit
+    return unlimited if is_free else math.copysign(limit, unlimited), 1.0 if is_free else 0.0

@@ -1,7 +1,8 @@
-"""Roll-outs: what a robot does on command, its drives closing their loops, beside its logs.
+"""Closed-loop simulation of windows of logs, with sensitivities.
 
-A robot with a fixed base falls into parts that the base alone joins, as the legs of a quadruped;
-each is simulated by itself. Windows of logs go side by side in the lanes of the compiled code.
+A robot with a fixed base consists of parts that only the base joins, such as the legs of a
+quadruped; each part is simulated independently. The lanes of the compiled code simulate several
+windows in parallel.
 """
 
 import math
@@ -39,26 +40,26 @@ __all__ = [
     "open_loops",
 ]
 
-#: Kind, joint and index of what a roll-out is differentiated by; see ``loop_lanes``.
+#: Kind, joint and index of a parameter of the sensitivities; see ``loop_lanes``.
 Column: TypeAlias = tuple[int, int, int]
 
-_GAP = 3.0  # median steps: across a longer one nothing is simulated
-_AROUND = 0.03  # [s] about the first sample, whose slope is the speed a roll-out starts with
-_FEWEST = 2  # samples on each side for it
-_SHORT = 0.5  # of a window: a rest of that size joins the window before it
-_SAME = 1e-3  # of a tick, by which it may be off a row that is sent at it
-_FASTEST = 1e6  # [rad/s or m/s] of a joint whose held loop runs away
+_GAP = 3.0  # step in time above which a segment ends [median steps]
+_AROUND = 0.03  # half-width of the fit for the initial speed [s]
+_FEWEST = 2  # smallest number of samples on each side of that fit
+_SHORT = 0.5  # smallest last window; a shorter one is part of the previous one [windows]
+_SAME = 1e-3  # largest difference of a tick from the row at the same time [ticks]
+_FASTEST = 1e6  # speed above which a closed loop is unstable [rad/s or m/s]
 
 
 @dataclass(frozen=True, eq=False)
 class Loops:
-    """What bodies and drives are, and how the drives close their loops.
+    """Parameters of bodies, drives and the drives' control loops.
 
-    torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref, at most ``limit``, the commands ``delay``
-    late; position 0 of a joint's encoder is position ``zero`` of the URDF. With a ``rate``, all are
-    those of the controller's last tick, and the torque stays until its next. Ticks are counted from
-    the first row of a log; a command counts by its share of a row from the tick on, so that a delay
-    of part of a row lies between those of whole ones.
+    torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref, at most ``limit``, with commands delayed by
+    ``delay``; position 0 of a joint's encoder is position ``zero`` of the URDF. With a ``rate``,
+    the controller samples all signals at its ticks, with a zero-order hold of the torque. Ticks are
+    counted from the first row of a log. A command at a tick is averaged over the row after the
+    tick, so that a delay of part of a row interpolates between whole rows.
 
     Attributes:
         bodies: Ten inertial parameters of each body, shape (n, 10), in the order of the layout.
@@ -70,7 +71,7 @@ class Loops:
         zero: Shape (n,) [rad or m].
         terms: Friction and offset of each joint.
         values: Their parameters, joint by joint, shape (T,).
-        rate: Ticks of the controller per second [Hz]; None: it has no clock.
+        rate: Sampling rate of the controller [Hz]; None: continuous time.
     """
 
     bodies: Array
@@ -85,17 +86,17 @@ class Loops:
     rate: float | None = None
 
     def place(self, joint: int, term: DriveTerm) -> int:
-        """Return where the parameter of a joint's term stands in ``values``.
+        """Return the index of the parameter of a joint's term in ``values``.
 
         Args:
-            joint: Number of the joint.
+            joint: Index of the joint.
             term: One of its terms.
         """
         return sum(map(len, self.terms[:joint])) + self.terms[joint].index(term)
 
 
 def open_loops(model: RobotModel, pi: Array) -> Loops:
-    """Return bodies and drives of standard parameters, their loops open: no gain, no delay.
+    """Return bodies and drives of standard parameters without control: no gain, no delay.
 
     Args:
         model: The robot.
@@ -121,46 +122,46 @@ def open_loops(model: RobotModel, pi: Array) -> Loops:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A segment of a log of commands that is simulated from what was measured where it begins.
+    """A segment of a log of commands that is simulated from its measured initial state.
 
     Attributes:
         log: The log, with commands.
-        begin: Sample at which the roll-out begins.
-        first: First sample that counts; those before let what is wrong at the start die away.
+        start_row: First simulated sample.
+        first: First counted sample; before it, the error of the initial state decays.
         stop: Sample after the last one.
-        given: Position and speed where it begins, shape (2, n); those measured if None.
+        given: Initial position and speed, shape (2, n); the measured ones if None.
     """
 
     log: Log
-    begin: int
+    start_row: int
     first: int
     stop: int
     given: Array | None = None
 
     @property
     def counted(self) -> slice:
-        """The samples that count."""
+        """The counted samples."""
         return slice(self.first, self.stop)
 
     @property
     def around(self) -> Array:
-        """Mean position about where it begins, shape (n,): that of a joint at rest."""
+        """Mean position about the first sample, shape (n,): that of a joint at rest."""
         mean: Array = self.log.q[self._near].mean(axis=0)
         return mean
 
     @property
     def _near(self) -> slice:
-        """The samples about where it begins."""
+        """The samples about the first one."""
         dt = float(np.median(np.diff(self.log.t)))
         wide = max(_FEWEST, round(_AROUND / dt))
-        return slice(max(self.begin - wide, 0), min(self.begin + wide + 1, len(self.log.t)))
+        return slice(max(self.start_row - wide, 0), min(self.start_row + wide + 1, len(self.log.t)))
 
     @cached_property
     def start(self) -> Array:
-        """Position and speed where it begins, shape (2, n)."""
+        """Initial position and speed, shape (2, n)."""
         if self.given is not None:
             return self.given
-        t, q, k = self.log.t, self.log.q, self.begin
+        t, q, k = self.log.t, self.log.q, self.start_row
         near = self._near
         along, order = t[near] - t[k], min(2, len(t[near]) - 1)
         fit = np.polynomial.polynomial.polyfit(along, q[near], order)
@@ -173,7 +174,7 @@ def cut_windows(log: Log, length: float, lead: float) -> tuple[Window, ...]:
     Args:
         log: The log, with commands.
         length: Their length [s]; infinite for whole segments.
-        lead: How long before what counts a roll-out begins, where the segment has that [s].
+        lead: Simulated time before the counted samples, where the segment has it [s].
     """
     steps = np.diff(log.t)
     dt = float(np.median(steps))
@@ -196,15 +197,15 @@ def cut_windows(log: Log, length: float, lead: float) -> tuple[Window, ...]:
 
 @dataclass(frozen=True, eq=False)
 class RollOut:
-    """What a window came out as.
+    """The simulated motion of a window.
 
     Attributes:
-        window: Which one.
-        q: Positions of the samples that count, shape (N, n) [rad or m].
-        v: Speeds, likewise.
-        slopes: For each part of the robot its joints, shape (k,), the sensitivities that move them,
-            by number in order, shape (c,), and the derivatives of their positions, shape (N, k, c);
-            where those of speeds were asked for, they follow, shape (N, 2k, c).
+        window: The window.
+        q: Positions of the counted samples, shape (N, n) [rad or m].
+        v: Speeds of the counted samples, shape (N, n) [rad/s or m/s].
+        slopes: For each part of the robot: its joints, shape (k,); the indices of its
+            sensitivities, ascending, shape (c,); and the derivatives of its positions, shape
+            (N, k, c), or of its positions and speeds, shape (N, 2k, c).
     """
 
     window: Window
@@ -215,15 +216,15 @@ class RollOut:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A part of the robot that the base alone joins to others, as the compiled code takes it."""
+    """A part of the robot that only the base joins to others, for the compiled code."""
 
-    joints: Array  # rows of its joints in the model, (k,)
-    bodies: Array  # their bodies in the layout, (k,)
+    joints: Array  # indices of its joints in the model, (k,)
+    bodies: Array  # indices of their bodies in the layout, (k,)
     tree: Tree
 
 
 class ClosedLoopRobot:
-    """A robot whose drives close their loops, to be simulated."""
+    """Simulator of a robot with closed-loop drives."""
 
     def __init__(self, model: RobotModel, *, step: float = 2e-3, corrects: bool = False) -> None:
         """Flatten a robot.
@@ -231,16 +232,17 @@ class ClosedLoopRobot:
         Args:
             model: The robot.
             step: Longest step of the integration [s].
-            corrects: Whether each step is solved once more, at its middle; it has no derivatives.
+            corrects: Whether each step is solved a second time, at its midpoint; such roll-outs
+                have no derivatives.
 
         Raises:
-            SettingsError: If the robot floats, a drive turns with several joints, or a joint is of
-                a kind that is not compiled.
+            SettingsError: If the base floats, a drive couples several joints, or the compiled code
+                has no joint of some type.
         """
         if model.free_flyer or model.layout.couplings or model.mimic == "coupled":
             raise SettingsError(
-                f"{model.name}: a floating base, drives that turn with several joints and coupled "
-                "mimic joints cannot be simulated; fix the base, leave out [[coupling]], and set "
+                f"{model.name}: a floating base, drives that couple several joints and coupled "
+                "mimic joints cannot be simulated. Fix the base, leave out [[coupling]], and set "
                 "mimic = 'independent'"
             )
         if (why := why_not(model)) is not None:
@@ -250,7 +252,7 @@ class ClosedLoopRobot:
 
     @property
     def kinds(self) -> dict[str, int]:
-        """What a roll-out is differentiated by, as columns number it."""
+        """Numbers of the kinds of sensitivities, by name."""
         lanes = _lanes()
         return {
             "armature": lanes.ARMATURE,
@@ -258,7 +260,7 @@ class ClosedLoopRobot:
             "kd": lanes.KD,
             "limit": lanes.LIMIT,
             "term": lanes.TERM,
-            "delay": lanes.LATE,
+            "delay": lanes.DELAY,
             "zero": lanes.ZERO,
             "body": lanes.INERTIAL,
             "start": lanes.START,
@@ -267,7 +269,7 @@ class ClosedLoopRobot:
 
     @property
     def parts(self) -> tuple[Array, ...]:
-        """The joints of each part that moves by itself."""
+        """The joints of each independent part."""
         return tuple(part.joints for part in self._parts)
 
     @property
@@ -290,19 +292,20 @@ class ClosedLoopRobot:
         owners: Sequence[int] | None = None,
         with_speeds: bool = False,
     ) -> list[RollOut]:
-        """Return what windows come out as.
+        """Return the simulated motion of windows.
 
         Args:
             loops: Bodies, drives and loops.
             windows: The windows.
-            columns: What to differentiate by: kind, joint, and index of a term or a direction.
-            directions: Changes of a body's ten parameters, shape (D, 10).
-            owners: Number of the sensitivity that each column belongs to, as of a parameter that
-                joints share: the sum of its columns. Each column is its own if None; starts are.
+            columns: Parameters of the sensitivities: kind, joint, and index of a term or direction.
+            directions: Directions in a body's ten parameters, shape (D, 10).
+            owners: Index of the sensitivity of each column. A sensitivity is the sum of its
+                columns, for a parameter that joints share; with None, and for initial states, each
+                column is a sensitivity.
             with_speeds: Whether speeds are differentiated, too.
 
         Raises:
-            NotConvergedError: If a step has no solution, as where friction falls below 0.
+            NotConvergedError: If a step has no solution, for example with negative friction.
         """
         wanted = np.array(columns, dtype=np.int64).reshape(-1, 3)
         numbers = np.arange(len(wanted)) if owners is None else np.array(owners, dtype=np.int64)
@@ -321,15 +324,15 @@ class ClosedLoopRobot:
         for b, block in enumerate(blocks):
             parts = list(zip(self._parts, done[b * each : (b + 1) * each], strict=True))
             for lane, window in enumerate(block):
-                kept = slice(window.first - window.begin, window.stop - window.begin)
-                q, v = np.empty((2, kept.stop - kept.start, n))
+                counted = slice(window.first - window.start_row, window.stop - window.start_row)
+                q, v = np.empty((2, counted.stop - counted.start, n))
                 slopes = []
                 for part, (numbers_of, q_part, v_part, S) in parts:
                     q[:, part.joints], v[:, part.joints] = (
-                        q_part[kept, :, lane],
-                        v_part[kept, :, lane],
+                        q_part[counted, :, lane],
+                        v_part[counted, :, lane],
                     )
-                    slopes.append((part.joints, numbers_of, S[kept, :, :, lane]))
+                    slopes.append((part.joints, numbers_of, S[counted, :, :, lane]))
                 found.append(RollOut(window, q, v, tuple(slopes) if len(wanted) else ()))
         return found
 
@@ -344,7 +347,7 @@ class ClosedLoopRobot:
     ) -> tuple[Array, Array, Array, Array]:
         """Return sensitivities, positions, speeds and derivatives of a part in a block of windows.
 
-        Columns that are wanted are rows of kind, joint, index and number of the sensitivity.
+        ``wanted`` has a row for each column: kind, joint, index, and index of the sensitivity.
         """
         lanes = _lanes()
         own, n = part.joints, len(part.joints)
@@ -384,12 +387,12 @@ class ClosedLoopRobot:
         return numbers, q, v, S
 
     def _why_not(self, joints: Array, loops: Loops, q: Array) -> str:
-        """Return why a part with these joints, which begins at q, has no roll-out."""
+        """Return why a part with these joints and the initial position q has no roll-out."""
         names = listed(self.model.joints[j] for j in joints)
         if loops.rate is None:
             return (
-                f"the roll-out of {names} has no solution: friction below 0, or gains too high for "
-                f"steps of {self.step:g} s"
+                f"the simulation of {names} has no solution: a friction parameter is negative, or "
+                f"the gains are too high for steps of {self.step:g} s"
             )
         pi = self.model.standard_parameters()
         pi[: self.model.layout.n_inertial] = loops.bodies.reshape(-1)
@@ -400,18 +403,18 @@ class ClosedLoopRobot:
         least = 0.5 * np.linalg.eigvals(np.linalg.solve(M, np.diag(kd))).real.max()
         least = max([least, *(0.5 * kp[kd > 0] / kd[kd > 0])])
         return (
-            f"the roll-out of {names} runs away: a controller of {loops.rate:g} Hz holds its "
-            f"torques too long. Gains kp {listed(f'{x:.3g}' for x in kp)} and kd "
-            f"{listed(f'{x:.3g}' for x in kd)} need some {least:.3g} Hz with these inertias; state "
-            "the rate at which the drives close their loops in [controller], or leave it out"
+            f"the simulation of {names} is unstable: the controller's rate of {loops.rate:g} Hz is "
+            f"too low. Gains kp {listed(f'{x:.3g}' for x in kp)} and kd "
+            f"{listed(f'{x:.3g}' for x in kd)} need about {least:.3g} Hz with these inertias. "
+            "State the sampling rate of the drives' controllers in [controller], or leave it out"
         )
 
     def _course(self, part: _Part, windows: Sequence[Window], loops: Loops) -> "Course":
-        """Return what the joints of a part are told in a block of windows."""
+        """Return the commands of a part's joints in a block of windows."""
         from robotid.simulation.course_lanes import average_command  # imports Numba
 
         lanes = _lanes()
-        samples = max(window.stop - window.begin for window in windows)
+        samples = max(window.stop - window.start_row for window in windows)
         grids = [_Grid.of(window, samples, loops.rate) for window in windows]
         every = max(grid.least_steps(self.step, loops.rate) for grid in grids)
         size, n = (samples - 1) * every, len(part.joints)
@@ -419,24 +422,24 @@ class ClosedLoopRobot:
         steps, start = np.empty((size, lanes.LANES)), np.empty((2, n, lanes.LANES))
         ticks = np.zeros((0 if loops.rate is None else size, lanes.LANES), dtype=bool)
         for lane in range(lanes.LANES):
-            if lane >= len(windows):  # lanes that nobody asked for do what the first one does
+            if lane >= len(windows):  # unused lanes copy the first one
                 command[..., lane], steps[:, lane] = command[..., 0], steps[:, 0]
                 start[..., lane], ticks[:, lane] = start[..., 0], ticks[:, 0]
                 continue
             log, (times, is_tick) = windows[lane].log, grids[lane].divided(every)
             steps[:, lane] = np.diff(times)
             start[..., lane] = windows[lane].start[:, part.joints]
-            told, of_step = times, np.arange(size)
+            edges, of_step = times, np.arange(size)
             if loops.rate is not None:
                 ticks[:, lane], of_step = is_tick, 2 * (np.cumsum(is_tick) - 1)
-                told = grids[lane].heard(times[:-1][is_tick])
-            mean, change = np.empty((2, len(told) - 1))
+                edges = grids[lane].sampled(times[:-1][is_tick])
+            mean, change = np.empty((2, len(edges) - 1))
             for values, k, by_delay in ((log.q_ref, 0, 1), (log.v_ref, 2, 4), (log.tau_ref, 3, 5)):
                 if values is None:
                     continue
                 for i, j in enumerate(part.joints):
                     x = np.ascontiguousarray(values[:, j])
-                    average_command(log.t, x, told, loops.delay[j], mean, change)
+                    average_command(log.t, x, edges, loops.delay[j], mean, change)
                     command[:, i, k, lane] = mean[of_step]
                     command[:, i, by_delay, lane] = change[of_step]
         course: Course = lanes.Course(command, steps, ticks, every, start)
@@ -445,16 +448,16 @@ class ClosedLoopRobot:
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """What the steps of a window divide."""
+    """Rows and controller ticks of a window, which the integration steps divide."""
 
-    stamps: Array  # of its rows, and after them as many as other windows have, shape (N,) [s]
-    ticks: Array  # of the controller after the first row, to the first that no step reaches [s]
-    dt: float  # median of the log's rows [s]
+    stamps: Array  # of its rows, continued to the number of rows of the longest window, (N,) [s]
+    ticks: Array  # of the controller after the first row, to the first one after the last row [s]
+    dt: float  # median step of the log [s]
 
     @classmethod
     def of(cls, window: Window, samples: int, rate: float | None) -> "_Grid":
-        """Return the grid of a window, continued at the log's median."""
-        t = window.log.t[window.begin : window.stop]
+        """Return the grid of a window, continued with the log's median step."""
+        t = window.log.t[window.start_row : window.stop]
         dt = float(np.median(np.diff(window.log.t)))
         stamps = np.concatenate([t, t[-1] + dt * np.arange(1, samples - len(t) + 1)])
         if rate is None:
@@ -466,23 +469,23 @@ class _Grid:
             ticks = np.where(np.abs(ticks - stamps[row]) < _SAME / rate, stamps[row], ticks)
         return cls(stamps, ticks[ticks > stamps[0]], dt)
 
-    def heard(self, ticks: Array) -> Array:
-        """Return from when to when ticks take their commands: a row, but no longer than a tick."""
+    def sampled(self, ticks: Array) -> Array:
+        """Return start and end of the command average of ticks: one row, but at most one tick."""
         after = self.ticks[np.searchsorted(self.ticks, self.stamps[-1])]
         ends = ticks + np.minimum(self.dt, np.diff(ticks, append=after))
         return np.stack([ticks, ends], axis=1).reshape(-1)
 
     def least_steps(self, step: float, rate: float | None) -> int:
-        """Return how many steps a row needs: as many make a tick, and end at each tick."""
+        """Return the number of steps of a row, so that steps divide ticks and end at each."""
         tick = math.inf if rate is None else 1.0 / rate
         longest = step if math.isinf(tick) else tick / math.ceil(tick / step - 1e-9)
-        usual = math.ceil(self.dt / longest - 1e-9)
+        typical = math.ceil(self.dt / longest - 1e-9)
         inside = np.diff(np.searchsorted(self.ticks, self.stamps))
         at_rows = np.isin(self.stamps[:-1], self.ticks)
-        return max(1, usual, int((inside - at_rows).max()) + 1)
+        return max(1, typical, int((inside - at_rows).max()) + 1)
 
     def divided(self, every: int) -> tuple[Array, Array]:
-        """Return where steps begin and end, and which begin with a tick."""
+        """Return the ends of all steps, and which steps start with a tick."""
         size = (len(self.stamps) - 1) * every
         times, is_tick = np.empty(size + 1), np.empty(size, dtype=bool)
         from robotid.simulation.course_lanes import divide_rows  # imports Numba
@@ -492,7 +495,7 @@ class _Grid:
 
 
 def _parts(tree: Tree) -> list[_Part]:
-    """Return the parts of a robot that the world alone joins."""
+    """Return the parts of a robot that only the world joins."""
     root: list[int] = []
     for i, parent in enumerate(tree.parents):
         root.append(i if parent < 0 else root[parent])
@@ -504,11 +507,11 @@ def _parts(tree: Tree) -> list[_Part]:
 
 
 def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
-    """Return where the terms of joints stand in ``loops.values``, those of a joint side by side.
+    """Return the indices in ``loops.values`` of the terms of joints, joint by joint.
 
-    With where in that row the terms of each joint begin, where bristles and affine terms follow,
-    and the end, shape (n, 3); and what affine terms sum up to, by 1, the speed and its direction,
-    shape (n, 3).
+    Also, for each joint, the index of its first term, of its first bristle or affine term, and of
+    its end, shape (n, 3); and the sums of its affine terms: constant, by the speed, and by its
+    direction, shape (n, 3).
     """
     first = np.cumsum([0, *map(len, loops.terms)])
     places, spans, affine = list[int](), [], np.zeros((len(joints), 3))

@@ -1,4 +1,4 @@
-"""Motions to follow: Fourier series within limits, quintics from rest to rest, samples."""
+"""Reference motions: Fourier series within limits, quintics from rest to rest, samples."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,10 +14,10 @@ __all__ = ["FourierTrajectory", "Motion", "ProgramMotion", "SampledMotion", "ran
 
 _ORDER = 5  # of the polynomials through samples
 _HARMONICS = 5  # of a random motion
-_ROTARY_REACH = 1.2  # [rad] amplitude of a joint whose limits are wider or unknown
-_LINEAR_REACH = 0.15  # [m]
-_ROTARY_SPEED = 1.5  # [rad/s] peak speed where the limit is higher or unknown
-_LINEAR_SPEED = 0.3  # [m/s]
+_ROTARY_AMPLITUDE = 1.2  # largest amplitude of a revolute joint [rad]
+_LINEAR_AMPLITUDE = 0.15  # largest amplitude of a prismatic joint [m]
+_ROTARY_SPEED = 1.5  # largest peak speed of a revolute joint [rad/s]
+_LINEAR_SPEED = 0.3  # largest peak speed of a prismatic joint [m/s]
 
 
 class Motion(Protocol):
@@ -47,8 +47,8 @@ class FourierTrajectory(Motion):
     def __post_init__(self) -> None:
         if self.sine.shape != self.cosine.shape or self.sine.shape[1:] != self.q0.shape:
             raise DataError(
-                f"sine {self.sine.shape} and cosine {self.cosine.shape} must have one shape "
-                f"(h, {len(self.q0)})"
+                f"sine has shape {self.sine.shape} and cosine {self.cosine.shape}, wanted the same "
+                f"shape (h, {len(self.q0)})"
             )
 
     def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
@@ -64,14 +64,14 @@ class FourierTrajectory(Motion):
 class ProgramMotion(Motion):
     """The motion q(t) = q0 + A (a1 t^5 + a2 t^4 + a3 t^3), from rest to rest.
 
-    The coefficients a1 = 6 / T^5, a2 = -15 / T^4, a3 = 10 / T^3 take q from q0 to q0 + A and leave
-    no velocity and no acceleration at either end. Before 0 and after T the robot rests.
+    With a1 = 6 / T^5, a2 = -15 / T^4, a3 = 10 / T^3 the motion is from q0 to q0 + A, with zero
+    velocity and acceleration at both ends. Before 0 and after T the robot is at rest.
 
     References:
         Tzvetkova, (28).
     """
 
-    amplitude: Array  # A, the way each joint goes, shape (n,), or (R, n) for R motions [rad or m]
+    amplitude: Array  # A, displacement of each joint, (n,), or (R, n) for R motions [rad or m]
     duration: float | Array  # T, one for all or one per motion, shape () or (R,) [s]
     start: float | Array = 0.0  # q0, of the amplitude's shape or that of one motion [rad or m]
 
@@ -85,7 +85,7 @@ class ProgramMotion(Motion):
             raise SettingsError(f"duration is {self.duration}, wanted a positive number")
 
     def evaluate(self, t: Array | float) -> tuple[Array, Array, Array]:
-        """Return q, v and a [as of ``Motion``], each of shape t.shape + (n,), or (R, n).
+        """Return q, v and a as in ``Motion``, each of shape t.shape + (n,), or (R, n).
 
         Args:
             t: Times of one motion, any shape, or one per motion, shape (R,) [s].
@@ -100,9 +100,9 @@ class ProgramMotion(Motion):
 
 @dataclass(frozen=True, eq=False)
 class SampledMotion(Motion):
-    """A motion through samples: by pieces of order 5 through q, v and a, or a spline through q.
+    """A motion through samples: piecewise quintics through q, v and a, or a spline through q.
 
-    Both have a continuous acceleration; time starts at the first sample.
+    Both have a continuous acceleration. Time starts at the first sample.
     """
 
     t: Array  # shape (N,) [s]
@@ -116,7 +116,7 @@ class SampledMotion(Motion):
 
     @property
     def duration(self) -> float:
-        """How long it takes [s]."""
+        """Duration [s]."""
         return float(self.t[-1] - self.t[0])
 
     @cached_property
@@ -146,7 +146,7 @@ def random_fourier(
     """Return a random motion within the limits of a robot.
 
     Args:
-        model: The robot; position and speed limits of its URDF are kept where it states them.
+        model: The robot; the motion is within the position and speed limits of its URDF.
         rng: Source of the coefficients.
         period: Period [s].
         centre: Mean position, shape (n,) [rad or m]; the middle of the limits, or 0, if None.
@@ -158,20 +158,22 @@ def random_fourier(
     sine, cosine = rng.standard_normal((2, _HARMONICS, n)) / np.arange(1, _HARMONICS + 1)[:, None]
     middle = [(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits]
     mean = np.array(middle) if centre is None else centre
-    reach, speed = np.empty(n), np.empty(n)
+    amplitude, speed = np.empty(n), np.empty(n)
     for j, joint in enumerate(model.limits):
-        slides = joint.type == "prismatic"
-        reach[j] = _LINEAR_REACH if slides else _ROTARY_REACH
+        is_prismatic = joint.type == "prismatic"
+        amplitude[j] = _LINEAR_AMPLITUDE if is_prismatic else _ROTARY_AMPLITUDE
         if joint.has_limits:
-            reach[j] = min(reach[j], 0.9 * min(joint.upper - mean[j], mean[j] - joint.lower))
-            if reach[j] <= 0:
+            amplitude[j] = min(
+                amplitude[j], 0.9 * min(joint.upper - mean[j], mean[j] - joint.lower)
+            )
+            if amplitude[j] <= 0:
                 raise DataError(
                     f"the centre {mean[j]:g} of joint {joint.name!r} is not inside its limits "
                     f"{joint.lower:g} to {joint.upper:g}"
                 )
-        usual = _LINEAR_SPEED if slides else _ROTARY_SPEED
-        speed[j] = min(usual, 0.9 * joint.velocity) if joint.velocity > 0 else usual
+        highest = _LINEAR_SPEED if is_prismatic else _ROTARY_SPEED
+        speed[j] = min(highest, 0.9 * joint.velocity) if joint.velocity > 0 else highest
     unit = FourierTrajectory(np.zeros(n), sine, cosine, period)
     q, v, _ = unit.evaluate(np.linspace(0.0, period, 1000))
-    scale = np.minimum(reach / np.abs(q).max(axis=0), speed / np.abs(v).max(axis=0))
+    scale = np.minimum(amplitude / np.abs(q).max(axis=0), speed / np.abs(v).max(axis=0))
     return FourierTrajectory(mean, sine * scale, cosine * scale, period)

@@ -1,4 +1,4 @@
-"""The true robot: forward dynamics by Pinocchio, with the drives that a URDF does not know."""
+"""The simulated plant: forward dynamics by Pinocchio, with drive terms that no URDF has."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,23 +14,23 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["Friction", "RobotPlant", "rk4"]
 
-_ITERATIONS = 200  # of the load and its friction, which shrink by the size of the parameter
-_SETTLED = 1e-12  # relative change of the load that ends them
+_ITERATIONS = 200  # of the fixed point of load and load-dependent friction
+_SETTLED = 1e-12  # relative change of the load at convergence
 _SIMPLE = (Coulomb, Viscous, Offset)
-_SIGN_SPEED = 2e-4  # [rad/s or m/s] speed over which the plant's Coulomb friction changes sign
+_SIGN_SPEED = 2e-4  # speed over which the plant's Coulomb friction reverses [rad/s or m/s]
 
 
 @dataclass(frozen=True)
 class _Group:
-    """Drives that have one term in common."""
+    """Drives that have a common term."""
 
     term: Bristles | MemorylessTerm
-    drives: Array | slice  # their k numbers
+    drives: Array | slice  # their k indices
     theta: Array  # its parameters, shape (k,)
-    states: slice  # their places among the states of bristles; empty without any
+    states: slice  # their bristle states; empty without any
 
     def torque(self, angle: Array, w: Array) -> Array:
-        """Return what it adds, for positive direction and unit load, shape (k,)."""
+        """Return the torque of the term, for positive direction and unit load, shape (k,)."""
         speed = w[self.drives]
         if isinstance(self.term, Bristles):
             return self.theta * self.term.level(speed)
@@ -39,10 +39,7 @@ class _Group:
 
 @dataclass(frozen=True)
 class Friction:
-    """The torque of drives that move, ``along * sign(w) + rest``, all of shape (d,).
-
-    Beside it ``loaded * sign(w)`` times the size of the load of each.
-    """
+    """Friction torque of drives, ``(along + loaded |load|) sign(w) + rest``, all of shape (d,)."""
 
     along: Array
     rest: Array
@@ -52,11 +49,11 @@ class Friction:
 class RobotPlant:
     """The plant M(q) a + b(q, v) + Ia a + Fv v + Fc sign(v) + off = u of a robot.
 
-    The drives' terms are those of the model; sign(v) is tanh(v / 0.2 mm/s), so that it can be
-    integrated; drives that turn with several joints load all of them. Friction that grows with the
-    load knows the load of this very instant. What presliding has taken up, z, is a state of the
-    plant with the rate of ``taking_up``; where it is not given, the drives have slid for long.
-    A torque that comes late (``Lag``) does so in what is measured, not in the plant.
+    The drives have the terms of the model. sign(v) is tanh(v / 0.2 mm/s), so that it can be
+    integrated. Drives that couple several joints load all of them. Load-dependent friction uses the
+    load of the same instant. The bristle deflection z of presliding is a state of the plant with
+    the rate of ``bristle_rate``; if it is not given, sliding is steady. A delay of the torque
+    (``Lag``) is one of the measurement, not of the plant.
 
     Args:
         model: The robot, with a fixed base.
@@ -81,7 +78,7 @@ class RobotPlant:
         self.n_states = sum(g.states.stop - g.states.start for g in self._groups)
         self.is_loaded = any(_is_loaded(g.term) for g in self._groups)
         G, A = model.velocity_map, self.armature
-        # joints that are Pinocchio's own, each with a rotor of its own: its ABA does it all
+        # Pinocchio's own joints, each with its own rotor: its ABA is sufficient
         self._is_plain = np.array_equal(G, np.eye(len(G))) and np.array_equal(
             A, np.diag(A.diagonal())
         )
@@ -116,7 +113,7 @@ class RobotPlant:
         return rigid + self.friction_torque(self.friction(q, v), v, rigid)
 
     def bodies_torque(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the torque that the bodies alone ask for, shape (n,) [N m or N].
+        """Return the inverse dynamics of the bodies alone, shape (n,) [N m or N].
 
         Args:
             q: Joint coordinates, shape (n,) [rad or m].
@@ -128,12 +125,12 @@ class RobotPlant:
         return rigid
 
     def friction(self, q: Array, v: Array, z: Array | None = None) -> Friction:
-        """Return the torque of the drives but for their inertia and the sign of their speed.
+        """Return the friction of the drives, without inertia and the sign of the speed.
 
         Args:
-            q: Coordinates of what the drives turn, shape (n,) [rad or m].
-            v: Their velocities, shape (n,) [rad/s or m/s].
-            z: What presliding has taken up, shape (n_states,) [-]; None: drives that have slid.
+            q: Coordinates on the drives' side, shape (n,) [rad or m].
+            v: Velocities on the drives' side, shape (n,) [rad/s or m/s].
+            z: Bristle deflections, shape (n_states,) [-]; None: steady sliding.
         """
         angle, w = self.ratios @ q, self.ratios @ v
         coulomb, viscous, offset = self._simple
@@ -151,11 +148,11 @@ class RobotPlant:
         return Friction(along, rest, loaded)
 
     def friction_torque(self, F: Friction, v: Array, load: Array) -> Array:
-        """Return the torque of the drives but for their inertia, shape (n,) [N m or N].
+        """Return the friction torque of the drives, shape (n,) [N m or N].
 
         Args:
-            F: As of ``friction``.
-            v: As of ``friction``.
+            F: Friction, from ``friction``.
+            v: Velocities on the drives' side, shape (n,) [rad/s or m/s].
             load: Torque of the bodies, shape (n,) [N m or N].
         """
         along = F.along + F.loaded * np.abs(self._share @ load) if self.is_loaded else F.along
@@ -163,12 +160,12 @@ class RobotPlant:
         return torque
 
     def chord(self, F: Friction, v: Array, load: Array) -> Array:
-        """Return the friction that follows the sign of the speed, over the speed, shape (n, n).
+        """Return the friction with the sign of the speed, divided by the speed, shape (n, n).
 
         Args:
-            F: As of ``friction``.
-            v: As of ``friction``.
-            load: As of ``friction_torque``.
+            F: Friction, from ``friction``.
+            v: Velocities on the drives' side, shape (n,) [rad/s or m/s].
+            load: Torque of the bodies, shape (n,) [N m or N].
         """
         along = F.along + F.loaded * np.abs(self._share @ load) if self.is_loaded else F.along
         x = np.maximum(np.abs(self.ratios @ v) / _SIGN_SPEED, 1e-6)  # tanh(x) / x is 1 at 0
@@ -176,11 +173,11 @@ class RobotPlant:
         over: Array = (self.ratios.T * slope) @ self.ratios
         return over
 
-    def taking_up(self, v: Array) -> tuple[Array, Array]:
-        """Return how presliding is taken up, dz/dt = r (g sign(w) - z): r [1/s], g sign(w).
+    def bristle_rate(self, v: Array) -> tuple[Array, Array]:
+        """Return r [1/s] and g sign(w) of the bristle deflection, dz/dt = r (g sign(w) - z).
 
         Args:
-            v: Velocities of what the drives turn, shape (n,) [rad/s or m/s].
+            v: Velocities on the drives' side, shape (n,) [rad/s or m/s].
         """
         w = self.ratios @ v
         rate, end = np.zeros((2, self.n_states))
@@ -193,7 +190,7 @@ class RobotPlant:
         return rate, end
 
     def acceleration(self, q: Array, v: Array, u: Array, F: Friction | None = None) -> Array:
-        """Return the acceleration of a torque, D(q)^-1 (u - C(q, v)) [rad/s^2 or m/s^2], as q.
+        """Return the acceleration D(q)^-1 (u - C(q, v)) of a torque, shape as q.
 
         Args:
             q: Joint coordinates, shape (n,), or (R, n) for R robots [rad or m].
@@ -201,8 +198,11 @@ class RobotPlant:
             u: Torque, shape as q [N m or N].
             F: Friction of one robot, if it is known.
 
+        Returns:
+            The acceleration [rad/s^2 or m/s^2].
+
         Raises:
-            NotConvergedError: If friction that grows with the load would hold any load.
+            NotConvergedError: If load-dependent friction is so large that it locks the drives.
 
         References:
             Tzvetkova, (11).
@@ -216,13 +216,13 @@ class RobotPlant:
         return self._loaded(q, free, a, F.loaded * sign) if self.is_loaded else a
 
     def free_acceleration(self, q: Array, v: Array, tau: Array, *, rotors: bool = True) -> Array:
-        """Return the acceleration of bodies and rotors that a torque leaves, shape (n,).
+        """Return the acceleration of bodies and rotors without friction, shape (n,).
 
         Args:
             q: Joint coordinates, shape (n,) [rad or m].
             v: Joint velocities, shape (n,) [rad/s or m/s].
-            tau: The torque that friction has been taken from, shape (n,) [N m or N].
-            rotors: Whether the drives' rotors turn with the bodies.
+            tau: Torque after subtraction of friction, shape (n,) [N m or N].
+            rotors: Whether the inertia of the drives' rotors is included.
         """
         x, G = self._configuration(q), self.model.velocity_map
         if self._is_plain:
@@ -234,22 +234,22 @@ class RobotPlant:
         return np.linalg.solve(D, tau - bias)
 
     def _loaded(self, q: Array, free: Array, a: Array, coefficient: Array) -> Array:
-        """Return the acceleration whose load makes the friction that leaves it, by iteration."""
+        """Return the acceleration consistent with load-dependent friction, by iteration."""
         D = self.mass_matrix(q)
-        lost = np.linalg.solve(D, self.ratios.T * coefficient)  # (n, d), a per load
+        per_load = np.linalg.solve(D, self.ratios.T * coefficient)  # acceleration per load, (n, d)
         bare = self._share @ (free - self.armature @ a)  # load of the drives without it
-        slope = self._share @ (self.ratios.T * coefficient - self.armature @ lost)
+        slope = self._share @ (self.ratios.T * coefficient - self.armature @ per_load)
         load = bare
-        if not np.isfinite(bare).all():  # of a state that has diverged
+        if not np.isfinite(bare).all():  # the state has diverged
             return a
         for _ in range(_ITERATIONS):
             before, load = load, bare - slope @ np.abs(load)
             if np.abs(load - before).max() <= _SETTLED * (1.0 + np.abs(load).max()):
-                settled: Array = a - lost @ np.abs(load)
+                settled: Array = a - per_load @ np.abs(load)
                 return settled
         raise NotConvergedError(
-            f"the friction that grows with the load does not settle in {_ITERATIONS} steps: its "
-            "parameters are too large for a drive that moves",
+            f"load-dependent friction does not converge in {_ITERATIONS} steps: its parameters are "
+            "so large that the drives lock. Set smaller parameters",
             "max_iterations",
         )
 
@@ -262,10 +262,10 @@ class RobotPlant:
 
 
 def _grouped(model: RobotModel, pi: Array) -> tuple[Array, tuple[_Group, ...]]:
-    """Return the terms of the drives that are neither inertia nor of what is measured.
+    """Return the friction terms of the drives, without inertia and terms of the measurement.
 
-    First Coulomb, viscous friction and offset of each drive, shape (3, d), whose columns need no
-    motion but the speed itself; then the others.
+    First Coulomb friction, viscous friction and offset of each drive, shape (3, d), which depend
+    only on the speed; then the others.
     """
     theta, simple = pi[model.layout.n_inertial :], np.zeros((3, len(model.layout.drives)))
     terms: dict[Bristles | MemorylessTerm, list[int]] = {}
@@ -302,14 +302,14 @@ def rk4(
     h: float | Array,
     a: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Return positions and velocities one step later, by Runge-Kutta of order 4.
+    """Return positions and velocities one step later, by the Runge-Kutta method of order 4.
 
     Args:
-        acceleration: Acceleration of a state q, v at a share of the step, 0, 0.5 or 1.
+        acceleration: Acceleration of a state q, v at a fraction of the step, 0, 0.5 or 1.
         q: Positions, any shape [rad or m].
         v: Velocities, shape as q.
         h: Length of the step, a number or a shape that multiplies q [s].
-        a: Accelerations at the start of the step, where they are known.
+        a: Accelerations at the start of the step, if known.
     """
     a1 = acceleration(q, v, 0.0) if a is None else a
     v2 = v + h / 2 * a1

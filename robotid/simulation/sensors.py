@@ -1,4 +1,4 @@
-"""What sensors make of how a robot moved: noise, steps, delay, jitter, samples that are lost."""
+"""Sensor models: noise, resolution, delay, jitter, and dropped samples."""
 
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["measure"]
 
-_TICK = 1e-6  # [s] a time stamp is at least this long after the one before
+_TICK = 1e-6  # smallest step between time stamps [s]
 
 
 def measure(
@@ -25,29 +25,28 @@ def measure(
     *,
     delay: Array | float = 0.0,
 ) -> Log:
-    """Return what sensors log of a robot's motion.
+    """Return the log of a robot's motion by sensors.
 
-    Readings are late, then noisy, then rounded; the time stamps of those that are kept err by
-    themselves.
+    Delay, noise and rounding are applied in this order. Jitter changes only the time stamps.
 
     Args:
-        run: How the robot moved.
-        sensors: What is logged, and what is wrong with it.
+        run: The motion of the robot.
+        sensors: Logged signals and sensor errors.
         joints: Names of the n joints.
-        rng: Source of noise, jitter and losses.
-        delay: How late each torque is by its drive, beside the sensors, shape (n,) [s].
+        rng: Source of noise, jitter and dropped samples.
+        delay: Delay of each torque by its drive, in addition to the sensors', shape (n,) [s].
 
     Raises:
-        DataError: If fewer than two samples are left.
-        SettingsError: If a joint is named that is not there.
+        DataError: If fewer than two samples remain.
+        SettingsError: If a setting names an unknown joint.
     """
 
     def of(value: PerJoint, name: str) -> Array:
         return by_joint(value, joints, f"sensors: {name}")
 
     noise, step, n = sensors.noise, sensors.step, len(joints)
-    v = _late(run.t, run.v, np.full(n, sensors.velocity_delay))
-    tau = _late(run.t, run.tau, sensors.torque_delay + delay * np.ones(n))
+    v = _delayed(run.t, run.v, np.full(n, sensors.velocity_delay))
+    tau = _delayed(run.t, run.tau, sensors.torque_delay + delay * np.ones(n))
     share = of(noise.tau, "noise.tau") * np.sqrt(np.mean(tau**2, axis=0))
     level = np.hypot(share, of(noise.torque, "noise.torque"))
     q = _noisy(run.q, of(noise.q, "noise.q"), rng)
@@ -57,13 +56,13 @@ def measure(
         _rounded(x, of(size, f"step.{name}"))
         for x, size, name in ((q, step.q, "q"), (v, step.v, "v"), (tau, step.tau, "tau"))
     )
-    kept = np.ones(len(run.t), dtype=bool)
+    logged = np.ones(len(run.t), dtype=bool)
     if sensors.dropped:
-        kept = rng.random(len(kept)) >= sensors.dropped
-        if kept.sum() < 2:
+        logged = rng.random(len(logged)) >= sensors.dropped
+        if logged.sum() < 2:
             raise DataError(
-                f"{kept.sum()} of {len(kept)} samples are left, wanted at least 2; lower dropped, "
-                "or make the log longer"
+                f"{logged.sum()} of {len(logged)} samples remain, wanted at least 2. Set a smaller "
+                "dropped, or a longer duration"
             )
     t = run.t
     if sensors.jitter:
@@ -71,17 +70,17 @@ def measure(
         t = t + sensors.jitter * rng.standard_normal(len(t))
         t = np.maximum.accumulate(t - spread) + spread
     return Log(
-        t=t[kept],
-        q=q[kept],
-        v=v[kept] if sensors.velocity else None,
-        a=run.a[kept] if sensors.acceleration else None,
-        tau=tau[kept],
+        t=t[logged],
+        q=q[logged],
+        v=v[logged] if sensors.velocity else None,
+        a=run.a[logged] if sensors.acceleration else None,
+        tau=tau[logged],
         joints=joints,
     )
 
 
-def _late(t: Array, values: Array, delay: Array) -> Array:
-    """Return values as they were some time ago, by joint; before the start, as at the start."""
+def _delayed(t: Array, values: Array, delay: Array) -> Array:
+    """Return values delayed by joint; before the start, the first values."""
     if not delay.any():
         return values
     columns = [np.interp(t - d, t, x) for d, x in zip(delay, values.T, strict=True)]
@@ -89,7 +88,7 @@ def _late(t: Array, values: Array, delay: Array) -> Array:
 
 
 def _noisy(values: Array, level: Array, rng: np.random.Generator) -> Array:
-    """Return values with white noise of a standard deviation by joint."""
+    """Return values with white noise, its standard deviation given by joint."""
     if not level.any():
         return values
     noisy: Array = values + level * rng.standard_normal(values.shape)
@@ -97,6 +96,6 @@ def _noisy(values: Array, level: Array, rng: np.random.Generator) -> Array:
 
 
 def _rounded(values: Array, step: Array) -> Array:
-    """Return values rounded to steps, of the joints that have one."""
+    """Return values rounded to steps, for the joints that have one."""
     size = np.where(step > 0, step, 1.0)
     return np.where(step > 0, np.round(values / size) * size, values)

@@ -1,3 +1,3 @@
-"""Who works on the pieces of a long log: this process, others, or a Dask cluster; checkpoints."""
+"""Parallel processing of long logs: worker processes, Dask clusters and checkpoints."""
 
 __all__: list[str] = []

@@ -1,4 +1,4 @@
-"""Finished pieces of a long reduction, kept beside its results until it is complete."""
+"""Checkpoints: finished pieces of a long reduction, stored until it is complete."""
 
 import errno
 import hashlib
@@ -24,21 +24,21 @@ __all__ = ["FOLDER", "Checkpoint", "released_on_error"]
 
 FOLDER = ".robotid-checkpoint"
 
-_SHOWN = 5  # differences that a message names
+_SHOWN = 5  # largest number of differences that a message names
 
 _log = logging.getLogger(__name__)
 
 
 class _Lock:
-    """The right of one run alone to work in a folder; a process that ends gives it back.
+    """An exclusive lock of a folder for one run; it ends with the process.
 
-    Where the system or the file system has no locks (Windows, some network drives) there is none.
+    Without locks in the system or the file system (Windows, some network drives) there is none.
 
     Args:
         folder: The folder; it must exist.
 
     Raises:
-        DataError: If another run has it.
+        DataError: If another run has the lock.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -57,21 +57,21 @@ class _Lock:
         if not is_free:
             self.release()
             raise DataError(
-                f"another run works in {folder} now, wanted a checkpoint of this run alone; wait "
-                "for its end, or write to another folder",
+                f"another run is using the checkpoint {folder}. Wait for its end, or write to "
+                "another folder",
                 "checkpoint",
             )
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A folder with a file per finished piece, each for one set of inputs only.
+    """A folder with a file per finished piece, for one set of inputs.
 
-    Only one run at a time has it open, until it is released or removed.
+    Only one run has it open, until it is released or removed.
     """
 
     folder: Path
-    key: str  # SHA-256 of all that determines the reductions, in hexadecimal
+    key: str  # SHA-256 of all inputs of the reductions, in hexadecimal
     lock: _Lock
 
     @classmethod
@@ -86,14 +86,14 @@ class Checkpoint:
         """Open the checkpoint of a reduction; an old one is replaced unless it is resumed.
 
         Args:
-            parent: Folder of the results; made if it is missing.
-            inputs: All that determines the reductions, as values that JSON can hold.
+            parent: Folder of the results; created if it does not exist.
+            inputs: All inputs of the reductions, as JSON values.
             pieces: The pieces.
             resume: Whether finished pieces of an interrupted run are used.
 
         Raises:
-            DataError: If the one to resume is of other inputs or cannot be read, or another run
-                works in the folder.
+            DataError: If the checkpoint to resume has other inputs or cannot be read, or another
+                run is using the folder.
         """
         folder = Path(parent) / FOLDER
         stated = {**inputs, "pieces": [piece.name for piece in pieces]}
@@ -102,19 +102,21 @@ class Checkpoint:
         key = hashlib.sha256(text.encode()).hexdigest()
         found = cls(folder, key, _Lock(folder))
         with released_on_error(found):
-            found._begin(text, resume=resume)
+            found._prepare(text, resume=resume)
         return found
 
-    def _begin(self, text: str, *, resume: bool) -> None:
-        """Keep what an interrupted run finished, if it is resumed, or empty the folder."""
+    def _prepare(self, text: str, *, resume: bool) -> None:
+        """Check the inputs of an interrupted run, if it is resumed, or empty the folder."""
         stated = self.folder / "inputs.json"
         if stated.is_file() and resume:
             self._require_same(json.loads(text))
             return
         if stated.is_file():
-            _log.warning("%s holds an unfinished run, which is replaced (no --resume)", self.folder)
+            _log.warning(
+                "%s has an unfinished run. It is replaced, since --resume is not set", self.folder
+            )
         elif resume:
-            _log.warning("%s does not exist: nothing to resume, starting anew", self.folder)
+            _log.warning("%s does not exist: no run to resume, a new one starts", self.folder)
         for old in self.folder.iterdir():
             if old.is_dir() and not old.is_symlink():
                 shutil.rmtree(old)
@@ -124,39 +126,39 @@ class Checkpoint:
             beside.write_text(text)
 
     def finished(self) -> frozenset[int]:
-        """Return the indices of the pieces whose reductions are kept."""
+        """Return the indices of the finished pieces."""
         found = self.folder.glob(f"piece-{'[0-9]' * 6}.npz")
         return frozenset(int(path.stem.split("-")[1]) for path in found)
 
     def load(self, index: int) -> Reduction:
-        """Return a reduction that is kept, to the same bits.
+        """Return a stored reduction, with the same bits.
 
         Args:
-            index: Which piece.
+            index: Index of the piece.
 
         Raises:
-            DataError: If the file cannot be read or belongs to other inputs.
+            DataError: If the file cannot be read or has other inputs.
         """
         path = self._path(index)
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 content = dict(arrays)
-        except Exception as error:  # a broken archive fails in many ways
+        except Exception as error:  # a damaged archive raises various exceptions
             raise DataError(
-                f"{path} cannot be read ({error}); delete it, its piece is reduced again",
+                f"{path} cannot be read ({error}). Delete it; its piece is then reduced again",
                 "checkpoint",
             ) from error
         if str(content.pop("key")) != self.key:
-            raise DataError(f"{path} belongs to other inputs; delete it", "checkpoint")
+            raise DataError(f"{path} is of a run with other inputs. Delete it", "checkpoint")
         return Reduction.from_arrays(content)
 
     def save(self, index: int, name: str, reduction: Reduction) -> None:
-        """Keep the reduction of a piece; the file is there as a whole or not at all.
+        """Store the reduction of a piece; the file is written completely or not at all.
 
         Args:
-            index: Which piece.
+            index: Index of the piece.
             name: Name of the piece.
-            reduction: What it came down to.
+            reduction: Its reduction.
         """
         content: dict[str, Any] = reduction.to_arrays()
         content |= {"key": self.key, "piece": name}
@@ -166,12 +168,12 @@ class Checkpoint:
             os.fsync(file.fileno())
 
     def remove(self) -> None:
-        """Remove the folder, as when the run is complete."""
+        """Remove the folder, after the run is complete."""
         shutil.rmtree(self.folder)
         self.release()
 
     def release(self) -> None:
-        """Let another run have it."""
+        """Release the lock, so that another run can open it."""
         self.lock.release()
 
     def _path(self, index: int) -> Path:
@@ -180,24 +182,24 @@ class Checkpoint:
     def _require_same(self, stated: Mapping[str, Any]) -> None:
         path = self.folder / "inputs.json"
         try:
-            kept = json.loads(path.read_text())
+            before = json.loads(path.read_text())
         except ValueError as error:
-            raise DataError(f"{path} is no JSON: {error}; run without --resume") from error
-        differences = list(_differences(kept, stated))
+            raise DataError(f"{path} is not valid JSON: {error}. Run without --resume") from error
+        differences = list(_differences(before, stated))
         if differences:
             more = len(differences) - _SHOWN
             tail = f", and {more} more" if more > 0 else ""
             raise DataError(
                 f"{self.folder} is the checkpoint of other inputs: "
-                f"{'; '.join(differences[:_SHOWN])}{tail}. Restore them, or run without --resume "
-                "to start anew",
+                f"{'; '.join(differences[:_SHOWN])}{tail}. Restore the inputs, or start a new run "
+                "without --resume",
                 "checkpoint",
             )
 
 
 @contextmanager
 def released_on_error(checkpoint: Checkpoint | None) -> Iterator[None]:
-    """Release a checkpoint if the work in the context fails; a later run may resume it then.
+    """Release a checkpoint if the work in the context fails, so that it can be resumed.
 
     Args:
         checkpoint: The checkpoint, if there is one.
@@ -210,16 +212,16 @@ def released_on_error(checkpoint: Checkpoint | None) -> Iterator[None]:
         raise
 
 
-def _differences(kept: object, now: object, name: str = "") -> Iterator[str]:
-    """Yield in words where two trees of plain values differ."""
-    if isinstance(kept, dict) and isinstance(now, dict):
-        for key in sorted(kept.keys() | now.keys()):
-            yield from _differences(kept.get(key), now.get(key), f"{name}.{key}" if name else key)
-    elif isinstance(kept, list) and isinstance(now, list) and len(kept) == len(now):
-        for k, (one, other) in enumerate(zip(kept, now, strict=True)):
+def _differences(old: object, new: object, name: str = "") -> Iterator[str]:
+    """Yield the differences of two trees of plain values as text."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted(old.keys() | new.keys()):
+            yield from _differences(old.get(key), new.get(key), f"{name}.{key}" if name else key)
+    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for k, (one, other) in enumerate(zip(old, new, strict=True)):
             yield from _differences(one, other, f"{name}[{k}]")
-    elif kept != now:
-        yield f"{name} was {_short(kept)}, is {_short(now)}"
+    elif old != new:
+        yield f"{name} was {_short(old)}, is {_short(new)}"
 
 
 def _short(value: object) -> str:

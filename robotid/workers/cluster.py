@@ -1,4 +1,4 @@
-"""Work on pieces by the workers of a Dask cluster."""
+"""Processing of pieces by the workers of a Dask cluster."""
 
 import logging
 import socket
@@ -21,16 +21,16 @@ _log = logging.getLogger(__name__)
 
 
 class ClusterBackend(Backend):
-    """Works on pieces on a Dask cluster; results come home as they are finished.
+    """Processes pieces on a Dask cluster; results are returned as they are finished.
 
-    Logs must be reachable from every worker under the same path. A piece whose worker is lost is
-    done again by another one; a result counts once, by the index of its piece. At most two pieces
-    per thread of the cluster are under way. What cannot be done is a ``WorkerError``: no cluster,
-    workers with another robotid, a piece that loses every worker that tries it.
+    Every worker must be able to read the logs under the same path. If a worker ends, another one
+    repeats its piece; each result is used once, by the index of its piece. At most two pieces per
+    thread of the cluster are submitted. It raises ``WorkerError`` without a cluster, with workers
+    of another version of robotid, and if every worker that processes a piece ends.
 
     Args:
-        address: Address of the scheduler, as ``tcp://host:8786``.
-        patience: How long to wait for the scheduler and its first worker [s].
+        address: Address of the scheduler, such as ``tcp://host:8786``.
+        patience: Time to wait for the scheduler and its first worker [s].
     """
 
     def __init__(self, address: str, *, patience: float = 30.0) -> None:
@@ -65,7 +65,7 @@ class ClusterBackend(Backend):
             client = Client(self.address, timeout=self.patience, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
             raise WorkerError(
-                f"no Dask scheduler answers at {self.address!r} ({error}); start one with "
+                f"no Dask scheduler answers at {self.address!r} ({error}). Start one with "
                 "'dask scheduler' and give its address"
             ) from error
         try:
@@ -73,7 +73,7 @@ class ClusterBackend(Backend):
         except TimeoutError as error:
             client.close()
             raise WorkerError(
-                f"the Dask scheduler {self.address} has no workers; start some with "
+                f"the Dask scheduler {self.address} has no workers. Start workers with "
                 f"'dask worker {self.address}'"
             ) from error
         return client
@@ -106,12 +106,13 @@ class ClusterBackend(Backend):
                         outcome: Outcome = future.result()
                 except KilledWorker as error:
                     raise WorkerError(
-                        f"the cluster lost every worker that worked on {piece.name} (killed, or "
-                        "short of memory)"
+                        f"every worker of the cluster that processed {piece.name} ended (killed, "
+                        "or out of memory)"
                     ) from error
                 except CancelledError as error:
                     raise WorkerError(
-                        f"the cluster {self.address} was lost while it worked on {piece.name}"
+                        f"the connection to the cluster {self.address} ended while it processed "
+                        f"{piece.name}"
                     ) from error
                 del running[future.key]
                 future.release()
@@ -123,14 +124,14 @@ class ClusterBackend(Backend):
 
 
 def _run(work: Work, piece: Workload, level: int, wanted: str) -> Outcome:
-    """Work on a piece on a worker, and say on an error which host met it."""
+    """Process a piece on a worker; an error gets a note with the name of the host."""
     if __version__ != wanted:  # a worker that joined after the start
         raise WorkerError(_wrong_version({socket.gethostname(): __version__}, wanted))
     try:
         return run_task(work, piece, level)
     except Exception as error:
         error.add_note(
-            f"on the worker's host {socket.gethostname()!r}; logs must be readable there under the "
+            f"on the worker's host {socket.gethostname()!r}. Logs must be readable there under the "
             "same path"
         )
         raise
@@ -141,14 +142,14 @@ def _about() -> dict[str, str]:
 
 
 def _require_same_version(address: str, client: "Client") -> None:
-    """Refuse workers with another robotid; warn of those whose last bits may differ."""
+    """Refuse workers with another version of robotid; warn of other versions of libraries."""
     here = code_versions()
     workers: Mapping[str, Any] = client.run(_about, on_error="return")
     broken = {name: about for name, about in workers.items() if isinstance(about, BaseException)}
     if broken:
         name, error = next(iter(broken.items()))
         raise WorkerError(
-            f"the worker {name} of {address} cannot run robotid {__version__} ({error}); install "
+            f"the worker {name} of {address} cannot run robotid {__version__} ({error}). Install "
             "the same version there"
         )
     others = {
@@ -163,7 +164,7 @@ def _require_same_version(address: str, client: "Client") -> None:
         if differs:
             found = ", ".join(f"{key} {about[key]} (here {here[key]})" for key in differs)
             _log.warning(
-                "worker %s on %s has %s: last bits may differ from a run here",
+                "worker %s on %s has %s: results may differ by rounding from a run here",
                 name, about["host"], found,
             )  # fmt: skip
     _log.info("%d workers on %s", len(workers), sorted({a["host"] for a in workers.values()}))
@@ -171,4 +172,4 @@ def _require_same_version(address: str, client: "Client") -> None:
 
 def _wrong_version(found: Mapping[str, str], wanted: str) -> str:
     listed = ", ".join(f"{name} has {other}" for name, other in found.items())
-    return f"workers must run robotid {wanted}, but {listed}; install the same version everywhere"
+    return f"workers must run robotid {wanted}, but {listed}. Install the same version on all hosts"

@@ -1,7 +1,7 @@
-"""Pieces of long logs, and what a worker does with one, in whichever process or machine it runs.
+"""Pieces of long logs, and their processing by a worker, in any process and on any machine.
 
-A piece is a fixed segment of rows of one log, whatever the number of workers: what it comes down
-to never depends on who reduces it, nor on what else is reduced beside it.
+A piece is a fixed segment of rows of one log, for any number of workers. Its reduction does not
+depend on the worker or on other pieces.
 """
 
 import logging
@@ -18,53 +18,53 @@ __all__ = ["Outcome", "Piece", "Work", "Workload", "reduce_piece", "run_task"]
 
 
 class Workload(Protocol):
-    """Something to work on, as a piece of a log; can be pickled."""
+    """A unit of work, such as a piece of a log; can be pickled."""
 
     @property
     @abstractmethod
     def name(self) -> str:
-        """What messages call it, as ``run3.parquet rows 0-16384``."""
+        """Name in messages, such as ``run3.parquet rows 0-16384``."""
 
     @property
     @abstractmethod
     def samples(self) -> int:
-        """About how many samples it has, for progress."""
+        """Approximate number of samples, for the progress."""
 
 
 class Piece(Workload):
-    """A segment of a log that is reduced by itself. Pieces can be pickled, and are small."""
+    """A segment of a log with its own reduction. Pieces can be pickled, and are small."""
 
     @abstractmethod
     def reduce(self, *, threads: int | None = None) -> Reduction:
-        """Return the factors of the piece's base problem, of no samples if none of it is left.
+        """Return the factors of the piece's base problem; of no samples if none are usable.
 
         Args:
-            threads: As of ``compress``; they do not change the result.
+            threads: As in ``compress``; they do not change the result.
 
         Raises:
             DataError: If a row cannot be used.
         """
 
 
-#: What is done with a piece, given the number of threads or None for any; can be pickled.
+#: Work on a piece, with the number of threads or None for any; can be pickled.
 Work: TypeAlias = Callable[[Any, int | None], Any]
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a worker sends home."""
+    """The result of a worker."""
 
-    result: Any  # what it made of its piece
-    messages: tuple[tuple[str, int, str], ...]  # logger, level, text of what was logged meanwhile
+    result: Any  # result of the piece
+    messages: tuple[tuple[str, int, str], ...]  # logger, level and text of logged messages
 
     def log(self) -> None:
-        """Log in this process what the worker had to say."""
+        """Log the messages of the worker in this process."""
         for name, level, text in self.messages:
             logging.getLogger(name).log(level, "%s", text)
 
 
-class _Memory(logging.Handler):
-    """Keeps records as plain text, which can be sent anywhere."""
+class _Recorder(logging.Handler):
+    """Stores records as plain text, which can be pickled."""
 
     def __init__(self, level: int) -> None:
         super().__init__(level)
@@ -75,11 +75,11 @@ class _Memory(logging.Handler):
 
 
 def reduce_piece(piece: Piece, threads: int | None) -> Reduction:
-    """Return what a piece comes down to.
+    """Return the reduction of a piece.
 
     Args:
         piece: The piece.
-        threads: As of ``Piece.reduce``.
+        threads: As in ``Piece.reduce``.
 
     Raises:
         DataError: If a row cannot be used.
@@ -88,24 +88,24 @@ def reduce_piece(piece: Piece, threads: int | None) -> Reduction:
 
 
 def run_task(work: Work, piece: Workload, level: int) -> Outcome:
-    """Work on a piece with one thread; return the result and what was logged.
+    """Process a piece with one thread; return the result and the logged messages.
 
     Args:
-        work: What to do with the piece.
+        work: The work on the piece.
         piece: The piece.
-        level: Level from which on messages are kept.
+        level: Lowest level of the returned messages.
 
     Raises:
         DataError: If a row cannot be used.
     """
-    logger, memory = logging.getLogger("robotid"), _Memory(level)
+    logger, recorder = logging.getLogger("robotid"), _Recorder(level)
     before = logger.level
-    logger.addHandler(memory)
+    logger.addHandler(recorder)
     logger.setLevel(level)
     try:
         with threadpool_limits(limits=1, user_api="blas"):
             result = work(piece, 1)
     finally:
-        logger.removeHandler(memory)
+        logger.removeHandler(recorder)
         logger.setLevel(before)
-    return Outcome(result, tuple(memory.messages))
+    return Outcome(result, tuple(recorder.messages))

@@ -1,4 +1,4 @@
-"""Who works on the pieces of long logs, what is shown of it, and what is kept if it is cut off."""
+"""Distribution of pieces of long logs to workers, with progress and checkpoints."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -15,24 +15,24 @@ from robotid.workers.processes import Backend, ProcessBackend, SerialBackend, re
 
 __all__ = ["WorkPlan", "choose_workers", "map_pieces"]
 
-_WORTH_WORKERS = 500_000  # samples from which workers pay their start, about a second each
+_WORTH_WORKERS = 500_000  # smallest number of samples for workers; their start takes about 1 s
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass
 class WorkPlan:
-    """How work on pieces is done; it never changes a result.
+    """Distribution of work on pieces; it never changes a result.
 
-    As a context manager, it keeps its workers for more work until the context ends.
+    As a context manager, it reuses its workers until the context ends.
     """
 
-    workers: int | None = 1  # worker processes; None for one per core where the work is long
+    workers: int | None = 1  # worker processes; None: one per core for long work
     scheduler: str | None = None  # address of a Dask scheduler, whose workers are used instead
-    resume: bool = False  # whether an interrupted run goes on from its checkpoint
-    progress: ProgressCallback | None = None  # gets the work, samples done, in all, their name
-    _kept: Backend | None = field(default=None, init=False, repr=False)
-    _keeps: bool = field(default=False, init=False, repr=False)
+    resume: bool = False  # whether an interrupted run continues from its checkpoint
+    progress: ProgressCallback | None = None  # called with work, samples done, total, "samples"
+    _reused: Backend | None = field(default=None, init=False, repr=False)
+    _reuses: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.workers is not None:
@@ -40,25 +40,25 @@ class WorkPlan:
 
     @property
     def is_asked_for(self) -> bool:
-        """Whether anything but the default was asked for, which short logs have no use of."""
+        """Whether settings differ from the defaults; short logs have no use for them."""
         return self.resume or self.scheduler is not None or (self.workers or 1) > 1
 
     def __enter__(self) -> Self:
-        self._keeps = True
+        self._reuses = True
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._keeps = False
-        if self._kept is not None:
-            self._kept.close()
-            self._kept = None
+        self._reuses = False
+        if self._reused is not None:
+            self._reused.close()
+            self._reused = None
 
     @contextmanager
     def _backend(self, pieces: Sequence[Workload]) -> Iterator[Backend]:
         """Yield the cluster, worker processes, or this process."""
-        backend = self._kept or self._choose(pieces)
-        if self._keeps and not isinstance(backend, SerialBackend):
-            self._kept = backend
+        backend = self._reused or self._choose(pieces)
+        if self._reuses and not isinstance(backend, SerialBackend):
+            self._reused = backend
             yield backend
             return
         with backend:
@@ -73,11 +73,11 @@ class WorkPlan:
     def reduce(
         self, pieces: Sequence[Piece], *, checkpoint: Checkpoint | None = None
     ) -> Iterator[Reduction]:
-        """Yield one reduction per piece, in order, as of ``map``; ``join`` gives the whole.
+        """Yield one reduction per piece, in order, as ``map`` does; ``join`` combines them.
 
         Args:
             pieces: The pieces.
-            checkpoint: As of ``map_pieces``.
+            checkpoint: As in ``map_pieces``.
         """
         return self.map(reduce_piece, pieces, "reducing", checkpoint=checkpoint)
 
@@ -89,13 +89,13 @@ class WorkPlan:
         *,
         checkpoint: Checkpoint | None = None,
     ) -> Iterator[Any]:
-        """Do the same with every piece by the workers chosen; yields as ``map_pieces``.
+        """Process every piece by the chosen workers; yields results as ``map_pieces`` does.
 
         Args:
-            work: What to do with a piece.
+            work: The work on a piece.
             pieces: The pieces.
-            what: What the work is called.
-            checkpoint: As of ``map_pieces``.
+            what: Name of the work.
+            checkpoint: As in ``map_pieces``.
         """
         with self._backend(pieces) as backend:
             yield from map_pieces(
@@ -112,38 +112,38 @@ def map_pieces(
     progress: ProgressCallback | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Iterator[Any]:
-    """Do the same with every piece; no more results are in memory than are ahead of their turn.
+    """Process every piece; only results that are ahead of their order are in memory.
 
     Args:
-        work: What to do with a piece.
+        work: The work on a piece.
         pieces: The pieces.
-        what: What the work is called.
-        backend: Where it is done; in this process if None.
-        progress: Called with (what, samples done, samples in all, "samples").
-        checkpoint: Where results are kept, if they are reductions, and, if resumed, taken from.
+        what: Name of the work.
+        backend: The backend; this process if None.
+        progress: Called with (what, samples done, samples in total, "samples").
+        checkpoint: Stores the results, if they are reductions; a resumed one provides them.
 
     Yields:
-        One result per piece, in order, with the same bits whatever the backend.
+        One result per piece, in order, with the same bits for any backend.
 
     Raises:
         DataError: If a row cannot be used.
-        WorkerError: If a worker ends before its work.
+        WorkerError: If a worker ends during its work.
     """
     chosen, report = backend or SerialBackend(), progress or ignore_progress
-    kept = frozenset() if checkpoint is None else checkpoint.finished()
-    missing = [(k, piece) for k, piece in enumerate(pieces) if k not in kept]
+    stored = frozenset() if checkpoint is None else checkpoint.finished()
+    missing = [(k, piece) for k, piece in enumerate(pieces) if k not in stored]
     total = sum(piece.samples for piece in pieces)
     done = total - sum(piece.samples for _, piece in missing)
     _log.info(
-        "%s %d pieces, %d of them kept from before, %d samples in all: %s",
-        what, len(pieces), len(kept), total, chosen.description,
+        "%s %d pieces, %d of them finished before, %d samples in total: %s",
+        what, len(pieces), len(stored), total, chosen.description,
     )  # fmt: skip
     report(what, done, total, "samples")
     early: dict[int, Any] = {}
     left = len(missing)
     with _resumable(checkpoint), closing(chosen.run(work, missing)) as finished:  # type: ignore[type-var]
         for k in range(len(pieces)):
-            while k not in kept and k not in early:
+            while k not in stored and k not in early:
                 index, result = next(finished)
                 early[index] = result
                 if checkpoint is not None:
@@ -152,21 +152,21 @@ def map_pieces(
                 report(what, done, total, "samples")
                 left -= 1
                 if not left:
-                    next(finished, None)  # there is none: the work ends, and is not broken off
-            yield early.pop(k) if checkpoint is None or k not in kept else checkpoint.load(k)
+                    next(finished, None)  # ends the iterator, so that the work is not cancelled
+            yield early.pop(k) if checkpoint is None or k not in stored else checkpoint.load(k)
 
 
 def choose_workers(pieces: Sequence[Workload], workers: int | None = None) -> int:
-    """Return how many worker processes to use, never more than there are pieces.
+    """Return the number of worker processes, at most that of the pieces.
 
-    That is the number asked for; else one per core where the work pays their start, otherwise 1.
+    It is the given number; else one per core if the work is long, otherwise 1.
 
     Args:
         pieces: The work.
-        workers: What the user asked for, or None.
+        workers: The number set by the user, or None.
 
     Raises:
-        SettingsError: If fewer than one is asked for.
+        SettingsError: If the number is less than 1.
     """
     if workers is None:
         is_long = sum(piece.samples for piece in pieces) >= _WORTH_WORKERS
@@ -176,12 +176,14 @@ def choose_workers(pieces: Sequence[Workload], workers: int | None = None) -> in
 
 @contextmanager
 def _resumable(checkpoint: Checkpoint | None) -> Iterator[None]:
-    """Note on what stops the work where finished pieces are kept."""
+    """Add a note with the folder of the checkpoint to an error that stops the work."""
     try:
         yield
     except GeneratorExit:
         raise
     except BaseException as error:
         if checkpoint is not None and checkpoint.folder.is_dir():
-            error.add_note(f"finished pieces are kept in {checkpoint.folder}: --resume uses them")
+            error.add_note(
+                f"finished pieces are stored in {checkpoint.folder}. Continue with --resume"
+            )
         raise

@@ -1,7 +1,7 @@
-"""Work on pieces: in this process, in worker processes, or by another backend.
+"""Processing of pieces: in this process, in worker processes, or by another backend.
 
-Every piece is worked on by itself with one BLAS thread, so what it comes down to has the same bits
-wherever that is done.
+Every piece is processed independently with one BLAS thread, so that its result has the same bits
+with any backend.
 """
 
 import logging
@@ -30,14 +30,14 @@ __all__ = ["Backend", "ProcessBackend", "SerialBackend", "named", "require_worke
 
 _log = logging.getLogger(__name__)
 
-# The pool's thread that feeds its workers may be the last to hold a semaphore. Where the process
-# ends between its two calls, remove and unregister, the tracker of resources tells of a leak.
+# The pool's feeder thread may be the last owner of a semaphore. If the process ends between the
+# calls that remove and unregister it, the resource tracker warns of a leak.
 _FEEDER = "QueueFeederThread"
-_PATIENCE = 5.0  # [s] that it is waited for
+_PATIENCE = 5.0  # largest time to wait for this thread [s]
 
 
 class Backend(ABC):
-    """Where pieces are worked on; a context manager, which lets its workers go at its end."""
+    """Executor of work on pieces; as a context manager it stops its workers at the end."""
 
     def __enter__(self) -> Self:
         return self
@@ -47,19 +47,19 @@ class Backend(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Let the workers go; the next work starts them anew."""
+        """Stop the workers; the next work starts new ones."""
 
     @property
     @abstractmethod
     def description(self) -> str:
-        """What messages call it, as ``2 worker processes``."""
+        """Name in messages, such as ``2 worker processes``."""
 
     @abstractmethod
     def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
-        """Do the same with each of some pieces; closing the iterator ends it.
+        """Process pieces; closing the iterator ends the work.
 
         Args:
-            work: What to do with a piece.
+            work: The work on a piece.
             pieces: Index and piece.
 
         Yields:
@@ -67,12 +67,12 @@ class Backend(ABC):
 
         Raises:
             DataError: If a row cannot be used.
-            WorkerError: If a worker ends before its work.
+            WorkerError: If a worker ends during its work.
         """
 
 
 class SerialBackend(Backend):
-    """Works on pieces one after the other in this process."""
+    """Processes pieces one after the other in this process."""
 
     def close(self) -> None: ...
 
@@ -88,16 +88,16 @@ class SerialBackend(Backend):
 
 
 class ProcessBackend(Backend):
-    """Works on pieces in worker processes, started anew, with one BLAS thread each.
+    """Processes pieces in new worker processes, with one BLAS thread each.
 
-    The workers wait for more work until ``close``; an error or the end of the process that
-    started them, however it ends, ends them at once.
+    The workers wait for more work until ``close``. An error, or any end of the process that started
+    them, stops them immediately.
 
     Args:
         workers: Number of processes, at least 1.
 
     Raises:
-        SettingsError: If it is less.
+        SettingsError: If the number is less than 1.
     """
 
     def __init__(self, workers: int) -> None:
@@ -127,7 +127,7 @@ class ProcessBackend(Backend):
             self.workers,
             initializer=_start_worker,
             initargs=(os.getpid(),),
-            env={"LOKY_MAX_MEMORY_LEAK_SIZE": "1e15"},  # [bytes]: pieces bound the memory
+            env={"LOKY_MAX_MEMORY_LEAK_SIZE": "1e15"},  # [bytes]; pieces limit the memory
         )
         return self._pool
 
@@ -142,14 +142,14 @@ class ProcessBackend(Backend):
     def _collect(
         self, work: Work, pieces: Iterable[tuple[int, Workload]]
     ) -> Iterator[tuple[int, Any]]:
-        """Yield what the workers return, with at most two pieces per worker under way."""
+        """Yield the results of the workers, with at most two submitted pieces per worker."""
         waiting, level = iter(pieces), _log.getEffectiveLevel()
         running: dict[Future[Outcome], tuple[int, Workload]] = {}
         finished: SimpleQueue[Future[Outcome]] = SimpleQueue()
         try:
             while True:
                 for index, piece in islice(waiting, 2 * self.workers - len(running)):
-                    with _interrupts_held():
+                    with _interrupts_deferred():
                         pool = self._pool or self._start()
                         future = pool.submit(run_task, work, piece, level)
                         running[future] = index, piece
@@ -166,8 +166,8 @@ class ProcessBackend(Backend):
         except BrokenProcessPool as error:
             names = [piece.name for _, piece in running.values()]
             raise WorkerError(
-                "a worker process ended in the middle of its work (killed from outside, or short "
-                f"of memory); under way: {names}"
+                "a worker process ended during its work (killed, or out of memory). Unfinished "
+                f"pieces: {names}"
             ) from error
 
 
@@ -178,7 +178,7 @@ def require_workers(workers: int) -> int:
         workers: The number.
 
     Raises:
-        SettingsError: If it is less.
+        SettingsError: If it is less than 1.
     """
     if workers < 1:
         raise SettingsError(f"workers is {workers}, wanted at least 1")
@@ -187,47 +187,49 @@ def require_workers(workers: int) -> int:
 
 @contextmanager
 def named(piece: Workload) -> Iterator[None]:
-    """Note on an error which piece it met.
+    """Add a note with the name of the piece to an error.
 
     Args:
-        piece: The piece that is worked on.
+        piece: The piece that is processed.
     """
     try:
         yield
     except Exception as error:
-        error.add_note(f"while working on {piece.name}")
+        error.add_note(f"while processing {piece.name}")
         raise
 
 
 @contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C, SIGTERM and SIGHUP back until the context ends.
+def _interrupts_deferred() -> Iterator[None]:
+    """Defer Ctrl-C, SIGTERM and SIGHUP until the context ends.
 
-    In the middle of the pool's own functions they would leave locks that nobody opens. Workers
-    started meanwhile never hear Ctrl-C.
+    During the pool's own functions they would leave locks closed. Workers started in the context
+    ignore Ctrl-C.
     """
-    heard: list[int] = []
+    received: list[int] = []
     names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     before = {number: signal.getsignal(number) for number in (signal.Signals[n] for n in names)}
     is_ours = threading.current_thread() is threading.main_thread()
-    held = {number: handler for number, handler in before.items() if callable(handler) and is_ours}
+    deferred = {
+        number: handler for number, handler in before.items() if callable(handler) and is_ours
+    }
     can_mask = hasattr(signal, "pthread_sigmask")
-    for number in held:
-        signal.signal(number, lambda number, _: heard.append(number))
+    for number in deferred:
+        signal.signal(number, lambda number, _: received.append(number))
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if can_mask else None
     try:
         yield
     finally:
         if mask is not None:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for number, handler in held.items():
+        for number, handler in deferred.items():
             signal.signal(number, handler)
-        if heard:
-            signal.raise_signal(heard[0])
+        if received:
+            signal.raise_signal(received[0])
 
 
 def _start_worker(parent: int) -> None:
-    """Set a worker up: deaf to Ctrl-C, gone when the process that started it is."""
+    """Prepare a worker: it ignores Ctrl-C, and ends with the process that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
 

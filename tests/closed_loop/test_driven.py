@@ -150,7 +150,9 @@ def test_full_turns_are_taken_out_of_joints_that_turn_freely(tmp_path):
 def test_a_log_without_torque_drives_nothing(arm):
     robot, log, _ = arm
     bare = Log(log.t, log.q, np.zeros_like(log.q), log.joints, has_torque=False)
-    with pytest.raises(DataError, match=r"has no torque, which drives the robot"):
+    with pytest.raises(
+        DataError, match=r"has no torque, which \[controller\] kind = 'torque' needs"
+    ):
         identify_loops(robot.model, [bare], [], DRIVEN, SimulationSettings())
 
 

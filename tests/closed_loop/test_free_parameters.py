@@ -66,7 +66,7 @@ def test_slopes_of_residuals_are_those_of_differences(simulator, rng, compared):
         simulator = replace(simulator, velocities=True)
     if compared in ("torques", "all"):
         error = "output" if compared == "all" else "input"
-        simulator = replace(limited(simulator), error=error, behind=np.array([3, 2, 2.5]))
+        simulator = replace(limited(simulator), error=error, lag=np.array([3, 2, 2.5]))
     theta = off(simulator, rng)
     found = simulator.residuals(theta, with_slopes=True)
     slopes = np.concatenate([r.slopes for r in found])  # of the outputs
@@ -132,9 +132,9 @@ def test_what_is_compared_is_what_was_logged(simulator):
     log, n = simulator.windows[0].log, 3
     outs = simulator.roll_out(theta)
     both = replace(simulator, velocities=True).residuals(theta, with_slopes=False)
-    behind = np.array([0, 3, 2.25])
-    torques = replace(simulator, error="input", behind=behind).residuals(theta, with_slopes=False)
-    all_ = replace(simulator, velocities=True, behind=behind).residuals(theta, with_slopes=False)
+    lag = np.array([0, 3, 2.25])
+    torques = replace(simulator, error="input", lag=lag).residuals(theta, with_slopes=False)
+    all_ = replace(simulator, velocities=True, lag=lag).residuals(theta, with_slopes=False)
     for out, moved, given, whole in zip(outs, both, torques, all_, strict=True):
         np.testing.assert_array_equal(whole.e, np.hstack([moved.e, given.e]))
         k = out.window.counted
@@ -142,7 +142,7 @@ def test_what_is_compared_is_what_was_logged(simulator):
         np.testing.assert_array_equal(moved.e[:, n:], log.v[k] - out.v)
         rows = np.arange(k.start, k.stop)
         for j in range(n):
-            told = np.interp(rows - behind[j], np.arange(len(log.t)), log.q_ref[:, j])
+            told = np.interp(rows - lag[j], np.arange(len(log.t)), log.q_ref[:, j])
             tau = 20.0 * (told - out.q[:, j]) - 1.5 * out.v[:, j]
             np.testing.assert_allclose(given.e[:, j], log.tau[k, j] - tau, atol=1e-12)
 
@@ -150,7 +150,7 @@ def test_what_is_compared_is_what_was_logged(simulator):
 def test_direct_slopes_are_those_of_inverse_dynamics_along_the_roll_out(simulator, rng):
     """By the recursive Newton-Euler algorithm, with bodies a little different."""
     theta = off(simulator, rng)
-    direct = replace(simulator, error="direct", behind=np.full(3, 3))
+    direct = replace(simulator, error="direct", lag=np.full(3, 3))
     found = direct.residuals(theta, with_slopes=True)
     torques = direct.exact.residuals(theta, with_slopes=False)
     model = simulator.robot.model
@@ -191,14 +191,14 @@ def truth_of(arm):
 
 def stiff(error, highest=1.5):
     """A stiff arm with exact logs, windows that begin as it did, its drives unknown."""
-    rng, behind = np.random.default_rng(2), np.zeros(2, dtype=int)
+    rng, lag = np.random.default_rng(2), np.zeros(2, dtype=int)
     arm = plant("planar", rng, delay=0.0, kp=2e4, kd=1.6e3)
     t = np.arange(1000) / 500.0
     q_ref = multisine(t, arm.middle, arm.reach, rng, highest=highest)
     told = Log(t, q_ref, 0 * q_ref, arm.model.joints, q_ref=q_ref, has_torque=False)
     robot, loops = ClosedLoopRobot(arm.model), truth_of(arm)
     [out] = robot.roll_out(loops, cut_windows(told, np.inf, 0.0))
-    tau = drive_torques(out, loops, behind).given
+    tau = drive_torques(out, loops, lag).limited
     log, free_parameters = replace(told, q=out.q, tau=tau, has_torque=True), []
     for j in range(2):
         J = loops.armature[j]
@@ -207,12 +207,12 @@ def stiff(error, highest=1.5):
             value, name = loops.values[loops.place(j, term)], f"{j}.{term.name}"
             free_parameters.append(FreeParameter(name, "term", (j,), value, 1e6, term=term))
     windows = [
-        replace(w, given=np.stack([out.q[w.begin], out.v[w.begin]]))
+        replace(w, given=np.stack([out.q[w.start_row], out.v[w.start_row]]))
         for w in cut_windows(log, 0.5, 0.0)
     ]
-    told_by = None if error == "output" else behind
+    told_by = None if error == "output" else lag
     return LoopSimulator(
-        robot, tuple(windows), loops, tuple(free_parameters), error=error, behind=told_by
+        robot, tuple(windows), loops, tuple(free_parameters), error=error, lag=told_by
     )
 
 
@@ -249,9 +249,9 @@ def test_the_row_whose_command_a_torque_follows_is_found(told):
     arm, loops, log = told
     outs = ClosedLoopRobot(arm.model).roll_out(loops, cut_windows(log, np.inf, 0.0))
     known, unknown = np.zeros((2, 2), dtype=bool), np.array([[False, True], [True, False]])
-    for is_open in (known, unknown):
-        behind, found = find_gains(outs, loops, is_open, knows_delay=True, is_whole=False)
-        np.testing.assert_array_equal(behind, [3, 3])
+    for is_free in (known, unknown):
+        lag, found = find_gains(outs, loops, is_free, knows_delay=True, is_whole=False)
+        np.testing.assert_array_equal(lag, [3, 3])
         np.testing.assert_allclose(found.kp, loops.kp, rtol=5e-3)
         np.testing.assert_allclose(found.kd, loops.kd, rtol=2e-2)
         np.testing.assert_array_equal(found.kp[0], loops.kp[0])  # is stated
@@ -262,31 +262,29 @@ def test_the_row_whose_command_a_torque_follows_is_found(told):
         ([2.06, 3.95], [2.0, 4.0], 0.1),  # hardly
         ([2.3, 3.8], [2.0, 4.0], 30.0),  # as far as can be told
     ):
-        tau = drive_torques(outs[0], loops, np.array(true)).given + loud * noise
-        behind, _ = find_gains(
-            with_torques(outs, tau), loops, known, knows_delay=True, is_whole=False
-        )
-        np.testing.assert_allclose(behind, told_as, atol=0.05 if true == told_as else 0.0)
+        tau = drive_torques(outs[0], loops, np.array(true)).limited + loud * noise
+        lag, _ = find_gains(with_torques(outs, tau), loops, known, knows_delay=True, is_whole=False)
+        np.testing.assert_allclose(lag, told_as, atol=0.05 if true == told_as else 0.0)
 
 
 def test_torques_tell_gains_before_anything_is_fitted(told):
     _, loops, log = told
     moved = [measured_motion(window) for window in cut_windows(log, np.inf, 0.0)]
     open_ = replace(loops, kp=np.ones(2), kd=np.zeros(2), delay=np.zeros(2))
-    is_open = np.ones((2, 2), dtype=bool)
-    behind, found = find_gains(moved, open_, is_open, knows_delay=False, is_whole=True)
-    np.testing.assert_array_equal(behind, [3, 3])
+    is_free = np.ones((2, 2), dtype=bool)
+    lag, found = find_gains(moved, open_, is_free, knows_delay=False, is_whole=True)
+    np.testing.assert_array_equal(lag, [3, 3])
     np.testing.assert_allclose(found.kp, loops.kp, rtol=0.02)
     np.testing.assert_allclose(found.kd, loops.kd, rtol=0.05)
     _, found = find_gains(
-        with_torques(moved, -log.tau), open_, is_open, knows_delay=False, is_whole=True
+        with_torques(moved, -log.tau), open_, is_free, knows_delay=False, is_whole=True
     )
     np.testing.assert_array_equal(found.kp, open_.kp)  # no gain that would drive it away
     np.testing.assert_array_equal(found.kd, open_.kd)
 
 
 def test_torques_are_missed_over_all_windows_by_the_larger_of_logged_and_given(simulator):
-    behind = np.array([3.0, 2.0, 2.5])
+    lag = np.array([3.0, 2.0, 2.5])
     theta = simulator.prior.copy()
     for share in ([0.5, 1.0, 4.0], [4.0, 0.2, 1.0]):
         windows = [
@@ -294,9 +292,9 @@ def test_torques_are_missed_over_all_windows_by_the_larger_of_logged_and_given(s
                 simulator.windows, (1.0, np.array(share)), strict=True
             )
         ]  # fmt: skip
-        sim = replace(simulator, windows=tuple(windows), behind=behind)
+        sim = replace(simulator, windows=tuple(windows), lag=lag)
         outs, loops = sim.roll_out(theta), sim.loops(theta)
-        given = np.concatenate([drive_torques(out, loops, behind).given for out in outs])
+        given = np.concatenate([drive_torques(out, loops, lag).limited for out in outs])
         logged = np.concatenate([w.log.tau[w.counted] for w in windows])
         rms = [np.sqrt(np.mean(x**2, axis=0)) for x in (logged - given, logged, given)]
         np.testing.assert_allclose(sim.torque_mismatch(theta), rms[0] / np.maximum(*rms[1:]))
@@ -314,9 +312,9 @@ def test_what_drives_give_follows_commands_whole_or_broken_rows_late():
     loops = replace(
         stated_loops(plant("planar", rng).model, LoopSettings()), kp=kp, kd=kd, limit=limit
     )
-    for behind in ([0.0, 1.0], [2.25, 0.5], [4.0, 1.75]):
-        found = drive_torques(out, loops, np.array(behind))
-        for j, late in enumerate(behind):
+    for lag in ([0.0, 1.0], [2.25, 0.5], [4.0, 1.75]):
+        found = drive_torques(out, loops, np.array(lag))
+        for j, late in enumerate(lag):
             at = np.arange(2, 8) - late  # between two rows their mean, by how near they are
 
             def told(x, j=j, at=at):
@@ -324,7 +322,7 @@ def test_what_drives_give_follows_commands_whole_or_broken_rows_late():
 
             reach, rate = told(q_ref) - q[2:8, j], told(v_ref) - v[2:8, j]
             asked = kp[j] * reach + kd[j] * rate + told(tau_ref)
-            np.testing.assert_allclose(found.reach[:, j], reach)
-            np.testing.assert_allclose(found.rate[:, j], rate)
-            np.testing.assert_allclose(found.asked[:, j], asked)
-            np.testing.assert_allclose(found.given[:, j], np.clip(asked, -limit[j], limit[j]))
+            np.testing.assert_allclose(found.position_error[:, j], reach)
+            np.testing.assert_allclose(found.speed_error[:, j], rate)
+            np.testing.assert_allclose(found.unlimited[:, j], asked)
+            np.testing.assert_allclose(found.limited[:, j], np.clip(asked, -limit[j], limit[j]))

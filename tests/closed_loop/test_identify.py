@@ -151,12 +151,12 @@ def test_it_is_an_identification_as_others_are(found, tmp_path):
     entries = {entry["name"]: entry for entry in content["drive_parameters"]}
     share = dict(zip(estimate.names, found.shrunk, strict=True))
     known = zip(estimate.names, estimate.theta, estimate.std_error, estimate.quantile, strict=True)
-    for key, value, error, reach in known:
+    for key, value, error, quantile in known:
         own = entries[key]
-        assert (own["value"], own["quantile"]) == (value, reach)
+        assert (own["value"], own["quantile"]) == (value, quantile)
         assert own["std_error"] == pytest.approx(error, rel=1e-6)
         if key in layout.names:
-            ends = [value - reach * error, value + reach * error]
+            ends = [value - quantile * error, value + quantile * error]
             assert own["interval_95"] == pytest.approx(ends, rel=1e-6)
             assert own["source"] == ("data" if share[key] < 0.3 else "mixed")
             i = layout.names.index(key)
@@ -281,7 +281,7 @@ def test_a_stated_delay_that_is_wrong_is_no_good_result(leg):
     [bound] = [f for f in found.findings if f.code == "at_bound"]
     assert bound.severity == "warning"
     assert "armature" in bound.message
-    assert "leave the delay out of [controller]" in bound.message
+    assert "Leave the delay out of [controller]" in bound.message
     assert found.verdict.status != "good"
     assert bound.message in found.verdict.reasons
 

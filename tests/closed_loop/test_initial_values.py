@@ -121,7 +121,7 @@ def test_first_loops_and_unknowns_begin_with_usual_sizes(planar, logged):
         {"viscous": pytest.approx(0.8 * s), "coulomb": pytest.approx(0.6 * s), "offset": 0.0},
     ]
     found = free_drive_parameters(
-        planar, loop, ["both", "both"], first, usual, tells_kd=True,
+        planar, loop, ["both", "both"], first, usual, finds_kd=True,
         finds_limit=np.array([False, True]),
     )  # fmt: skip
     a, b = planar.joints
@@ -144,7 +144,7 @@ def test_first_loops_and_unknowns_begin_with_usual_sizes(planar, logged):
         assert table[name][0] == joints, name
         assert table[name][1:] == pytest.approx(tuple(figures)), name
     bare = free_drive_parameters(
-        planar, LoopSettings(kp=1.0, kd=1.0, delay=0.0), ["a", "b"], first, usual, tells_kd=False,
+        planar, LoopSettings(kp=1.0, kd=1.0, delay=0.0), ["a", "b"], first, usual, finds_kd=False,
         finds_limit=np.zeros(2, dtype=bool),
     )  # fmt: skip
     kinds = {u.what for u in bare}

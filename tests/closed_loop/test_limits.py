@@ -67,7 +67,7 @@ def test_a_drive_at_its_limit_has_it_found(limited):
     assert said.where == calf
     error = dict(zip(estimate.names, estimate.std_error, strict=True))[f"{calf}.limit"]
     assert said.evidence == {"limit": values[f"{calf}.limit"], "std_error": error}
-    assert f"at most {values[f'{calf}.limit']:.3g} +- {error:.2g} N m, beyond" in said.message
+    assert f"as {values[f'{calf}.limit']:.3g} +- {error:.2g} N m; at the limit" in said.message
 
 
 def test_a_limit_that_is_stated_is_taken(limited):

@@ -123,19 +123,19 @@ def test_encoders_are_told_with_the_figures_of_their_own_joint(found):
 
     [open_] = told(margin=[0.05, 0.13]).values()
     assert (open_.where, open_.evidence) == ("rail, turn", {"margin": 0.13})
-    assert "leave 13 % more of the squared error of the loops at most" in open_.message
+    assert "leaves at most 13 % more squared position error" in open_.message
     turned = {"gain": [0.0, 0.31], "sign": [1.0, -1.0], "next_zero": [0.4, -0.25]}
     every = told(**turned, margin=[0.5, 2.1], explained=[0.62, 0.9])
     assert {code: f.where for code, f in every.items()} == {
         "encoder": "turn", "encoder_uncorrected": "rail",
     }  # fmt: skip
     said = every["encoder"].message
-    assert "turn: its encoder counts the other way, and reads 0" in said
-    assert "explains 31 % of what holds" in said
-    assert "the next best, -0.25 rad, counted the other way, leaves 210 % more" in said
+    assert "turn: its encoder has the opposite sign and reads 0" in said
+    assert "explains 31 % of the squared position error" in said
+    assert "The next best, -0.25 rad and the other sign, leaves 210 % more" in said
     kept = every["encoder_uncorrected"].message
-    assert "explains 62 % of what slowly holds" in kept
-    assert "the next best, +0.4 rad leaves 50 % more" in kept
+    assert "explains 62 % of the slow part" in kept
+    assert "The next best, +0.4 rad leaves 50 % more" in kept
 
 
 def test_speeds_of_a_log_are_those_between_its_gaps():

@@ -41,7 +41,7 @@ def test_a_joint_of_two_groups_is_refused():
     ],
 )  # fmt: skip
 def test_a_logged_torque_closes_no_loop(name, value):
-    with pytest.raises(SettingsError, match=rf"\[controller\] {name} is .*no loop is closed"):
+    with pytest.raises(SettingsError, match=rf"\[controller\] {name} is .*without a controller"):
         LoopSettings(kind="torque", **{name: value})
     assert LoopSettings(kind="pd", **{name: value}).kind == "pd"
 

@@ -26,7 +26,7 @@ def simulator(rng):
     noisy = replace(log, q=out.q + NOISE * rng.standard_normal(out.q.shape))
     unknown = FreeParameter("delay", "delay", (0, 1), 0.006, 0.1)
     windows = cut_windows(noisy, 1.0, 0.0)
-    truth = np.array([[out.q[w.begin], out.v[w.begin]] for w in windows])
+    truth = np.array([[out.q[w.start_row], out.v[w.start_row]] for w in windows])
     return LoopSimulator(robot, windows, loops, (unknown,)), truth
 
 
@@ -37,6 +37,6 @@ def test_starts_that_fit_are_nearer_to_the_truth_than_those_measured(rng):
     assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
     left = np.concatenate([r.e for r in better.residuals(measured.prior, with_slopes=False)])
     assert np.sqrt(np.mean(left**2)) < 1.2 * NOISE
-    assert [(w.begin, w.first, w.stop) for w in better.windows] == [
-        (w.begin, w.first, w.stop) for w in measured.windows
+    assert [(w.start_row, w.first, w.stop) for w in better.windows] == [
+        (w.start_row, w.first, w.stop) for w in measured.windows
     ]

@@ -77,7 +77,7 @@ def test_two_workers_of_the_job_give_the_same_result_to_the_last_bit(
     assert found["settings"]["reduction"].pop("workers") == 2
     assert found == json.loads(expected)
     assert "reducing 8 pieces" in shown.err
-    assert "2000 samples in all: 2 worker processes, one BLAS thread each" in shown.err
+    assert "2000 samples in total: 2 worker processes, one BLAS thread each" in shown.err
     assert shown.err.count("samples: Pinocchio (fewer than") == 1  # once for all pieces
     assert "%" not in shown.err  # progress is for terminals
 
@@ -120,7 +120,7 @@ def test_a_killed_run_resumes_to_the_same_bits_and_does_only_what_is_missing(
     assert [path.name for path in out.iterdir()] == [CHECKPOINT]
     words = ["identify", job, "--workers", "1", "--out", str(out)]
     assert main([*words, "--resume", "--verbose"]) == 0
-    assert "reducing 8 pieces, 3 of them kept from before" in capsys.readouterr().err
+    assert "reducing 8 pieces, 3 of them finished before" in capsys.readouterr().err
     assert (out / "result.json").read_text() == expected
     assert not (out / CHECKPOINT).exists()
 
@@ -133,7 +133,7 @@ def test_a_signal_to_end_is_heard_as_ctrl_c_is(job, tmp_path, number, code, coun
     found, error = cut_off(job, out, number, str(count), workers)
     assert found == code
     assert error.count("\n") == 1
-    assert error.startswith("robotid: interrupted; finished pieces are kept in ")
+    assert error.startswith("robotid: interrupted; finished pieces are stored in ")
     assert [path.name for path in out.iterdir()] == [CHECKPOINT]
     assert len(workers) >= (count if count > 1 else 0)
     end = time.monotonic() + 10
@@ -147,7 +147,7 @@ def test_ctrl_c_ends_with_one_line_and_resumes_to_the_same_bits(job, expected, t
     code, error = cut_off(job, out, signal.SIGINT, "2")
     assert code == 130
     assert error.count("\n") == 1
-    assert error.startswith("robotid: interrupted; finished pieces are kept in ")
+    assert error.startswith("robotid: interrupted; finished pieces are stored in ")
     assert [path.name for path in out.iterdir()] == [CHECKPOINT]
     assert main(["identify", job, "--out", str(out), "--workers", "1", "--resume"]) == 0
     assert (out / "result.json").read_text() == expected

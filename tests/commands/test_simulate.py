@@ -192,7 +192,7 @@ def test_a_plant_file_is_checked_key_by_key(folder, capsys):
     for text, words in (
         ("[sensor]\nnoise = 1", "sensor is not a known key; did you mean 'sensors'?"),
         ("[sensors.noise]\nq = 'much'", "sensors.noise.q is 'much', wanted a number"),
-        ("[actuator]\nbacklash = 0.1", "backlash is of elastic gears; state their stiffness too"),
+        ("[actuator]\nbacklash = 0.1", "backlash applies only to elastic gears. State"),
         ("[drives]\nelbow_joint = ['stribeck']", "a plant states its terms with their shapes"),
         ("rate = ", "is not valid TOML"),
     ):

@@ -187,7 +187,7 @@ def test_what_static_models_cannot_do_is_refused(rng):
         robot("panda", dynamics="slow")
     with pytest.raises(SettingsError, match="dynamics is 'static', but gravity is 0"):
         robot("panda", dynamics="static", gravity=(0, 0, 0))
-    with pytest.raises(DataError, match="needs a model with dynamics = 'full'"):
+    with pytest.raises(DataError, match="online identification needs dynamics = 'full'"):
         OnlineIdentifier(static)
     log = poses(full, truth(full), rng)
     with pytest.raises(SettingsError, match="'prx' needs the mass matrix, which dynamics"):

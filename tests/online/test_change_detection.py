@@ -65,7 +65,7 @@ def test_the_noise_is_learnt_also_while_the_parameters_are_uncertain(rng):
         assert monitor.push(0.01 * k, e, e, residual, doubt, used, 0.2) is None
     assert monitor.variance[0] == pytest.approx(0.25, rel=0.15)
     assert not monitor.is_converged
-    assert monitor.doubt[0] == pytest.approx(3.0 / 0.25, rel=0.2)
+    assert monitor.ratio[0] == pytest.approx(3.0 / 0.25, rel=0.2)
 
 
 def test_a_row_that_is_not_used_teaches_nothing():
@@ -75,9 +75,9 @@ def test_a_row_that_is_not_used_teaches_nothing():
     monitor.push(0.0, e, e, e, np.zeros(2), np.array([False, True]), 1.0)
     assert monitor.variance[0] == before[0]
     assert monitor.variance[1] < before[1]
-    assert np.isinf(monitor.doubt[0])
+    assert np.isinf(monitor.ratio[0])
     # one row that is open is enough not to have converged
-    assert monitor.doubt[1] == 0.0
+    assert monitor.ratio[1] == 0.0
     assert not monitor.is_converged
     monitor.push(0.01, e, e, e, np.zeros(2), np.array([True, False]), 1.0)
     assert monitor.is_converged
@@ -146,7 +146,7 @@ def test_the_noise_and_what_the_parameters_leave_open_are_their_recursions(rng):
             variance[j] += (product - variance[j]) / seen[j]
             open_[j] = ratio if np.isinf(open_[j]) else open_[j] + dt * (ratio - open_[j])
         np.testing.assert_allclose(monitor.variance, variance)
-        np.testing.assert_allclose(monitor.doubt, open_)
+        np.testing.assert_allclose(monitor.ratio, open_)
         np.testing.assert_allclose(detector.evidence, evidence)
     assert evidence.max() > 0.0
     assert monitor.is_converged

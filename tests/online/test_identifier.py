@@ -196,7 +196,7 @@ def test_before_the_robot_has_moved_there_is_no_estimate(ur5):
         identifier.update(k / 200.0, np.zeros(6), np.ones(6))
     assert not identifier.is_ready
     with pytest.raises(
-        DataError, match=r"no estimate yet: the robot has moved for 0\.00 s of the 1"
+        DataError, match=r"the robot has moved for 0\.00 s, and the warm-up needs 1 s of motion"
     ):
         _ = identifier.reading
     with pytest.raises(DataError, match="there is no change -1: 0 were flagged"):
@@ -209,7 +209,7 @@ def test_before_the_robot_has_moved_there_is_no_estimate(ur5):
         seen += len(list(signals.push(k / 200.0, q, np.ones(6))))
         identifier.update(k / 200.0, q, np.ones(6))
     assert seen > 80
-    with pytest.raises(DataError, match=rf"moved for {seen // 2 / 100:.2f} s of the 1 s of the"):
+    with pytest.raises(DataError, match=rf"moved for {seen // 2 / 100:.2f} s, and the warm-up"):
         _ = identifier.compared
 
 

@@ -198,7 +198,7 @@ def test_friction_that_holds_any_load_is_refused_by_the_plant():
     )  # fmt: skip
     pi = truth(model)
     pi[-1] = 5.0
-    with pytest.raises(NotConvergedError, match="grows with the load does not settle"):
+    with pytest.raises(NotConvergedError, match="load-dependent friction does not converge"):
         RobotPlant(model, pi).acceleration(np.ones(3), np.ones(3), 50 * np.ones(3))
 
 

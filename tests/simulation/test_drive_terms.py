@@ -28,7 +28,7 @@ from robotid.robot.drives import (
     Tanh,
 )
 from robotid.robot.model import RobotModel
-from robotid.simulation.law_lanes import coded_term, deflection, slid, term, turned
+from robotid.simulation.law_lanes import coded_term, deflection, direction, initial_deflection, term
 from robotid.simulation.plant import RobotPlant
 
 OWN = (
@@ -67,7 +67,7 @@ def with_term(own):
 
 def compiled_term(own, q, v):
     codes, shapes = (np.array([part]) for part in coded_term(own))
-    return term(codes, shapes, 0, q, v, *turned(v))
+    return term(codes, shapes, 0, q, v, *direction(v))
 
 
 def test_every_registered_term_is_walked_over():
@@ -115,12 +115,14 @@ def test_what_bristles_take_up_is_one_in_regressor_plant_and_roll_out(own, v):
     q, speeds, theta = np.array([0.4, -0.3]), np.array([v, -v]), pi[-2:]
     plant, size = RobotPlant(model, pi), model.layout.n_inertial
     _, x = coded_term(own)
-    long = theta * [slid(np.array(x), w, 1e9)[0] for w in speeds]  # it has moved for long
+    long = theta * [
+        initial_deflection(np.array(x), w, 1e9)[0] for w in speeds
+    ]  # it has moved for long
     Y = joint_torque_regressor(model, q[None], speeds[None], 0 * q[None])
     np.testing.assert_allclose(Y[:, size:] @ theta, long, atol=1e-12)
     friction = plant.friction(q, speeds)
     np.testing.assert_allclose(plant.friction_torque(friction, speeds, 0 * q), long, atol=1e-12)
-    rate, end = plant.taking_up(speeds)
+    rate, end = plant.bristle_rate(speeds)
     x, z, span = np.array(x), 0.3, 0.01
     after, by_speed, by_before = deflection(x, z, v, span)
     assert after == pytest.approx(end[0] + (z - end[0]) * np.exp(-rate[0] * span), rel=1e-12)
@@ -128,6 +130,6 @@ def test_what_bristles_take_up_is_one_in_regressor_plant_and_roll_out(own, v):
     assert by_speed == pytest.approx((faster - slower) / (2 * H), rel=1e-6)
     more, less = (deflection(x, y, v, span)[0] for y in (z + H, z - H))
     assert by_before == pytest.approx((more - less) / (2 * H), rel=1e-6)
-    (_, by_v), h = slid(x, v, 0.1), 1e-7
-    slope = (slid(x, v + h, 0.1)[0] - slid(x, v - h, 0.1)[0]) / (2 * h)
+    (_, by_v), h = initial_deflection(x, v, 0.1), 1e-7
+    slope = (initial_deflection(x, v + h, 0.1)[0] - initial_deflection(x, v - h, 0.1)[0]) / (2 * h)
     assert by_v == pytest.approx(slope, rel=1e-5)

@@ -63,7 +63,7 @@ def test_gains_that_are_not_stated_suit_the_mass_matrix(ur5):
     q, v, q_r, v_r, ahead = np.random.default_rng(0).standard_normal((5, 6))
     wanted = ahead + kp * (q_r - q) + kd * (v_r - v)
     np.testing.assert_allclose(found.of(q, v, q_r, v_r, 0 * q, ahead), wanted)
-    assert not found.ahead(q[None], v[None], q_r[None]).any(), "no feed-forward was asked for"
+    assert not found.feedforward(q[None], v[None], q_r[None]).any(), "no feed-forward was asked for"
 
 
 def test_limits_are_a_share_of_the_urdfs_but_where_stated(panda):

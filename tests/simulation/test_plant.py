@@ -61,7 +61,7 @@ def test_presliding_is_taken_up_over_its_way_and_level(sticky):
     for v in ([0.4, -0.1], [-0.2, 0.5]):
         w = np.array([v[1], v[0] - 0.5 * v[1]])  # of joint 2 and of the motor
         level = np.array([1 + 0.6 * np.exp(-((w[0] / 0.3) ** 2)), 1.0])
-        rate, end = sticky.taking_up(np.array(v))
+        rate, end = sticky.bristle_rate(np.array(v))
         np.testing.assert_allclose(rate, np.abs(w) / ([0.05, 0.02] * level))
         np.testing.assert_allclose(end, np.sign(w) * level)
 

@@ -76,13 +76,13 @@ def test_samples_are_lost_at_random(run):
     kept = np.searchsorted(run.t, log.t)
     np.testing.assert_array_equal(log.tau, run.tau[kept])
     two = Run(*(x[:3] for x in (run.t, run.q, run.v, run.a, run.tau, run.q)), np.zeros(2))
-    with pytest.raises(DataError, match="of 3 samples are left, wanted at least 2; lower dropped"):
+    with pytest.raises(DataError, match=r"of 3 samples remain, wanted at least 2. Set a smaller"):
         of(two, dropped=0.999)
 
 
 def test_settings_that_cannot_be_are_named(run):
     with pytest.raises(SettingsError, match=re.escape(
-        "sensors: noise.q is stated for 'c', which is not among the joints that move: a, b"
+        "sensors: noise.q is stated for 'c', which is not a moving joint: a, b"
     )):  # fmt: skip
         of(run, noise=Noise(q={"c": 1.0}))
     with pytest.raises(SettingsError, match=r"sensors.noise: q is -1.0, wanted 0 to 1e12"):

@@ -78,7 +78,9 @@ def test_a_file_of_another_run_is_refused(tmp_path):
         tmp_path / ".robotid-checkpoint" / "piece-000004.npz"
     )
     checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces, resume=True)
-    with pytest.raises(DataError, match=r"piece-000004.npz belongs to other inputs; delete it"):
+    with pytest.raises(
+        DataError, match=r"piece-000004.npz is of a run with other inputs. Delete it"
+    ):
         reduce_all(pieces, checkpoint=checkpoint)
 
 
@@ -90,7 +92,7 @@ def test_a_damaged_file_is_refused_by_name(tmp_path, damage):
     content[len(content) // 2] ^= 255
     path.write_bytes(content if damage == "flip" else content[: len(content) // 2])
     checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces, resume=True)
-    with pytest.raises(DataError, match=r"piece-000001.npz cannot be read .* delete it"):
+    with pytest.raises(DataError, match=r"piece-000001.npz cannot be read .* Delete it"):
         reduce_all(pieces, checkpoint=checkpoint)
 
 
@@ -105,7 +107,7 @@ def test_without_resume_an_unfinished_run_is_replaced_and_that_is_said(tmp_path,
     pieces = interrupted(tmp_path)
     with caplog.at_level(logging.WARNING):
         checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces)
-    assert "holds an unfinished run, which is replaced" in caplog.text
+    assert "has an unfinished run. It is replaced" in caplog.text
     assert checkpoint.finished() == frozenset()
     assert [path.name for path in checkpoint.folder.iterdir()] == ["inputs.json"]
 
@@ -114,7 +116,7 @@ def test_nothing_to_resume_is_said(tmp_path, caplog):
     pieces = pieces_in(tmp_path / "marks", 2)
     with caplog.at_level(logging.WARNING):
         Checkpoint.open(tmp_path / "new", INPUTS, pieces, resume=True)
-    assert "nothing to resume, starting anew" in caplog.text
+    assert "no run to resume, a new one starts" in caplog.text
 
 
 def test_a_kept_piece_has_the_same_bits(tmp_path):
@@ -129,7 +131,9 @@ def test_a_checkpoint_that_another_run_works_in_is_refused_and_left_as_it_is(tmp
     pieces = pieces_in(tmp_path / "marks", 3)
     first = Checkpoint.open(tmp_path, INPUTS, pieces)
     first.save(1, pieces[1].name, reduce_all(pieces[1:2])[0])
-    with pytest.raises(DataError, match=r"another run works in .*checkpoint now, .*wait for its"):
+    with pytest.raises(
+        DataError, match=r"another run is using the checkpoint .*checkpoint. Wait for"
+    ):
         Checkpoint.open(tmp_path, INPUTS, pieces, resume=resume)
     assert first.finished() == {1}
     first.release()
@@ -162,7 +166,7 @@ def test_a_run_whose_checkpoint_is_gone_does_not_promise_to_resume_it(tmp_path):
     checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces)
     with pytest.raises(DataError, match="row 7") as kept:
         reduce_all(pieces, checkpoint=checkpoint)
-    promise = f"finished pieces are kept in {checkpoint.folder}: --resume uses them"
+    promise = f"finished pieces are stored in {checkpoint.folder}. Continue with --resume"
     assert promise in kept.value.__notes__
     checkpoint.release()
     checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces)

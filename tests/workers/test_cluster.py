@@ -58,7 +58,7 @@ def test_an_error_of_the_data_comes_home_with_piece_and_host(address, tmp_path):
     with pytest.raises(DataError, match="row 7 is not finite") as caught:
         reduce_all(pieces, backend=ClusterBackend(address))
     assert caught.value.code == "not_finite"
-    assert "while working on random rows 2" in caught.value.__notes__
+    assert "while processing random rows 2" in caught.value.__notes__
 
 
 def test_a_worker_that_cannot_read_says_so_with_host_and_path(address, tmp_path):
@@ -88,7 +88,9 @@ def test_a_piece_that_kills_every_worker_is_named(address, tmp_path):
     pieces = pieces_in(tmp_path / "marks", 2, faults={1: "kill"}.items())[1:]  # blames no neighbour
     allow_failures(address, 0)
     try:
-        with pytest.raises(WorkerError, match="lost every worker that worked on random rows 1"):
+        with pytest.raises(
+            WorkerError, match="every worker of the cluster that processed random rows 1"
+        ):
             reduce_all(pieces, backend=ClusterBackend(address))
     finally:
         allow_failures(address, 3)

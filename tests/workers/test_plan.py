@@ -105,7 +105,7 @@ def test_other_inputs_are_named_up_to_five_and_the_rest_is_counted(tmp_path):
         Checkpoint.open(tmp_path, other, pieces, resume=True)
     said = str(caught.value)
     assert "key0 was 0, is -1; key1 was 1, is -1; " in said
-    assert "key4 was 4, is -1, and 4 more. Restore them" in said
+    assert "key4 was 4, is -1, and 4 more. Restore the inputs" in said
     with pytest.raises(DataError) as caught:
         Checkpoint.open(tmp_path, inputs | {"long": "y"}, pieces, resume=True)
     said = str(caught.value)

@@ -121,12 +121,12 @@ def test_an_error_of_the_data_keeps_its_type_and_names_the_piece(tmp_path, backe
     with pytest.raises(DataError, match="row 7 is not finite") as caught:
         reduce_all(pieces, backend=backend)
     assert caught.value.code == "not_finite"
-    assert "while working on random rows 3" in caught.value.__notes__
+    assert "while processing random rows 3" in caught.value.__notes__
 
 
 def test_a_worker_that_is_killed_is_an_error_that_names_what_was_under_way(tmp_path):
     pieces = pieces_in(tmp_path / "marks", faults={2: "kill"}.items())
-    with pytest.raises(WorkerError, match="worker process ended in the middle") as caught:
+    with pytest.raises(WorkerError, match="worker process ended during its work") as caught:
         reduce_all(pieces, backend=ProcessBackend(2))
     assert "random rows 2" in str(caught.value)
     assert eventually(lambda: not any(map(is_running, workers_of(tmp_path / "marks"))))
@@ -186,7 +186,7 @@ def test_ctrl_c_in_a_terminal_reaches_the_workers_too_and_shows_one_traceback(tm
     error = run.communicate(timeout=60)[1]
     assert error.count("Traceback") == 1  # of the script; workers say nothing
     assert "KeyboardInterrupt" in error
-    assert error.strip().endswith(".robotid-checkpoint: --resume uses them")
+    assert error.strip().endswith(".robotid-checkpoint. Continue with --resume")
 
 
 def test_a_script_needs_no_guard(tmp_path):
