@@ -116,7 +116,7 @@ def test_a_parameter_without_a_standard_error_has_no_interval_and_no_reach(monke
         standard_error=np.array([0.25, 0.125, inf]), standard_quantile=np.array([2.0, 2.5, 1.96]),
         standard_interval=np.array([[2.0, 3.0], [0.1875, 0.8125], [-inf, inf]]),
     )  # fmt: skip
-    keys = ("name", "value", "std_error", "reach", "interval_95", "unit", "prior", "source",
+    keys = ("name", "value", "std_error", "quantile", "interval_95", "unit", "prior", "source",
             "at_bound")  # fmt: skip
     body = ("one.m", 2.5, 0.25, 2.0, [2.0, 3.0], "kg", 3.0, "data", False)
     first = ("a.viscous", 0.5, 0.125, 2.5, [0.1875, 0.8125], "N m s/rad", 0.0, "mixed", False)
