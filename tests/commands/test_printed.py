@@ -296,7 +296,7 @@ def test_identify(shown):
         "  one *  150.0  12.0  N  99.0  210.0     98.0",
         "  * worse than a constant",
         "",
-        "friction beside viscous and Coulomb's:",
+        "friction besides viscous and Coulomb:",
         "  one: tanh + load (held-out error 9.0 -> 5.0 %)",
         "",
         "warning: slow: one: it is slow",

@@ -248,7 +248,7 @@ def test_the_residual_against_time_is_drawn_as_time_is_asked_of_it(rng):
     time = found.follows[-1]
     assert time.name == "time"
     chart = why_charts(found)["time"]
-    assert "less its mean over position against time" in chart.title
+    assert "minus its mean over position against time" in chart.title
     assert chart.series[0].y.std() < 0.6  # drift and noise; the plain residual is far larger
     assert why_charts(found)["position"].series[0].y.std() > 1.0
 
