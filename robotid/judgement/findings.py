@@ -337,7 +337,7 @@ def consistency_findings(fit: Fit) -> list[Finding]:
         )
         is_stated = bool(_stated(fit).intersection(bounds))
         severity = "warning" if against and is_stated else "note"
-        message = f"active bounds: {listed(bounds)}; {why}"
+        message = f"the bounds {listed(bounds)} are active: {why}"
         findings.append(Finding("active_bound", severity, ", ".join(bounds), message))
     gap = min(details.get("gaps", [0.0]))
     if gap > _SAME_OPTIMUM:

@@ -180,11 +180,11 @@ def test_bounds_that_bind_are_a_warning_where_data_or_masses_contradict_a_stated
         return [(f.severity, f.where, f.message) for f in found]
 
     fine = "the URDF's values are outside them; they do not increase the torque error"
-    assert said("mass one") == [("note", "mass one", f"active bounds: mass one; {fine}")]
+    assert said("mass one") == [("note", "mass one", f"the bounds mass one are active: {fine}")]
     ((severity, where, message),) = said("mass one", "cone two", "mass two", ours=(1.06, 2.11))
     assert (severity, where) == ("warning", "mass one, mass two")
     assert message.startswith(
-        "active bounds: mass one, mass two; they increase the torque error of a, b; check these"
+        "the bounds mass one, mass two are active: they increase the torque error of a, b; check"
     )
     ((severity, _, message),) = said("total_mass all", ours=(1.0, 2.11))
     assert severity == "warning"
