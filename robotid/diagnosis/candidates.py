@@ -145,8 +145,8 @@ def _coupled(m: JointMotion, other: str, ratio: float) -> Array:
     if other not in m.others:  # it is at rest
         none = np.zeros_like(m.v)
         return np.column_stack([none, none, np.tanh(m.v / (_REVERSES * _rms(m, drive_speed)))])
-    beside, w = m.others[other], drive_speed(m)
-    return np.column_stack([beside.a, beside.v, np.tanh(w / (_REVERSES * _rms(m, drive_speed)))])
+    partner, w = m.others[other], drive_speed(m)
+    return np.column_stack([partner.a, partner.v, np.tanh(w / (_REVERSES * _rms(m, drive_speed)))])
 
 
 #: The candidates of each joint, without couplings: Coulomb friction where the model lacks it, the

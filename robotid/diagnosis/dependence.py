@@ -46,7 +46,7 @@ class Dependence:
     p_value: float
 
     @property
-    def is_sure(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether the dependence is significant, and large enough to matter."""
         return (
             self.share is not None
@@ -57,8 +57,8 @@ class Dependence:
     @property
     def where(self) -> float:
         """The value of the quantity where the mean residual differs from 0 most significantly."""
-        sure = np.abs(self.means) / np.where(self.errors > 0, self.errors, np.inf)
-        return float(self.centres[int(np.argmax(sure))])
+        significance = np.abs(self.means) / np.where(self.errors > 0, self.errors, np.inf)
+        return float(self.centres[int(np.argmax(significance))])
 
     def at(self, x: Array) -> tuple[Array, Array]:
         """Return the mean residual and its standard error, linear between bins, shape (N,) each.

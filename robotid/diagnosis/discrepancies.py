@@ -101,12 +101,12 @@ def explain_residual(
         lacking = _columns(misfits, sample)
         if _left(sample, altered) < _left(sample, lacking):
             alone = {(misfit.joint, misfit.term.code) for misfit in misfits}
-            beside = find_misfits(found[0].there.beside(altered))
-            misfits = tuple(m for m in beside if (m.joint, m.term.code) in alone)
+            remaining = find_misfits(found[0].there.with_columns(altered))
+            misfits = tuple(m for m in remaining if (m.joint, m.term.code) in alone)
         else:
             among = {one.alteration for one in found}
-            beside_them = _found(fit, sample.beside(lacking), own)
-            found = [one for one in beside_them if one.alteration in among]
+            retested = _found(fit, sample.with_columns(lacking), own)
+            found = [one for one in retested if one.alteration in among]
     return misfits, tuple(one.finding for one in found)
 
 
@@ -184,8 +184,8 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
         applied = partial(offset, j)
         Z = moved(none, only)
         yield _Alteration("position_offset", joint, Z, 0.01, _zero(joint, unit), applied)
-        lost = 0.5 * Z * sample.motions[j].direction[:, None, None]
-        yield _Alteration("lost_motion", joint, lost, 0.005, _lost_motion(joint, unit))
+        backlash = 0.5 * Z * sample.motions[j].direction[:, None, None]
+        yield _Alteration("lost_motion", joint, backlash, 0.005, _lost_motion(joint, unit))
         yield _Alteration("angle_scale", joint, moved(only, none), 0.02, _scale(f"q_{joint}"))
         yield _Alteration("torque_scale", joint, (tau * only)[..., None], 0.05, _gain(joint))
     for first in range(1, n - 1):  # the drives of a wrist are of the same type

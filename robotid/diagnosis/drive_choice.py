@@ -235,8 +235,8 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
             break
         own = found.own
         known = known if set(chosen) <= set(beside[best]) else []
-        anew = _reweighted(sample, drive, own)
-        every, torque = _Options.of(anew, drive, [*own, *grid]), float(anew.torque[0])
+        weighted = _reweighted(sample, drive, own)
+        every, torque = _Options.of(weighted, drive, [*own, *grid]), float(weighted.torque[0])
         chosen = list(range(len(own)))
         before = every.left(chosen)
     choice = _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
@@ -382,8 +382,8 @@ def _found(
     flat = _flat(refined)
     shapes = [(family, shape) for family in families for shape in family.shapes]
     is_at_bound = _at_bound(drive, refined)
-    anew = _reweighted(sample, drive, refined)
-    covariance = _shape_covariance(anew, drive, families, flat)
+    weighted = _reweighted(sample, drive, refined)
+    covariance = _shape_covariance(weighted, drive, families, flat)
     return DriveChoice(
         joint=sample.joints[0],
         families=tuple(family.name for family in families),
@@ -404,7 +404,7 @@ def _found(
         shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
         sizes=tuple(tuple(own) for _, own in refined),
         data_range=drive.data_range,
-        grown=_grown(anew, drive, refined),
+        grown=_grown(weighted, drive, refined),
     )
 
 

@@ -139,7 +139,7 @@ class Sample:
         """Number of segments of fitted logs."""
         return self.normal.fitted
 
-    def beside(self, Z: Array) -> "Sample":
+    def with_columns(self, Z: Array) -> "Sample":
         """Return the same samples with more columns that are refitted with the base parameters.
 
         Args:

@@ -276,8 +276,8 @@ class JointTorque:
 
     @staticmethod
     def _best(follows: Sequence[Dependence]) -> Dependence | None:
-        sure = [d for d in follows if d.is_sure]
-        return max(sure, key=lambda d: d.share or 0.0, default=None)
+        significant = [d for d in follows if d.is_significant]
+        return max(significant, key=lambda d: d.share or 0.0, default=None)
 
     @property
     def sentence(self) -> str:
@@ -318,7 +318,7 @@ class JointTorque:
     def _has_changed(self, name: str) -> bool:
         """Whether the residual of the fitted recordings does not depend on a quantity."""
         before = () if self.fitted is None else self.fitted.follows
-        return any(d.name == name and d.share is not None and not d.is_sure for d in before)
+        return any(d.name == name and d.share is not None and not d.is_significant for d in before)
 
 
 def joint_torques(found: Fit) -> tuple[JointTorque, ...]:
@@ -424,8 +424,8 @@ def _broadband_shares(evaluations: Sequence[Evaluation]) -> list[float | None]:
         lag = 1
         if signals.cutoff is not None and motion.rate is not None:
             lag = max(1, round(motion.rate / signals.cutoff))
-        beside = (motion.segment[lag:] == motion.segment[:-lag])[:, None]
-        both = beside & e.recording.mask[lag:] & e.recording.mask[:-lag]
+        same_segment = (motion.segment[lag:] == motion.segment[:-lag])[:, None]
+        both = same_segment & e.recording.mask[lag:] & e.recording.mask[:-lag]
         products += np.sum(r[lag:] * r[:-lag], axis=0, where=both)
         squares += np.sum(0.5 * (r[lag:] ** 2 + r[:-lag] ** 2), axis=0, where=both)
     return [

@@ -91,8 +91,8 @@ def error_lines(
         mark = "" if m["better_than_constant"] else " *"
         is_worse = is_worse or bool(mark)
         rmse = f"{m['rmse']:#.3g}".rstrip(".")
-        error, *beside = (cell(m.get(key)) for key in ("relative_error_pct", *shown))
-        rows.append([joint + mark, error, rmse, m["unit"], *beside])
+        error, *plain = (cell(m.get(key)) for key in ("relative_error_pct", *shown))
+        rows.append([joint + mark, error, rmse, m["unit"], *plain])
     named = dict(zip(keys, _BESIDE.values(), strict=True))
     heads = ["joint\n", "error\n%", "rmse\n", "\n", *(named[key] for key in shown)]
     lines = columns(heads, rows, width=width, needed=4, left=(0, 3))
@@ -128,8 +128,8 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
     by_cell: dict[str, list[str]] = {}
     for name, joint in verdict["per_joint"].items():
         by_cell.setdefault(verdict_cell(name, joint), []).append(name)
-    beside = {joint["reasons"][0] for joint in verdict["per_joint"].values() if joint["reasons"]}
-    reasons = [f"  - {reason}" for reason in verdict["reasons"] if reason not in beside]
+    at_joints = {joint["reasons"][0] for joint in verdict["per_joint"].values() if joint["reasons"]}
+    reasons = [f"  - {reason}" for reason in verdict["reasons"] if reason not in at_joints]
     if list(by_cell) == ["good"]:
         by_cell = {"good": ["every joint"]}
     return [

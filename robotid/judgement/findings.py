@@ -251,8 +251,8 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
         model: The robot.
         stated: Names of the locked joints with a stated position, or that follow others.
     """
-    beside = set(model.locked) if model.free_flyer else _in_line(model)
-    assumed = [name for name in model.locked if name not in stated and name in beside]
+    relevant = set(model.locked) if model.free_flyer else _in_line(model)
+    assumed = [name for name in model.locked if name not in stated and name in relevant]
     if not assumed:
         return []
     message = (

@@ -177,7 +177,7 @@ def test_columns_beside_the_base_parameters_are_refitted_with_them(model, rng):
     sample = take_sample(found)
     Z = rng.standard_normal((*sample.r.shape, 2)) + sample.r[..., None]
     together, _ = Trials(sample, Z).whole.estimate([0, 1], sample.fitted)
-    beside = sample.beside(Z[..., :1])
+    beside = sample.with_columns(Z[..., :1])
     alone, _ = Trials(beside, Z[..., 1:]).whole.estimate([0], sample.fitted)
     assert alone[0] == pytest.approx(together[1], rel=2e-3)
     tau = np.concatenate([m.tau for m in sample.at])

@@ -91,7 +91,7 @@ def test_a_column_of_a_joint_at_rest_takes_nothing(sample, rng):
 
 def test_columns_beside_are_as_free_as_what_is_left(sample, rng):
     Z = rng.standard_normal((N, JOINTS, 1))
-    beside = sample.beside(Z)
+    beside = sample.with_columns(Z)
     columns = sample.weight[:, :, None] * Z
     spread = 1e3 * np.linalg.norm(sample.r) / np.linalg.norm(columns)
     np.testing.assert_allclose(beside.W, np.concatenate([sample.W, spread * columns], axis=2))

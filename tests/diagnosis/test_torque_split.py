@@ -227,7 +227,7 @@ def test_what_a_residual_follows_is_found_with_its_share(name, rng):
     # bins take a part of it that their width blurs
     low = 0.35 if name in ("speed", "time") else 0.44
     assert low < share[name] < 0.53
-    assert [d.name for d in found.follows if d.is_sure] == [name]
+    assert [d.name for d in found.follows if d.is_significant] == [name]
     said = found.sentence
     if name == "constant":
         assert re.search(r"4\d % of its power is a constant of (1|0.9\d|1.0) N m", said)
@@ -264,7 +264,7 @@ def test_noise_of_any_colour_follows_nothing():
         v, q, load = motion(rng)
         noise = coloured(rng, (len(v),), (0, 5, 20)[trial % 3])
         found = torque(noise, v, q, load)
-        log_errors += sum(d.is_sure for d in found.follows)
+        log_errors += sum(d.is_significant for d in found.follows)
         tried += len(found.follows)
         shares.append([d.share for d in found.follows])
     assert log_errors <= 1, f"{log_errors} of {tried}"
