@@ -80,7 +80,7 @@ class Predictions:
             why = f"{listed(self.refitted)} contain fitted samples"
         return [f"prediction of unseen motion not evaluated: {why}"]
 
-    def left_to_urdf(self) -> list[str]:
+    def better_by_urdf(self) -> list[str]:
         """Return the joints that the URDF with fitted drives predicts better, and the remedy."""
         worse = [j for own in self.tested.values() for j, m in own.items() if is_beaten(m)]
         if not worse:
@@ -91,7 +91,7 @@ class Predictions:
             "[estimator.constraints])"
         ]
 
-    def unseen(self) -> list[str]:
+    def at_rest(self) -> list[str]:
         """Return the joints at rest in all recordings, and those at rest in all validation logs."""
         fitted, validated = self.fitted, {joint for own in self.tested.values() for joint in own}
         names = [joint for joint in self.on_each() if joint not in validated]
@@ -110,7 +110,7 @@ class Predictions:
             )
         return reasons
 
-    def why_unseen(self, joint: str) -> str:
+    def why_untested(self, joint: str) -> str:
         """Return why a joint was evaluated on no validation log.
 
         Args:

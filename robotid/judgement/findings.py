@@ -256,8 +256,8 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
     if not assumed:
         return []
     message = (
-        f"neither identified nor locked in the job: {listed(assumed)}. Their positions are "
-        "assumed to be 0; state them with locked = { joint = position }, or confirm 0 for all "
+        f"the job neither identifies nor locks {listed(assumed)}. Their positions are assumed "
+        "to be 0; state them with locked = { joint = position }, or confirm 0 for all "
         'others with locked = { "*" = 0.0 }'
     )
     return [Finding("locked_at_zero", "warning", ", ".join(assumed), message)]
@@ -333,7 +333,7 @@ def consistency_findings(fit: Fit) -> list[Finding]:
         why = (
             f"{against}; check these bounds, the torque scale (gains) and the payload"
             if against
-            else "the URDF's values are outside them; they do not increase the torque error"
+            else "the URDF's values are outside them; the bounds do not increase the torque error"
         )
         is_stated = bool(_stated(fit).intersection(bounds))
         severity = "warning" if against and is_stated else "note"
@@ -436,9 +436,9 @@ def _bound_findings(fit: Fit) -> list[Finding]:
     at_bound = [name for name, is_at in zip(names, fit.at_bound, strict=True) if is_at]
     if at_bound:
         message = (
-            f"{listed(at_bound, _NAMED)}: 0, at the bound, without a standard error. The fit "
-            "without this bound is below 0, which no drive has: the friction model lacks a term, "
-            "or the motion does not distinguish these terms from others"
+            f"{listed(at_bound, _NAMED)}: 0, at the bound, without a standard error. Without "
+            "this bound the value is negative, which no drive has: the friction model lacks a "
+            "term, or the motion does not distinguish these terms from others"
         )
         findings.append(Finding("at_bound", "note", ", ".join(at_bound), message))
     for body in fit.estimate.details.get("relaxed", ()):
@@ -511,11 +511,11 @@ def _contradiction(fit: Fit) -> str:
     masses = fit.standard[: layout.n_inertial : 10]
     urdf = fit.model.standard_parameters()[: layout.n_inertial : 10]
     vanished = [
-        f"{link}: {mass:.2g} kg of {before:.3g} kg"
+        f"{link} has {mass:.2g} of its {before:.3g} kg"
         for link, mass, before in zip(layout.bodies, masses, urdf, strict=True)
         if mass < _VANISHED * before
     ]
-    return f"masses with them: {', '.join(vanished)}" if vanished else ""
+    return f"with them {', '.join(vanished)}" if vanished else ""
 
 
 def _stated(fit: Fit) -> set[str]:

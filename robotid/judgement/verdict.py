@@ -40,7 +40,7 @@ _HARMLESS = 1.0  # [%] ... but not below this share of the torque
 _SMALL = 5.0  # [%] of the torque: a missing drive term below this gives no warning
 #: Reasons of a verdict by code of the warning: such a result is at most "usable". Names in braces
 #: are figures of the evidence.
-_WORDS = {
+_REASONS = {
     "angle_scale": "positions fit best when multiplied by another factor",
     "active_bound": "the data, or the masses that result from it, contradict a stated bound",
     "com_outside": "its centre of mass is {outside:.2g} m outside its geometry: not possible",
@@ -61,8 +61,8 @@ _WORDS = {
     "joint_origin": "the joint's origin differs from the URDF's",
     "joint_axis": "the joint axis may be reversed",
     "joint_order": "the columns may belong to another joint",
-    "joint_torque_delay": "the torque is delayed by {delay:+.3f} s relative to the position, the "
-    "torques of other joints are not",
+    "joint_torque_delay": "the torque is delayed by {delay:+.3f} s relative to the position "
+    "(negative: early), the torques of other joints are not",
     "lost_motion": "there may be backlash between the joint and its encoder",
     "mass_matrix": "the mass matrix is not positive definite in all poses",
     "payload_change": "its last link carries {mass:+.2g} kg relative to the fitted logs",
@@ -72,7 +72,8 @@ _WORDS = {
     "solvers_differ": "two solvers give different parameters",
     "time_scale": "inertia and gravity contradict each other: the time stamps or the magnitude "
     "of gravity may be wrong",
-    "torque_delay": "the torque is delayed by {delay:+.3f} s relative to the position",
+    "torque_delay": "the torque is delayed by {delay:+.3f} s relative to the position (negative: "
+    "early)",
     "torque_order": "the torque may belong to another joint",
     "torque_scale": "the scale of the torque differs from that of the other joints",
     "torque_sign": "the torque may have the opposite sign",
@@ -91,13 +92,13 @@ _MISFITS = {
     "position_periodic": "a torque that is periodic in the position",
     "spring": "a spring or counterbalance",
 }
-_WORDS |= {
+_REASONS |= {
     code: f"{term} would explain {{share_pct:.0f}} % of the squared residual ({{error_pct:.1f}} % "
     "of the torque): the drive model lacks it"
     for code, term in _MISFITS.items()
 }
 #: Codes of the warnings that make a result at most "usable".
-WARNING_CODES = (*_WORDS, "repeated_motion")
+WARNING_CODES = (*_REASONS, "repeated_motion")
 _OF_RESULTS = ("total_mass",)  # errors that only a result can have
 _HYPOTHESES = (
     "current_for_torque",
@@ -203,10 +204,10 @@ def judge(
     reasons = [
         *predictions.untested(),
         *(reason for _, cautions, _ in found.values() for reason in cautions),
-        *predictions.left_to_urdf(),
+        *predictions.better_by_urdf(),
         *_described(warnings),
         *([scale_check.message] if scale_check is not None and is_contradicted else []),
-        *predictions.unseen(),
+        *predictions.at_rest(),
         *determined.warnings(),
     ]
     notes = [
@@ -223,7 +224,7 @@ def judge(
             checked=f"error at most {max(errors):.1f} %, smaller than that of a constant and "
             "that of the URDF"
             if errors
-            else predictions.why_unseen(joint),
+            else predictions.why_untested(joint),
         )
         for joint, (worse, cautions, errors) in found.items()
     }
@@ -393,7 +394,7 @@ def warnings_of(
     }
     found: list[VerdictWarning] = []
     for finding in findings:
-        if finding.severity != "warning" or finding.code not in _WORDS or _is_harmless(finding):
+        if finding.severity != "warning" or finding.code not in _REASONS or _is_harmless(finding):
             continue
         # the unexplained torque is the spikes, which a robust fit downweights
         if finding.code == "unexplained_torque" and finding.where in downweighted:
@@ -431,7 +432,7 @@ def _rank(reason: str) -> int:
 
 
 def _warnings(finding: Finding, joints: Sequence[str]) -> Iterator[VerdictWarning]:
-    message = _WORDS[finding.code].format(**finding.evidence)
+    message = _REASONS[finding.code].format(**finding.evidence)
     log, _, last = finding.where.rpartition(": ")
     named = [joint for joint in last.split(", ") if joint in joints]
     for joint in named:

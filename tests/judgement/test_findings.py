@@ -179,7 +179,7 @@ def test_bounds_that_bind_are_a_warning_where_data_or_masses_contradict_a_stated
         assert all(f.code == "active_bound" for f in found)
         return [(f.severity, f.where, f.message) for f in found]
 
-    fine = "the URDF's values are outside them; they do not increase the torque error"
+    fine = "the URDF's values are outside them; the bounds do not increase the torque error"
     assert said("mass one") == [("note", "mass one", f"the bounds mass one are active: {fine}")]
     ((severity, where, message),) = said("mass one", "cone two", "mass two", ours=(1.06, 2.11))
     assert (severity, where) == ("warning", "mass one, mass two")
@@ -192,11 +192,11 @@ def test_bounds_that_bind_are_a_warning_where_data_or_masses_contradict_a_stated
     # next to nothing is left of a link
     ((severity, _, message),) = said("centre_of_mass two", masses=(0.09, 0.21))
     assert severity == "warning"
-    assert "masses with them: one: 0.09 kg of 2 kg; check" in message
+    assert "with them one has 0.09 of its 2 kg; check" in message
     # a bound of the geometry is no one's statement
     ((severity, _, message),) = said("mass two", masses=(0.09, 0.19))
     assert severity == "note"
-    assert "masses with them: one: 0.09 kg of 2 kg, two: 0.19 kg of 4 kg; check" in message
+    assert "with them one has 0.09 of its 2 kg, two has 0.19 of its 4 kg; check" in message
     assert said("cone one", "inertia two") == []
 
 

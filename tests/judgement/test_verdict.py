@@ -261,7 +261,9 @@ def test_what_several_logs_show_is_said_once():
 
 def test_figures_are_stated():
     (late,) = warnings_of([finding("torque_delay", "run.csv", delay=0.0562)], JOINTS)
-    assert late.message == "run.csv: the torque is delayed by +0.056 s relative to the position"
+    assert late.message == (
+        "run.csv: the torque is delayed by +0.056 s relative to the position (negative: early)"
+    )
     (costs,) = warnings_of(
         [finding("constraint_costs", "a", error_pct=4.0, wls_error_pct=1)], JOINTS
     )
@@ -410,7 +412,7 @@ def test_a_stated_bound_that_only_the_urdf_minds_is_a_note(ur5):
     (finding,) = [f for f in found.findings if f.code == "active_bound"]
     assert found.warnings == ()
     assert finding.severity == "note"
-    assert "they do not increase the torque error" in finding.message
+    assert "the bounds do not increase the torque error" in finding.message
     assert found.verdict.status == "good"
 
 
