@@ -48,7 +48,7 @@ class Round(Generic[Option]):
 
     Attributes:
         before: Squared residual of each of K segments without any option, shape (K,).
-        left: The same with each option.
+        left: Squared residuals with each option, shape (K,).
         fitted: Number of segments of fitted logs, which come first; the others are validation.
         whole: Squared residual to which shares refer.
         least: Smallest reduction of the squared residual, whatever its share.

@@ -353,7 +353,7 @@ def _torques_of(found: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTor
     rows, broadband = _rows(own), _broadband_shares(evaluations)
     judged = []
     for j, joint in enumerate(model.row_names):
-        terms = [split.terms_of(j) for split in splits]  # alike in all
+        terms = [split.terms_of(j) for split in splits]  # equal in all
         angle = "m" if joint in model.layout.prismatic else "rad"
         quantities = {
             "position": (angle, q[:, j]),

@@ -39,7 +39,7 @@ def correlated_parameters(found: Identified) -> dict[int, tuple[int, float]]:
     """Return drive parameters strongly correlated with another parameter of the same drive.
 
     Args:
-        found: What was identified.
+        found: The identification.
 
     Returns:
         By index of the standard parameter: the index of the parameter with the largest correlation

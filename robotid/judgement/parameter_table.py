@@ -44,7 +44,7 @@ def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dic
     """Return the parameters of the bodies and of the drives, as in result.json.
 
     Args:
-        found: What was identified.
+        found: The identification.
     """
     layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
     errors, ends, quantile = found.standard_error, found.standard_interval, found.standard_quantile

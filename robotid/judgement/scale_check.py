@@ -24,7 +24,7 @@ _HELD_BACK = 1.5  # residual over that of WLS beyond which the prior determines 
 _ANOTHER = 0.35  # ... and farther than this, they contradict it
 _OFF = 0.1  # a common factor of all torques is reported if it is at least so far from 1,
 _CLEARLY = 4.0  # ... if that distance is so many times the unexplained share of gravity
-_BETTER = 0.5  # ... and that share is less than this times the one beside a payload
+_BETTER = 0.5  # ... and that share is less than this times the one with a payload
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def check_scale(found: Fit) -> ScaleCheck:
     result gives its standard error.
 
     Args:
-        found: What was identified.
+        found: The identification.
     """
     model, size = found.model, found.model.layout.n_inertial
     bounds = found.estimator.bounds

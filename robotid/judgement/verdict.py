@@ -319,7 +319,7 @@ def blocking(
     """Return the errors that make an identification wrong, except those that the user ignores.
 
     Args:
-        findings: What was found.
+        findings: The findings.
         ignore: Codes of errors that the user states as wrong.
         is_robust: Whether a robust loss was set, which downweights jumps of the torque.
     """
@@ -339,7 +339,7 @@ def rejected(
     of the URDF's.
 
     Args:
-        findings: What was found.
+        findings: The findings.
         validation: Metrics of each validation log.
         scale_check: The identified gravity torque against the URDF's.
     """
