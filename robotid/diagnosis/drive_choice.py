@@ -160,13 +160,13 @@ class _Options:
         """Return the squared residual of each segment with some candidates."""
         return self.trials.held_out.left(self._columns(chosen))
 
-    def left_each(self, beside: Mapping[int, Sequence[int]]) -> dict[int, Array]:
+    def left_each(self, retained: Mapping[int, Sequence[int]]) -> dict[int, Array]:
         """Return the squared residual of each segment with each candidate and some others.
 
         Only of candidates with physical parameters: friction opposes motion and is below the
         largest torque of the joint.
         """
-        columns = {i: self._columns([*others, i]) for i, others in beside.items()}
+        columns = {i: self._columns([*others, i]) for i, others in retained.items()}
         theta = self.trials.whole.parameters_each(columns)
         possible = {
             i: which
@@ -208,14 +208,14 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
     chosen = list(range(len(known)))
     undecided: list[tuple[Family, list[float]]] = []
     before = every.left(chosen)
-    beside: dict[int, list[int]] = {}
+    retained: dict[int, list[int]] = {}
     names = tuple(family.name for family, _ in known)
     tried = [Tried(names, _percent(before, torque), 1.0, True)]
 
     def offered() -> Round[int]:
-        nonlocal beside
-        beside = _beside(every, chosen, len(known))
-        left = every.left_each(beside)
+        nonlocal retained
+        retained = _retained(every, chosen, len(known))
+        left = every.left_each(retained)
         whole = float(before.sum())
         return Round(before, left, len(before), whole, FAMILY_LEAST**2 * torque)
 
@@ -225,16 +225,16 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
     for this, best in select(offered, FAMILY, cost):
         found = None
         if best is not None:
-            found = _conditioned(sample, drive, every, this, beside, best)
+            found = _conditioned(sample, drive, every, this, retained, best)
             best = found.number
-        tried += list(_considered(every, this, torque, beside, best))
+        tried += list(_considered(every, this, torque, retained, best))
         if found is None or best is None:
             nearest = min(this.left, key=lambda i: float(this.left[i].sum()), default=None)
             if nearest is not None and this.p_value(nearest) < UNDECIDED_P_VALUE:
                 undecided = [every.own[nearest]]
             break
         own = found.own
-        known = known if set(chosen) <= set(beside[best]) else []
+        known = known if set(chosen) <= set(retained[best]) else []
         weighted = _reweighted(sample, drive, own)
         every, torque = _Options.of(weighted, drive, [*own, *grid]), float(weighted.torque[0])
         chosen = list(range(len(own)))
@@ -243,7 +243,7 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
     return replace(choice, doubted=_terms(drive, undecided))
 
 
-def _beside(every: _Options, chosen: Sequence[int], known: int) -> dict[int, list[int]]:
+def _retained(every: _Options, chosen: Sequence[int], known: int) -> dict[int, list[int]]:
     """Return the chosen candidates that remain with each candidate that may be added.
 
     A joint has one family of each kind. Only families given before the selection are replaced.
@@ -280,7 +280,7 @@ def _conditioned(
     drive: _Drive,
     every: _Options,
     this: Round[int],
-    beside: Mapping[int, Sequence[int]],
+    retained: Mapping[int, Sequence[int]],
     best: int,
 ) -> _Refined:
     """Return the best candidate, or an equally good and better conditioned one of another family.
@@ -291,7 +291,7 @@ def _conditioned(
     """
 
     def refined(i: int) -> _Refined:
-        own = _refined(sample, drive, [every.own[k] for k in (*beside[i], i)])
+        own = _refined(sample, drive, [every.own[k] for k in (*retained[i], i)])
         grown = _grown(_reweighted(sample, drive, own), drive, own)
         is_grown = max(grown.values(), default=1.0) > TENFOLD
         return _Refined(i, own, (bool(_at_bound(drive, own).any()), is_grown))
@@ -325,7 +325,7 @@ def _considered(
     every: _Options,
     this: Round[int],
     torque: float,
-    beside: Mapping[int, Sequence[int]],
+    retained: Mapping[int, Sequence[int]],
     best: int | None,
 ) -> Iterator[Tried]:
     """Yield the error that each family would give at its best shape."""
@@ -338,7 +338,7 @@ def _considered(
         ):
             by_family[name] = i
     for name, i in by_family.items():
-        names = [every.own[k][0].name for k in beside[i]]
+        names = [every.own[k][0].name for k in retained[i]]
         yield Tried((*names, name), _percent(left[i], torque), this.p_value(i), i == best)
 
 
@@ -501,8 +501,8 @@ def _shape_covariance(
     """Return the covariance of shapes: of columns d(torque)/d(shape), fitted with all others."""
     if not len(flat):
         return np.empty((0, 0))
-    count, beside = _with_slopes(sample, drive, families, flat)
-    _, every = beside.estimate(list(range(count + len(flat))), sample.fitted)
+    count, trial = _with_slopes(sample, drive, families, flat)
+    _, every = trial.estimate(list(range(count + len(flat))), sample.fitted)
     covariance: Array = every[count:, count:]
     return covariance
 
