@@ -148,7 +148,7 @@ def follows(user):
             command += f" {own or f'--gain {name}={GAINS[name]}'}"
     asked = [w["message"] for w in user.result().get("warnings", ()) if w["code"] == "coupling"]
     for message in asked[:1]:
-        assert "Add [[coupling]] to the job with name = " in message
+        assert "Add [[coupling]] to the job: name = " in message
         assert all(f"{joint} = 1.0" in message for joint in RATIOS)
         (user.folder / "job.toml").write_text(own_job())
         user.types("robotid identify job.toml --out result")

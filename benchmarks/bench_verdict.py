@@ -38,7 +38,7 @@ QUICK = (("ur5", "tiago"), ("clean", "clean, far from the URDF", "torque 20 ms l
          "mounted on a wall", "all torques x 0.8"))  # fmt: skip
 
 OF_URDF = ("rounded_rpy",)  # true of the URDF, whatever was recorded
-UNCHECKED = "depends on the sensors alone"
+UNCHECKED = "absolute scale not verified"
 NOTE = re.compile(r"doctor: \w+: (?P<code>\w+): ")
 
 
@@ -64,7 +64,7 @@ class Answer:
 
     @property
     def says_unchecked(self):
-        """Whether it says that the scale of the recordings depends on the sensors alone."""
+        """Whether it states that the absolute scale is not verified."""
         return any(UNCHECKED in reason for reason in self.reasons)
 
     @property

@@ -177,7 +177,7 @@ class LoopIdentification(Identified):
         return judge_positions(
             position_metrics(self.model, self.validation or self.fitted, moving=True),
             self.model.joints,
-            is_kept=bool(self.validation),
+            is_validation=bool(self.validation),
             is_settled=self.estimate.converged,
             log_errors=self.log_errors,
             cautions=[f.message for f in self.findings if f.code in _CAUTIONS],

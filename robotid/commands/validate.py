@@ -87,12 +87,12 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
     logs = [log_of_commands(job, entry, loaded) for entry in entries]
     runs = [loaded.open_loop(log) for log in logs]
     hashes = {i["sha256"] for i in loaded.content["inputs"] if i["role"] == "identification"}
-    is_kept = not any(file_sha256(entry.path) in hashes for entry in entries)
+    is_validation = not any(file_sha256(entry.path) in hashes for entry in entries)
     log_errors = blocking(diagnose(model, (), logs, job.signals), job.ignore)
     verdict = judge_positions(
         position_metrics(model, runs, moving=True),
         model.joints,
-        is_kept=is_kept,
+        is_validation=is_validation,
         log_errors=[finding.message for finding in log_errors],
     )
     return {

@@ -1,3 +1,3 @@
-"""What the residual of a fit says: terms that drives have, faults of recordings and of the URDF."""
+"""Analysis of the residual of a fit: missing drive terms, faults of recordings and of the URDF."""
 
 __all__: list[str] = []

@@ -1,6 +1,6 @@
-"""What this room decides by: p-values, shares and sizes from which something is found and said.
+"""Thresholds of this package: p-values, shares and sizes above which something is reported.
 
-Each group names what shows how often it finds what is there, and what is not.
+Each group names the benchmark that measures its correct and false detections.
 """
 
 from robotid.diagnosis.selection import Rule
@@ -13,60 +13,60 @@ __all__ = [
     "CONFIRMED",
     "DEPENDENCE_P_VALUE",
     "DEPENDENCE_SHARE",
-    "DOUBTED",
     "FAMILY",
-    "FAMILY_SEEN",
+    "FAMILY_LEAST",
     "GROWN",
     "MAIN",
     "MISFIT",
     "MISFIT_MATTERS",
-    "MISFIT_SEEN",
+    "MISFIT_REPORTED",
     "MISFIT_WARNS",
     "ONE_SIDED",
-    "SURE",
+    "SIGNIFICANT",
     "TENFOLD",
+    "UNDECIDED_P_VALUE",
     "WEAK",
     "WEAK_P_VALUE",
     "WEAK_SIZE",
 ]
 
-_ALIKE = 0.02  # of the squared residual, within which the simpler of two options is found
+_ALIKE = 0.02  # of the squared residual: within this difference the simpler option is selected
 
-# Families that a joint's drive is given: benchmarks/bench_friction.py
+# Families selected for a joint's drive: benchmarks/bench_friction.py
 FAMILY = Rule(most=4, share=0.05, p_value=0.01, alike=_ALIKE)
-#: Of the torque: a gain that is smaller may be of how signs pass the filter.
-FAMILY_SEEN = 0.006
-#: p-value up to which a family that is not taken is counted as open.
-DOUBTED = 0.25
-#: Times that terms may make the standard error of another parameter grow, unreported.
+#: Share of the torque: a smaller gain may be an effect of the filter on velocity signs.
+FAMILY_LEAST = 0.006
+#: p-value below which a family that is not selected is undecided: it widens intervals.
+UNDECIDED_P_VALUE = 0.25
+#: Factor on the standard error of another parameter above which terms are reported.
 TENFOLD = 10.0
-#: Of the logarithm of its range, within which a shape is at its bound.
+#: Distance from a bound, of the logarithm of its range, within which a shape is at the bound.
 AT_BOUND = 0.02
 
-# Terms that a drive's model lacks: benchmarks/bench_misfit.py
+# Terms that a drive model lacks: benchmarks/bench_misfit.py
 MISFIT = Rule(most=3, share=0.1, p_value=3e-4, alike=_ALIKE)
-#: Share of the squared residual from which a term is a warning.
+#: Share of the squared residual above which a term is a warning.
 MISFIT_WARNS = 0.25
-#: Size over the torque from which a term is named, and from which it is a warning.
-MISFIT_SEEN, MISFIT_MATTERS = 0.005, 0.02
-#: Share from which a coupling is named that the other joint does not show.
+#: Size over the torque above which a term is reported, and above which it is a warning.
+MISFIT_REPORTED, MISFIT_MATTERS = 0.005, 0.02
+#: Share above which a coupling is reported although the other joint does not confirm it.
 ONE_SIDED = 0.6
-#: Of the share, that validation must show of it, if there is any.
+#: Part of the share that validation logs must confirm, if there are any.
 CONFIRMED = 0.25
-#: [%] of the squared residual: a term that explains more outranks a guess.
+#: [%] of the squared residual: a term that explains more replaces a hypothesis of the doctor.
 MAIN = 50.0
-#: Times by which a standard error grows that stands on a misfit.
+#: Factor on a standard error above which a parameter is reported as affected by a misfit.
 GROWN = 1.3
 
-# What recordings or URDF have otherwise than stated: benchmarks/bench_verdict.py. The best of all
-# is tested, or none.
+# Recordings or URDF that differ from what was stated: benchmarks/bench_verdict.py. Only the best
+# hypothesis is tested.
 ALTERATION = Rule(most=3, share=-float("inf"), p_value=None, alike=_ALIKE)
 ALTERATION_P_VALUE, ALTERATION_SHARE = 3e-4, 0.1
-#: A smaller share is named, too, if validation shows no less of it, by chance hardly ever, and its
-#: size is twice what changes a result: noise that hides it does not keep it out of masses.
+#: A smaller share is also reported if validation logs confirm it fully, its p-value is tiny and its
+#: size is twice the one that changes a result: it biases masses even if noise hides it.
 WEAK, WEAK_P_VALUE, WEAK_SIZE = 0.03, 1e-5, 2.0
-#: Standard errors that its size is from nothing.
-SURE = 5.0
+#: Standard errors that its size must differ from 0.
+SIGNIFICANT = 5.0
 
-# A residual that follows a quantity: no benchmark, tests/diagnosis/test_torque_split.py
+# A residual that depends on a quantity: no benchmark, tests/diagnosis/test_torque_split.py
 DEPENDENCE_SHARE, DEPENDENCE_P_VALUE = 0.1, 1e-3

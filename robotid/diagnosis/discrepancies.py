@@ -1,12 +1,13 @@
-"""What recordings or URDF have otherwise than stated: zeros, scales, the clock, where joints lie.
+"""Tests for recordings or URDFs that differ from what was stated: offsets, scales, clock, origins.
 
-A robot of other masses could imitate none of these for long: each changes the torque tau(q, v, a)
-that the estimate gives in its own way. To first order, in all joints together,
+Other masses cannot imitate any of these: each changes the predicted torque tau(q, v, a) in its own
+way. To first order, in all joints together,
 
     tau_measured - tau = W delta + Z x + e,    Z = d tau / d x,
 
-where W delta is what other base parameters may do, and x is refitted without one segment of the
-recordings after the other (``misfit``). x is the size of what is otherwise, with its own error.
+where W delta is the effect of other base parameters. x is the size of the difference, with its
+standard error. It is refitted with one segment of the recordings held out after the other
+(``misfit``).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -21,7 +22,7 @@ from robotid.diagnosis.decisions import (
     ALTERATION_P_VALUE,
     ALTERATION_SHARE,
     CONFIRMED,
-    SURE,
+    SIGNIFICANT,
     WEAK,
     WEAK_P_VALUE,
     WEAK_SIZE,
@@ -39,21 +40,21 @@ __all__ = ["explain_residual"]
 
 _Applied = Callable[[Array], tuple[RobotModel, Sequence[Trajectory]]]
 
-_STEP = 1e-5  # of a derivative [-, rad or m]
-_STEPS = 5  # of sizes that are sought anew from where they were found
+_STEP = 1e-5  # step of a finite difference [-, rad or m]
+_STEPS = 5  # Gauss-Newton steps of a size
 
 
 @dataclass(frozen=True, eq=False)
 class _Alteration:
-    """Something that may be otherwise than stated, with sizes x of which 0 is as stated.
+    """A possible difference from what was stated, with sizes x, 0 if there is none.
 
     Attributes:
         code: Code of the finding.
-        where: Joint that it is about; empty for all of them.
-        Z: Torque that a size of 1 adds, shape (N, n, c).
+        where: Joint concerned; empty for all of them.
+        Z: Torques of sizes of 1, shape (N, n, c).
         least: Smallest size that changes a result.
-        words: Returns the finding's sentence of sizes (c,) and their standard errors (c,).
-        applied: Returns the robot and its motions with sizes (c,), where torques bend with these.
+        words: Returns the finding's sentence for sizes (c,) and their standard errors (c,).
+        applied: Returns the robot and its motions with sizes (c,), if torques are nonlinear.
     """
 
     code: str
@@ -66,7 +67,7 @@ class _Alteration:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """An alteration that was found: its finding, and the rows as it leaves them."""
+    """An alteration that was found: its finding, and the samples corrected by it."""
 
     alteration: _Alteration
     finding: Finding
@@ -76,19 +77,19 @@ class _Found:
 def explain_residual(
     fit: Fit, sample: Sample | None
 ) -> tuple[tuple[Misfit, ...], tuple[Finding, ...]]:
-    """Return what the drives lack, and what recordings or URDF have otherwise than stated.
+    """Return the terms that drive models lack, and differences of recordings or URDF.
 
-    A spring imitates a zero that is off, and a zero a spring: what explains more of the residual of
-    all joints together is taken first, and what is found of the others alone is sought beside it.
+    A spring and a position offset imitate each other: what explains more of the residual of all
+    joints together is accepted first, and the other hypotheses are tested again together with it.
 
     Args:
-        fit: What was found.
-        sample: Rows of its recordings; None if they are too few to judge by.
+        fit: The fit.
+        sample: Samples of its recordings; None if there are too few for a test.
 
     Returns:
-        Terms that the drives lack, the largest first, and warnings "position_offset",
+        Terms that drive models lack, the largest first, and warnings "position_offset",
         "lost_motion", "angle_scale", "torque_scale", "time_scale", "gravity" and "joint_origin",
-        what explains most of the residual first.
+        the one that explains most of the residual first.
     """
     if sample is None:
         return (), ()
@@ -100,17 +101,17 @@ def explain_residual(
         lacking = _columns(misfits, sample)
         if _left(sample, altered) < _left(sample, lacking):
             alone = {(misfit.joint, misfit.term.code) for misfit in misfits}
-            beside = find_misfits(found[0].there.beside(altered))
-            misfits = tuple(m for m in beside if (m.joint, m.term.code) in alone)
+            remaining = find_misfits(found[0].there.with_columns(altered))
+            misfits = tuple(m for m in remaining if (m.joint, m.term.code) in alone)
         else:
             among = {one.alteration for one in found}
-            beside_them = _found(fit, sample.beside(lacking), own)
-            found = [one for one in beside_them if one.alteration in among]
+            retested = _found(fit, sample.with_columns(lacking), own)
+            found = [one for one in retested if one.alteration in among]
     return misfits, tuple(one.finding for one in found)
 
 
 def _columns(misfits: Sequence[Misfit], sample: Sample) -> Array:
-    """Return the torque of the parameters of terms that drives lack, shape (N, n, c)."""
+    """Return the columns of terms that drive models lack, shape (N, n, c)."""
     columns = []
     for misfit in misfits:
         j = sample.joints.index(misfit.joint)
@@ -121,22 +122,22 @@ def _columns(misfits: Sequence[Misfit], sample: Sample) -> Array:
 
 
 def _left(sample: Sample, Z: Array) -> float:
-    """Return the squared residual that columns leave of segments they were not fitted to."""
-    left = Trials(sample, Z).apart.left(list(range(Z.shape[2])))
+    """Return the squared residual of held-out segments with columns added."""
+    left = Trials(sample, Z).held_out.left(list(range(Z.shape[2])))
     return float(left[: sample.fitted].sum())
 
 
 def _refined(applied: _Applied, x: Array, pi: Array, sample: Sample) -> tuple[Array, Array, Sample]:
-    """Return the sizes of an alteration, their standard errors, and the rows as it leaves them.
+    """Return the sizes of an alteration, their standard errors, and the samples corrected by it.
 
-    Torques are no straight line over a tenth of a radian: sizes are sought anew from where they
-    were found, until they stay.
+    Torques are nonlinear over a tenth of a radian: Gauss-Newton steps are repeated until the sizes
+    converge.
 
     Args:
         applied: Returns the robot and its motions with sizes (c,).
         x: The sizes to first order, shape (c,).
         pi: Standard parameters of the estimate, shape (p,).
-        sample: Rows of the recordings.
+        sample: Samples of the recordings.
     """
     every, error = list(range(len(x))), np.full(len(x), np.inf)
     for _ in range(_STEPS):
@@ -154,7 +155,7 @@ def _refined(applied: _Applied, x: Array, pi: Array, sample: Sample) -> tuple[Ar
 
 
 def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alteration]:
-    """Yield what may be otherwise, with what it would do to the torques of the sample."""
+    """Yield the possible differences, with their effect on the torques of the sample."""
     n = len(model.joints)
     tau, of_drives = _torques(model, pi, sample.at), _drives(model, pi, sample.at)
     of_motions = [body_slopes(model, pi, motion).arrays for motion in sample.at]
@@ -162,7 +163,7 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
     q, v, a = (np.concatenate([getattr(m, key) for m in sample.at]) for key in "qva")
 
     def moved(scale: Array, shift: Array) -> Array:
-        """Return what positions (1 + e scale) q + e shift would change, over e."""
+        """Return the derivative of the torques for positions (1 + e scale) q + e shift by e."""
         factor = 1.0 + _STEP * scale
         change = [
             replace(m, q=factor * m.q + _STEP * shift, v=factor * m.v, a=factor * m.a)
@@ -174,7 +175,7 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
         return Z
 
     def offset(joint: int, x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
-        """Return the motions with the position of a joint that was x farther."""
+        """Return the motions with x added to the position of a joint."""
         return model, [replace(m, q=m.q + x * np.eye(n)[joint]) for m in sample.at]
 
     for j, joint in enumerate(model.joints):
@@ -183,11 +184,11 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
         applied = partial(offset, j)
         Z = moved(none, only)
         yield _Alteration("position_offset", joint, Z, 0.01, _zero(joint, unit), applied)
-        lost = 0.5 * Z * sample.motions[j].direction[:, None, None]
-        yield _Alteration("lost_motion", joint, lost, 0.005, _lost_motion(joint, unit))
+        backlash = 0.5 * Z * sample.motions[j].direction[:, None, None]
+        yield _Alteration("lost_motion", joint, backlash, 0.005, _lost_motion(joint, unit))
         yield _Alteration("angle_scale", joint, moved(only, none), 0.02, _scale(f"q_{joint}"))
         yield _Alteration("torque_scale", joint, (tau * only)[..., None], 0.05, _gain(joint))
-    for first in range(1, n - 1):  # the drives of a wrist are of one kind
+    for first in range(1, n - 1):  # the drives of a wrist are of the same type
         names = listed(model.joints[first:])
         Z = (tau * (np.arange(n) >= first))[..., None]
         yield _Alteration("torque_scale", ", ".join(model.joints[first:]), Z, 0.05, _gains(names))
@@ -199,10 +200,10 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
     yield _Alteration("time_scale", "", inertial[..., None], 0.04, _clock)
     down = np.array(model.pin_model.gravity.linear)
     if down.any():
-        across = np.linalg.svd(down[None])[2][1:]  # two directions at right angles to gravity
+        across = np.linalg.svd(down[None])[2][1:]  # two directions perpendicular to gravity
 
         def tilted(x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
-            return model.with_gravity(_turned(x, across, down)), sample.at
+            return model.with_gravity(_tilted(x, across, down)), sample.at
 
         Z = by_gravity @ (np.linalg.norm(down) * across).T
         yield _Alteration("gravity", "", Z, 0.05, _tilt(across, down), tilted)
@@ -222,38 +223,39 @@ def _drives(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
     return np.concatenate([drive_torque(model, pi, motion) for motion in at])
 
 
-def _turned(x: Array, across: Array, down: Array) -> Array:
-    """Return gravity turned towards the two axes across it, by tangents x of angles (2,)."""
+def _tilted(x: Array, across: Array, down: Array) -> Array:
+    """Return gravity rotated towards two perpendicular axes, by tangents x of angles (2,)."""
     size = np.linalg.norm(down)
-    turned = down + size * x @ across
-    return np.asarray(turned * size / np.linalg.norm(turned))
+    tilted = down + size * x @ across
+    return np.asarray(tilted * size / np.linalg.norm(tilted))
 
 
 def _found(fit: Fit, sample: Sample, own: Sequence[_Alteration]) -> Iterator[_Found]:
-    """Yield what explains the residual, one after the other, beside what was found before."""
+    """Yield the alterations that explain the residual, each together with those found before."""
     Z = np.concatenate([alteration.Z for alteration in own], axis=2)
     ends = np.cumsum([alteration.Z.shape[2] for alteration in own]).tolist()
     place = [list(range(end - a.Z.shape[2], end)) for a, end in zip(own, ends, strict=True)]
     trials = Trials(sample, Z)
-    apart, whole = trials.apart, trials.whole
+    held_out, whole = trials.held_out, trials.whole
     chosen: list[int] = []
-    total = before = apart.left([])
-    of_fitted, of_kept = (float(part.sum()) for part in np.split(total, [sample.fitted]))
+    total = before = held_out.left([])
+    of_fitted, of_validation = (float(part.sum()) for part in np.split(total, [sample.fitted]))
     untried = dict(zip(own, place, strict=True))
 
     def offered() -> Round[_Alteration]:
-        left = apart.left_each({one: [*chosen, *which] for one, which in untried.items()})
+        left = held_out.left_each({one: [*chosen, *which] for one, which in untried.items()})
         return Round(before, left, sample.fitted, of_fitted)
 
     for this, best in select(offered, ALTERATION, _complexity):
         if best is None:
             return
-        kept = float((before - this.left[best])[sample.fitted :].sum()) / max(of_kept, 1e-300)
+        gain = float((before - this.left[best])[sample.fitted :].sum())
+        confirmed = gain / max(of_validation, 1e-300)
         share, by_p_value = this.share(best), this.p_value(best)
-        has_kept, is_weak = len(total) > sample.fitted, share < ALTERATION_SHARE
-        is_confirmed = not has_kept or kept > CONFIRMED * share
+        has_validation, is_weak = len(total) > sample.fitted, share < ALTERATION_SHARE
+        is_confirmed = not has_validation or confirmed > CONFIRMED * share
         if is_weak:
-            is_confirmed = has_kept and kept > share > WEAK and by_p_value < WEAK_P_VALUE
+            is_confirmed = has_validation and confirmed > share > WEAK and by_p_value < WEAK_P_VALUE
         if by_p_value > ALTERATION_P_VALUE or not is_confirmed:
             return
         which = untried.pop(best)
@@ -261,7 +263,7 @@ def _found(fit: Fit, sample: Sample, own: Sequence[_Alteration]) -> Iterator[_Fo
         sizes, covariance = whole.estimate(chosen, sample.fitted)
         size, error = (x[-len(which) :] for x in (sizes, np.sqrt(np.diag(covariance))))
         least = best.least * (WEAK_SIZE if is_weak else 1.0)
-        if np.linalg.norm(size) < max(least, SURE * float(np.linalg.norm(error))):
+        if np.linalg.norm(size) < max(least, SIGNIFICANT * float(np.linalg.norm(error))):
             return
         there = sample
         if best.applied is not None and len(chosen) == len(which):
@@ -271,7 +273,7 @@ def _found(fit: Fit, sample: Sample, own: Sequence[_Alteration]) -> Iterator[_Fo
 
 
 def _complexity(one: _Alteration) -> tuple[int, int]:
-    """Return how many sizes an alteration has, and how many joints it names."""
+    """Return the number of sizes of an alteration, and the number of joints it names."""
     return one.Z.shape[2], one.where.count(",")
 
 
@@ -279,10 +281,10 @@ def _finding(
     found: _Alteration, size: Array, error: Array, share: float, alike: Sequence[_Alteration]
 ) -> Finding:
     others = [f"{one.code} of {one.where}" for one in alike if one.where]
-    also = f"; {listed(others)} would explain as much" if others else ""
+    also = f"; {listed(others)} would explain the same share" if others else ""
     message = (
         f"{found.words(size, error)}. This explains {100 * share:.0f} % of the squared residual, "
-        f"which other masses and friction do not{also}"
+        f"which other masses and friction do not explain{also}"
     )
     evidence = {
         "size": float(size[0] if len(size) == 1 else np.linalg.norm(size)),
@@ -294,57 +296,57 @@ def _finding(
 
 def _zero(joint: str, unit: str) -> Callable[[Array, Array], str]:
     return lambda x, error: (
-        f"{joint}: the zero of its position is off by {-x[0]:.3g} +- {error[0]:.2g} {unit}: "
-        f"correct q_{joint}, or the joint's origin in the URDF"
+        f"{joint}: position offset {-x[0]:.3g} +- {error[0]:.2g} {unit}: correct q_{joint}, or the "
+        "joint's origin in the URDF"
     )
 
 
 def _lost_motion(joint: str, unit: str) -> Callable[[Array, Array], str]:
     return lambda x, error: (
-        f"{joint}: its position is {abs(x[0]):.2g} +- {error[0]:.1g} {unit} farther in one "
-        "direction of motion than in the other: backlash between the joint and its encoder; remove "
-        "it, or log the position of an encoder on the joint"
+        f"{joint}: its position differs by {abs(x[0]):.2g} +- {error[0]:.1g} {unit} between the "
+        "directions of motion: backlash between the joint and its encoder; remove the backlash, or "
+        "log the position of an encoder on the joint"
     )
 
 
 def _scale(what: str) -> Callable[[Array, Array], str]:
     return lambda x, error: (
-        f"{what} fits best times {1 + x[0]:.3f} +- {error[0]:.2g}: check the unit, the gear ratio "
-        "and the counts per turn"
+        f"{what} fits best with a factor of {1 + x[0]:.3f} +- {error[0]:.2g}: check the unit, the "
+        "gear ratio and the encoder counts per revolution"
     )
 
 
 def _gain(joint: str) -> Callable[[Array, Array], str]:
     return lambda x, error: (
-        f"{joint}: its torque is about {1 + x[0]:.2f} (+- {error[0]:.1g}) times what those of the "
-        f"other joints imply: check its gain and gear ratio (--gain {joint}=...)"
+        f"{joint}: its torque is about {1 + x[0]:.2f} (+- {error[0]:.1g}) times the value that the "
+        f"other joints indicate: check its gain and gear ratio (--gain {joint}=...)"
     )
 
 
 def _gains(joints: str) -> Callable[[Array, Array], str]:
     return lambda x, error: (
         f"{joints}: their torques are {'at least' if x[0] > 0 else 'at most'} {1 + x[0]:.2f} (+- "
-        f"{error[0]:.1g}) times what those of the joints before them imply: check their gains "
+        f"{error[0]:.1g}) times the values that the joints before them indicate: check their gains "
         "and gear ratios (--gain JOINT=...)"
     )
 
 
 def _clock(x: Array, error: Array) -> str:
     return (
-        f"inertial torques are {1 + x[0]:.3f} +- {error[0]:.2g} times what gravity implies: the "
-        f"time stamps run {np.sqrt(max(1 + x[0], 0.0)):.3f} times as fast as the clock, or gravity "
-        "is stated wrongly"
+        f"inertial torques are {1 + x[0]:.3f} +- {error[0]:.2g} times the value that gravity "
+        f"indicates: the time stamps run {np.sqrt(max(1 + x[0], 0.0)):.3f} times as fast as the "
+        "clock, or the stated gravity is wrong"
     )
 
 
 def _tilt(across: Array, down: Array) -> Callable[[Array, Array], str]:
     def words(x: Array, error: Array) -> str:
-        turned = _turned(x, across, down)
-        angle, sure = (np.degrees(np.arctan(np.linalg.norm(size))) for size in (x, error))
-        shown = ", ".join(f"{value:.2f}" for value in turned)
+        tilted = _tilted(x, across, down)
+        angle, std_error = (np.degrees(np.arctan(np.linalg.norm(size))) for size in (x, error))
+        shown = ", ".join(f"{value:.2f}" for value in tilted)
         return (
-            f"gravity is tilted by about {angle:.2g} +- {sure:.1g} degrees from what is stated: if "
-            f"the base is not level, state gravity = [{shown}] in the job file"
+            f"gravity is tilted by about {angle:.2g} +- {std_error:.1g} degrees from the stated "
+            f"direction: if the base is not level, set gravity = [{shown}] in the job file"
         )
 
     return words
@@ -352,6 +354,6 @@ def _tilt(across: Array, down: Array) -> Callable[[Array, Array], str]:
 
 def _origin(joint: str) -> Callable[[Array, Array], str]:
     return lambda x, error: (
-        f"{joint} seems to lie {np.linalg.norm(x):.2g} +- {np.linalg.norm(error):.1g} m from where "
-        "the URDF has it: check that the URDF is of this robot"
+        f"{joint}: its origin differs by {np.linalg.norm(x):.2g} +- {np.linalg.norm(error):.1g} m "
+        "from the URDF's: check that the URDF is of this robot"
     )

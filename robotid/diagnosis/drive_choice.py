@@ -1,11 +1,12 @@
-"""Which terms the drive of each joint has: the fewest that explain what was held out.
+"""Selection of the terms of each joint's drive: the fewest that explain held-out segments.
 
-Terms are tried beside viscous and Coulomb friction, joint by joint, on rows spread over the fitted
-logs. The family that explains most of the segments left out is taken if it does so beyond chance,
-then the next one beside it, until nothing is left to gain. Validation Recordings have no say in it.
+Terms are added to viscous and Coulomb friction, joint by joint, on samples spread over the fitted
+logs. The family that explains most of the held-out segments is selected if it is significant, then
+the next one together with it, until no family improves the fit. Validation logs are not used.
 
-What a family is not linear in, its shape, is sought on a grid; then all shapes of a joint together,
-with the linear parameters refitted each time (Golub, Pereyra 2003, variable projection).
+The nonlinear parameters of a family, its shape, are searched on a grid. Then all shapes of a joint
+are refined together, with the linear parameters refitted in each step (variable projection, Golub,
+Pereyra 2003).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,7 +16,7 @@ from itertools import product
 import numpy as np
 
 from robotid._typing import Array
-from robotid.diagnosis.decisions import AT_BOUND, DOUBTED, FAMILY, FAMILY_SEEN, TENFOLD
+from robotid.diagnosis.decisions import AT_BOUND, FAMILY, FAMILY_LEAST, TENFOLD, UNDECIDED_P_VALUE
 from robotid.diagnosis.sample import RIDGE, Sample, Trial, Trials, take_sample
 from robotid.diagnosis.selection import Round, select
 from robotid.exceptions import SettingsError
@@ -27,31 +28,31 @@ from robotid.robot.drives import FAMILIES, DataRange, DriveMotion, DriveTerm, Fa
 
 __all__ = ["choose_drives"]
 
-_GRID = 6  # sizes of a shape that are tried, over its bounds
-_SPAN = 100.0  # from the smallest of them to the largest; a bound beyond is tried, too
-_SLOWEST = 0.0  # share of the rows that are slower than what counts as seen
-_TURN = 2 * np.pi  # [rad]
-_ROUNDING = 1e-10  # share of a column that is rounding: shapes and their errors know no other
-_STEP = 1e-3  # relative, of a derivative
-_STEPS = 40  # of the search for all shapes of a joint together
-_SHARPEST = 1e-6  # of the squared residual: exact data leave nothing to weigh by
+_GRID = 6  # values of a shape tested between its bounds
+_SPAN = 100.0  # largest over smallest of them; an upper bound beyond is also tested
+_SLOWEST = 0.0  # share of samples slower than the data range
+_REVOLUTION = 2 * np.pi  # [rad]
+_ROUNDING = 1e-10  # share of a column below which it is rounding: the ridge of shapes
+_STEP = 1e-3  # relative step of a finite difference
+_STEPS = 40  # iterations of the search for all shapes of a joint together
+_SHARPEST = 1e-6  # of the squared residual: lower limit for weights, for exact data
 _NOTHING = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
 class _Drive:
-    """A joint's drive along the sampled rows."""
+    """A joint's drive along the samples."""
 
-    slides: bool
-    motions: tuple[DriveMotion, ...]  # of each recording, all its rows
-    taken: tuple[Array, ...]  # rows of each recording in the sample
+    is_prismatic: bool
+    motions: tuple[DriveMotion, ...]  # of each recording, all its samples
+    taken: tuple[Array, ...]  # indices of the samples in each recording
     data_range: DataRange
-    largest: float  # of its torques there, by their size [N m or N]
-    plain: Mapping[str, Array]  # what of x is each of its plain parameters, U^T x, by name
+    largest: float  # largest absolute torque in the samples [N m or N]
+    plain: Mapping[str, Array]  # columns of U of its plain parameters, by name
     known: dict[DriveTerm, Array] = field(default_factory=dict)  # columns of terms, (N,)
 
     def columns(self, terms: Sequence[DriveTerm]) -> Array:
-        """Return what terms multiply in the sampled rows, shape (N, c)."""
+        """Return the columns of terms in the samples, shape (N, c)."""
         Z = np.empty((sum(map(len, self.taken)), len(terms)))
         for k, term in enumerate(terms):
             if term not in self.known:
@@ -69,13 +70,13 @@ def choose_drives(
     """Return the terms of each joint's drive.
 
     Args:
-        fit: What was found with viscous and Coulomb friction alone.
-        wanted: Families that joints are to have, by name; None: those that held-out segments of
-            the fitted logs ask for; see ``wanted_families``.
-        balanced: Family of the counterbalance of joints whose families are to be chosen.
+        fit: The fit with viscous and Coulomb friction only.
+        wanted: Families stated for each joint, by name; None: those that held-out segments of the
+            fitted logs require; see ``wanted_families``.
+        balanced: Family of the counterbalance of joints whose families are selected.
 
     Returns:
-        A choice per joint; none where a joint hardly moved, or the logs are too short to judge.
+        A choice per joint; none for a joint that hardly moved, or if the logs are too short.
     """
     sample = take_sample(fit, for_drives=True)
     if sample is None or fit.model.free_flyer:
@@ -90,14 +91,14 @@ def choose_drives(
         if not used[:, j].any() or (names is not None and not names):
             continue
         own = tuple(motion.of(j) for motion in motions)
-        data_range = _seen(own, sample.taken, used[:, j])
+        data_range = _range_of(own, sample.taken, used[:, j])
         plain = {
             name: sample.U[:, k]
             for k, name in enumerate(fit.mapping.base_names)
             if name.startswith(f"{joint}.")
         }
         largest = float(np.abs(torques[:, j]).max())
-        drive = _Drive(bool(sample.slides[j]), own, sample.taken, data_range, largest, plain)
+        drive = _Drive(bool(sample.is_prismatic[j]), own, sample.taken, data_range, largest, plain)
         first = [own for own in [(balanced or {}).get(joint)] if own is not None]
         alone = sample.of_joint(j)
         chosen = _auto(alone, drive, first) if names is None else _fixed(alone, drive, names)
@@ -105,8 +106,8 @@ def choose_drives(
     return tuple(choices)
 
 
-def _seen(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Array) -> DataRange:
-    """Return the ranges of position and of the size of speed in the rows that count."""
+def _range_of(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Array) -> DataRange:
+    """Return the ranges of position and of absolute velocity in the used samples."""
     own = [(m.q[rows], m.v[rows]) for m, rows in zip(motions, taken, strict=True)]
     q, v = (np.concatenate(x)[used] for x in zip(*own, strict=True))
     speed = np.abs(v)
@@ -117,11 +118,11 @@ def _seen(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Array) -
 
 
 def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[tuple[Family, list[float]]]:
-    """Yield families with every shape on their grid."""
+    """Yield families with every shape on its grid."""
     for family in families:
-        turns = (drive.data_range["q"][1] - drive.data_range["q"][0]) / _TURN
+        revolutions = (drive.data_range["q"][1] - drive.data_range["q"][0]) / _REVOLUTION
         bounds = [shape.within(drive.data_range) for shape in family.shapes]
-        if family.needs and (drive.slides or turns < family.needs):
+        if family.needs and (drive.is_prismatic or revolutions < family.needs):
             continue
         if not all(0.0 < low < high for low, high in bounds):  # it hardly moved
             continue
@@ -130,19 +131,19 @@ def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[tuple[Fam
 
 
 def _sizes(low: float, high: float) -> Array:
-    """Return the sizes of a shape that are tried."""
+    """Return the tested values of a shape."""
     own = np.geomspace(low, min(high, _SPAN * low), _GRID)
     return own if own[-1] >= high else np.append(own, high)
 
 
 @dataclass(frozen=True, eq=False)
 class _Options:
-    """Candidates of a joint, with every shape on the grid, and what they leave."""
+    """Candidates of a joint, with every shape on the grid, and their residuals."""
 
     own: list[tuple[Family, list[float]]]
     place: list[list[int]]  # columns of each
-    is_positive: Array  # which columns multiply what cannot be negative, bool
-    highest: Array  # what their parameters are at most
+    is_positive: Array  # columns whose parameter cannot be negative, bool
+    highest: Array  # upper bounds of their parameters
     trials: Trials
 
     @classmethod
@@ -152,20 +153,20 @@ class _Options:
         place = [list(range(e - len(those), e)) for those, e in zip(terms, ends, strict=True)]
         flat = [term for those in terms for term in those]
         positive = np.array([term.is_nonnegative for term in flat], dtype=bool)
-        highest = np.array([min(x.highest, drive.largest / _reach(drive, x)) for x in flat])
+        highest = np.array([min(x.highest, drive.largest / _amplitude(drive, x)) for x in flat])
         return cls(own, place, positive, highest, _trials(sample, drive, flat))
 
     def left(self, chosen: Sequence[int]) -> Array:
         """Return the squared residual of each segment with some candidates."""
-        return self.trials.apart.left(self._columns(chosen))
+        return self.trials.held_out.left(self._columns(chosen))
 
-    def left_each(self, beside: Mapping[int, Sequence[int]]) -> dict[int, Array]:
-        """Return the squared residual of each segment with each candidate beside some others.
+    def left_each(self, retained: Mapping[int, Sequence[int]]) -> dict[int, Array]:
+        """Return the squared residual of each segment with each candidate and some others.
 
-        Only of those whose parameters have no size that physics forbids: friction is of one sign,
-        and below the largest torque of the joint.
+        Only of candidates with physical parameters: friction opposes motion and is below the
+        largest torque of the joint.
         """
-        columns = {i: self._columns([*others, i]) for i, others in beside.items()}
+        columns = {i: self._columns([*others, i]) for i, others in retained.items()}
         theta = self.trials.whole.parameters_each(columns)
         possible = {
             i: which
@@ -173,7 +174,7 @@ class _Options:
             if (theta[i][self.is_positive[which]] >= 0).all()
             and (np.abs(theta[i]) <= self.highest[which]).all()
         }
-        return self.trials.apart.left_each(possible)
+        return self.trials.held_out.left_each(possible)
 
     def _columns(self, chosen: Sequence[int]) -> list[int]:
         return [k for i in chosen for k in self.place[i]]
@@ -186,10 +187,10 @@ def _trials(
     return Trials(sample, drive.columns(terms)[:, None], ridge)
 
 
-def _reach(drive: _Drive, term: DriveTerm) -> float:
-    """Return how large the column of a curve of speed may be; next to 0 of another term.
+def _amplitude(drive: _Drive, term: DriveTerm) -> float:
+    """Return the largest value of a curve of velocity; next to 0 for another term.
 
-    Behind a filter directions are small where a drive is slow, and hide how large a curve is there.
+    At low speed the filter reduces the sign of the velocity and hides the amplitude of the curve.
     """
     if term.guards != "v" or not isinstance(term, MemorylessTerm):
         return _NOTHING
@@ -198,25 +199,25 @@ def _reach(drive: _Drive, term: DriveTerm) -> float:
 
 
 def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoice:
-    """Return the fewest families that held-out segments require beside the first ones."""
+    """Return the fewest families that held-out segments require together with the first ones."""
     grid = list(_candidates(drive, [f for f in FAMILIES.values() if f.is_automatic]))
     known = list(_candidates(drive, [FAMILIES[name] for name in first]))
-    start = _weighed_anew(sample, drive, known)
+    start = _reweighted(sample, drive, known)
     every = _Options.of(start, drive, [*known, *grid])
     torque = float(start.torque[0])
     chosen = list(range(len(known)))
-    doubted: list[tuple[Family, list[float]]] = []
+    undecided: list[tuple[Family, list[float]]] = []
     before = every.left(chosen)
-    beside: dict[int, list[int]] = {}
+    retained: dict[int, list[int]] = {}
     names = tuple(family.name for family, _ in known)
     tried = [Tried(names, _percent(before, torque), 1.0, True)]
 
     def offered() -> Round[int]:
-        nonlocal beside
-        beside = _beside(every, chosen, len(known))
-        left = every.left_each(beside)
+        nonlocal retained
+        retained = _retained(every, chosen, len(known))
+        left = every.left_each(retained)
         whole = float(before.sum())
-        return Round(before, left, len(before), whole, FAMILY_SEEN**2 * torque)
+        return Round(before, left, len(before), whole, FAMILY_LEAST**2 * torque)
 
     def cost(i: int) -> tuple[int, int]:
         return _simplicity(every, i)
@@ -224,28 +225,28 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
     for this, best in select(offered, FAMILY, cost):
         found = None
         if best is not None:
-            found = _conditioned(sample, drive, every, this, beside, best)
+            found = _conditioned(sample, drive, every, this, retained, best)
             best = found.number
-        tried += list(_told(every, this, torque, beside, best))
+        tried += list(_considered(every, this, torque, retained, best))
         if found is None or best is None:
             nearest = min(this.left, key=lambda i: float(this.left[i].sum()), default=None)
-            if nearest is not None and this.p_value(nearest) < DOUBTED:
-                doubted = [every.own[nearest]]
+            if nearest is not None and this.p_value(nearest) < UNDECIDED_P_VALUE:
+                undecided = [every.own[nearest]]
             break
         own = found.own
-        known = known if set(chosen) <= set(beside[best]) else []
-        anew = _weighed_anew(sample, drive, own)
-        every, torque = _Options.of(anew, drive, [*own, *grid]), float(anew.torque[0])
+        known = known if set(chosen) <= set(retained[best]) else []
+        weighted = _reweighted(sample, drive, own)
+        every, torque = _Options.of(weighted, drive, [*own, *grid]), float(weighted.torque[0])
         chosen = list(range(len(own)))
         before = every.left(chosen)
     choice = _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
-    return replace(choice, doubted=_terms(drive, doubted))
+    return replace(choice, doubted=_terms(drive, undecided))
 
 
-def _beside(every: _Options, chosen: Sequence[int], known: int) -> dict[int, list[int]]:
-    """Return what stays of the chosen candidates beside each other one that may join them.
+def _retained(every: _Options, chosen: Sequence[int], known: int) -> dict[int, list[int]]:
+    """Return the chosen candidates that remain with each candidate that may be added.
 
-    A joint has one family of each kind; only those it was given before the choice are replaced.
+    A joint has one family of each kind. Only families given before the selection are replaced.
     """
     groups = [_group(every.own[k][0]) for k in chosen]
     return {
@@ -256,22 +257,22 @@ def _beside(every: _Options, chosen: Sequence[int], known: int) -> dict[int, lis
 
 
 def _group(family: Family) -> str:
-    """Return what families of one kind have in common, of which a joint has one."""
+    """Return the kind of a family; a joint has one family of each kind."""
     return family.name.rstrip("0123456789")
 
 
 def _simplicity(every: _Options, i: int) -> tuple[int, int]:
-    """Return how many columns a candidate has, and where its family is in the order of them."""
+    """Return the number of columns of a candidate, and the place of its family in their order."""
     return len(every.place[i]), list(FAMILIES).index(every.own[i][0].name)
 
 
 @dataclass(frozen=True)
 class _Refined:
-    """A candidate beside those chosen, with shapes between the sizes of the grid."""
+    """A candidate together with those chosen, with shapes refined between the grid's values."""
 
     number: int
-    own: list[tuple[Family, list[float]]]  # of those chosen and of itself
-    faults: tuple[bool, bool]  # a shape is at its bound, a standard error grows tenfold
+    own: list[tuple[Family, list[float]]]  # those chosen and the candidate
+    faults: tuple[bool, bool]  # a shape is at its bound, a standard error increases tenfold
 
 
 def _conditioned(
@@ -279,19 +280,19 @@ def _conditioned(
     drive: _Drive,
     every: _Options,
     this: Round[int],
-    beside: Mapping[int, Sequence[int]],
+    retained: Mapping[int, Sequence[int]],
     best: int,
 ) -> _Refined:
-    """Return the best candidate, or one of another family that is as good and better conditioned.
+    """Return the best candidate, or an equally good and better conditioned one of another family.
 
-    As good: it leaves no more of held-out segments than the best, within the standard error of the
-    difference. Better conditioned: no shape is at its bound, or no term makes the standard error of
-    another parameter of the drive grow tenfold, where the best has that.
+    Equally good: its residual of held-out segments is not larger than that of the best, within the
+    standard error of the difference. Better conditioned: no shape is at its bound, or no term
+    increases the standard error of another parameter of the drive tenfold, unlike the best.
     """
 
     def refined(i: int) -> _Refined:
-        own = _refined(sample, drive, [every.own[k] for k in (*beside[i], i)])
-        grown = _grown(_weighed_anew(sample, drive, own), drive, own)
+        own = _refined(sample, drive, [every.own[k] for k in (*retained[i], i)])
+        grown = _grown(_reweighted(sample, drive, own), drive, own)
         is_grown = max(grown.values(), default=1.0) > TENFOLD
         return _Refined(i, own, (bool(_at_bound(drive, own).any()), is_grown))
 
@@ -314,20 +315,20 @@ def _conditioned(
 
 
 def _is_alike(best: Array, other: Array, slack: float) -> bool:
-    """Return whether segments are left as small, within a slack or the difference's scatter."""
+    """Return whether residuals are equal within a slack or the scatter of their difference."""
     more = other - best
     scatter = np.sqrt(len(more)) * float(np.std(more, ddof=1))
     return bool(float(more.sum()) <= max(slack, scatter))
 
 
-def _told(
+def _considered(
     every: _Options,
     this: Round[int],
     torque: float,
-    beside: Mapping[int, Sequence[int]],
+    retained: Mapping[int, Sequence[int]],
     best: int | None,
 ) -> Iterator[Tried]:
-    """Yield what each family would leave, at its best shape."""
+    """Yield the error that each family would give at its best shape."""
     by_family: dict[str, int] = {}
     left = this.left
     for i, after in left.items():
@@ -337,7 +338,7 @@ def _told(
         ):
             by_family[name] = i
     for name, i in by_family.items():
-        names = [every.own[k][0].name for k in beside[i]]
+        names = [every.own[k][0].name for k in retained[i]]
         yield Tried((*names, name), _percent(left[i], torque), this.p_value(i), i == best)
 
 
@@ -346,18 +347,18 @@ def _percent(left: Array, torque: float) -> float:
 
 
 def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
-    """Return the families asked for, with the shapes that fit best."""
+    """Return the stated families with the shapes that fit best."""
     families = [FAMILIES[name] for name in names]
     every = _Options.of(sample, drive, list(_candidates(drive, families)))
     groups = [[i for i, (f, _) in enumerate(every.own) if f.name == name] for name in names]
     missing = [name for name, group in zip(names, groups, strict=True) if not group]
     if missing:
         raise SettingsError(
-            f"friction of {sample.joints[0]} has {listed(missing)}, but the joint slides, or "
-            "turned less than half a turn in the fitted logs; leave it out, or record more"
+            f"friction of {sample.joints[0]} has {listed(missing)}, which needs a revolute joint "
+            "and at least half a revolution in the fitted logs; remove it, or record more motion"
         )
     chosen = [group[len(group) // 2] for group in groups]
-    for _ in range(3 if len(names) > 1 else 1):  # one after the other, a few times over
+    for _ in range(3 if len(names) > 1 else 1):  # one after the other, repeated a few times
         for at, group in enumerate(groups):
             rest = [*chosen[:at], *chosen[at + 1 :]]
             chosen[at] = min(group, key=lambda i: float(every.left([*rest, i]).sum()))
@@ -381,8 +382,8 @@ def _found(
     flat = _flat(refined)
     shapes = [(family, shape) for family in families for shape in family.shapes]
     is_at_bound = _at_bound(drive, refined)
-    anew = _weighed_anew(sample, drive, refined)
-    covariance = _shape_covariance(anew, drive, families, flat)
+    weighted = _reweighted(sample, drive, refined)
+    covariance = _shape_covariance(weighted, drive, families, flat)
     return DriveChoice(
         joint=sample.joints[0],
         families=tuple(family.name for family in families),
@@ -393,7 +394,7 @@ def _found(
                 name=f"{family.name}.{shape.name}",
                 value=float(value),
                 std_error=float(std_error),
-                unit=shape.units[int(drive.slides)],
+                unit=shape.units[int(drive.is_prismatic)],
                 is_at_bound=bool(is_edge),
             )
             for (family, shape), value, std_error, is_edge in zip(
@@ -403,7 +404,7 @@ def _found(
         shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
         sizes=tuple(tuple(own) for _, own in refined),
         data_range=drive.data_range,
-        grown=_grown(anew, drive, refined),
+        grown=_grown(weighted, drive, refined),
     )
 
 
@@ -413,7 +414,7 @@ def _flat(chosen: Sequence[tuple[Family, Sequence[float]]]) -> Array:
 
 
 def _at_bound(drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]) -> Array:
-    """Return which shapes are at the end of the range in which they are sought, shape (k,)."""
+    """Return which shapes are at a bound of their search range, shape (k,)."""
     bounds = _log_bounds(drive, [family for family, _ in chosen])
     margin = AT_BOUND * np.ptp(bounds, axis=1)
     is_near: Array = np.min(np.abs(np.log(_flat(chosen))[:, None] - bounds), axis=1) < margin
@@ -423,7 +424,7 @@ def _at_bound(drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]) -
 def _grown(
     sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
 ) -> dict[str, float]:
-    """Return how many times larger terms make the standard error of each plain drive parameter.
+    """Return the factor by which terms increase the standard error of each plain parameter.
 
     With X the columns of terms and shapes, M = 1 - W (W^T W + 1)^-1 W^T and T = (W^T W + 1)^-1 W^T
     X, the covariance (W^T W + 1)^-1 of the base parameters becomes that plus T (X^T M X)^-1 T^T.
@@ -441,20 +442,20 @@ def _grown(
     return grown
 
 
-def _weighed_anew(
+def _reweighted(
     sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
 ) -> Sample:
-    """Return the rows with the joint's weighed by what its new terms leave of the residual.
+    """Return the samples with the joint's weights from its residual with the new terms.
 
-    By that of the fit without them the data of this joint would be far too weak: against those of
-    the others, and against what is known before the data.
+    With the residual without them the weights of this joint would be far too small, compared with
+    those of other joints and with the prior.
     """
     if not chosen:
         return sample
     terms = _terms(drive, chosen)
     whole = _trials(sample, drive, terms).whole
     before, after = (float(whole.left(which).sum()) for which in ([], list(range(len(terms)))))
-    return sample.weighed(np.sqrt(before / max(after, _SHARPEST * before, _NOTHING)))
+    return sample.reweighted(np.sqrt(before / max(after, _SHARPEST * before, _NOTHING)))
 
 
 def _terms(
@@ -465,7 +466,7 @@ def _terms(
 
 
 def _log_bounds(drive: _Drive, families: Sequence[Family]) -> Array:
-    """Return logarithms of where each shape is sought, shape (k, 2)."""
+    """Return the logarithms of the search range of each shape, shape (k, 2)."""
     bounds = [shape.within(drive.data_range) for family in families for shape in family.shapes]
     logs: Array = np.log(np.reshape(bounds, (-1, 2)))
     return logs
@@ -474,7 +475,7 @@ def _log_bounds(drive: _Drive, families: Sequence[Family]) -> Array:
 def _refined(
     sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
 ) -> list[tuple[Family, list[float]]]:
-    """Return families with the shapes that together leave least of the fitted rows, near theirs."""
+    """Return families with the nearby shapes that give the smallest residual together."""
     from scipy.optimize import minimize
 
     families = [family for family, _ in chosen]
@@ -487,7 +488,7 @@ def _refined(
 
     best = start
     if len(start):
-        sample = _weighed_anew(sample, drive, chosen).joined()
+        sample = _reweighted(sample, drive, chosen).joined()
         bounds, options = _log_bounds(drive, families), {"eps": _STEP, "maxiter": _STEPS}
         found = minimize(left, start, method="L-BFGS-B", bounds=bounds, options=options)
         best = found.x if found.fun <= left(start) else start
@@ -497,11 +498,11 @@ def _refined(
 def _shape_covariance(
     sample: Sample, drive: _Drive, families: Sequence[Family], flat: Array
 ) -> Array:
-    """Return the covariance of shapes: that of the columns d(torque)/d(shape) beside all."""
+    """Return the covariance of shapes: of columns d(torque)/d(shape), fitted with all others."""
     if not len(flat):
         return np.empty((0, 0))
-    count, beside = _with_slopes(sample, drive, families, flat)
-    _, every = beside.estimate(list(range(count + len(flat))), sample.fitted)
+    count, trial = _with_slopes(sample, drive, families, flat)
+    _, every = trial.estimate(list(range(count + len(flat))), sample.fitted)
     covariance: Array = every[count:, count:]
     return covariance
 

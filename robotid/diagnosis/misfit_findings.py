@@ -1,4 +1,4 @@
-"""Findings of terms that the model of a drive lacks, and what the user can write to add them."""
+"""Findings of terms that a drive model lacks, and the entries of a job file that add them."""
 
 import json
 from collections.abc import Sequence
@@ -23,29 +23,29 @@ __all__ = [
 
 _OF_POSITION = ("position_periodic", "spring", "position_offset")
 _OF_MASSES = ("counterbalance", "current_for_torque", "urdf_mismatch")
-_SPRINGS = ("ripple", "spring")  # parts of the torque that follow the position
+_SPRINGS = ("ripple", "spring")  # parts of the torque that depend on the position
 _DIGITS = "0123456789"
 
 
 def misfit_findings(fit: Fit, misfits: Sequence[Misfit], on_misfit: Sequence[str]) -> list[Finding]:
-    """Return a finding for each term that the model of a drive lacks.
+    """Return a finding for each term that a drive model lacks.
 
     Args:
-        fit: What was found.
+        fit: The fit.
         misfits: The terms.
-        on_misfit: Names of the drive parameters whose errors grew by them.
+        on_misfit: Names of the drive parameters whose errors increased for them.
     """
     return [_finding(misfit, fit, on_misfit) for misfit in misfits]
 
 
 def setting_of(misfit: Misfit, fit: Fit) -> str:
-    """Return what to write into a job file to add a term to the model; empty if nothing does.
+    """Return the entry of a job file that adds a term to the model; empty if there is none.
 
-    A line of [drives], which has what the joint's drive has already, or a table [[coupling]].
+    It is a line of [drives] that includes the present terms of the joint, or a table [[coupling]].
 
     Args:
         misfit: The term.
-        fit: What was found without it.
+        fit: The fit without it.
     """
     joint, other = misfit.joint, misfit.term.coupled
     if other:
@@ -57,10 +57,10 @@ def setting_of(misfit: Misfit, fit: Fit) -> str:
 
 
 def with_entries(fit: Fit, joint: str, entries: Sequence[str | DriveTerm]) -> str:
-    """Return the line of a job's [drives] that adds entries to what a joint's drive has.
+    """Return the line of a job's [drives] that adds entries to the present ones of a joint.
 
     Args:
-        fit: What was found without them.
+        fit: The fit without them.
         joint: The joint.
         entries: Names of families, or terms.
     """
@@ -75,10 +75,10 @@ def with_entries(fit: Fit, joint: str, entries: Sequence[str | DriveTerm]) -> st
 
 
 def counterbalanced(found: Sequence[Finding], logs: Sequence[str]) -> dict[str, str]:
-    """Return the family of the counterbalance of each joint that the fitted logs show one of.
+    """Return the family of the counterbalance of each joint with one in the fitted logs.
 
     Args:
-        found: What was found before the fit.
+        found: Findings before the fit.
         logs: Names of the fitted logs.
     """
     joints = {}
@@ -90,11 +90,11 @@ def counterbalanced(found: Sequence[Finding], logs: Sequence[str]) -> dict[str, 
 
 
 def with_known_springs(found: Sequence[Finding], fit: Fit) -> list[Finding]:
-    """Return what was found before a fit, a counterbalance that its model has as a note.
+    """Return the findings before a fit; a counterbalance that its model includes becomes a note.
 
     Args:
-        found: What was found before the fit.
-        fit: The fit, whose drives have their terms.
+        found: Findings before the fit.
+        fit: The fit, with the terms of its drives.
     """
     own = fit.model.layout.own
     springs = {joint for joint, terms in own.items() if any(t.part in _SPRINGS for t in terms)}
@@ -104,67 +104,71 @@ def with_known_springs(found: Sequence[Finding], fit: Fit) -> list[Finding]:
         if finding.code != "counterbalance" or joint not in springs:
             return finding
         names = listed(term.name for term in own[joint] if term.part in _SPRINGS)
-        message = f"{finding.message.partition('. Add')[0]}. The model has it: {names} of {joint}"
+        message = (
+            f"{finding.message.partition('. Add')[0]}. The model includes it: {names} of {joint}"
+        )
         return replace(finding, severity="note", message=message)
 
     return [as_known(finding) for finding in found]
 
 
 def settled(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
-    """Return what was found before the fit and of the fit, without guesses that a term explains.
+    """Return the findings before and of the fit, without hypotheses that a term explains.
 
-    The doctor knows no springs: a joint whose torque follows its position weighs wrong for him, or
-    its torque fits nothing. The term that explains it is a warning then, however little is left.
+    The doctor's model has no springs: it attributes a torque that depends on the position to wrong
+    masses, or to nothing. The term that explains it is then a warning, even if it is small.
 
     Args:
-        found: What was found before the fit.
-        of_fit: What was found of the fit.
+        found: Findings before the fit.
+        of_fit: Findings of the fit.
     """
-    kept, terms = list(found), []
+    rest, terms = list(found), []
     for term in of_fit:
-        guesses = [f for f in kept if _explains(term, f)]
-        kept = [f for f in kept if f not in guesses]
-        if guesses:
-            codes = listed(dict.fromkeys(f.code for f in guesses))
-            message = f"{term.message}. It explains {codes}, and may have gone into masses in part"
-            evidence = {**term.evidence, "replaces": float(len(guesses))}
+        hypotheses = [f for f in rest if _explains(term, f)]
+        rest = [f for f in rest if f not in hypotheses]
+        if hypotheses:
+            codes = listed(dict.fromkeys(f.code for f in hypotheses))
+            message = f"{term.message}. It explains {codes} and may bias the masses"
+            evidence = {**term.evidence, "replaces": float(len(hypotheses))}
             term = replace(term, severity="warning", message=message, evidence=evidence)
         terms.append(term)
-    return kept + terms
+    return rest + terms
 
 
-def _explains(term: Finding, guess: Finding) -> bool:
-    """Return whether a term that the fit found explains what was found before the fit."""
+def _explains(term: Finding, hypothesis: Finding) -> bool:
+    """Return whether a term of the fit explains a hypothesis from before the fit."""
     if term.evidence.get("share_pct", 0.0) < MAIN:
         return False
-    if guess.code == "unexplained_torque":
-        return guess.where.rpartition(": ")[2] == term.where
-    return guess.code in _OF_MASSES and term.code in _OF_POSITION
+    if hypothesis.code == "unexplained_torque":
+        return hypothesis.where.rpartition(": ")[2] == term.where
+    return hypothesis.code in _OF_MASSES and term.code in _OF_POSITION
 
 
 def _advice(term: Candidate, setting: str) -> str:
-    """Return in words what the user can do about a term that the model lacks."""
+    """Return the remedy for a term that the model lacks, as text."""
     if not setting:
         return term.advice
     table, *lines = setting.split("\n")
     if term.coupled:
-        size = "the size of the second from the data sheet"
-        return f"Add {table} to the job with {' and '.join(lines)}, {size}"
-    added = f"state {lines[0]} in {table} to add it to the model"
+        size = "with the second ratio from the data sheet"
+        return f"Add {table} to the job: {' and '.join(lines)}, {size}"
+    added = f"add it to the model with {lines[0]} in {table}"
     return f"{term.advice}, or {added}" if term.advice else f"{added[0].upper()}{added[1:]}"
 
 
 def _finding(misfit: Misfit, found: Fit, on_misfit: Sequence[str]) -> Finding:
-    term, kept = misfit.term, misfit.confirmed
+    term, validation = misfit.term, misfit.confirmed
     wide = [name for name in on_misfit if name.startswith(f"{misfit.joint}.")]
-    stands = f"; {listed(wide)} stand on this misfit, and their intervals count it" if wide else ""
-    confirmed = "" if kept is None else f" ({100 * max(kept, 0.0):.0f} % on the validation logs)"
-    done = _advice(term, setting_of(misfit, found))
+    widened = f"; the intervals of {listed(wide)} include this misfit" if wide else ""
+    confirmed = ""
+    if validation is not None:
+        confirmed = f" ({100 * max(validation, 0.0):.0f} % on the validation logs)"
+    remedy = _advice(term, setting_of(misfit, found))
     message = (
         f"{misfit.joint}: {term.meaning}: {misfit.size:.3g} +- {misfit.std_error:.2g} "
         f"{misfit.unit}. It would explain {100 * misfit.share:.0f} % of the squared residual"
         f"{confirmed}; the residual is {100 * misfit.error:.1f} % of the torque. "
-        f"{done or 'No term of the model is like it'}{stands}"
+        f"{remedy or 'The model has no such term'}{widened}"
     )
     evidence = {
         "share_pct": 100 * misfit.share,
@@ -173,7 +177,7 @@ def _finding(misfit: Misfit, found: Fit, on_misfit: Sequence[str]) -> Finding:
         "std_error": misfit.std_error,
         "p_value": misfit.p_value,
     }
-    if kept is not None:
-        evidence["validation_share_pct"] = 100 * kept
+    if validation is not None:
+        evidence["validation_share_pct"] = 100 * validation
     severity = "warning" if misfit.matters else "note"
     return Finding(term.code, severity, misfit.joint, message, evidence)

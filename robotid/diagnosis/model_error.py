@@ -1,14 +1,14 @@
-"""Standard errors that know what the drive model lacks, and what is open of its shapes.
+"""Standard errors that include model errors: missing drive terms, and uncertain friction shapes.
 
-A term that the drives have and the model lacks moves the other parameters, by -T theta if theta is
-what it would be. That is no noise, and does not shrink with the length of the log: its square adds
-to their covariance; so does that of a term which was nearly chosen. A shape that was found beside
-them has an error of its own, and so do they:
+A term that the drives have and the model lacks changes the other parameters by -T theta, with its
+own parameters theta. This is a bias and does not decrease with the length of the log: its square
+is added to their covariance. So is that of a term that was nearly selected. A fitted shape has a
+standard error, which adds to theirs:
 
     C += sum_terms (T theta) (T theta)^T + sum_joints T C_s T^T,  T = (W^T W + C_0^-1)^-1 W^T z
 
-A prediction errs by what such a term moves and by its own torque at once, and the two cancel in
-part: W T theta - z theta. Hence each is kept as an ``OpenTerm``, beside what it adds to C.
+The error of a prediction has two parts, the changed parameters and the missing torque, which partly
+cancel: W T theta - z theta. Hence each term is stored as an ``OpenTerm``, with its part of C.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -33,30 +33,30 @@ if TYPE_CHECKING:
 
 __all__ = ["settled_shapes", "with_model_error"]
 
-_STEP = 1e-3  # relative, of a derivative
-_ROUNDING = 1e-10  # share of a column that is rounding
-_MOVES = 0.2  # standard errors by which a shape moves that is worth another fit
-_PINNED = 1e-6  # of the smallest spread: that of a parameter that is known
+_STEP = 1e-3  # relative step of a finite difference
+_ROUNDING = 1e-10  # share of a column below which it is rounding
+_MOVES = 0.2  # change of a shape in standard errors above which the fit is repeated
+_PINNED = 1e-6  # of the smallest prior spread: spread of a parameter that is fixed
 
 
 def with_model_error(
     found: Fit, sample: Sample | None, misfits: Sequence[Misfit]
 ) -> tuple[Fit, tuple[str, ...]]:
-    """Return a fit whose errors count what its drive model lacks.
+    """Return a fit whose standard errors include the errors of its drive model.
 
     Args:
-        found: What was found.
-        sample: Rows of its recordings; None if they are too few to judge by.
-        misfits: Terms that the model of its drives lacks.
+        found: The fit.
+        sample: Samples of its recordings; None if there are too few for a test.
+        misfits: Terms that its drive models lack.
 
     Returns:
-        The fit, and names of the drive parameters whose errors grew by the misfits.
+        The fit, and names of the drive parameters whose errors increased for the misfits.
     """
     if sample is None:
         return found, ()
     motions = _motions(found, sample) if found.drives else []
     found = _wider(found, sample, list(_of_shapes(found, sample, motions)))
-    found = _wider(found, sample, list(_of_warnings(found, sample, motions)))
+    found = _wider(found, sample, list(_of_undecided(found, sample, motions)))
     wider = _wider(found, sample, [_of_misfit(misfit) for misfit in misfits])
     before, after = found.standard_error, wider.standard_error
     drives = np.arange(len(before)) >= found.model.layout.n_inertial
@@ -66,7 +66,7 @@ def with_model_error(
 
 @dataclass(frozen=True, eq=False)
 class _Move:
-    """What is open of a drive, in the sample's units."""
+    """An uncertain part of a drive model, in the sample's units."""
 
     joint: str
     shift: Array  # of base parameters over their spread, (b,)
@@ -74,7 +74,7 @@ class _Move:
 
 
 def _wider(found: Fit, sample: Sample, moved: Sequence[_Move]) -> Fit:
-    """Return a fit with what else is open of its drives."""
+    """Return a fit with the errors from further uncertain parts of its drive models."""
     if not moved:
         return found
     X = sample.U.T @ np.column_stack([move.shift for move in moved])  # (b, m), base parameters
@@ -91,40 +91,40 @@ def _wider(found: Fit, sample: Sample, moved: Sequence[_Move]) -> Fit:
 
 
 def _gain(found: Fit) -> Array:
-    """Return how a change of base parameters spreads over the standard ones, shape (p, b)."""
+    """Return the gain from a change of base parameters to standard parameters, shape (p, b)."""
     spread = found.prior_std
-    least = _PINNED * float(spread[spread > 0].min())  # what is known exactly hardly moves
+    least = _PINNED * float(spread[spread > 0].min())  # a fixed parameter hardly changes
     return found.mapping.gain(np.maximum(spread, least))
 
 
 def _of_shapes(found: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
-    """Yield what is open of shapes.
+    """Yield the uncertain directions of shapes.
 
-    Shapes of a joint err together: their covariance is C_s = L L^T, one move for each column of L.
+    The errors of a joint's shapes are correlated: C_s = L L^T, one direction per column of L.
     """
     for choice in found.drives:
         if choice.shapes:
             T = _shape_trial(found, choice, sample, motions).T[:, :-1]
             variance, axes = np.linalg.eigh(np.array(choice.shape_covariance))
             for axis in (axes * np.sqrt(np.maximum(variance, 0.0))).T:
-                bends = partial(_bent, found, choice, axis)
-                yield _Move(choice.joint, -(T @ axis), bends)
+                torque = partial(_shape_change, found, choice, axis)
+                yield _Move(choice.joint, -(T @ axis), torque)
 
 
-def _bent(
+def _shape_change(
     found: Fit,
     choice: "DriveChoice",
     axis: Array,
     motion: DriveMotion,
     alone: JointMotion,
 ) -> Array:
-    """Return what shapes that are larger by an axis (k,) change in a drive's torque, shape (N,)."""
+    """Return the change of a drive's torque for a change of its shapes by (k,), shape (N,)."""
     slopes = [shape_slope(found, choice, k, motion) for k in range(len(axis))]
     return np.asarray(np.column_stack(slopes) @ axis)
 
 
 def _of_misfit(misfit: Misfit) -> _Move:
-    """Return what is open by a term that the model lacks."""
+    """Return the uncertain part of a term that the model lacks."""
 
     def torque(motion: DriveMotion, alone: JointMotion) -> Array:
         return misfit.torque(alone)
@@ -135,7 +135,7 @@ def _of_misfit(misfit: Misfit) -> _Move:
 def _shape_trial(
     found: Solution, choice: "DriveChoice", sample: Sample, motions: Sequence[DriveMotion]
 ) -> Trial:
-    """Return a trial of the columns d(torque)/d(shape) of a joint, beside all that was fitted."""
+    """Return a trial of the columns d(torque)/d(shape) of a joint, with all that was fitted."""
     j = sample.joints.index(choice.joint)
     slopes = [
         np.column_stack(
@@ -147,15 +147,15 @@ def _shape_trial(
 
 
 def settled_shapes(found: Solution) -> "tuple[DriveChoice, ...] | None":
-    """Return choices with shapes that fit better now that all joints have their terms.
+    """Return choices with shapes refitted now that all joints have their terms.
 
-    One step of Gauss and Newton: what a shape should be moved by is the parameter of its column.
+    One Gauss-Newton step: the step of a shape is the parameter of its column.
 
     Args:
-        found: What was found with the shapes as they are.
+        found: The fit with the present shapes.
 
     Returns:
-        The choices; None if no shape moves by more than a part of its standard error.
+        The choices; None if no shape changes by more than 0.2 of its standard error.
     """
     sample = take_sample(found, for_drives=True)
     if sample is None or not any(choice.shapes for choice in found.drives):
@@ -174,8 +174,8 @@ def settled_shapes(found: Solution) -> "tuple[DriveChoice, ...] | None":
     return tuple(drives) if farthest > _MOVES else None
 
 
-def _of_warnings(found: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
-    """Yield what is open by terms that were nearly taken."""
+def _of_undecided(found: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
+    """Yield the uncertain parts of terms that were nearly selected."""
     for choice in found.drives:
         if not choice.doubted:
             continue
@@ -200,19 +200,19 @@ def _of_terms(
 
 
 def _motions(found: Solution, sample: Sample) -> list[DriveMotion]:
-    """Return how the drives move along each recording, as ``Sample.taken`` counts them."""
+    """Return the motion of the drives along each recording, see ``Sample.taken``."""
     model = found.model.with_reference(found.standard)
     return [drive_motion_along(model, x.trajectory) for x in sample.recordings]
 
 
 def shape_slope(found: Solution, choice: "DriveChoice", which: int, motion: DriveMotion) -> Array:
-    """Return how the torque of a joint's drive changes with one of its shapes, shape (N,).
+    """Return the derivative of a drive's torque with respect to one of its shapes, shape (N,).
 
     Args:
         found: The fit.
         choice: The joint's terms.
-        which: Which of its shapes.
-        motion: How the drive moves, arrays of shape (N,).
+        which: Index of the shape.
+        motion: Motion of the drive, arrays of shape (N,).
     """
     layout = found.model.layout
     theta = dict(zip(layout.names, found.standard, strict=True))

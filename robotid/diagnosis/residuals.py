@@ -1,4 +1,4 @@
-"""What a residual still holds: its spectrum, its autocorrelation, and friction against speed."""
+"""Spectrum and autocorrelation of a residual, and friction against speed."""
 
 import itertools
 
@@ -15,22 +15,22 @@ __all__ = ["autocorrelation", "friction_split", "spectrum"]
 def spectrum(
     x: Array, used: NDArray[np.bool_], segment: Array, dt: float, *, length: float = 5.0
 ) -> tuple[Array, Array]:
-    """Return the power spectral density of a signal that has gaps and rows left out.
+    """Return the power spectral density of a signal with gaps and excluded samples.
 
-    Welch's mean over half-overlapping Hann windows w, none of them across a gap. Rows left out
-    count as zero, and a window is normalised by the rows it has:
-    S(f) = 2 dt sum |FFT(w m x)|^2 / sum w^2 m, with m = 1 where a row is used.
+    Welch's mean over half-overlapping Hann windows w, none of them across a gap. Excluded samples
+    count as zero, and a window is normalised by its used samples:
+    S(f) = 2 dt sum |FFT(w m x)|^2 / sum w^2 m, with m = 1 where a sample is used.
 
     Args:
         x: The signal, shape (N,) [unit].
-        used: Rows used, shape (N,), bool.
-        segment: Number of the uninterrupted segment of each row, shape (N,).
+        used: Samples used, shape (N,), bool.
+        segment: Number of the uninterrupted segment of each sample, shape (N,).
         dt: Sample period [s].
         length: Length of a window [s]; that of the longest segment where it is shorter.
 
     Returns:
         Frequencies, shape (F,) [Hz], and the one-sided density, shape (F,) [unit^2/Hz]. Its
-        integral is the mean square of the rows used. Both empty if no window holds a used row.
+        integral is the mean square of the used samples. Both are empty if no window has one.
 
     References:
         Welch (1967), The use of fast Fourier transform for the estimation of power spectra.
@@ -38,13 +38,13 @@ def spectrum(
     """
     bounds = np.flatnonzero(np.r_[True, np.diff(segment) != 0, True])
     size = min(max(round(length / dt), 8), int(np.diff(bounds).max()))
-    window = np.hanning(size + 2)[1:-1]  # no zero at its ends
+    window = np.hanning(size + 2)[1:-1]  # without the zeros at its ends
     power, weight = np.zeros(size // 2 + 1), 0.0
     for start, end in itertools.pairwise(bounds):
         for first in range(int(start), int(end) - size + 1, max(size // 2, 1)):
-            kept = window * used[first : first + size]
-            power += np.abs(np.fft.rfft(kept * x[first : first + size])) ** 2
-            weight += float(np.sum(kept**2))
+            masked = window * used[first : first + size]
+            power += np.abs(np.fft.rfft(masked * x[first : first + size])) ** 2
+            weight += float(np.sum(masked**2))
     if weight == 0.0:
         return np.empty(0), np.empty(0)
     density = 2.0 * dt * power / weight
@@ -55,19 +55,19 @@ def spectrum(
 
 
 def autocorrelation(x: Array, used: NDArray[np.bool_], segment: Array, lags: int) -> Array:
-    """Return the autocorrelation of a signal that has gaps and rows left out.
+    """Return the autocorrelation of a signal with gaps and excluded samples.
 
-    r(k) = sum x(i) x(i + k) / sqrt(sum x(i)^2 sum x(i + k)^2), all over the pairs of used rows in
-    one segment: by Cauchy and Schwarz it never exceeds 1, however few pairs are so far apart.
+    r(k) = sum x(i) x(i + k) / sqrt(sum x(i)^2 sum x(i + k)^2), summed over pairs of used samples in
+    one segment: by Cauchy and Schwarz it is at most 1, however few pairs have this lag.
 
     Args:
-        x: The signal, shape (N,); its mean is not taken out.
-        used: Rows used, shape (N,), bool.
-        segment: Number of the uninterrupted segment of each row, shape (N,).
+        x: The signal, shape (N,); its mean is not subtracted.
+        used: Samples used, shape (N,), bool.
+        segment: Number of the uninterrupted segment of each sample, shape (N,).
         lags: Longest lag [samples].
 
     Returns:
-        Autocorrelation at lags 0 to ``lags``, shape (lags + 1,); NaN where no pair of rows is.
+        Autocorrelation at lags 0 to ``lags``, shape (lags + 1,); NaN without a pair of samples.
 
     References:
         Parzen (1963), On spectral analysis with missing observations.
@@ -76,10 +76,10 @@ def autocorrelation(x: Array, used: NDArray[np.bool_], segment: Array, lags: int
     bounds = np.flatnonzero(np.r_[True, np.diff(segment) != 0, True])
     for start, end in itertools.pairwise(bounds):
         mask = used[start:end].astype(float)
-        seen = mask * x[start:end]
-        products += _lagged(seen, seen, lags)
-        earlier += _lagged(seen**2, mask, lags)
-        later += _lagged(mask, seen**2, lags)
+        masked = mask * x[start:end]
+        products += _lagged(masked, masked, lags)
+        earlier += _lagged(masked**2, mask, lags)
+        later += _lagged(mask, masked**2, lags)
         pairs += _lagged(mask, mask, lags)
     size = np.sqrt(np.maximum(earlier * later, 0.0))
     known = (np.round(pairs) > 0) & (size > 1e-12 * size[0])  # the FFT rounds
@@ -88,9 +88,9 @@ def autocorrelation(x: Array, used: NDArray[np.bool_], segment: Array, lags: int
 
 
 def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tuple[Array, Array]:
-    """Return the torque that inertia and gravity leave, and the friction identified.
+    """Return the measured torque without rigid-body torques, and the identified friction.
 
-    Left is tau - Y pi with pi without friction and offset; identified is what these add.
+    The first is tau - Y pi with pi without friction and offset, the second their torque.
 
     Args:
         model: The robot.
@@ -98,8 +98,7 @@ def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tupl
         pi: Standard parameters, shape (p,).
 
     Returns:
-        Torque left and friction identified, shape (N, n) each [N m or N]; an offset counts as
-        friction.
+        Both torques, shape (N, n) each [N m or N]; an offset counts as friction.
     """
     layout = model.layout
     inertial = [True] * layout.n_inertial

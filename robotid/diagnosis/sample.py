@@ -1,12 +1,12 @@
-"""Rows of the recordings to test terms on, and what columns beside the regressor explain of them.
+"""Samples of the recordings for tests of terms, and trials of columns added to the regressor.
 
-Columns Z of a candidate term join the regressor, and theta is refitted without one segment of the
-logs after the other, base parameters and all:
+Columns Z of a candidate term are added to the regressor. Its parameters theta are refitted together
+with the base parameters, with one segment of the logs held out after the other:
 
     r = W delta + Z theta + e,    theta = (Z^T M Z)^-1 Z^T M r,    M = 1 - W (W^T W + C^-1)^-1 W^T,
 
-so that what base parameters can explain does not count (Frisch, Waugh 1933); C is their covariance
-before the data. What a term explains of the segments left out, it explains beyond chance.
+so that what base parameters can explain does not count (Frisch, Waugh 1933). C is their prior
+covariance. A term that is not in the data does not reduce the residual of held-out segments.
 """
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -28,29 +28,29 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["RIDGE", "Normal", "Sample", "Trial", "Trials", "along", "take_sample"]
 
-#: Share of a column that the regressor must leave of it.
+#: Smallest share of a column that the regressor must not explain.
 RIDGE = 1e-4
-_ROWS = 3000  # of all fitted logs, and of all kept ones, that are read
-_NUMBERS = 2**24  # of the regressor in them
-_PER_INDEPENDENT = 2.0  # rows for each that is independent behind the filter
-_SEGMENTS = 16  # left out in turn
-_SHORTEST = 10  # independent rows in a segment
-_FEWEST = 6  # segments to judge by
+_ROWS = 3000  # samples of all fitted logs together, and of all validation logs
+_NUMBERS = 2**24  # elements of their regressor
+_PER_INDEPENDENT = 2.0  # samples per independent one behind the filter
+_SEGMENTS = 16  # held out in turn
+_SHORTEST = 10  # independent samples in a segment
+_FEWEST = 6  # segments for a test
 _NEAR = 0.5  # periods of the filter's cut-off
-_OUTLIER = 12.0  # typical residuals from which a row is left out
-_FREE = 1e3  # residuals that a column beside the base parameters may explain before the data
+_OUTLIER = 12.0  # typical residuals above which a sample is excluded
+_FREE = 1e3  # prior spread of an added column, in residuals
 
 OptionT = TypeVar("OptionT", bound=Hashable)
 
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations of the base parameters in K segments of the rows, all joints together.
+    """Normal equations of the base parameters in K segments, all joints together.
 
     Attributes:
         A: W^T W of each segment, shape (K, b, b).
-        B: W^T r likewise, shape (K, b).
-        fitted: How many of the segments are of fitted logs, the first ones.
+        B: W^T r of each segment, shape (K, b).
+        fitted: Number of segments of fitted logs, which come first.
     """
 
     A: Array
@@ -59,13 +59,13 @@ class Normal:
 
     @classmethod
     def of(cls, W: Array, r: Array, segments: Sequence[slice], fitted: int) -> "Normal":
-        """Return those of rows.
+        """Return the normal equations of samples.
 
         Args:
             W: Regressor, shape (N, n, b).
             r: Residual, shape (N, n).
-            segments: Which of the N rows each has.
-            fitted: How many of them are of fitted logs.
+            segments: Samples of each segment.
+            fitted: Number of segments of fitted logs.
         """
         rows = [(W[k].reshape(-1, W.shape[2]), r[k].ravel()) for k in segments]
         A, B = (np.array(x) for x in zip(*[(w.T @ w, w.T @ e) for w, e in rows], strict=True))
@@ -77,8 +77,8 @@ class Normal:
         return np.arange(len(self.A)) < self.fitted
 
     @cached_property
-    def apart(self) -> tuple[Array, Array]:
-        """What row k of segments is fitted to that judges it not, (K, K), and its inverses."""
+    def held_out(self) -> tuple[Array, Array]:
+        """Segments fitted while segment k is held out, row k of (K, K), and the inverses."""
         K, fitted = len(self.A), self.fitted
         used = (self.is_fitted & ~np.eye(K, dtype=bool)).astype(float)
         own, whole = self._inverse(used[:fitted]), self.whole[1]
@@ -97,29 +97,29 @@ class Normal:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Rows of the recordings, each joint's over its typical residual, 0 where they are not used.
+    """Samples of the recordings, weighted for each joint by its RMS residual, 0 where not used.
 
     Attributes:
         joints: Names of the n joints.
-        slides: Which of them slide, shape (n,), bool.
-        motions: How each joint moves in the N rows.
-        recordings: The recordings, fitted ones and then those kept apart, if they are read.
-        at: Their motions, those rows alone.
-        taken: Which of their rows these are.
-        weight: What torques of the rows are multiplied by, shape (N, n) [1/(N m), 1/N].
-        torque: Sum of the squared torques of fitted rows, likewise weighted, shape (n,).
-        segments: Which rows each of the K segments has, those of the validation logs last.
-        rows: How many of the rows are of fitted logs.
-        W: Regressor of the base parameters over their spread before the data, shape (N, n, b), and
-            columns that are refitted beside them.
+        is_prismatic: Which of them are prismatic, shape (n,), bool.
+        motions: Motion of each joint in the N samples.
+        recordings: The fitted recordings, then the validation recordings, if they are used.
+        at: Their motions at these samples.
+        taken: Indices of these samples in each recording.
+        weight: Weights of the torques, shape (N, n) [1/(N m), 1/N].
+        torque: Weighted sum of the squared torques of fitted samples, shape (n,).
+        segments: Samples of each of the K segments, those of the validation logs last.
+        rows: Number of samples of fitted logs.
+        W: Regressor of the base parameters over their prior spread, shape (N, n, b), and columns
+            that are refitted with them.
         r: Residual of the estimate, shape (N, n).
-        independent: Which columns of the regressor are those of base parameters, shape (b,), int.
-        U: Factor of the covariance of base parameters before the data, C = U^T U, shape (b, b).
+        independent: Columns of the regressor that belong to base parameters, shape (b,), int.
+        U: Factor of the prior covariance of base parameters, C = U^T U, shape (b, b).
         normal: Normal equations of the segments, of all joints of the robot.
     """
 
     joints: tuple[str, ...]
-    slides: Array
+    is_prismatic: Array
     motions: tuple[JointMotion, ...]
     recordings: tuple[Recording, ...]
     at: tuple[Trajectory, ...]
@@ -136,14 +136,14 @@ class Sample:
 
     @property
     def fitted(self) -> int:
-        """How many of the segments are of fitted logs."""
+        """Number of segments of fitted logs."""
         return self.normal.fitted
 
-    def beside(self, Z: Array) -> "Sample":
-        """Return the same rows with more columns that are refitted as base parameters are.
+    def with_columns(self, Z: Array) -> "Sample":
+        """Return the same samples with more columns that are refitted with the base parameters.
 
         Args:
-            Z: What sizes of 1 add to the torques, shape (N, n, c) [N m or N].
+            Z: Torques of parameters of 1, shape (N, n, c) [N m or N].
         """
         columns = self.weight[:, :, None] * Z
         size = np.linalg.norm(columns, axis=(0, 1))
@@ -152,16 +152,16 @@ class Sample:
         return replace(self, W=W, normal=Normal.of(W, self.r, self.segments, self.fitted))
 
     def of_joint(self, j: int) -> "Sample":
-        """Return the rows of one joint; the others count by the normal equations alone.
+        """Return the samples of one joint; other joints count only in the normal equations.
 
         Args:
-            j: Which joint.
+            j: Index of the joint.
         """
         own = slice(j, j + 1)
         return replace(
             self,
             joints=self.joints[own],
-            slides=self.slides[own],
+            is_prismatic=self.is_prismatic[own],
             motions=self.motions[own],
             weight=self.weight[:, own],
             torque=self.torque[own],
@@ -171,14 +171,14 @@ class Sample:
 
     @cached_property
     def own(self) -> Normal:
-        """Normal equations of its own rows, those of one joint."""
+        """Normal equations of its own samples, those of one joint."""
         return Normal.of(self.W, self.r, self.segments, self.fitted)
 
-    def weighed(self, factor: float) -> "Sample":
-        """Return the rows of one joint weighed anew.
+    def reweighted(self, factor: float) -> "Sample":
+        """Return the samples of one joint with other weights.
 
         Args:
-            factor: What their weights are multiplied by.
+            factor: Factor on the weights.
         """
         normal, more = self.normal, factor**2 - 1.0
         return replace(
@@ -191,7 +191,7 @@ class Sample:
         )
 
     def joined(self) -> "Sample":
-        """Return the rows of fitted logs as one segment, for what is fitted to all of them."""
+        """Return the samples of fitted logs as one segment, for a fit to all of them."""
         normal, rows = self.normal, slice(self.rows)
         A, B = (x[: self.fitted].sum(axis=0, keepdims=True) for x in (normal.A, normal.B))
         return replace(
@@ -205,19 +205,19 @@ class Sample:
 
 
 def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
-    """Return rows spread over the recordings; None if there are too few, or static ones.
+    """Return samples spread over the recordings; None if there are too few, or static ones.
 
     Args:
-        fit: What was found.
-        for_drives: Whether terms of drives are chosen by them: rows of fitted logs alone, among
-            them those near reversals, where a drive that sticks is smeared.
+        fit: The fit.
+        for_drives: Whether drive terms are selected with them: only samples of fitted logs, also
+            those near reversals, where the filter smears stiction.
     """
     model, mapping = fit.model, fit.mapping
     if model.is_static:
         return None
-    kept = [e for e in fit.validation if not e.is_refitted]
-    rows, independent = _spread_rows(model, fit.fitted, kept)
-    parts = list(zip([*fit.fitted, *kept], rows, strict=True))
+    validation = [e for e in fit.validation if not e.is_refitted]
+    rows, independent = _spread_rows(model, fit.fitted, validation)
+    parts = list(zip([*fit.fitted, *validation], rows, strict=True))
     if for_drives:
         del parts[len(fit.fitted) :]
     rows = [k for _, k in parts]
@@ -233,19 +233,19 @@ def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
     used = np.concatenate([e.recording.mask[k] for e, k in parts])
     if not for_drives:
         used &= np.concatenate([_is_steady(e.recording)[k] for e, k in parts])
-    used = used & (np.abs(r) <= _OUTLIER * _usual_size(r[:own], used[:own]))
+    used = used & (np.abs(r) <= _OUTLIER * _typical_size(r[:own], used[:own]))
     squares = np.sum(r[:own] ** 2, axis=0, where=used[:own])
     scale = np.sqrt(squares / np.maximum(used[:own].sum(axis=0), 1))
     weight = used * np.sqrt(independent) / np.where(scale > 0, scale, np.inf)
     size = model.layout.n_inertial
     load = Y[:, :, :size] @ fit.standard[:size]
-    # over their spread before the data, C = U^T U, base parameters are of size 1
+    # C = U^T U: base parameters over their prior spread are of size 1
     U = np.asarray(np.linalg.qr((mapping.K * fit.prior_std).T, mode="r"))
     W = weight[:, :, None] * (Y[:, :, mapping.independent] @ U.T)
     r = weight * r
     return Sample(
         joints=model.joints,
-        slides=np.isin(model.joints, list(model.layout.prismatic)),
+        is_prismatic=np.isin(model.joints, list(model.layout.prismatic)),
         motions=joint_motions([e.recording for e, _ in parts], rows, load, model),
         recordings=tuple(e.recording for e, _ in parts),
         at=tuple(motion),
@@ -263,16 +263,16 @@ def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
 
 
 def along(sample: Sample, model: RobotModel, at: Sequence[Trajectory], tau: Array) -> Sample:
-    """Return the same rows of another robot, or with other positions than the recordings have.
+    """Return the same samples for another robot, or with changed positions.
 
     Args:
-        sample: The rows.
-        model: The robot, of the same parameters.
+        sample: The samples.
+        model: The robot, with the same parameters.
         at: The motions, as of ``Sample.at``.
         tau: Torques of the estimate along them, shape (N, n) [N m or N].
     """
-    known = sample.independent
-    Y = np.concatenate([_regressor(model, motion)[:, :, known] for motion in at])
+    independent = sample.independent
+    Y = np.concatenate([_regressor(model, motion)[:, :, independent] for motion in at])
     W = sample.weight[:, :, None] * (Y @ sample.U.T)
     W = np.concatenate([W, sample.W[:, :, W.shape[2] :]], axis=2)
     r = sample.weight * (np.concatenate([motion.tau for motion in at]) - tau)
@@ -281,12 +281,12 @@ def along(sample: Sample, model: RobotModel, at: Sequence[Trajectory], tau: Arra
 
 
 def _spread_rows(
-    model: RobotModel, fitted: Sequence[Evaluation], kept: Sequence[Evaluation]
+    model: RobotModel, fitted: Sequence[Evaluation], validation: Sequence[Evaluation]
 ) -> tuple[list[Array], float]:
-    """Return which rows of each recording are read, and the share of them that is independent."""
+    """Return the samples used of each recording, and the share of them that is independent."""
     most = min(_ROWS, _NUMBERS // (model.n_rows * len(model.layout.names)))
     rows, shares = [], []
-    for evaluations in (fitted, kept):
+    for evaluations in (fitted, validation):
         least = -(-sum(len(e.recording.trajectory.t) for e in evaluations) // most)
         for e in evaluations:
             share = independent_share(e.recording.signals)
@@ -296,10 +296,10 @@ def _spread_rows(
     return rows, min(shares)
 
 
-def _segments(fitted: int, kept: int, independent: float) -> tuple[slice, ...]:
-    """Return how the rows of fitted and validation recordings are cut into segments."""
+def _segments(fitted: int, validation: int, independent: float) -> tuple[slice, ...]:
+    """Return the segments of the samples of fitted and of validation recordings."""
     edges = [0]
-    for rows in (fitted, kept):
+    for rows in (fitted, validation):
         count = min(_SEGMENTS, max(1, int(rows * independent / _SHORTEST))) if rows else 0
         first = edges[-1]
         edges += [first + rows * (i + 1) // count for i in range(count)]
@@ -312,16 +312,16 @@ def _regressor(model: RobotModel, motion: Trajectory, samples: Array | None = No
     return Y.reshape(-1, model.n_rows, Y.shape[1])
 
 
-def _usual_size(r: Array, used: Array) -> Array:
-    """Return the median size of each joint's residual over the rows used, shape (n,)."""
+def _typical_size(r: Array, used: Array) -> Array:
+    """Return the median absolute residual of each joint over the used samples, shape (n,)."""
     columns = zip(r.T, used.T, strict=True)
     return np.array([np.median(np.abs(x[k])) if k.any() else np.inf for x, k in columns])
 
 
 def _is_steady(recording: Recording) -> Array:
-    """Return where no reversal of a joint, nor its at rest, is near, shape (N, n), bool.
+    """Return the samples that are far from reversals and rest of each joint, shape (N, n), bool.
 
-    A drive that sticks there is smeared by the filter, and no friction.
+    Near these the filter smears stiction, which then does not look like friction.
     """
     motion, signals = recording.trajectory, recording.signals
     if signals.cutoff is None:
@@ -338,11 +338,11 @@ def _is_steady(recording: Recording) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """What columns Z of joints, beside the base parameters, leave of their residual.
+    """Fit of columns Z, together with the base parameters, to a residual.
 
     Attributes:
-        S: [Z r]^T M [Z r] of the rows fitted, shape (..., c + 1, c + 1).
-        T: What of the columns of W imitates [Z r], shape (..., b, c + 1).
+        S: [Z r]^T M [Z r] of the fitted samples, shape (..., c + 1, c + 1).
+        T: Fit of the columns of W to [Z r], shape (..., b, c + 1).
         rows: W and [Z r] of each of K segments, shapes (N_k, b) and (N_k, c + 1).
     """
 
@@ -352,7 +352,7 @@ class Trial:
 
     @cached_property
     def H(self) -> Array:
-        """What [Z r] leaves of each segment after the regressor's fit, (K, c + 1, c + 1)."""
+        """Products of [Z r] less its fit by the regressor in each segment, (K, c + 1, c + 1)."""
         every_T = np.broadcast_to(self.T, (len(self.rows), *self.T.shape[-2:]))
         left = [X - W @ T for (W, X), T in zip(self.rows, every_T, strict=True)]
         return np.array([E.T @ E for E in left])
@@ -372,12 +372,12 @@ class Trial:
     def estimate(self, which: Sequence[int], fitted: int) -> tuple[Array, Array]:
         """Return the parameters of some columns and their covariance, shapes (k,) and (k, k).
 
-        Of a fit to all rows; from scores that scatter from segment to segment, as noise of any
-        colour does.
+        Of a fit to all samples. The covariance is that of clusters: from the scatter of the scores
+        between segments, valid for noise of any colour.
 
         Args:
             which: The k columns.
-            fitted: How many of the segments are of fitted logs.
+            fitted: Number of segments of fitted logs.
         """
         theta, S = self.parameters(which), self.S[which][:, which]
         H = self.H[:fitted, which]
@@ -409,7 +409,7 @@ class Trial:
         return _each(choices, lambda which: self.left(which).T)
 
     def parameters_each(self, choices: Mapping[OptionT, Sequence[int]]) -> dict[OptionT, Array]:
-        """Return the parameters of columns of each option, shapes (k,), of a fit to all rows.
+        """Return the parameters of columns of each option, shapes (k,), of a fit to all samples.
 
         Args:
             choices: Columns of each option.
@@ -420,7 +420,7 @@ class Trial:
 def _each(
     choices: Mapping[OptionT, Sequence[int]], of: Callable[[Array], Array]
 ) -> dict[OptionT, Array]:
-    """Return what a function gives of the columns of each option, all of one number at once.
+    """Evaluate a function of the columns of each option, all options of one size together.
 
     Args:
         choices: Columns of each option.
@@ -438,9 +438,9 @@ class Trials:
     """Trials of columns.
 
     Attributes:
-        sample: The rows.
-        Z: What sizes of 1 add to their torques, shape (N, n, c).
-        ridge: Share of a column that the regressor must leave of it.
+        sample: The samples.
+        Z: Torques of parameters of 1, shape (N, n, c).
+        ridge: Smallest share of a column that the regressor must not explain.
     """
 
     sample: Sample
@@ -448,9 +448,9 @@ class Trials:
     ridge: float = RIDGE
 
     @cached_property
-    def apart(self) -> Trial:
-        """Fitted without the segment that judges."""
-        return self._trial(*self.sample.normal.apart)
+    def held_out(self) -> Trial:
+        """Fitted without the segment that is evaluated."""
+        return self._trial(*self.sample.normal.held_out)
 
     @cached_property
     def whole(self) -> Trial:
@@ -470,7 +470,7 @@ class Trials:
         """X^T X and W^T X of each segment, shapes (K, c + 1, c + 1) and (K, b, c + 1)."""
         D = np.array([X.T @ X for _, X in self._rows])
         B = np.array([W.T @ X for W, X in self._rows])
-        B[:, :, -1] = self.sample.normal.B  # other joints know of the base parameters, too
+        B[:, :, -1] = self.sample.normal.B  # other joints determine the base parameters, too
         return D, B
 
     def _trial(self, used: Array, inverse: Array) -> Trial:
@@ -478,6 +478,6 @@ class Trials:
         T = inverse @ B  # (..., b, c + 1)
         S = D - B.swapaxes(-1, -2) @ T
         c = np.arange(S.shape[-1] - 1)
-        still = D[..., c, c] == 0  # a column of a joint that does not move
-        S[..., c, c] += np.where(still, 1.0, self.ridge * D[..., c, c])
+        is_zero = D[..., c, c] == 0  # a column of a joint that does not move
+        S[..., c, c] += np.where(is_zero, 1.0, self.ridge * D[..., c, c])
         return Trial(S, T, self._rows)

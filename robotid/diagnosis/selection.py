@@ -1,10 +1,10 @@
-"""Greedy forward selection on segments that are held out: the one that all choices are made with.
+"""Greedy forward selection on held-out segments, used for all choices of terms.
 
-Options compete to explain a residual. Each is fitted beside what was found without one segment of
-the recordings after the other, and judged by the squared residual of that segment. An option is
-found if it takes away a share of it that matters, beyond chance; of those that explain alike the
-simplest is; then the others compete beside it, until nothing is left to gain. What becomes of an
-option that is found is its owner's: a term is taken, reported or doubted.
+Options compete to explain a residual. Each is fitted together with those selected before, with one
+segment of the recordings held out after the other, and compared by the squared residual of the
+held-out segments. An option is selected if it reduces it significantly and by enough; of options
+that explain about the same the simplest is selected. Then the others compete again, until none
+improves the fit. The caller decides what follows: a term is added, reported or left undecided.
 """
 
 from collections.abc import Callable, Hashable, Iterator, Mapping
@@ -18,8 +18,8 @@ from robotid._typing import Array
 
 __all__ = ["Round", "Rule", "p_value", "select"]
 
-_STILL = 1e-9  # of the squared residual of another segment: the joint is at rest in it
-_FEWEST = 3  # segments that show chance
+_STILL = 1e-9  # of the largest squared residual of a segment: below, the joint is at rest in it
+_FEWEST = 3  # segments for a test
 _NOTHING = 1e-300
 
 Option = TypeVar("Option", bound=Hashable)
@@ -27,13 +27,13 @@ Option = TypeVar("Option", bound=Hashable)
 
 @dataclass(frozen=True)
 class Rule:
-    """What an option must show to be found.
+    """Conditions for the selection of an option.
 
     Attributes:
-        most: Options that are found, at most.
-        share: Share of the squared residual from which an option is found [-].
-        p_value: p-value of an option that is found, at most [-]; None: it is not tested.
-        alike: Share of the squared residual within which options explain alike [-].
+        most: Largest number of options selected.
+        share: Smallest share of the squared residual of a selected option [-].
+        p_value: Largest p-value of a selected option [-]; None: it is not tested.
+        alike: Share of the squared residual within which options count as equal [-].
     """
 
     most: int
@@ -44,14 +44,14 @@ class Rule:
 
 @dataclass(frozen=True, eq=False)
 class Round(Generic[Option]):
-    """What options leave of segments that they were not fitted to, beside what was found.
+    """Squared residuals of held-out segments with each option, together with those selected.
 
     Attributes:
-        before: Squared residual of each of K segments without any of them, shape (K,).
-        left: The same with each option.
-        fitted: How many segments are of fitted logs, the first ones; the others are validation.
-        whole: Squared residual that shares are of.
-        least: What an option must take away of the squared residual, whatever its share.
+        before: Squared residual of each of K segments without any option, shape (K,).
+        left: Squared residuals with each option, shape (K,).
+        fitted: Number of segments of fitted logs, which come first; the others are validation.
+        whole: Squared residual to which shares refer.
+        least: Smallest reduction of the squared residual, whatever its share.
     """
 
     before: Array
@@ -61,7 +61,7 @@ class Round(Generic[Option]):
     least: float = -np.inf
 
     def gain(self, option: Option) -> float:
-        """Return what an option takes away of the squared residual of fitted logs.
+        """Return the reduction of the squared residual of fitted logs by an option.
 
         Args:
             option: The option.
@@ -69,7 +69,7 @@ class Round(Generic[Option]):
         return float((self.before - self.left[option])[: self.fitted].sum())
 
     def share(self, option: Option) -> float:
-        """Return the share that an option takes away of fitted logs [-].
+        """Return the share of the squared residual of fitted logs that an option removes [-].
 
         Args:
             option: The option.
@@ -77,7 +77,7 @@ class Round(Generic[Option]):
         return self.gain(option) / max(self.whole, _NOTHING)
 
     def p_value(self, option: Option) -> float:
-        """Return the p-value of what an option gains [-].
+        """Return the p-value of the reduction by an option [-].
 
         Args:
             option: The option.
@@ -85,11 +85,12 @@ class Round(Generic[Option]):
         return p_value(self.before, self.left[option], self.fitted)
 
     def alike(self, rule: Rule, tried: Callable[[Option], int] = lambda option: 1) -> list[Option]:
-        """Return the options that may be found and explain as much as the best of them.
+        """Return the options that may be selected and explain as much as the best of them.
 
         Args:
-            rule: What they must show.
-            tried: Of how many each is the best by the same data, which multiplies its p-value.
+            rule: The conditions.
+            tried: Number of options among which the same data selected each: a factor on its
+                p-value.
         """
         shares = {
             option: share
@@ -111,8 +112,8 @@ class Round(Generic[Option]):
         """Return the simplest of the options that explain as much as the best; None without one.
 
         Args:
-            rule: What they must show.
-            cost: How simple each is, smallest first; of equal ones the one that explains more wins.
+            rule: The conditions.
+            cost: Complexity of each, compared first; of equal ones the one that explains more wins.
             tried: As of ``alike``.
         """
         alike = self.alike(rule, tried)
@@ -125,11 +126,11 @@ def select(
     cost: Callable[[Option], Any] = lambda option: 0,
     tried: Callable[[Option], int] = lambda option: 1,
 ) -> Iterator[tuple[Round[Option], Option | None]]:
-    """Yield each round with the option that is found in it, None in a last one without any.
+    """Yield each round with the option selected in it; None in a last round without one.
 
     Args:
-        offered: Returns the round of the options beside what was found before.
-        rule: What they must show.
+        offered: Returns the round of the options together with those selected before.
+        rule: The conditions.
         cost: As of ``Round.best``.
         tried: As of ``Round.best``.
     """
@@ -142,21 +143,21 @@ def select(
 
 
 def p_value(before: Array, after: Array, fitted: int) -> float:
-    """Return how likely segments gain that much, in the mean of their shares, by chance [-].
+    """Return the p-value of a reduction of the squared residuals of segments [-].
 
-    By Student's test of the shares, each between -1 and 1, of the segments of fitted logs or of
-    all, whichever is surer; those in which the joint is at rest do not count.
+    Student's test of the mean of their shares, each between -1 and 1, over the segments of fitted
+    logs or over all, whichever p-value is smaller. Segments with the joint at rest do not count.
 
     Args:
         before: Squared residual of each segment, shape (K,).
-        after: The same with an option.
-        fitted: How many of the segments are of fitted logs, the first ones.
+        after: Squared residuals with an option, shape (K,).
+        fitted: Number of segments of fitted logs, which come first.
     """
     return min(_student(before[:k], after[:k]) for k in {fitted, len(before)})
 
 
 def _student(before: Array, after: Array) -> float:
-    """Return the p-value of the mean share that segments gain; 1 of too few."""
+    """Return the p-value of the mean share; 1 for too few segments."""
     moves = before > _STILL * before.max(initial=0.0)
     if moves.sum() < _FEWEST:
         return 1.0

@@ -1,10 +1,10 @@
-"""Why a joint is predicted as it is: what its torque consists of, and what its residual follows.
+"""Parts of a joint's torque, and the quantities that its residual depends on.
 
-A torque is gravity, inertia, velocity torques, and what each drive adds, sum by sum:
+A torque is the sum of gravity, inertia, velocity torques, and the torques of the drives:
 
     tau = g(q) + M(q) a + C(q, v) v + friction + motor inertia + offset + ... + residual.
 
-What the residual follows, and whether by chance, ``dependence`` tells.
+``dependence`` tests what the residual depends on.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,38 +26,38 @@ from robotid.robot.model import RobotModel
 __all__ = ["JointTorque", "Rows", "TorqueSplit", "joint_torques", "split_torque", "spread_rows"]
 
 _RIGID = ("gravity", "inertia", "Coriolis")
-_ROWS = 4000  # of all recordings together that are split
-_SEGMENTS = 16  # left out in turn
-_SHORTEST = 10  # independent rows in a segment
-_OUTLIER = 12.0  # typical residuals from which a row is left out
-_QUARTERS = 4  # of a recording, between which its residual may drift; and pieces of each
-_ROUNDING = 1e-10  # of the torque, below which a part is none
-_SLOW = 0.25  # of the typical speed: below it is low speed
-_FORGOTTEN = 0.5  # share that is as quick as noise, from which the rest needs no other reason
+_ROWS = 4000  # samples of all recordings together that are split
+_SEGMENTS = 16  # held out in turn
+_SHORTEST = 10  # independent samples in a segment
+_OUTLIER = 12.0  # typical residuals above which a sample is excluded
+_QUARTERS = 4  # parts of a recording for the test of a drift, and pieces of each part
+_ROUNDING = 1e-10  # of the torque, below which a part counts as 0
+_SLOW = 0.25  # of the RMS speed: below is low speed
+_NOISY = 0.5  # broadband share above which the residual counts as noise
 _ADVICE = {
-    "constant": "Zero the torque sensor, and look for a spring or a weight that the model lacks",
-    "position": "Look for a spring, a cable or a gear's ripple that the model lacks",
+    "constant": "Zero the torque sensor, and check for a spring or a load that the model lacks",
+    "position": "Check for a spring, a cable or a gear ripple that the model lacks",
     "speed": "Try another friction model",
-    "acceleration": "Look for an inertia that the model lacks, or a torque that comes late",
-    "load": "Look at the scale of the torque, and for friction that grows with the load",
-    "time": "Friction that warms up, a sensor that drifts or a load that was changed does this",
+    "acceleration": "Check for an inertia that the model lacks, or a delayed torque",
+    "load": "Check the scale of the torque, and for friction that increases with the load",
+    "time": "Possible causes: warm-up of the friction, drift of a sensor, a changed load",
 }
 _CHANGED = (
-    "The fitted recordings do not show this: something has changed since (friction with "
-    "temperature, the zero of a sensor, a load), or they do not move the joint that way"
+    "The fitted recordings do not have this dependence: something has changed since (friction with "
+    "temperature, a sensor offset, a load), or the joint does not move this way in them"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueSplit:
-    """What predicted torques consist of.
+    """Parts of predicted torques.
 
     Attributes:
         parts: "gravity", "inertia" and "Coriolis" (with centrifugal torques) of the bodies, then
-            what the drives add, by ``DriveTerm.part``; each of shape (N, n_rows) [N m, N].
+            the torques of the drives, by ``DriveTerm.part``; each of shape (N, n_rows) [N m, N].
         names: Names of the k drive parameters.
-        kinds: Which part each of them counts as.
-        terms: What each of them adds at its drive, shape (k, N) [N m, N].
+        kinds: Part that each of them belongs to.
+        terms: Torque of each of them at its drive, shape (k, N) [N m, N].
         loads: Ratio of each row to the drive of each parameter, shape (n_rows, k) [-].
     """
 
@@ -78,10 +78,10 @@ class TorqueSplit:
         return np.asarray(sum(self.parts[name] for name in _RIGID if name in self.parts))
 
     def terms_of(self, row: int) -> dict[str, dict[str, Array]]:
-        """Return what each drive parameter that loads a row adds to it, (N,), by part and name.
+        """Return the torque (N,) of each drive parameter in a row, by part and name.
 
         Args:
-            row: Which row.
+            row: Index of the row.
         """
         terms: dict[str, dict[str, Array]] = {}
         for name, kind, ratio, torque in zip(
@@ -101,9 +101,9 @@ def split_torque(
     direction: Array | None = None,
     memory: Array | None = None,
 ) -> TorqueSplit:
-    """Return what the torques that parameters predict consist of.
+    """Return the parts of the torques that parameters predict.
 
-    Of a static model, no torque of motion is known, so that gravity stands alone for the bodies.
+    A static model has no torques of motion: gravity is the only part of the bodies.
 
     Args:
         model: The robot.
@@ -112,7 +112,7 @@ def split_torque(
         v: Velocities, shape (N, n_rows) [rad/s, m/s].
         a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
         direction: As of ``joint_torque_regressor``.
-        memory: As of ``Trajectory.memory``; needed if drives remember anything.
+        memory: As of ``Trajectory.memory``; needed if drive terms have internal states.
 
     Raises:
         DataError: If a shape does not fit the model.
@@ -139,15 +139,15 @@ def split_torque(
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Rows of recordings, one after the other.
+    """Samples of recordings, one after the other.
 
     Attributes:
         recordings: Names of the recordings.
         t: Time stamps, shape (N,) [s].
-        recording: Which recording each row is of, shape (N,), int.
-        segment: Which uninterrupted segment of it, shape (N,), int.
-        segments: Which of the segments that are left out in turn, shape (N,), int; None if the
-            recordings are too short for six.
+        recording: Recording of each sample, shape (N,), int.
+        segment: Uninterrupted segment of it, shape (N,), int.
+        segments: Segment that is held out in turn, shape (N,), int; None if the recordings are too
+            short for six.
     """
 
     recordings: tuple[str, ...]
@@ -158,7 +158,7 @@ class Rows:
 
     @property
     def time(self) -> Array:
-        """Time of the log; of several recordings, from the start of the first, without breaks."""
+        """Time of the log; for several recordings, from the start of the first, without breaks."""
         starts = np.flatnonzero(np.diff(self.recording, prepend=-1))
         if len(starts) == 1:
             return self.t
@@ -168,7 +168,7 @@ class Rows:
 
     @cached_property
     def pieces(self) -> Array:
-        """Which of 16 pieces of its recording each row is in, counted on, shape (N,), int."""
+        """Piece of each sample, 16 per recording, numbered on, shape (N,), int."""
         count = _QUARTERS**2
         pieces = np.empty(len(self.t), dtype=int)
         for k in range(len(self.recordings)):
@@ -179,20 +179,20 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class JointTorque:
-    """Torque of one row of the equations, split, and what its residual follows.
+    """Torque of one row of the equations, its parts, and what its residual depends on.
 
     Attributes:
         joint: Name of the row.
         unit: Unit of its torque.
         rows: The N samples.
-        used: Which of them are used, shape (N,), bool.
+        used: Whether each sample is used, shape (N,), bool.
         tau: Measured torque, shape (N,).
-        parts: What the predicted torque consists of, by name, each of shape (N,).
-        terms: What each drive parameter adds, likewise, by part and name.
-        quantities: What the residual may follow: unit and values, (N,), by name.
-        quick: Share of the squared residual that is forgotten within a period of the filter's
-            cut-off, as filtered noise is, or from sample to sample; None if that is not known.
-        fitted: The same of the fitted recordings; None if it is of them itself.
+        parts: Parts of the predicted torque, by name, each of shape (N,).
+        terms: Torque of each drive parameter, shape (N,), by part and name.
+        quantities: Quantities that the residual may depend on: unit and values, (N,), by name.
+        broadband: Share of the squared residual above the filter's cut-off: not correlated over
+            one period of it, or from sample to sample without a filter; None if not available.
+        fitted: The same for the fitted recordings; None if it is of them itself.
     """
 
     joint: str
@@ -203,7 +203,7 @@ class JointTorque:
     parts: Mapping[str, Array]
     terms: Mapping[str, Mapping[str, Array]]
     quantities: Mapping[str, tuple[str, Array]]
-    quick: float | None
+    broadband: float | None
     fitted: "JointTorque | None" = None
 
     @cached_property
@@ -219,18 +219,18 @@ class JointTorque:
 
     @property
     def power(self) -> Array | None:
-        """Mechanical power tau v, shape (N,) [W]; None where no speed is known."""
+        """Mechanical power tau v, shape (N,) [W]; None without a speed."""
         speed = self.quantities.get("speed")
         return None if speed is None else self.tau * speed[1]
 
     @property
     def rms(self) -> dict[str, float]:
-        """Root mean square of each part, of "residual" and of "measured" over the rows used."""
+        """RMS value of each part, of "residual" and of "measured" over the used samples."""
         every = {**self.parts, "residual": self.residual, "measured": self.tau}
         return {name: self.size(x) for name, x in every.items()}
 
     def size(self, x: Array) -> float:
-        """Return the root mean square of a signal over the rows used; NaN without one.
+        """Return the RMS value of a signal over the used samples; NaN without one.
 
         Args:
             x: The signal, shape (N,).
@@ -239,9 +239,9 @@ class JointTorque:
 
     @cached_property
     def follows(self) -> tuple[Dependence, ...]:
-        """How the residual follows nothing (a constant), each quantity, and time.
+        """Dependence of the residual on a constant, on each quantity, and on time.
 
-        A quantity is asked what it explains beside a constant; time, of what the best other leaves.
+        A quantity is tested together with a constant, time on the residual after the best other.
         """
         r = self.residual
         if not self.used.any():
@@ -260,14 +260,14 @@ class JointTorque:
 
     @cached_property
     def against_time(self) -> tuple[Array, str]:
-        """The residual as time is asked what it explains, shape (N,), and what it is less of.
+        """The residual that is tested against time, shape (N,), and the subtracted quantity.
 
-        The second is the quantity that explains most, whose means are subtracted; "" if none is.
+        The means over the quantity that explains most are subtracted; "" if there is none.
         """
         return self._less_best(self.follows[:-1])
 
     def _less_best(self, found: Sequence[Dependence]) -> tuple[Array, str]:
-        """Return the residual less what the best quantity explains of it, and its name."""
+        """Return the residual after the best quantity, and its name."""
         best = self._best(found)
         if best is None or best.name not in self.quantities:
             return self.residual, ""
@@ -276,64 +276,65 @@ class JointTorque:
 
     @staticmethod
     def _best(follows: Sequence[Dependence]) -> Dependence | None:
-        sure = [d for d in follows if d.is_sure]
-        return max(sure, key=lambda d: d.share or 0.0, default=None)
+        significant = [d for d in follows if d.is_significant]
+        return max(significant, key=lambda d: d.share or 0.0, default=None)
 
     @property
     def sentence(self) -> str:
-        """Why the joint is predicted no better, in words."""
+        """The cause of the residual, as text."""
         rms, best = self.rms, self._best(self.follows)
         if np.isnan(rms["measured"]):
-            return "no row is used: the joint does not move"
+            return "no sample is used: the joint does not move"
         if rms["measured"] == 0:
             return "the measured torque is 0 throughout"
         left = f"the residual is {_percent(rms['residual'] / rms['measured'])} of the torque"
         if best is not None:
             advice = _CHANGED if self._has_changed(best.name) else _ADVICE[best.name]
-            return f"{left} and {self._said(best)}. {advice}"
-        if self.quick is None or self.rows.segments is None:
-            return f"{left}; too little was recorded to tell what it follows"
-        quick = f"{_percent(self.quick)} of its square is as quick as noise"
-        if self.quick >= _FORGOTTEN:
-            return f"{left}, and nothing explains it: {quick}"
+            return f"{left} and {self._described(best)}. {advice}"
+        if self.broadband is None or self.rows.segments is None:
+            return f"{left}; the recordings are too short to determine its cause"
+        if self.broadband >= _NOISY:
+            share = _percent(self.broadband)
+            return f"{left}; {share} of its power is broadband (above the cut-off): noise"
         names = [d.name for d in self.follows if d.name != "constant"]
         return (
-            f"{left}, and neither a constant nor {', '.join(names)} alone explain it, though only "
-            f"{quick}. Look at the motion of other joints, and at elasticity"
+            f"{left}; neither a constant nor {', '.join(names)} explain it, but "
+            f"{_percent(1.0 - self.broadband)} of its power is below the cut-off: systematic. "
+            "Check the motion of other joints, and elasticity"
         )
 
-    def _said(self, best: Dependence) -> str:
-        """Return in words what the residual follows."""
+    def _described(self, best: Dependence) -> str:
+        """Return the dependence of the residual as text."""
         share = _percent(best.share or 0.0)
         if best.name == "constant":
-            return f"{share} of its square is a constant of {best.means[0]:.2g} {self.unit}"
-        usual = self.size(self.quantities[best.name][1]) if best.name == "speed" else 0.0
-        low = " at low speed," if abs(best.where) < _SLOW * usual else ""
+            return f"{share} of its power is a constant of {best.means[0]:.2g} {self.unit}"
+        rms_speed = self.size(self.quantities[best.name][1]) if best.name == "speed" else 0.0
+        low = " at low speed," if abs(best.where) < _SLOW * rms_speed else ""
         return (
-            f"follows the {best.name}, which explains {share} of its variance (best seen{low} "
-            f"about {best.where:.2g} {best.unit})"
+            f"depends on the {best.name}, which explains {share} of its variance (most "
+            f"clearly{low} at {best.where:.2g} {best.unit})"
         )
 
     def _has_changed(self, name: str) -> bool:
-        """Whether the residual of the fitted recordings, asked the same, does not follow it."""
+        """Whether the residual of the fitted recordings does not depend on a quantity."""
         before = () if self.fitted is None else self.fitted.follows
-        return any(d.name == name and d.share is not None and not d.is_sure for d in before)
+        return any(d.name == name and d.share is not None and not d.is_significant for d in before)
 
 
 def joint_torques(found: Fit) -> tuple[JointTorque, ...]:
-    """Return the torque of each row, split, and what its residual follows.
+    """Return the torque of each row, its parts, and what its residual depends on.
 
-    It is that of the validation recordings, or of the fitted ones without any; of at most 4000
-    samples spread over what is at hand of them.
+    The samples, at most 4000, are spread over the validation recordings, or over the fitted ones if
+    there are none.
 
     Args:
-        found: What was found.
+        found: The fit.
     """
-    kept = [e for e in found.validation if not e.is_refitted]
+    validation = [e for e in found.validation if not e.is_refitted]
     fitted = _torques_of(found, found.fitted)
-    if not kept:
+    if not validation:
         return fitted
-    judged = zip(_torques_of(found, kept), fitted, strict=True)
+    judged = zip(_torques_of(found, validation), fitted, strict=True)
     return tuple(replace(torque, fitted=of_fit) for torque, of_fit in judged)
 
 
@@ -349,10 +350,10 @@ def _torques_of(found: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTor
         np.concatenate([getattr(m, x) for m in motions]) for x in ("q", "v", "a", "tau")
     )
     load = np.concatenate([s.load for s in splits])
-    rows, quick = _rows(own), _quick_shares(evaluations)
+    rows, broadband = _rows(own), _broadband_shares(evaluations)
     judged = []
     for j, joint in enumerate(model.row_names):
-        terms = [split.terms_of(j) for split in splits]  # alike in all
+        terms = [split.terms_of(j) for split in splits]  # equal in all
         angle = "m" if joint in model.layout.prismatic else "rad"
         quantities = {
             "position": (angle, q[:, j]),
@@ -377,24 +378,24 @@ def _torques_of(found: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTor
                     for part, own in terms[0].items()
                 },
                 quantities=quantities,
-                quick=quick[j],
+                broadband=broadband[j],
             )
         )
     return tuple(judged)
 
 
 def spread_rows(count: int, most: int) -> Array:
-    """Return which of so many samples are taken, spread evenly over all.
+    """Return the indices of selected samples, spread evenly over all.
 
     Args:
-        count: Their number.
-        most: The most that are taken.
+        count: Number of samples.
+        most: Largest number of selected samples.
     """
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
 def _rows(own: Sequence[tuple[Evaluation, Array]]) -> Rows:
-    """Return samples of recordings, cut into segments long enough to be left out in turn."""
+    """Return samples of recordings, cut into segments long enough to be held out in turn."""
     counts = [len(k) for _, k in own]
     independent = sum(
         min(len(k), independent_share(e.recording.signals) * len(e.recording.trajectory.t))
@@ -410,8 +411,8 @@ def _rows(own: Sequence[tuple[Evaluation, Array]]) -> Rows:
     )
 
 
-def _quick_shares(evaluations: Sequence[Evaluation]) -> list[float | None]:
-    """Return which share of each row's squared residual is forgotten as filtered noise is.
+def _broadband_shares(evaluations: Sequence[Evaluation]) -> list[float | None]:
+    """Return the broadband share of each row's squared residual, as of filtered noise.
 
     It is 1 - r(L) / r(0) with r the autocovariance and L a period of the filter's cut-off.
     """
@@ -423,8 +424,8 @@ def _quick_shares(evaluations: Sequence[Evaluation]) -> list[float | None]:
         lag = 1
         if signals.cutoff is not None and motion.rate is not None:
             lag = max(1, round(motion.rate / signals.cutoff))
-        beside = (motion.segment[lag:] == motion.segment[:-lag])[:, None]
-        both = beside & e.recording.mask[lag:] & e.recording.mask[:-lag]
+        same_segment = (motion.segment[lag:] == motion.segment[:-lag])[:, None]
+        both = same_segment & e.recording.mask[lag:] & e.recording.mask[:-lag]
         products += np.sum(r[lag:] * r[:-lag], axis=0, where=both)
         squares += np.sum(0.5 * (r[lag:] ** 2 + r[:-lag] ** 2), axis=0, where=both)
     return [

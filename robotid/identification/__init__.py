@@ -1,3 +1,3 @@
-"""Model and logs -> Identification: priors, errors, what is determined, verdict."""
+"""Model and logs -> Identification: priors, errors, determined parameters, verdict."""
 
 __all__: list[str] = []

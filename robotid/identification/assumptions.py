@@ -1,4 +1,4 @@
-"""What is assumed where nothing was recorded: noise of torques, drives of a typical size."""
+"""Assumptions for motions without a recording: noise of torques, friction of a typical size."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,23 +23,23 @@ __all__ = [
     "largest_torques",
 ]
 
-#: Correlation time of noise of which nothing else is known [s].
+#: Assumed correlation time of noise [s].
 CORRELATION = 0.1
-_NOISE = 0.01  # its standard deviation, as a share of the largest torque
-_FRICTION = 0.05  # assumed Coulomb friction, and viscous at full speed, likewise
-_POSES = 200  # random ones at which gravity is looked at
-#: Of the largest torque of all joints, that of one that carries nothing.
+_NOISE = 0.01  # assumed standard deviation of noise, as a share of the largest torque
+_FRICTION = 0.05  # assumed Coulomb friction, and viscous at full speed, as such a share
+_POSES = 200  # random poses at which gravity is evaluated
+#: Smallest largest torque of a joint, as a share of that of all joints.
 FAINTEST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueNoise:
-    """How far the torque of each joint lies off the model.
+    """Noise of the torque of each joint.
 
     Attributes:
         std: Standard deviation of each joint, shape (n,) [N m or N].
         correlation: Time over which it is correlated, shape (n,) [s]; 0 for white noise.
-        origins: Where it comes from: "stated", "assumed" or "found" in a run before, of each.
+        origins: Origin for each joint: "stated", "assumed", or "found" in an earlier run.
     """
 
     std: Array
@@ -63,16 +63,16 @@ def assumed_noise(
     correlation: float | None = None,
     found: TorqueNoise | None = None,
 ) -> TorqueNoise:
-    """Return the noise of each joint: stated, or that of a run before, or assumed.
+    """Return the noise of each joint: stated, or of an earlier run, or assumed.
 
-    What is assumed is 1 % of the joint's largest torque.
+    The assumed noise is 1 % of the joint's largest torque.
 
     Args:
         model: The robot.
         size: Largest torque of each joint, shape (n,) [N m or N].
-        stated: Standard deviation by joint [N m or N], of those that it is known of.
+        stated: Standard deviation by joint [N m or N], for the joints with a stated one.
         correlation: As of ``preview_logs``.
-        found: That of a run before, if there is one.
+        found: Noise of an earlier run, if there is one.
 
     Raises:
         SettingsError: If a joint is unknown, or a number is not positive.
@@ -80,7 +80,7 @@ def assumed_noise(
     for joint, value in stated.items():
         if joint not in model.joints:
             raise SettingsError(
-                f"noise is stated of {joint!r}, which is not among the joints "
+                f"noise is stated for {joint!r}, which is not among the joints "
                 f"{listed(model.joints)}{suggestion(str(joint), model.joints)}"
             )
         if not (is_number(value) and value > 0):
@@ -94,29 +94,29 @@ def assumed_noise(
     if correlation is not None:
         time = np.where(is_stated | (found is None), correlation, time)
     other = "assumed" if found is None else "found"
-    origins = tuple("stated" if known else other for known in is_stated)
+    origins = tuple("stated" if own else other for own in is_stated)
     return TorqueNoise(np.where(is_stated, values, std), time, origins)
 
 
 def largest_gravity(model: RobotModel) -> Array:
-    """Return the largest torque that gravity asks of each joint over random poses, shape (n,).
+    """Return the largest gravity torque of each joint over random poses, shape (n,).
 
     Args:
         model: The robot.
     """
-    reach = [(j.lower, j.upper) if j.has_limits else (-np.pi, np.pi) for j in model.limits]
-    low, high = np.array(reach).T
-    q = np.random.default_rng(0).uniform(low, high, (_POSES, len(reach)))
+    ranges = [(j.lower, j.upper) if j.has_limits else (-np.pi, np.pi) for j in model.limits]
+    low, high = np.array(ranges).T
+    q = np.random.default_rng(0).uniform(low, high, (_POSES, len(ranges)))
     torque: Array = np.abs(predict_instants(model, model.standard_parameters(), q)).max(axis=0)
     return torque
 
 
 def largest_torques(model: RobotModel, peak: Array) -> Array:
-    """Return the largest torque of each joint, shape (n,): the URDF's limit, or one that was seen.
+    """Return the largest torque of each joint, shape (n,): the URDF's limit, or that of a motion.
 
     Args:
         model: The robot.
-        peak: What stands for the limit where the URDF states none, shape (n,) [N m or N].
+        peak: Largest torque of a motion, used where the URDF has no limit, shape (n,) [N m or N].
     """
     peak = np.maximum(peak, FAINTEST * max(float(peak.max()), 1e-300))
     limit = np.array([joint.effort for joint in model.limits])
@@ -129,7 +129,7 @@ def assumed_parameters(model: RobotModel, size: Array, fastest: Array) -> Array:
     Args:
         model: The robot.
         size: Largest torque of each joint, shape (n,) [N m or N].
-        fastest: What stands for the largest speed where the URDF states none, shape (n,)
+        fastest: Largest speed of a motion, used where the URDF has no limit, shape (n,)
             [rad/s or m/s].
     """
     pi = model.standard_parameters()

@@ -1,4 +1,4 @@
-"""What hangs on a link: a run with it against a run without, and gains from a known mass."""
+"""Payload identification from a run with and a run without it, and gains from a known mass."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -40,25 +40,25 @@ __all__ = [
     "own_friction",
 ]
 
-_SURE = 3.0  # standard errors that a mass has at least
-_MASS = 0.3  # largest standard error of a mass that counts as determined, of that mass,
-_NOTHING = 0.05  # ... or of this share of the robot's
-_COM = 0.05  # ... of a centre of mass, of the robot's length
-_INERTIA = 0.3  # ... of an inertia about it, of the mean principal moment
-_SAME = 1e-3  # of the largest: a column of a link that motion shows that little is not shown
-_MOST_LOADS = 20  # fits until the load of the gears is that of the bodies found
-_SETTLED = 1e-4  # relative change of the parameters at which it is
-_FREE = 1e-9  # weight of the prior in the fit that keeps a payload possible: none
+_SIGNIFICANT = 3.0  # standard errors from which a mass differs from 0
+_MASS = 0.3  # largest standard error of a determined mass, as a share of that mass,
+_SMALL = 0.05  # ... or of this share of the robot's mass
+_COM = 0.05  # ... of a determined centre of mass, as a share of the robot's length
+_INERTIA = 0.3  # ... of a determined inertia about it, as a share of the mean principal moment
+_SAME = 1e-3  # of the largest column of a link: below, motion does not determine a parameter
+_MOST_LOADS = 20  # fits until the joint load torque is that of the identified bodies
+_CONVERGED = 1e-4  # relative change of the parameters at convergence
+_FREE = 1e-9  # weight of the prior in the fit that makes a payload consistent: none
 
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """What hangs on a link, in the link's own frame.
+    """Payload of a link, in the frame of the link.
 
     Attributes:
         link: The link.
         mass: Mass [kg].
-        mass_std_error: Its standard error [kg]; 0 if it was known.
+        mass_std_error: Its standard error [kg]; 0 if the mass was stated.
         mass_interval: 95 % interval of it, shape (2,) [kg].
         com: Centre of mass, shape (3,) [m].
         com_std_error: Its standard errors, shape (3,) [m].
@@ -79,7 +79,7 @@ class Payload:
 
     @property
     def determined(self) -> tuple[str, ...]:
-        """Which of "mass", "com" and "inertia" the motion determines."""
+        """Those of "mass", "com" and "inertia" that the motion determines."""
         return tuple(name for name in ("mass", "com", "inertia") if name not in self.reasons)
 
     @property
@@ -96,10 +96,10 @@ class Payload:
         return np.array([self.mass, *(self.mass * self.com), xx, xy, yy, xz, yz, zz])
 
     def lines(self) -> list[str]:
-        """Return the payload in words: mass, centre of mass and inertia, or why they are open."""
+        """Return mass, centre of mass and inertia as text, or why they are not determined."""
         low, high = self.mass_interval.tolist()
         known = "known" if self.mass_std_error == 0 else f"95 %: [{low:.4g}, {high:.4g}]"
-        said = [f"{self.link}: {self.mass:.4g} +- {self.mass_std_error:.2g} kg, {known}"]
+        lines = [f"{self.link}: {self.mass:.4g} +- {self.mass_std_error:.2g} kg, {known}"]
         shown = (
             ("com", "centre of mass", "m", self.com, self.com_std_error),
             ("inertia", "inertia about it, diagonal", "kg m^2",
@@ -109,11 +109,11 @@ class Payload:
             pairs = zip(values.tolist(), errors.tolist(), strict=True)
             figures = ", ".join(f"{x:.3g} +- {error:.2g}" for x, error in pairs)
             why = self.reasons.get(key)
-            said.append(f"  {words}: {f'{figures} {unit}' if why is None else why}")
-        return said
+            lines.append(f"  {words}: {f'{figures} {unit}' if why is None else why}")
+        return lines
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values; what is not determined is None."""
+        """Return plain values, None for what is not determined."""
         values = {
             "mass": self.mass,
             "mass_std_error": self.mass_std_error,
@@ -149,16 +149,16 @@ class Gain:
 
 @dataclass(frozen=True, eq=False)
 class PayloadFit:
-    """Payloads, and gains that a known one tells.
+    """Identified payloads, and gains identified from a known payload.
 
     Attributes:
         model: The robot.
         payloads: One per link.
-        gains: Gains that were unknown, by joint.
+        gains: Identified gains, by joint.
         names: Names of the base parameters of the robot without payloads.
         base: Base parameters, shape (b,), SI units.
-        base_error: Their standard errors, shape (b,), with what is not known of the gains.
-        unexplained: Share of each joint's torque that the fit leaves, shape (n,) [-].
+        base_error: Their standard errors, shape (b,), including the uncertainty of the gains.
+        unexplained: Relative torque error of each joint, shape (n,) [-].
     """
 
     model: RobotModel
@@ -177,7 +177,7 @@ class PayloadFit:
             for joint, gain in self.gains.items()
         ]
         left = zip(self.model.row_names, 100 * self.unexplained, strict=True)
-        every.append(f"torque left [%]: {', '.join(f'{j} {x:.1f}' for j, x in left)}")
+        every.append(f"torque error [%]: {', '.join(f'{j} {x:.1f}' for j, x in left)}")
         return "\n".join(every)
 
     def __repr__(self) -> str:
@@ -219,29 +219,29 @@ def identify_payload(
     signals: SignalSettings | None = None,
     friction: str | Mapping[str, str] = AUTO,
 ) -> PayloadFit:
-    """Identify what hangs on links in some logs and not in others.
+    """Identify the payloads of links from logs with and logs without them.
 
-    Both runs are fitted at once: they share all but the payloads' ten parameters each and the
+    Both runs are fitted together. They share all parameters except the ten of each payload and the
     friction and offsets of the drives, which change with load and temperature.
 
     Args:
         model: The robot; or the path of its URDF, all of whose joints move.
         logs: Recordings with the payloads: a ``Log``, the path of a file, a DataFrame, or several.
-        reference: Recordings without them, likewise; whatever both have counts to the robot.
-        links: Links that the payloads hang on, which may be fixed to a moving one; the last
-            moving link if empty.
-        masses: Masses that are known, by link [kg].
+        reference: Recordings without them, in the same forms; what both have belongs to the robot.
+        links: Links with the payloads, which may be fixed to a moving link; the last moving link if
+            empty.
+        masses: Known masses, by link [kg].
         unknown_gains: Joints whose ``tau`` in the logs is a current of unknown gain. A known mass,
-            or a joint whose gain is known, sets their scale.
+            or a joint with a known gain, sets their scale.
         signals: How logs become trajectories; the defaults if None.
-        friction: Friction beside the model's, as of ``identify``; what is to be chosen is chosen on
-            the reference.
+        friction: Friction in addition to the model's, as of ``identify``; "auto" selects it on the
+            reference.
 
     Returns:
-        The payloads, each with intervals, physically possible, and the gains.
+        The payloads with intervals, physically consistent, and the gains.
 
     Raises:
-        DataError: If a log cannot be used, or the motion does not show a mass.
+        DataError: If a log cannot be used, or the motion does not determine a mass.
         ModelError: If the model is no robot, or a link is not in the URDF.
         SettingsError: If links or gains do not fit the robot.
         NotConvergedError: If a solver fails.
@@ -290,7 +290,7 @@ def identify_payload(
 def own_friction(
     reference: Recordings, friction: str | Mapping[str, str]
 ) -> Mapping[str, tuple[DriveTerm, ...]]:
-    """Return the terms of friction that a reference has beside the model's, by drive.
+    """Return the friction terms of a reference in addition to the model's, by drive.
 
     Args:
         reference: Recordings without payloads, torques in N m or N.
@@ -303,7 +303,7 @@ def own_friction(
     wanted = wanted_families(friction, reference.model.joints)
     if all(names == () for names in wanted.values()):
         return {}
-    # which friction there is asks for no shape of bodies, and a quadratic fit always settles
+    # the selection of friction needs no consistent bodies, and a quadratic fit always converges
     choice = ConsistentSettings(prior="euclidean", prior_weight=1.0, draws=0)
     return with_drives(reference, choice, wanted).model.layout.own
 
@@ -321,8 +321,8 @@ def fit_payloads(
     Args:
         loaded: Recordings with the payloads.
         reference: Recordings without them.
-        links: Links that they hang on.
-        masses: Masses that are known, by link [kg].
+        links: Links with the payloads.
+        masses: Known masses, by link [kg].
         unknown_gains: Joints whose torque column is a current of unknown gain.
 
     Raises:
@@ -330,7 +330,7 @@ def fit_payloads(
     """
     if not loaded.model.layout.remembering:
         return _fit(loaded, reference, links, masses, unknown_gains)
-    # gears are loaded by the bodies that are sought
+    # the unknown bodies load the gears
     bodies, before = loaded.model.standard_parameters(), np.inf
     payload = np.zeros_like(bodies)
     for _ in range(_MOST_LOADS):
@@ -340,13 +340,13 @@ def fit_payloads(
         )
         found = _fit(other, ground, links, masses, unknown_gains)
         size = float(np.linalg.norm(found.base))
-        if abs(size - before) < _SETTLED * size:
+        if abs(size - before) < _CONVERGED * size:
             return found
         bodies, payload = _loads(found, ground)
         before = size
     raise NotConvergedError(
-        f"the load of the gears still changes after {_MOST_LOADS} fits; use friction = "
-        "'viscous+coulomb', or record motion that determines more",
+        f"the joint load torque has not converged after {_MOST_LOADS} fits; use friction = "
+        "'viscous+coulomb', or record a richer motion",
         "max_iterations",
     )
 
@@ -358,7 +358,7 @@ def _fit(
     masses: Mapping[str, float],
     unknown_gains: Sequence[str],
 ) -> PayloadFit:
-    """Fit two runs whose gears are loaded as their models say."""
+    """Fit two runs with the joint load torques of their models."""
     model = loaded.model
     columns = _payload_columns(model, loaded.mapping.K, links)
     _check_known(model, links, masses, unknown_gains)
@@ -400,7 +400,7 @@ def _fit(
 
 
 def _loads(found: PayloadFit, reference: Recordings) -> tuple[Array, Array]:
-    """Return what loads the gears: the robot's standard parameters, and what payloads add."""
+    """Return the standard parameters that load the gears, and the part of the payloads."""
     model = reference.model
     bodies = reference.mapping.to_standard(found.base, model.standard_parameters())
     added = np.zeros_like(bodies)
@@ -411,23 +411,23 @@ def _loads(found: PayloadFit, reference: Recordings) -> tuple[Array, Array]:
 
 
 def _payload_columns(model: RobotModel, K: Array, links: Sequence[str]) -> Array:
-    """Return what the ten parameters of each payload add to the base parameters, (b, 10 links)."""
+    """Return the columns from the ten parameters of each payload to base parameters, (b, 10 k)."""
     columns, bodies = [], dict[int, str]()
     for link in links:
         body, transfer = link_transfer(model, link)
         if body < 0:
-            raise SettingsError(f"{link} does not move: no torque shows what hangs on it")
+            raise SettingsError(f"{link} does not move: no torque depends on its payload")
         if body in bodies:
             raise SettingsError(
                 f"{bodies[body]} and {link} belong to one moving body, {model.layout.bodies[body]}:"
-                " no torque tells their payloads apart; name one of them"
+                " torques do not distinguish their payloads; name one of them"
             )
         bodies[body] = link
         own = K[:, 10 * body : 10 * body + 10] @ transfer
         if np.abs(own[:, 0]).max(initial=0.0) < _SAME * np.abs(own).max(initial=1e-300):
             raise DataError(
-                f"no motion shows the mass of what hangs on {link}: no joint lifts or accelerates "
-                "it; weigh it"
+                f"no motion determines the mass of the payload on {link}: no joint lifts or "
+                "accelerates it; measure it with a scale"
             )
         columns.append(own)
     return np.hstack(columns)
@@ -439,8 +439,8 @@ def _check_known(
     for link, mass in masses.items():
         if link not in links:
             raise SettingsError(
-                f"a mass of {link} is stated, but the payloads hang on {listed(links)}; name the "
-                "link among them"
+                f"a mass is stated for {link}, but the payloads are on {listed(links)}; add the "
+                "link to these"
             )
         if not (is_number(mass) and 0 < mass < 1e6):
             raise SettingsError(
@@ -450,13 +450,13 @@ def _check_known(
     unknown = [joint for joint in gains if joint not in model.joints]
     if unknown:
         raise SettingsError(
-            f"gains of {listed(unknown)} are wanted, which are not identified; joints: "
-            f"{listed(model.joints)}"
+            f"unknown gains are stated for {listed(unknown)}, which are not identified joints; "
+            f"joints: {listed(model.joints)}"
         )
     if len(gains) == len(model.joints) and not masses:
         raise SettingsError(
-            "all gains are unknown and no mass is known: nothing sets their scale; state the mass "
-            "of the payload, or the gain of one joint that bears it"
+            "all gains are unknown and no mass is known: their scale is not determined; state "
+            "the mass of the payload, or the gain of one joint that it loads"
         )
 
 
@@ -471,28 +471,28 @@ def _payload_parameters(found: Compared, known: Array) -> tuple[Array, Array, Ar
 
 
 def _check_mass(model: RobotModel, link: str, mass: float, error: float, is_known: bool) -> None:
-    """Refuse a mass that the motion does not show, and runs that are the wrong way round."""
+    """Check that the motion determines the mass, and that the runs are not swapped."""
     if is_known:
         return
     arm = payload_spread(model)[0]
-    if error > _MASS * max(abs(mass), _NOTHING * arm):
+    if error > _MASS * max(abs(mass), _SMALL * arm):
         raise DataError(
-            f"the motion does not show the mass of what hangs on {link}: {mass:.3g} +- "
-            f"{error:.2g} kg; record poses and motions in which gravity on it loads other joints "
-            "in turn, with the payload and without it"
+            f"the motion does not determine the mass of the payload on {link}: {mass:.3g} +- "
+            f"{error:.2g} kg; record poses and motions in which its gravity loads different "
+            "joints, with and without the payload"
         )
-    if mass < -_SURE * error:
+    if mass < -_SIGNIFICANT * error:
         raise DataError(
             f"{link} carries {-mass:.3g} +- {error:.2g} kg less than in the reference: the "
-            "reference has the payload; swap the two"
+            "reference contains the payload; swap the logs and the reference"
         )
 
 
 def _possible(
     model: RobotModel, links: Sequence[str], x: Array, C: Array, masses: Mapping[str, float]
 ) -> Array:
-    """Return the physically possible parameters nearest to x in the metric of its covariance."""
-    mass = np.maximum(np.abs(x[::10]), _NOTHING * payload_spread(model)[0])
+    """Return the physically consistent parameters nearest to x in the metric of its covariance."""
+    mass = np.maximum(np.abs(x[::10]), _SMALL * payload_spread(model)[0])
     radius = model.length
     unit = np.array([1.0, *[radius] * 3, *[radius**2] * 6])
     scale = (mass[:, None] * unit).reshape(-1)
@@ -508,7 +508,7 @@ def _possible(
         prior_weight=_FREE,
         constraints=Constraints(mass=stated),
     )
-    # what is known exactly has no covariance, and is held by its constraint
+    # a stated mass has no covariance; its constraint fixes it
     exact = np.diag(np.where(np.diag(C) == 0, scale**2, 0.0))
     names = fit.layout.names
     start = Estimate(x, C + exact, names, np.ones(1), count, 1.0, (), True, 0, "two runs")
@@ -516,35 +516,35 @@ def _possible(
 
 
 def _payload(model: RobotModel, link: str, x: Array, C: Array, freedom: Array) -> Payload:
-    """Return a payload from its ten parameters; errors of the rest by first order."""
-    step = 1e-20  # of a derivative along the imaginary axis: exact
+    """Return a payload from its ten parameters; first-order errors of derived quantities."""
+    step = 1e-20  # complex-step derivative: exact
     shown = _about_com(x)
     J = np.column_stack([_about_com(x + 1j * step * e).imag / step for e in np.eye(10)])
     errors = np.sqrt(np.maximum(np.diag(J @ C @ J.T), 0.0))
-    mass, error, reach = float(x[0]), float(np.sqrt(C[0, 0])), float(quantile(freedom[:1])[0])
+    mass, error, t = float(x[0]), float(np.sqrt(C[0, 0])), float(quantile(freedom[:1])[0])
     com, com_error = shown[:3], errors[:3]
     inertia, inertia_error = _matrix(shown[3:]), _matrix(errors[3:])
     moment, largest = float(np.trace(inertia)) / 3, float(inertia_error.max())
     reasons = {}
     if com_error.max() > _COM * model.length:
         reasons["com"] = (
-            f"its standard error would be {com_error.max():.2g} m; record poses of {link} about "
-            "all axes"
+            f"its standard error of {com_error.max():.2g} m is too large; record poses of {link} "
+            "about all axes"
         )
     if largest > _INERTIA * moment:
         reasons["inertia"] = (
-            f"the motion turns {link} too little: an inertia about the centre of mass of about "
-            f"{moment:.2g} kg m^2 would have a standard error of {largest:.2g}; record fast turns "
+            f"{link} rotates too little: an inertia about the centre of mass of about "
+            f"{moment:.2g} kg m^2 would have a standard error of {largest:.2g}; record fast motion "
             "of the joints next to it, about all axes"
         )
-    if error > 0 and mass < _SURE * error:
-        words = f"nothing hangs on {link} that can be told from 0 kg"
+    if error > 0 and mass < _SIGNIFICANT * error:
+        words = f"the payload on {link} does not differ significantly from 0 kg"
         reasons = dict.fromkeys(("com", "inertia"), words)
     return Payload(
         link,
         mass,
         error,
-        np.array([mass - reach * error, mass + reach * error]),
+        np.array([mass - t * error, mass + t * error]),
         com.real,
         com_error,
         inertia,
@@ -570,10 +570,10 @@ def _matrix(entries: Array) -> Array:
 def _gains(model: RobotModel, runs: TwoRuns, found: Compared) -> dict[str, Gain]:
     first = len(found.theta)
     error = np.sqrt(np.diag(found.covariance)[first:])  # of the logarithm
-    reach = quantile(found.freedom[first:]) * error
+    half_width = quantile(found.freedom[first:]) * error
     gains = {}
     for k, j in enumerate(runs.unknown):
         value = float(found.gain[j])
-        ends = sorted((value * np.exp([-reach[k], reach[k]])).tolist())
+        ends = sorted((value * np.exp([-half_width[k], half_width[k]])).tolist())
         gains[model.joints[j]] = Gain(value, abs(value) * float(error[k]), (ends[0], ends[1]))
     return gains

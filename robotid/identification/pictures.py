@@ -29,12 +29,12 @@ __all__ = [
 _DOTS = 800  # of one friction chart
 _LAGS = 400  # points of one autocorrelation
 _LONGEST_LAG = 2.0  # [s]
-_DWARFED = 4.0  # times the height of the measured torque beyond which the URDF's is hidden
-_PIXELS = 500  # spans closer than one of so many are one
+_DWARFED = 4.0  # times the height of the measured torque above which the URDF's is hidden
+_PIXELS = 500  # spans closer than one of these pixels are merged
 
 
 def shown_evaluation(found: "Identification") -> Evaluation:
-    """Return the recording that is looked into: the first one that was not fitted.
+    """Return the recording to show: the first validation recording, or the first fitted one.
 
     Args:
         found: The identification.
@@ -52,14 +52,14 @@ def torque_charts(
 ) -> tuple[Chart, Chart]:
     """Return measured and predicted torque over the log's own time, and the residual.
 
-    Where rows were not used, the ground is shaded and only the measured torque is drawn: the sign
-    of friction is not known there. No line is drawn across a gap of the recording.
+    Where samples were not used, the background is shaded and only the measured torque is drawn: the
+    sign of friction is not known there. No line is drawn across a gap of the recording.
 
     Args:
         found: The identification.
         evaluation: One of its recordings.
-        row: Number of the torque row.
-        band: How far the predictions can be trusted; computed if None.
+        row: Index of the torque row.
+        band: Band of the predictions; computed if None.
         link: The charts' link.
     """
     motion, used = evaluation.recording.trajectory, evaluation.recording.mask[:, row].astype(bool)
@@ -75,7 +75,7 @@ def torque_charts(
     spans = unused_spans(t, np.isfinite(model))
     kind = "force" if unit == "N" else "torque"
     torque = Chart(
-        f"{kind.capitalize()} of {name} over time: measured, identified, the URDF's",
+        f"{kind.capitalize()} of {name} over time: measured, identified, URDF",
         t,
         (
             Series("URDF", urdf, "urdf", is_weak=True, is_hidden=_dwarfs(urdf, tau, model)),
@@ -89,7 +89,7 @@ def torque_charts(
     )
     zero = np.where(np.isfinite(model), 0.0, np.nan)
     residual = Chart(
-        f"Residual of {name} over time, measured less identified",
+        f"Residual of {name} over time, measured minus identified",
         t,
         (
             Series("95 % band", zero, "residual", half=half, is_weak=True),
@@ -105,7 +105,7 @@ def torque_charts(
 
 
 def _dwarfs(y: Array, *others: Array) -> bool:
-    """Whether a line would press the others, drawn with it, into a fraction of the height."""
+    """Whether a line would reduce the others, drawn with it, to a fraction of the height."""
     rest = np.concatenate(others)
     every = np.concatenate([rest, y])
     sizes = [np.ptp(x[np.isfinite(x)]) for x in (every, rest)]
@@ -113,11 +113,11 @@ def _dwarfs(y: Array, *others: Array) -> bool:
 
 
 def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
-    """Return the segments of time that lie between used rows; those closer than a pixel as one.
+    """Return the time spans between used samples; those closer than a pixel are merged.
 
     Args:
         t: Times, shape (N,) [s].
-        used: Rows used, shape (N,), bool.
+        used: Samples used, shape (N,), bool.
     """
     edges = np.flatnonzero(np.diff(np.r_[True, used, True].astype(int))).reshape(-1, 2)
     pixel = float(t[-1] - t[0]) / _PIXELS if len(t) else 0.0
@@ -134,7 +134,7 @@ def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float]
 def residual_charts(
     found: "Identification", evaluation: Evaluation, row: int
 ) -> tuple[Chart, Chart] | None:
-    """Return spectrum and autocorrelation of a joint's residual; None if no row was used.
+    """Return spectrum and autocorrelation of a joint's residual; None if no sample was used.
 
     Args:
         found: The identification.
@@ -181,16 +181,16 @@ def residual_charts(
 def friction_chart(
     found: "Identification", joint: str, *, split: tuple[Array, Array] | None = None
 ) -> Chart | None:
-    """Return friction against speed: measured, identified, and that of steady motion.
+    """Return friction against speed: measured, identified, and at constant speed.
 
     Args:
         found: The identification.
         joint: The joint.
-        split: Torque left and friction identified, as ``friction_split`` returns them for
+        split: Measured and identified friction, as ``friction_split`` returns them for
             ``shown_evaluation``; computed if None.
 
     Returns:
-        The chart; None if no row of the joint was used.
+        The chart; None if no sample of the joint was used.
     """
     evaluation, model = shown_evaluation(found), found.model
     motion, row = evaluation.recording.trajectory, model.row_names.index(joint)
@@ -206,11 +206,11 @@ def friction_chart(
         load = float(np.sqrt(np.mean(loads[row, rows] ** 2)))
     v, unit = motion.v[rows, row], model.row_units[row]
     curve = friction_curve(found, joint, v, q=float(np.median(motion.q[rows, row])), load=load)
-    # dry friction jumps where the motion turns: no line leads across
+    # Coulomb friction jumps where the motion reverses: no line crosses it
     v, left, friction, steady, std = broken(
         np.sign(v), v, left[rows, row], friction[rows, row], curve.torque, curve.std
     )
-    under = f" at {load:.3g} {unit} of load" if load else ""
+    under = f" at a load of {load:.3g} {unit}" if load else ""
     return Chart(
         f"Friction of {joint} against speed, measured and identified",
         v,
@@ -225,11 +225,11 @@ def friction_chart(
 
 
 def parameter_charts(found: "Identification", terms: Sequence[str]) -> tuple[Chart, ...]:
-    """Return each term of all bodies or drives beside the value before the fit.
+    """Return charts of each term of all bodies or drives, with the value before the fit.
 
     Args:
         found: The identification.
-        terms: Terms, as "m" or "viscous"; parameters of another unit have a chart of their own.
+        terms: Terms, as "m" or "viscous"; there is one chart per unit.
     """
     layout = found.model.layout
     owners, ends = zip(*(name.rsplit(".", 1) for name in layout.names), strict=True)
@@ -267,17 +267,19 @@ def singular_chart(values: Array, rank: int) -> Chart:
 
     Args:
         values: Singular values, shape (b,) [-].
-        rank: How many of them the data determine.
+        rank: Number of directions that the data determine.
     """
     number = np.arange(1, len(values) + 1)
     values = np.maximum(values, float(values.max()) * 1e-17)
-    seen = [Series("determined", np.where(number <= rank, values, np.nan), "predicted", "dots")]
+    series = [Series("determined", np.where(number <= rank, values, np.nan), "predicted", "dots")]
     if rank < len(values):
-        seen.append(Series("open", np.where(number > rank, values, np.nan), "residual", "dots"))
+        series.append(
+            Series("not determined", np.where(number > rank, values, np.nan), "residual", "dots")
+        )
     return Chart(
         "Singular values of the regressor, columns scaled to unit norm",
         number.astype(float),
-        tuple(seen),
+        tuple(series),
         "number of the direction",
         "singular value [-]",
         logarithmic="y",

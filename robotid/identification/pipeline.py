@@ -1,4 +1,4 @@
-"""identify(): from a model and logs to parameters and how far they can be trusted."""
+"""identify(): from a model and logs to parameters and a verdict on them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -42,7 +42,7 @@ from robotid.robot.model import RobotModel
 __all__ = ["conclude", "identify", "robot_of", "with_drives"]
 
 _ROBOTS = (".urdf", ".xml", ".xacro")  # suffixes of files that describe robots
-_MOST_SHAPES = 2  # fits until shapes fit together with the terms of all joints
+_MOST_SHAPES = 2  # fits for the refinement of shapes together with the terms of all joints
 
 
 def identify(
@@ -64,20 +64,22 @@ def identify(
         logs: Recordings to fit: a ``Log`` that has the model's joints, the path of a file, a
             DataFrame with the columns of such a file, or several of these. Files are read whole,
             as by ``read_log``; ``robotid.run_job`` reads long ones in pieces.
-        validation: Validation Recordings to measure the prediction with, likewise.
+        validation: Validation recordings for the prediction error, in the same forms.
         signals: How logs become trajectories; the defaults if None.
         estimator: Name or settings of the estimator.
-        friction: What friction joints have beside viscous and Coulomb's, as of
-            ``wanted_families``: "auto" has it chosen.
-        doctor: Whether the doctor looks at the logs first; the verdict counts what it finds.
-        ignore: Codes of errors and doubts that you know better.
-        progress: Called as each of ``STAGES`` begins: its name, stages done, in all, "stages"; and
-            in between with the name of a work, units done, in all, and what they are.
+        friction: Friction of joints in addition to viscous and Coulomb, as of
+            ``wanted_families``: "auto" selects it.
+        doctor: Whether the doctor checks the logs first; the verdict includes its findings.
+        ignore: Codes of errors and warnings that you state as wrong.
+        progress: Called at the start of each of ``STAGES`` with its name, the stages done, their
+            number and "stages"; and in between with the name of a task, the units done, their
+            number and their name.
 
     Raises:
         DataError: If a log cannot be read, does not fit the model or is too short.
-        ModelError: If the model is no model, nor the path of a URDF that can be used.
-        RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
+        ModelError: If the model is neither a model nor the path of a valid URDF.
+        RankDeficientError: If the estimator is "ols" or "wls" and the data do not determine all
+            parameters.
         NotConvergedError: If a solver fails.
         SettingsError: If a setting is out of range, or a code to ignore is unknown.
     """
@@ -97,19 +99,21 @@ def identify(
     )
     if not first:
         raise DataError("no log was given; at least one is needed to identify anything")
-    fitted, kept = ([hold_log(model, log, settings) for log in some] for some in (first, second))
+    fitted, held_out = (
+        [hold_log(model, log, settings) for log in some] for some in (first, second)
+    )
     report_stage(progress, "checking logs")
     found = diagnose(model, first, second, settings) if doctor else ()
-    recordings = Recordings(model, structural_mapping(model), fitted, kept)
+    recordings = Recordings(model, structural_mapping(model), fitted, held_out)
     return conclude(recordings, choice, found, ignore, friction=friction, progress=progress)
 
 
 def robot_of(model: RobotModel | str | Path, logs: object) -> RobotModel:
-    """Return the robot that a user gives, read if it is the path of a URDF.
+    """Return the robot, read if it is given as the path of a URDF.
 
     Args:
         model: The robot; or the path of its URDF, all of whose joints move.
-        logs: What is given as the logs, to see whether the two are swapped.
+        logs: The argument given as the logs, to check whether the two are swapped.
 
     Raises:
         ModelError: If it is no robot, or the two are swapped.
@@ -122,8 +126,8 @@ def robot_of(model: RobotModel | str | Path, logs: object) -> RobotModel:
     if is_robot or (suffixes[1] in _ROBOTS and suffixes[0] not in _ROBOTS):
         what = f"the file {Path(str(model)).name}" if is_path else f"a {kind}"
         raise ModelError(
-            f"model is {what}, and the robot is given as the logs; wanted the robot first, then "
-            "the logs: swap the two"
+            f"model is {what}, and the robot is given as the logs; wanted: the robot first, then "
+            "the logs; swap the two"
         )
     if not is_path:
         raise ModelError(f"model is a {kind}, wanted a RobotModel or the path of a URDF")
@@ -139,26 +143,26 @@ def conclude(
     friction: str | Mapping[str, str] = AUTO,
     progress: ProgressCallback | None = None,
 ) -> Identification:
-    """Identify a robot's parameters from recordings, in memory or not, and judge the result.
+    """Identify a robot's parameters from recordings, in memory or not, and give a verdict.
 
     Args:
         recordings: The recordings.
-        choice: Which estimator.
-        found: What was found of them before, as by the doctor.
-        ignore: Codes of findings that the verdict does not count.
+        choice: The estimator.
+        found: Findings about the recordings, as of the doctor.
+        ignore: Codes of findings that the verdict ignores.
         friction: As of ``identify``.
         progress: As of ``identify``.
 
     Raises:
-        DataError: If a row of a log cannot be used.
+        DataError: If a log cannot be used.
         RankDeficientError, NotConvergedError: As of ``identify``.
     """
     model, is_robust = recordings.model, choice.is_robust
     wanted = wanted_families(friction, model.joints)
     if model.is_static and any(wanted.values()):
         raise SettingsError(
-            "dynamics is 'static', which has friction 'none' or 'viscous+coulomb' (without the "
-            "viscous), but more is stated; leave it out, or set dynamics = 'full'"
+            "dynamics is 'static', which allows friction 'none' or 'viscous+coulomb' (without "
+            "the viscous term), but more is stated; remove it, or set dynamics = 'full'"
         )
     report_stage(progress, "fitting")
     with _explained(found):
@@ -171,14 +175,14 @@ def conclude(
     own = {field.name: getattr(fit, field.name) for field in fields(fit)}
     asked = Asked(recordings.fitted[0].asked, friction, tuple(ignore))
     result = Identification(**own, misfits=misfits, on_misfit=on_misfit, asked=asked)
-    # what the motion excites the fit shows from all rows: finding "undetermined"
+    # the fit reports the excitation over all samples, see finding "undetermined"
     before = [f for f in found if f.severity != "note" and f.code != "excitation"]
     of_fit = fit_findings(fit, misfits, on_misfit, discrepancies)
-    beside = settled(with_known_springs(before, fit), of_fit)
-    beside = rejected(beside, result.predictions, result.scale_check)
-    log_errors = blocking(beside, ignore, is_robust=is_robust)
+    merged = settled(with_known_springs(before, fit), of_fit)
+    merged = rejected(merged, result.predictions, result.scale_check)
+    log_errors = blocking(merged, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.kept)]
-    findings = [*log_findings(heads), *impossible_inertials(model), *beside]
+    findings = [*log_findings(heads), *impossible_inertials(model), *merged]
     findings += unwritten(fit, log_errors)
     ignored = {current_code(code) for code in ignore}
     counted = [finding for finding in findings if finding.code not in ignored]
@@ -193,7 +197,7 @@ def conclude(
 
 @contextmanager
 def _explained(found: Sequence[Finding]) -> Iterator[None]:
-    """Add what the doctor found to the error of a fit that fails."""
+    """Add the findings of the doctor to the error of a fit that fails."""
     try:
         yield
     except (DataError, NotConvergedError, RankDeficientError) as error:
@@ -211,14 +215,14 @@ def with_drives(
     *,
     progress: ProgressCallback | None = None,
 ) -> Fit:
-    """Identify a robot's parameters, and the friction of its joints that the logs show.
+    """Identify a robot's parameters, and the friction terms of its joints from the logs.
 
     Args:
         recordings: The recordings.
-        choice: Which estimator.
+        choice: The estimator.
         wanted: Friction of each joint, as of ``wanted_families``.
         balanced: As of ``choose_drives``.
-        progress: Called with "fits", those done, those in all as far as is known, and "fits".
+        progress: Called with "fits", the number done, the expected number, and "fits".
 
     Raises:
         DataError, RankDeficientError, NotConvergedError: As of ``identify``.
@@ -244,12 +248,12 @@ def with_drives(
 
 
 def _with_own(recordings: Recordings, fit: Solution, drives: Sequence[DriveChoice]) -> Recordings:
-    """Return recordings of the robot whose drives have the terms chosen, loaded as a fit says."""
+    """Return recordings of the robot with the selected drive terms, under the load of a fit."""
     plain, own = recordings.model, {drive.joint: drive.terms for drive in drives}
     model = plain.with_terms(
         {d.name: (*plain.layout.own.get(d.name, ()), *own.get(d.name, ()))
          for d in plain.layout.drives}
     )  # fmt: skip
-    known = dict(zip(fit.mapping.names, fit.standard, strict=True))
-    start = np.array([known.get(name, 0.0) for name in model.layout.names])
+    fitted = dict(zip(fit.mapping.names, fit.standard, strict=True))
+    start = np.array([fitted.get(name, 0.0) for name in model.layout.names])
     return recordings.with_model(model.with_reference(start))

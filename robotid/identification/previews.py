@@ -1,13 +1,13 @@
-"""What a motion will tell before it is recorded: the standard errors to be expected of it.
+"""Expected standard errors of a motion before it is recorded.
 
-The motion goes the way of a log, with the torque that the model predicts for it: filter, rows used,
-factors and base parameters are those of an identification. What is not known before is the noise.
-One of standard deviation s, correlated over the time T, has the density S = s^2 T, white noise T =
-one sample. Behind the filter it leaves a residual of variance s_j^2 <= S_j 2 B, B the filter's
-band, but however few of the r rows a second are then independent, the score of a joint,
-W_j^T (tau_j - W_j theta) / s_j^2, varies by S_j r W_j^T W_j / s_j^4: W_j is slow, and slow noise
-passes the filter. With the bread (sum_j W_j^T W_j / s_j^2)^-1 that is the covariance of weighted
-least squares, and with the prior's information that of a consistent fit.
+The motion is processed like a log, with the torque that the model predicts: filter, used samples,
+factors and base parameters are those of an identification. Only the noise must be assumed. Noise of
+standard deviation s with correlation time T has the density S = s^2 T; for white noise T is one
+sample. Behind the filter the residual has the variance s_j^2 <= S_j 2 B, with the bandwidth B of
+the filter. The score of a joint, W_j^T (tau_j - W_j theta) / s_j^2, has the covariance
+S_j r W_j^T W_j / s_j^4, with r samples per second, however few of them are independent: W_j is
+slow, and slow noise passes the filter. With the bread (sum_j W_j^T W_j / s_j^2)^-1 this gives the
+covariance of weighted least squares, and with the prior's information that of a consistent fit.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,27 +53,27 @@ from robotid.robot.prior import prior_spread
 
 __all__ = ["Preview", "Run", "preview", "preview_logs"]
 
-#: The same of a consistent fit's prior where "auto" weighs it, and what is plausible beside that:
-#: the heaviest weight that held-out segments do not reject, of robots as far from their URDF.
+#: Typical weight of a consistent fit's prior with "auto", and the plausible weight: the largest one
+#: that held-out segments do not reject, for robots that differ from their URDF as much.
 _WEIGHT = (10.0, 1.0)
-_EXACT = 1e-9  # share of the largest residual that every joint has at least
-_LEAST_FREE = 0.1  # share of a joint's rows that are left to tell its noise, at least
-_IMPULSE = 40.0  # periods of the filter after which nothing is left of an impulse
+_EXACT = 1e-9  # smallest residual of a joint, as a share of the largest one
+_LEAST_FREE = 0.1  # smallest share of residual degrees of freedom in a joint's samples
+_IMPULSE = 40.0  # periods of the filter after which its impulse response is 0
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What was recorded and identified before.
+    """An earlier recording and its identification.
 
     Attributes:
-        segments: Factors of its segments, base parameters.
-        standard: The parameters found, shape (p,).
+        segments: Factors of its segments, for base parameters.
+        standard: The identified parameters, shape (p,).
         squares: As of ``Reduction``.
         samples: As of ``Reduction``.
-        share: Share of its rows that count as independent [-].
-        step: Time between two rows [s].
-        weight: Weight of the prior that its fit chose, and the plausible one; None if it chose
-            none.
+        share: Share of its samples that count as independent [-].
+        step: Time between two samples [s].
+        weight: Weight of the prior selected by its fit, and the plausible one; None if its fit
+            selected none.
     """
 
     segments: tuple[Factors, ...]
@@ -86,12 +86,12 @@ class Run:
 
     @classmethod
     def of(cls, recordings: Recordings, standard: Array, details: Mapping[str, Any]) -> "Run":
-        """Return the run of logs that were identified before.
+        """Return the run of logs that were identified earlier.
 
         Args:
-            recordings: Its fitted logs, of the model with the friction found.
-            standard: The parameters found, shape (p,).
-            details: Those of its estimate.
+            recordings: Its fitted logs, with the model that includes the identified friction.
+            standard: The identified parameters, shape (p,).
+            details: Details of its estimate.
 
         Raises:
             DataError: If a log cannot be used.
@@ -106,14 +106,14 @@ class Run:
 
     @property
     def factors(self) -> Factors:
-        """Those of all segments together."""
+        """Factors of all segments together."""
         return merge(self.segments)
 
     def noise(self, K: Array) -> TorqueNoise:
-        """Return the noise that it shows: its residuals, correlated as their scores scatter.
+        """Return the noise of its residuals, with the correlation given by the scatter of scores.
 
-        The score of a joint scatters otherwise in each direction; what it does to the parameters
-        that the joint tells most of, in the geometric mean, stands for all.
+        The scatter of a joint's score depends on the direction. The geometric mean over the
+        parameters, weighted by the joint's share of their variance, is used.
 
         Args:
             K: Map to the base parameters, shape (b, p).
@@ -128,19 +128,19 @@ class Run:
                 alone = np.where(np.arange(len(sigma)) == j, sigma, np.inf)
                 own = np.diag(bread @ factors.information(alone**-2.0) @ bread)
                 share = own / np.diag(bread)  # of each parameter's variance, by this joint
-                told = share > FAINTEST
+                counts = share > FAINTEST
                 scattered = np.diag(scatter(self.segments, beta, alone, bread).covariance)
-                ratio = np.log(scattered[told] / own[told])
-                inflation[j] = np.exp(np.average(ratio, weights=share[told]))
-        spent = factors.leverages(bread) / sigma**2
-        free = np.maximum(1.0 - spent / np.maximum(factors.rows, 1), _LEAST_FREE)
+                ratio = np.log(scattered[counts] / own[counts])
+                inflation[j] = np.exp(np.average(ratio, weights=share[counts]))
+        effective = factors.leverages(bread) / sigma**2  # degrees of freedom
+        free = np.maximum(1.0 - effective / np.maximum(factors.rows, 1), _LEAST_FREE)
         # its density is sigma^2 inflation step, whatever its standard deviation is
         return TorqueNoise(
             sigma / np.sqrt(free), free * inflation * self.step, ("found",) * len(sigma)
         )
 
     def meat(self, K: Array, sigma: Array) -> Array:
-        """Return the covariance of its score for rows so weighted, shape (b, b).
+        """Return the covariance of its score for samples weighted by sigma^-2, shape (b, b).
 
         Args:
             K: Map to the base parameters, shape (b, p).
@@ -155,14 +155,14 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """What motions will tell.
+    """Expected result of motions that are not recorded yet.
 
     Attributes:
-        expected: The identification to be expected: it predicts their torque exactly, and has the
-            standard errors, sources and bands that noise would leave it.
+        expected: The expected identification: it predicts their torque exactly, and has the
+            standard errors, sources and bands that follow from the noise.
         noise: The noise of the torque.
-        before: Standard errors of the base parameters by the run before alone, shape (b,), inf
-            where it said nothing; None if there was none.
+        before: Standard errors of the base parameters from the earlier run only, shape (b,), inf
+            where it does not determine one; None without an earlier run.
     """
 
     expected: Identification
@@ -170,15 +170,15 @@ class Preview:
     before: Array | None = None
 
     def __repr__(self) -> str:
-        known, found = self.expected.determination, self.expected
+        determined, found = self.expected.determination, self.expected
         return (
-            f"<Preview of {found.model.name}: {known.rank} of {len(known.names)} base parameters "
-            f"determined by {len(found.fitted)} motions>"
+            f"<Preview of {found.model.name}: {determined.rank} of {len(determined.names)} base "
+            f"parameters determined by {len(found.fitted)} motions>"
         )
 
     @property
     def base_error(self) -> Array:
-        """Standard errors of the base parameters, shape (b,); inf where nothing is said."""
+        """Standard errors of the base parameters, shape (b,); inf where not determined."""
         return self.expected.base_error
 
     @property
@@ -188,7 +188,7 @@ class Preview:
 
     @property
     def gain(self) -> Array | None:
-        """Factor by which the base parameters' standard errors fall, shape (b,); None of no run."""
+        """Factor by which the base standard errors decrease, shape (b,); None without a run."""
         if self.before is None:
             return None
         before, after = (np.minimum(x, self.plausible) for x in (self.before, self.base_error))
@@ -197,17 +197,17 @@ class Preview:
 
     @property
     def plausible(self) -> Array:
-        """How far the base parameters may plausibly lie from the URDF's, shape (b,)."""
+        """Plausible difference of the base parameters from the URDF's, shape (b,)."""
         return base_spread(self.expected.mapping.K, self.expected.prior_std)
 
     @property
     def bands(self) -> tuple[TorqueBand, ...]:
-        """How far each motion's predicted torques could be trusted."""
+        """Expected band of each motion's predicted torques."""
         return tuple(expected_band(self.expected, e) for e in self.expected.fitted)
 
     @property
     def words(self) -> str:
-        """What the motions determine, and what they leave open."""
+        """What the motions determine, and what they do not determine, as text."""
         found = self.expected
         names = listed(dict.fromkeys(e.recording.log.name for e in found.fitted))
         return excitation_finding(found.wls, found.determination, names).message
@@ -222,19 +222,19 @@ def preview(
     estimator: EstimatorSettings | str = "consistent",
     given: Identification | None = None,
 ) -> Preview:
-    """Return the standard errors to be expected of motions, before they are recorded.
+    """Return the expected standard errors of motions before they are recorded.
 
     Args:
-        model: The robot; or the path of its URDF, all of whose joints move. With a run before, the
-            robot is that run's.
+        model: The robot; or the path of its URDF, all of whose joints move. With an earlier
+            run, the robot is that of the run.
         motions: The motions: a ``Log``, whose torques are ignored, the path of a file with
             positions, a DataFrame, or several of these.
-        noise: Standard deviation of the torque's noise by joint [N m or N], of those that it is
-            known of, or all about it; as of ``assumed_noise`` for the others, or as a run before
-            has it.
-        signals: How logs become trajectories; those of the run before, or the defaults, if None.
+        noise: Standard deviation of the torque's noise [N m or N], by joint for those where it is
+            known, or a ``TorqueNoise``; for the others that of the earlier run, or that of
+            ``assumed_noise``.
+        signals: How logs become trajectories; those of the earlier run, or the defaults, if None.
         estimator: Name or settings of the estimator.
-        given: A run that was identified before, which adds what it said.
+        given: An earlier identification, whose information is added.
 
     Raises:
         DataError: If a motion cannot be read, does not fit the model or is too short.
@@ -257,8 +257,8 @@ def preview(
         recordings = Recordings(model, given.mapping, logs)
         run = Run.of(recordings, given.standard, given.estimate.details)
     read = read_logs(motions, model.joints, prismatic=model.layout.prismatic, needs="motion")
-    held = [hold_log(model, motion, settings) for motion in read]
-    return preview_logs(model, held, choice, noise=noise, run=run)
+    in_memory = [hold_log(model, motion, settings) for motion in read]
+    return preview_logs(model, in_memory, choice, noise=noise, run=run)
 
 
 def preview_logs(
@@ -271,17 +271,17 @@ def preview_logs(
     run: Run | None = None,
     like: Run | None = None,
 ) -> Preview:
-    """Return the standard errors to be expected of motions that were read.
+    """Return the expected standard errors of motions that were read.
 
     Args:
-        model: The robot, with the friction that a run before has found.
+        model: The robot, with the friction that an earlier run identified.
         motions: The motions, in memory.
         choice: Which estimator.
         noise: As of ``preview``.
-        correlation: Time over which noise that is stated or assumed is correlated [s]; if None, as
-            a run before has it, or 0.1 s.
-        run: What was recorded before, if anything; it adds what it said.
-        like: A run whose noise and parameters these motions have, too, without adding to them.
+        correlation: Correlation time of stated or assumed noise [s]; if None, that of an earlier
+            run, or 0.1 s.
+        run: An earlier run, if any, whose information is added.
+        like: A run whose noise and parameters are used, without adding its information.
 
     Raises:
         DataError: As of ``preview``.
@@ -290,40 +290,43 @@ def preview_logs(
     if not motions:
         raise DataError("no motion was given; at least one is needed to preview anything")
     mapping = structural_mapping(model)
-    peak, fastest = _seen(model, motions)
+    peak, fastest = _largest(model, motions)
     size = largest_torques(model, peak)
-    known = run or like
-    pi = assumed_parameters(model, size, fastest) if known is None else known.standard
+    earlier = run or like
+    pi = assumed_parameters(model, size, fastest) if earlier is None else earlier.standard
     for motion in motions:
         _expect(motion, pi)
     if not isinstance(noise, TorqueNoise):
-        found = None if known is None else known.noise(mapping.K)
+        found = None if earlier is None else earlier.noise(mapping.K)
         noise = assumed_noise(model, size, noise or {}, correlation, found)
-    said = _Information.of(model, mapping, motions, noise)
-    said = said if run is None else said.beside(run)
-    prior, spread = model.standard_parameters(), prior_spread(model, said.squares, said.samples)
-    ground = Known(model, mapping, prior, spread, said.share, said.sigma)
-    weight = _WEIGHT if known is None or known.weight is None else known.weight
-    estimate, wls = _errors(said, ground, choice, weight)
-    expected = _expected(motions, pi, said, ground, choice, estimate, wls)
+    information = _Information.of(model, mapping, motions, noise)
+    information = information if run is None else information.added_to(run)
+    prior, spread = (
+        model.standard_parameters(),
+        prior_spread(model, information.squares, information.samples),
+    )
+    ground = Known(model, mapping, prior, spread, information.share, information.sigma)
+    weight = _WEIGHT if earlier is None or earlier.weight is None else earlier.weight
+    estimate, wls = _errors(information, ground, choice, weight)
+    expected = _expected(motions, pi, information, ground, choice, estimate, wls)
     before = None
     if run is not None:
-        alone, _ = _errors(said.without_motions(), ground, choice, weight)
+        alone, _ = _errors(information.without_motions(), ground, choice, weight)
         before = _base_error(alone, mapping, prior, spread)
     return Preview(expected, noise, before)
 
 
 @dataclass(frozen=True, eq=False)
 class _Information:
-    """What recordings say, or will."""
+    """Information in recordings, made or planned."""
 
     factors: Factors
     sigma: Array  # (n,), noise level of each joint behind the filter [N m or N]
-    levels: tuple[tuple[Factors, Array], ...]  # of motions to come: noise that counts per row, (n,)
-    run: Run | None  # what was recorded before
+    levels: tuple[tuple[Factors, Array], ...]  # of planned motions: noise density per sample, (n,)
+    run: Run | None  # an earlier recording
     squares: Array  # as of Reduction
     samples: int
-    share: float  # share of their rows that count as independent [-]
+    share: float  # share of their samples that count as independent [-]
 
     @classmethod
     def of(
@@ -333,7 +336,7 @@ class _Information:
         motions: Sequence[SurveyedLog],
         noise: TorqueNoise,
     ) -> "_Information":
-        """Return what motions will say, whose torque is expected."""
+        """Return the information of planned motions with predicted torque."""
         levels, residuals = [], []
         for log in motions:
             part = compress(base_problem(model, mapping, log.whole.trajectory, log.whole.mask))
@@ -352,8 +355,8 @@ class _Information:
             min(independent_share(log.signals) for log in motions),
         )
 
-    def beside(self, run: Run) -> "_Information":
-        """Return what a run before and these say together."""
+    def added_to(self, run: Run) -> "_Information":
+        """Return the information of an earlier run and of these motions together."""
         return replace(
             self,
             factors=merge([run.factors, self.factors]),
@@ -364,13 +367,13 @@ class _Information:
         )
 
     def without_motions(self) -> "_Information":
-        """Return what the run before says alone, rows weighted as they are."""
+        """Return the information of the earlier run only, with the same weights."""
         if self.run is None:
             return self
         return replace(self, factors=self.run.factors, levels=(), share=self.run.share)
 
     def meat(self, K: Array, sigma: Array) -> Array:
-        """Return the covariance of the score of all rows weighted by sigma^-2, shape (b, b)."""
+        """Return the covariance of the score of samples weighted by sigma^-2, shape (b, b)."""
         meat = np.zeros((len(K), len(K))) if self.run is None else self.run.meat(K, sigma)
         for part, level in self.levels:
             meat = meat + part.information(level / sigma**4)
@@ -378,12 +381,12 @@ class _Information:
 
 
 def _white_step(log: SurveyedLog) -> float:
-    """Return the time between two rows of independent noise, if it is white [s]."""
+    """Return the time between two samples of independent noise, if it is white [s]."""
     return log.step if log.signals.cutoff is not None else max(log.step, _row_step(log))
 
 
 def _row_step(log: SurveyedLog) -> float:
-    """Return the time between two rows of a log's trajectory [s]; 1 of stands, which are apart."""
+    """Return the time between two samples of a trajectory [s]; 1 s for poses at rest."""
     if log.model.is_static:
         return 1.0
     rate = log.signals.rate
@@ -401,8 +404,8 @@ def _band(log: SurveyedLog) -> float:
     return float(rate * np.sum(low_pass(impulse, rate, log.signals) ** 2))
 
 
-def _seen(model: RobotModel, motions: Sequence[SurveyedLog]) -> tuple[Array, Array]:
-    """Return the largest torque and speed of each joint in motions, by the URDF's bodies, (n,)."""
+def _largest(model: RobotModel, motions: Sequence[SurveyedLog]) -> tuple[Array, Array]:
+    """Return the largest torque (URDF's bodies) and speed of each joint in motions, (n,)."""
     bodies = model.standard_parameters()
     moved = [np.abs(predict(model, [bodies], log.whole.trajectory)[0]) for log in motions]
     peak = np.max([torque.max(axis=0) for torque in moved], axis=0)
@@ -410,7 +413,7 @@ def _seen(model: RobotModel, motions: Sequence[SurveyedLog]) -> tuple[Array, Arr
 
 
 def _expect(log: SurveyedLog, pi: Array) -> None:
-    """Give a motion the torque that parameters predict, behind its filter."""
+    """Set the torque of a motion to the one that parameters predict, behind its filter."""
     rows = log.whole
     (torque,) = predict(log.model, [pi], rows.trajectory)
     (piece,) = log.pieces
@@ -418,27 +421,28 @@ def _expect(log: SurveyedLog, pi: Array) -> None:
 
 
 def _errors(
-    said: _Information, known: Known, choice: EstimatorSettings, usual: tuple[float, float]
+    information: _Information, known: Known, choice: EstimatorSettings, typical: tuple[float, float]
 ) -> tuple[Estimate, Estimate]:
-    """Return the estimate and that of WLS to be expected, both at the prior.
+    """Return the expected estimate and that of WLS, both at the prior.
 
-    The bounds of a consistent fit are left out, for which of them bind is not known before the
-    data; nor is the weight of its prior, and the plausible one, unless it is stated: the typical.
+    The bounds of a consistent fit are left out: it is not known in advance which are active. The
+    weight of its prior, unless it is stated, and the plausible weight are the typical ones.
     """
-    factors, K = said.factors, known.mapping.K
+    factors, K = information.factors, known.mapping.K
     plain, alike = (
-        _least_squares(said, known, sigma) for sigma in (said.sigma, np.ones_like(said.sigma))
+        _least_squares(information, known, sigma)
+        for sigma in (information.sigma, np.ones_like(information.sigma))
     )
     if not isinstance(choice, ConsistentSettings):
         return (alike if choice.weighs_alike else plain), plain
     stated = choice.prior_weight
-    weight, plausible = usual if isinstance(stated, str) else (stated, 1.0)
+    weight, plausible = typical if isinstance(stated, str) else (stated, 1.0)
     bounds = {**choice.constraints, "extent": "none"}
     settings = replace(choice, prior_weight=weight, constraints=bounds)
     fit = replace(consistent_fit(settings, known), plausible_weight=plausible)
-    C = fit.programme.covariance(weight, fit.rows(factors, said.sigma))
-    R, meat = factors.weighted(said.sigma)[:-1, :-1], said.meat(K, said.sigma)
-    covariance = about_prior(C, K, said.share**2 * meat, R, said.share, fit.pull)
+    C = fit.programme.covariance(weight, fit.rows(factors, information.sigma))
+    R, meat = factors.weighted(information.sigma)[:-1, :-1], information.meat(K, information.sigma)
+    covariance = about_prior(C, K, information.share**2 * meat, R, information.share, fit.pull)
     estimate = replace(
         plain, theta=known.pi, covariance=covariance, names=known.mapping.names,
         prior_std=fit.spread_before,
@@ -446,31 +450,33 @@ def _errors(
     return estimate, plain
 
 
-def _least_squares(said: _Information, known: Known, sigma: Array) -> Estimate:
-    """Return least squares of rows weighted by sigma^-2, at the prior."""
-    solution = solve_factor(said.factors, sigma, known.beta)
+def _least_squares(information: _Information, known: Known, sigma: Array) -> Estimate:
+    """Return least squares of samples weighted by sigma^-2, at the prior."""
+    solution = solve_factor(information.factors, sigma, known.beta)
     bread = solution.covariance
-    covariance = bread @ said.meat(known.mapping.K, sigma) @ bread
-    found = solution.estimate(said.factors.names, covariance, said.sigma, 0, "expected")
+    covariance = bread @ information.meat(known.mapping.K, sigma) @ bread
+    found = solution.estimate(
+        information.factors.names, covariance, information.sigma, 0, "expected"
+    )
     return replace(found, theta=known.beta)
 
 
 def _expected(
     motions: Sequence[SurveyedLog],
     pi: Array,
-    said: _Information,
+    information: _Information,
     known: Known,
     choice: EstimatorSettings,
     estimate: Estimate,
     wls: Estimate,
 ) -> Identification:
-    """Return the identification to be expected."""
+    """Return the expected identification."""
     model, mapping = known.model, known.mapping
-    standard = known.pi if said.run is None else pi
-    rows = said.factors.weighted(said.sigma / np.sqrt(said.share))[:, :-1]
+    standard = known.pi if information.run is None else pi
+    rows = information.factors.weighted(information.sigma / np.sqrt(information.share))[:, :-1]
     before = base_spread(mapping.K, known.spread, model.layout.owned_by(choice.bounds.pinned))
     fitted, _ = evaluate_logs(motions, (), {"estimate": pi, "wls": pi}, known.pi)
-    inflation = np.mean([level / said.sigma**2 for _, level in said.levels])
+    inflation = np.mean([level / information.sigma**2 for _, level in information.levels])
     errors = StandardErrors("noise expected", 0, float(inflation), np.full(len(mapping.K), np.inf))
     return Identification(
         model=model,
@@ -488,13 +494,13 @@ def _expected(
         fitted=fitted,
         validation=(),
         errors=errors,
-        factors=said.factors,
-        determination=determine(said.factors.names, rows, before),
+        factors=information.factors,
+        determination=determine(information.factors.names, rows, before),
     )
 
 
 def _base_error(estimate: Estimate, mapping: BaseMapping, prior: Array, spread: Array) -> Array:
-    """Return the standard errors of the base parameters, shape (b,); inf where nothing is said."""
+    """Return the standard errors of the base parameters, shape (b,); inf if not determined."""
     if estimate.names == mapping.base_names:
         return estimate.std_error
     _, covariance = standard_of(estimate, mapping, prior, spread)

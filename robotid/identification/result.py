@@ -1,4 +1,4 @@
-"""An identification: a fit, and what is concluded of it."""
+"""An identification: a fit with findings and a verdict."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -33,7 +33,7 @@ __all__ = ["Asked", "Identification"]
 
 @dataclass(frozen=True)
 class Asked:
-    """What an identification was asked for, beside robot, logs and estimator.
+    """Settings of an identification other than robot, logs and estimator.
 
     Attributes:
         signals: How logs become trajectories.
@@ -50,16 +50,16 @@ class Asked:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification(Fit):
-    """Everything that an identification found.
+    """Complete result of an identification.
 
     Attributes:
-        findings: What the user should know of the robot, of the logs and of the fit.
-        log_errors: Faults of the recordings that make the result wrong, as the doctor found them.
-        warnings: Why it may be wrong however well it predicts, as the doctor and the fit found.
+        findings: Findings about the robot, the logs and the fit.
+        log_errors: Faults of the recordings that make the result wrong, found by the doctor.
+        warnings: Why it may be wrong although it predicts well, from the doctor and the fit.
         report: File of the report, if one was written with the result.
-        misfits: Terms that the model of its drives still lacks.
-        on_misfit: Names of drive parameters whose errors grew by these.
-        asked: Signals, friction and findings to ignore, as they were asked for.
+        misfits: Terms that its drive models lack.
+        on_misfit: Names of drive parameters whose errors increased for these.
+        asked: Stated signals, friction and findings to ignore.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -88,9 +88,8 @@ class Identification(Fit):
         Returns:
             A pandas DataFrame if pandas is installed, else a list of dictionaries. Columns:
             "part" (link or drive), "parameter", "urdf", "value", "std_error", "low" and "high"
-            (95 % interval), "source" (as of ``sources``), "unit". A URDF has no value of drives
-            that is used, and a parameter at its bound no standard error: None, or NaN in a
-            DataFrame.
+            (95 % interval), "source" (as of ``sources``), "unit". Missing values are None, or NaN
+            in a DataFrame: "urdf" of drives, "std_error" of a parameter at its bound.
         """
         return parameter_table(*parameter_entries(self))
 
@@ -99,11 +98,11 @@ class Identification(Fit):
 
         Args:
             joints: The joints; all if none is named.
-            recording: One of ``fitted`` or ``validation``; None: the first that was kept apart,
-                or the first fitted without any.
+            recording: One of ``fitted`` or ``validation``; None: the first validation recording,
+                or the first fitted one.
 
         Returns:
-            Charts that a notebook shows, and that ``.write("torques.html")`` keeps.
+            Charts that a notebook shows and ``.write("torques.html")`` saves.
 
         Raises:
             DataError: If there is no such joint.
@@ -130,7 +129,7 @@ class Identification(Fit):
             joints: The joints; all if none is named.
 
         Returns:
-            Charts that a notebook shows, and that ``.write("friction.html")`` keeps.
+            Charts that a notebook shows and ``.write("friction.html")`` saves.
 
         Raises:
             DataError: If there is no such joint, or none that moved.
@@ -139,17 +138,17 @@ class Identification(Fit):
         charts = [(friction_chart(self, name), f"{name}: friction and offset") for name in names]
         shown = tuple((chart, caption) for chart, caption in charts if chart is not None)
         if not shown:
-            raise DataError(f"{listed(names)}: no rows used, so there is no friction to show")
+            raise DataError(f"{listed(names)}: no samples used, so there is no friction to show")
         return Plot(f"Friction of {listed(names)} against speed", shown)
 
     def plot_why(self, joint: str) -> Plot:
-        """Return charts of what a joint's torque consists of, and of what its residual follows.
+        """Return charts of the parts of a joint's torque, and of its residual's dependences.
 
         Args:
             joint: The joint.
 
         Returns:
-            Charts that a notebook shows, and that ``.write("why.html")`` keeps.
+            Charts that a notebook shows and ``.write("why.html")`` saves.
 
         Raises:
             DataError: If there is no such joint.
@@ -159,32 +158,32 @@ class Identification(Fit):
         about = {name: f"residual against {name}" for name in charts}
         about |= {"split": torque.sentence, "power": "mechanical power"}
         shown = tuple((chart, f"{joint}: {about[name]}") for name, chart in charts.items())
-        return Plot(f"Why {joint} is predicted as it is", shown)
+        return Plot(f"Torque parts and residual of {joint}", shown)
 
     def _row(self, joint: str) -> int:
-        """Return the number of a joint's torque row."""
+        """Return the index of a joint's torque row."""
         require_kind(joint, str, "joint", "the name of a joint")
         names = self.model.row_names
         if joint not in names:
             raise DataError(
-                f"joint {joint!r} is not among those identified: {listed(names)}"
+                f"joint {joint!r} is not among the identified joints: {listed(names)}"
                 f"{suggestion(joint, names)}"
             )
         return names.index(joint)
 
     @property
     def has_urdf(self) -> bool:
-        """Whether a URDF may be written of it: it is possible, and no fault makes it wrong."""
+        """Whether a URDF may be written: it is consistent, and no fault makes it wrong."""
         return self.is_consistent and not self.log_errors
 
     @cached_property
     def scale_check(self) -> ScaleCheck:
-        """Gravity and masses against the URDF's: what speaks for the scale but the sensors."""
+        """Scale check: identified gravity and masses against the URDF's."""
         return check_scale(self)
 
     @cached_property
     def verdict(self) -> Verdict:
-        """How far to trust the result."""
+        """Verdict on the result, with reasons."""
         predictions = Predictions(
             self.metrics(),
             self.predictions,

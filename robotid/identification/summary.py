@@ -1,4 +1,4 @@
-"""How results show themselves: a line, a text, and HTML for a notebook."""
+"""Summaries of results: a line, a text, and HTML for a notebook."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
     "verdict_lines",
 ]
 
-#: Heads of the errors of other predictions, by name: of torques, then of positions.
+#: Column heads of the errors of other predictions, by name: of torques, then of positions.
 _BESIDE = {
     "urdf_with_drives": "URDF +\ndrives %",
     "wls": "WLS\n%",
@@ -34,7 +34,7 @@ _BESIDE = {
     "urdf": "URDF\n%",
     "gravity_only": "gravity\nonly %",
     "command": "command\n%",
-    "steady": "same\nspeed %",
+    "steady": "constant\nspeed %",
 }
 _NO_REPORT = "robotid.write_report(found, 'report.html') writes the whole report"
 
@@ -45,7 +45,7 @@ def identification_line(found: Identified, estimator: str, status: str) -> str:
     Args:
         found: The identification.
         estimator: Name of its estimator.
-        status: Its verdict, in a word.
+        status: Status of its verdict.
     """
     return (
         f"<Identification of {found.model.name}: {len(found.base)} base parameters by "
@@ -76,8 +76,8 @@ def error_lines(
 
     Args:
         metrics: Metrics, as in result.json.
-        wls: Those of weighted least squares, or none.
-        width: Characters of a line; columns beyond it are left out, and named.
+        wls: Metrics of weighted least squares, or None.
+        width: Characters per line; further columns are left out and named.
     """
     others = {} if wls is None else wls["per_joint"]
     joints = {
@@ -91,8 +91,8 @@ def error_lines(
         mark = "" if m["better_than_constant"] else " *"
         is_worse = is_worse or bool(mark)
         rmse = f"{m['rmse']:#.3g}".rstrip(".")
-        error, *beside = (cell(m.get(key)) for key in ("relative_error_pct", *shown))
-        rows.append([joint + mark, error, rmse, m["unit"], *beside])
+        error, *plain = (cell(m.get(key)) for key in ("relative_error_pct", *shown))
+        rows.append([joint + mark, error, rmse, m["unit"], *plain])
     named = dict(zip(keys, _BESIDE.values(), strict=True))
     heads = ["joint\n", "error\n%", "rmse\n", "\n", *(named[key] for key in shown)]
     lines = columns(heads, rows, width=width, needed=4, left=(0, 3))
@@ -100,7 +100,7 @@ def error_lines(
 
 
 def friction_lines(friction: Mapping[str, Any]) -> list[str]:
-    """Return what friction joints have beside viscous and Coulomb's, and what it gained, as text.
+    """Return the friction of joints besides viscous and Coulomb, and its effect, as text.
 
     Args:
         friction: By joint, as in result.json.
@@ -114,13 +114,13 @@ def friction_lines(friction: Mapping[str, Any]) -> list[str]:
             )
             gain = f"held-out error {before:.1f} -> {after:.1f} %"
             lines.append(f"  {joint}: {' + '.join(found['families'])} ({gain})")
-    return ["friction beside viscous and Coulomb's:", *lines] if lines else []
+    return ["friction besides viscous and Coulomb:", *lines] if lines else []
 
 
 def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
-    """Return a verdict as lines of text: on all, with its reasons; then joint by joint.
+    """Return a verdict as lines of text: status and reasons, then the verdict on each joint.
 
-    A reason that stands beside a joint is not said twice.
+    A reason that is shown at a joint is not repeated.
 
     Args:
         verdict: Status, reasons and joints, as in result.json.
@@ -128,19 +128,19 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
     by_cell: dict[str, list[str]] = {}
     for name, joint in verdict["per_joint"].items():
         by_cell.setdefault(verdict_cell(name, joint), []).append(name)
-    beside = {joint["reasons"][0] for joint in verdict["per_joint"].values() if joint["reasons"]}
-    reasons = [f"  - {reason}" for reason in verdict["reasons"] if reason not in beside]
+    at_joints = {joint["reasons"][0] for joint in verdict["per_joint"].values() if joint["reasons"]}
+    reasons = [f"  - {reason}" for reason in verdict["reasons"] if reason not in at_joints]
     if list(by_cell) == ["good"]:
         by_cell = {"good": ["every joint"]}
     return [
         f"verdict: {verdict['status']}",
         *reasons,
-        *(f"  {', '.join(names)}: {said}" for said, names in by_cell.items()),
+        *(f"  {', '.join(names)}: {words}" for words, names in by_cell.items()),
     ]
 
 
 def verdict_cell(joint: str, verdict: Mapping[str, Any]) -> str:
-    """Return the verdict on a joint with its first reason, as in "usable: predicted to 20 %".
+    """Return the verdict on a joint with its first reason, as in "usable: error 20 % on b.csv".
 
     Args:
         joint: The joint.
@@ -155,11 +155,11 @@ def joint_reason(joint: str, reasons: Sequence[str]) -> str:
 
     Args:
         joint: The joint.
-        reasons: Why, the worst first.
+        reasons: Reasons of the verdict, the worst first.
     """
     why = reasons[0] if reasons else ""
-    about, _, said = why.partition(": ")
-    return said if joint in about.split(", ") else why
+    about, _, words = why.partition(": ")
+    return words if joint in about.split(", ") else why
 
 
 def cell(value: float | None) -> str:
@@ -189,12 +189,12 @@ def identification_html(found: Identification) -> str:
 
 
 def _tables(found: Identification) -> list[tuple[str, Metrics, Metrics]]:
-    """Return the metrics of each kept and of the fitted recordings, and those of WLS."""
-    kept = [
+    """Return the metrics of each validation log and of the fitted logs, and those of WLS."""
+    validation = [
         (f"{e.recording.name}: not fitted", e.metrics["estimate"], e.metrics["wls"])
         for e in found.validation
     ]
-    return [*kept, ("fitted rows", found.metrics(), found.metrics("wls"))]
+    return [*validation, ("fitted rows", found.metrics(), found.metrics("wls"))]
 
 
 def _errors(caption: str, metrics: Metrics) -> str:

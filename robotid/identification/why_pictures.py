@@ -1,4 +1,4 @@
-"""Charts of what a joint's torque consists of, of its power, and of what its residual follows."""
+"""Charts of the parts of a joint's torque, of its power, and of its residual's dependences."""
 
 import numpy as np
 
@@ -28,16 +28,16 @@ _TONES = {
 def why_charts(
     torque: JointTorque, *, link: str = "time", points: int = _POINTS
 ) -> dict[str, Chart]:
-    """Return the charts of a joint by what they show.
+    """Return the charts of a joint by name.
 
     They are "split", the parts of the torque stacked over time; one for each quantity that the
-    residual may follow, by its name; and "power", where a speed is known. Those over time show the
+    residual may depend on, by its name; and "power", if there is a speed. Charts over time show the
     first recording.
 
     Args:
         torque: Torque of the joint, from ``joint_torques``.
-        link: What those over time share cursor and zoom with.
-        points: About how many rows each of them shows.
+        link: Group of charts over time that share cursor and zoom.
+        points: Approximate number of samples in each.
     """
     charts = {"split": _split(torque, link, points)}
     for dependence in torque.follows:
@@ -74,8 +74,8 @@ def _split(torque: JointTorque, link: str, points: int) -> Chart:
 def _power(torque: JointTorque, power: Array, link: str, points: int) -> Chart:
     k = _first(torque, points)
     speed = torque.quantities["speed"][1]
-    lost = torque.parts.get("friction", np.zeros_like(speed)) * speed
-    t, whole, heat = broken(torque.rows.segment[k], torque.rows.t[k], power[k], lost[k])
+    dissipated = torque.parts.get("friction", np.zeros_like(speed)) * speed
+    t, whole, heat = broken(torque.rows.segment[k], torque.rows.t[k], power[k], dissipated[k])
     return Chart(
         title=f"Mechanical power of {torque.joint} over time, and that of its friction",
         x=t,
@@ -96,7 +96,7 @@ def _residual(torque: JointTorque, dependence: Dependence, link: str, points: in
     mean, error = dependence.at(x[k])
     is_one = name == "time" and len(torque.rows.recordings) == 1
     residual, less = torque.against_time if name == "time" else (torque.residual, "")
-    explained = f" less its mean over {less}" if less else ""
+    explained = f" minus its mean over {less}" if less else ""
     return Chart(
         title=f"Residual of {torque.joint}{explained} against {name}, with its mean and 95 % "
         "interval",
@@ -113,6 +113,6 @@ def _residual(torque: JointTorque, dependence: Dependence, link: str, points: in
 
 
 def _first(torque: JointTorque, points: int) -> Array:
-    """Return rows spread evenly over the first recording."""
+    """Return samples spread evenly over the first recording."""
     own = np.flatnonzero(torque.rows.recording == 0)
     return own[spread_rows(len(own), points)]

@@ -1,3 +1,3 @@
-"""What is concluded from a fit: findings, the check of the scale, and the verdict."""
+"""Conclusions from a fit: findings, the scale check and the verdict."""
 
 __all__: list[str] = []

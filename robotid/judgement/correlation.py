@@ -1,4 +1,4 @@
-"""Parameters whose errors are strongly correlated: known together far better than one by one."""
+"""Strongly correlated parameters: their sum is far better determined than each one."""
 
 from collections.abc import Sequence
 
@@ -22,11 +22,11 @@ def _correlations(C: Array, own: Sequence[int]) -> Array:
 
 
 def correlated_sets(C: Array, own: Sequence[int]) -> list[list[int]]:
-    """Return the sets of parameters that strong correlations join.
+    """Return the sets of parameters that strong correlations connect.
 
     Args:
         C: Covariance, shape (p, p).
-        own: Numbers of the parameters that are looked at, each with a variance above 0.
+        own: Indices of the parameters to compare, each with a variance above 0.
     """
     sets: list[set[int]] = []
     for pair in np.argwhere(np.triu(np.abs(_correlations(C, own)) > CORRELATED, 1)).tolist():
@@ -36,14 +36,14 @@ def correlated_sets(C: Array, own: Sequence[int]) -> list[list[int]]:
 
 
 def correlated_parameters(found: Identified) -> dict[int, tuple[int, float]]:
-    """Return drive parameters that are strongly correlated with another one of the drive.
+    """Return drive parameters strongly correlated with another parameter of the same drive.
 
     Args:
-        found: What was identified.
+        found: The identification.
 
     Returns:
-        By number of the standard parameter, that of the one it is correlated with most and their
-        correlation.
+        By index of the standard parameter: the index of the parameter with the largest correlation
+        with it, and that correlation.
     """
     layout, C, at_bound = found.model.layout, found.standard_covariance, found.at_bound
     pairs = {}

@@ -1,4 +1,4 @@
-"""What a user should know of a fit: open parameters, outliers, mass matrix, solvers, bounds."""
+"""Findings about a fit: undetermined parameters, outliers, mass matrix, solvers, bounds."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ __all__ = [
 ]
 
 _SAME_TORQUE = 1e-3  # two solvers that differ by more, relative to the torque, disagree
-_SAME_OPTIMUM = 1e-3  # the same of the objectives of log-Cholesky and cone programme
-_COSTS = 1.05  # residual over that of WLS from which bounds cost torque
-_FAR = 3.0  # a total mass so many times the URDF's, or its share, is no robot's
-_ROUNDING = 1e-6  # [m^2] by which a body that touches its box may leave it
+_SAME_OPTIMUM = 1e-3  # the same for the objectives of log-Cholesky and the cone programme
+_COSTS = 1.05  # residual over that of WLS above which bounds increase the torque error
+_FAR = 3.0  # a total mass differs from the URDF's at most by this factor
+_ROUNDING = 1e-6  # [m^2] tolerance of a body that touches its box
 _NAMED = 5  # outliers that a finding names
-_WIDE = 1e-2  # margin of a pseudo-inertia above which it may hold a fit back
-_DIFFERS = 1.2  # a consistent fit that misses this much more than WLS is reported
-_SHRUNK = 0.1  # of the URDF's smallest moment of mass: a link so much smaller is hardly possible
-_MUCH = 0.2  # share of a body's mass in links on locked joints that may leave it so
+_WIDE = 1e-2  # margin of a pseudo-inertia above which it may restrict a fit
+_DIFFERS = 1.2  # residual of a consistent fit over that of WLS above which it is reported
+_SHRUNK = 0.1  # of the URDF's smallest eigenvalue: below, a body is barely possible
+_MUCH = 0.2  # ... if links on locked joints have more than this share of its mass
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
-_BEYOND = 0.02  # share of a recording's rows beyond what friction was fitted to, that is told
+_BEYOND = 0.02  # share of samples outside the fitted range of friction that is reported
 _DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
-_LIGHT = 0.05  # share of a link's mass below which next to nothing is left of it
+_VANISHED = 0.05  # share of a link's URDF mass below which the link has practically vanished
 
 
 def fit_findings(
@@ -55,21 +55,21 @@ def fit_findings(
     on_misfit: Sequence[str] = (),
     discrepancies: Sequence[Finding] = (),
 ) -> list[Finding]:
-    """Return what a user should know of a fit: what it leaves open, outliers, costs of physics.
+    """Return the findings about a fit: undetermined parameters, outliers, costs of constraints.
 
     Args:
-        fit: What was found.
-        misfits: Terms that the model of its drives lacks.
-        on_misfit: Names of the drive parameters whose errors grew by these.
-        discrepancies: What recordings or URDF have otherwise than stated.
+        fit: The fit.
+        misfits: Terms that its drive models lack.
+        on_misfit: Names of the drive parameters whose errors increased for these.
+        discrepancies: Findings of recordings or a URDF that differ from what was stated.
     """
     findings = _static_findings(fit)
-    known = fit.determination
-    if known.groups:
+    determined = fit.determination
+    if determined.groups:
         message = (
-            f"the data determine {known.rank} of {len(known.names)} base parameters: "
-            f"{known.described()}. What they leave open keeps the URDF's values; record a richer "
-            "trajectory to determine it"
+            f"the data determine {determined.rank} of {len(determined.names)} base parameters: "
+            f"{determined.described()}. What is not determined keeps the URDF's values; record a "
+            "richer motion"
         )
         severity = "warning" if fit.is_poorly_excited else "note"
         findings.append(Finding("undetermined", severity, "base_parameters", message))
@@ -85,20 +85,20 @@ def fit_findings(
     findings += encoder_findings(fit)
     for evaluation in fit.refitted:
         message = (
-            f"the validation log {evaluation.recording.name} holds rows that were fitted: its "
-            "score shows the fit, not the prediction; validate on another recording"
+            f"the validation log {evaluation.recording.name} contains fitted samples: its "
+            "error is that of the fit, not of a prediction; validate on another recording"
         )
         where = evaluation.recording.log.path
         findings.append(Finding("validation_was_fitted", "warning", where, message))
     wls, asked = fit.metrics("wls").per_joint, _asked(fit)
-    kept = _kept_links(fit)
+    locked = _locked_links(fit)
     for joint, measured in fit.metrics().per_joint.items():
         free = wls[joint]
         if measured.rmse > _DIFFERS * free.rmse:
             message = (
-                f"{joint}: the residual is {measured.rmse:.3g} {measured.unit} against "
-                f"{free.rmse:.3g} of unconstrained WLS: physics and data disagree there; check "
-                f"{asked}{kept}the torque scale (gains), the drive model and the payload"
+                f"{joint}: the residual is {measured.rmse:.3g} {measured.unit}, that of "
+                f"unconstrained WLS {free.rmse:.3g}: physics and data disagree; check "
+                f"{asked}{locked}the torque scale (gains), the drive model and the payload"
             )
             errors = {"error_pct": measured, "wls_error_pct": free}
             evidence = {key: m.relative_error_pct or 0.0 for key, m in errors.items()}
@@ -107,7 +107,7 @@ def fit_findings(
 
 
 def _static_findings(fit: Fit) -> list[Finding]:
-    """Return what was used of the logs of a static model, and joints without their friction."""
+    """Return a note on the samples of a static model, and on joints without Coulomb friction."""
     if not fit.model.is_static:
         return []
     recordings = [e.recording for e in fit.fitted]
@@ -115,22 +115,22 @@ def _static_findings(fit: Fit) -> list[Finding]:
         sum(getattr(r.extent, key) for r in recordings) for key in ("samples", "smooth")
     )
     message = (
-        f"the {rows} rows count as {samples} stands and slow segments of a quarter of a "
-        "second; inertias about the centres of mass keep the URDF's values"
+        f"the {rows} rows count as {samples} independent samples: poses at rest and slow segments "
+        "of 0.25 s; inertias about the centres of mass keep the URDF's values"
     )
-    if still := _standing_drives(fit):
+    if still := _drives_at_rest(fit):
         message += (
-            f". Stands do not show the Coulomb friction of {listed(still)}, which holds anything "
-            "between its bounds there: intervals have room for it. Add slow sweeps of these "
-            "joints, or leave it out with friction = 'none' in [model]; to halve what it does, "
-            "approach each pose from both sides"
+            f". Poses at rest do not determine the Coulomb friction of {listed(still)}: at rest it "
+            "has any value between its bounds, and the intervals include it. Add slow motion of "
+            "these joints, or set friction = 'none' in [model]; to halve its effect, approach each "
+            "pose from both sides"
         )
     evidence = {"rows": float(rows), "samples": float(samples)}
     return [Finding("static", "note", "standard_parameters", message, evidence)]
 
 
-def _standing_drives(fit: Fit) -> list[str]:
-    """Return the drives whose friction has no direction in any row used, by name."""
+def _drives_at_rest(fit: Fit) -> list[str]:
+    """Return the names of drives whose friction has no direction in any used sample."""
     layout, still = fit.model.layout, []
     for d, (drive, ratios) in enumerate(zip(layout.drives, layout.drive_ratios, strict=True)):
         motions = [(e.recording.trajectory, e.recording.mask) for e in fit.fitted]
@@ -143,15 +143,15 @@ def _standing_drives(fit: Fit) -> list[str]:
 
 
 def _drive_findings(fit: Fit) -> list[Finding]:
-    """Return notes on shapes of friction at their bounds, and on motion beyond what was seen."""
+    """Return notes on friction shapes at their bounds, and on motion outside the fitted range."""
     findings, model = [], fit.model
     for choice in fit.drives:
         for shape in choice.shapes:
             if shape.is_at_bound:
                 message = (
-                    f"{choice.joint}: {shape.name} is {shape.value:.3g} {shape.unit}, at the end "
-                    "of the range that it was sought in: the motion does not show where the curve "
-                    "bends; record slower and faster motion of this joint to tell"
+                    f"{choice.joint}: {shape.name} is {shape.value:.3g} {shape.unit}, the "
+                    "bound of its search range: the motion does not determine where the curve "
+                    "bends; record slower and faster motion of this joint"
                 )
                 findings.append(Finding("shape_at_bound", "note", choice.joint, message))
         guards = {term.guards for term in choice.terms if np.isfinite(term.data_range).all()} - {""}
@@ -165,10 +165,9 @@ def _drive_findings(fit: Fit) -> list[Finding]:
                 if share > _BEYOND:
                     what = {"q": "positions", "v": "speeds"}[key]
                     message = (
-                        f"{choice.joint}: {100 * share:.0f} % of the rows of "
-                        f"{evaluation.recording.name} have {what} beyond {low:.3g} to {high:.3g}, "
-                        f"which the fit has seen; {listed(choice.families)} stays there as it was "
-                        "at the end of that range"
+                        f"{choice.joint}: {100 * share:.0f} % of the samples of "
+                        f"{evaluation.recording.name} have {what} outside the fitted range of "
+                        f"{low:.3g} to {high:.3g}; {listed(choice.families)} is constant there"
                     )
                     evidence = {"share_pct": 100 * share}
                     findings.append(
@@ -178,7 +177,7 @@ def _drive_findings(fit: Fit) -> list[Finding]:
 
 
 def _correlated(found: Fit) -> list[Finding]:
-    """Return a note on each drive with a pair of parameters of which only the sum is known."""
+    """Return a note on each drive with a pair of parameters of which only the sum is determined."""
     names, pairs, findings = found.model.layout.names, correlated_parameters(found), []
     for joint in dict.fromkeys(names[i].rpartition(".")[0] for i in pairs):
         own = [(i, *pair) for i, pair in pairs.items() if names[i].rpartition(".")[0] == joint]
@@ -203,16 +202,16 @@ def _correlated(found: Fit) -> list[Finding]:
     return [*findings, *_grown(found, {finding.where for finding in findings})]
 
 
-def _grown(found: Fit, said: Collection[str]) -> list[Finding]:
-    """Return notes on terms that make the standard error of another parameter grow tenfold."""
+def _grown(found: Fit, reported: Collection[str]) -> list[Finding]:
+    """Return notes on terms that increase the standard error of another parameter tenfold."""
     findings = []
     for choice in found.drives:
         name = max(choice.grown, key=lambda name: choice.grown[name], default="")
-        if choice.joint not in said and choice.grown.get(name, 1.0) > TENFOLD:
+        if choice.joint not in reported and choice.grown.get(name, 1.0) > TENFOLD:
             grown = choice.grown[name]
             message = (
-                f"{choice.joint}: {listed(choice.families)} makes the standard error of {name} "
-                f"{grown:.0f} times as large; the friction curve is known better than its terms"
+                f"{choice.joint}: {listed(choice.families)} multiplies the standard error of "
+                f"{name} by {grown:.0f}; the friction curve is more accurate than its terms"
             )
             evidence = {"grown": grown}
             findings.append(Finding("correlated_terms", "note", choice.joint, message, evidence))
@@ -220,22 +219,22 @@ def _grown(found: Fit, said: Collection[str]) -> list[Finding]:
 
 
 def unwritten(fit: Fit, log_errors: Sequence[Finding]) -> list[Finding]:
-    """Return a warning that no URDF is written, and why.
+    """Return a warning that the URDF is not written, with the reason.
 
     Args:
-        fit: What was found.
-        log_errors: Faults that make it wrong.
+        fit: The fit.
+        log_errors: Faults of the logs that make it wrong.
     """
     if log_errors:
         codes = listed(dict.fromkeys(finding.code for finding in log_errors))
         message = (
-            f"no URDF was written, for the result is wrong by what was found: {codes}. Correct it, "
-            "or, if you know better, state these codes as ignore in [doctor]"
+            f"URDF not written: {codes} failed. Correct the cause; if a finding is wrong, add "
+            "its code to ignore in [doctor]"
         )
     elif not fit.is_consistent:
         message = (
-            f"the {fit.estimator.name} estimate is not physically consistent, so no "
-            "URDF was written; use the 'consistent' estimator for one that loads"
+            f"URDF not written: the {fit.estimator.name} estimate is not physically consistent; "
+            "use the 'consistent' estimator"
         )
     else:
         return []
@@ -243,29 +242,29 @@ def unwritten(fit: Fit, log_errors: Sequence[Finding]) -> list[Finding]:
 
 
 def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]:
-    """Return a warning of locked joints whose positions matter and that nobody stated.
+    """Return a warning about locked joints whose positions matter but were not stated.
 
-    They matter where a joint that is identified carries them, or they carry it: how the legs stand
-    changes no torque of an arm. Of a floating base they all matter.
+    A position matters if the locked joint is on a chain with an identified joint: the pose of the
+    legs does not change the torques of an arm. On a floating base all positions matter.
 
     Args:
         model: The robot.
-        stated: Names of the locked joints that stand where the user says, or follow others.
+        stated: Names of the locked joints with a stated position, or that follow others.
     """
-    beside = set(model.locked) if model.free_flyer else _in_line(model)
-    assumed = [name for name in model.locked if name not in stated and name in beside]
+    relevant = set(model.locked) if model.free_flyer else _in_line(model)
+    assumed = [name for name in model.locked if name not in stated and name in relevant]
     if not assumed:
         return []
     message = (
-        f"neither identified nor locked in the job: {listed(assumed)}. They are taken to "
-        "stand at 0; state their true positions with locked = { joint = position }, or that all "
-        'others stand at 0 with locked = { "*" = 0.0 }'
+        f"the job neither identifies nor locks {listed(assumed)}. Their positions are assumed "
+        "to be 0; state them with locked = { joint = position }, or confirm 0 for all "
+        'others with locked = { "*" = 0.0 }'
     )
     return [Finding("locked_at_zero", "warning", ", ".join(assumed), message)]
 
 
 def _in_line(model: RobotModel) -> set[str]:
-    """Return the joints that carry one that is identified, or are carried by one."""
+    """Return the joints that carry an identified joint, or are carried by one."""
     above = {joint.child: joint for joint in model.tree.joints}
     carriers: dict[str, set[str]] = {}
     for joint in model.tree.joints:
@@ -275,13 +274,13 @@ def _in_line(model: RobotModel) -> set[str]:
             link = above[link].parent
     identified = set(model.joints)
     carrying = set[str]().union(*(carriers[name] for name in identified))
-    # where a base stands changes no torque, only how it is turned
-    turning = {joint.name for joint in model.tree.joints if joint.type != "prismatic"}
-    return carrying & turning | {name for name, own in carriers.items() if own & identified}
+    # the position of a base changes no torque, only its orientation
+    rotating = {joint.name for joint in model.tree.joints if joint.type != "prismatic"}
+    return carrying & rotating | {name for name, own in carriers.items() if own & identified}
 
 
 def log_findings(logs: Sequence[Log]) -> list[Finding]:
-    """Return the notes on logs, each once with the names of its logs.
+    """Return the notes on logs, each once, with the names of its logs.
 
     Args:
         logs: The logs.
@@ -300,7 +299,7 @@ def consistency_findings(fit: Fit) -> list[Finding]:
     """Return findings about the consistency of a fit.
 
     Args:
-        fit: What was found.
+        fit: The fit.
     """
     findings = []
     check, details = fit.mass_matrix, fit.estimate.details
@@ -310,65 +309,66 @@ def consistency_findings(fit: Fit) -> list[Finding]:
         message = (
             f"the mass matrix is not positive definite at {100 * (1 - check.positive_share):.3g} % "
             f"of {check.poses} random poses (smallest eigenvalue {check.smallest_eigenvalue:.3g}): "
-            f"a simulation with these parameters is unstable; {advice}"
+            f"a simulation with these parameters diverges; {advice}"
         )
         findings.append(Finding("mass_matrix", "warning", "standard_parameters", message))
     second = details.get("check")
     if second is not None and "torque_difference" not in second:
         message = (
             f"the second solver, {second['solver']}, did not solve the fit "
-            f"(status: {second['status']}); the result is that of {details['solver']} alone"
+            f"(status: {second['status']}); the result is from {details['solver']} only"
         )
         findings.append(Finding("second_solver_failed", "warning", "estimator", message))
     elif second is not None and second["torque_difference"] > _SAME_TORQUE:
         message = (
             f"{details['solver']} and {second['solver']} differ by "
             f"{100 * second['torque_difference']:.2g} % of the torque (objective: "
-            f"{100 * second['objective_difference']:.2g} %); trust the lower objective"
+            f"{100 * second['objective_difference']:.2g} %); use the lower "
+            "objective"
         )
         findings.append(Finding("solvers_differ", "warning", "estimator", message))
     bounds = [name for name in details.get("active", ()) if name.startswith(_USER_BOUNDS)]
     if bounds:
-        against = _speaks_against(fit)
+        against = _contradiction(fit)
         why = (
             f"{against}; check these bounds, the torque scale (gains) and the payload"
             if against
-            else "the URDF's values lie beyond them, and the torque is explained as well as without"
+            else "the URDF's values are outside them; the bounds do not increase the torque error"
         )
         is_stated = bool(_stated(fit).intersection(bounds))
         severity = "warning" if against and is_stated else "note"
-        message = f"the bounds {listed(bounds)} bind: {why}"
+        message = f"the bounds {listed(bounds)} are active: {why}"
         findings.append(Finding("active_bound", severity, ", ".join(bounds), message))
     gap = min(details.get("gaps", [0.0]))
     if gap > _SAME_OPTIMUM:
         message = (
-            f"log-Cholesky ended {100 * gap:.2g} % above the optimum of the cone programme; use "
-            "the 'consistent' estimator, or more starts"
+            f"the objective of log-Cholesky is {100 * gap:.2g} % above the optimum of the cone "
+            "programme; use the 'consistent' estimator, or more starts"
         )
         findings.append(Finding("optimum_gap", "warning", "estimator", message))
     return findings
 
 
 def _total_mass(fit: Fit) -> list[Finding]:
-    """Return the error that all links together weigh what no robot like the URDF's does."""
+    """Return an error if the total mass differs from the URDF's by more than a factor of 3."""
     size = fit.model.layout.n_inertial
     pi = np.array([fit.prior, fit.standard])
     before, after = pi[:, :size:10].sum(axis=1).tolist()
-    if fit.estimator.bounds.total is not None:  # the user knows better
+    if fit.estimator.bounds.total is not None:  # the user states it
         return []
     if not before > 0 or before / _FAR <= after <= _FAR * before:
         return []
     message = (
-        f"the identified links weigh {after:.4g} kg together, the URDF's {before:.4g} kg; wanted "
-        f"within a factor of {_FAR:g}. Check the sign, the order and the unit of the torques and "
-        "the masses of the URDF; if the URDF is that wrong, ignore total_mass"
+        f"the identified total mass is {after:.4g} kg, the URDF's is {before:.4g} kg; wanted: "
+        f"within a factor of {_FAR:g}. Check the sign, the order and the unit of the torques, and "
+        "the masses of the URDF; if the URDF's masses are wrong, ignore total_mass"
     )
     evidence = {"urdf": before, "identified": after}
     return [Finding("total_mass", "error", "standard_parameters", message, evidence)]
 
 
 def _is_within_box(fit: Fit, body: str, box: Array) -> bool:
-    """Return whether a body's mass lies in the box of the fit, wider than that of the geometry."""
+    """Return whether a body's mass is in the box of the fit, wider than that of the geometry."""
     i = fit.model.layout.bodies.index(body)
     (J,) = pseudo_inertia(fit.standard[10 * i : 10 * i + 10])
     slack = np.einsum("ij,kji->k", J, slabs(box)) / J[3, 3]  # tr(J Q_k) / m
@@ -378,9 +378,10 @@ def _is_within_box(fit: Fit, body: str, box: Array) -> bool:
 
 
 def _impossible_shapes(fit: Fit) -> list[Finding]:
-    """Return which identified bodies cannot be so in their geometry.
+    """Return the identified bodies that are not possible in their geometry.
 
-    As notes where the URDF's cannot either, and within the box that a fit with extents keeps to.
+    As notes if the URDF's body is not possible either, or if the body is in the box of a fit with
+    extents.
     """
     model, points = fit.model, body_points(fit.model)
     boxes = body_boxes(model)
@@ -388,24 +389,24 @@ def _impossible_shapes(fit: Fit) -> list[Finding]:
     findings = []
     for finding in audit_bodies(model, fit.standard, points):
         if (finding.code, finding.where) in before:
-            message = f"{finding.message.partition(';')[0]}; so it is in the URDF already"
+            message = f"{finding.message.partition(';')[0]}; the URDF has the same fault"
             finding = replace(finding, severity="note", message=message)
         elif _is_within_box(fit, body := finding.where.removeprefix("link "), boxes[body]):
-            said = finding.message.partition(";")[0]
-            message = f"as identified, {said}; it is within the margin that the fit leaves"
+            fault = finding.message.partition(";")[0]
+            message = f"as identified, {fault}; it is within the margin of the fit"
             finding = replace(finding, severity="note", message=message)
         else:
-            said = finding.message.partition(";")[0]
-            message = f"as identified, {said}; record more motion of it, or pin it to the URDF"
+            fault = finding.message.partition(";")[0]
+            message = f"as identified, {fault}; record more motion of it, or pin it to the URDF"
             finding = replace(finding, message=message)
         findings.append(finding)
     return findings
 
 
 def _dense_bodies(fit: Fit) -> list[Finding]:
-    """Return which identified bodies are so thin that no material is dense enough for their mass.
+    """Return the identified bodies whose inertia needs a density above that of any material.
 
-    Bodies that are as dense in the URDF are left out.
+    Bodies that have this density in the URDF are left out.
     """
     findings, size = [], fit.model.layout.n_inertial
     before, after = (pi[:size].reshape(-1, 10) for pi in (fit.prior, fit.standard))
@@ -413,16 +414,16 @@ def _dense_bodies(fit: Fit) -> list[Finding]:
         density = least_density(now)
         if density <= max(_DENSEST, least_density(was)):
             continue
-        volume = (
-            f"a volume so small that its density is at least {density:.3g} kg/m^3, wanted at most "
-            f"{_DENSEST:g}"
+        thinness = (
+            f"its inertia needs a density of at least {density:.3g} kg/m^3 (wanted: at most "
+            f"{_DENSEST:g})"
             if np.isfinite(density)
-            else "no volume at all: its inertia is that of a flat body, or of none"
+            else "its inertia is that of a body without volume"
         )
         message = (
-            f"{body}: as identified, its mass of {now[0]:.3g} kg is in {volume}. The torque may be "
-            "right, the body is not: record motion that moves it in more ways, or pin it to the "
-            "URDF"
+            f"{body}: as identified, its mass is {now[0]:.3g} kg and {thinness}. The predicted "
+            "torque may be right, the body is not: record motion about more axes, or pin it to "
+            "the URDF"
         )
         evidence = {"mass": float(now[0]), "density": density}
         findings.append(Finding("dense_body", "warning", f"link {body}", message, evidence))
@@ -430,21 +431,21 @@ def _dense_bodies(fit: Fit) -> list[Finding]:
 
 
 def _bound_findings(fit: Fit) -> list[Finding]:
-    """Return notes on drive terms at 0, and warnings of bodies beyond their extents."""
+    """Return notes on drive terms at 0, and warnings about bodies outside their geometry."""
     findings, names = [], fit.model.layout.names
     at_bound = [name for name, is_at in zip(names, fit.at_bound, strict=True) if is_at]
     if at_bound:
         message = (
-            f"{listed(at_bound, _NAMED)}: 0, at the bound, so how uncertain is not known. The data "
-            "ask for less than 0, which no drive can have: the friction model lacks something "
-            "there, or the motion does not tell these terms from others"
+            f"{listed(at_bound, _NAMED)}: 0, at the bound, without a standard error. Without "
+            "this bound the value is negative, which no drive has: the friction model lacks a "
+            "term, or the motion does not distinguish these terms from others"
         )
         findings.append(Finding("at_bound", "note", ", ".join(at_bound), message))
     for body in fit.estimate.details.get("relaxed", ()):
         message = (
-            f"{body}: the data clearly put mass outside the box of its geometry, which was left "
-            "out of the fit for it. If something is mounted there, add it to the URDF; otherwise "
-            "check the URDF's geometry and the torque scale"
+            f"{body}: the data contradict the box of its geometry: mass is outside. The fit "
+            "ignored the box of this link. If a part is mounted there, add it to the URDF; "
+            "otherwise check the URDF's geometry and the torque scale"
         )
         findings.append(Finding("extent_contradicted", "warning", f"link {body}", message))
     return findings
@@ -455,35 +456,35 @@ def _outlier_findings(fit: Fit) -> list[Finding]:
     if not outliers:
         return []
     places = [
-        f"{o.joint} at {o.t:.3f} s of {o.log}: {o.torque:.4g} against {o.predicted:.4g} predicted, "
-        f"{o.size:.0f} times its typical residual"
+        f"{o.joint} at {o.t:.3f} s of {o.log}: measured {o.torque:.4g}, predicted "
+        f"{o.predicted:.4g}, residual {o.size:.0f} times the typical one"
         for o in outliers[:_NAMED]
     ]
     more = f"; and {len(outliers) - _NAMED} more" if len(outliers) > _NAMED else ""
-    advice = "look at the recording there, cut it out, or set robust = 'tukey' in [estimator]"
+    advice = "check the recording there, cut it out, or set robust = 'tukey' in [estimator]"
     if fit.estimator.is_robust:
-        advice = "they were weighted down"
-    found = f"{len(outliers)} places of the fitted logs are not explained: {'; '.join(places)}"
+        advice = "the robust loss downweighted them"
+    found = f"{len(outliers)} outliers in the fitted logs: {'; '.join(places)}"
     evidence = {"places": float(len(outliers)), "largest": outliers[0].size}
     where, message = outliers[0].joint, f"{found}{more}; {advice}"
     return [Finding("outliers", "warning", where, message, evidence)]
 
 
 def _asked(fit: Fit) -> str:
-    """Return in words what the user asks of the parameters, empty if nothing."""
+    """Return the constraints that the user states, as text; empty if none."""
     settings = fit.estimator
     if not isinstance(settings, BoundedSettings):
         return ""
-    asked = {key: value for key, value in settings.constraints.items() if value}
+    asked = [key for key, value in settings.constraints.items() if value]
     if settings.margin > _WIDE:
-        asked["margin"] = settings.margin
-    return f"what [estimator] asks for ({asked}), " if asked else ""
+        asked.append(f"margin = {settings.margin:g}")
+    return f"the constraints in [estimator] ({listed(asked)}), " if asked else ""
 
 
-def _kept_links(fit: Fit) -> str:
-    """Return in words which bodies links on locked joints leave hardly possible, empty if none.
+def _locked_links(fit: Fit) -> str:
+    """Return the bodies that links on locked joints make barely possible, as text; empty if none.
 
-    Those links keep the URDF's inertials, so that all that is wrong of them is the moved link's.
+    Such links keep the URDF's inertials: the moved link takes all their errors.
     """
     model, size = fit.model, fit.model.layout.n_inertial
     held, found = held_parameters(model), fit.standard[:size]
@@ -491,34 +492,34 @@ def _kept_links(fit: Fit) -> str:
         np.linalg.eigvalsh(pseudo_inertia(pi[:size] - held))[:, 0]
         for pi in (found, model.standard_parameters())
     )
-    said = [
-        f"the inertials of the links on locked joints, {held[10 * k]:.3g} of the "
-        f"{found[10 * k]:.3g} kg of {model.layout.bodies[k]}, which are the URDF's (identify their "
-        "joints, too, if they are wrong), "
+    links = [
+        f"the URDF's inertials of the links on locked joints, {held[10 * k]:.3g} kg of the "
+        f"{found[10 * k]:.3g} kg of {model.layout.bodies[k]} (identify their joints, too, if they "
+        "are wrong), "
         for k in np.flatnonzero((own < _SHRUNK * before) & (held[::10] > _MUCH * found[::10]))
     ]
-    return "".join(said)
+    return "".join(links)
 
 
-def _speaks_against(fit: Fit) -> str:
-    """Return what data or masses say against bounds that bind, in words; empty if nothing."""
+def _contradiction(fit: Fit) -> str:
+    """Return how data or masses contradict active bounds, as text; empty if they do not."""
     ours, wls = (fit.metrics(name).per_joint for name in ("estimate", "wls"))
     costs = [joint for joint in ours if ours[joint].rmse > _COSTS * wls[joint].rmse]
     if costs:
-        return f"the data push against them at {listed(costs)}"
+        return f"they increase the torque error of {listed(costs)}"
     layout = fit.model.layout
     masses = fit.standard[: layout.n_inertial : 10]
     urdf = fit.model.standard_parameters()[: layout.n_inertial : 10]
-    light = [
-        f"{mass:.2g} of its {before:.3g} kg to {link}"
+    vanished = [
+        f"{link} has {mass:.2g} of its {before:.3g} kg"
         for link, mass, before in zip(layout.bodies, masses, urdf, strict=True)
-        if mass < _LIGHT * before
+        if mass < _VANISHED * before
     ]
-    return f"they leave {', '.join(light)}" if light else ""
+    return f"with them {', '.join(vanished)}" if vanished else ""
 
 
 def _stated(fit: Fit) -> set[str]:
-    """Return the bounds that the user states; those of the links' geometry may well bind."""
+    """Return the bounds that the user states; those of the links' geometry are often active."""
     stated = fit.estimator.bounds
     return {
         "total_mass all",

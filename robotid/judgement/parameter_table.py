@@ -17,14 +17,14 @@ __all__ = [
     "parameter_table",
 ]
 
-#: What a row says: link or drive, parameter, the URDF's value, the identified one, its standard
+#: Columns of a row: link or drive, parameter, the URDF's value, the identified one, its standard
 #: error, its 95 % interval, what determined it, unit.
 HEADERS = ("part", "parameter", "urdf", "value", "std_error", "low", "high", "source", "unit")
 _NUMBERS = HEADERS[2:7]
 
 
 class ParameterRows(list[dict[str, Any]]):
-    """The rows without pandas: a list of dictionaries, which a notebook shows as a table."""
+    """The rows if pandas is not installed: dictionaries, which a notebook shows as a table."""
 
     def _repr_html_(self) -> str:
         cells = [
@@ -41,10 +41,10 @@ class ParameterRows(list[dict[str, Any]]):
 
 
 def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return the parameters of the bodies and those of the drives, as result.json has them.
+    """Return the parameters of the bodies and of the drives, as in result.json.
 
     Args:
-        found: What was identified.
+        found: The identification.
     """
     layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
     errors, ends, quantile = found.standard_error, found.standard_interval, found.standard_quantile
@@ -78,18 +78,18 @@ def parameter_table(
 
     Args:
         bodies: Parameters of the bodies, as of ``parameter_entries``.
-        drives: Those of the drives. What the URDF says of them is not used: it has no value.
+        drives: Parameters of the drives. Their ``urdf`` column is empty.
 
     Returns:
         A pandas DataFrame if pandas is installed, else a list of dictionaries; of ``HEADERS``.
-        What has no value, as the standard error of a parameter at its bound, is None; NaN in a
+        A missing value, such as the standard error of a parameter at its bound, is None; NaN in a
         DataFrame.
     """
     entries = [*bodies, *({**entry, "prior": None} for entry in drives)]
     rows = ParameterRows()
     for entry in entries:
         part, _, parameter = entry["name"].rpartition(".")
-        low, high = entry.get("interval_95", (None, None))  # of results that lack it
+        low, high = entry.get("interval_95", (None, None))  # of results without intervals
         values = [entry.get("prior"), entry["value"], entry.get("std_error"), low, high]
         row = (part, parameter, *values, entry.get("source", ""), entry["unit"])
         rows.append(dict(zip(HEADERS, row, strict=True)))

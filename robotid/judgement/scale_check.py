@@ -1,4 +1,4 @@
-"""What speaks for the scale of a result but the torque sensors: the URDF's gravity and masses."""
+"""Scale check of a result, independent of the torque sensors: the URDF's gravity and masses."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from robotid.regressor.torque import joint_torque_regressor
 __all__ = ["ScaleCheck", "check_scale"]
 
 _POSES = 300  # at which gravity is compared
-_LOADED = 0.02  # share of the largest gravity torque that a joint must hold to be compared
-_KNOWN = 0.1  # standard error of a ratio that says something
-_AGREES = 0.05  # farther from 1 than this, gravity and total mass bear no witness
-_HELD_BACK = 1.5  # a residual over that of weighted least squares beyond this is the prior's doing
+_LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
+_KNOWN = 0.1  # standard error of a ratio below which it is used
+_AGREES = 0.05  # farther from 1 than this, gravity and total mass do not confirm the scale
+_HELD_BACK = 1.5  # residual over that of WLS beyond which the prior determines the result
 _ANOTHER = 0.35  # ... and farther than this, they contradict it
-_OFF = 0.1  # a factor of all torques at least so far from 1 is told from one of single masses,
-_CLEARLY = 4.0  # if it is so many times what it leaves unexplained of gravity
-_BETTER = 0.5  # and leaves less than this share of what a payload leaves
+_OFF = 0.1  # a common factor of all torques is reported if it is at least so far from 1,
+_CLEARLY = 4.0  # ... if that distance is so many times the unexplained share of gravity
+_BETTER = 0.5  # ... and that share is less than this times the one with a payload
 
 
 @dataclass(frozen=True)
@@ -32,17 +32,17 @@ class ScaleCheck:
     """The identified gravity and masses against the URDF's.
 
     Attributes:
-        gravity: By joint that bears a load, identified over URDF's gravity torque [-].
-        gravity_error: Their standard errors.
-        scale: The same of all joints together beside a payload; None if gravity loads none.
-        factor: The same without a payload.
-        unexplained: Share of the identified gravity that one factor leaves, and that a payload
-            leaves [-].
-        masses: Total mass of the URDF, as identified, and of that payload [kg].
-        is_stated: Whether a mass is stated, which is a witness by itself.
-        friction: Share of each joint's torque that viscous and Coulomb friction make up [-].
-        follows: Whether the result follows the data as weighted least squares does: one that its
-            prior holds back agrees with the URDF whatever the sensors say.
+        gravity: Identified over URDF's gravity torque, by joint that gravity loads [-].
+        gravity_error: Standard errors of these ratios [-].
+        scale: Ratio over all joints together, fitted with a payload; None if gravity loads none.
+        factor: Ratio over all joints together, without a payload [-].
+        unexplained: Share of the identified gravity torque that remains unexplained by one factor,
+            and by a payload [-].
+        masses: Total mass of the URDF, identified total mass, mass of that payload [kg].
+        is_stated: Whether a mass is stated, which sets the scale by itself.
+        friction: Share of viscous and Coulomb friction in each joint's torque [-].
+        follows: Whether the result fits the data about as well as WLS. A result that its prior
+            determines agrees with the URDF whatever the sensors measured.
     """
 
     gravity: Mapping[str, float] = field(default_factory=dict)
@@ -62,19 +62,21 @@ class ScaleCheck:
         return self.is_stated or (is_near and self.follows)
 
     @property
-    def is_against(self) -> bool:
-        """Whether they are so far off that the scale is in doubt."""
+    def contradicts(self) -> bool:
+        """Whether gravity and total mass contradict the scale."""
         return not self.is_stated and (self._off > _ANOTHER or self.has_one_factor)
 
     @property
     def has_one_factor(self) -> bool:
-        """Whether one factor of all gravity explains it, as of the scale, not of single masses."""
-        left, beside = self.unexplained
-        return abs(self.factor - 1.0) > max(_OFF, _CLEARLY * left) and left < _BETTER * beside
+        """Whether one common factor explains gravity: the scale is wrong, not single masses."""
+        by_factor, by_payload = self.unexplained
+        return abs(self.factor - 1.0) > max(_OFF, _CLEARLY * by_factor) and (
+            by_factor < _BETTER * by_payload
+        )
 
     @property
     def figures(self) -> str:
-        """Gravity and total mass in words."""
+        """Gravity torque and total mass against the URDF's, as text."""
         before, after, _ = self.masses
         mass = f"total mass {after:.4g} kg against the URDF's {before:.4g} kg"
         if self.scale is None:
@@ -83,38 +85,38 @@ class ScaleCheck:
 
     @property
     def message(self) -> str:
-        """What was confirmed, or what could not be checked and what to do."""
+        """What was verified, or what could not be verified and the remedy."""
         if self.is_stated:
-            return f"the scale depends on the mass that was stated: {self.figures}"
+            return f"absolute scale set by the stated mass: {self.figures}"
         if self.agrees:
-            rests = "the scale of the torques depends on the URDF's gravity and total mass, which"
+            agrees = "absolute scale: gravity and total mass agree with the URDF's within 5 %"
             if self._off_whole <= _AGREES:
-                return f"{rests} agree within 5 %: {self.figures}"
+                return f"{agrees}: {self.figures}"
             before, after, payload = self.masses
             return (
-                f"{rests} agree within 5 % only beside a load of {payload:+.3g} kg on the last "
-                f"link that the URDF does not have: without it gravity torque {self.scale:.2f} x "
-                f"the URDF's, total mass {after - payload:.4g} kg against the URDF's "
-                f"{before:.4g} kg; with it {self.figures}. If no such load was mounted, check the "
-                "gains of the torques"
+                f"{agrees} only if a load of {payload:+.3g} kg is added to the last link, "
+                "which the URDF does not have. Without the load: gravity torque "
+                f"{self.scale:.2f} x the URDF's, total mass {after - payload:.4g} kg against the "
+                f"URDF's {before:.4g} kg. With it: {self.figures}. If no such load was mounted, "
+                "check the gains of the torques"
             )
         hint = ""
         if self.has_one_factor:
             hint = (
-                f" All joints alike are off by {self.factor:.2f}: check the gains of the torques."
+                f" The same factor {self.factor:.2f} fits all joints: check the gains of the "
+                "torques."
             )
-        elif odd := [f"{j} {x:.2f}" for j, x in self.gravity.items() if abs(x - 1.0) > _ANOTHER]:
-            hint = f" Gravity over the URDF's by joint: {listed(odd)}."
-        return (
-            "the scale of torques, angles and time could not be checked, it depends on the sensors "
-            f"alone: {self.figures}.{hint} Weigh the robot and state total_mass"
-        )
+        elif outside := [
+            f"{j} {x:.2f}" for j, x in self.gravity.items() if abs(x - 1.0) > _ANOTHER
+        ]:
+            hint = f" Gravity torque over the URDF's, by joint: {listed(outside)}."
+        return f"absolute scale not verified: {self.figures}.{hint} State a known mass (total_mass)"
 
     @property
     def _off(self) -> float:
-        """How far gravity and total mass are off, a payload left out if it explains them [-].
+        """Relative difference of gravity and total mass, less a payload if it explains them [-].
 
-        A payload without mass is none: it says nothing of the scale.
+        A payload without mass is ignored: it does not determine the scale.
         """
         before, after, payload = self.masses
         if not (before > 0 and payload > 0):
@@ -124,7 +126,7 @@ class ScaleCheck:
 
     @property
     def _off_whole(self) -> float:
-        """How far gravity and total mass are off as they are [-]."""
+        """Relative difference of gravity and total mass without a payload [-]."""
         before, after, _ = self.masses
         if not before > 0:
             return np.inf
@@ -137,24 +139,24 @@ class ScaleCheck:
 
 
 def check_scale(found: Fit) -> ScaleCheck:
-    """Return gravity and masses of a result against the URDF's.
+    """Compare gravity and masses of a result with the URDF's.
 
     With g_u and g the gravity torques of the URDF and of the result over the fitted poses, a
-    joint's ratio is g_u . g / g_u . g_u, linear in the base parameters: its standard error is that
-    of the covariance of the result.
+    joint's ratio is g_u . g / g_u . g_u. It is linear in the base parameters: the covariance of the
+    result gives its standard error.
 
     Args:
-        found: What was identified.
+        found: The identification.
     """
     model, size = found.model, found.model.layout.n_inertial
     bounds = found.estimator.bounds
     is_stated = bounds.total is not None or any(np.ptp(m) == 0 for m in bounds.masses.values())
     before, after = (float(pi[:size:10].sum()) for pi in (found.prior, found.standard))
-    rubbing = _friction(found)
+    friction = _friction(found)
     errors = [found.metrics(name).per_joint for name in ("estimate", "wls")]
     follows = all(errors[0][j].rmse <= _HELD_BACK * free.rmse for j, free in errors[1].items())
     plain = ScaleCheck(
-        masses=(before, after, 0.0), is_stated=is_stated, friction=rubbing, follows=follows
+        masses=(before, after, 0.0), is_stated=is_stated, friction=friction, follows=follows
     )
     q = np.vstack([e.recording.trajectory.q for e in found.fitted])
     if model.free_flyer:
@@ -182,7 +184,7 @@ def check_scale(found: Fit) -> ScaleCheck:
             gravity[model.row_names[j]] = float(of_urdf[:, j] @ of_result[:, j] / load[j])
             error[model.row_names[j]] = spread
     factor = float(np.sum(of_urdf * of_result) / load.sum())
-    scale, payload, left = _beside_payload(of_urdf, of_result, last)
+    scale, payload, left = _with_payload(of_urdf, of_result, last)
     rest = float(np.linalg.norm(of_result - factor * of_urdf) / np.linalg.norm(of_result))
     return replace(
         plain, gravity=gravity, gravity_error=error, scale=scale, factor=factor,
@@ -191,7 +193,7 @@ def check_scale(found: Fit) -> ScaleCheck:
 
 
 def _friction(found: Fit) -> dict[str, float]:
-    """Return which share of each joint's torque its friction makes up, root mean squares."""
+    """Return the share of friction in the RMS torque of each joint [-]."""
     layout = found.model.layout
     is_friction = [name.endswith((".viscous", ".coulomb")) for name in layout.names]
     pi = np.where(is_friction, found.standard, 0.0)
@@ -202,8 +204,8 @@ def _friction(found: Fit) -> dict[str, float]:
     return dict(zip(found.model.row_names, share.tolist(), strict=True))
 
 
-def _beside_payload(of_urdf: Array, of_result: Array, last: Array) -> tuple[float, float, float]:
-    """Return scale, mass of a payload and what a payload alone leaves of the gravity torque.
+def _with_payload(of_urdf: Array, of_result: Array, last: Array) -> tuple[float, float, float]:
+    """Return scale and mass of a payload, and the share that a payload alone leaves unexplained.
 
     Args:
         of_urdf: Gravity torque of the URDF, shape (N, n).

@@ -1,4 +1,4 @@
-"""How far to trust a result: findings with reasons, and a verdict that never passes the unknown."""
+"""Verdict on a result, with reasons; what was not tested is never "good"."""
 
 import difflib
 import logging
@@ -33,72 +33,73 @@ __all__ = [
 
 _LOGGER = logging.getLogger("robotid")
 
-_REJECTED = 5.0  # [%] a hypothesis on columns or masses is rejected by a prediction so good
-_SCALED = 2.0  # a gravity within this factor of the URDF's contradicts another unit of the torque
-_WRONG = 2.0  # a fit that misses this many times what WLS misses ...
-_HARMLESS = 1.0  # [%] ... is doubtful, but not below this share of the torque
-_SMALL = 5.0  # [%] of the torque: a term that a drive lacks leaves no doubt below
-#: Warnings that make a result doubtful, in words that a verdict can hold. A word in braces is a
-#: figure of the evidence.
-_WORDS = {
-    "angle_scale": "positions fit best times another factor",
-    "active_bound": "the data, or the masses that it leaves, contradict a stated bound",
-    "com_outside": "its centre of mass lies {outside:.2g} m outside its geometry: no such body",
+_REJECTED = 5.0  # [%] a smaller prediction error rejects a hypothesis on columns or masses
+_SCALED = 2.0  # a gravity torque within this factor of the URDF's contradicts a wrong unit
+_WRONG = 2.0  # an error this many times that of WLS gives a warning ...
+_HARMLESS = 1.0  # [%] ... but not below this share of the torque
+_SMALL = 5.0  # [%] of the torque: a missing drive term below this gives no warning
+#: Reasons of a verdict by code of the warning: such a result is at most "usable". Names in braces
+#: are figures of the evidence.
+_REASONS = {
+    "angle_scale": "positions fit best when multiplied by another factor",
+    "active_bound": "the data, or the masses that result from it, contradict a stated bound",
+    "com_outside": "its centre of mass is {outside:.2g} m outside its geometry: not possible",
     "clipped": "the torque is clipped at a limit",
-    "constant_torque": "the torque never changes: the channel is dead",
-    "constraint_costs": "{error_pct:.1f} % of the torque is missed where it was fitted, "
+    "constant_torque": "the torque is constant: the channel does not work",
+    "constraint_costs": "torque error {error_pct:.1f} % on the fitted recordings, "
     "{wls_error_pct:.1f} % without constraints: physics and data disagree",
-    "counterbalance": "a counterbalance or spring takes {cancelled_pct:.0f} % of its gravity: the "
-    "model of its drive lacks it",
-    "current_for_torque": "the torque fits the URDF in another scale only: if it is a current or "
-    "in another unit, masses and inertias are wrong in the same proportion",
-    "density": "its mass makes {density:.2g} kg/m^3 of the box around its geometry",
-    "gravity": "the direction of gravity may be stated wrongly",
+    "counterbalance": "a counterbalance or spring cancels {cancelled_pct:.0f} % of its gravity "
+    "torque: the drive model lacks it",
+    "current_for_torque": "the torque fits the URDF only in another scale. If it is a current or "
+    "has another unit, masses and inertias are wrong by the same factor",
+    "density": "its mass gives a density of {density:.2g} kg/m^3 in the box around its geometry",
+    "gravity": "the stated direction of gravity may be wrong",
     "gravity_compensated": "the torque may be logged without gravity",
-    "repeated_torque": "the torque is repeated over {rows:.0f} rows: delayed and stepped",
-    "gyration": "its mass lies {gyration:.2g} m from its centre on average, its geometry ends at "
-    "{farthest:.2g} m: no body can be so",
-    "joint_origin": "the joint seems to lie elsewhere than the URDF has it",
-    "joint_axis": "the joint's axis may be reversed",
-    "joint_order": "the columns may be those of another joint",
-    "joint_torque_delay": "the torque is {delay:+.3f} s (+ late, - early) against the position, "
-    "those of the other joints are not",
-    "lost_motion": "backlash may lie between the joint and its encoder",
-    "mass_matrix": "the mass matrix is not positive definite everywhere",
-    "payload_change": "its last link carries {mass:+.2g} kg against the fitted logs",
-    "position_offset": "the zero of the position may be off",
-    "position_order": "the position may be that of another joint",
+    "repeated_torque": "each torque value is repeated over {rows:.0f} samples: delayed and stepped",
+    "gyration": "its radius of gyration is {gyration:.2g} m, its geometry extends only "
+    "{farthest:.2g} m: not possible",
+    "joint_origin": "the joint's origin differs from the URDF's",
+    "joint_axis": "the joint axis may be reversed",
+    "joint_order": "the columns may belong to another joint",
+    "joint_torque_delay": "the torque is delayed by {delay:+.3f} s relative to the position "
+    "(negative: early), the torques of other joints are not",
+    "lost_motion": "there may be backlash between the joint and its encoder",
+    "mass_matrix": "the mass matrix is not positive definite in all poses",
+    "payload_change": "its last link carries {mass:+.2g} kg relative to the fitted logs",
+    "position_offset": "the position may have an offset",
+    "position_order": "the position may belong to another joint",
     "position_sign": "the position may have the opposite sign",
-    "solvers_differ": "two solvers found different parameters",
-    "time_scale": "inertia and gravity contradict each other: the time stamps, or the size of "
-    "gravity, may be wrong",
-    "torque_delay": "the torque is {delay:+.3f} s (+ late, - early) against the position",
-    "torque_order": "the torque may be that of another joint",
-    "torque_scale": "the torque is in another scale than those of the other joints",
+    "solvers_differ": "two solvers give different parameters",
+    "time_scale": "inertia and gravity contradict each other: the time stamps or the magnitude "
+    "of gravity may be wrong",
+    "torque_delay": "the torque is delayed by {delay:+.3f} s relative to the position (negative: "
+    "early)",
+    "torque_order": "the torque may belong to another joint",
+    "torque_scale": "the scale of the torque differs from that of the other joints",
     "torque_sign": "the torque may have the opposite sign",
-    "unexplained_torque": "much of the torque fits neither gravity, inertia nor friction",
-    "unsigned_torque": "the torque may be a size without its sign",
-    "unmounted_part": "{mass:.2g} kg of the URDF's last link seem not to have been mounted",
-    "urdf_mismatch": "the torques do not fit the URDF's masses: it may be of another robot, or "
-    "lack a load",
+    "unexplained_torque": "gravity, inertia and friction do not explain much of the torque",
+    "unsigned_torque": "the torque may be a magnitude without sign",
+    "unmounted_part": "{mass:.2g} kg of the URDF's last link were probably not mounted",
+    "urdf_mismatch": "the torques do not fit the URDF's masses: the URDF may be of another robot "
+    "or lack a load",
 }
 _MISFITS = {
     "backlash": "backlash or windup",
-    "coupling": "a drive that turns with another joint, too,",
+    "coupling": "a drive that is coupled to another joint",
     "drift": "a drift with time",
     "friction_shape": "friction of another shape than viscous and Coulomb",
-    "load_friction": "friction that grows with the load",
-    "position_periodic": "a torque that repeats with its position",
+    "load_friction": "friction that increases with the load",
+    "position_periodic": "a torque that is periodic in the position",
     "spring": "a spring or counterbalance",
 }
-_WORDS |= {
+_REASONS |= {
     code: f"{term} would explain {{share_pct:.0f}} % of the squared residual ({{error_pct:.1f}} % "
-    "of the torque): the model of its drive lacks it"
+    "of the torque): the drive model lacks it"
     for code, term in _MISFITS.items()
 }
-#: Codes of the warnings that make a result doubtful.
-WARNING_CODES = (*_WORDS, "repeated_motion")
-_OF_RESULTS = ("total_mass",)  # errors that a result alone can show
+#: Codes of the warnings that make a result at most "usable".
+WARNING_CODES = (*_REASONS, "repeated_motion")
+_OF_RESULTS = ("total_mass",)  # errors that only a result can have
 _HYPOTHESES = (
     "current_for_torque",
     "gravity",
@@ -106,25 +107,24 @@ _HYPOTHESES = (
     "unexplained_torque",
     "urdf_mismatch",
 )
-_REPEATED = "the validation motion is in a fitted log, too, so no prediction was tested"
+_REPEATED = "the validation motion is also in a fitted log: no prediction was tested"
 _STATIC = (
-    "static: gravity, offsets and friction that needs no speed were identified; inertias, armature "
-    "and viscous friction were not, and keep the URDF's values: the result holds for standing and "
-    "slow motion"
+    "static model: gravity, offsets and Coulomb friction were identified. Inertias, armature and "
+    "viscous friction keep the URDF's values: the result is valid at rest and for slow motion"
 )
-_HIDDEN = "gravity changes its torque less than friction does where it stands"
-# places that are no recording
+_HIDDEN = "gravity changes its torque less than friction does at rest"
+# places that are not a recording
 _OF_THE_FIT = ("all joints", "estimator", "recordings", "standard_parameters")
 
 
 @dataclass(frozen=True)
 class VerdictWarning:
-    """Why a result may be wrong although it predicts torque well.
+    """Reason why a result may be wrong although it predicts torque well.
 
     Attributes:
-        code: Code of the finding that it comes from.
-        joint: The joint that it is about; empty for all of the result.
-        message: Why, in words.
+        code: Code of the finding.
+        joint: The joint concerned; empty if the whole result is.
+        message: The reason as text.
     """
 
     code: str
@@ -134,7 +134,7 @@ class VerdictWarning:
 
 @dataclass(frozen=True)
 class JointVerdict:
-    """How far to trust the torque that is predicted for one joint.
+    """Verdict on the torque prediction of one joint.
 
     Attributes:
         status: "good", "usable", "poor" or "not evaluated".
@@ -147,14 +147,14 @@ class JointVerdict:
 
 @dataclass(frozen=True)
 class Verdict:
-    """How far to trust a result.
+    """Verdict on a result.
 
     Attributes:
         status: "good", "usable", "poor" or "not evaluated".
         reasons: Why, the worst first; for "good" what was checked.
-        joints: The same of each joint of the model.
-        log_errors: Faults of the recordings that it was told of.
-        warnings: Doubts that it was told of.
+        joints: The verdict on each joint of the model.
+        log_errors: Faults of the recordings.
+        warnings: Warnings of the doctor and of the fit.
     """
 
     status: str
@@ -173,7 +173,7 @@ class Verdict:
                 for joint, verdict in self.joints.items()
             },
             "log_errors": list(self.log_errors),
-            "warnings": [asdict(doubt) for doubt in self.warnings],
+            "warnings": [asdict(warning) for warning in self.warnings],
         }
 
 
@@ -188,51 +188,52 @@ def judge(
     """Return the verdict on a result.
 
     Args:
-        predictions: How well it predicts torque.
-        determined: What the data determine of its parameters.
-        log_errors: Faults of the recordings that make any result of them wrong.
-        warnings: Why the result may be wrong however well it predicts.
-        scale_check: What speaks for the scale of the result but the sensors.
+        predictions: Its torque prediction errors.
+        determined: Which of its parameters the data determine.
+        log_errors: Faults of the recordings that make every result of them wrong.
+        warnings: Why the result may be wrong although it predicts well.
+        scale_check: The scale check against the URDF's gravity and masses.
 
     Returns:
-        The verdict. Without a validation log, or with a doubt, it is at best "usable"; so is that
-        of a joint with a doubt, and that of all joints with one about all.
+        The verdict. Without a validation log, or with a warning, it is at most "usable". So is the
+        verdict on a joint with a warning, and on all joints if a warning concerns the result.
     """
     found, hidden = predictions.on_each(), predictions.hidden
     poor = sorted((reason for worse, _, _ in found.values() for reason in worse), key=_rank)
-    against = scale_check is not None and scale_check.is_against
+    is_contradicted = scale_check is not None and scale_check.contradicts
     reasons = [
         *predictions.untested(),
-        *(reason for _, doubt, _ in found.values() for reason in doubt),
-        *predictions.left_to_urdf(),
+        *(reason for _, cautions, _ in found.values() for reason in cautions),
+        *predictions.better_by_urdf(),
         *_described(warnings),
-        *([scale_check.message] if scale_check is not None and against else []),
-        *predictions.unseen(),
+        *([scale_check.message] if scale_check is not None and is_contradicted else []),
+        *predictions.at_rest(),
         *determined.warnings(),
     ]
     notes = [
         *determined.notes(),
-        *([scale_check.message] if scale_check is not None and not against else []),
+        *([scale_check.message] if scale_check is not None and not is_contradicted else []),
         *([f"{listed(hidden)}: {_HIDDEN}: not evaluated"] if hidden else []),
         *([_STATIC] if determined.is_static else []),
     ]
     per_joint = {
         joint: on_joint(
             sorted(worse, key=_rank),
-            [*doubt, *_described([d for d in warnings if d.joint in ("", joint)])],
+            [*cautions, *_described([w for w in warnings if w.joint in ("", joint)])],
             is_tested=bool(errors),
-            said=f"predicted within {max(errors):.1f} %, better than by a constant and than by the "
-            "URDF"
+            checked=f"error at most {max(errors):.1f} %, smaller than that of a constant and "
+            "that of the URDF"
             if errors
-            else predictions.why_unseen(joint),
+            else predictions.why_untested(joint),
         )
-        for joint, (worse, doubt, errors) in found.items()
+        for joint, (worse, cautions, errors) in found.items()
     }
     per_joint |= {joint: JointVerdict("not evaluated", (_HIDDEN,)) for joint in hidden}
     worst = max((error for _, _, errors in found.values() for error in errors), default=0.0)
     good = (
-        f"every joint is predicted within {worst:.1f} % on recordings that were not fitted, better "
-        "than by a constant and than by the URDF, and every parameter is physically consistent"
+        f"torque prediction error on validation logs: at most {worst:.1f} % at every joint, "
+        "smaller than that of a constant and that of the URDF; all parameters are physically "
+        "consistent"
     )
     verdict = concluded(
         per_joint, poor=poor, warnings=reasons, good=good, notes=notes, log_errors=log_errors
@@ -250,16 +251,17 @@ def concluded(
     log_errors: Sequence[str] = (),
     is_tested: bool = True,
 ) -> Verdict:
-    """Return the verdict that reasons make up.
+    """Return the verdict that follows from reasons.
 
     Args:
         joints: The verdict on each joint.
         poor: What makes the result poor.
-        warnings: What keeps it from being good.
+        warnings: What makes it at most usable.
         good: What was checked, if it is good.
-        notes: What follows the reasons, and changes no verdict.
-        log_errors: Faults of the recordings that make it poor, whatever else is found.
-        is_tested: Whether anything was evaluated; else a result that is not poor has no verdict.
+        notes: Sentences after the reasons that do not change the verdict.
+        log_errors: Faults of the recordings, which make it poor.
+        is_tested: Whether anything was evaluated; if not, a result that is not poor is "not
+            evaluated".
     """
     status = "usable" if warnings else "good"
     status = "poor" if poor or log_errors else status if is_tested else "not evaluated"
@@ -268,25 +270,25 @@ def concluded(
 
 
 def on_joint(
-    poor: Sequence[str], warnings: Sequence[str], *, is_tested: bool, said: str
+    poor: Sequence[str], warnings: Sequence[str], *, is_tested: bool, checked: str
 ) -> JointVerdict:
     """Return the verdict on a joint.
 
     Args:
         poor: What makes it poor.
-        warnings: What keeps it from being good.
+        warnings: What makes it at most usable.
         is_tested: Whether a validation log tests it.
-        said: What was checked, if it is good; why nothing was, if it is not tested.
+        checked: What was checked if it is good; why nothing was checked if it is not tested.
     """
     if not is_tested:  # never a pass
-        return JointVerdict("not evaluated", (said, *warnings))
+        return JointVerdict("not evaluated", (checked, *warnings))
     if poor or warnings:
         return JointVerdict("poor" if poor else "usable", (*poor, *warnings))
-    return JointVerdict("good", (said,))
+    return JointVerdict("good", (checked,))
 
 
 def check_ignored(ignore: Sequence[str]) -> None:
-    """Refuse codes to ignore that no error and no doubt has.
+    """Check that every code to ignore is the code of an error or a warning.
 
     Args:
         ignore: The codes.
@@ -300,24 +302,26 @@ def check_ignored(ignore: Sequence[str]) -> None:
         require_kind(stated, str, "a code in ignore", "the code of a finding")
         code = current_code(stated)
         if code != stated:
-            _LOGGER.warning("doctor: ignore names %r, which is %r since 0.2", stated, code)
+            _LOGGER.warning(
+                "doctor: ignore has the code %r, which is named %r since 0.2", stated, code
+            )
         if code not in known:
             near = difflib.get_close_matches(code, known, n=1)
             hint = f". Did you mean {near[0]!r}?" if near else ""
             raise SettingsError(
-                f"doctor: ignore names {code!r}, wanted some of {listed(known)}{hint}"
+                f"doctor: ignore has the unknown code {code!r}, wanted: {listed(known)}{hint}"
             )
 
 
 def blocking(
     findings: Sequence[Finding], ignore: Sequence[str], *, is_robust: bool = False
 ) -> tuple[Finding, ...]:
-    """Return the errors that make an identification wrong, but for those the user knows better.
+    """Return the errors that make an identification wrong, except those that the user ignores.
 
     Args:
-        findings: What was found.
-        ignore: Codes of errors that the user knows better.
-        is_robust: Whether a robust loss was set, which outvotes jumps of the torque.
+        findings: The findings.
+        ignore: Codes of errors that the user states as wrong.
+        is_robust: Whether a robust loss was set, which downweights jumps of the torque.
     """
     known = {current_code(code) for code in ignore}
     errors = (f for f in findings if f.severity == "error" and f.code not in known)
@@ -325,26 +329,26 @@ def blocking(
 
 
 def rejected(
-    findings: Sequence[Finding], kept: Mapping[str, Metrics], scale_check: ScaleCheck
+    findings: Sequence[Finding], validation: Mapping[str, Metrics], scale_check: ScaleCheck
 ) -> list[Finding]:
-    """Return findings, hypotheses that a prediction of unseen motion contradicts as notes.
+    """Return findings; hypotheses that a good prediction of unseen motion rejects become notes.
 
-    That masses or the direction of gravity are not as stated, or that no physics explains a
-    torque, is rejected where the result predicts these torques of every validation recording
-    within 5 %; another unit of the torque, or a torque without gravity, if gravity as identified
-    is also within a factor of two of the URDF's there.
+    Wrong masses, a wrong direction of gravity or an unexplained torque are rejected if the error of
+    these torques is below 5 % on every validation log. Another unit of the torque, or a torque
+    without gravity, is rejected if the identified gravity torque is also within a factor of two
+    of the URDF's.
 
     Args:
-        findings: What was found.
-        kept: Metrics of each validation recording and shows a prediction.
-        scale_check: The identified gravity against the URDF's.
+        findings: The findings.
+        validation: Metrics of each validation log.
+        scale_check: The identified gravity torque against the URDF's.
     """
     errors: dict[str, float] = {}
-    for metrics in kept.values():
+    for metrics in validation.values():
         for joint, measured in metrics.per_joint.items():
             errors[joint] = max(errors.get(joint, 0.0), error_of(measured))
     if any(finding.code == "repeated_motion" for finding in findings):
-        errors = {}  # the motion was seen
+        errors = {}  # the motion was fitted
     found = []
     for finding in findings:
         named = [j for j in finding.where.rpartition(": ")[2].split(", ") if j in errors]
@@ -352,7 +356,7 @@ def rejected(
         worst = max((errors[joint] for joint in joints), default=np.inf)
         is_rejected = finding.code in _HYPOTHESES and worst < _REJECTED
         if finding.where == "all joints":
-            is_rejected = False  # it was found in what the prediction leaves
+            is_rejected = False  # it was found in the residual of the prediction
         elif finding.code == "current_for_torque":
             ratios = [scale_check.gravity[j] for j in joints if j in scale_check.gravity]
             is_rejected &= all(1 / _SCALED < ratio < _SCALED for ratio in ratios)
@@ -363,7 +367,7 @@ def rejected(
         elif finding.severity == "error":
             is_rejected = False
         if is_rejected:
-            but = f"; but the result predicts unseen motion within {worst:.1f} %"
+            but = f"; rejected: torque error on validation logs at most {worst:.1f} %"
             finding = replace(finding, severity="note", message=f"{finding.message}{but}")
         found.append(finding)
     return found
@@ -372,50 +376,50 @@ def rejected(
 def warnings_of(
     findings: Sequence[Finding],
     joints: Sequence[str],
-    kept: Sequence[str] = (),
+    validation: Sequence[str] = (),
     *,
     is_robust: bool = False,
 ) -> tuple[VerdictWarning, ...]:
-    """Return the doubts that findings raise, each once.
+    """Return the warnings of a verdict that follow from findings, each once.
 
     Args:
-        findings: What the doctor and the fit found; notes and errors raise no doubt.
-        joints: The model's joints. A finding whose place names some is about these only.
-        kept: Names of the validation recordings, one each.
+        findings: Findings of the doctor and of the fit; notes and errors are left out.
+        joints: The model's joints. A finding whose place names some concerns only these.
+        validation: Names of the validation logs.
         is_robust: Whether a robust loss was set.
     """
-    # the places of jumps of a torque, as other findings call them: log and joint
+    # places of jumps of a torque in the form of other findings: log and joint
     downweighted = {
         f.where.replace(": tau_", ": ") for f in findings if is_robust and is_downweighted(f)
     }
     found: list[VerdictWarning] = []
     for finding in findings:
-        if finding.severity != "warning" or finding.code not in _WORDS or _is_harmless(finding):
+        if finding.severity != "warning" or finding.code not in _REASONS or _is_harmless(finding):
             continue
-        # spikes that a robust fit leaves out are what physics could not explain
+        # the unexplained torque is the spikes, which a robust fit downweights
         if finding.code == "unexplained_torque" and finding.where in downweighted:
             continue
         found += _warnings(finding, joints)
     repeated = {f.where for f in findings if f.code == "repeated_motion"}
-    if kept and repeated.issuperset(kept):
+    if validation and repeated.issuperset(validation):
         found.append(VerdictWarning("repeated_motion", "", _REPEATED))
     return tuple(dict.fromkeys(found))
 
 
 def is_downweighted(finding: Finding) -> bool:
-    """Return whether a robust loss makes it harmless: it is about jumps of the torque only.
+    """Return whether a robust loss makes a finding harmless: it concerns jumps of the torque only.
 
     Args:
-        finding: The finding; a position that jumps spoils the regressor.
+        finding: The finding. Jumps of a position are never harmless: they enter the regressor.
     """
     return finding.code == "spikes" and finding.where.rsplit(": ", 1)[-1].startswith("tau_")
 
 
 def _described(warnings: Sequence[VerdictWarning]) -> list[str]:
-    """Return one sentence per kind of doubt, with the joints that share it."""
+    """Return one sentence per kind of warning, with the joints that share it."""
     shared: dict[tuple[str, str], list[str]] = {}
-    for doubt in warnings:
-        shared.setdefault((doubt.message, doubt.code), []).append(doubt.joint)
+    for warning in warnings:
+        shared.setdefault((warning.message, warning.code), []).append(warning.joint)
     return [
         f"{', '.join(joints)}: {message} ({code})" if any(joints) else f"{message} ({code})"
         for (message, code), joints in shared.items()
@@ -423,12 +427,12 @@ def _described(warnings: Sequence[VerdictWarning]) -> list[str]:
 
 
 def _rank(reason: str) -> int:
-    """Return 0 for what is worse than a constant, 1 for worse than the URDF, 2 for the rest."""
+    """Return 0 for worse than a constant, 1 for worse than the URDF, 2 for the rest."""
     return 0 if "a constant" in reason else 1 if "the URDF" in reason else 2
 
 
 def _warnings(finding: Finding, joints: Sequence[str]) -> Iterator[VerdictWarning]:
-    message = _WORDS[finding.code].format(**finding.evidence)
+    message = _REASONS[finding.code].format(**finding.evidence)
     log, _, last = finding.where.rpartition(": ")
     named = [joint for joint in last.split(", ") if joint in joints]
     for joint in named:
@@ -439,7 +443,7 @@ def _warnings(finding: Finding, joints: Sequence[str]) -> Iterator[VerdictWarnin
 
 
 def _is_harmless(finding: Finding) -> bool:
-    """Return whether the torque is explained well in spite of a constraint or a missing term."""
+    """Return whether the torque error is small in spite of a constraint or a missing term."""
     if finding.code in _MISFITS:
         return finding.evidence["error_pct"] < _SMALL and "replaces" not in finding.evidence
     if finding.code != "constraint_costs":

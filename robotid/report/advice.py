@@ -198,7 +198,7 @@ def _of_verdict(found: Identification) -> list[Cause]:
     if not found.is_consistent:
         causes.append(Cause("impossible", "warning", (), (), ()))
     if not found.scale_check.agrees:
-        severity = "warning" if found.scale_check.is_against else "note"
+        severity = "warning" if found.scale_check.contradicts else "note"
         causes.append(Cause("unweighed", severity, (), (), ()))
     return causes
 

@@ -56,7 +56,7 @@ POSITION = Quantity(
         "rows": Mark("torques alone", "M-5 19h10l-5 -6z", "fill"),
         "urdf": Mark("URDF", "M0 0v18", "line"),
         "command": Mark("command", "M-3 6l6 6m0 -6l-6 6", "line"),
-        "steady": Mark("same speed", "M-3 9h6", "line"),
+        "steady": Mark("constant speed", "M-3 9h6", "line"),
     },
     _SMALL,
     "m",

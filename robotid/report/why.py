@@ -61,7 +61,7 @@ def _joint(torque: JointTorque, link: str, points: int, *, is_full: bool) -> str
     charts = why_charts(torque, link=link, points=points)
     said = "Torque in parts, stacked; shaded: rows not used"
     split = _chart(charts.pop("split"), said, _STILL_SPLIT)
-    sure = {d.name for d in torque.follows if d.is_sure}
+    sure = {d.name for d in torque.follows if d.is_significant}
     small = "".join(
         _chart(chart, _caption(torque, name))
         for name, chart in charts.items()
@@ -85,7 +85,7 @@ def _caption(torque: JointTorque, name: str) -> str:
     said = "explains nothing"
     if dependence.share is None:
         said = "too little was recorded to tell"
-    elif dependence.is_sure:
+    elif dependence.is_significant:
         said = f"<strong>explains {share} % of its variance</strong>"
     elif dependence.share >= DEPENDENCE_SHARE:
         said = f"explains {share} %, perhaps by chance"

@@ -222,14 +222,16 @@ def test_a_joint_that_is_told_to_stand_is_not_evaluated(leg, found):
     joints = model.joints
 
     def judged(runs):
-        return judge_positions(position_metrics(model, runs, moving=True), joints, is_kept=True)
+        return judge_positions(
+            position_metrics(model, runs, moving=True), joints, is_validation=True
+        )
 
     still = replace(run.log, q_ref=np.where([True, True, False], run.log.q_ref, run.log.q_ref[0]))
     stands = replace(run, log=still, spread=np.array([*run.spread[:2], 1e-4]))
     verdict = judged([stands])
     assert [verdict.joints[joint].status for joint in joints] == ["good", "good", "not evaluated"]
     assert verdict.status == "usable"
-    assert verdict.reasons == (f"{joints[2]}: commanded to are at rest in all logs: not evaluated",)
+    assert verdict.reasons == (f"{joints[2]}: commanded to rest in all logs: not evaluated",)
     assert judged([stands, run]).status == "good"
     nobody = replace(run, log=replace(still, q_ref=np.tile(still.q_ref[0], (len(still.t), 1))))
     assert judged([nobody]).status == "not evaluated"

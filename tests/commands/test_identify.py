@@ -157,7 +157,7 @@ def test_a_result_of_reversed_torques_is_no_urdf_and_exit_code_1(arm, logs, tmp_
     assert not list((tmp_path / "out").glob("*.urdf"))
     assert result["verdict"]["status"] == "poor"
     (said,) = [w["message"] for w in result["warnings"] if w["code"] == "urdf_not_written"]
-    assert "wrong by what was found: torque_sign" in said
+    assert "URDF not written: torque_sign failed" in said
     assert main([*command, "--ignore", "torque_sign"]) == 0
     assert "urdf" in json.loads(capsys.readouterr().out)["outputs"]
 
@@ -175,7 +175,7 @@ def test_a_mass_beyond_a_factor_of_three_is_no_urdf_but_where_it_is_ignored(
     (alarm,) = result["verdict"]["log_errors"]
     before, after, _ = result["scale_check"]["masses"]
     assert before == pytest.approx(11.9)
-    said = f"weigh {after:.4g} kg together, the URDF's 11.9 kg; wanted within a factor of 3"
+    said = f"total mass is {after:.4g} kg, the URDF's is 11.9 kg; wanted: within a factor of 3"
     assert said in alarm
     assert main([*command, "--ignore", "total_mass"]) == 0
     assert "urdf" in json.loads(capsys.readouterr().out)["outputs"]
@@ -212,7 +212,7 @@ def test_python_says_what_the_command_line_says(arm, logs, tmp_path, delay):
     known = identify(arm, **logs, ignore=["torque_delay"])
     assert "torque_delay" not in {doubt.code for doubt in (*blind.warnings, *known.warnings)}
     assert known.findings != blind.findings
-    with pytest.raises(SettingsError, match="ignore names 'late'"):
+    with pytest.raises(SettingsError, match="unknown code 'late'"):
         identify(arm, named[:1], ignore=["late"])
 
 

@@ -83,7 +83,7 @@ def test_fitted_rows_show_no_prediction(here, part):
     folder, first, _ = here
     found = verdict(folder, rows(first, part))
     assert found["status"] == "usable"
-    assert "hold rows that were fitted" in found["reasons"][0]
+    assert "contain fitted samples" in found["reasons"][0]
     assert {joint["status"] for joint in found["per_joint"].values()} == {"not evaluated"}
 
 
@@ -111,7 +111,7 @@ def test_without_the_fitted_logs_nobody_knows(here):
     assert found["status"] == "usable"
     assert "the fitted logs run.csv are not where they were" in found["reasons"][0]
     # the file itself is known by its hash
-    assert "hold rows that were fitted" in verdict(folder, first)["reasons"][0]
+    assert "contain fitted samples" in verdict(folder, first)["reasons"][0]
 
 
 def test_an_alarm_of_the_result_stays_one_whatever_the_new_log(here):
@@ -148,7 +148,7 @@ def test_a_longer_log_that_holds_the_fitted_rows_is_no_new_one(here):
     )
     for log in (longer, rows(first, slice(0, 60))):
         found = verdict(folder, log)
-        assert "hold rows that were fitted" in found["reasons"][0]
+        assert "contain fitted samples" in found["reasons"][0]
 
 
 def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_does(here):
@@ -167,7 +167,10 @@ def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_d
         assert found["verdict"] == alone["verdict"]
     write_log(rows(first, slice(0, 700)), folder / "cut.csv")
     found = validate_result(result, [folder / "old.csv", folder / "cut.csv"])
-    assert "old.csv 0-9.99 s, cut.csv 0-6.99 s hold rows that" in found["verdict"]["reasons"][0]
+    assert (
+        "old.csv 0-9.99 s, cut.csv 0-6.99 s contain fitted samples"
+        in found["verdict"]["reasons"][0]
+    )
 
 
 def test_what_the_result_ignores_is_no_doubt(here, rng):

@@ -63,7 +63,7 @@ def test_few_stretches_show_means_but_no_share(rows):
     x, r, bins, segments = rows
     few = segments < 3 * (FEWEST - 1)
     found = follow("speed", "rad/s", x[few], r[few], bins[few], segments[few])
-    assert (found.share, found.p_value, found.is_sure) == (None, 1.0, False)
+    assert (found.share, found.p_value, found.is_significant) == (None, 1.0, False)
     assert np.isfinite(found.errors[:3]).all()
     none = follow("speed", "rad/s", x, r, bins, None)
     np.testing.assert_allclose(none.means, follow("speed", "", x, r, bins, segments).means)

@@ -86,13 +86,13 @@ def test_nothing_is_said_of_drives_that_do_more_than_their_model(model, effect):
     ("change", "code", "where", "size", "words"),
     [
         (lambda log, one: replace(log, q=log.q + one("elbow_joint", 0.1, 0.0)),
-         "position_offset", "elbow_joint", -0.1, "zero of its position is off by 0."),
+         "position_offset", "elbow_joint", -0.1, "position offset 0."),
         (lambda log, one: replace(log, q=log.q + one("elbow_joint", 0.02, 0.0) * np.sign(log.v)),
-         "lost_motion", "elbow_joint", -0.04, "position is 0.04"),
+         "lost_motion", "elbow_joint", -0.04, "position differs by 0.04"),
         (lambda log, one: replace(log, q=1.1 * log.q, v=None),
-         "angle_scale", "all joints", 1 / 1.1 - 1, "every position fits best times 0.9"),
+         "angle_scale", "all joints", 1 / 1.1 - 1, "every position fits best with a factor of 0.9"),
         (lambda log, one: replace(log, q=log.q * one("elbow_joint", 1.2, 1.0), v=None),
-         "angle_scale", "elbow_joint", 1 / 1.2 - 1, "q_elbow_joint fits best times 0.8"),
+         "angle_scale", "elbow_joint", 1 / 1.2 - 1, "q_elbow_joint fits best with a factor of 0.8"),
         (lambda log, one: replace(log, tau=log.tau * one("elbow_joint", 1.3, 1.0)),
          "torque_scale", "elbow_joint", 0.3, "about 1."),
         (lambda log, one: replace(times(log, t=1.1), v=None),
@@ -177,7 +177,7 @@ def test_columns_beside_the_base_parameters_are_refitted_with_them(model, rng):
     sample = take_sample(found)
     Z = rng.standard_normal((*sample.r.shape, 2)) + sample.r[..., None]
     together, _ = Trials(sample, Z).whole.estimate([0, 1], sample.fitted)
-    beside = sample.beside(Z[..., :1])
+    beside = sample.with_columns(Z[..., :1])
     alone, _ = Trials(beside, Z[..., 1:]).whole.estimate([0], sample.fitted)
     assert alone[0] == pytest.approx(together[1], rel=2e-3)
     tau = np.concatenate([m.tau for m in sample.at])

@@ -241,11 +241,11 @@ def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
     assert grown[f"{ELBOW}.coulomb"] > 1.5
     # a shape has the error of its derivative's column beside that of the term
     for slides, unit in ((False, "rad/s"), (True, "m/s")):
-        sliding = replace(drive, slides=slides)
+        sliding = replace(drive, is_prismatic=slides)
         choice = drive_choice._found(alone, sliding, [(family, [speed])], ())
         (shape,) = choice.shapes
         assert (shape.name, shape.unit) == ("stribeck.speed", unit)
-    anew = drive_choice._weighed_anew(alone, drive, [(family, [shape.value])])
+    anew = drive_choice._reweighted(alone, drive, [(family, [shape.value])])
     Z = np.hstack(
         [
             drive.columns([Stribeck(speed=shape.value + x, data_range=SEEN["v"])])
@@ -259,7 +259,7 @@ def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
     assert shape.std_error == pytest.approx(np.sqrt(C[1, 1]), rel=0.01)
     assert choice.shape_covariance == ((pytest.approx(shape.std_error**2),),)
     # rows that are weighed by what terms leave keep their residual's share of the torque
-    anew = drive_choice._weighed_anew(alone, drive, [(family, [speed])])
+    anew = drive_choice._reweighted(alone, drive, [(family, [speed])])
     factor = anew.r[:, 0] @ alone.r[:, 0] / np.sum(alone.r[:, 0] ** 2)
     assert factor > 1.5
     np.testing.assert_allclose(anew.weight, factor * alone.weight)
@@ -313,7 +313,7 @@ def test_what_was_seen_is_of_the_rows_that_count_in_all_recordings():
     motions = [SimpleNamespace(q=own, v=speed) for own, speed in zip(q, v, strict=True)]
     taken = [np.array([1, 2, 3]), np.array([0, 1, 2])]
     used = np.array([True, True, False, True, False, True])
-    assert drive_choice._seen(motions, taken, used) == {"q": (-1.5, 1.25), "v": (0.25, 2.0)}
+    assert drive_choice._range_of(motions, taken, used) == {"q": (-1.5, 1.25), "v": (0.25, 2.0)}
 
 
 def test_a_grid_of_a_wide_range_has_its_end_too():
@@ -330,7 +330,7 @@ def test_harmonics_are_for_joints_that_turn_far_enough(plain):
     names = {family for families in chosen(found).values() for family in families}
     assert not names & {"harmonics2", "harmonics4"}
     assert not any("harmonics" in f for c in found.drives for x in c.tried for f in x.families)
-    with pytest.raises(SettingsError, match=r"elbow_joint has harmonics4, but .* half a turn"):
+    with pytest.raises(SettingsError, match=r"elbow_joint has harmonics4, .* half a revolution"):
         fitted_in(plain, [log], friction={ELBOW: "harmonics4"})
 
 
@@ -345,7 +345,7 @@ def test_a_shape_beyond_its_bounds_is_named(plain):
     assert shape.value == pytest.approx(sizes[1], rel=0.02)
     (said,) = [f for f in found.findings if f.code == "shape_at_bound"]
     assert said.where == ELBOW
-    assert f"elbow_joint: tanh.speed is {shape.value:.3g} rad/s, at the end" in said.message
+    assert f"elbow_joint: tanh.speed is {shape.value:.3g} rad/s, the bound" in said.message
 
 
 def test_validation_beyond_what_was_seen_is_named_and_has_no_say(plain, cases):
@@ -362,7 +362,7 @@ def test_validation_beyond_what_was_seen_is_named_and_has_no_say(plain, cases):
     share = 100 * np.mean(np.abs(fast.v[:, 1])[np.abs(fast.v[:, 1]) > 0.02] > top)
     assert said.where == ELBOW
     assert said.evidence["share_pct"] == pytest.approx(share, abs=1.0)
-    assert f"have speeds beyond 0 to {top:.3g}" in said.message
+    assert f"have speeds outside the fitted range of 0 to {top:.3g}" in said.message
     slow = driven_log(true, pi, SEED, reach=QUANTILE, speed=0.7)
     again = found_in(plain, [log], validation=[slow])
     assert not any(f.code == "beyond_range" for f in again.findings)

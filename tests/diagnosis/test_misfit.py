@@ -144,7 +144,7 @@ def test_a_size_without_a_unit_is_that_of_the_torque_beside_base_parameters(rng)
     W, r = rng.standard_normal((count, 2, 3)), rng.standard_normal((count, 2))
     segments = tuple(slice(k, k + 10) for k in range(0, count, 10))
     sample = Sample(
-        joints=("a", "b"), slides=np.array([False, True]), motions=(), recordings=(), at=(),
+        joints=("a", "b"), is_prismatic=np.array([False, True]), motions=(), recordings=(), at=(),
         taken=(), weight=weight, torque=np.ones(2), segments=segments, rows=fitted,
         W=W, r=r, independent=np.arange(3), U=np.eye(3), normal=Normal.of(W, r, segments, 6),
     )  # fmt: skip
@@ -256,7 +256,7 @@ def test_a_counterbalance_is_named_taken_into_the_model_and_no_error(ur5):
     assert (choice.joint, choice.families) == (LIFT, ("harmonics1",))
     known = [f for f in found.findings if f.code == "counterbalance"]
     assert {f.severity for f in known} == {"note"}
-    assert "The model has it: cos1, sin1 of shoulder_lift_joint" in known[0].message
+    assert "The model includes it: cos1, sin1 of shoulder_lift_joint" in known[0].message
     assert found.verdict.status == "good"
     for name, size in (("cos1", 40.0 * np.cos(0.1)), ("sin1", -40.0 * np.sin(0.1))):
         k = found.model.layout.names.index(f"{LIFT}.{name}")
@@ -285,7 +285,7 @@ def test_a_coupling_is_named_on_both_joints_with_the_setting_to_copy(ur5):
     assert [(f.code, f.severity, f.where) for f in (one, other)] == [
         ("coupling", "warning", joint) for joint in pair
     ]
-    assert 'Add [[coupling]] to the job with name = "wrist_2_joint_wrist_3_joint"' in one.message
+    assert 'Add [[coupling]] to the job: name = "wrist_2_joint_wrist_3_joint"' in one.message
     assert "ratios = { wrist_2_joint = 1.0, wrist_3_joint = 1.0 }" in one.message
     assert one.evidence["share_pct"] > 90
 
@@ -295,7 +295,7 @@ def test_columns_join_the_regressor_and_base_parameters_are_refitted(ur5):
     j, b = 2, sample.W.shape[-1]
     Z = np.column_stack([sample.motions[j].q, sample.motions[j].v ** 3])
     trials = Trials(sample.of_joint(j), Z[:, None])
-    for trial, left_out in ((trials.whole, None), (trials.apart, 3)):
+    for trial, left_out in ((trials.whole, None), (trials.held_out, 3)):
         rows = np.arange(len(sample.r)) < sample.rows
         if left_out is not None:
             rows[sample.segments[left_out]] = False
@@ -325,7 +325,7 @@ def test_a_misfit_reaches_the_verdict_unless_the_torque_is_explained_well(ur5):
     assert (doubt.code, doubt.joint) == ("friction_shape", LIFT)
     assert doubt.message == (
         "friction of another shape than viscous and Coulomb would explain 90 % of the squared "
-        "residual (5.1 % of the torque): the model of its drive lacks it"
+        "residual (5.1 % of the torque): the drive model lacks it"
     )
 
 
@@ -344,9 +344,9 @@ def test_a_hook_of_stribeck_makes_its_joint_usable(ur5, tmp_path):
     found, result = run_job(job_from_settings(table, "job", tmp_path), tmp_path / "out")
     (named,) = [f for f in result["warnings"] if f["code"] == "friction_shape"]
     assert named["where"] == ELBOW
-    assert f"state {ELBOW} = [" in named["message"].lower()
-    assert "in [drives] to add it to the model" in named["message"]
-    assert f"{ELBOW}.coulomb" in named["message"].partition("stand on this misfit")[0]
+    assert f"with {ELBOW} = [".lower() in named["message"].lower()
+    assert "Add it to the model with" in named["message"]
+    assert f"{ELBOW}.coulomb" in named["message"].partition("include this misfit")[0]
     assert set(found.on_misfit) <= {name for name in found.mapping.names if ELBOW in name}
     by_joint = found.verdict.joints
     assert by_joint[ELBOW].status == "usable"
@@ -370,7 +370,7 @@ def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(ur5):
     kept, term = said("spring", 90.0)
     assert kept == [2, 3]
     assert (term.severity, term.evidence["replaces"]) == ("warning", 2.0)
-    assert "It explains urdf_mismatch, unexplained_torque, and" in term.message
+    assert "It explains urdf_mismatch, unexplained_torque and" in term.message
     assert [doubt.joint for doubt in warnings_of([term], ur5.joints)] == [LIFT]
     assert said("position_offset", 90.0)[0] == [2, 3]
     assert said("load_friction", 90.0)[0] == [0, 2, 3]

@@ -12,7 +12,7 @@ from robotid.diagnosis.sample import (
     _is_steady,
     _segments,
     _spread_rows,
-    _usual_size,
+    _typical_size,
 )
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
@@ -30,7 +30,7 @@ def sample(rng):
     segments = tuple(slice(k, k + 10) for k in range(0, N, 10))
     normal = Normal.of(W, r, segments, FITTED)
     return Sample(
-        joints=("a", "b"), slides=np.zeros(2, dtype=bool), motions=(), recordings=(), at=(),
+        joints=("a", "b"), is_prismatic=np.zeros(2, dtype=bool), motions=(), recordings=(), at=(),
         taken=(), weight=weight, torque=np.ones(2), segments=segments, rows=10 * FITTED,
         W=W, r=r, independent=np.arange(BASE), U=np.eye(BASE), normal=normal,
     )  # fmt: skip
@@ -45,7 +45,7 @@ def solved(X, r, prior):
 def test_columns_on_all_joints_have_the_scatter_of_the_scores_of_stretches(sample, rng, which):
     Z = rng.standard_normal((N, JOINTS, 2)) + 0.4 * sample.r[:, :, None]
     tried = Trials(sample, Z)
-    apart, whole = tried.apart, tried.whole
+    apart, whole = tried.held_out, tried.whole
     columns = (sample.weight[:, :, None] * Z)[..., which]
     k, own = len(which), slice(0, 10 * FITTED)
     C, R = columns[own].reshape(-1, k), sample.r[own].ravel()
@@ -85,13 +85,13 @@ def test_a_column_of_a_joint_at_rest_takes_nothing(sample, rng):
     Z[:, 0, 1] = 0.0
     tried = Trials(sample.of_joint(1), Z)
     assert tried.whole.parameters([0, 1])[1] == 0.0
-    apart = tried.apart
+    apart = tried.held_out
     np.testing.assert_allclose(apart.left([0, 1]), apart.left([0]))
 
 
 def test_columns_beside_are_as_free_as_what_is_left(sample, rng):
     Z = rng.standard_normal((N, JOINTS, 1))
-    beside = sample.beside(Z)
+    beside = sample.with_columns(Z)
     columns = sample.weight[:, :, None] * Z
     spread = 1e3 * np.linalg.norm(sample.r) / np.linalg.norm(columns)
     np.testing.assert_allclose(beside.W, np.concatenate([sample.W, spread * columns], axis=2))
@@ -155,7 +155,7 @@ def test_rows_near_a_reversal_or_a_stop_are_not_steady():
     assert _is_steady(SimpleNamespace(trajectory=motion, signals=unfiltered)).all()
 
 
-def test_the_usual_size_is_the_median_of_the_rows_used():
+def test_the_typical_size_is_the_median_of_the_rows_used():
     r = np.array([[1.0, -5.0], [-2.0, 1.0], [9.0, 1.0], [4.0, 2.0]])
     used = np.array([[True, False], [True, False], [False, False], [True, False]])
-    assert _usual_size(r, used).tolist() == [2.0, np.inf]
+    assert _typical_size(r, used).tolist() == [2.0, np.inf]

@@ -15,7 +15,7 @@ from scipy.signal import butter, sosfiltfilt
 from robotid.diagnosis.torque_split import (
     JointTorque,
     Rows,
-    _quick_shares,
+    _broadband_shares,
     joint_torques,
     split_torque,
 )
@@ -164,7 +164,7 @@ def test_a_joint_is_judged_on_what_was_kept_apart(identified):
             sum(torque.parts.values()) + torque.residual, motion.tau[:, j], atol=1e-11
         )
         # white noise is all that this log has beside its model
-        assert torque.quick > 0.5
+        assert torque.broadband > 0.5
         assert torque.fitted.rows.recordings == tuple(e.recording.name for e in identified.fitted)
 
 
@@ -227,13 +227,13 @@ def test_what_a_residual_follows_is_found_with_its_share(name, rng):
     # bins take a part of it that their width blurs
     low = 0.35 if name in ("speed", "time") else 0.44
     assert low < share[name] < 0.53
-    assert [d.name for d in found.follows if d.is_sure] == [name]
+    assert [d.name for d in found.follows if d.is_significant] == [name]
     said = found.sentence
     if name == "constant":
-        assert re.search(r"4\d % of its square is a constant of (1|0.9\d|1.0) N m", said)
+        assert re.search(r"4\d % of its power is a constant of (1|0.9\d|1.0) N m", said)
         assert "Zero the torque sensor" in said
     else:
-        assert f"follows the {name}, which explains" in said
+        assert f"depends on the {name}, which explains" in said
     assert ("at low speed" in said) == (name == "speed")
 
 
@@ -248,7 +248,7 @@ def test_the_residual_against_time_is_drawn_as_time_is_asked_of_it(rng):
     time = found.follows[-1]
     assert time.name == "time"
     chart = why_charts(found)["time"]
-    assert "less its mean over position against time" in chart.title
+    assert "minus its mean over position against time" in chart.title
     assert chart.series[0].y.std() < 0.6  # drift and noise; the plain residual is far larger
     assert why_charts(found)["position"].series[0].y.std() > 1.0
 
@@ -264,12 +264,12 @@ def test_noise_of_any_colour_follows_nothing():
         v, q, load = motion(rng)
         noise = coloured(rng, (len(v),), (0, 5, 20)[trial % 3])
         found = torque(noise, v, q, load)
-        log_errors += sum(d.is_sure for d in found.follows)
+        log_errors += sum(d.is_significant for d in found.follows)
         tried += len(found.follows)
         shares.append([d.share for d in found.follows])
     assert log_errors <= 1, f"{log_errors} of {tried}"
     assert (np.mean(shares, axis=0) < 0).all(), "what was fitted to noise predicts no other noise"
-    assert "nothing explains it: 90 % of its square is as quick as noise" in found.sentence
+    assert "90 % of its power is broadband (above the cut-off): noise" in found.sentence
 
 
 def test_errors_of_bins_hold_the_scatter_of_correlated_noise():
@@ -287,7 +287,7 @@ def test_too_short_a_recording_says_so(rng):
     v, q, load = motion(rng, 300)
     found = torque(rng.standard_normal(300), v, q, load, segments=None)
     assert all(d.share is None for d in found.follows if d.name != "time")
-    assert "too little was recorded" in found.sentence
+    assert "the recordings are too short" in found.sentence
 
 
 def test_what_the_fitted_recordings_do_not_show_has_changed(rng):
@@ -317,8 +317,8 @@ def test_filtered_noise_is_quick_and_what_is_slow_is_not(kind, low, high):
         ),
         torques={"estimate": np.zeros((N, 1))},
     )  # fmt: skip
-    (quick,) = _quick_shares([e])
-    assert low <= quick <= high
+    (broadband,) = _broadband_shares([e])
+    assert low <= broadband <= high
 
 
 def test_what_is_forgotten_is_one_less_the_autocorrelation_of_all_recordings(rng):
@@ -340,6 +340,6 @@ def test_what_is_forgotten_is_one_less_the_autocorrelation_of_all_recordings(rng
                 if mask[i, j] and mask[i + lag, j] and segment[i] == segment[i + lag]:
                     a, b = r[i, j], r[i + lag, j]
                     shares[:, j] += a * b, (a**2 + b**2) / 2
-    *found, still = _quick_shares(evaluations)
+    *found, still = _broadband_shares(evaluations)
     np.testing.assert_allclose(found, 1.0 - shares[0, :2] / shares[1, :2])
     assert still is None

@@ -85,11 +85,11 @@ def test_former_codes_can_be_ignored_and_are_named(caplog):
     with caplog.at_level(logging.WARNING, logger="robotid"):
         check_ignored(["late_command", "gravity"])
     assert caplog.messages == [
-        "doctor: ignore names 'late_command', which is 'delayed_command' since 0.2"
+        "doctor: ignore has the code 'late_command', which is named 'delayed_command' since 0.2"
     ]
     assert blocking([late], ["late_command"]) == blocking([late], ["delayed_command"]) == ()
     assert blocking([late], ["gravity"]) == (late,)
-    with pytest.raises(SettingsError, match="ignore names 'nothing'"):
+    with pytest.raises(SettingsError, match="unknown code 'nothing'"):
         check_ignored(["nothing"])
 
 

@@ -52,7 +52,7 @@ def test_gravity_is_found_of_slow_motion(ran):
     assert len(entries) == 5
     z = standardised({"base_parameters": entries}, values)
     assert 0.3 < rms(z) < 2
-    assert "every parameter is physically consistent" in " ".join(
+    assert "all parameters are physically consistent" in " ".join(
         known["result"]["verdict"]["reasons"]
     )
 

@@ -187,7 +187,7 @@ def test_a_fit_is_said_and_written_with_its_figures():
         "  centre of mass: 0.02 +- 0.002, 0.03 +- 0.003, 0.08 +- 0.008 m",
         "  inertia about it, diagonal: it turns too little",
         "gain of b: 7.25 +- 0.5 [6.25, 8.25]",
-        "torque left [%]: a 6.2, b 50.0",
+        "torque error [%]: a 6.2, b 50.0",
     ]
     assert repr(found) == "<PayloadFit of arm: tool 2 +- 0.12 kg, elbow 3 +- 0 kg>"
     assert (found["tool"], found["elbow"]) == (one, two)
@@ -295,7 +295,7 @@ def test_an_inertia_that_the_motion_does_not_show_is_refused(ur5, rng):
     (log, without) = recorded(ur5, rng, noise=LEVEL, inertia=1e-4 * np.eye(3))
     payload = with_known_friction(ur5, [log], [without], links=["tool0"], signals=EXACT)["tool0"]
     assert payload.determined == ("mass", "com")
-    assert "the motion turns tool0 too little" in payload.reasons["inertia"]
+    assert "tool0 rotates too little" in payload.reasons["inertia"]
     plain = payload.to_dict()
     assert plain["inertia"] is None
     assert plain["inertia_std_error"] is None
@@ -322,18 +322,20 @@ def test_what_cannot_be_asked_is_refused_by_name(ur5, rng):
 
     refused(DataError, "tool0 carries 2.* less than in the reference: .* swap", (without, log),
             links=["tool0"])  # fmt: skip
-    refused(DataError, "no motion shows the mass of what hangs on shoulder_link",
+    refused(DataError, "no motion determines the mass of the payload on shoulder_link",
             links=["shoulder_link"])  # fmt: skip
     refused(SettingsError, "base_link does not move", links=["base_link"])
     refused(SettingsError, "tool0 and ee_link belong to one moving body, wrist_3_link",
             links=["tool0", "ee_link"])  # fmt: skip
     refused(ModelError, "link 'hook' is not in ur5_robot.urdf; links: ", links=["hook"])
-    refused(SettingsError, "nothing sets their scale", unknown_gains=ur5.joints)
-    refused(SettingsError, "a mass of ee_link is stated", masses={"ee_link": 1.0})
+    refused(SettingsError, "their scale is not determined", unknown_gains=ur5.joints)
+    refused(SettingsError, "a mass is stated for ee_link", masses={"ee_link": 1.0})
     refused(SettingsError, "is -1.0 kg", masses={"wrist_3_link": -1.0})
-    refused(SettingsError, "gains of hip are wanted", unknown_gains=["hip"])
+    refused(SettingsError, "unknown gains are stated for hip", unknown_gains=["hip"])
     short = [x.window(0.0, 1.0) for x in (log, without)]
-    refused(DataError, "the motion does not show the mass of what hangs on wrist_3_link", short)
+    refused(
+        DataError, "the motion does not determine the mass of the payload on wrist_3_link", short
+    )
 
 
 def test_the_load_of_a_ur10e_and_what_it_says_of_its_gains(recordings, monkeypatch):

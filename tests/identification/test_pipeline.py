@@ -258,5 +258,5 @@ def test_links_on_locked_joints_that_weigh_less_than_the_urdf_says_are_named():
         found = identify(model, [log])
         costs.append([f.message for f in found.findings if f.code == "constraint_costs"])
     assert costs[1] == []
-    assert "the inertials of the links on locked joints, 1.41 of the " in costs[0][0]
-    assert "kg of wrist_1_link, which are the URDF's (identify their joints, too" in costs[0][0]
+    assert "the URDF's inertials of the links on locked joints, 1.41 kg of the " in costs[0][0]
+    assert "kg of wrist_1_link (identify their joints, too" in costs[0][0]

@@ -115,7 +115,9 @@ def test_what_a_residual_follows_is_drawn_with_its_interval_and_what_friction_ta
 
 @pytest.mark.parametrize("plot", ["plot_torques", "plot_friction", "plot_why"])
 def test_another_joint_is_refused_by_name(identified, plot):
-    words = r"joint 'elbow_joind' is not among those identified: .*Did you mean 'elbow_joint'\?"
+    words = (
+        r"joint 'elbow_joind' is not among the identified joints: .*Did you mean 'elbow_joint'\?"
+    )
     with pytest.raises(DataError, match=words):
         getattr(identified, plot)("elbow_joind")
 

@@ -29,7 +29,7 @@ from robotid.identification.previews import (
     Run,
     _band,
     _Information,
-    _seen,
+    _largest,
     _white_step,
     preview,
 )
@@ -140,7 +140,7 @@ def test_motions_of_two_lengths_and_filters_tell_as_much_as_their_rows(rng):
     assert said.share == pytest.approx(2 * 5.0 / RATE)
     np.testing.assert_allclose(said.squares, sum(log.whole.trajectory.squares for log in held))
     run = Run((said.factors,), np.zeros(len(mapping.names)), 2 * said.squares, 7, 0.01, 0.01)
-    both = said.beside(run)
+    both = said.added_to(run)
     assert (both.samples, both.share) == (said.samples + 7, 0.01)
     np.testing.assert_allclose(both.squares, 3 * said.squares)
     np.testing.assert_array_equal(both.factors.rows, 2 * said.factors.rows)
@@ -192,7 +192,7 @@ def test_the_largest_of_several_motions_is_seen(rng):
     fast = replace(logs[0], t=0.5 * logs[0].t)
     held = [hold_log(model, log, SignalSettings()) for log in (logs[1], fast, logs[1])]
     bodies = model.standard_parameters()
-    peak, fastest = _seen(model, held)
+    peak, fastest = _largest(model, held)
     for j in range(3):
         v = max(np.abs(log.whole.trajectory.v[:, j]).max() for log in held)
         torques = [predict(model, [bodies], log.whole.trajectory)[0] for log in held]

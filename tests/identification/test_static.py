@@ -98,7 +98,9 @@ def test_gravity_is_found_with_true_intervals(name, kind, rng):
     assert np.sqrt(np.mean((given - wanted) ** 2, axis=0)).max() < near * size.max()
     assert found.is_consistent
     assert found.verdict.status in ("good", "usable")
-    assert found.verdict.reasons[-1].startswith("static: gravity, offsets and friction that needs")
+    assert found.verdict.reasons[-1].startswith(
+        "static model: gravity, offsets and Coulomb friction"
+    )
     (note,) = [f for f in found.findings if f.code == "static"]
     count = note.evidence["samples"]
     assert count == 60 if kind == "poses" else count > 500
@@ -133,7 +135,10 @@ def test_poses_leave_coulomb_friction_open_and_say_so(rng):
     open_ = set(found.determination.undetermined)
     assert open_ == {f"{joint}.coulomb" for joint in static.joints}
     (note,) = [f for f in found.findings if f.code == "static"]
-    assert "Stands do not show the Coulomb friction of panda_joint1, panda_joint2" in note.message
+    assert (
+        "Poses at rest do not determine the Coulomb friction of panda_joint1, panda_joint2"
+        in note.message
+    )
     assert "not evaluated" in found.verdict.joints["panda_joint1"].status  # gravity turns it not
 
 
@@ -163,7 +168,7 @@ def test_a_job_writes_a_urdf_of_its_gravity_that_other_logs_validate(tmp_path, r
     verdict = checked["verdict"]
     assert verdict["per_joint"]["shoulder_lift_joint"]["status"] == "good"
     assert verdict["per_joint"]["shoulder_pan_joint"]["status"] == "not evaluated"
-    assert verdict["reasons"][-1].startswith("static: ")
+    assert verdict["reasons"][-1].startswith("static model: ")
 
 
 def test_stands_of_a_joint_that_moves_more_elsewhere_are_left_out():

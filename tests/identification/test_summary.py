@@ -138,7 +138,7 @@ def test_friction_is_said_from_the_first_step_to_the_last_that_was_taken():
         "c": {"families": ["lag"], "tried": tried[:3]},
     }
     assert friction_lines(joints) == [
-        "friction beside viscous and Coulomb's:",
+        "friction besides viscous and Coulomb:",
         "  a: tanh + load (held-out error 20.0 -> 5.1 %)",
         "  c: lag (held-out error 20.0 -> 8.0 %)",
     ]

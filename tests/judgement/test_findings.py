@@ -58,7 +58,7 @@ def test_of_several_starts_the_best_is_above_the_optimum_by_its_own_gap():
         assert consistency_findings(solved(gaps=gaps)) == []
     (finding,) = consistency_findings(solved(gaps=[0.3, 0.0123, 0.5]))
     assert (finding.code, finding.severity) == ("optimum_gap", "warning")
-    assert finding.message.startswith("log-Cholesky ended 1.2 % above the optimum")
+    assert finding.message.startswith("the objective of log-Cholesky is 1.2 % above the optimum")
 
 
 def test_two_solvers_differ_by_the_shares_that_are_said():
@@ -94,12 +94,14 @@ def test_five_outliers_are_named_and_the_others_counted():
         return finding.message
 
     few, many = said(5, False), said(7, True)
-    assert few.startswith("5 places of the fitted logs are not explained: j0 at 0.000 s of run.csv")
-    assert few.endswith("j4 at 5.000 s of run.csv: 14 against -8 predicted, 36 times its typical "
-                        "residual; look at the recording there, cut it out, or set robust = "
+    assert few.startswith("5 outliers in the fitted logs: j0 at 0.000 s of run.csv")
+    assert few.endswith("j4 at 5.000 s of run.csv: measured 14, predicted -8, residual 36 times "
+                        "the typical one; check the recording there, cut it out, or set robust = "
                         "'tukey' in [estimator]")  # fmt: skip
     assert "j5" not in many
-    assert many.endswith("36 times its typical residual; and 2 more; they were weighted down")
+    assert many.endswith(
+        "residual 36 times the typical one; and 2 more; the robust loss downweighted them"
+    )
 
 
 def test_the_parameter_that_terms_make_least_sure_is_named_from_tenfold_on():
@@ -116,7 +118,7 @@ def test_the_parameter_that_terms_make_least_sure_is_named_from_tenfold_on():
     first, last = _grown(SimpleNamespace(drives=drives), {"c"})
     assert (first.where, first.evidence) == ("a", {"grown": 41.6})
     assert first.message.startswith(
-        "a: lugre, load makes the standard error of viscous 42 times as large"
+        "a: lugre, load multiplies the standard error of viscous by 42;"
     )
     assert (last.where, last.evidence) == ("e", {"grown": 10.1})
 
@@ -177,24 +179,24 @@ def test_bounds_that_bind_are_a_warning_where_data_or_masses_contradict_a_stated
         assert all(f.code == "active_bound" for f in found)
         return [(f.severity, f.where, f.message) for f in found]
 
-    fine = "the URDF's values lie beyond them, and the torque is explained as well as without"
-    assert said("mass one") == [("note", "mass one", f"the bounds mass one bind: {fine}")]
+    fine = "the URDF's values are outside them; the bounds do not increase the torque error"
+    assert said("mass one") == [("note", "mass one", f"the bounds mass one are active: {fine}")]
     ((severity, where, message),) = said("mass one", "cone two", "mass two", ours=(1.06, 2.11))
     assert (severity, where) == ("warning", "mass one, mass two")
     assert message.startswith(
-        "the bounds mass one, mass two bind: the data push against them at a, b; check these"
+        "the bounds mass one, mass two are active: they increase the torque error of a, b; check"
     )
     ((severity, _, message),) = said("total_mass all", ours=(1.0, 2.11))
     assert severity == "warning"
-    assert "push against them at b; check" in message
+    assert "they increase the torque error of b; check" in message
     # next to nothing is left of a link
     ((severity, _, message),) = said("centre_of_mass two", masses=(0.09, 0.21))
     assert severity == "warning"
-    assert "bind: they leave 0.09 of its 2 kg to one; check" in message
+    assert "with them one has 0.09 of its 2 kg; check" in message
     # a bound of the geometry is no one's statement
     ((severity, _, message),) = said("mass two", masses=(0.09, 0.19))
     assert severity == "note"
-    assert "they leave 0.09 of its 2 kg to one, 0.19 of its 4 kg to two; check" in message
+    assert "with them one has 0.09 of its 2 kg, two has 0.19 of its 4 kg; check" in message
     assert said("cone one", "inertia two") == []
 
 
@@ -224,9 +226,9 @@ def test_drives_whose_friction_has_no_direction_where_all_of_their_joints_count_
 
     found = said(first, second)
     assert found.evidence == {"rows": 300.0, "samples": 21.0}
-    assert "the 300 rows count as 21 stands" in found.message
-    assert "the Coulomb friction of a, pair, which holds" in found.message
-    assert "the Coulomb friction of a, b, pair, which holds" in said(second).message
+    assert "the 300 rows count as 21 independent samples" in found.message
+    assert "the Coulomb friction of a, pair: at rest" in found.message
+    assert "the Coulomb friction of a, b, pair: at rest" in said(second).message
     assert "Coulomb" not in said(first, third).message
 
 
@@ -256,17 +258,20 @@ def test_the_share_of_a_validation_log_beyond_what_friction_was_fitted_to_is_sai
         )  # fmt: skip
         first, *found = _drive_findings(fit)
         assert (first.code, first.where) == ("shape_at_bound", "b")
-        assert "b: stribeck.speed is 0.0123 rad/s, at the end" in first.message
+        assert "b: stribeck.speed is 0.0123 rad/s, the bound" in first.message
         return found
 
     places, speeds = said(term, other, loose)
     assert (places.code, places.where, places.evidence) == ("beyond_range", "b", {"share_pct": 4.0})
     assert places.message.startswith(
-        "b: 4 % of the rows of run.csv 0-2 s have positions beyond -0.5 to 0.8, which the fit has "
-        "seen; stribeck, position stays there as it was"
+        "b: 4 % of the samples of run.csv 0-2 s have positions outside the fitted range of -0.5 "
+        "to 0.8; stribeck, position is constant there"
     )
     assert speeds.evidence == {"share_pct": 8.0}
-    assert "8 % of the rows of run.csv 0-2 s have speeds beyond 0 to 1, which" in speeds.message
+    assert (
+        "8 % of the samples of run.csv 0-2 s have speeds outside the fitted range of 0 to 1;"
+        in speeds.message
+    )
     assert said(loose) == []
 
 
@@ -290,5 +295,5 @@ def test_all_links_weigh_within_a_factor_of_three_of_the_urdf_s():
         (finding,) = found(factor)
         assert (finding.code, finding.severity) == ("total_mass", "error")
         assert finding.evidence == {"urdf": 4.0, "identified": pytest.approx(4.0 * factor)}
-        assert f"weigh {4 * factor:.4g} kg together, the URDF's 4 kg" in finding.message
+        assert f"total mass is {4 * factor:.4g} kg, the URDF's is 4 kg" in finding.message
     assert found(3.1, total=(1.0, 20.0)) == found(3.1, urdf=0.0) == []

@@ -4,13 +4,13 @@ from robotid.fitting.metrics import JointMetrics, Metrics
 from robotid.judgement.positions import judge_positions
 
 
-def judged(errors, is_kept=True, joints=("a", "b"), **known):
+def judged(errors, is_validation=True, joints=("a", "b"), **known):
     """Return the verdict on joints by their errors [%], or by errors with baselines."""
     per_joint = {}
     for name, own in errors.items():
         error, baselines = own if isinstance(own, tuple) else (own, {})
         per_joint[name] = JointMetrics(1e-3, "rad", error, 0.9, 100, baselines, True)
-    return judge_positions(Metrics(per_joint, 1e-3), joints, is_kept=is_kept, **known)
+    return judge_positions(Metrics(per_joint, 1e-3), joints, is_validation=is_validation, **known)
 
 
 def statuses(found):
@@ -22,7 +22,7 @@ def test_the_worst_joint_decides_by_the_thresholds():
     assert good.status == "good"
     assert good.reasons == (
         "simulated position error on validation logs: at most 5 % of each joint's RMS motion, "
-        "smaller than that of plainer models",
+        "smaller than those of simpler models",
     )
     usable = judged({"a": 5.1, "b": 2.0})
     assert (usable.status, statuses(usable)) == ("usable", {"a": "usable", "b": "good"})
@@ -39,9 +39,7 @@ def test_a_plainer_model_that_is_better_keeps_it_from_being_good_and_the_command
     assert near.status == "good", "within a twentieth"
     beaten = judged({"a": (2.0, others), "b": 1.0})
     assert statuses(beaten) == {"a": "usable", "b": "good"}
-    assert beaten.reasons[0].endswith(
-        "2 % of its RMS motion; smaller with the plain model of second order"
-    )
+    assert beaten.reasons[0].endswith("2 % of its RMS motion; smaller with a second-order model")
     worse = judged({"a": (2.0, others | {"command": 1.0}), "b": 1.0})
     assert worse.status == "poor"
     driven = judged({"a": (2.0, {"urdf": 1.0, "rows": 3.0, "steady": 40.0}), "b": 1.0})
@@ -51,13 +49,13 @@ def test_a_plainer_model_that_is_better_keeps_it_from_being_good_and_the_command
 
 
 def test_what_no_log_tests_is_not_evaluated():
-    fitted = judged({"a": 2.0, "b": 60.0}, is_kept=False)
+    fitted = judged({"a": 2.0, "b": 60.0}, is_validation=False)
     assert fitted.status == "not evaluated"
     assert statuses(fitted) == {"a": "not evaluated", "b": "not evaluated"}
     assert fitted.reasons[0].endswith("no validation log given")
     still = judged({"a": 2.0})
     assert (still.status, statuses(still)) == ("usable", {"a": "good", "b": "not evaluated"})
-    assert still.reasons == ("b: commanded to are at rest in all logs: not evaluated",)
+    assert still.reasons == ("b: commanded to rest in all logs: not evaluated",)
     assert judged({}).status == "not evaluated"
 
 
@@ -65,10 +63,10 @@ def test_faults_and_cautions_come_first_and_the_scale_last():
     errors = {"a": 2.0, "b": 2.0}
     unsettled = judged(errors, is_settled=False, scale="the scale depends on kp")
     assert unsettled.status == "usable"
-    assert unsettled.reasons == ("the fit has not settled", "the scale depends on kp")
+    assert unsettled.reasons == ("the fit has not converged", "the scale depends on kp")
     assert judged(errors, scale="the scale depends on kp").status == "good"
     doubtful = judged(errors, is_settled=False, cautions=["at its bound"])
-    assert doubtful.reasons == ("at its bound", "the fit has not settled")
+    assert doubtful.reasons == ("at its bound", "the fit has not converged")
     wrong = judged({"a": 2.0, "b": 9.0}, log_errors=["the clock jumps"], cautions=["at its bound"])
     assert wrong.status == "poor"
     assert wrong.log_errors == ("the clock jumps",)

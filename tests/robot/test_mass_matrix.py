@@ -110,12 +110,18 @@ def test_the_second_solver_and_active_bounds_are_reported(forearm, rng):
     (finding,) = consistency_findings(found)
     # 9 kg find no room in the forearm's box; 3 kg do, and no motion shows a single mass
     assert (finding.code, finding.severity) == ("active_bound", "warning")
-    assert "bounds mass forearm_link bind: the data push against them at elbow" in finding.message
+    assert (
+        "the bounds mass forearm_link are active: they increase the torque error of elbow"
+        in finding.message
+    )
     settings = EstimatorSettings(constraints={"mass": {"forearm_link": [3.0, 20.0]}})
     found = identify(forearm, [log], signals=EXACT, estimator=settings)
     (finding,) = consistency_findings(found)
     assert (finding.code, finding.severity) == ("active_bound", "note")
-    assert "bounds mass forearm_link bind: the URDF's values lie beyond them" in finding.message
+    assert (
+        "the bounds mass forearm_link are active: the URDF's values are outside them"
+        in finding.message
+    )
 
 
 def test_a_second_solver_that_fails_is_reported_with_its_status(forearm, rng, monkeypatch):
