@@ -52,7 +52,7 @@ def test_spikes_are_counted_by_their_share_of_what_varies():
         "rows": 3.0, "largest": pytest.approx(120.0, abs=0.2), "first": pytest.approx(6.1),
         "energy_share": pytest.approx(share, rel=0.01),
     }  # fmt: skip
-    assert "tau of b jumps by up to 120 for 3 rows, the first at t = 6.1 s" in found.message
+    assert "tau of b has spikes of up to 120 in 3 rows, the first at t = 6.1 s" in found.message
 
 
 @pytest.mark.parametrize("rows", [3, 5, 6])
