@@ -65,9 +65,9 @@ def test_a_held_torque_is_late_by_half_of_what_it_is_held_less_a_row(rows):
     late = own.mean() * 0.01
     assert found.where == "run.csv: b"
     assert found.evidence == {"rows": rows, "delay": pytest.approx(late)}
-    told = f"held for {rows} rows: it is updated at {100 / rows:.3g} Hz and logged at 100 Hz"
+    told = f"is constant for {rows} rows: it is updated at {100 / rows:.3g} Hz and logged at 100 Hz"
     assert told in found.message
-    assert f"{1e3 * late:.2g} ms late on average" in found.message
+    assert f"mean delay of {1e3 * late:.2g} ms" in found.message
     assert f"torque_delay = {late:.4f} (--torque-delay {late:.4f})" in found.message
     assert f"a cutoff below {25 / rows:.2g} Hz" in found.message
 
@@ -166,9 +166,9 @@ def test_held_commands_are_told_with_their_period():
     log = log_of(q_ref=log_of().q[held])
     [found] = _held(log, [_Loop(log, j) for j in range(2)])
     assert found.evidence == {"rows": 5.0, "period": pytest.approx(0.05)}
-    assert "of a, b is updated every 5 rows, 20 times a second in the mean" in found.message
-    assert "held for 50 ms" in found.message
-    assert "or 25 ms are taken for the drive's own delay" in found.message
+    assert "of a, b is updated every 5 rows, at 20 Hz on average" in found.message
+    assert "is constant for 50 ms" in found.message
+    assert "else 25 ms are added to the identified delay of the drive" in found.message
 
 
 def test_a_lag_is_the_slope_of_the_phase_with_the_error_of_a_weighted_mean():
