@@ -128,7 +128,7 @@ def test_a_payload_is_told_with_its_moments(mass, severity):
     }  # fmt: skip
     assert (found.where, found.severity) == ("run.csv: low", severity)
     sign = "more" if mass > 0 else "less"
-    assert f"low carries about {abs(mass):.2g} +- 0.05 kg {sign} than the URDF" in found.message
+    assert f"low carries about {abs(mass):.2g} +- 0.05 kg {sign} than in the URDF" in found.message
     assert list(_payload(SimpleNamespace(model=model), np.array([0.14, 0, 0, 0]), 0.05, "x")) == []
 
 
