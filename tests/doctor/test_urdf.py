@@ -98,7 +98,7 @@ def test_a_moving_link_without_inertial_is_named(tmp_path):
     frame = inspected(tmp_path, ("</robot>", TOOL.format(inertial="")))
     (finding,) = found(frame, "missing_inertial")
     assert (finding["link"], finding["severity"]) == ("tool", "note")
-    assert "the mass of its body is in lower" in finding["message"]
+    assert "The mass of its body is in lower" in finding["message"]
 
 
 def test_masses_of_zero_and_less_are_named(tmp_path):
@@ -204,7 +204,7 @@ def test_rounded_angles_of_several_joints_are_one_note():
     joints = ", ".join(f"joint{k}" for k in range(2, 8))
     assert f"the joints {joints} have rounded angles in rpy; write " in finding["message"]
     quarter = math.pi / 2
-    assert f"write {-quarter!r} for -1.5708, {quarter!r} for 1.5708; the" in finding["message"]
+    assert f"write {-quarter!r} for -1.5708, {quarter!r} for 1.5708. " in finding["message"]
 
 
 COARSE = ('<origin xyz="0.5 0 0"/>', '<origin xyz="0.5 0 0" rpy="3.14 0 0"/>')
