@@ -9,7 +9,7 @@ from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Log
 from robotid.logs.measured_velocity import (
     COARSE,
-    LATE,
+    LARGEST_LAG,
     quantum,
     unlike_velocities,
     velocity_lags,
@@ -180,7 +180,7 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     error = max(scatter / np.sqrt(max(len(used), 1)), 0.02 * step)
     if abs(lag) < max(_LAG, 3 * error, 0.1 * step):
         return
-    is_delayed = abs(lag) >= LATE
+    is_delayed = abs(lag) >= LARGEST_LAG
     what = (
         "velocity = 'auto' uses it only if it predicts torque as well as the differentiated one"
         if is_delayed

@@ -162,7 +162,7 @@ def test_full_turns_are_taken_out_of_free_joints_only():
     log = Log(t=t, q=wrapped, tau=angle, joints=("a", "b"))
     out = unwrap(log, np.array([True, False]))
     np.testing.assert_allclose(out.q, angle, atol=1e-12)
-    assert out.notes == ("full turns taken out of the angle of a",)
+    assert out.notes == ("full turns removed from the angle of a",)
     with pytest.raises(DataError, match=r"q_a jumps by a full turn at t = 1.58 s"):
         unwrap(log, np.array([False, False]))
 
