@@ -287,7 +287,7 @@ def test_what_is_in_the_file_is_examined(ur5, tmp_path):
         assert (read.q_ref is None) == (needed == "torque")
     half = dict(list(table.items())[:9])  # two joints have a command, none a torque
     write_columns(half, tmp_path / "half.parquet")
-    with pytest.raises(DataError, match=r"commanded positions, but none of elbow_joint, wrist_1"):
+    with pytest.raises(DataError, match=r"no commanded positions of elbow_joint, wrist_1"):
         read_log(tmp_path / "half.parquet", log.joints, needs="any")
     with pytest.raises(DataError, match="has no torque"):
         check_logs(ur5, replace(log, q_ref=None))

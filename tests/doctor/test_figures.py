@@ -101,7 +101,7 @@ def test_impossible_inertias_are_told_with_their_moments():
     assert broken.evidence == pytest.approx(
         {"smallest": 1.0, "middle": 2.5, "largest": 4.0, "triangle": -0.5}
     )
-    assert "the two smaller ones add up to 3.5, wanted more than 4" in broken.message
+    assert "the sum of the two smaller ones is 3.5, wanted more than 4" in broken.message
     [negative] = found(1.0, 2.0, 0.0, 1.0, 0.0, 2.5)  # -1, 2.5, 3
     assert "moments of inertia -1, 2.5, 3 kg m^2 are not all positive" in negative.message
     assert "(-1 is not)" in negative.message

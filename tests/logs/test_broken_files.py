@@ -129,7 +129,7 @@ def test_values_whose_squares_overflow_are_refused(tmp_path, column):
     table = {"time": T.copy(), "q_a": Q.copy(), "dq_a": Q.copy(), "tau_a": Q.copy()}
     table[column][-1] = 1e308
     np.savez(tmp_path / "run.npz", **table)
-    refused(tmp_path / "run.npz", f"{column} is 1e.308, beyond any robot's, at row 19")
+    refused(tmp_path / "run.npz", f"{column} is 1e.308, which is implausibly large, at row 19")
 
 
 def test_a_pipe_a_device_and_a_folder_are_no_log(tmp_path):
@@ -173,7 +173,7 @@ def test_a_few_rows_have_no_lag_and_no_trajectory(rows, tmp_path):
     log = log_of(T[:rows], Q[:rows])
     assert velocity_lag(log) == 0.0
     write_log(log, tmp_path / "run.csv")
-    with pytest.raises(DataError, match="none of its 1 uninterrupted segments is long enough"):
+    with pytest.raises(DataError, match="none of its 1 segments without gaps is long enough"):
         process(read_log(tmp_path / "run.csv", ["a"]), SignalSettings())
 
 

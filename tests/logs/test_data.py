@@ -126,12 +126,12 @@ def test_shapes_that_do_not_fit_are_refused():
 
 
 def test_fewer_than_two_rows_are_refused():
-    with refused("log has 1 rows, wanted at least 2"):
+    with refused("log has 1 rows, wanted at least 2; record longer"):
         Log(t=[0.0], q=[[0.0]], tau=[[0.0]], joints=("elbow",))
 
 
 def test_joints_are_names_each_once():
-    with refused("run3.csv: joints elbow are named twice; name each joint once"):
+    with refused("run3.csv: joints contains elbow twice; name each joint once"):
         make_log(joints=("elbow", "elbow"))
     with refused("run3.csv: joints is 'ab', wanted at least one name in a tuple"):
         make_log(joints="ab")
@@ -323,8 +323,8 @@ def test_velocity_in_degrees_is_suspected():
     with refused(
         "run3.csv: dq_shoulder is 57.3 times d(q)/dt: the velocity looks like degrees, the other "
         "like radians. Convert one of them in the recording. To read the values without "
-        'conversion, state units angle = "rad" (job file table [units], CLI --angle-unit rad, Python '
-        'units=LogUnits(angle="rad"))'
+        'conversion, state units angle = "rad" (job file table [units], CLI --angle-unit rad, '
+        'Python units=LogUnits(angle="rad"))'
     ):
         check_units(log, LogUnits())
     check_units(log, LogUnits(angle="rad"))

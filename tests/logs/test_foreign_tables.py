@@ -223,7 +223,8 @@ def test_names_that_differ_in_case_alone_are_to_be_renamed(ur5, rng):
     said = str(refusal.value)
     assert said.startswith(
         "log has the joints SHOULDER_PAN_JOINT, SHOULDER_LIFT_JOINT, which are "
-        "shoulder_pan_joint, shoulder_lift_joint in the model; rename them: dataclasses.replace(log, joints="
+        "shoulder_pan_joint, shoulder_lift_joint in the model; rename them: "
+        "dataclasses.replace(log, joints="
     )
     renamed = eval(said.rpartition("rename them: ")[2], {"dataclasses": dataclasses, "log": other})
     (back,) = read_logs(renamed, ur5.joints)

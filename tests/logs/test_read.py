@@ -197,7 +197,7 @@ def test_columns_must_name_what_is_read(run):
     with pytest.raises(DataError) as caught:
         read_log(path, JOINTS, columns={"tau_elbow": "tau_elbo"})
     assert str(caught.value).startswith(
-        f"{path.name} has no column 'tau_elbo', which columns gives for 'tau_elbow'; columns found:"
+        f"{path.name} has no column 'tau_elbo', which is stated for 'tau_elbow' in columns; columns"
     )
     assert str(caught.value).endswith("Did you mean 'tau_elbow'?")
 
@@ -400,7 +400,7 @@ def test_parquet_columns_that_are_no_numbers_are_refused(tmp_path):
 
 def test_fewer_than_two_rows_are_refused(run):
     path = run({"t": [0.0], "q_a": [0.0], "tau_a": [0.0]})
-    with refused(f"{path.name} has 1 rows, wanted at least 2"):
+    with refused(f"{path.name} has 1 rows, wanted at least 2; record longer"):
         read_log(path, ["a"])
 
 

@@ -203,7 +203,7 @@ def test_a_log_without_velocity_cannot_use_it():
 
 
 def test_a_log_too_short_for_its_trim_is_refused():
-    with pytest.raises(DataError, match="none of its 1 uninterrupted segments is long enough"):
+    with pytest.raises(DataError, match="none of its 1 segments without gaps is long enough"):
         process(sine_log(np.arange(0, 0.3, 0.01)), SignalSettings(trim=0.2))
 
 
