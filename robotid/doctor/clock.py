@@ -57,26 +57,30 @@ def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterato
     # a prismatic joint that moves by a millimetre is at rest, too
     yield from _standstill(log, motion.t[(np.abs(motion.v) > _STILL).any(axis=1)])
     for j, joint in enumerate(log.joints):
-        reach = float(np.ptp(motion.q[:, j]))
+        extent = float(np.ptp(motion.q[:, j]))
         share = float(np.mean(speed[:, j] > _STILL))
-        if reach < _STATIC:
+        if extent < _STATIC:
             code, severity = "static_joint", "warning"
             message = (
-                f"{joint} is at rest (range {reach:.2g}): this log does not determine its friction "
-                "and inertia, nor most parameters of the links that it carries; move it, or lock it"
+                f"{joint} is at rest (range {extent:.2g}): this log does not determine its "
+                "friction and inertia, nor most parameters of the links that it carries; move it, "
+                "or lock it"
             )
         elif (
-            reach < (_HARDLY_PRISMATIC if joint in layout.prismatic else _HARDLY) or share < _MOVING
+            extent < (_HARDLY_PRISMATIC if joint in layout.prismatic else _HARDLY)
+            or share < _MOVING
         ):
             code, severity = "hardly_moves", "note"
             message = (
-                f"{joint} hardly moves (range {reach:.2g}, moving {100 * share:.2g} % of the "
+                f"{joint} hardly moves (range {extent:.2g}, moving {100 * share:.2g} % of the "
                 "time): parameters that only this joint excites are poorly determined; move it "
                 "farther and longer"
             )
         else:
             continue
-        yield log_finding(log.name, code, severity, message, joint, range=reach, moving_share=share)
+        yield log_finding(
+            log.name, code, severity, message, joint, range=extent, moving_share=share
+        )
 
 
 def runs_of(flags: Array) -> list[tuple[int, int]]:

@@ -21,7 +21,7 @@ _EXCUSED = 0.3  # ... and the largest with a load, at which the sign may still b
 _MUCH_BETTER = 12.0  # ratio of unexplained shares from which the other sign is right nevertheless
 _NOISE = 3e-3  # share of a torque's variance that is negligible
 _TILT = 5.0  # [deg] angle of gravity from the stated one that is a warning
-_TURNED = 30.0  # [deg] ... and an error
+_WRONG_TILT = 30.0  # [deg] ... and an error
 _HINT = 0.7  # gain from which a tilt is reported
 _UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported
 
@@ -175,8 +175,8 @@ def _gravity(reading: _Reading) -> Iterator[Finding]:
         return
     cosine = float(g @ believed) / (float(np.linalg.norm(g)) * size) if size > 0 else 0.0
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    turned = angle > _TURNED and reading.is_certain
-    if not turned and (angle < _TILT or gain < _HINT):
+    is_wrong = angle > _WRONG_TILT and reading.is_certain
+    if not is_wrong and (angle < _TILT or gain < _HINT):
         return
     shown, stated = (", ".join(f"{x:.2f}" for x in vector) for vector in (g, believed))
     message = (
@@ -185,7 +185,7 @@ def _gravity(reading: _Reading) -> Iterator[Finding]:
         f"state gravity = [{shown}] in the job file"
     )
     evidence = {"angle_deg": angle, "x": g[0], "y": g[1], "z": g[2], "gain": gain}
-    severity = "error" if turned else "warning"
+    severity = "error" if is_wrong else "warning"
     yield log_finding(reading.log, "gravity", severity, message, **evidence)
 
 

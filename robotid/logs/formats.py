@@ -94,8 +94,8 @@ def write_columns(table: Mapping[str, Array], path: Path) -> None:
         OSError: If the folder cannot be written to.
     """
     form = _WRITTEN[check_suffix(path)]
-    with written_whole(path) as beside:
-        form.write(table, beside)
+    with written_whole(path) as temporary:
+        form.write(table, temporary)
 
 
 def check_suffix(path: Path, what: str = "logs", *, also: Sequence[str] = ()) -> str:

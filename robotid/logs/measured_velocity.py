@@ -174,7 +174,7 @@ def _measured(log: Log) -> Array:
 
 
 def _means(steps: Array, length: int) -> Array:
-    """Return the means over each segment of so many consecutive rows."""
+    """Return the means over each segment of ``length`` consecutive rows."""
     total = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
     means: Array = (total[length:] - total[:-length]) / length
     return means

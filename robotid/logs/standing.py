@@ -44,19 +44,19 @@ def standing_motion(
     # the slope of a short block is noise: it is reduced with the duration
     length = log.t[first + count - 1] - log.t[first]
     v = v * np.minimum(1.0, 2 * length / _LENGTH)[:, None]
-    beside = np.diff(segment) == 0
+    is_adjacent = np.diff(segment) == 0
     change = np.zeros_like(v)
-    steps = np.abs(np.diff(v, axis=0)) / np.diff(t)[:, None] * beside[:, None]
+    steps = np.abs(np.diff(v, axis=0)) / np.diff(t)[:, None] * is_adjacent[:, None]
     np.maximum(change[1:], steps, out=change[1:])
     np.maximum(change[:-1], steps, out=change[:-1])
     slow = np.all((np.abs(v) <= fastest) & (change <= hardest), axis=1)
     signs = np.where(np.abs(v) < least, 0.0, np.sign(v))
     still = slow & ~signs.any(axis=1)
     # next to a block of another sign, a joint may have reversed within this block
-    is_reversal = (np.diff(signs, axis=0) != 0) & beside[:, None]
+    is_reversal = (np.diff(signs, axis=0) != 0) & is_adjacent[:, None]
     v[1:][is_reversal] = v[:-1][is_reversal] = 0.0
-    alike = (np.abs(np.diff(q, axis=0)) < least * np.diff(t)[:, None]).all(axis=1)
-    joined = np.append(False, still[1:] & still[:-1] & beside & alike)[slow]
+    is_same_pose = (np.abs(np.diff(q, axis=0)) < least * np.diff(t)[:, None]).all(axis=1)
+    joined = np.append(False, still[1:] & still[:-1] & is_adjacent & is_same_pose)[slow]
     starts, weight = np.flatnonzero(~joined), count[slow]
     total = np.add.reduceat(weight, starts) if len(starts) else weight
     t, q, tau = (
