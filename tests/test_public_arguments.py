@@ -53,13 +53,13 @@ def test_a_masked_value_is_no_value(log, column):
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        ({"tau": None}, "tau is None, wanted an array; without torques, give zeros and has_torque"),
+        ({"tau": None}, "tau is None, wanted an array; without torques, pass zeros and has_torque"),
         ({"q": None}, "q is None, wanted an array"),
-        ({"q": "x"}, "q is no array of real numbers"),
-        ({"q": [[1.0, 2.0], [3.0]]}, "wanted one of floats, with rows of equal length"),
-        ({"q": np.full((60, 2), 1j)}, "q is no array of real numbers .numbers of kind 'c'"),
+        ({"q": "x"}, "q is not an array of real numbers"),
+        ({"q": [[1.0, 2.0], [3.0]]}, "wanted an array of floats with rows of equal length"),
+        ({"q": np.full((60, 2), 1j)}, "q is not an array of real numbers .numbers of kind 'c'"),
         ({"joints": 5}, "joints is 5, wanted at least one name in a tuple"),
-        ({"t": 10**400}, "t is no array of real numbers"),
+        ({"t": 10**400}, "t is not an array of real numbers"),
         ({"joints": (1, 2)}, "wanted at least one name in a tuple"),
         ({"joints": {"joint_1": 0, "joint_2": 1}}, "wanted at least one name in a tuple"),
     ],
@@ -170,11 +170,11 @@ def found(model, log):
 
 
 CALLS_OF_A_RESULT = {
-    "q is no array of real numbers": lambda found, q: found.predict("x"),
-    "v is no array of real numbers": lambda found, q: found.predict(q, 1j * q),
-    "a is no array of real numbers": lambda found, q: found.predict(q, q, 10**400),
+    "q is not an array of real numbers": lambda found, q: found.predict("x"),
+    "v is not an array of real numbers": lambda found, q: found.predict(q, 1j * q),
+    "a is not an array of real numbers": lambda found, q: found.predict(q, q, 10**400),
     "joint is 5, a int, wanted the name of a joint": lambda found, q: found.friction(5),
-    "v is no array of real": lambda found, q: found.friction("joint_1", "x"),
+    "v is not an array of real": lambda found, q: found.friction("joint_1", "x"),
     "v has shape (3, 2), wanted finite speeds": lambda found, q: found.friction("joint_1", q),
     "q is 'x', wanted a finite number": lambda found, q: found.friction("joint_1", q="x"),
     "load is 'nan', wanted a finite": lambda found, q: found.friction("joint_1", load=np.nan),
@@ -226,7 +226,7 @@ def test_a_path_that_no_file_system_takes_is_refused(model, log, path):
         (0.0, None, [0, 0], "q is None, wanted an array"),
         (0.0, [0, 0, 0], [0], r"q has shape \(3,\) and tau \(1,\), wanted \(2,\) each"),
         (0.0, [0, 0], [0, 0, 0], r"q has shape \(2,\) and tau \(3,\), wanted \(2,\) each"),
-        (0.0, [0, 0], ["x", 0], "tau is no array of real numbers"),
+        (0.0, [0, 0], ["x", 0], "tau is not an array of real numbers"),
         (0.0, [0, 0], [np.nan, 0], "is not finite, so it was refused"),
     ],
 )

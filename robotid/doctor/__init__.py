@@ -1,3 +1,3 @@
-"""What is wrong with logs, or with a URDF."""
+"""Checks of logs and of URDF files for faults."""
 
 __all__: list[str] = []

@@ -1,4 +1,4 @@
-"""What each channel of a log shows of its sensor: steps, limits, spikes, noise, lag; no model."""
+"""Checks of each channel of a log without a model: quantisation, spikes, noise, velocity lag."""
 
 from collections.abc import Iterator
 
@@ -9,7 +9,7 @@ from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Log
 from robotid.logs.measured_velocity import (
     COARSE,
-    LATE,
+    LARGEST_LAG,
     quantum,
     unlike_velocities,
     velocity_lags,
@@ -18,37 +18,38 @@ from robotid.logs.settings import SignalSettings
 
 __all__ = ["check_channels"]
 
-_SPIKE = 15.0  # a row this many times farther off its neighbours than typical is a spike
-_BEYOND = 1.5  # ... if it is also farther off than this many times what the channel ever is
-_RESTING = 3.0  # within so many times its noise a channel stays at a value
-_LEAST = {"q": 1e-3, "dq": 0.02}  # [rad or m, rad/s or m/s] less than this is at rest
-_LEAST_TORQUE = 0.01  # of the median joint's torque that is as good as none
-_ABSURD = 5.0  # a spike this many times what the channel ever is cannot be motion
+_SPIKE = 15.0  # smallest distance of a spike from its neighbours, over the typical distance
+_BEYOND = 1.5  # ... and over the amplitude of the channel
+_RESTING = 3.0  # [standard deviations of the noise] within which a channel is constant
+_LEAST = {"q": 1e-3, "dq": 0.02}  # [rad or m, rad/s or m/s] smaller values: at rest
+_LEAST_TORQUE = 0.01  # share of the median joint's torque below which a torque is negligible
+_ABSURD = 5.0  # spike over the amplitude of the channel, above which it cannot be motion
 _HARM = 0.02  # share of a channel's energy in its spikes that ruins a least-squares fit
-_NOISY = 0.3  # noise over signal from which a torque tells little
+_NOISY = 0.3  # noise over signal from which a torque is uninformative
 _LAG = 0.002  # [s] a shorter lag is not reported
-_ALIKE = 0.8  # correlation of a velocity with the derivative of its position
-_SCALE = 1.1  # a velocity that is this many times d(q)/dt, or its inverse, is in another unit
-_DEAD = 1e-3  # a velocity that moves by less than this share of d(q)/dt does not move
+_ALIKE = 0.8  # least correlation of a velocity with the derivative of its position
+_SCALE = 1.1  # velocity over d(q)/dt, or the inverse, from which the unit differs
+_DEAD = 1e-3  # velocity over d(q)/dt below which the channel is constant
 
 
 def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
-    """Yield what the channels of a log show of their sensors.
+    """Yield the findings on the sensors behind the channels of a log.
 
     Args:
         log: The log.
-        signals: Where velocities come from, and the delay of measured ones that is corrected.
+        signals: Source of the velocities, and the delay of measured ones that is corrected.
 
     Yields:
         "quantised" per kind of channel: a warning for torques of few steps, and for velocities of
-        few steps unless they are differentiated, else a note; "spikes" per channel: an error where
-        they are absurd and strong enough to ruin a fit; notes "noise" per kind of channel and
-        "noisy_torque" where noise prevails; of measured velocities an error "velocity_order" for
-        each that is the derivative of another joint's position, "velocity_mismatch" for each other
-        one that is not that of its own: an error where they are used, a warning where "auto"
-        leaves them out, else a note; at most one "velocity_delay", with the scatter over the
-        joints as its uncertainty, and "velocity_scale" per joint: an error where they are used,
-        else a note.
+        few steps unless they are differentiated; else a note.
+        "spikes" per channel: an error if they are absurd and large enough to ruin a fit.
+        "noise" per kind of channel and "noisy_torque" per joint: notes.
+        "velocity_order" per joint: an error if a measured velocity is the derivative of another
+        joint's position.
+        "velocity_mismatch" for each other measured velocity that is not the derivative of its own
+        position: an error if it is used, a warning if "auto" rejects it, else a note.
+        "velocity_delay", at most one, with the scatter over the joints as its uncertainty.
+        "velocity_scale" per joint: an error if the velocity is used, else a note.
     """
     channels = dict(_channels(log))
     noise = {kind: _white_noise(log.t, values) for kind, values in channels.items()}
@@ -70,7 +71,7 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
 
 
 def _quantisation(log: Log, kind: str, values: Array, velocity: str) -> Iterator[Finding]:
-    """Yield the joints whose channel moves in steps: those of few steps, and the others."""
+    """Yield the joints with a quantised channel: those of few steps, and the others."""
     is_used = kind == "tau" or (kind == "dq" and velocity != "differentiated")
     steps = np.array([quantum(x) for x in values.T])
     count = np.ptp(values, axis=0) / np.where(steps > 0, steps, 1.0)
@@ -80,53 +81,53 @@ def _quantisation(log: Log, kind: str, values: Array, velocity: str) -> Iterator
             continue
         names = [log.joints[j] for j in chosen]
         evidence = {f"steps_{log.joints[j]}": count[j] for j in chosen}
-        todo = "it is uninformative: scale or log it finer" if few else "log more digits"
+        todo = "its resolution is too low: log it with more digits" if few else "log more digits"
         if few and kind == "dq":
             todo += ", or set velocity = 'differentiated'; 'auto' differentiates the position"
         message = (
-            f"{kind} of {listed(names)} moves in steps of {steps[chosen].max():.3g}, "
-            f"{count[chosen].min():.0f} of them over its range; {todo}"
+            f"{kind} of {listed(names)} is quantised in steps of {steps[chosen].max():.3g}, "
+            f"{count[chosen].min():.0f} steps over its range; {todo}"
         )
         severity = "warning" if few and is_used else "note"
         yield log_finding(log.name, "quantised", severity, message, kind, **evidence)
 
 
 def _spikes(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding]:
-    """Yield rows that jump away from both neighbours."""
+    """Yield rows that differ strongly from both neighbours."""
     smooth = _without_spikes(values)
-    reaches = [_reach(*own) for own in zip(values.T, smooth.T, noise, strict=True)]
-    least = _LEAST.get(kind, _LEAST_TORQUE * float(np.median(reaches)))
+    amplitudes = [_amplitude(*own) for own in zip(values.T, smooth.T, noise, strict=True)]
+    least = _LEAST.get(kind, _LEAST_TORQUE * float(np.median(amplitudes)))
     for j, (joint, x) in enumerate(zip(log.joints, values.T, strict=True)):
-        reach = max(reaches[j], least)
-        rows, height = _jumps(x - smooth[:, j], noise[j], reach)
+        amplitude = max(amplitudes[j], least)
+        rows, height = _jumps(x - smooth[:, j], noise[j], amplitude)
         if len(rows) == 0:
             continue
         largest, first = np.abs(height).max(), log.t[rows[0]]
         energy = np.sum(height**2) / np.sum((x - np.median(x)) ** 2)
         message = (
-            f"{kind} of {joint} jumps by up to {largest:.4g} for {len(rows)} rows, the first at "
-            f"t = {first:.6g} s; remove these rows from the recording"
+            f"{kind} of {joint} has spikes of up to {largest:.4g} in {len(rows)} rows, the first "
+            f"at t = {first:.6g} s; remove these rows from the recording"
         )
-        severity = "error" if largest > _ABSURD * reach and energy > _HARM else "note"
+        severity = "error" if largest > _ABSURD * amplitude and energy > _HARM else "note"
         evidence = {"rows": len(rows), "largest": largest, "energy_share": energy, "first": first}
         yield log_finding(log.name, "spikes", severity, message, f"{kind}_{joint}", **evidence)
 
 
 def _noise(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding]:
-    """Yield the noise level of a kind of channel, and torques in which it prevails."""
+    """Yield the noise level of a kind of channel, and the torques with too much noise."""
     size = values.std(axis=0)
     share = np.divide(noise, size, out=np.zeros_like(noise), where=size > 0)
     message = (
-        f"white noise of {kind} {', '.join(f'{level:.2g}' for level in noise)} (standard deviation "
-        "per joint, in the channel's unit); nothing needs doing"
+        f"white noise of {kind}: {', '.join(f'{level:.2g}' for level in noise)} (standard "
+        "deviation per joint, in the channel's unit); no action needed"
     )
     evidence = dict(zip(log.joints, noise.tolist(), strict=True))
     yield log_finding(log.name, "noise", "note", message, kind, **evidence)
     for j in np.flatnonzero(share > _NOISY) if kind == "tau" else ():
         joint = log.joints[j]
         message = (
-            f"the torque of {joint} is {100 * share[j]:.0f} % noise; record longer, faster, or "
-            "with a lower cutoff"
+            f"noise is {100 * share[j]:.0f} % of the torque signal of {joint}; record a longer or "
+            "faster motion, or lower the cutoff"
         )
         yield log_finding(log.name, "noisy_torque", "note", message, joint, share=share[j])
 
@@ -140,24 +141,25 @@ def _velocity_order(log: Log, alike: Array) -> Iterator[Finding]:
             continue
         message = (
             f"dq_{log.joints[k]} is d(q)/dt of q_{joint} (correlation {found:.2f}; with dq_{joint} "
-            f"{own:.2f}): position or velocity columns are in another order; name them rightly"
+            f"{own:.2f}): the position or the velocity columns are in the wrong order; correct "
+            "their names"
         )
         evidence = {"correlation": found, "own_correlation": own}
         yield log_finding(log.name, "velocity_order", "error", message, joint, **evidence)
 
 
 def _unlike_velocity(log: Log, velocity: str) -> Iterator[Finding]:
-    """Yield measured velocities that are not those of their positions, however late."""
+    """Yield measured velocities that are not the derivatives of their positions at any delay."""
     severity = {"measured": "error", "auto": "warning"}.get(velocity, "note")
     todo = (
-        "velocity = 'auto' differentiates every position instead"
+        "or leave velocity = 'auto', which differentiates every position instead"
         if velocity == "auto"
-        else "set [signals] velocity = 'differentiated' (--velocity differentiated)"
+        else "or set [signals] velocity = 'differentiated' (--velocity differentiated)"
     )
     for joint, alike in unlike_velocities(log).items():
         message = (
             f"dq_{joint} is not d(q)/dt of q_{joint} (correlation {alike:.2f} at any lag up to "
-            f"0.3 s): the channel holds noise or another quantity; correct it, {todo}"
+            f"0.3 s): the channel contains noise or another quantity; correct it, {todo}"
         )
         yield log_finding(
             log.name, "velocity_mismatch", severity, message, f"dq_{joint}", correlation=alike
@@ -165,7 +167,12 @@ def _unlike_velocity(log: Log, velocity: str) -> Iterator[Finding]:
 
 
 def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
-    """Yield how late the measured velocity is against the position, beyond what is stated [s]."""
+    """Yield the delay of the measured velocity relative to the position, beyond the stated one.
+
+    Args:
+        log: The log.
+        stated: The delay that the settings correct [s].
+    """
     common, single = velocity_lags(log)
     lag, used = common - stated, single[single != 0.0] - stated
     scatter = float(np.median(np.abs(used - lag))) * 1.48 if len(used) else 0.0
@@ -173,15 +180,15 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     error = max(scatter / np.sqrt(max(len(used), 1)), 0.02 * step)
     if abs(lag) < max(_LAG, 3 * error, 0.1 * step):
         return
-    is_delayed = abs(lag) >= LATE
+    is_delayed = abs(lag) >= LARGEST_LAG
     what = (
-        "velocity = 'auto' takes it only if it predicts torque as well as the differentiated one"
+        "velocity = 'auto' uses it only if it predicts torque as well as the differentiated one"
         if is_delayed
-        else "if the torque is as late, keep velocity = 'measured'; else differentiate"
+        else "use velocity = 'measured' if the torque has the same delay, else 'differentiated'"
     )
     message = (
-        f"the measured velocity is {1e3 * lag:.1f} +- {1e3 * error:.1f} ms late against d(q)/dt; "
-        f"{what}, or state [signals] velocity_delay = {lag + stated:z.4f}"
+        f"the measured velocity has a delay of {1e3 * lag:.1f} +- {1e3 * error:.1f} ms relative "
+        f"to d(q)/dt; {what}, or set [signals] velocity_delay = {lag + stated:z.4f}"
     )
     severity = "warning" if is_delayed else "note"
     yield log_finding(log.name, "velocity_delay", severity, message, delay=lag, std_error=error)
@@ -190,10 +197,10 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
 def _velocity_scale(
     log: Log, slope: Array, v: Array, alike: Array, velocity: str
 ) -> Iterator[Finding]:
-    """Yield measured velocities that are a multiple of d(q)/dt, or none.
+    """Yield measured velocities that are a multiple of d(q)/dt, or constant.
 
-    The factor lies between the regression of one on the other and the inverse of the regression
-    of the other on the one, whatever the noise of both.
+    The factor lies between the slope of the regression of v on d(q)/dt and the inverse of the
+    slope of the regression of d(q)/dt on v, for any noise in the two.
     """
     slope, v = slope - slope.mean(axis=0), v - v.mean(axis=0)
     for j, joint in enumerate(log.joints):
@@ -204,11 +211,11 @@ def _velocity_scale(
         if not is_dead and not (is_alike and (ab / a > _SCALE or b / ab < 1 / _SCALE)):
             continue
         factor = 0.0 if is_dead else float(np.sqrt(b / a))
-        what = "hardly changes while the position moves" if is_dead else "is in another unit"
+        what = "hardly changes while the position moves" if is_dead else "has another unit"
         message = (
-            f"dq_{joint} is {factor:.3g} times d(q)/dt of q_{joint}: the measured velocity {what}, "
-            "and every friction and inertia with it; correct the column, or set [signals] velocity "
-            "= 'differentiated'"
+            f"dq_{joint} is {factor:.3g} times d(q)/dt of q_{joint}: the measured velocity {what}. "
+            "Friction and inertia identified with it are wrong; correct the column, or set "
+            "[signals] velocity = 'differentiated'"
         )
         is_used = {"differentiated": "note", "auto": "error" if log.has_torque else "warning"}
         severity = is_used.get(velocity, "error")
@@ -218,13 +225,13 @@ def _velocity_scale(
 def _slopes(log: Log, velocity: Array) -> tuple[Array, Array]:
     """Return d(q)/dt and the measured velocity, shape (m, n) each, without gaps."""
     step = np.diff(log.t)[:, None]
-    usual = (step < 5 * np.median(step))[:, 0]
+    is_regular = (step < 5 * np.median(step))[:, 0]
     every = max(1, len(step) // 20000)
     slope, v = (
         np.diff(np.unwrap(log.q, axis=0), axis=0) / step,
         0.5 * (velocity[1:] + velocity[:-1]),
     )
-    return slope[usual][::every], v[usual][::every]
+    return slope[is_regular][::every], v[is_regular][::every]
 
 
 def _channels(log: Log) -> Iterator[tuple[str, Array]]:
@@ -233,30 +240,30 @@ def _channels(log: Log) -> Iterator[tuple[str, Array]]:
             yield kind, values
 
 
-def _jumps(off: Array, noise: float, reach: float) -> tuple[Array, Array]:
-    """Return the rows that jump away from their neighbours, and how far."""
-    usual = max(1.48 * float(np.median(np.abs(off))), noise)
-    rows = np.flatnonzero(np.abs(off) > max(_SPIKE * usual, _BEYOND * reach))
-    return rows, off[rows]
+def _jumps(deviation: Array, noise: float, amplitude: float) -> tuple[Array, Array]:
+    """Return the rows that differ strongly from their neighbours, and their deviations."""
+    typical = max(1.48 * float(np.median(np.abs(deviation))), noise)
+    rows = np.flatnonzero(np.abs(deviation) > max(_SPIKE * typical, _BEYOND * amplitude))
+    return rows, deviation[rows]
 
 
-def _reach(x: Array, smooth: Array, noise: float) -> float:
-    """Return how far a channel goes from its typical value, spikes apart.
+def _amplitude(x: Array, smooth: Array, noise: float) -> float:
+    """Return the 99.5 % quantile of the distance of a channel from its median, without spikes.
 
-    A joint that rests most of the log is judged by the rest of it.
+    Of a joint that is at rest in most of the log, only the rows in which it moves count.
     """
-    usual = np.median(x)
-    away = np.abs(smooth - usual)
+    median = np.median(x)
+    away = np.abs(smooth - median)
     away = away[away > _RESTING * noise]
-    ever = np.abs(x - usual)
-    return max(float(np.quantile(part, 0.995)) for part in (ever, away) if len(part))
+    distance = np.abs(x - median)
+    return max(float(np.quantile(part, 0.995)) for part in (distance, away) if len(part))
 
 
 def _without_spikes(x: Array) -> Array:
-    """Return the median of each row and the two before and after it, shape (N, n)."""
+    """Return the running median over five rows, shape (N, n)."""
     padded = np.pad(x, ((2, 2), (0, 0)), mode="edge")
     a, b, c, d, e = (padded[k : len(x) + k] for k in range(5))
-    # the median of five is that of e and of the middle two of the others
+    # the median of five is the median of e and of the middle two of the others
     low = np.maximum(np.minimum(a, b), np.minimum(c, d))
     high = np.minimum(np.maximum(a, b), np.maximum(c, d))
     middle: Array = np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e))
@@ -264,14 +271,14 @@ def _without_spikes(x: Array) -> Array:
 
 
 def _white_noise(t: Array, values: Array) -> Array:
-    """Return the white noise of smooth signals, from their third divided differences, (n,)."""
+    """Return the white noise of signals from their third divided differences, shape (n,)."""
     if len(t) < 10:
         return np.zeros(values.shape[1])
     step = float(np.median(np.diff(t)))
     times = np.array([t[k : len(t) - 3 + k] for k in range(4)]) / step
-    apart = times[:, None] - times[None]  # (4, 4, N - 3)
-    apart[range(4), range(4)] = 1.0
-    weight = 1 / apart.prod(axis=1)
+    distance = times[:, None] - times[None]  # (4, 4, N - 3)
+    distance[range(4), range(4)] = 1.0
+    weight = 1 / distance.prod(axis=1)
     size = np.sqrt(np.einsum("kn,kn->n", weight, weight))
     weight /= size
     differences = sum(w[:, None] * values[k : len(t) - 3 + k] for k, w in enumerate(weight))

@@ -1,7 +1,7 @@
-"""The doctor: what is wrong with logs, or with the URDF for them, before anything is identified.
+"""The doctor: finds faults of logs, and of the URDF for these logs, before an identification.
 
-Findings never change data. An error is what would give a wrong answer; it stops an identification
-unless its code is ignored.
+Findings never change data. An error is a fault that makes the result wrong; it stops an
+identification unless its code is ignored.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["CODES", "check_logs", "diagnose", "findings_to_dict"]
 
-#: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
+#: Codes of the doctor's errors, which can be ignored.
 CODES = (
     "gravity", "gravity_compensated", "joint_axis", "joint_order", "delayed_command",
     "locked_position", "position_offset", "position_order", "position_sign", "spikes",
@@ -45,20 +45,20 @@ def check_logs(
     validation: Readable | Sequence[Readable] = (),
     signals: SignalSettings | None = None,
 ) -> tuple[Finding, ...]:
-    """Ask the doctor what is wrong with logs, before anything is identified from them.
+    """Check logs for faults before an identification.
 
     Args:
         model: The robot.
         logs: Logs to fit, one or several: of the model's joints in its order, or paths or
-            DataFrames that hold them.
-        validation: Validation Logs, likewise.
+            DataFrames with their columns.
+        validation: Validation logs, likewise.
         signals: How logs become trajectories; the defaults if None.
 
     Returns:
-        The findings, errors first: each with a code, a severity, where, and what to do.
+        The findings, errors first. Each has a code, a severity, a place and a message.
 
     Raises:
-        DataError: If a file or a DataFrame does not hold a log.
+        DataError: If a file or a DataFrame is no log.
         SettingsError: If a setting does not fit a log.
     """
     require_kind(model, RobotModel, "model", "a robotid.RobotModel")
@@ -71,14 +71,14 @@ def check_logs(
 
 
 def diagnose(
-    model: RobotModel, fitted: Sequence[Log], kept: Sequence[Log], signals: SignalSettings
+    model: RobotModel, fitted: Sequence[Log], validation: Sequence[Log], signals: SignalSettings
 ) -> tuple[Finding, ...]:
-    """Examine logs that were read, as ``check_logs`` does.
+    """Check logs that are in memory, as ``check_logs`` does.
 
     Args:
         model: The robot.
         fitted: Logs to fit, of the model's joints in its order.
-        kept: Validation Logs to validate with.
+        validation: Validation logs.
         signals: How the logs become trajectories.
 
     Returns:
@@ -87,15 +87,15 @@ def diagnose(
     Raises:
         SettingsError: If a setting does not fit a log.
     """
-    model = model.with_terms({})  # what a joint's own friction remembers is no log's fault
+    model = model.with_terms({})  # friction with an internal state is not examined here
     findings: list[Finding] = []
-    motions = [_examine_log(model, log, signals, findings) for log in (*fitted, *kept)]
+    motions = [_examine_log(model, log, signals, findings) for log in (*fitted, *validation)]
     first = [motion for motion, _ in motions[: len(fitted)] if motion is not None]
     probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
     mapping = structural_mapping(model) if probes else None
     moving = [probe.motion for probe in probes]
     segments = Segments(model, mapping, moving, signals.min_velocity) if mapping else None
-    for log, (motion, probe) in zip(kept, motions[len(fitted) :], strict=True):
+    for log, (motion, probe) in zip(validation, motions[len(fitted) :], strict=True):
         if motion is not None:
             findings += check_repeated_motion(first, motion, log.name)
         if probe is not None and segments is not None:
@@ -127,20 +127,20 @@ def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:
 def _examine_log(
     model: RobotModel, log: Log, signals: SignalSettings, findings: list[Finding]
 ) -> tuple[Trajectory | None, Probe | None]:
-    """Add the findings on one log; return its smooth motion and a probe of it, if there are."""
+    """Add the findings on one log; return its smooth motion and a probe of it, or None."""
     name = log.name
     findings += [log_finding(name, "log_note", "note", note) for note in log.notes]
-    if not model.is_static:  # the rows of poses may be apart
+    if not model.is_static:  # rows of static poses may have gaps between them
         findings += [*check_clock(log), *check_channels(log, signals)]
     findings += check_commands(log)
     sizes = list(check_torque_channels(log)) if log.has_torque else []
     findings += sizes
     if model.free_flyer:
-        message = "torques of a robot with a floating base are not judged"
+        message = "the torques of a robot with a floating base are not checked"
         findings.append(log_finding(name, "floating_base", "note", message))
         return None, None
     if model.is_static:
-        return None, None  # what follows judges by accelerations
+        return None, None  # the other checks need accelerations
     try:
         motion = smooth_motion(model, log, signals)
     except DataError as error:
@@ -151,11 +151,11 @@ def _examine_log(
         return motion, None
     probe = take_probe(model, motion)
     if probe is None:
-        message = "too little moves to judge torques by; record motion of every joint"
+        message = "the motion is too small to check the torques; record motion of every joint"
         findings.append(log_finding(name, "no_motion", "warning", message))
         return motion, None
     if any(finding.severity == "error" for finding in sizes):
-        return motion, probe  # no physics fits torques without signs
+        return motion, probe  # torques without signs fit no model
     torques = list(check_torques(probe, name))
     findings += torques
     if not any(finding.severity == "error" for finding in torques):

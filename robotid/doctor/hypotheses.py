@@ -1,6 +1,6 @@
-"""How well physics explains each torque, as stated and if something were otherwise.
+"""Tests of how well the model explains each torque, as stated and under other hypotheses.
 
-A joint's torque must be a sum, with factors >= 0, of what each link it carries would load it with
+The torque of a joint must be a sum, with factors >= 0, of the torques of the links that it carries
 by the URDF, of the inertia and the frictions of its drive, and of a constant. Masses may be wrong
 by any factor; signs, columns, gravity and positions may not.
 """
@@ -17,29 +17,29 @@ from robotid.doctor.sample import Probe
 
 __all__ = ["Explanation", "compensated", "explanations", "own_share", "unexplained"]
 
-_FLOOR = 1e-3  # an unexplained share below this is as good as none
-_POOR = 0.08  # a share above this lets other readings of the positions be tried
-_CLEARLY = 2.0  # gain in misfit, a factor 7, over what needs no other position
-_ROWS, _QUARTER = 200, 4  # rows with which these are tried, and how many fewer before
-_OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] that a zero position may be off
+_FLOOR = 1e-3  # an unexplained share below this is negligible
+_POOR = 0.08  # unexplained share from which other readings of the positions are tested
+_CLEARLY = 2.0  # decrease of the misfit, a factor 7, beyond the readings with stated positions
+_ROWS, _QUARTER = 200, 4  # rows of these tests, and the divisor of their number in a first pass
+_OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] errors of a zero position
 _EARTH = 9.81  # [m/s^2]
-_RINGING = 0.05  # of its top, that the filter makes a torque of one sign pass 0
-_TURNS = 8  # of signs and fit
-_FOLDED = 0.4  # share of what is unexplained that may be left to take a torque for a size
-_CONSTANT = 1e-9  # of its size: a torque that varies less does not, but for rounding
+_RINGING = 0.05  # of its largest value, undershoot below 0 by the filter
+_ITERATIONS = 8  # of signs and fit
+_FOLDED = 0.4  # largest ratio of unexplained shares at which a torque is an absolute value
+_CONSTANT = 1e-9  # relative variation of a torque that is rounding
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """What would have to be otherwise, and how well the torques are explained then.
+    """A hypothesis on the log, and how well the torques are explained under it.
 
     Attributes:
         kind: "stated", "payload", "torque_sign", "unsigned_torque", "torque_order", "gravity",
             "joint_order", "joint_axis", "position_order", "position_sign" or "position_offset".
         share: Unexplained share of each torque's variance, shape (n,).
         joints: Indices of the joints concerned.
-        values: "torque_order": which joint each torque column belongs to; "gravity": the vector
-            [m/s^2]; "position_offset": the offset [rad].
+        values: "torque_order": the joint of each torque column; "gravity": the vector [m/s^2];
+            "position_offset": the offset [rad].
     """
 
     kind: str
@@ -54,30 +54,29 @@ class Explanation:
 
 
 def compensated(probe: Probe) -> tuple[Probe, Array]:
-    """Return a motion with the URDF's gravity added to its torques, and what stays unexplained.
+    """Return a motion with the URDF's gravity added to its torques, and its unexplained shares.
 
     Args:
         probe: The motion.
 
     Returns:
-        The motion, and what no physics explains as shares of the variance of the torques as logged,
-        shape (n,).
+        The motion, and the unexplained shares of the variance of the torques as logged, shape (n,).
     """
-    weight = probe.loads() - probe.loads(np.zeros(3))
-    whole = replace(probe, tau=probe.tau + weight.sum(axis=2))
+    gravity = probe.loads() - probe.loads(np.zeros(3))
+    whole = replace(probe, tau=probe.tau + gravity.sum(axis=2))
     size, logged = _variation(whole.tau), _variation(probe.tau)
     return whole, _over(own_share(whole) * size, logged)
 
 
 def unexplained(probe: Probe) -> Array:
-    """Return which share of each torque column no physics of each joint explains.
+    """Return the share of each torque column that the model of each joint does not explain.
 
     Args:
         probe: The motion.
 
     Returns:
-        Shares of variance, shape (n, n, 2): torque column i, physics of joint k, with the column's
-        sign as it is and reversed. 0 for a constant column.
+        Shares of variance, shape (n, n, 2): torque column i, model of joint k, with the stated and
+        the reversed sign of the column. 0 for a constant column.
     """
     N, n = probe.tau.shape
     every = np.hstack([probe.tau, -probe.tau])
@@ -86,13 +85,13 @@ def unexplained(probe: Probe) -> Array:
 
 
 def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanation]]:
-    """Return how the torques are explained as stated, and by each reading that is tried.
+    """Return how well the torques are explained as stated, and under each other hypothesis.
 
     Args:
         probe: The motion.
 
     Returns:
-        The reading as stated; the same with any load on the last link; and others.
+        The stated reading; the same with any load on the last link; and the others.
     """
     share = unexplained(probe)
     own = np.diagonal(share).T  # (n, 2)
@@ -105,17 +104,18 @@ def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanati
 
 
 def _signs(own: Array) -> Explanation:
-    turned = np.flatnonzero(own[:, 1] < own[:, 0])
-    return Explanation("torque_sign", own.min(axis=1), tuple(turned.tolist()))
+    reversed_ = np.flatnonzero(own[:, 1] < own[:, 0])
+    return Explanation("torque_sign", own.min(axis=1), tuple(reversed_.tolist()))
 
 
 def _unsigned(probe: Probe, own: Array) -> Explanation:
-    """Return the torques that are never negative as sizes of torques of either sign.
+    """Return the hypothesis that torques that are never negative are absolute values.
 
-    The signs are those of what physics makes of the signed torque, in turn, from those of the
-    URDF's torque, of the velocity or of the acceleration on. They must explain how the size varies,
-    for a constant one turned with the speed would be all friction; the share that is left counts of
-    the signed torque, for the size of one that is mostly friction hardly varies.
+    The signs are those of the torque predicted from the signed torque, iterated from the signs of
+    the URDF's torque, of the velocity or of the acceleration. The variation of the absolute value
+    must be explained, because a constant value with the sign of the speed looks like friction. The
+    unexplained share refers to the signed torque, because the absolute value of a torque that is
+    mostly friction hardly varies.
     """
     share, joints = own[:, 0].copy(), []
     loads = probe.loads()
@@ -132,12 +132,12 @@ def _unsigned(probe: Probe, own: Array) -> Explanation:
 
 
 def _folded_misfit(X: Array, tau: Array, sign: Array) -> tuple[float, float]:
-    """Return what is unexplained of a torque whose signs are found in turn from a first guess.
+    """Return the unexplained shares of a torque whose signs are iterated from initial ones.
 
     Returns:
-        The share of the variance of the torque as logged, and of that with signs.
+        The share of the variance of the torque as logged, and of the torque with signs.
     """
-    for _ in range(_TURNS):
+    for _ in range(_ITERATIONS):
         sign = np.where(_nonnegative_prediction(X, sign * tau) < 0, -1.0, 1.0)
     signed = sign * tau
     left = float(_misfits(X[None], signed[None, :, None])[0, 0])
@@ -173,12 +173,12 @@ def _gravity(probe: Probe) -> Explanation:
     start = np.array(best.values)
     if not start.any():
         return best
-    # two directions across the start, on which the tangent of the tilt is measured
+    # two directions orthogonal to the start; x are tangents of the tilt in these directions
     _, _, frame = np.linalg.svd(start.reshape(1, 3))
-    across = frame[1:]
+    orthogonal = frame[1:]
 
     def tilted(x: Array) -> Explanation:
-        g = start + size * x @ across
+        g = start + size * x @ orthogonal
         return explained(size * g / np.linalg.norm(g))
 
     simplex = [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]
@@ -188,12 +188,12 @@ def _gravity(probe: Probe) -> Explanation:
 
 
 def _shares_by_gravity(probe: Probe) -> Callable[[Array], Array]:
-    """Return a function of gravity (3,): the share that own physics leaves of each torque, (n,).
+    """Return a function of gravity (3,): the unexplained share of each torque, (n,).
 
-    Loads are linear in gravity, so that one triangle of each joint serves for all of them.
+    Loads are linear in gravity, so one triangular factor per joint is used for all of them.
     """
     links, size = probe.loads(), _variation(probe.tau)
-    X = [links, *probe.parts.pulls, probe.drives, probe.tau[:, :, None]]
+    X = [links, *probe.parts.gravity_loads, probe.drives, probe.tau[:, :, None]]
     R = _triangles(np.concatenate(X, axis=2).swapaxes(0, 1))
     bodies = links.shape[2]
     parts = R[:, :, : 4 * bodies].reshape(*R.shape[:2], 4, bodies)
@@ -208,10 +208,10 @@ def _shares_by_gravity(probe: Probe) -> Callable[[Array], Array]:
 
 
 def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
-    """Yield readings in which a position column means something else, if one is clearly better.
+    """Yield readings with another position column, sign or zero, if one is clearly better.
 
-    They are tried with fewer rows, and with a quarter of these first: what is not half as much
-    better there is not tried further.
+    They are tested with few rows, first with a quarter of them: a reading without half of the
+    required decrease there is not tested further.
     """
     every = max(1, len(probe.rows) // _ROWS)
     some, few = (probe.at(probe.rows[::k]) for k in (every, _QUARTER * every))
@@ -224,7 +224,7 @@ def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
     for read in readings:
         if any(e.misfit < likely for e in read(few)):
             yield from (e for e in read(some) if e.misfit < enough)
-    offsets = [_offset(few, j, offset) for j in _turning(few) for offset in _OFFSETS]
+    offsets = [_offset(few, j, offset) for j in _revolute(few) for offset in _OFFSETS]
     first = min(offsets, key=lambda e: e.misfit, default=None)
     if first is not None and _refined(few, first).misfit < likely:
         near = [e for e in offsets if e.misfit < first.misfit + 0.5 * _CLEARLY]
@@ -233,16 +233,16 @@ def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
         yield from [found] if found.misfit < enough else []
 
 
-def _turning(probe: Probe) -> list[int]:
+def _revolute(probe: Probe) -> list[int]:
     """Return the revolute joints."""
     names = probe.model.joints
     return [j for j in range(len(names)) if names[j] not in probe.model.layout.prismatic]
 
 
 def _exchanged(probe: Probe, pair: tuple[int, int]) -> list[Explanation]:
-    """Return the readings that the position columns of two joints, or all of theirs, are swapped.
+    """Return the readings that the position columns, or all columns, of two joints are exchanged.
 
-    Of each joint its own torque, and that of the joint whose position it has.
+    Each joint is tested with its own torque, and with the torque of the other joint.
     """
     order = np.arange(len(probe.model.joints))
     order[list(pair)] = pair[::-1]
@@ -255,13 +255,13 @@ def _exchanged(probe: Probe, pair: tuple[int, int]) -> list[Explanation]:
 
 
 def _reversed(probe: Probe, j: int) -> list[Explanation]:
-    """Return the readings that a joint turns the other way, and its torque as well."""
-    turned = probe.with_motion(_moved(probe, j, -1.0, 0.0))
-    share = _shares(turned, np.stack([probe.tau.T, -probe.tau.T], axis=2))
+    """Return the readings that the position of a joint is reversed, and its torque as well."""
+    other = probe.with_motion(_moved(probe, j, -1.0, 0.0))
+    share = _shares(other, np.stack([probe.tau.T, -probe.tau.T], axis=2))
     is_j = np.arange(len(share)) == j
     axis = Explanation("joint_axis", np.where(is_j, share[:, 1], share[:, 0]), (j,))
     sign = Explanation("position_sign", share[:, 0], (j,))
-    return [sign, axis] if j in _turning(probe) else [axis]
+    return [sign, axis] if j in _revolute(probe) else [axis]
 
 
 def _offset(probe: Probe, j: int, offset: float) -> Explanation:
@@ -270,7 +270,7 @@ def _offset(probe: Probe, j: int, offset: float) -> Explanation:
 
 
 def _refined(probe: Probe, rough: Explanation) -> Explanation:
-    """Return the offset near a rough one that explains the torques best."""
+    """Return the reading with the offset near a rough one that explains the torques best."""
     from scipy.optimize import minimize_scalar
 
     j, centre = rough.joints[0], rough.values[0]
@@ -291,13 +291,13 @@ def _moved(probe: Probe, j: int, sign: float, offset: float) -> tuple[Array, Arr
 
 
 def own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False) -> Array:
-    """Return the share that each joint's own physics leaves of its torque, shape (n,).
+    """Return the unexplained share of each joint's torque, shape (n,).
 
     Args:
         probe: The motion.
         gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
-        any_load: Whether the last link may also have any mass more, and any centre of it, in the
-            model's gravity.
+        any_load: Whether the last link may have an additional load with any mass and any centre of
+            mass, in the model's gravity.
     """
     return _shares(probe, probe.tau.T[:, :, None], gravity, any_load)[:, 0]
 
@@ -305,7 +305,7 @@ def own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False
 def _shares(
     probe: Probe, torques: Array, gravity: Array | None = None, any_load: bool = False
 ) -> Array:
-    """Return which share of k torques, (n, N, k), each joint's physics leaves, shape (n, k)."""
+    """Return the unexplained shares of k torques per joint, (n, N, k), shape (n, k)."""
     loads = probe.loads(gravity)
     if any_load:
         last = probe.last_body
@@ -315,20 +315,20 @@ def _shares(
 
 
 def _over(left: Array, size: Array) -> Array:
-    """Return sums of squares as shares of a size, at most 1; 0 of none."""
+    """Return sums of squares over a size, at most 1; 0 if the size is 0."""
     share = np.divide(left, size, out=np.zeros_like(size), where=size > 0)
     return np.minimum(share, 1.0)
 
 
 def _variation(tau: Array) -> Array:
-    """Return the sum of squares of torques (N, ...) about their mean, 0 of a constant one."""
+    """Return the sum of squares of torques (N, ...) about their mean, 0 if constant."""
     centred = tau - tau.mean(axis=0)
     is_constant = np.ptp(tau, axis=0) <= _CONSTANT * np.abs(tau).max(axis=0)
     return np.where(is_constant, 0.0, np.sum(centred**2, axis=0))
 
 
 def _misfits(X: Array, torques: Array) -> Array:
-    """Return the squares that columns, (n, N, c), with factors >= 0 leave of torques, (n, N, k)."""
+    """Return the residual squares of torques, (n, N, k), by columns, (n, N, c), factors >= 0."""
     from scipy.optimize import nnls
 
     size = np.linalg.norm(X, axis=1, keepdims=True)
@@ -345,7 +345,7 @@ def _triangles(rows: Array) -> Array:
 
 
 def _nonnegative_prediction(X: Array, tau: Array) -> Array:
-    """Return what columns with factors >= 0 make of a torque, shape (N,)."""
+    """Return the prediction of a torque by columns with factors >= 0, shape (N,)."""
     from scipy.optimize import nnls
 
     size = np.linalg.norm(X, axis=0)

@@ -1,7 +1,8 @@
-"""Does the torque fit the URDF's masses: scale of each torque, payload, mismatch.
+"""Check of the torques against the URDF's masses: scale of each torque, payload, mismatch.
 
-One linear model of all joints with priors: each link as the URDF has it times 1 +- 0.3, a payload
-of any size in the last link, drives of any size, and torques known to 5 %.
+One linear model of all joints with priors: each link has the URDF's parameters times 1 +- 0.3, the
+last link has a payload with a wide prior, the drives have no prior, and the torques are accurate to
+5 %.
 """
 
 from collections.abc import Iterator
@@ -25,45 +26,46 @@ __all__ = [
     "load_model",
 ]
 
-#: What is said of torques without gravity.
+#: Message on torques without gravity.
 NO_GRAVITY = (
-    "the torques hold no gravity: with the URDF's gravity added they fit the URDF, as logged they "
-    "do not. If the controller compensates gravity before they are logged, log the whole torque of "
-    "the motors; if the robot moves in a horizontal plane or floats, state gravity = [0, 0, 0]"
+    "the torques contain no gravity: they fit the URDF with its gravity added, and do not fit it "
+    "as logged. If the controller compensates gravity before they are logged, log the total torque "
+    "of the motors; if the robot moves in a horizontal plane or floats, state gravity = [0, 0, 0]"
 )
-_SPREAD = 0.3  # of a link's mass about the URDF's
+_SPREAD = 0.3  # prior standard deviation of a link's mass, relative to the URDF's
 _PRECISION = 0.05  # of a torque, model errors included
-_INDEPENDENT = 20.0  # instants of a log that are independent of each other
-_PER_SECOND = 3.0  # ... of a short one
-_MASS, _MOMENT = 20.0, 10.0  # [kg], [kg m] of a payload, wide
-_CONSTANT = 1e-6  # of the largest torque: one that varies less says nothing
-_EXPLAINED = 0.25  # a torque of which physics leaves more says nothing of its scale
-_WORSE = 0.25  # in variances of its precision, that a torque may fit worse than by itself
-_ALIKE = 1.6  # factors that differ by less are one: they are sought in steps of 1.26
-_GAIN = 20.0  # drop of the misfit that makes another torque scale believable
-_OTHER_SCALE = 3.0  # a torque scale farther from 1 than this is no error of masses
-_OTHER_UNIT = 30.0  # ... and one of all torques farther than this is another unit, no gain
-_CLEARER = 5.0  # drop of the misfit that a counterbalance has over another scale of one torque
+_INDEPENDENT = 20.0  # number of independent instants of a log
+_PER_SECOND = 3.0  # ... per second of a short one
+_MASS, _MOMENT = 20.0, 10.0  # [kg], [kg m] prior standard deviations of a payload
+_CONSTANT = 1e-6  # of the largest torque: a torque that varies less is not used
+_EXPLAINED = 0.25  # largest unexplained share of a torque whose scale is checked
+_WORSE = 0.25  # allowed increase of a torque's misfit over its own fit, in variances
+_ALIKE = 1.6  # ratio below which two factors are equal: they lie on a grid of steps of 1.26
+_GAIN = 20.0  # decrease of the misfit from which another torque scale is accepted
+_OTHER_SCALE = 3.0  # a torque scale farther from 1 is no error of masses
+_OTHER_UNIT = 30.0  # ... and a common scale of all torques farther from 1 is another unit, no gain
+_CLEARER = 5.0  # decrease of the misfit by a counterbalance beyond that by another torque scale
 _SCALES = np.logspace(-3, 3, 61)
-_HEAVY = 0.08  # payload over the arm's mass that is surely more than the links' errors
-_FLOOR = 1e-3  # an unexplained share below this is as good as none
-_FOLLOWED = 0.5  # times the unexplained share falls with gravity of a torque that follows it
+_LARGE = 0.08  # payload over the arm's mass that errors of the links do not explain
+_FLOOR = 1e-3  # an unexplained share below this is negligible
+_FOLLOWED = 0.5  # ratio of unexplained shares with and without gravity, if a torque contains it
 _LIFTS = 0.3  # of the largest gravity torque: a joint with less has no counterbalance
-_CANCELS, _MOST_CANCELLED = 0.2, 1.6  # of its gravity, between which a counterbalance takes
-_MISMATCH = 7.5  # sum of squares of the links' errors, in standard deviations, that is too much
+_CANCELS, _MOST_CANCELLED = 0.2, 1.6  # limits of the share of gravity that a counterbalance cancels
+_MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
 
 
 @dataclass(frozen=True, eq=False)
 class LoadModel:
-    """The torques of each joint, whitened, as far as their drive cannot explain them.
+    """The whitened torques of each joint, projected orthogonally to the columns of its drive.
 
     Attributes:
-        R: Triangular factor of the c unknowns and the torque of each joint, shape (n, c+1, c+1);
-            0 of joints that are ignored.
-        mean: Prior mean of the unknowns: links over the URDF's, and m, mcx, mcy, mcz of a payload.
+        R: Triangular factor of the c free parameters and the torque of each joint, shape
+            (n, c+1, c+1); 0 of joints that are ignored.
+        mean: Prior mean of the free parameters: factors of the URDF's links, and m, mcx, mcy, mcz
+            of a payload.
         spread: Prior standard deviation, shape (c,).
-        expected: Misfit of torques that are explained as well as by each joint's own.
-        independent: Number of independent torques they stand for.
+        expected: Misfit of torques that fit as well as with separate parameters for each joint.
+        independent: Number of independent torques.
     """
 
     R: Array
@@ -73,23 +75,23 @@ class LoadModel:
     independent: float
 
     def misfits(self, scales: Array) -> Array:
-        """Return how badly scaled torques fit: chi-squares, prior included, shape (T,).
+        """Return the misfits of scaled torques: chi-squares, prior included, shape (T,).
 
         Args:
-            scales: T times a factor of each torque column, shape (T, n).
+            scales: T sets of factors of the torque columns, shape (T, n).
         """
         R = np.asarray(np.linalg.qr(self._rows(scales), mode="r"))  # (T, c+1, c+1)
         chi: Array = R[:, -1, -1] ** 2
         return chi
 
     def fit(self, scale: Array) -> tuple[float, Array, Array]:
-        """Fit with the torque columns multiplied by a scale, links of no negative mass.
+        """Fit with the torque columns multiplied by a scale, without negative masses of links.
 
         Args:
             scale: Factor of each torque column, shape (n,).
 
         Returns:
-            The misfit (chi-square, prior included), the unknowns and their standard deviations.
+            The misfit (chi-square, prior included), the parameters and their standard errors.
         """
         from scipy.optimize import lsq_linear
 
@@ -102,7 +104,7 @@ class LoadModel:
         return 2 * float(found.cost), self.spread * found.x, error
 
     def _rows(self, scales: Array) -> Array:
-        """Return the rows of torques and prior, of unknowns over their spread, (T, N, c+1)."""
+        """Return the rows of torques and prior, columns times the spread, (T, N, c+1)."""
         c, (T, n) = len(self.mean), scales.shape
         rows = self.R * np.append(self.spread, 1.0)
         rows = np.repeat(rows[None], T, axis=0)  # (T, n, c+1, c+1)
@@ -113,15 +115,15 @@ class LoadModel:
 
 
 def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadModel:
-    """Return the rows of a motion.
+    """Return the load model of a motion.
 
     Args:
         probe: The motion.
-        share: Share of each torque's variance that no physics explains, shape (n,).
+        share: Share of each torque's variance that the model does not explain, shape (n,).
         level: Standard deviation of each torque as logged, shape (n,); the motion's if None.
 
     Returns:
-        The load model; a torque that is constant or that physics does not explain is ignored.
+        The load model; a torque that is constant or unexplained is ignored.
     """
     N, n = probe.tau.shape
     duration = float(np.ptp(probe.motion.t[probe.rows]))
@@ -130,9 +132,9 @@ def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadMo
     bodies = links.shape[2]
     X = np.concatenate([links, last, probe.tau[:, :, None]], axis=2)
     level = probe.tau.std(axis=0) if level is None else level
-    told = (level > _CONSTANT * np.abs(probe.tau).max()) & (share < _EXPLAINED)
+    used = (level > _CONSTANT * np.abs(probe.tau).max()) & (share < _EXPLAINED)
     R = np.zeros((n, bodies + 5, bodies + 5))
-    for j in np.flatnonzero(told).tolist():
+    for j in np.flatnonzero(used).tolist():
         drive = np.delete(probe.drives[:, j], 4, axis=1)
         length = np.linalg.norm(drive, axis=0)
         U, s, _ = np.linalg.svd(drive / np.where(length > 0, length, 1.0), full_matrices=False)
@@ -142,25 +144,25 @@ def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadMo
         R[j] = np.linalg.qr(left * np.sqrt(independent / N) / sigma, mode="r")
     mean = np.append(np.ones(bodies), np.zeros(4))
     spread = np.append(np.full(bodies, _SPREAD), [_MASS, *[_MOMENT] * 3])
-    expected = independent * float((share / (_PRECISION**2 + share))[told].sum())
-    return LoadModel(R, mean, spread, expected, independent * float(told.sum()))
+    expected = independent * float((share / (_PRECISION**2 + share))[used].sum())
+    return LoadModel(R, mean, spread, expected, independent * float(used.sum()))
 
 
 def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
     """Yield torques in another scale, a payload, a URDF of another robot.
 
-    Another scale is believed where the links then weigh about what the URDF says and the torques
-    fit; else the URDF is of another robot.
+    Another scale is accepted if the torques then fit with about the URDF's masses; else the URDF
+    is of another robot.
 
     Args:
         probe: The motion; signs, order and gravity must be right.
-        share: Share of each torque's variance that no physics explains, shape (n,).
-        name: What the log is called.
+        share: Share of each torque's variance that the model does not explain, shape (n,).
+        name: Name of the log.
 
     Yields:
-        Warnings "current_for_torque" per joint, or once for all joints of one factor (an error if
-        all share one of a different unit), or else an error "gravity_compensated", or else a
-        warning "urdf_mismatch", or else "payload".
+        The first that applies: warnings "current_for_torque" per joint, or one for all joints with
+        the same factor (an error if it is the factor of another unit in all joints); an error
+        "gravity_compensated"; a warning "urdf_mismatch"; a warning or note "payload".
     """
     model = load_model(probe, share)
     bodies = len(probe.model.layout.bodies)
@@ -181,27 +183,27 @@ def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
 
 
 def _is_this_robot(model: LoadModel, chi: float, theta: Array) -> bool:
-    """Return whether torques fit about as well as by themselves, by links that weigh as stated."""
+    """Return whether torques fit well with masses of the links near the URDF's."""
     is_good = chi - model.expected < _WORSE * model.independent
     return is_good and _error_of_links(theta) < _MISMATCH
 
 
 def _holds_no_gravity(probe: Probe) -> bool:
-    """Return whether the torques fit the URDF if its gravity is added, and not as they are.
+    """Return whether the torques fit the URDF if its gravity is added, and not as logged.
 
-    Both are judged alike: to the size of the torques as logged, without a load on the last link.
+    Both tests use the level of the logged torques, and no load on the last link.
     """
     if not probe.gravity.any() or holds_gravity(probe):
         return False
     readings = [(probe, own_share(probe)), compensated(probe)]
     models = [load_model(reading, share, probe.tau.std(axis=0)) for reading, share in readings]
     ones = np.ones(probe.tau.shape[1])
-    logged, mended = (_is_this_robot(model, *model.fit(ones)[:2]) for model in models)
-    return mended and not logged
+    logged, corrected = (_is_this_robot(model, *model.fit(ones)[:2]) for model in models)
+    return corrected and not logged
 
 
 def holds_gravity(probe: Probe) -> bool:
-    """Return whether the torque of some joint follows the gravity that the URDF loads it with.
+    """Return whether the torque of a joint contains its gravity torque by the URDF.
 
     Args:
         probe: The motion.
@@ -212,14 +214,14 @@ def holds_gravity(probe: Probe) -> bool:
 
 
 def counterbalance(probe: Probe, name: str) -> tuple[Probe, tuple[Finding, ...]]:
-    """Return a motion whose counterbalanced joint, if there is one, is known, and the finding.
+    """Return a motion with its counterbalanced joint, if there is one, and the finding.
 
-    The torques do not fit the URDF's masses as they are; with one torque more, a cosine and a sine
-    of the position of one joint, they do, and that torque opposes gravity.
+    A joint is counterbalanced if the torques do not fit the URDF's masses as they are, but fit with
+    an additional torque, a cosine and a sine of its position, that opposes gravity.
 
     Args:
         probe: The motion; signs and order must be right.
-        name: What the log is called.
+        name: Name of the log.
     """
     if not probe.gravity.any():
         return probe, ()
@@ -245,26 +247,27 @@ def counterbalance(probe: Probe, name: str) -> tuple[Probe, tuple[Finding, ...]]
 
 
 def _lifting(probe: Probe) -> list[int]:
-    """Return the revolute joints that the URDF's gravity loads, those it loads most first."""
+    """Return the revolute joints that the URDF's gravity loads, sorted by decreasing load."""
     load = np.abs((probe.loads() - probe.loads(np.zeros(3))).sum(axis=2)).mean(axis=0)  # (n,)
-    slides = np.isin(probe.model.joints, list(probe.model.layout.prismatic))
-    return [int(j) for j in np.argsort(-load) if load[j] > _LIFTS * load.max() and not slides[j]]
+    is_lifting = load > _LIFTS * load.max()
+    is_lifting &= ~np.isin(probe.model.joints, list(probe.model.layout.prismatic))
+    return [int(j) for j in np.argsort(-load) if is_lifting[j]]
 
 
 def _cancelled(probe: Probe, j: int, theta: Array) -> float:
-    """Return which share of a joint's gravity its counterbalance takes, by fitted links [-]."""
+    """Return the share of a joint's gravity that its counterbalance cancels by the fit [-]."""
     Y = np.concatenate([probe.loads()[:, j], probe.last_body[:, j]], axis=1)
     swing = probe.swing(j)
     X = np.hstack([probe.drives[:, j, :4], swing])
     size = np.linalg.norm(X, axis=0)
     x = np.linalg.lstsq(X / size, probe.tau[:, j] - Y @ theta)[0] / size
     gravity = (probe.loads() - probe.loads(np.zeros(3)))[:, j].sum(axis=1)
-    gravity, own = (y - y.mean() for y in (gravity, swing @ x[4:]))  # the offset is not known
+    gravity, own = (y - y.mean() for y in (gravity, swing @ x[4:]))  # the offset is unknown
     return -float(gravity @ own) / float(gravity @ gravity)
 
 
 def _scaled_fit(model: LoadModel) -> float:
-    """Return the misfit with torques in other scales, if the links weigh as stated then."""
+    """Return the misfit with torques in other scales, if the URDF's masses then fit, else inf."""
     scale = _torque_scales(model)
     chi, theta, _ = model.fit(scale)
     is_other = np.abs(np.log(scale)).max() > np.log(_OTHER_SCALE)
@@ -272,14 +275,14 @@ def _scaled_fit(model: LoadModel) -> float:
 
 
 def _balanced(probe: Probe, j: int, cancelled: float, name: str) -> Finding:
-    joint, turned = probe.model.joints[j], float(np.ptp(probe.motion.q[:, j]))
-    family = spring_family(turned, COUNTERBALANCE)
+    joint, extent = probe.model.joints[j], float(np.ptp(probe.motion.q[:, j]))
+    family = spring_family(extent, COUNTERBALANCE)
     message = (
-        f"{joint}: a torque that follows its own position cancels {100 * cancelled:.0f} % of the "
-        "gravity that the URDF loads it with, and the other joints hold theirs: a counterbalance "
-        f"or a spring. Add it to the model: {drive_line(joint, family)} in [drives]"
+        f"{joint}: a torque that depends on its position cancels {100 * cancelled:.0f} % of its "
+        "gravity torque by the URDF, and the other torques contain gravity: the joint has a "
+        f"counterbalance or a spring. Add it to the model: {drive_line(joint, family)} in [drives]"
     )
-    evidence = {"cancelled_pct": 100 * cancelled, "turned": turned}
+    evidence = {"cancelled_pct": 100 * cancelled, "turned": extent}
     return log_finding(name, "counterbalance", "warning", message, joint, **evidence)
 
 
@@ -288,7 +291,7 @@ def _error_of_links(theta: Array) -> float:
 
 
 def _torque_scales(model: LoadModel) -> Array:
-    """Return the factors of the torque columns that the data insist on, 1 elsewhere."""
+    """Return the factors of the torque columns that reduce the misfit significantly, else 1."""
     n = len(model.R)
     common = np.repeat(_SCALES[:, None], n, axis=1)
     chi = model.misfits(np.vstack([np.ones(n), common]))
@@ -302,7 +305,7 @@ def _torque_scales(model: LoadModel) -> Array:
 
 
 def _descended(model: LoadModel, scale: Array) -> Array:
-    """Return the factors that are reached from some by changing one after the other."""
+    """Return the factors after a coordinate descent from initial ones."""
     n = len(scale)
     for _ in range(n):
         trials = np.repeat(scale[None], n * len(_SCALES), axis=0)
@@ -315,16 +318,16 @@ def _descended(model: LoadModel, scale: Array) -> Array:
 
 
 def _needed(model: LoadModel, scale: Array, other: Array) -> Array:
-    """Return the joints without whose scale the torques no longer fit; all if all are scaled."""
+    """Return the joints whose other scale is needed to fit the torques; all if all are scaled."""
     if len(other) == len(scale):
         return other
-    kept = scale.copy()
+    smallest = scale.copy()
     for j in other:
-        without = kept.copy()
+        without = smallest.copy()
         without[j] = 1.0
         if _is_this_robot(model, *model.fit(without)[:2]):
-            kept = without
-    needed: Array = other[kept[other] != 1.0]
+            smallest = without
+    needed: Array = other[smallest[other] != 1.0]
     return needed
 
 
@@ -334,9 +337,9 @@ def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Fin
     if len(other) > 1 and np.ptp(np.log(factors)) < np.log(_ALIKE):
         factor = float(np.exp(np.log(factors).mean()))
         message = (
-            f"the torques of {listed(joints)} fit the URDF far better times {factor:.3g}: they may "
-            "be currents, or have another unit or gain; give them as current_<joint> "
-            + todo.format("JOINT")
+            f"the torques of {listed(joints)} fit the URDF much better if multiplied by "
+            f"{factor:.3g}: they may be currents, or have another unit or gain; name the columns "
+            "current_<joint> " + todo.format("JOINT")
         )
         is_all = len(other) == len(scale)
         is_unit = is_all and abs(np.log(factor)) > np.log(_OTHER_UNIT)
@@ -345,9 +348,9 @@ def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Fin
         return
     for joint, factor in zip(joints, factors, strict=True):
         message = (
-            f"the torque of {joint} fits the URDF far better times {factor:.3g}: it may be a "
-            f"current, or have another unit or gain; give it as current_{joint} "
-            + todo.format(joint)
+            f"the torque of {joint} fits the URDF much better if multiplied by {factor:.3g}: it "
+            "may be a current, or have another unit or gain; name the column "
+            f"current_{joint} " + todo.format(joint)
         )
         yield log_finding(name, code, "warning", message, joint, factor=factor)
 
@@ -356,9 +359,9 @@ def _mismatch(probe: Probe, factors: Array, name: str) -> Finding:
     found = dict(zip(probe.model.layout.bodies, factors.tolist(), strict=True))
     shown = ", ".join(f"{link} {factor:.2g}" for link, factor in found.items())
     message = (
-        f"to explain the torques, the URDF's links would have to weigh {shown} times what it says: "
-        "the URDF may be of another robot or lack a load, or the torques be currents of several "
-        "gains; check the model and the unit, and use the URDF's values as prior with care"
+        f"the torques fit only if the URDF's masses are multiplied by {shown}: the URDF may be of "
+        "another robot or without a load that is mounted, or the torques may be currents with "
+        "several gains; check the model and the unit. A prior from this URDF is not reliable"
     )
     return log_finding(name, "urdf_mismatch", "warning", message, **found)
 
@@ -371,9 +374,9 @@ def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Fin
     link = probe.model.layout.bodies[-1]
     message = (
         f"{link} carries about {abs(mass):.2g} +- {error:.2g} kg {'more' if mass > 0 else 'less'} "
-        "than the URDF says; if a tool or payload is mounted, add it to the URDF or expect it in "
-        "the last link"
+        "than in the URDF; if a tool or payload is mounted, add it to the URDF, else it is "
+        "identified as part of the last link"
     )
     evidence = {"mass": mass, "std_error": error, "mcx": load[1], "mcy": load[2], "mcz": load[3]}
-    severity = "warning" if abs(mass) - 2 * error > _HEAVY * arm else "note"
+    severity = "warning" if abs(mass) - 2 * error > _LARGE * arm else "note"
     yield log_finding(name, "payload", severity, message, link, **evidence)

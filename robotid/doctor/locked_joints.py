@@ -1,4 +1,4 @@
-"""Do the joints that a job holds still stand where it says, as far as a log tells."""
+"""Check of locked joints against their logged positions."""
 
 from collections.abc import Collection, Iterator, Mapping
 
@@ -10,33 +10,33 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["STILL", "check_locked"]
 
-#: A held joint may move, or stand elsewhere, by so much [rad or m].
+#: Largest range of a locked joint, and largest difference from its stated position [rad or m].
 STILL = 0.02
 
 
 def check_locked(
     model: RobotModel, positions: Mapping[str, Array], log: str, asked: Collection[str]
 ) -> Iterator[Finding]:
-    """Yield an error "locked_position" per held joint that a log shows to move or stand elsewhere.
+    """Yield an error "locked_position" per locked joint that moves or has another position.
 
     Args:
-        model: The robot, whose locked joints are held.
-        positions: The held joints' positions in the log by name, shape (N,) [rad or m].
+        model: The robot.
+        positions: Logged positions of the locked joints by name, shape (N,) [rad or m].
         log: Name of the log.
-        asked: Joints that the user asked to be locked.
+        asked: Joints that the user asked to lock.
     """
     for joint, q in positions.items():
         stated = model.locked[joint]
-        middle, reach = float(np.median(q)), float(np.ptp(q))
-        if reach <= STILL and abs(middle - stated) <= STILL:
+        middle, extent = float(np.median(q)), float(np.ptp(q))
+        if extent <= STILL and abs(middle - stated) <= STILL:
             continue
-        said = f"the job holds {joint} at {stated:.4g}" + ("" if joint in asked else ", unasked")
-        if reach > STILL:
-            what = f"moves over {reach:.3g} there"
-            todo = f"identify {joint}, too, or cut the log to where it stands"
+        default = "" if joint in asked else " by default"
+        if extent > STILL:
+            what = f"moves over a range of {extent:.3g} in the log"
+            todo = f"identify {joint}, too, or use only the part of the log in which it is at rest"
         else:
-            what = f"stands at {middle:.4g} there"
+            what = f"is at {middle:.4g} in the log"
             todo = f"state locked = {{ {joint} = {middle:.4g} }} (--lock {joint}={middle:.4g})"
-        message = f"{said}, but the log has its position, and it {what}; {todo}"
-        evidence = {"stated": stated, "median": middle, "range": reach}
+        message = f"{joint} is locked at {stated:.4g}{default} but {what}; {todo}"
+        evidence = {"stated": stated, "median": middle, "range": extent}
         yield log_finding(log, "locked_position", "error", message, joint, **evidence)

@@ -1,4 +1,4 @@
-"""Are the motions of several logs fit for their roles: rich to fit, new to validate with."""
+"""Checks of motions for their roles: excitation to fit, and no repetition to validate."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -25,40 +25,40 @@ __all__ = [
     "is_poorly_excited",
 ]
 
-_AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0)  # [s] positions compared: the same now and in a second
-_NEAR = 0.02  # of the range of each joint
-_SHARE = 0.3  # of the validation motion that has been seen before
+_AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0)  # [s] after an instant, positions that are compared
+_NEAR = 0.02  # of the range of each joint: closer positions are equal
+_SHARE = 0.3  # of the validation motion that is in a fitted log, too
 _INSTANTS = 300
-_ROWS = 5000  # of a log, that tell what its motion determines
-_ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion could be better
-_RICHER = "a richer motion, of all joints together, back and forth and as fast as they may,"
-_LOST = "the motion is rich, but this hardly loads a joint and is lost in the noise"
+_ROWS = 5000  # of a log, from which its excitation is computed
+_ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion is poor
+_RICHER = "a motion of all joints together, in both directions and as fast as permitted"
+_LOST = "the excitation is good, but these parameters are not identifiable above the noise"
 
 
 def check_repeated_motion(
-    fitted: Sequence[Trajectory], kept: Trajectory, name: str
+    fitted: Sequence[Trajectory], validation: Trajectory, name: str
 ) -> Iterator[Finding]:
     """Yield a warning "repeated_motion" if a validation log repeats motion that is fitted.
 
     Args:
         fitted: Smooth motions that are fitted.
-        kept: Smooth motion that is kept apart.
-        name: What its log is called.
+        validation: Smooth motion of the validation log.
+        name: Name of the validation log.
     """
     from scipy.spatial import cKDTree
 
-    size = np.maximum(np.ptp(kept.q, axis=0), 1e-3)
-    seen = _segments(kept, size, _INSTANTS)
+    size = np.maximum(np.ptp(validation.q, axis=0), 1e-3)
+    own = _segments(validation, size, _INSTANTS)
     share = 0.0
-    for known in [_segments(motion, size, None) for motion in fitted if len(seen)]:
+    for known in [_segments(motion, size, None) for motion in fitted if len(own)]:
         if len(known):
-            distance, _ = cKDTree(known).query(seen, p=np.inf, distance_upper_bound=_NEAR)
+            distance, _ = cKDTree(known).query(own, p=np.inf, distance_upper_bound=_NEAR)
             share = max(share, float(np.mean(np.isfinite(distance))))
     if share < _SHARE:
         return
     message = (
-        f"{100 * share:.0f} % of this motion is in a fitted log, too: its score shows how well the "
-        "fit repeats itself, not how it predicts; record another motion to validate with"
+        f"{100 * share:.0f} % of this validation motion is in a fitted log, too: its torque "
+        "prediction error is too optimistic; record another motion to validate with"
     )
     yield log_finding(name, "repeated_motion", "warning", message, share=share)
 
@@ -72,18 +72,18 @@ def check_excitation(
 ) -> Iterator[Finding]:
     """Yield which base parameters the fitted motions determine, by ``determine``.
 
-    Of long logs a share of the rows stands for all.
+    Of long logs every n-th row is used.
 
     Args:
         model: The robot.
         mapping: Its structural base parameters.
         motions: Smooth motions that are fitted.
-        signals: How the job smooths, and which rows it leaves out.
-        name: What the logs are called.
+        signals: The filter, and the rows that are left out.
+        name: Names of the logs.
 
     Yields:
-        One "excitation": a warning if the motion leaves some open, a note if they are lost in the
-        noise of a rich one or all are determined.
+        One "excitation": a warning if the motion does not determine some parameters; a note if all
+        are determined, or if the excitation is good and the noise leaves some undetermined.
     """
     prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
     thinned = [motion.every(step) for motion in motions]
@@ -95,7 +95,7 @@ def check_excitation(
         factors = merge([compress(problem) for problem in problems])
         found = WLS(prior=mapping.to_base(prior)).fit(factors)
     except RobotIdError as error:
-        message = f"which parameters the motion determines cannot be told: {error}"
+        message = f"the excitation was not checked: {error}"
         yield log_finding(name, "excitation", "warning", message)
         return
     share = step * min(independent_share(replace(signals, rate=m.rate)) for m in motions)
@@ -107,12 +107,12 @@ def check_excitation(
 
 
 def excitation_finding(wls: Estimate, known: Determination, name: str) -> Finding:
-    """Return which base parameters a motion determines, in words.
+    """Return the finding on which base parameters a motion determines.
 
     Args:
         wls: Weighted least squares on the motion.
-        known: What it determines.
-        name: What its logs are called.
+        known: Which parameters it determines.
+        name: Names of its logs.
     """
     count = len(known.names)
     evidence = {"rank": known.rank, "base": count, "weakest": known.shrinkage[-1]}
@@ -124,20 +124,20 @@ def excitation_finding(wls: Estimate, known: Determination, name: str) -> Findin
     )
     is_poor = is_poorly_excited(wls, count)
     if known.groups:
-        advice = f"record {_RICHER[:-1]}" if is_poor else f"{_LOST}: faster motion would show more"
+        advice = f"record {_RICHER}" if is_poor else f"{_LOST}; a faster motion determines more"
         message += f": {known.described()}; {advice}"
     elif is_poor:
         left = 100 * known.shrinkage[-1]
-        message += f"; the least known sum keeps {left:.2g} % of its plausible spread: {_RICHER}"
-        message += " would tell more"
+        message += f". The standard error of the least determined one is {left:.2g} % of its prior"
+        message += f" standard deviation; to determine it better, record {_RICHER}"
     else:
-        message += "; nothing needs doing"
+        message += "; no action needed"
     severity = "warning" if known.groups and is_poor else "note"
     return log_finding(name, "excitation", severity, message, **evidence)
 
 
 def is_poorly_excited(wls: Estimate, count: int) -> bool:
-    """Return whether it is the motion, not the noise, that leaves base parameters open.
+    """Return whether the motion, not the noise, leaves base parameters undetermined.
 
     Args:
         wls: Weighted least squares on the motion.
@@ -147,7 +147,7 @@ def is_poorly_excited(wls: Estimate, count: int) -> bool:
 
 
 def _segments(motion: Trajectory, size: Array, count: int | None) -> Array:
-    """Return the positions now and a little later, in units of the size, where something moves."""
+    """Return positions at instants and up to a second after, over the size, where joints move."""
     step = float(np.median(np.diff(motion.t)))
     ahead = [round(s / step) for s in _AHEAD]
     last = len(motion.t) - ahead[-1]
@@ -160,6 +160,6 @@ def _segments(motion: Trajectory, size: Array, count: int | None) -> Array:
     if count is not None and len(starts) > count:
         starts = starts[np.linspace(0, len(starts) - 1, count).astype(int)]
     else:
-        # fast motion must not slip between two instants: it moves less than the bound per step
+        # instants so close that fast motion moves less than the bound between two of them
         starts = starts[:: max(1, round(0.005 / step))]
     return np.hstack([motion.q[starts + k] / size for k in ahead])

@@ -1,4 +1,4 @@
-"""What is mounted on the last link: parts that the URDF has, loads that only some logs have."""
+"""Checks of the last link: parts of the URDF that are not mounted, loads of some logs only."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -24,14 +24,14 @@ from robotid.robot.prior import payload_spread, prior_spread
 
 __all__ = ["Segments", "check_payload_change", "check_unmounted_parts"]
 
-_LIGHTER = 4.0  # drop of the misfit, of a factor 7 in likelihood, from which a part is missed
-_ALIKE = 2.0  # misfits that differ by less are alike
-_LIGHT = 0.02  # of the arm's mass, below which a part is not missed
-_NO_LOAD = 1e-6  # [kg, kg m] spread of a payload that is left out
-_P_VALUE = 3e-7  # that a log without another load seems to have one, as of five standard errors
-_NOTHING = 0.01  # share of the arm's mass that a change of load has at least
-_CLEARLY = 1.5  # how many times more the logs leave if torques have other scales, not a load
-_ROWS = 2000  # of a motion: more say nothing new behind the filter
+_LIGHTER = 4.0  # decrease of the misfit, a likelihood ratio of 7, from which a part is not mounted
+_ALIKE = 2.0  # smallest significant difference of misfits
+_LIGHT = 0.02  # of the arm's mass, below which a part is not checked
+_NO_LOAD = 1e-6  # [kg, kg m] prior standard deviation of a payload that is left out
+_P_VALUE = 3e-7  # of a log without another load, five standard errors
+_NOTHING = 0.01  # of the arm's mass, the smallest change of load
+_CLEARLY = 1.5  # least ratio of the misfit of other torque scales to that of a load
+_ROWS = 2000  # of a motion: more are not independent after the filter
 _SEGMENT = 0.4  # [s] longer than the correlation of noise
 _SEGMENTS = 24
 
@@ -39,13 +39,13 @@ _SEGMENTS = 24
 def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
     """Yield a warning "unmounted_part" if the torques fit better without a part of the last link.
 
-    Parts are links that fixed or locked joints hang on the link that the last joint moves, with
-    all that hangs on them.
+    Parts are links that fixed or locked joints attach to the link of the last moving joint, with
+    all links that they carry.
 
     Args:
         probe: The motion; signs, order, scale and gravity must be right.
-        share: Share of each torque's variance that no physics explains, shape (n,).
-        name: What the log is called.
+        share: Share of each torque's variance that the model does not explain, shape (n,).
+        name: Name of the log.
     """
     model = load_model(probe, share)
     whole, loaded = _misfit_without_load(model), model.fit(np.ones(len(share)))[0]
@@ -60,15 +60,15 @@ def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Fin
             left = _misfit_without_load(load_model(lighter, share))
             trials.append((left, links, float(parameters[0])))
     left, links, mass = min(trials, default=(np.inf, [], 0.0))
-    # any load, of either sign, must not explain the torques much better
+    # a load of any mass, positive or negative, must not explain the torques much better
     if left > min(whole - _LIGHTER, loaded + _ALIKE):
         return
     gain = whole - left
     last = probe.model.layout.bodies[-1]
     message = (
-        f"the torques fit the URDF better without {listed(links, 4)}, which weigh {mass:.3g} kg in "
-        f"all on {last}: if they were not mounted, take them out of the URDF; else {last} is "
-        "lighter than the URDF says"
+        f"the torques fit the URDF better without {listed(links, 4)}, with a total mass of "
+        f"{mass:.3g} kg on {last}; if these parts were not mounted, remove them from the URDF, "
+        f"else correct the mass of {last}, which is too large"
     )
     evidence = {"mass": mass, "gain": gain}
     yield log_finding(name, "unmounted_part", "warning", message, last, **evidence)
@@ -76,13 +76,13 @@ def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Fin
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Motions of a robot, and what segments of some of their rows come down to.
+    """Motions of a robot, and the reduced least-squares problems of their segments.
 
     Attributes:
         model: The robot.
         mapping: Standard to base parameters.
         motions: The motions.
-        min_velocity: Bound on the speed of the rows that count.
+        min_velocity: Lower bound on the speed of the rows that are used.
     """
 
     model: RobotModel
@@ -92,17 +92,17 @@ class Segments:
 
     @property
     def seconds(self) -> float:
-        """How long they are [s]."""
+        """Total duration [s]."""
         return sum(float(np.ptp(motion.t)) for motion in self.motions)
 
     @cached_property
     def reductions(self) -> tuple[Reduction, ...]:
-        """What each segment comes down to, in order."""
+        """The reduced problem of each segment, in order."""
         return tuple(part for motion in self.motions for part in self._of(motion))
 
     def _of(self, motion: Trajectory) -> Iterator[Reduction]:
         thin = motion.every(max(1, len(motion.t) // _ROWS))
-        keep_inertial_rows(self.model, thin)  # whose excitation is looked at, too
+        keep_inertial_rows(self.model, thin)  # used for the excitation, too
         count = int(np.clip(np.ptp(thin.t) / _SEGMENT, 1, _SEGMENTS))
         length = -(-len(thin.t) // count)
         rows = row_mask(self.model, thin, self.min_velocity)
@@ -113,26 +113,26 @@ class Segments:
 
 
 def check_payload_change(
-    fitted: Segments, kept: Segments, signals: SignalSettings, name: str
+    fitted: Segments, validation: Segments, signals: SignalSettings, name: str
 ) -> Iterator[Finding]:
     """Yield a warning "payload_change" if a validation log has another load than the fitted ones.
 
-    Both are fitted at once, all links unknown, and a load in the last link that only the
-    validation log has. It is believed if it makes one robot of both.
+    Both are fitted together, with free parameters of all links and a load in the last link of the
+    validation log only. The load is reported if the same robot with it fits both.
 
     Args:
         fitted: Motions that are fitted.
-        kept: The motion that is kept apart.
+        validation: The motion of the validation log.
         signals: How logs become trajectories.
-        name: What its log is called.
+        name: Name of the validation log.
     """
     model, mapping = fitted.model, fitted.mapping
-    first, second, layout = fitted.reductions, kept.reductions, model.layout
+    first, second, layout = fitted.reductions, validation.reductions, model.layout
     every = (*first, *second)
     squares, samples = sum(r.squares for r in every), sum(r.samples for r in every)
     size = payload_spread(model)
     last = mapping.K[:, layout.n_inertial - 10 : layout.n_inertial]
-    seconds = fitted.seconds + kept.seconds
+    seconds = fitted.seconds + validation.seconds
     runs = payload_runs(
         first,
         second,
@@ -146,22 +146,22 @@ def check_payload_change(
     theta, covariance = runs.alike()
     least = -float(scipy.special.ndtri(_P_VALUE)) * float(np.sqrt(covariance[-10, -10]))
     if abs(theta[-10]) <= max(least, _NOTHING * size[0]):
-        return  # errors that count what changes with time are no smaller
-    # whether there is one at all is asked of what changes with time; scales are tried below
+        return  # standard errors with changes over time are not smaller
+    # the load is tested with errors that include changes over time; torque scales are tried below
     found = runs.compare(by_joint=False)
     mass, error = float(found.theta[-10]), float(np.sqrt(found.covariance[-10, -10]))
-    reach = -float(scipy.special.stdtrit(found.freedom[-10], _P_VALUE)) * error
-    if not max(reach, _NOTHING * size[0]) < abs(mass) < size[0]:
+    half_width = -float(scipy.special.stdtrit(found.freedom[-10], _P_VALUE)) * error
+    if not max(half_width, _NOTHING * size[0]) < abs(mass) < size[0]:
         return
     left = runs.held_together(found.theta) - 1.0
     by_scales = runs.held_by_scales(runs.D.shape[1] - 10) - 1.0
     if _CLEARLY * left.mean() > by_scales.mean():
-        return  # the logs differ by something else
+        return  # the logs differ by another effect
     link = layout.bodies[-1]
     message = (
         f"{link} carries {abs(mass):.2g} +- {error:.1g} kg {'more' if mass > 0 else 'less'} "
-        "than in the fitted logs: this log does not test the same robot; record it with the same "
-        "load, or fit it by itself; robotid payload says more of the load"
+        "than in the fitted logs: this log does not validate the same robot; record it with the "
+        "same load, fit it separately, or identify the load with robotid payload"
     )
     evidence = {"mass": mass, "std_error": error}
     yield log_finding(name, "payload_change", "warning", message, link, **evidence)
@@ -177,17 +177,17 @@ def _parts(probe: Probe) -> Iterator[tuple[list[str], Array]]:
     last = len(probe.model.layout.bodies) - 1
     places = {p.link: p for p in link_places(probe.model) if p.body == last and p.role != "moved"}
     parent = {joint.child: joint.parent for joint in probe.model.tree.joints}
-    told = set()
+    seen = set()
     for root in places:
         links = [link for link in places if root in _ancestry(link, parent)]
-        heavy = [link for link in links if places[link].parameters[0] > 0]
-        if heavy and tuple(heavy) not in told:
-            told.add(tuple(heavy))
-            yield heavy, np.sum([places[link].parameters for link in heavy], axis=0)
+        massive = [link for link in links if places[link].parameters[0] > 0]
+        if massive and tuple(massive) not in seen:
+            seen.add(tuple(massive))
+            yield massive, np.sum([places[link].parameters for link in massive], axis=0)
 
 
 def _ancestry(link: str, parent: dict[str, str]) -> Iterator[str]:
-    """Yield a link and all that it hangs on."""
+    """Yield a link and the links that carry it."""
     yield link
     while link in parent:
         link = parent[link]

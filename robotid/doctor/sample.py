@@ -1,4 +1,4 @@
-"""A log's motion at a few hundred instants, with each part of its torque apart: for the doctor."""
+"""The motion of a log at a few hundred instants, with the separate parts of the model's torque."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,16 +15,16 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["Probe", "coupled_columns", "smooth_motion", "take_probe"]
 
-_MARGIN = 0.15  # [s] rows nearer to the end of a segment are left out: the filter has not settled
-_STILL = 0.02  # [rad/s] slower than this the sign of a friction torque is not known
-_SLOW = 0.05  # ... of a joint that is slow throughout: this share of its largest speed
+_MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
+_STILL = 0.02  # [rad/s] slower, the sign of a friction torque is unknown
+_SLOW = 0.05  # ... for a slow joint: share of its largest speed
 
 
 @dataclass(frozen=True, eq=False)
 class _Loads:
-    """The torques of links and the columns of drives at N instants, each when first asked for.
+    """The torques of links and the columns of drives at N instants, each computed at first use.
 
-    Whole regressors are too large for it: of 60 joints 0.3 MB an instant.
+    Whole regressors are too large: 0.3 MB per instant for 60 joints.
     """
 
     model: RobotModel
@@ -34,7 +34,7 @@ class _Loads:
 
     @cached_property
     def moving(self) -> tuple[Array, Array]:
-        """Of each link by the URDF, (N, n, bodies), and the last body's first four columns."""
+        """Torques of each link by the URDF, (N, n, bodies), and four columns of the last body."""
         columns = carried_columns(self.model, self.q, self.v, self.a)
         ten = columns.reshape(len(columns), -1, 10)
         rows, bodies = self._places
@@ -49,16 +49,16 @@ class _Loads:
         return coupled_columns(self.model, self.q, self.v, self.a)
 
     @cached_property
-    def pulls(self) -> Array:
-        """Of links at rest, per m/s^2 of gravity along x, y and z, shape (3, N, n, bodies)."""
-        still = np.zeros_like(self.v)
-        pulled = [self.model.with_gravity(axis) for axis in np.eye(3)]
-        columns = (carried_columns(model, self.q, still, still) for model in pulled)
+    def gravity_loads(self) -> Array:
+        """Torques of links at rest, per m/s^2 of gravity in x, y, z, (3, N, n, bodies)."""
+        rest = np.zeros_like(self.v)
+        models = [self.model.with_gravity(axis) for axis in np.eye(3)]
+        columns = (carried_columns(model, self.q, rest, rest) for model in models)
         return np.array([self._by_link(x.reshape(len(x), -1, 10)) for x in columns])
 
     @cached_property
     def _places(self) -> tuple[Array, Array]:
-        """Rows and bodies of the carried columns, ten by ten."""
+        """Rows and bodies of the carried columns, one entry for ten columns."""
         carried = self.model.support()[:, : self.model.layout.n_inertial : 10]
         rows, bodies = np.nonzero(carried)
         return rows, bodies
@@ -73,18 +73,18 @@ class _Loads:
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """What a model says of a motion, linear in what it does not know: masses and gravity.
+    """The parts of the model's torque at some instants, linear in masses and gravity.
 
     Attributes:
         model: The robot.
-        motion: The smooth motion the instants were taken from.
+        motion: The smooth motion that contains the instants.
         rows: The N instants, as rows of the motion, shape (N,), int.
         q: Joint positions, shape (N, n) [rad or m].
         v: Velocities, shape (N, n).
         a: Accelerations, shape (N, n).
         tau: Torques, shape (N, n) [N m or N].
         parts: The parts of the model's torque at these instants.
-        balanced: Joints whose torque may also follow their own position, as a counterbalance's.
+        balanced: Joints whose torque may also depend on their position, as with a counterbalance.
     """
 
     model: RobotModel
@@ -99,7 +99,7 @@ class Probe:
 
     @property
     def gravity(self) -> Array:
-        """Gravity as the model states it, shape (3,) [m/s^2]."""
+        """Gravity of the model, shape (3,) [m/s^2]."""
         return np.array(self.model.pin_model.gravity.linear)
 
     @property
@@ -108,7 +108,7 @@ class Probe:
         return self.parts.moving[1]
 
     def loads(self, gravity: Array | None = None) -> Array:
-        """Return the torque that each link loads each joint with by the URDF, (N, n, bodies).
+        """Return the torque of each link on each joint by the URDF, shape (N, n, bodies).
 
         Args:
             gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
@@ -116,15 +116,15 @@ class Probe:
         links = self.parts.moving[0]
         if gravity is None:
             return links
-        more: Array = np.tensordot(gravity - self.gravity, self.parts.pulls, axes=1)
+        more: Array = np.tensordot(gravity - self.gravity, self.parts.gravity_loads, axes=1)
         return links + more
 
     @cached_property
     def drives(self) -> Array:
-        """What each drive may add: inertia, frictions, offset of either sign, shape (N, n, 5 + k).
+        """Columns of the drives: inertia, frictions, offset of either sign, shape (N, n, 5 + k).
 
-        Columns a, v, sign v, 1, -1, those of coupled drives, and those of a counterbalance if
-        there is one, 0 of other joints.
+        These are a, v, sign v, 1, -1, the columns of coupled drives, and those of a counterbalance
+        if there is one, 0 for other joints.
         """
         v, one = self.v, np.ones_like(self.v)
         least = _STILL * self.model.layout.drive_speeds[: v.shape[1]]
@@ -136,10 +136,10 @@ class Probe:
         return np.concatenate([np.stack(own, axis=2), self.parts.coupled, swings], axis=2)
 
     def swing(self, j: int) -> Array:
-        """Return what follows the position of a revolute joint, as a counterbalance does, (N, 2).
+        """Return the columns of a counterbalance, cos q and sin q, shape (N, 2).
 
         Args:
-            j: Index of the joint.
+            j: Index of a revolute joint.
         """
         return np.column_stack([np.cos(self.q[:, j]), np.sin(self.q[:, j])])
 
@@ -152,7 +152,7 @@ class Probe:
         return replace(self, model=model, parts=replace(self.parts, model=model))
 
     def at(self, rows: Array) -> "Probe":
-        """Return the probe at other rows of the same motion, computed anew.
+        """Return the probe at other rows of the same motion.
 
         Args:
             rows: Rows of the motion, shape (N,), int.
@@ -160,7 +160,7 @@ class Probe:
         return replace(_probe_at(self.model, self.motion, rows), balanced=self.balanced)
 
     def with_motion(self, state: tuple[Array, Array, Array]) -> "Probe":
-        """Return the probe with another motion, torques as they are, computed anew.
+        """Return the probe with another motion and the same torques.
 
         Args:
             state: Positions, velocities and accelerations, each of shape (N, n).
@@ -173,7 +173,7 @@ def coupled_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
     """Return the regressor's columns of coupled drives, shape (N, n, k).
 
     Args:
-        model: The robot, with a fixed base and no drive that remembers.
+        model: The robot, with a fixed base and no drive with an internal state.
         q: Joint positions, shape (N, n) [rad or m].
         v: Velocities, shape (N, n).
         a: Accelerations, shape (N, n).
@@ -187,12 +187,12 @@ def coupled_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
 
 
 def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Trajectory:
-    """Return the motion of a log with everything derived from its positions.
+    """Return the motion of a log with velocities and accelerations derived from its positions.
 
     Args:
         model: The robot.
         log: The log, of the model's joints in its order.
-        settings: How the job smooths; what it says of velocities is not used.
+        settings: The filter; the settings of velocity and acceleration are not used.
 
     Raises:
         DataError: If the log is too short or an angle jumps.
@@ -205,15 +205,15 @@ def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Traj
 
 
 def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> Probe | None:
-    """Return a probe of a motion, None if too little moves to judge anything by.
+    """Return a probe of a motion, None if the motion is too small for any check.
 
     Args:
         model: The robot, with a fixed base.
         motion: The smooth motion.
-        samples: Number of instants, spread evenly over the rows at which something moves.
+        samples: Number of instants, at equal distances over the rows in which a joint moves.
     """
-    still = _STILL * model.layout.drive_speeds[: len(model.joints)]
-    rows = np.flatnonzero((np.abs(motion.v) > still).any(axis=1) & _inner(motion))
+    slow = _STILL * model.layout.drive_speeds[: len(model.joints)]
+    rows = np.flatnonzero((np.abs(motion.v) > slow).any(axis=1) & _inner(motion))
     if len(rows) < 50:
         return None
     chosen = np.unique(np.linspace(0, len(rows) - 1, samples).astype(int))
@@ -221,7 +221,7 @@ def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> 
 
 
 def _inner(motion: Trajectory) -> Array:
-    """Return which rows are not near the end of a segment, shape (N,), bool."""
+    """Return which rows are far from the ends of their segment, shape (N,), bool."""
     inner = np.ones(len(motion.t), dtype=bool)
     for number in np.unique(motion.segment):
         part = motion.segment == number

@@ -1,4 +1,4 @@
-"""What the torque channels of a log show of the sensor or driver behind them; no model."""
+"""Checks of the torque channels of a log for faults of the sensor or driver, without a model."""
 
 from collections.abc import Iterator
 
@@ -12,25 +12,25 @@ from robotid.logs.measured_velocity import COARSE, quantum
 
 __all__ = ["check_torque_channels"]
 
-_PLATEAU = 5  # rows in a row at the very limit of a channel that are no coincidence
+_PLATEAU = 5  # consecutive rows at the limit of a clipped channel, at least
 _CLIPPED = 0.01  # share of the rows at the limit from which a channel is clipped
-_ZERO = 0.05  # of its top, below which a torque that is never negative has come down to 0
-_AWAY = 0.2  # of its top, above which it has left 0 again
-_TOUCHES = 3  # times that it comes to 0 and turns back that are no coincidence
-_ALL = 3  # joints from which it is no coincidence that no torque is ever negative
-_REGULAR = 0.8  # share of holds of about one length that no quantised torque has
+_ZERO = 0.05  # of its largest value, below which a torque that is never negative is 0
+_AWAY = 0.2  # of its largest value, above which it is not 0 any more
+_TOUCHES = 3  # times that a torque without sign reaches 0 and increases again, at least
+_ALL = 3  # joints of which no torque is ever negative, at least
+_REGULAR = 0.8  # share of holds of about one length that a quantised torque does not reach
 
 
 def check_torque_channels(log: Log) -> Iterator[Finding]:
-    """Yield what the torques of a log show of their sensors.
+    """Yield the findings on the torque sensors behind a log.
 
     Args:
         log: The log.
 
     Yields:
         Warnings "clipped" per joint and limit, or "constant_torque" per joint; one error
-        "unsigned_torque" if no torque has a sign; one warning "repeated_torque" of the joints whose
-        torque is updated less often than it is logged.
+        "unsigned_torque" if no torque has a sign; one warning "repeated_torque" for the joints
+        whose torque is updated less often than it is logged.
     """
     moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
     for joint, x in zip(log.joints, log.tau.T, strict=True):
@@ -40,12 +40,12 @@ def check_torque_channels(log: Log) -> Iterator[Finding]:
 
 
 def _clipping(log: Log, joint: str, x: Array, moving: Array) -> Iterator[Finding]:
-    """Yield whether a torque stays at a limit, or at one value, in rows where the robot moves."""
+    """Yield a torque that is at a limit, or constant, in rows where the robot moves."""
     if moving.any() and np.ptp(x) == 0:
         value = float(x[0]) + 0.0  # no -0
         message = (
             f"the torque of {joint} is {value:.6g} in every row while the robot moves: the channel "
-            "is dead, and nothing of this joint's drive can be identified; log "
+            "is dead. The drive of this joint cannot be identified; log "
             f"tau_{joint}, or leave the joint out"
         )
         yield log_finding(log.name, "constant_torque", "warning", message, joint, value=value)
@@ -59,41 +59,41 @@ def _clipping(log: Log, joint: str, x: Array, moving: Array) -> Iterator[Finding
         if share < _CLIPPED or plateau < _PLATEAU or is_coarse:
             continue
         message = (
-            f"the torque of {joint} stays at its limit {limit:.6g} in {100 * share:.3g} % of the "
-            "rows while the robot moves: it is clipped, and those rows are wrong; record a gentler "
-            "motion or cut them out"
+            f"the torque of {joint} is at its limit {limit:.6g} in {100 * share:.3g} % of the "
+            "rows while the robot moves: it is clipped, and these rows are wrong; record a slower "
+            "motion, or remove these rows"
         )
         yield log_finding(log.name, "clipped", "warning", message, joint, limit=limit, share=share)
 
 
 def _unsigned(log: Log) -> Iterator[Finding]:
-    """Yield whether no torque is ever negative although several come to 0 again and again.
+    """Yield a finding if no torque is ever negative although several reach 0 repeatedly.
 
-    One such torque may be that of a joint that gravity loads one way only.
+    A single such torque may belong to a joint that gravity loads in one direction only.
     """
     touching = sum(_touches(x) >= _TOUCHES for x in log.tau.T)
     if log.tau.min() < 0 or touching < _ALL:
         return
     message = (
-        f"no torque is ever negative, although those of {touching} joints come down to 0 again and "
-        "again: they are sizes without their signs, as some servos report their load, and nothing "
-        "identified from them is right; log torques with their signs"
+        f"no torque is ever negative, although the torques of {touching} joints reach 0 "
+        "repeatedly: they are absolute values, as some servos report their load. An "
+        "identification from them is wrong; log torques with their signs"
     )
     yield log_finding(log.name, "unsigned_torque", "error", message, joints=touching)
 
 
 def _touches(x: Array) -> int:
-    """Return how often a torque comes to 0 and leaves again."""
+    """Return how often a torque reaches 0 and increases again."""
     top = float(np.quantile(np.abs(x), 0.995))
     near = runs_of(x < _AWAY * top)
     return sum(x[i:k].min() < _ZERO * top for i, k in near if i > 0 and k < len(x))
 
 
 def _held(log: Log) -> Iterator[Finding]:
-    """Yield the joints whose torque changes every so many rows only, while the robot moves.
+    """Yield the joints whose torque is updated less often than it is logged while the robot moves.
 
-    Rows that repeat in every channel are those of the logger and are told elsewhere; a torque of
-    few steps stays at one of them for irregular times.
+    Rows that repeat in every channel are a fault of the logger and reported elsewhere; a quantised
+    torque is constant for irregular times.
     """
     fresh = np.append(True, (np.diff(log.q, axis=0) != 0).any(axis=1))
     tau = log.tau[fresh]
@@ -101,27 +101,27 @@ def _held(log: Log) -> Iterator[Finding]:
     for length in np.unique(lengths[lengths > 1]):
         names = [log.joints[j] for j in np.flatnonzero(lengths == length)]
         step = float(np.median(np.diff(log.t)))
-        late = 0.5 * (length - 1) * step
+        delay = 0.5 * (length - 1) * step
         message = (
-            f"the torque of {listed(names)} is held for {length:.0f} rows: it is updated at "
-            f"{1 / (length * step):.3g} Hz and logged at {1 / step:.3g} Hz, which makes it "
-            f"{1e3 * late:.2g} ms late on average; log it as often as the position, or state "
-            f"[signals] torque_delay = {late:.4f} (--torque-delay {late:.4f}) and a cutoff below "
+            f"the torque of {listed(names)} is constant for {length:.0f} rows: it is updated at "
+            f"{1 / (length * step):.3g} Hz and logged at {1 / step:.3g} Hz. This is a mean delay "
+            f"of {1e3 * delay:.2g} ms; log it at the rate of the position, or set "
+            f"[signals] torque_delay = {delay:.4f} (--torque-delay {delay:.4f}) and a cutoff below "
             f"{0.25 / (length * step):.2g} Hz"
         )
         part = "" if len(names) == len(log.joints) else listed(names)
         yield log_finding(
-            log.name, "repeated_torque", "warning", message, part, rows=length, delay=late
+            log.name, "repeated_torque", "warning", message, part, rows=length, delay=delay
         )
 
 
 def _hold(x: Array) -> int:
-    """Return for how many rows a torque is held at a time, 1 if for none or irregularly."""
+    """Return for how many rows a torque is constant between updates; 1 if this is irregular."""
     changes = np.flatnonzero(np.diff(x) != 0)
     if len(changes) < 20:
         return 1
     lengths = np.diff(changes)
-    usual = int(np.median(lengths))
-    # a rate that is no whole share of the log's makes holds of two lengths
-    is_regular = np.mean(np.abs(lengths - usual) <= (1 if usual > 2 else 0)) > _REGULAR
-    return usual if usual > 1 and is_regular else 1
+    typical = int(np.median(lengths))
+    # if the log rate is no multiple of the update rate, two lengths occur
+    is_regular = np.mean(np.abs(lengths - typical) <= (1 if typical > 2 else 0)) > _REGULAR
+    return typical if typical > 1 and is_regular else 1

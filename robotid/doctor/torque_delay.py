@@ -1,7 +1,7 @@
-"""How late the torque is against the position, as far as the model's physics tells.
+"""Estimate of the delay of the torque relative to the position, from the model.
 
-The regressor is made of a motion of thrice the bandwidth, and torque and regressor then go through
-the same filter: what a filter takes from one of them alone looks like a delay.
+The regressor is computed from a motion with three times the bandwidth. The same filter is then
+applied to torque and regressor, because a filter of only one of them looks like a delay.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -23,42 +23,40 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["check_torque_delay"]
 
-_LONGEST = 0.1  # [s] delays are sought up to this
-_ROUNDING = 1e-10  # of the longest column
-_DEPENDENT = 1e-5  # of the largest singular value: columns that hold no more are dependent
+_LONGEST = 0.1  # [s] largest delay of the grid
+_ROUNDING = 1e-10  # of the longest column: shorter columns are 0 except for rounding
+_DEPENDENT = 1e-5  # of the largest singular value: smaller ones are of dependent columns
 _GRID = np.linspace(-_LONGEST, _LONGEST, 81)
-_NEAR = 0.01  # [s] about the delay, where the misfit is a parabola
-_FINEST = 0.001  # [s] by which friction that no curve describes imitates a delay
-_HELD = 0.1  # [samples] ... or a torque that is held from row to row
-_SURE = 3.0  # standard errors from which a delay is reported
-_DELAYED = (
-    0.04  # [s] a longer delay that hardly shows is none: other errors of the model imitate it
-)
-_HELPS = 0.15  # share of what is unexplained that it must take away
-_FEW = 100  # rows from which a joint counts for the delay
-_MOVING = 0.1  # share of the instants in which it must move
-_SLOW = 0.05  # [rad/s] slower than this a drive may stick
-_STILL = 0.02  # [rad/s] about which the direction of friction changes
-_AWAY = 0.75  # [periods of the filter] so near a slow instant friction is not known
-_ROWS = 2000  # instants that are looked at
-_WINDOWS = 8  # segments they are in, where the log has more of them
-_BLOCKS = 8  # parts of the log that are left out in turn
-_OVERSAMPLED = 8.0  # instants per period of the filter: products of motions are faster than they
-# Cut-off of the comparison over the job's, and over the rate at most: noise that is interpolated
-# between rows would be smoothed there.
+_NEAR = 0.01  # [s] around the delay, where the misfit is a parabola
+_FINEST = 0.001  # [s] apparent delay by friction that the model does not describe
+_HELD = 0.1  # [samples] ... or by a zero-order hold of the torque
+_SIGNIFICANT = 3.0  # [standard errors] from which a delay is reported
+_DELAYED = 0.04  # [s] a longer delay must explain more: other model errors look like one, too
+_HELPS = 0.15  # least share of the unexplained torque that it must explain
+_FEW = 100  # least number of rows of a joint that is used
+_MOVING = 0.1  # least share of the instants in which it moves
+_SLOW = 0.05  # [rad/s] slower: a drive may be in stiction
+_STILL = 0.02  # [rad/s] width of the change of the direction of friction
+_AWAY = 0.75  # [periods of the filter] closer to a slow instant, friction is unknown
+_ROWS = 2000  # number of instants that are used
+_WINDOWS = 8  # number of segments with these instants in a long log
+_BLOCKS = 8  # number of blocks of the jackknife
+_OVERSAMPLED = 8.0  # instants per period of the filter: the regressor has a larger bandwidth
+# Cut-off of the comparison over the job's, and over the rate at most, since interpolation smooths
+# the noise at higher frequencies.
 _BAND = 1.5, 0.15
-_WIDE = 3.0, 0.4  # the same of the motion that the regressor is made of
-_SETTLED = 1.5  # [periods of the filter] from an end the filter of a segment has settled
+_WIDE = 3.0, 0.4  # the same of the motion from which the regressor is computed
+_SETTLED = 1.5  # [periods of the filter] settling time of the filter at an end of a segment
 _HARMONICS = 4  # of a torque that is periodic in the position, as of gears and magnets
-_EXACT = 1e-5  # share of a torque that is taken for noise in a log without any
-# One joint's torque is delayed by itself if that explains so much of what is unexplained, and part
-# of it in each block of the log; friction and elasticity alone explain up to 0.71 of it
+_EXACT = 1e-5  # share of a torque that is noise even in an exact log
+# Least share of the unexplained torque that a joint's own delay must explain, and some of it in
+# each block of the log; friction and elasticity alone explain up to 0.71
 _EXPLAINS = 0.75
 
 
 @dataclass(frozen=True, eq=False)
 class _Misfit:
-    """What is unexplained of each torque at each delay of the grid.
+    """The unexplained part of each torque at each delay of the grid.
 
     Attributes:
         squares: Sums of squares in each block of the log, as shares of the joint's torque, shape
@@ -72,7 +70,7 @@ class _Misfit:
     joints: tuple[str, ...]
 
     def delays_without(self, axis: int) -> list[float]:
-        """Return the delays if one joint (axis 0) or block of the log (1) is left out in turn."""
+        """Return the delays of the jackknife over joints (axis 0) or blocks of the log (1)."""
         parts = range(self.squares.shape[axis])
         if axis == 0:
             return [self.without({k}).delay() for k in parts]
@@ -80,12 +78,12 @@ class _Misfit:
 
     def without(self, left_out: Collection[int]) -> "_Misfit":
         """Return the misfit of the joints that are not left out."""
-        kept = [k for k in range(len(self.rows)) if k not in left_out]
-        names = tuple(self.joints[k] for k in kept)
-        return _Misfit(self.squares[kept], self.rows[kept], names)
+        used = [k for k in range(len(self.rows)) if k not in left_out]
+        names = tuple(self.joints[k] for k in used)
+        return _Misfit(self.squares[used], self.rows[used], names)
 
     def own_delay(self, k: int) -> "_OwnDelay":
-        """Return the delay of one joint's torque that explains it best by itself."""
+        """Return the delay that explains the torque of one joint best."""
         common = self.without({k}).delay()
         common = common if np.isfinite(common) else 0.0
         squares = self.squares[k]
@@ -97,13 +95,13 @@ class _Misfit:
         best = float(_GRID[np.argmin(squares.sum(axis=0))])
         error = float(np.hypot(_GRID[1] - _GRID[0], np.sqrt((len(delays) - 1) * np.var(delays))))
         explained = 1.0 - float((then.sum() + _EXACT) / (now.sum() + _EXACT))
-        is_sure = abs(best - common) > _SURE * error and bool((then < now).all())
-        return _OwnDelay(best, error, common, explained, is_sure and explained > _EXPLAINS)
+        is_distinct = abs(best - common) > _SIGNIFICANT * error and bool((then < now).all())
+        return _OwnDelay(best, error, common, explained, is_distinct and explained > _EXPLAINS)
 
     def delay(self) -> float:
-        """Return the delay that explains most [s], NaN if it is at an end of the grid."""
+        """Return the delay with the smallest misfit [s], NaN if it is at an end of the grid."""
         share = self.squares.sum(axis=1) + _EXACT
-        # relative to the best of each joint: one that is explained well says more
+        # relative to the smallest of each joint: a joint that is explained well has more weight
         cost = self.rows @ (share / share.min(axis=1, keepdims=True)) / self.rows.sum()
         best = float(_GRID[np.argmin(cost)])
         if abs(best) + _NEAR > _LONGEST:
@@ -120,7 +118,7 @@ class _Misfit:
         return float(np.sqrt(variance))
 
     def gain(self) -> float:
-        """Return the share of what is unexplained that the delay of the other blocks explains."""
+        """Return the share of the unexplained torque that the delay of other blocks explains."""
         now, then = np.zeros((2, len(self.squares)))
         delays = self.delays_without(1)
         for j, squares in enumerate(self.squares):
@@ -132,30 +130,31 @@ class _Misfit:
 
 @dataclass(frozen=True)
 class _OwnDelay:
-    """The delay of one joint's torque [s], its standard error, that of the other joints' torques.
+    """The delay of one joint's torque [s], and its standard error.
 
     Attributes:
-        explained: Share of what is unexplained that the delay of the other blocks explains.
-        is_sure: Whether the joint's torque has a delay of its own.
+        common: Delay of the torques of the other joints [s].
+        explained: Share of the unexplained torque that the delay of the other blocks explains.
+        is_significant: Whether the delay differs from the common one.
     """
 
     delay: float
     error: float
     common: float
     explained: float
-    is_sure: bool
+    is_significant: bool
 
     def finding(self, joint: str, log: str) -> Finding:
-        """Return that the torque of a joint has a delay of its own."""
+        """Return the finding that the torque of a joint has another delay."""
         size = 1e3 * abs(self.delay)
         is_end = abs(self.delay) >= _LONGEST - 1e-9
         value = f"{size:.0f} ms or more" if is_end else f"{size:.0f} +- {1e3 * self.error:.0f} ms"
         message = (
-            f"the torque of {joint} alone is {value} {'late' if self.delay > 0 else 'early'} "
-            f"against the position, the torques of the other joints by {1e3 * self.common:.0f} ms; "
-            f"moved back, {100 * self.explained:.0f} % of what no physics explains of it goes: "
-            f"correct the time stamps or the filter of tau_{joint} in the logger, for "
-            "torque_delay shifts all joints alike"
+            f"the torque of {joint} {'lags' if self.delay > 0 else 'leads'} the position by "
+            f"{value}, the torques of the other joints lag it by {1e3 * self.common:.0f} ms. The "
+            f"delay explains {100 * self.explained:.0f} % of the torque that the model does not "
+            f"explain; correct the time stamps or the filter of tau_{joint} in the logger, "
+            "because torque_delay shifts all joints"
         )
         evidence = {"delay": self.delay, "std_error": self.error, "gain": self.explained}
         return log_finding(log, "joint_torque_delay", "warning", message, joint, **evidence)
@@ -168,35 +167,36 @@ class _Window:
     Attributes:
         inertial: Of the bodies that each joint carries, joint after joint, shape (N, columns).
         drive: Of each joint's inertia, frictions and position, and of coupled drives, (N, n, k).
-        steady: Whether a joint is far from where its drive may stick, shape (N, n), bool.
-        late: Torques at each delay of the grid after the instants, shape (n, delays, N).
+        steady: Whether the drive is far from stiction, shape (N, n), bool.
+        delayed: Torques at each delay of the grid after the instants, shape (n, delays, N).
     """
 
     inertial: Array
     drive: Array
     steady: Array
-    late: Array
+    delayed: Array
 
 
 def check_torque_delay(
     model: RobotModel, log: Log, signals: SignalSettings, name: str
 ) -> Iterator[Finding]:
-    """Yield "torque_delay", how late the torque is against the position, at most once.
+    """Yield the delay of the torque relative to the position: "torque_delay", at most once.
 
-    Before it, a warning "joint_torque_delay" per joint whose torque has a delay of its own, which
-    then does not count for the common one.
+    Before it, a warning "joint_torque_delay" per joint whose torque has another delay; this joint
+    is then not used for the common delay.
 
-    The delay minimises what physics, friction of any odd curve of the speed and a torque that is
-    periodic in the position leave of the delayed torque, instants near slow ones apart. Its
-    uncertainty is the jackknife's over the joints and over segments of the log. It is a warning
-    from three standard errors on, if the delay of the other segments explains each segment better:
-    one of more than 40 ms clearly so.
+    The delay minimises the unexplained part of the delayed torque. The model has, besides the
+    inertias, friction as an antisymmetric function of the speed, and a torque that is periodic in
+    the position. Instants near slow ones are not used. The standard error is the jackknife's over
+    the joints and over blocks of the log. The finding is a warning from three standard errors, if
+    the delay of the other blocks explains each block better. A delay of more than 40 ms must
+    explain at least 15 % of the unexplained torque.
 
     Args:
         model: The robot, with a fixed base.
         log: The log, of the model's joints in its order.
         signals: How it becomes a trajectory.
-        name: What the log is called.
+        name: Name of the log.
 
     Raises:
         DataError: If the log is too short.
@@ -204,7 +204,7 @@ def check_torque_delay(
     """
     step = float(np.median(np.diff(log.t)))
     rate = min(1 / step, signals.rate or np.inf)
-    # the comparison is filtered even if the job is not: see _BAND
+    # the comparison is filtered even if the job has no filter: see _BAND
     times, most = _BAND
     cutoff = min(times * (signals.cutoff or np.inf), most * rate)
     times, most = _WIDE
@@ -214,8 +214,8 @@ def check_torque_delay(
     if misfit is None:
         return
     own = {k: misfit.own_delay(k) for k in range(len(misfit.joints))}
-    own = {k: one for k, one in own.items() if one.is_sure}
-    if 2 * len(own) < len(misfit.joints):  # more than half are no exception
+    own = {k: one for k, one in own.items() if one.is_significant}
+    if 2 * len(own) < len(misfit.joints):  # at most half of the joints are exceptions
         yield from (one.finding(misfit.joints[k], name) for k, one in own.items())
         misfit = misfit.without(own)
     if len(misfit.joints) > 1:
@@ -223,29 +223,36 @@ def check_torque_delay(
 
 
 def _common(misfit: _Misfit, step: float, signals: SignalSettings, name: str) -> Iterator[Finding]:
-    """Yield the delay that all torques have, if it can be found."""
+    """Yield the common delay of all torques, if it is determined."""
     delay, error, gain = misfit.delay(), misfit.error(), misfit.gain()
     if not np.isfinite([delay, error, gain]).all():
         return
     error = float(np.hypot(error, max(_FINEST, _HELD * step)))
-    is_sure = abs(delay) > _SURE * error and gain > (_HELPS if abs(delay) > _DELAYED else 0.0)
-    late = f"{1e3 * abs(delay):.1f} +- {1e3 * error:.1f} ms {'late' if delay > 0 else 'early'}"
+    is_significant = abs(delay) > _SIGNIFICANT * error and gain > (
+        _HELPS if abs(delay) > _DELAYED else 0.0
+    )
     total = delay + signals.torque_delay
-    if not is_sure:
-        todo = "; that may be none: nothing needs doing"
+    if not is_significant:
+        todo = ", which is not significant; no action needed"
     elif gain > _HELPS:
         todo = (
-            f"; moved back, {100 * gain:.0f} % of what no physics explains of it goes: correct the "
-            f"logger's clock, or set torque_delay = {total:.4f} (--torque-delay {total:.4f})"
+            f". The delay explains {100 * gain:.0f} % of the torque that the model does not "
+            "explain; correct the logger's clock, or set "
+            f"torque_delay = {total:.4f} (--torque-delay {total:.4f})"
         )
     else:
         todo = (
-            ". Friction that the model lacks can look like this; if the drive filters its torque, "
+            ". Unmodelled friction can look like this; if the drive filters its torque, "
             f"set torque_delay = {total:.4f} (--torque-delay {total:.4f})"
         )
-    message = f"the torque is {late} against the position{todo}"
+    message = (
+        f"the torque {'lags' if delay > 0 else 'leads'} the position by {1e3 * abs(delay):.1f} "
+        f"+- {1e3 * error:.1f} ms{todo}"
+    )
     evidence = {"delay": delay, "std_error": error, "gain": gain}
-    yield log_finding(name, "torque_delay", "warning" if is_sure else "note", message, **evidence)
+    yield log_finding(
+        name, "torque_delay", "warning" if is_significant else "note", message, **evidence
+    )
 
 
 def _misfit(
@@ -294,12 +301,12 @@ def _window(
     model: RobotModel, motion: Trajectory, rows: Array, step: float, every: int,
     signals: SignalSettings, period: float,
 ) -> _Window:  # fmt: skip
-    """Return the filtered columns at every so many of contiguous rows, but for their ends."""
+    """Return the filtered columns at every n-th of contiguous rows, without the ends."""
     t, q, v, coarse = motion.t[rows], motion.q[rows], motion.v[rows] / _units(model), rows[::every]
     edge = max(_LONGEST, _SETTLED * period)
     inner = (motion.t[coarse] >= t[0] + edge) & (motion.t[coarse] <= t[-1] - edge)
-    # friction of any odd curve of the speed, and torques periodic in the position, so that they are
-    # not taken for a delay; filtered before rows are left out, for friction jumps
+    # friction as an antisymmetric function of the speed and torques periodic in the position, so
+    # that they do not look like a delay; filtered before decimation, because friction jumps
     top = np.maximum(np.abs(motion.v).max(axis=0) / _units(model), _STILL)
     signs = [np.tanh(v / speed) for speed in (_STILL, 0.1 * top, 0.3 * top)]
     waves = [wave(k * q) for k in range(1, 1 + _HARMONICS) for wave in (np.cos, np.sin)]
@@ -311,13 +318,13 @@ def _window(
         for columns in (carried_columns, coupled_columns)
     )
     at = motion.t[coarse[inner]]
-    turns = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
-    slow = turns | (np.abs(v) < _SLOW)
+    is_reversal = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
+    slow = is_reversal | (np.abs(v) < _SLOW)
     steady = [_distance(at, t[slow[:, j]]) > _AWAY * period for j in range(v.shape[1])]
     tau = low_pass(motion.tau[rows], 1 / step, signals)
-    late = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 2, 0).copy()
+    delayed = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 2, 0).copy()
     drive = np.concatenate([own, coupled], axis=2)
-    return _Window(inertial, drive, np.column_stack(steady), late)
+    return _Window(inertial, drive, np.column_stack(steady), delayed)
 
 
 def _interpolated(t: Array, values: Array, times: Array) -> Array:
@@ -327,18 +334,18 @@ def _interpolated(t: Array, values: Array, times: Array) -> Array:
     return cubic_spline(t, values, times)
 
 
-def _distance(at: Array, turns: Array) -> Array:
-    """Return how far each time is from the nearest turn, shape as at [s]."""
-    bounds = np.concatenate([[-np.inf], turns, [np.inf]])
+def _distance(at: Array, slow: Array) -> Array:
+    """Return the distance of each time from the nearest slow instant, shape as at [s]."""
+    bounds = np.concatenate([[-np.inf], slow, [np.inf]])
     after = np.searchsorted(bounds, at)
     distance: Array = np.minimum(at - bounds[after - 1], bounds[after] - at)
     return distance
 
 
 def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, int] | None:
-    """Return what is unexplained of joint j's torque, shape (blocks, delays), and its instants.
+    """Return the unexplained part of joint j's torque, shape (blocks, delays), and its instants.
 
-    Its inertial columns are ``own``. None of a joint that moves in too few.
+    Its inertial columns are ``own``. None for a joint that moves in too few instants.
     """
     steady = [window.steady[:, j] for window in windows]
     used = sum(map(np.count_nonzero, steady))
@@ -348,18 +355,18 @@ def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, int
     inertial = np.concatenate([window.inertial[at, own] for window, at in pairs])
     drive = np.concatenate([window.drive[at, j] for window, at in pairs])
     X = np.hstack([inertial, drive, np.ones((used, 1))])
-    late = np.concatenate([window.late[j][:, at] for window, at in pairs], axis=1)
-    late -= late.mean(axis=1, keepdims=True)  # (delays, N)
-    size = np.einsum("dk,dk->d", late, late)
+    tau = np.concatenate([window.delayed[j][:, at] for window, at in pairs], axis=1)
+    tau -= tau.mean(axis=1, keepdims=True)  # (delays, N)
+    size = np.einsum("dk,dk->d", tau, tau)
     if size.min() <= 0:
         return None
     length = np.linalg.norm(X, axis=0)
-    seen = length > _ROUNDING * length.max()  # other columns are 0 but for rounding
-    X = X[:, seen] / length[seen]
-    # by QR iterations: of so many dependent columns, divide and conquer need not converge
+    is_excited = length > _ROUNDING * length.max()  # other columns are 0 except for rounding
+    X = X[:, is_excited] / length[is_excited]
+    # by QR iterations: with many dependent columns, divide and conquer may not converge
     _, s, Vt = svd(np.linalg.qr(X, mode="r"), lapack_driver="gesvd")
-    kept = s > _DEPENDENT * s[0]
-    Q = X @ (Vt[kept].T / s[kept])
-    late -= (late @ Q) @ Q.T
-    blocks = np.array_split(late, _BLOCKS, axis=1)
+    independent = s > _DEPENDENT * s[0]
+    Q = X @ (Vt[independent].T / s[independent])
+    tau -= (tau @ Q) @ Q.T
+    blocks = np.array_split(tau, _BLOCKS, axis=1)
     return np.array([np.einsum("dk,dk->d", b, b) / size for b in blocks]), used

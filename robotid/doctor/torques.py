@@ -1,4 +1,4 @@
-"""Do the torques fit the model: signs, order of columns, gravity, positions."""
+"""Checks of the torques against the model: signs, order of columns, gravity, positions."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -14,21 +14,21 @@ from robotid.findings import Finding, listed, log_finding
 
 __all__ = ["check_torques"]
 
-_CERTAIN = 2.5  # gain in the logarithm of the unexplained share, a factor 12, that is no chance
-_EXPLAINED = 0.2  # a reading that explains no torque better than this proves nothing
-_WRONG = 0.5  # a torque of the right sign is explained at least this well
-_EXCUSED = 0.3  # a torque that is explained so well with some load may have the right sign
-_MUCH_BETTER = 12.0  # ... unless the other sign explains it that many times better
-_NOISE = 3e-3  # share of a torque's variance that is as good as explained
-_TILT = 5.0  # [deg] gravity farther than this off is worth a warning
-_TURNED = 30.0  # [deg] ... and farther than this gives wrong answers
-_HINT = 0.7  # gain from which a tilt is believed
-_UNEXPLAINED = 0.25  # share of a torque's variance that no physics explains
+_CERTAIN = 2.5  # significant decrease of the logarithm of the unexplained share, a factor 12
+_EXPLAINED = 0.2  # largest unexplained share of a reading that is accepted
+_WRONG = 0.5  # largest unexplained share of a torque with the right sign
+_EXCUSED = 0.3  # ... and the largest with a load, at which the sign may still be right
+_MUCH_BETTER = 12.0  # ratio of unexplained shares from which the other sign is right nevertheless
+_NOISE = 3e-3  # share of a torque's variance that is negligible
+_TILT = 5.0  # [deg] angle of gravity from the stated one that is a warning
+_WRONG_TILT = 30.0  # [deg] ... and an error
+_HINT = 0.7  # gain from which a tilt is reported
+_UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported
 
 
 @dataclass(frozen=True)
 class _Reading:
-    """The reading that explains the torques of a log best, beside the stated one."""
+    """The reading of a log that explains its torques best, and the stated one."""
 
     probe: Probe
     stated: Explanation
@@ -48,7 +48,7 @@ class _Reading:
         return [self.probe.model.joints[j] for j in self.best.joints]
 
     def finding(self, message: str, part: str) -> Finding:
-        """Return that columns hold something else than is stated."""
+        """Return the error that columns contain other quantities than stated."""
         return log_finding(
             self.log, self.best.kind, "error", message, part, gain=self.gain,
             unexplained=self.stated.share.max(), unexplained_so_read=self.best.share.max(),
@@ -56,31 +56,31 @@ class _Reading:
 
 
 def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
-    """Yield what must be otherwise for the torques to fit the model.
+    """Yield the faults of signs, columns, gravity or URDF that keep the torques from fitting.
 
-    The reading that explains the torques best is named, and only it; where the log is right as it
-    stands, the URDF's masses are checked.
+    Only the reading that explains the torques best is reported; if it is the stated one, the
+    URDF's masses are checked.
 
     Args:
         probe: The motion.
-        name: What the log is called.
+        name: Name of the log.
 
     Yields:
         Errors "torque_sign", "unsigned_torque", "torque_order", "joint_order", "joint_axis",
-        "position_order", "position_sign", "position_offset", "gravity" or "gravity_compensated",
-        or else what ``check_unmounted_parts`` or ``check_loads`` yields; and "unexplained_torque";
-        beside these a warning "counterbalance".
+        "position_order", "position_sign", "position_offset", "gravity" or "gravity_compensated";
+        without these, the findings of ``check_unmounted_parts`` or ``check_loads`` and
+        "unexplained_torque"; in addition a warning "counterbalance".
     """
     probe, balanced = counterbalance(probe, name)
     yield from balanced
     stated, loaded, others = explanations(probe)
     best = min(others, key=lambda e: e.misfit)
     if best.kind not in ("torque_sign", "unsigned_torque") and loaded.misfit < best.misfit:
-        best = stated  # a load explains it better
+        best = stated  # a load explains the torques better
     make = _FINDINGS.get(best.kind)
     found = list(make(_Reading(probe, stated, best, name))) if make else []
     for finding in found:
-        # what a load on the last link would explain as well is no error for certain
+        # a fault that a load on the last link explains as well is only a warning
         yield replace(finding, severity="warning") if _is_excused(best, loaded) else finding
     if not found:
         loads = list(check_loads(probe, loaded.share, name))
@@ -97,8 +97,8 @@ def _sign(reading: _Reading) -> Iterator[Finding]:
         if before < _WRONG or after > _EXPLAINED:
             continue
         message = (
-            f"the torque of {joint} has the opposite sign: as it is, {100 * before:.0f} % of its "
-            f"variance cannot be explained, negated {100 * after:.2g} %; negate tau_{joint} (or "
+            f"the torque of {joint} has the opposite sign: {100 * before:.0f} % of its variance "
+            f"is unexplained, with the sign reversed {100 * after:.2g} %; negate tau_{joint} (or "
             "its gain), or check the joint's axis in the URDF"
         )
         evidence = {"unexplained": before, "unexplained_if_negated": after}
@@ -111,9 +111,9 @@ def _unsigned(reading: _Reading) -> Iterator[Finding]:
         if after > _EXPLAINED:
             continue
         message = (
-            f"the torque of {joint} is a size without its sign: as it is, {100 * before:.0f} % of "
-            f"its variance cannot be explained, with the signs of the motion {100 * after:.2g} %; "
-            f"log tau_{joint} with its sign"
+            f"the torque of {joint} is logged without its sign: {100 * before:.0f} % of its "
+            f"variance is unexplained, with the signs of the model {100 * after:.2g} %; log "
+            f"tau_{joint} with its sign"
         )
         evidence = {"unexplained": before, "unexplained_with_signs": after}
         yield log_finding(reading.log, "unsigned_torque", "error", message, joint, **evidence)
@@ -125,15 +125,17 @@ def _exchanged(reading: _Reading) -> Iterator[Finding]:
     names, best = reading.joints, reading.best
     if best.kind == "torque_order":
         owners = [reading.probe.model.joints[int(best.values[j])] for j in best.joints]
-        shown = ", ".join(f"tau_{a} is that of {b}" for a, b in zip(names, owners, strict=True))
-        what, todo = f"torque columns are exchanged: {shown}", "rename these torque columns"
+        pairs = zip(names, owners, strict=True)
+        shown = ", ".join(f"tau_{a} is the torque of {b}" for a, b in pairs)
+        what, todo = f"torque columns are exchanged: {shown}", "rename these columns"
     elif best.kind == "position_order":
         what, todo = f"the position columns of {listed(names)} are exchanged", "rename them"
     else:
-        what, todo = f"all columns of {listed(names)} are exchanged", "name the joints rightly"
+        what, todo = f"all columns of {listed(names)} are exchanged", "correct the joint names"
     message = (
-        f"{what}: so read, the unexplained share of the worst torque falls from "
-        f"{100 * reading.stated.share.max():.2g} to {100 * best.share.max():.2g} %; {todo}"
+        f"{what}. With these columns exchanged, the largest unexplained share of a torque "
+        f"decreases from {100 * reading.stated.share.max():.2g} to "
+        f"{100 * best.share.max():.2g} %; {todo}"
     )
     yield reading.finding(message, listed(names))
 
@@ -144,21 +146,21 @@ def _position(reading: _Reading) -> Iterator[Finding]:
     best, (joint,) = reading.best, reading.joints
     if best.kind == "joint_axis":
         what = (
-            f"position and torque of {joint} have the opposite sign: its axis is reversed; turn "
+            f"position and torque of {joint} have the opposite sign: its axis is reversed. Reverse "
             f"the joint's axis in the URDF, or negate q_{joint}, dq_{joint} and tau_{joint}"
         )
     elif best.kind == "position_sign":
-        what = f"the position of {joint} has the opposite sign; negate q_{joint} (and dq_{joint})"
+        what = f"the position of {joint} has the opposite sign. Negate q_{joint} (and dq_{joint})"
     else:
         what = (
-            f"the zero of {joint} is off by about {best.values[0]:.2g} rad; correct q_{joint} or "
-            "the joint's origin in the URDF"
+            f"the zero position of {joint} has an error of about {best.values[0]:.2g} rad. Correct "
+            f"q_{joint} or the joint's origin in the URDF"
         )
     before = reading.stated.share
     worst = int(np.argmax(before - best.share))
     message = (
-        f"{what}: so read, the unexplained share of {reading.probe.model.joints[worst]}'s torque "
-        f"falls from {100 * before[worst]:.3g} to {100 * best.share[worst]:.3g} %"
+        f"{what}. The unexplained share of the torque of {reading.probe.model.joints[worst]} then "
+        f"decreases from {100 * before[worst]:.3g} to {100 * best.share[worst]:.3g} %"
     )
     yield reading.finding(message, joint)
 
@@ -173,17 +175,17 @@ def _gravity(reading: _Reading) -> Iterator[Finding]:
         return
     cosine = float(g @ believed) / (float(np.linalg.norm(g)) * size) if size > 0 else 0.0
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    turned = angle > _TURNED and reading.is_certain
-    if not turned and (angle < _TILT or gain < _HINT):
+    is_wrong = angle > _WRONG_TILT and reading.is_certain
+    if not is_wrong and (angle < _TILT or gain < _HINT):
         return
     shown, stated = (", ".join(f"{x:.2f}" for x in vector) for vector in (g, believed))
     message = (
-        f"gravity along [{shown}] m/s^2 explains the torques best, {angle:.0f} degrees from the "
-        f"stated [{stated}]; if the robot is mounted on a wall, a ceiling or a slope, state "
-        f"gravity = [{shown}] in the job file"
+        f"gravity [{shown}] m/s^2 explains the torques best. Its direction is {angle:.0f} degrees "
+        f"from the stated [{stated}]; if the robot is mounted on a wall, a ceiling or a slope, "
+        f"state gravity = [{shown}] in the job file"
     )
     evidence = {"angle_deg": angle, "x": g[0], "y": g[1], "z": g[2], "gain": gain}
-    severity = "error" if turned else "warning"
+    severity = "error" if is_wrong else "warning"
     yield log_finding(reading.log, "gravity", severity, message, **evidence)
 
 
@@ -211,13 +213,14 @@ def _is_excused(best: Explanation, loaded: Explanation) -> bool:
 
 
 def _unexplained(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
-    """Yield torques of which physics leaves too much, or once that most of them are so."""
+    """Yield torques with a large unexplained share; one finding if these are most of them."""
     bad = np.flatnonzero(share > _UNEXPLAINED)
     if 2 * len(bad) > len(share):
         message = (
             f"the torques of {len(bad)} of {len(share)} joints fit neither gravity, inertia nor "
-            "friction of this model: the base may move or the robot touch something, the log or "
-            "the URDF may be of another robot; nothing identified from it can be right"
+            "friction of this model. The base may move, the robot may touch its environment, or "
+            "the log and the URDF may be of different robots; an identification from this log is "
+            "wrong"
         )
         evidence = {"joints": len(bad), "share": float(np.median(share))}
         yield log_finding(name, "unexplained_torque", "warning", message, **evidence)
@@ -226,8 +229,8 @@ def _unexplained(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
         joint = probe.model.joints[j]
         message = (
             f"{100 * share[j]:.0f} % of the variance of {joint}'s torque fits neither gravity, "
-            "inertia nor friction: the channel may hold another quantity, little but noise, a "
-            "spring, a gear that is not round, or a drive that is coupled to others; what depends "
-            "on it is not to be trusted"
+            "inertia nor friction. The channel may contain another quantity or mostly noise; the "
+            "joint may have a spring, an eccentric gear or a coupled drive. Parameters that depend "
+            "on this torque are not reliable"
         )
         yield log_finding(name, "unexplained_torque", "warning", message, joint, share=share[j])

@@ -1,4 +1,4 @@
-"""Audit of a URDF: its joints, its identifiable parameters, and its faults, before any log."""
+"""Audit of a URDF without logs: its joints, its identifiable parameters and its faults."""
 
 import math
 import xml.etree.ElementTree as ET
@@ -43,7 +43,7 @@ _NUMBERS = {
 
 @dataclass(frozen=True)
 class Structure:
-    """How many parameters a robot has and how well any motion can show them.
+    """Number and identifiability of a robot's parameters, for any motion.
 
     Attributes:
         standard: Number of standard inertial parameters, ten per body.
@@ -64,14 +64,14 @@ class Structure:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was found in a URDF.
+    """The result of the audit of a URDF.
 
     Attributes:
         robot: Name of the robot, "" if the file has none.
         joints: Names of its movable joints.
         structure: Its parameters; None if no model can be built.
-        base_groups: The inertial base parameters in words.
-        findings: What a user must know; ``where`` is "link NAME", "joint NAME" or "file NAME".
+        base_groups: The inertial base parameters as sums of standard parameters.
+        findings: The findings; ``where`` is "link NAME", "joint NAME" or "file NAME".
     """
 
     robot: str
@@ -104,7 +104,7 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
         free_flyer: Whether the base floats.
 
     Returns:
-        The inspection. A file that no model can be built from gives a finding, not an error.
+        The inspection. A file from which no model can be built gives a finding, not an exception.
     """
     require_kind(path, (str, Path), "path", "the path of a URDF")
     require_flag(free_flyer, "free_flyer")
@@ -168,7 +168,7 @@ def _numbers(robot: ET.Element) -> Iterator[Finding]:
 
 
 def _joint_findings(path: Path) -> Iterator[Finding]:
-    """Yield what yourdfpy finds of limits, damping, friction and mimic."""
+    """Yield faults of limits, damping, friction and mimic, read with yourdfpy."""
     try:
         joints = read_with_yourdfpy(path).joints
     except ModelError as error:
@@ -190,9 +190,9 @@ def _no_limits(joint: Any) -> Iterator[Finding]:  # noqa: ANN401
     if (lower or 0.0) < (upper or 0.0):
         return
     message = (
-        f"joint {joint.name!r} is {joint.type} but its range of positions is lower {lower}, upper "
+        f"joint {joint.name!r} is {joint.type}, but its limits are lower {lower}, upper "
         f'{upper}, wanted lower < upper; write <limit lower="..." upper="..."/>, '
-        + ('or type="continuous" if it turns without end' if joint.type == "revolute" else "in m")
+        + ('or type="continuous" if it has no limits' if joint.type == "revolute" else "in m")
     )
     yield Finding("no_limits", "warning", f"joint {joint.name}", message)
 
@@ -201,7 +201,8 @@ def _negative(joint: Any, key: str, text: str | None) -> Iterator[Finding]:  # n
     value = numbers(text or "", 1, math.inf)
     if not value or value[0] >= 0:
         return
-    harm = "Pinocchio refuses such a file" if key == "friction" else "simulators gain energy by it"
+    is_refused = key == "friction"
+    harm = "Pinocchio rejects the file" if is_refused else "it adds energy in simulators"
     message = (
         f"joint {joint.name!r} has {key} {text}, wanted 0 or more; robotid does not use it, but "
         f"{harm}: correct the sign"
@@ -213,20 +214,20 @@ def _mimic(joint: Any, names: set[str]) -> Finding:  # noqa: ANN401
     leader = joint.mimic.joint
     if leader not in names or leader == joint.name:
         message = (
-            f"joint {joint.name!r} mimics {leader!r}, which is no other movable joint of the file; "
-            "name the joint that leads it, or remove the <mimic>"
+            f"joint {joint.name!r} mimics {leader!r}, which is not another movable joint of the "
+            "file; name the leading joint, or remove the <mimic>"
         )
         return Finding("mimic_joint", "warning", f"joint {joint.name}", message)
     message = (
         f"joint {joint.name!r} mimics {leader!r} (multiplier {joint.mimic.multiplier:g}, offset "
-        f"{joint.mimic.offset:g}) but is treated as a joint of its own; use mimic = 'coupled' if "
+        f"{joint.mimic.offset:g}) but is treated as an independent joint; use mimic = 'coupled' if "
         f"the drive of {leader!r} moves both"
     )
     return Finding("mimic_joint", "note", f"joint {joint.name}", message)
 
 
 def _link_findings(model: RobotModel) -> Iterator[Finding]:
-    """Yield faults of the inertials and where they are summed."""
+    """Yield faults of the inertials, and the bodies of several links."""
     inertials = model.tree.inertials
     by_body: dict[int, list[LinkPlace]] = {}
     for place in link_places(model):
@@ -243,8 +244,8 @@ def _link_findings(model: RobotModel) -> Iterator[Finding]:
         if lumped and body >= 0:
             moved = model.layout.bodies[body]
             message = (
-                f"link {moved!r} is one body with {listed(lumped)}, joined to it by fixed joints: "
-                "one sum is identified, and a written URDF has it in this link; nothing needs doing"
+                f"link {moved!r} is one body with {listed(lumped)}, attached by fixed joints: "
+                "their sum is identified and written to this link of the URDF; no action needed"
             )
             yield Finding("fixed_lumped", "note", f"link {moved}", message)
 
@@ -252,13 +253,13 @@ def _link_findings(model: RobotModel) -> Iterator[Finding]:
 def _missing(link: str, having: list[str]) -> Finding:
     if having:
         message = (
-            f"link {link!r} moves but has no <inertial>, wanted one; the mass of its body is in "
-            f"{listed(having)}, so nothing needs doing if it is a mere frame"
+            f"link {link!r} moves but has no <inertial>, wanted one. The mass of its body is in "
+            f"{listed(having)}; no action needed if the link is only a frame"
         )
         return Finding("missing_inertial", "note", f"link {link}", message)
     message = (
-        f"link {link!r} moves but has no <inertial>, nor has any link joined to it, wanted one: "
-        "its body counts as massless; add an estimate of mass, centre and inertia"
+        f"link {link!r} moves but has no <inertial>, nor has any link attached to it, wanted one. "
+        "Its body is massless; add estimates of mass, centre of mass and inertia"
     )
     return Finding("missing_inertial", "warning", f"link {link}", message)
 

@@ -1,4 +1,4 @@
-"""What makes a robot's base parameters uncertain: rounded angles, 3.1416 for pi; faint ones."""
+"""Checks of the base parameters of a URDF: rounded angles (3.1416 for pi), weak parameters."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,8 +13,8 @@ from robotid.robot.urdf_text import exact_angle
 
 __all__ = ["rounded_angles", "rounded_robot", "weak_parameters"]
 
-_NOISE = 1e-10  # pivots below this share of the largest are rounding
-_HARMLESS = "the identifiable parameters do not change"
+_NOISE = 1e-10  # smaller pivots, over the largest, are rounding errors
+_HARMLESS = "The identifiable parameters do not change"
 _ADVICE = "snap_angles = true (--snap-angles) takes the exact angles"
 
 
@@ -26,14 +26,14 @@ def rounded_angles(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]
         mapping: Its base parameters.
 
     Yields:
-        "rounded_rpy" of the joints whose angles change how many parameters are, or look,
-        identifiable, and of the others, with the exact angles. It is a warning if more are, which
-        the user can undo; a note elsewhere.
+        "rounded_rpy" for the joints whose angles change the number of parameters that are, or
+        seem, identifiable, and for the others, with the exact angles: a warning if the number
+        increases, which the user can undo, else a note.
     """
     rounded = _rounded(model.tree)
     more, effect = _effect(model, mapping) if rounded else (0, "")
     felt = _carrying(model.tree) if effect else set()
-    for is_felt, said in ((True, f"{effect}; {_ADVICE}"), (False, _HARMLESS)):
+    for is_felt, consequence in ((True, f"{effect}; {_ADVICE}"), (False, _HARMLESS)):
         joints = {name: exact for name, exact in rounded.items() if (name in felt) == is_felt}
         if not joints:
             continue
@@ -42,7 +42,7 @@ def rounded_angles(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]
         where, subject = f"file {Path(model.tree.path).name}", f"the joints {listed(joints)} have"
         if len(joints) == 1:
             where, subject = f"joint {next(iter(joints))}", f"joint {next(iter(joints))!r} has"
-        message = f"{subject} rounded angles in rpy: write {wanted}; {said}"
+        message = f"{subject} rounded angles in rpy; write {wanted}. {consequence}"
         evidence = {
             "largest_error": max(abs(float(word) - angle) for word, angle in exact.items()),
             "felt": float(is_felt),
@@ -59,18 +59,18 @@ def rounded_robot(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
         mapping: Its base parameters.
 
     Yields:
-        "rounded_rpy" of the file, with the joints; a note if robotid leaves out what is more.
+        "rounded_rpy" of the file, with the joints; a note if robotid leaves these parameters out.
     """
     joints = [name for name in _rounded(model.tree) if name in _carrying(model.tree)]
     more, effect = _effect(model, mapping) if joints else (0, "")
     if effect:
         where, severity = Path(model.tree.path).name, "warning" if more else "note"
-        message = f"{where} rounds angles of the joints {listed(joints, 6)}: {effect}; {_ADVICE}"
+        message = f"{where} rounds angles of the joints {listed(joints, 6)}. {effect}; {_ADVICE}"
         yield Finding("rounded_rpy", severity, where, message, {"joints": float(len(joints))})
 
 
 def weak_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
-    """Yield a warning if parameters lie between those that motion shows and those it cannot.
+    """Yield a warning if parameters are at the limit between identifiable and unidentifiable.
 
     Args:
         model: The robot.
@@ -82,20 +82,20 @@ def weak_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding
     if weak := _between(mapping):
         where = Path(model.tree.path).name
         message = (
-            f"{where}: {weak} parameters load the joints less than 1e-4 as much as others, and "
-            f"are left out of the {len(mapping.K)} base parameters; identify fewer of the "
-            f"{len(model.joints)} joints at a time"
+            f"{where}: {weak} parameters have less than 1e-4 of the effect of others on the "
+            f"torques. They are left out of the {len(mapping.K)} base parameters; identify fewer "
+            f"of the {len(model.joints)} joints in one job"
         )
         yield Finding("weak_parameters", "warning", f"file {where}", message, {"faint": weak})
 
 
 def _between(mapping: BaseMapping) -> int:
-    """Return how many pivots are neither rounding nor large enough to count."""
+    """Return the number of pivots that are neither rounding errors nor large enough."""
     return int(np.sum(mapping.pivots > _NOISE)) - len(mapping.K)
 
 
 def _rounded(tree: Tree) -> dict[str, dict[str, float]]:
-    """Return the rounded angles of each joint that has some, as written, and what they round."""
+    """Return the rounded angles of each joint, as written, and the exact angles."""
     rounded = {}
     for joint in tree.robot.findall("joint"):
         origin = joint.find("origin")
@@ -107,26 +107,26 @@ def _rounded(tree: Tree) -> dict[str, dict[str, float]]:
 
 
 def _effect(model: RobotModel, mapping: BaseMapping) -> tuple[int, str]:
-    """Return how many base parameters the rounding adds, and what it does, "" if nothing."""
+    """Return how many base parameters the rounding adds, and a sentence on it, "" if none."""
     options = {**model.options, "couplings": model.layout.couplings}
     meant = structural_mapping(RobotModel.from_urdf(model.tree, **options, snap_angles=True))
     more = len(mapping.K) - len(meant.K)
     seeming = _between(mapping) - _between(meant)
     if more:
         return more, (
-            f"the file's rounding makes {len(mapping.K)} base parameters of {len(meant.K)}, and "
-            "only noise would fix the values of the others"
+            f"With the rounding there are {len(mapping.K)} base parameters instead of "
+            f"{len(meant.K)}, and noise determines the additional ones"
         )
     if seeming > 0:
         return 0, (
-            f"the file's rounding makes {seeming} more parameters look identifiable, though "
-            "only noise would fix their values; robotid leaves them out, other tools may not"
+            f"With the rounding, {seeming} more parameters seem identifiable, although noise "
+            "determines them. robotid leaves them out, other tools may not"
         )
     return 0, ""
 
 
 def _carrying(tree: Tree) -> set[str]:
-    """Return the joints that move or carry one that does: their angles shape the dynamics."""
+    """Return the joints that move or carry a moving joint: their angles affect the dynamics."""
     arriving = {joint.child: joint for joint in tree.joints}
     carrying: set[str] = set()
     for joint in tree.movable:

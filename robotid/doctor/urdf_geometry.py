@@ -1,4 +1,4 @@
-"""Inertials against the geometry that a URDF has: where no body of that shape can be so."""
+"""Check of inertials against the geometry of a URDF: values that no body of that shape has."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -14,29 +14,29 @@ from robotid.robot.tree import Inertial
 
 __all__ = ["audit_bodies", "audit_links"]
 
-_HEAVIEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: beyond solid tungsten, below foam
-_MARGIN = 0.1  # of the box's diagonal by which a centre of mass may lie outside
-_THIN = 0.01  # [m] to which each side of a box is widened: sheets have a volume, too
-_SMALL = 1e-3  # share of the robot's mass below which what is wrong of a body hardly matters
+_DENSEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: about solid tungsten, and foam
+_MARGIN = 0.1  # of the box's diagonal, by which a centre of mass may lie outside
+_THIN = 0.01  # [m] least side of a box, so that thin sheets have a volume
+_SMALL = 1e-3  # share of the robot's mass below which a fault of a body is only a note
 _ROUND = tuple(10.0**k for k in range(-6, 3))  # inertias [kg m^2] and masses [kg] of templates
-_ALIKE = 1e-9  # relative difference of inertials that are copies
-_SIZE = 0.05  # relative difference of boxes that are of one size
+_ALIKE = 1e-9  # largest relative difference of inertials that are copies
+_SIZE = 0.05  # largest relative difference of boxes of equal size
 
 
 def audit_links(model: RobotModel) -> Iterator[Finding]:
-    """Yield what is implausible about the inertials of a robot.
+    """Yield implausible inertials of a robot.
 
-    Bodies are taken as they move, each link with all that is fixed to it. Geometry is the
-    collision's, or the visual one; a body whose geometry cannot be read is not compared.
+    A body is a moving link with all links that are fixed to it. The collision geometry is used,
+    or the visual one; a body whose geometry cannot be read is not checked.
 
     Args:
         model: The robot.
 
     Yields:
-        "com_outside", "density", "gyration": of a body against the box around its geometry;
-        "copied_inertial": links of other size with the same inertial; "default_inertial": numbers
-        as templates have them; "geometry_unread": one note if bodies of a
-        file with meshes were not compared.
+        "com_outside", "density", "gyration": a body that does not fit the box around its geometry;
+        "copied_inertial": links of different size with the same inertial; "default_inertial":
+        numbers of a template; "geometry_unread": one note if bodies of a file with meshes were not
+        checked.
     """
     yield from _templates(model)
     points = body_points(model)
@@ -45,23 +45,23 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
     unread = [body for body in model.layout.bodies if body not in points]
     if unread and next(model.tree.robot.iter("mesh"), None) is not None:
         message = (
-            f"the geometry of {len(unread)} bodies, as {unread[0]!r}, is missing or in meshes that "
-            "are not found or cannot be read: their mass and centre of mass were not compared with "
-            "it; set ROS_PACKAGE_PATH to compare them"
+            f"the geometry of {len(unread)} bodies, as {unread[0]!r}, is missing, or its meshes "
+            "are not found or cannot be read: their mass and centre of mass were not checked "
+            "against it; set ROS_PACKAGE_PATH so that the meshes are found"
         )
         yield Finding("geometry_unread", "note", f"link {unread[0]}", message)
 
 
 def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> Iterator[Finding]:
-    """Yield which bodies cannot be so in the box around their geometry.
+    """Yield the bodies whose parameters are impossible in the box around their geometry.
 
     Args:
         model: The robot.
-        pi: Standard parameters, shape (p,), as of the URDF or as identified.
+        pi: Standard parameters, shape (p,), of the URDF or identified.
         points: Points of the geometry of each body that has one, shape (k, 3) [m].
 
     Yields:
-        "com_outside", "density", "gyration"; of a body that weighs next to nothing as notes.
+        "com_outside", "density", "gyration"; notes for a body of negligible mass.
     """
     J = pseudo_inertia(pi[: model.layout.n_inertial])
     for body, J_i in zip(model.layout.bodies, J, strict=True):
@@ -72,7 +72,7 @@ def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> I
 
 
 def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
-    """Yield what the box around a body's geometry does not allow."""
+    """Yield the parameters of a body that are impossible in the box around its geometry."""
     at, mass = f"link {body}", float(J[3, 3])
     low, high = points.min(axis=0), points.max(axis=0)
     sides = np.maximum(high - low, _THIN)
@@ -81,34 +81,34 @@ def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
     outside = float(np.linalg.norm(np.maximum(np.maximum(low - centre, centre - high), 0.0)))
     if outside > _MARGIN * diagonal:
         message = (
-            f"link {body!r}: its centre of mass {_metres(centre)} lies {outside:.3g} m outside the "
-            f"box of its geometry, {_metres(low)} to {_metres(high)}; check the frame and the unit "
-            "of <inertial><origin>"
+            f"link {body!r}: its centre of mass {_metres(centre)} m is {outside:.3g} m outside the "
+            f"box of its geometry, {_metres(low)} to {_metres(high)} m; check the frame and the "
+            "unit of <inertial><origin>"
         )
         yield Finding("com_outside", "warning", at, message, {"outside": outside})
     density = mass / float(np.prod(sides))
-    if not _LIGHTEST <= density <= _HEAVIEST:
+    if not _LIGHTEST <= density <= _DENSEST:
         message = (
-            f"link {body!r}: {mass:.4g} kg in a box of {_metres(sides)} m are {density:.3g} "
-            f"kg/m^3, wanted {_LIGHTEST:g} to {_HEAVIEST:g}; check the mass, and whether meshes "
-            "are in mm"
+            f"link {body!r}: its mass of {mass:.4g} kg in a box of {_metres(sides)} m gives a "
+            f"density of {density:.3g} kg/m^3, wanted {_LIGHTEST:g} to {_DENSEST:g}; check the "
+            "mass, and whether the meshes are in mm"
         )
         yield Finding("density", "warning", at, message, {"density": density})
-    second = np.trace(J[:3, :3]) / mass - float(centre @ centre)  # mean square distance from it
+    second = np.trace(J[:3, :3]) / mass - float(centre @ centre)  # mean square distance
     farthest = float(np.max(np.sum((points - centre) ** 2, axis=1))) ** 0.5
     gyration = max(float(second), 0.0) ** 0.5
     if gyration > farthest + 0.5 * _THIN:
         message = (
-            f"link {body!r}: its inertia puts the mass {gyration:.3g} m from its centre on "
-            f"average, but its geometry ends at {farthest:.3g} m; check the unit of the inertia, "
-            "and that it is about the centre of mass"
+            f"link {body!r}: its radius of gyration is {gyration:.3g} m, but its geometry ends "
+            f"{farthest:.3g} m from its centre of mass; check the unit of the inertia, and that it "
+            "is about the centre of mass"
         )
         evidence = {"gyration": gyration, "farthest": farthest}
         yield Finding("gyration", "warning", at, message, evidence)
 
 
 def _templates(model: RobotModel) -> Iterator[Finding]:
-    """Yield inertials whose numbers nobody measured."""
+    """Yield inertials with the numbers of a template."""
     for link, inertial in model.tree.inertials.items():
         ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
         is_isotropic = ixx == iyy == izz and ixy == ixz == iyz == 0
@@ -117,15 +117,15 @@ def _templates(model: RobotModel) -> Iterator[Finding]:
         if inertial.mass not in (*_ROUND, 0.5) and np.any(inertial.com):
             continue
         message = (
-            f"link {link!r} has the mass {inertial.mass:g} kg and {ixx:g} kg m^2 about every axis, "
-            "as templates have; take mass, centre and inertia from CAD, or identify them"
+            f"link {link!r} has the mass {inertial.mass:g} kg and {ixx:g} kg m^2 about every axis: "
+            "these are values of a template; use values from CAD, or identify them"
         )
         evidence = {"mass": inertial.mass, "moment": ixx}
         yield Finding("default_inertial", "warning", f"link {link}", message, evidence)
 
 
 def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
-    """Yield links that have the inertial of another one of another size."""
+    """Yield links with the same inertial as a link of another size."""
     inertials = model.tree.inertials
     owners = [body for body in model.layout.bodies if body in inertials and body in points]
     groups: list[list[str]] = []
@@ -144,8 +144,8 @@ def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
         if spread < _SIZE:
             continue
         message = (
-            f"the links {listed(group)} have the same mass, centre of mass and inertia, but other "
-            "sizes; one was copied: write each link's own"
+            f"the links {listed(group)} have the same mass, centre of mass and inertia, but "
+            "different sizes: the values were copied; write the values of each link"
         )
         evidence = {"links": float(len(group)), "difference": spread}
         yield Finding("copied_inertial", "warning", f"link {group[0]}", message, evidence)

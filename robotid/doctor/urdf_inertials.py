@@ -1,4 +1,4 @@
-"""Audit of a URDF's inertials by themselves: what no body can have."""
+"""Audit of the inertials of a URDF: values that are impossible for any body."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ _SLACK = 1e-9  # relative violation of the triangle inequality that is rounding
 
 
 def negative_masses(robot: ET.Element) -> Iterator[Finding]:
-    """Yield the negative masses of a file, which no model is built from.
+    """Yield the negative masses of a file, from which no model can be built.
 
     Args:
         robot: Root element of a URDF.
@@ -26,7 +26,7 @@ def negative_masses(robot: ET.Element) -> Iterator[Finding]:
     for link in robot.findall("link"):
         mass = link.find("inertial/mass")
         text = "" if mass is None else mass.get("value", "")
-        for value in numbers(text, 1):  # what is no number is a finding of its own
+        for value in numbers(text, 1):  # a text that is no number is another finding
             if value < 0:
                 name = link.get("name", "")
                 message = (
@@ -36,13 +36,13 @@ def negative_masses(robot: ET.Element) -> Iterator[Finding]:
 
 
 def impossible_inertials(model: RobotModel) -> list[Finding]:
-    """Return the moving inertials of a URDF that no body can have, as warnings about a fit to it.
+    """Return the impossible inertials of moving links, as warnings on a fit with this prior.
 
     Args:
         model: The robot.
     """
     inertials = model.tree.inertials
-    effect = "; a consistent fit takes the nearest possible body for what the URDF says"
+    effect = "; a consistent fit uses the nearest possible body instead"
     return [
         replace(finding, severity="warning", message=finding.message + effect)
         for place in link_places(model)
@@ -53,18 +53,18 @@ def impossible_inertials(model: RobotModel) -> list[Finding]:
 
 
 def impossible_inertial(link: str, inertial: Inertial, matters: bool) -> Iterator[Finding]:
-    """Yield what no body can have.
+    """Yield the findings on an inertial that is impossible for any body.
 
     Args:
         link: Name of the link.
-        inertial: What the URDF says of it.
-        matters: Whether a mass of 0 matters, since nothing else gives its body one.
+        inertial: Its inertial in the URDF.
+        matters: Whether a mass of 0 is a warning, because its body has no other mass.
     """
     at, mass = f"link {link}", inertial.mass
     if mass == 0:
         message = (
             f"link {link!r} has the mass 0 kg, wanted more than 0; write its mass, or remove the "
-            "<inertial> if the link is a mere frame"
+            "<inertial> if the link is only a frame"
         )
         yield Finding("zero_mass", "warning" if matters else "note", at, message)
     ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
@@ -78,20 +78,20 @@ def impossible_inertial(link: str, inertial: Inertial, matters: bool) -> Iterato
 
 
 def _inertia_fault(A: float, B: float, C: float) -> str | None:
-    """Return what keeps a body with these principal moments of inertia from being possible."""
+    """Return why a body with these principal moments of inertia is impossible, or None."""
     stated = f"principal moments of inertia {A:.4g}, {B:.4g}, {C:.4g} kg m^2"
-    advice = "take the inertia from CAD, about the centre of mass and in the stated frame"
+    advice = "use the inertia from CAD, about the centre of mass and in the stated frame"
     margin = A + B - C
     if min(A, 0.0) < -_SLACK * abs(C):
         return f"its {stated} are not all positive, wanted > 0 ({A:.4g} is not); {advice}"
     if margin < -_SLACK * abs(C):
         return (
-            f"its {stated} break the triangle inequality: the two smaller ones add up to "
+            f"its {stated} violate the triangle inequality: the sum of the two smaller ones is "
             f"{A + B:.4g}, wanted more than {C:.4g}; {advice}"
         )
     if margin <= _SLACK * abs(C):
         return (
-            f"flat or thin: of its {stated} the two smaller ones add up to no more than the third, "
-            "so the pseudo-inertia is singular; give it some thickness"
+            f"flat or thin: of its {stated} the sum of the two smaller ones is not larger than the "
+            "third, so the pseudo-inertia is singular; give the body some thickness"
         )
     return None

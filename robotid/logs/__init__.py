@@ -1,3 +1,3 @@
-"""What was recorded: files, logs and the smooth trajectories that come of them."""
+"""Recordings: files, logs, and the smooth trajectories computed from them."""
 
 __all__: list[str] = []

@@ -1,4 +1,4 @@
-"""NPZ, HDF5 and MATLAB files, arrays under paths, as tables of named columns."""
+"""NPZ, HDF5 and MATLAB files, which contain arrays at paths, as tables of named columns."""
 
 import math
 import zipfile
@@ -17,29 +17,29 @@ from robotid.exceptions import DataError, MissingDependencyError
 from robotid.findings import listed
 from robotid.logs.data import suggestion
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Table, WritableFormat, choose, prefixes, told
+from robotid.logs.table import Table, WritableFormat, choose, parsing, prefixes
 
 __all__ = ["Hdf5Format", "MatFormat", "NpzFormat"]
 
 _CLOCKS = ("time", "t")
 _LISTS = ("joints", "joint_names")  # entries that name the columns of wide arrays
 _WIDE = {prefix[:-1] for kinds in prefixes().values() for prefix in kinds}  # q, position, ...
-_MAT73 = b"MATLAB 7.3"  # how a MAT file starts that is HDF5 inside
-_DENSEST = 1032  # bytes that deflate makes of one, at most
-_MAT_NAME = 63  # characters that MATLAB allows in a name
+_MAT73 = b"MATLAB 7.3"  # first bytes of a MAT file in HDF5 format
+_LARGEST_RATIO = 1032  # of the sizes before and after compression by deflate
+_MAT_NAME = 63  # largest number of characters of a name in MATLAB
 
 
 class NpzFormat(WritableFormat):
-    """NPZ files, whose names may hold slashes; pickled objects are not read."""
+    """NPZ files, whose names may contain slashes; pickled objects are not read."""
 
     def open(self, path: Path, source: LogSource) -> Table:
         arrays: dict[str, Array] = {}
-        with told(path, "NPZ"), zipfile.ZipFile(path) as file:
+        with parsing(path, "NPZ"), zipfile.ZipFile(path) as file:
             for member in file.namelist():
                 name = member.removesuffix(".npy")
                 with file.open(member) as stream:
                     shape, dtype = _npy_header(stream)
-                    _require_room(path, name, shape)
+                    _require_plausible_size(path, name, shape)
                 if not dtype.hasobject:
                     with file.open(member) as stream:
                         arrays[name] = np.lib.format.read_array(stream)
@@ -52,14 +52,14 @@ class NpzFormat(WritableFormat):
 
 
 class Hdf5Format(WritableFormat):
-    """HDF5 files, compressed when written; only the columns that are read are loaded."""
+    """HDF5 files, written with compression; only the required columns are loaded."""
 
     def open(self, path: Path, source: LogSource) -> Table:
         return _table_of_arrays(path, _datasets(path, is_matlab=False), source)
 
     def write(self, table: Mapping[str, Array], path: Path) -> None:
         h5py = _h5py("writing HDF5")
-        # in memory first: on a full disk HDF5 itself ends the process
+        # first in memory: HDF5 ends the process if the disk is full
         with h5py.File(path, "w", driver="core", backing_store=False) as file:
             for name, values in table.items():
                 file.create_dataset(name, data=values, compression="gzip", shuffle=True)
@@ -68,7 +68,7 @@ class Hdf5Format(WritableFormat):
 
 
 class MatFormat(WritableFormat):
-    """MATLAB files of any version, v7.3 among them; column vectors of version 7 are written."""
+    """MATLAB files of any version including v7.3; written as column vectors in version 7."""
 
     def open(self, path: Path, source: LogSource) -> Table:
         with path.open("rb") as file:
@@ -82,8 +82,8 @@ class MatFormat(WritableFormat):
         for name in table:
             if not (name.isidentifier() and name.isascii() and len(name) <= _MAT_NAME):
                 raise DataError(
-                    f"MATLAB has no variable called {name!r} (letters, digits and _, at most "
-                    f"{_MAT_NAME}); write another format"
+                    f"{name!r} is not a valid name of a MATLAB variable (letters, digits and _, at "
+                    f"most {_MAT_NAME} characters); write another format"
                 )
         with path.open("wb") as file:
             savemat(file, dict(table), oned_as="column", do_compression=True)
@@ -91,14 +91,14 @@ class MatFormat(WritableFormat):
 
 @dataclass(frozen=True)
 class _Entry:
-    """One array of a file, loaded when it is asked for."""
+    """One array of a file, loaded at its first use."""
 
     shape: tuple[int, ...]
     is_number: bool
     load: Callable[[], Any]
 
 
-#: Where a column is: the path of an array and the index in it, None if the array is one column.
+#: Place of a column: the path of an array and the index in it, None if the array is one column.
 _Column: TypeAlias = tuple[str, int | None]
 
 
@@ -117,13 +117,13 @@ def _table_of_arrays(path: Path, entries: Mapping[str, _Entry], source: LogSourc
     columns: dict[str, _Column] = {}
     for name, at in inside.items():
         if entries[at].is_number:
-            _require_room(path, name, entries[at].shape)
+            _require_plausible_size(path, name, entries[at].shape)
             columns |= _columns_of(where, name, at, entries[at].shape, joints)
     return Table(list(columns), partial(_read, where, entries, columns))
 
 
 def _group(where: str, paths: Sequence[str], topic: str | None) -> str:
-    """Return what the paths of the group start with: "" or a name with a slash behind it."""
+    """Return the prefix of the paths in the group: "" or a name that ends with a slash."""
     parents = [path.rpartition("/") for path in paths]
     if topic is not None:
         group = topic.strip("/") + "/" if topic.strip("/") else ""
@@ -141,13 +141,13 @@ def _group(where: str, paths: Sequence[str], topic: str | None) -> str:
     return "" if chosen == "/" else chosen + "/"
 
 
-def _require_room(path: Path, name: str, shape: tuple[int, ...]) -> None:
-    """Refuse an array that is too large for its file, before it is allocated."""
+def _require_plausible_size(path: Path, name: str, shape: tuple[int, ...]) -> None:
+    """Reject an array that is too large for its file, before it is allocated."""
     size = path.stat().st_size
-    if math.prod(shape) > _DENSEST * size:
+    if math.prod(shape) > _LARGEST_RATIO * size:
         raise DataError(
-            f"{path.name}: {name} claims the shape {shape}, which no file of {size} bytes holds; "
-            "export it again"
+            f"{path.name}: {name} has the shape {shape}, which is too large for a file of {size} "
+            "bytes; export it again"
         )
 
 
@@ -156,7 +156,7 @@ def _npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:  # noqa: 
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0
     if version != (1, 0):
-        read = np.lib.format.read_array_header_2_0  # of version 3, too, but for its encoding
+        read = np.lib.format.read_array_header_2_0  # also of version 3, except its encoding
     shape, _, dtype = read(stream)
     return shape, dtype
 
@@ -167,13 +167,15 @@ def _joint_names(where: str, list_name: str, entry: _Entry) -> list[str]:
     try:
         return [(n.decode() if isinstance(n, bytes) else str(n)).strip() for n in names]
     except UnicodeDecodeError as error:
-        raise DataError(f"{where}: a name in {list_name} is not UTF-8 text: {error}") from error
+        raise DataError(
+            f"{where}: a name in {list_name} is not UTF-8 text: {error}; export it again"
+        ) from error
 
 
 def _columns_of(
     where: str, name: str, path: str, shape: tuple[int, ...], joints: Sequence[str]
 ) -> dict[str, _Column]:
-    """Return the columns that one array holds, by name."""
+    """Return the columns of one array, by name."""
     slim = len(shape) == 1 or (len(shape) == 2 and 1 in shape)
     is_wide = name.rpartition("/")[2] in _WIDE and name not in _CLOCKS
     if len(shape) not in (1, 2) or (len(shape) == 2 and 0 in shape):
@@ -183,8 +185,8 @@ def _columns_of(
     count = 1 if slim else min(shape)
     if joints and is_wide and len(joints) != count:
         raise DataError(
-            f"{where}: {name} has shape {shape}, but the file names {len(joints)} joints: "
-            f"{listed(joints)}; give each joint one column"
+            f"{where}: {name} has the shape {shape}, but the file names {len(joints)} joints: "
+            f"{listed(joints)}; write one column per joint"
         )
     names = joints if joints and len(joints) == count else [str(j) for j in range(count)]
     return {f"{name}_{names[j]}": (path, j) for j in range(count)}
@@ -196,7 +198,7 @@ def _read(
     columns: Mapping[str, _Column],
     wanted: Sequence[str],
 ) -> dict[str, Array]:
-    """Return columns; each array is loaded once, and all must be of one length."""
+    """Return columns; each array is loaded once, and all must have the same length."""
     chosen = {name: columns[name] for name in wanted}
     loaded = {path: np.asarray(entries[path].load()) for path in {p for p, _ in chosen.values()}}
     table: dict[str, Array] = {}
@@ -212,7 +214,7 @@ def _read(
         if len(values) != len(table[first]):
             raise DataError(
                 f"{where}: {name} has {len(values)} samples, {first} has {len(table[first])}; "
-                "a row needs both"
+                "record the same number of samples"
             )
     if not len(table[first]):
         raise DataError(f"{where} has columns but no rows; record at least 2")
@@ -236,12 +238,12 @@ def _h5py(purpose: str) -> ModuleType:
 @contextmanager
 def _open_hdf5(path: Path) -> Iterator[Any]:
     h5py = _h5py("reading HDF5 and MATLAB v7.3")
-    with told(path, "HDF5"), h5py.File(path, "r") as file:
+    with parsing(path, "HDF5"), h5py.File(path, "r") as file:
         yield file
 
 
 def _datasets(path: Path, *, is_matlab: bool) -> dict[str, _Entry]:
-    """Return the datasets of a file by path; MATLAB's own bookkeeping is left out."""
+    """Return the datasets of a file by path, without MATLAB's internal ones."""
     entries: dict[str, _Entry] = {}
 
     def visit(name: str, item: Any) -> None:  # noqa: ANN401
@@ -261,7 +263,7 @@ def _datasets(path: Path, *, is_matlab: bool) -> dict[str, _Entry]:
 
 
 def _load_dataset(path: Path, name: str, *, is_matlab: bool) -> Any:  # noqa: ANN401
-    """Return one dataset; characters and cell arrays of MATLAB as a list of texts."""
+    """Return one dataset; characters and cell arrays of MATLAB become a list of texts."""
     with _open_hdf5(path) as file:
         dataset = file[name]
         if not is_matlab:
@@ -274,13 +276,13 @@ def _load_dataset(path: Path, name: str, *, is_matlab: bool) -> Any:  # noqa: AN
 
 
 def _mat_variables(path: Path) -> dict[str, _Entry]:
-    """Return the variables of a MAT file before v7.3 by path, fields of structs among them."""
+    """Return the variables of a MAT file before v7.3 by path, including fields of structs."""
     from scipy.io import loadmat, whosmat
 
-    with told(path, "MATLAB"):
+    with parsing(path, "MATLAB"):
         for name, shape, kind in whosmat(path):
             if kind != "sparse":
-                _require_room(path, name, shape)
+                _require_plausible_size(path, name, shape)
         variables = loadmat(path, simplify_cells=True)
     entries: dict[str, _Entry] = {}
 
@@ -289,7 +291,7 @@ def _mat_variables(path: Path) -> dict[str, _Entry]:
             if isinstance(value, dict):
                 visit(f"{prefix}{name}/", value)
             elif not name.startswith("__"):
-                with suppress(ValueError):  # of cells of several shapes, which are no array
+                with suppress(ValueError):  # cells of several shapes are no array
                     entries[prefix + name] = _entry(np.asarray(value))
 
     visit("", variables)

@@ -1,6 +1,6 @@
-"""Bags of ROS 1 and ROS 2, MCAP among them: joint states and commands as a table of columns.
+"""Bags of ROS 1 and ROS 2, including MCAP: joint states and commands as a table of columns.
 
-The library rosbags reads all of them, without an installation of ROS.
+The library rosbags reads all of them; ROS need not be installed.
 """
 
 import re
@@ -29,12 +29,12 @@ _MEASURED = ("position", "velocity", "effort")
 _COMMANDED = ("qref", "dqref", "tauref")
 _FIELDS = (*_MEASURED, *_COMMANDED)
 
-Layout = tuple[tuple[str, ...], tuple[str, ...]]  # names of joints, and the fields that are filled
+Layout = tuple[tuple[str, ...], tuple[str, ...]]  # names of joints, and the fields with values
 
 
 @dataclass
 class _Block:
-    """The messages that name the same joints in the same order and fill the same fields."""
+    """The messages with the same joints in the same order and values in the same fields."""
 
     number: "array[int]" = field(default_factory=lambda: array("q"))  # place in the bag
     stamp: "array[int]" = field(default_factory=lambda: array("q"))  # [ns]
@@ -42,17 +42,17 @@ class _Block:
 
 
 class BagFormat(Format):
-    """Bags, .mcap, .db3 or .bag files, or the folder of a ROS 2 bag: a row is a message.
+    """Bags: .mcap, .db3 or .bag files, or the folder of a ROS 2 bag. A row is a message.
 
     The columns are ``time`` [s] since the epoch, ``position_<joint>``, ``velocity_<joint>`` and
-    ``effort_<joint>``. Each message may name its joints in another order. Messages that hold none
-    of the columns that are read, as those of another publisher, are passed over; a message that
-    does not fit together, or holds only some of what is read, is a ``DataError``.
+    ``effort_<joint>``. The order of the joints may differ between messages. Messages without any
+    of the required columns, as those of another publisher, are ignored; an inconsistent message,
+    or one with only some of the required columns, is a ``DataError``.
 
-    A JointTrajectoryControllerState gives commands, too: what it put out to the drives, else its
-    reference (once called desired), as ``qref_<joint>`` and ``dqref_<joint>``, and the reference's
-    effort as ``tauref_<joint>``. Of joint states, commands are those of a second topic, each held
-    until the next one.
+    A JointTrajectoryControllerState contains commands, too: its output to the drives, else its
+    reference (formerly "desired"), as ``qref_<joint>`` and ``dqref_<joint>``, and the effort of
+    the reference as ``tauref_<joint>``. For joint states, the commands are in a second topic; a
+    zero-order hold brings them to the time stamps of the states.
     """
 
     def open(self, path: Path, source: LogSource) -> Table:
@@ -60,18 +60,19 @@ class BagFormat(Format):
             types = {c.topic: _full_name(c.msgtype) for c in reader.connections}
             topic = _choose_topic(path.name, reader, types, source)
             blocks = _blocks(path, reader, decode, topic, source, _MEASURED)
-            told: dict[Layout, _Block] = {}
+            others: dict[Layout, _Block] = {}
             if source.command is not None:
-                told = _blocks(path, reader, decode, source.command, source, _COMMANDED)
+                others = _blocks(path, reader, decode, source.command, source, _COMMANDED)
         table = _table(f"{path.name}, topic {topic!r}", blocks)
         if source.command is not None:
-            commands = _table(f"{path.name}, topic {source.command!r}", told)
-            return _with_commands(table, commands, (_stamps(blocks), _stamps(told)), source.command)
-        others = sorted(x for x, kind in types.items() if kind == _CONTROLLER)
-        if others and types[topic] != _CONTROLLER:
+            commands = _table(f"{path.name}, topic {source.command!r}", others)
+            stamps = _stamps(blocks), _stamps(others)
+            return _with_commands(table, commands, stamps, source.command)
+        unread = sorted(x for x, kind in types.items() if kind == _CONTROLLER)
+        if unread and types[topic] != _CONTROLLER:
             note = (
-                f"commands are in topics that are not read: {listed(others)}; topic = "
-                f'"{others[0]}" reads them and what was measured with them'
+                f"commands are in topics that are not read: {listed(unread)}; topic = "
+                f'"{unread[0]}" reads them and their measured positions'
             )
             return replace(table, notes=(note,))
         return table
@@ -97,7 +98,7 @@ def _blocks(
     source: LogSource,
     fields: Sequence[str],
 ) -> dict[Layout, _Block]:
-    """Return the messages of a topic; fields name what position, velocity and effort are."""
+    """Return the messages of a topic; fields are the names of position, velocity and effort."""
     blocks: dict[Layout, _Block] = {}
     count = 0
     for count, (logged, message) in enumerate(_messages(path, reader, decode, topic), start=1):
@@ -111,9 +112,9 @@ def _blocks(
             block.values.frombytes(np.asarray(part, dtype=np.float64).tobytes())
     if source.stamp == "header" and not any(any(block.stamp) for block in blocks.values()):
         raise DataError(
-            f"{path.name}, topic {topic!r}: the stamps in the headers of all {count} messages are "
-            '0. To use the time of recording, state stamp = "log" (job file table [log], CLI '
-            '--stamp log, Python source=LogSource(stamp="log"))'
+            f"{path.name}, topic {topic!r}: the header stamps of all {count} messages are 0. To "
+            'use the time of recording, state stamp = "log" (job file table [log], CLI --stamp '
+            'log, Python source=LogSource(stamp="log"))'
         )
     return blocks
 
@@ -122,35 +123,35 @@ def _with_commands(
     states: Table, commands: Table, stamps: tuple[Array, Array], topic: str
 ) -> Table:
     """Return states with the last command before each; rows before the first one are left out."""
-    measured, told = stamps
-    note = f"commands of topic {topic!r} are held until the next one"
-    if len(told) > 1:
-        note += f", {1e3 * float(np.median(np.diff(told))):.3g} ms later in the median"
-    if early := int(np.sum(measured < told[0])):
-        note += f"; messages before the first one, left out: {early}"
-    if late := int(np.sum(measured > told[-1])):
-        note += f"; messages after the last one: {late}"
-    told_names = commands.names[1:]  # those of a controller's own state give way to them
-    own_names = [name for name in states.names if name not in told_names]
+    measured, sent = stamps
+    note = f"a zero-order hold is applied to the commands of topic {topic!r}"
+    if len(sent) > 1:
+        note += f", with a median interval of {1e3 * float(np.median(np.diff(sent))):.3g} ms"
+    if before := int(np.sum(measured < sent[0])):
+        note += f"; messages before the first command, left out: {before}"
+    if after := int(np.sum(measured > sent[-1])):
+        note += f"; messages after the last command: {after}"
+    command_names = commands.names[1:]  # used instead of those of a controller's state
+    own_names = [name for name in states.names if name not in command_names]
 
     def read(wanted: Sequence[str]) -> dict[str, Array]:
         mine = [name for name in wanted if name in own_names and name != "time"]
-        theirs = [name for name in wanted if name in told_names]
+        theirs = [name for name in wanted if name in command_names]
         rows = states.read(["time", *mine])
-        rows = {name: values[rows["time"] >= told[0]] for name, values in rows.items()}
-        for name in theirs:  # each by itself: joints may be commanded by messages of their own
-            held = commands.read(["time", name])
-            order = np.argsort(held["time"], kind="stable")
-            last = np.searchsorted(held["time"][order], rows["time"], side="right") - 1
-            rows[name] = np.where(last >= 0, held[name][order][np.maximum(last, 0)], np.nan)
+        rows = {name: values[rows["time"] >= sent[0]] for name, values in rows.items()}
+        for name in theirs:  # one by one: the commands of joints may be in different messages
+            own = commands.read(["time", name])
+            order = np.argsort(own["time"], kind="stable")
+            last = np.searchsorted(own["time"][order], rows["time"], side="right") - 1
+            rows[name] = np.where(last >= 0, own[name][order][np.maximum(last, 0)], np.nan)
         return {name: rows[name] for name in wanted}
 
-    return Table([*own_names, *told_names], read, (*states.notes, note))
+    return Table([*own_names, *command_names], read, (*states.notes, note))
 
 
 @contextmanager
 def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes, str], Any]]]:
-    """Open a bag: its reader, and what decodes a message; ROS need not be installed."""
+    """Open a bag: its reader, and a function that decodes a message."""
     try:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
@@ -160,9 +161,9 @@ def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes, str], Any]]]:
         raise MissingDependencyError(purpose, "rosbags", "bag") from error
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         raise DataError(
-            f"{path.name} is a folder without metadata.yaml, so not a ROS 2 bag, and without "
-            "meta/info.json, so not a LeRobot dataset; name the .mcap or "
-            ".db3 file in it, or restore it with 'ros2 bag reindex'"
+            f"{path.name} is a folder without metadata.yaml, so it is not a ROS 2 bag, and without "
+            "meta/info.json, so it is not a LeRobot dataset; give the .mcap or .db3 file in it, or "
+            "restore it with 'ros2 bag reindex'"
         )
     is_ros1 = path.suffix.lower() == ".bag" and not path.is_dir()
     types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
@@ -180,9 +181,9 @@ def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes, str], Any]]]:
         def decode(raw: bytes, kind: str) -> Any:  # noqa: ANN401
             if kind not in types.types:
                 raise DataError(
-                    f"{path.name} does not hold the definition of {kind}, as .db3 files of before "
-                    "ROS 2 Iron do not; convert it to MCAP where control_msgs is installed: "
-                    "'ros2 bag convert'"
+                    f"{path.name} does not contain the definition of {kind}, as .db3 files before "
+                    "ROS 2 Iron; convert it to MCAP on a machine with control_msgs: 'ros2 bag "
+                    "convert'"
                 )
             return deserialize(raw, kind)
 
@@ -190,7 +191,7 @@ def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes, str], Any]]]:
 
 
 def _definitions(path: Path, definition: Any, known: Container[str]) -> dict[str, Any]:  # noqa: ANN401
-    """Return the types that a bag defines for its controllers' states, those not known."""
+    """Return the unknown types that a bag defines for the states of its controllers."""
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
     found: dict[str, Any] = {}
@@ -206,7 +207,7 @@ def _definitions(path: Path, definition: Any, known: Container[str]) -> dict[str
 
 
 def _broken(path: Path, error: Exception) -> DataError:
-    """Return the error that tells what the library says of a file."""
+    """Return the error of a bag that the library cannot read."""
     reason = str(error) or type(error).__name__
     return DataError(
         f"{path.name}: broken, unfinished or foreign bag ({reason}); record it again, or "
@@ -220,7 +221,7 @@ def _messages(
     decode: Callable[[bytes, str], Any],
     topic: str,
 ) -> Iterator[tuple[int, Any]]:
-    """Yield time of recording [ns] and message; tell in our words where a bag breaks off."""
+    """Yield time of recording [ns] and message; errors of the library become a DataError."""
     chosen = [c for c in reader.connections if c.topic == topic]
     try:
         for connection, logged, raw in reader.messages(chosen):
@@ -237,9 +238,9 @@ def _choose_topic(
     types: Mapping[str, str],
     source: LogSource,
 ) -> str:
-    """Return the topic to read: the one wanted, or the only one of joint states or a controller's.
+    """Return the topic to read: the stated one, or the only one of joint states or a controller.
 
-    That of the commands must be another one, of joint states.
+    The topic of the commands must be another one, of joint states.
     """
     filled = {c.topic for c in reader.connections if c.msgcount}
     listing = f"topics: {dict(sorted(types.items()))}"
@@ -252,15 +253,15 @@ def _choose_topic(
             )
         if types[wanted] not in kinds:
             raise DataError(
-                f"{where}: topic {wanted!r} holds {types[wanted]}, wanted {' or '.join(kinds)}; "
-                f"{listing}"
+                f"{where}: topic {wanted!r} has messages of {types[wanted]}, wanted "
+                f"{' or '.join(kinds)}; {listing}"
             )
         if wanted not in filled:
-            raise DataError(f"{where}: topic {wanted!r} holds no message; {listing}")
+            raise DataError(f"{where}: topic {wanted!r} has no message; {listing}")
     if source.command is not None and source.command == source.topic:
         raise DataError(
-            f"{where}: topic and command are both {source.topic!r}; name the topic of what was "
-            "measured and that of what was commanded"
+            f"{where}: topic and command are both {source.topic!r}; give the topic of the "
+            "measurements and the topic of the commands"
         )
     if source.topic is not None:
         return source.topic
@@ -268,11 +269,11 @@ def _choose_topic(
         found = sorted(x for x in filled if types[x] == kind and x != source.command)
         if found:
             return choose(where, found, f"topics of {kind}", listing)
-    raise DataError(f"{where} holds no message of {_STATE}; {listing}")
+    raise DataError(f"{where} has no message of {_STATE}; {listing}")
 
 
 def _full_name(msgtype: str) -> str:
-    """Return a type as ROS 2 writes it: with "msg" in the middle."""
+    """Return the name of a type in ROS 2, with "/msg/"."""
     package, _, name = msgtype.rpartition("/")
     return f"{package.removesuffix('/msg')}/msg/{name}"
 
@@ -284,16 +285,17 @@ def _content(
     message: Any,  # noqa: ANN401
     fields: Sequence[str],
 ) -> tuple[Layout, list[Array]]:
-    """Return what a message names, and the fields that it fills."""
+    """Return the joints of a message, and its fields with values."""
     if hasattr(message, "joint_names"):
-        names, held = tuple(message.joint_names), _controlled(message)
+        names, content = tuple(message.joint_names), _controlled(message)
     else:
         names = tuple(message.name)
-        held = dict(zip(fields, (message.position, message.velocity, message.effort), strict=True))
-    for name, values in held.items():
+        values = (message.position, message.velocity, message.effort)
+        content = dict(zip(fields, values, strict=True))
+    for name, values in content.items():
         if len(values) not in (0, len(names)):
             raise DataError(
-                f"{where}: message {number} on {topic!r} names {len(names)} joints but holds "
+                f"{where}: message {number} on {topic!r} names {len(names)} joints but has "
                 f"{len(values)} values of {name}; correct the recording"
             )
     if len(set(names)) < len(names):
@@ -301,12 +303,12 @@ def _content(
             f"{where}: message {number} on {topic!r} names {listed(repeated(names))} twice; "
             "correct the recording"
         )
-    filled = {name: values for name, values in held.items() if len(values)}
+    filled = {name: values for name, values in content.items() if len(values)}
     return (names, tuple(filled)), list(filled.values())
 
 
 def _controlled(message: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Return what a controller's state holds; what is NaN throughout counts as empty.
+    """Return the fields of a controller's state; a field with NaN only is empty.
 
     Up to control_msgs 4 its points were called desired and actual.
     """
@@ -327,7 +329,7 @@ def _controlled(message: Any) -> dict[str, Any]:  # noqa: ANN401
 
 
 def _columns(layout: Layout) -> list[str]:
-    """Return the columns that messages of a layout fill, in the order of their values."""
+    """Return the columns of messages of a layout, in the order of their values."""
     joints, filled = layout
     return [f"{name}_{joint}" for name in filled for joint in joints]
 
@@ -351,19 +353,19 @@ def _read(where: str, blocks: dict[Layout, _Block], wanted: Sequence[str]) -> di
 
 
 def _require_whole(where: str, blocks: dict[Layout, _Block], columns: Sequence[str]) -> None:
-    """Refuse messages that hold only some of the columns."""
+    """Reject messages that have only some of the columns."""
     total = sum(len(block.number) for block in blocks.values())
     lacking: dict[int, list[str]] = {}  # by number of the first message
     count = 0
     for layout, block in blocks.items():
-        held = set(_columns(layout))
-        if missing := [name for name in columns if name not in held]:
+        own = set(_columns(layout))
+        if missing := [name for name in columns if name not in own]:
             lacking[block.number[0]] = missing
             count += len(block.number)
     if lacking:
         first = min(lacking)
         raise DataError(
-            f"{where}: {count} of {total} messages lack some of what is read, the first (message "
-            f"{first}) {listed(lacking[first])}. A row is one message: read only joints that are "
-            "always published together, and leave out the others"
+            f"{where}: {count} of {total} messages lack some of the required values, the first "
+            f"(message {first}) lacks {listed(lacking[first])}. A row is one message; read only "
+            "joints that are always published together, and leave out the others"
         )

@@ -1,4 +1,4 @@
-"""Which columns of a table are what: positions, speeds, torques and commands of the joints."""
+"""Columns of a table: positions, velocities, torques and commands of the joints by their names."""
 
 import difflib
 from collections.abc import Mapping, Sequence
@@ -20,10 +20,10 @@ from robotid.logs.transmission import Transmission
 
 __all__ = ["NOUNS", "TORQUES", "Finder", "Needs", "without_torque"]
 
-#: What a log is read for beside its positions, as of ``lay_out``.
+#: Quantities that are read besides the positions, as of ``lay_out``.
 Needs: TypeAlias = Literal["torque", "motion", "commands", "any"]
 
-#: What the columns of each kind are called.
+#: Nouns for the columns of each kind.
 NOUNS = {
     "q": "position",
     "dq": "velocity",
@@ -33,21 +33,21 @@ NOUNS = {
     "dqref": "commanded velocity",
     "tauref": "commanded torque",
 }
-#: Kinds of columns that hold torques.
+#: Kinds of columns with torques.
 TORQUES = ("tau", "tauref")
-_SIZES = ("loadsize_", "load_size_")  # of loads without their sign, as bus servos give them
+_SIZES = ("loadsize_", "load_size_")  # absolute values of loads, as bus servos report them
 
 
 def without_torque(is_commanded: bool) -> str:
-    """Return what a log without any torque can do.
+    """Return the remedy for a log without torques.
 
     Args:
         is_commanded: Whether it has commands.
     """
-    begin = "Its commands are" if is_commanded else "Commanded positions, qref_<joint>, would be"
+    subject = "Its commands are" if is_commanded else "Commanded positions, qref_<joint>, would be"
     return (
-        f'{begin} enough for [estimator] name = "simulation" with a [controller] table; all other '
-        "estimators need tau_<joint> or current_<joint>"
+        f'{subject} enough for [estimator] name = "simulation" with a [controller] table; all '
+        "other estimators need tau_<joint> or current_<joint>"
     )
 
 
@@ -56,16 +56,16 @@ class Finder:
     """Finds the columns of the wanted joints among the names in a file.
 
     Attributes:
-        where: What the file is called.
+        where: Name of the file.
         names: Names of its columns.
-        columns: Names that stand for others, as the user stated them.
+        columns: Names in the file by standard name, as the user stated them.
         joints: The wanted joints.
         gains: Gains of currents by joint.
-        source: How the file is read.
+        source: Place of the log in the file, and names of its joints.
         gears: Transmissions between motors and joints.
-        needs: What is read beside the positions.
-        notes: What was noticed.
-        seen: Columns that are read, or named in a note of their own.
+        needs: Quantities that are read besides the positions.
+        notes: Notes for the user.
+        seen: Columns that are read or named in a note.
     """
 
     where: str
@@ -77,10 +77,10 @@ class Finder:
     gears: tuple[Transmission, ...]
     needs: Needs = "torque"
     notes: list[str] = field(default_factory=list)
-    seen: set[str] = field(default_factory=set)  # read, or named in a note of their own
+    seen: set[str] = field(default_factory=set)
 
     def find_all(self) -> dict[str, list[str]]:
-        """Return the names of the columns to read: of time, q, what is needed, what is complete."""
+        """Return the columns to read: time, q, required quantities, complete optional ones."""
         self._check_arguments()
         found = {
             "time": [self._find("time", ["time", "t"]) or self._missing("time", "")],
@@ -107,7 +107,7 @@ class Finder:
         return found
 
     def factors(self, torques: Sequence[str]) -> tuple[float, ...]:
-        """Return what makes each of n columns a torque: a current's gain, or 1.
+        """Return the factor that converts each of n columns to a torque: a current's gain, or 1.
 
         Args:
             torques: Names of the columns.
@@ -121,7 +121,7 @@ class Finder:
 
     @property
     def motors(self) -> dict[str, str]:
-        """The motor in the place of each joint that has one, by joint."""
+        """The motor that corresponds to each joint that has one, by joint."""
         return {
             joint: motor
             for gear in self.gears
@@ -129,7 +129,7 @@ class Finder:
         }
 
     def of_motors(self, kind: str) -> tuple[bool, ...]:
-        """Return of which joints a quantity is read at the motor in their place.
+        """Return for which joints a quantity is read from the corresponding motor.
 
         Args:
             kind: "q", "dq", "ddq" or "tau".
@@ -138,7 +138,7 @@ class Finder:
             DataError: If joints of one transmission have it at the motors and at the joints.
         """
         kinds = ("tau", "current") if kind == "tau" else (kind,)
-        turned = set[str]()
+        driven = set[str]()
         for gear in self.gears:
             at_motors, at_joints = (
                 [found for name in names for k in kinds if (found := self._find_of(k + m, name))]
@@ -148,15 +148,16 @@ class Finder:
                 raise DataError(
                     f"{self.where} has {at_motors[0]!r} of a motor and {at_joints[0]!r} of a joint "
                     f"that it drives, two {NOUNS[kind].partition(' ')[0]} columns of one "
-                    "transmission; remove one side, or the [[transmission]] that reads the motors"
+                    "transmission; remove the columns of the motors or of the joints, or the "
+                    "[[transmission]]"
                 )
-            turned.update(gear.joints if at_motors else ())
-        return tuple(joint in turned for joint in self.joints)
+            driven.update(gear.joints if at_motors else ())
+        return tuple(joint in driven for joint in self.joints)
 
     def _each(self, kind: str) -> list[tuple[tuple[str, str], str | None]]:
-        """Return the column of one quantity of each joint, or of the motor in its place.
+        """Return the column of one quantity of each joint, or of its motor.
 
-        Each behind its kind, "q" or "qm", and the name of joint or motor.
+        Each entry starts with the kind, "q" or "qm", and the name of joint or motor.
         """
         places = [
             (f"{kind}m", self.motors[joint]) if is_motor else (kind, joint)
@@ -165,7 +166,7 @@ class Finder:
         return [(at, self._find_of(*at)) for at in places]
 
     def _check_arguments(self) -> None:
-        """Refuse names twice in the file, and gains and columns of what is not read."""
+        """Reject repeated names in the file, and gains and columns of joints that are not read."""
         if twice := repeated([name for name in self.names if name]):
             raise DataError(
                 f"{self.where} has more than one column {listed(twice)}; rename or remove one"
@@ -181,13 +182,13 @@ class Finder:
         for standard, name in self.columns.items():
             if standard not in known:
                 raise SettingsError(
-                    f"columns: {standard!r} is not the standard name of a column that is read, "
-                    f"as 'time' or 'tau_{self.joints[0]}'{suggestion(standard, known)}"
+                    f"columns: {standard!r} is not a standard name of a column, as 'time' or "
+                    f"'tau_{self.joints[0]}'{suggestion(standard, known)}"
                 )
             if name not in self.names:
                 raise DataError(
-                    f"{self.where} has no column {name!r}, which columns gives for {standard!r}; "
-                    f"columns found: {listed(self.names)}{suggestion(name, self.names)}"
+                    f"{self.where} has no column {name!r}, which is stated for {standard!r} in "
+                    f"columns; columns found: {listed(self.names)}{suggestion(name, self.names)}"
                 )
 
     def _require_read(self, joint: str, what: str) -> None:
@@ -220,7 +221,7 @@ class Finder:
         return self.source.joints.get(joint, joint)
 
     def _find_torque(self, joint: str, is_motor: bool) -> str:
-        """Return the column of a joint's or its motor's torque, or current if that has a gain."""
+        """Return the torque column of a joint or its motor, or its current column with a gain."""
         m, joint = ("m", self.motors[joint]) if is_motor else ("", joint)
         tau, current = self._find_of(f"tau{m}", joint), self._find_of(f"current{m}", joint)
         has_gain = joint in self.gains
@@ -237,16 +238,17 @@ class Finder:
         return tau or current or self._missing(f"tau{m}", joint)
 
     def _wanted(self) -> set[str]:
-        """Return which of torque and commands must be there, of every joint."""
+        """Return which of torque and commands are required of every joint."""
         if self.needs != "any":
             return {self.needs}
         has_torque = any(self.has_torque(joint) for joint in self.joints)
-        told = [self._has("qref", joint) for joint in self.joints]
-        wanted = {"commands"} if all(told) or (any(told) and not has_torque) else set[str]()
+        has_command = [self._has("qref", joint) for joint in self.joints]
+        is_commanded = all(has_command) or (any(has_command) and not has_torque)
+        wanted = {"commands"} if is_commanded else set[str]()
         return wanted | ({"torque"} if has_torque or not wanted else set())
 
     def _is_torque_whole(self) -> bool:
-        """Return whether every joint has a torque, or a current with its gain; note it if few."""
+        """Return whether every joint has a torque, or a current with a gain; add a note if not."""
         without = []
         for joint, is_motor in zip(self.joints, self.of_motors("tau"), strict=True):
             m, name = ("m", self.motors[joint]) if is_motor else ("", joint)
@@ -255,7 +257,7 @@ class Finder:
                 without.append(joint)
         if without and any(self.has_torque(joint) for joint in self.joints):
             self.notes.append(
-                f"torques ignored: {listed(without)} have none, nor a current with a gain"
+                f"torques ignored: {listed(without)} have no torque, and no current with a gain"
             )
         return not without
 
@@ -269,30 +271,30 @@ class Finder:
         if len(without) == len(found):
             raise DataError(
                 f"{self.where} has no commanded position, as 'qref_{self.joints[0]}', of any joint "
-                f"read; columns of commanded positions found: {listed(known)}. Record what the "
-                "controller was told, rename the columns, or pass columns={'qref_<joint>': ...}"
+                f"read; columns of commanded positions found: {listed(known)}. Record the commands "
+                "of the controller, rename the columns, or pass columns={'qref_<joint>': ...}"
                 + "".join(f"; {note}" for note in self.notes),
                 code="missing_column",
             )
         raise DataError(
-            f"{self.where} has commanded positions, but none of {listed(without)}: no column "
-            f"'qref_{self._named(without[0])}'; found: {listed(known)}. Record or rename what is "
-            "missing, pass columns={'qref_<joint>': ...}, or lock joints that was at rest",
+            f"{self.where} has no commanded positions of {listed(without)}: no column "
+            f"'qref_{self._named(without[0])}'; found: {listed(known)}. Record them, rename the "
+            "columns, pass columns={'qref_<joint>': ...}, or lock joints that were at rest",
             code="missing_column",
         )
 
     def _note_sizes(self) -> None:
-        """Note loads without their sign, which nothing reads."""
+        """Add a note on loads without sign, which are not used."""
         sizes = [name for name in self.names if name.startswith(_SIZES) and name not in self.seen]
         self.seen.update(sizes)
         if sizes:
             self.notes.append(
-                f"{listed(sizes)} ignored: the size of a load without its sign is no torque; it "
-                "does not tell a drive that pushes from one that brakes"
+                f"{listed(sizes)} ignored: the absolute value of a load does not determine the "
+                "direction of the torque"
             )
 
     def _no_gain(self, joint: str, current: str) -> DataError:
-        """Return the error of a current without a gain, with all that the others lack, too."""
+        """Return the error of a current without a gain, with the missing columns of all joints."""
         without = [joint]
         if joint in self.joints:
             logged = [other for other in self.joints if self._has("current", other)]
@@ -307,18 +309,18 @@ class Finder:
         if absent and joint in self.joints:
             locks = " ".join(f"--lock {name}=0" for name in absent)
             also = (
-                f". There is no torque of {listed(absent)} either; if they was at rest, lock them "
-                f"where they stood, as with {locks}"
+                f". No torque of {listed(absent)} was found; if at rest, lock them at their "
+                f"positions, as with {locks}"
             )
         return DataError(
-            f"{self.where}: {has} but no gain; give it in N m/A: "
+            f"{self.where}: {has} but no gain; state it in N m/A: "
             f"gains={{{without[0]!r}: ...{more}}} (job file table [torque], key gains; CLI "
             f"{flags}){also}",
             code="missing_gain",
         )
 
     def _find_optional(self, kind: str) -> list[str]:
-        """Return the columns of a quantity that every joint has; none if some joint lacks it."""
+        """Return the columns of an optional quantity; none if a joint does not have it."""
         found = self._each(kind)
         names = [name for _, name in found if name]
         without = [joint for (_, joint), name in found if not name]
@@ -327,12 +329,12 @@ class Finder:
         return [] if without else names
 
     def _missing(self, kind: str, joint: str) -> str:
-        """Refuse a file without a column, naming those of its kind and the nearest."""
+        """Reject a file without a column; the error names the columns of its kind."""
         standard = f"{kind}_{joint}" if joint else kind
         noun = f"{NOUNS[kind.removesuffix('m')]} columns" if joint else "columns"
         kinds, named = (kind, "current") if kind == "tau" else (kind,), self._named(joint)
         others = {self._named(other) for other in self.joints}
-        found, ends = [], {}  # columns; and by the joint that they name, if it is not another's
+        found, ends = [], {}  # columns; and by their joint, unless it is another one
         for name in self.names:
             quantity, end = quantity_of(name, self.source.effort) or ("", name)
             if quantity in kinds or not joint:
@@ -343,39 +345,39 @@ class Finder:
         near = repr(ends[nearest[0]]) if nearest else "..."
         hint = f"Did you mean {near}? " if nearest else ""
         sought = f"{kind}_{named}" if joint else kind
-        stood = ""
+        remedy = ""
         if joint in self.joints and kind in NOUNS:
-            stood = f"; if {joint!r} was at rest, leave it out of joints and lock it"
-            stood += self._how_to_lock()
+            remedy = f"; if {joint!r} was at rest, leave it out of joints and lock it"
+            remedy += self._how_to_lock()
         if at_motors := [name for name in self.names if name.startswith(f"{kind}m_")]:
-            stood = (
-                f". Columns of motors, as {at_motors[0]}, need the gears: [[transmission]] with "
-                "joints and matrix"
+            remedy = (
+                f". For columns of motors, as {at_motors[0]}, state [[transmission]] with joints "
+                "and matrix"
             )
         if kind == "tau" and not any(self.has_torque(other) for other in self.joints):
             is_commanded = all(self._has("qref", other) for other in self.joints)
-            stood = f". {without_torque(is_commanded)}"
+            remedy = f". {without_torque(is_commanded)}"
         raise DataError(
             f"{self.where} has no column {sought!r}; {noun} found: {listed(found)}. {hint}"
-            f"Rename it, or pass columns={{{standard!r}: {near}}}{stood}",
+            f"Rename it, or pass columns={{{standard!r}: {near}}}{remedy}",
             code="missing_column",
         )
 
     def _how_to_lock(self) -> str:
-        """Return the flags that leave out the joints whose columns are missing, "" if all are."""
+        """Return the flags that lock the joints without columns, "" if all joints are such."""
         logged = [joint for joint in self.joints if self._is_logged(joint)]
         absent = [joint for joint in self.joints if joint not in logged]
         if not logged:
             return ""
         locks = " ".join(f"--lock {joint}=0" for joint in absent)
-        held = ", ".join(f"{joint!r}: 0" for joint in absent)
+        locked = ", ".join(f"{joint!r}: 0" for joint in absent)
         return (
-            f" where it stood, as with --joints {','.join(logged)} {locks}; in Python "
-            f"RobotModel.from_urdf(..., locked={{{held}}})"
+            f" at its position, as with --joints {','.join(logged)} {locks}; in Python "
+            f"RobotModel.from_urdf(..., locked={{{locked}}})"
         )
 
     def _is_logged(self, joint: str) -> bool:
-        """Return whether the file has what is needed of a joint."""
+        """Return whether the file has the required columns of a joint."""
         wanted = self._wanted()
         return (
             self._has("q", joint)
@@ -392,7 +394,7 @@ class Finder:
         return self._has("tau", joint) or self._has("current", joint)
 
     def _has(self, kind: str, joint: str) -> bool:
-        """Return whether the file has a quantity of a joint, or of the motor in its place."""
+        """Return whether the file has a quantity of a joint or of its motor."""
         names = (prefix + self._named(joint) for prefix in prefixes(self.source.effort)[kind])
         return (
             f"{kind}_{joint}" in self.columns

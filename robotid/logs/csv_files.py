@@ -22,9 +22,9 @@ _BLOCK = 4096  # lines read at a time
 
 
 class CsvFormat(WritableFormat):
-    """CSV files: UTF-8, the first line names the columns.
+    """CSV files: UTF-8, the first line contains the names of the columns.
 
-    The decimals written are the shortest that give the same bits.
+    Numbers are written with the fewest digits that reproduce them exactly.
     """
 
     def open(self, path: Path, source: LogSource) -> Table:
@@ -65,7 +65,7 @@ class _CsvRows(RowReader):
         return {name: np.concatenate([part[name] for part in parts]) for name in wanted}
 
     def _blocks(self, near: Place, stop: int | None) -> Iterator[tuple[list[str], Place, int]]:
-        """Yield lines, blank ones among them, the place of the first and how many are rows."""
+        """Yield lines, blank lines included, the place of the first, and the number of rows."""
         with self.path.open("rb") as file:
             place = near
             if near.offset == 0:
@@ -107,12 +107,12 @@ class _CsvRows(RowReader):
         return dict(zip(wanted, values.T, strict=True))
 
     def _whole(self, lines: Iterable[str], first: int = 2) -> Iterator[str]:
-        """Yield the lines that are not blank, and refuse those with too few or too many cells."""
+        """Yield the lines that are not blank, and reject those with too few or too many cells."""
         count, separator = len(self.names), self.separator
         for number, line in enumerate(lines, start=first):
             if line.isspace():
                 continue
-            if line.count(separator) != count - 1:  # unless a separator stands in quotes
+            if line.count(separator) != count - 1:  # unless a separator is in quotes
                 found = len(self._cells(line, number))
                 if found != count:
                     raise DataError(
@@ -125,7 +125,7 @@ class _CsvRows(RowReader):
         return _split(self.path.name, line, self.separator, number)
 
     def _bad_cell(self, columns: list[int]) -> DataError:
-        """Return the error that names the first cell that is not a number."""
+        """Return the error on the first cell that is not a number."""
         where = self.path.name
         with _open_csv(self.path) as file:
             file.readline()
@@ -139,12 +139,12 @@ class _CsvRows(RowReader):
                             f"{where}: {self.names[i]} is {found} at row {row}, wanted a "
                             f"number{hint}; remove the row or correct the recording"
                         )
-        return DataError(f"{where} holds a cell that is not a plain decimal number")
+        return DataError(f"{where} contains a cell that is not a decimal number; correct it")
 
 
 @contextmanager
 def _open_csv(path: Path) -> Iterator[TextIO]:
-    """Open a text file, whether or not it starts with a byte order mark."""
+    """Open a text file, with or without a byte order mark."""
     try:
         with path.open(encoding="utf-8-sig") as file:
             yield file
@@ -157,7 +157,7 @@ def _not_utf8(path: Path, error: UnicodeDecodeError) -> DataError:
 
 
 def _csv_header(path: Path) -> tuple[list[str], str]:
-    """Return the column names of a CSV file and what separates them."""
+    """Return the column names of a CSV file and their separator."""
     with _open_csv(path) as file:
         line = file.readline()
     if not line.strip():
@@ -171,7 +171,7 @@ def _csv_header(path: Path) -> tuple[list[str], str]:
 
 
 def _split(where: str, line: str, separator: str, number: int) -> list[str]:
-    """Return the cells of a line; quotes may hold separators."""
+    """Return the cells of a line; quoted cells may contain separators."""
     try:
         return next(csv.reader([line], delimiter=separator))
     except (csv.Error, StopIteration) as error:
@@ -180,7 +180,7 @@ def _split(where: str, line: str, separator: str, number: int) -> list[str]:
 
 
 def _is_number(text: str) -> bool:
-    """Whether a cell holds a number, NaN and infinity among them."""
+    """Whether a cell contains a number, NaN or infinity."""
     try:
         float(text)
     except ValueError:

@@ -1,6 +1,6 @@
-"""A robot's motion as arrays: `Log` as it was recorded, `Trajectory` as it is identified from.
+"""Motion of a robot as arrays: `Log`, the recording, and `Trajectory`, the input of a fit.
 
-Reading and writing files is in `robotid.logs.read`.
+Files are read and written by `robotid.logs.read`.
 """
 
 import difflib
@@ -22,7 +22,7 @@ from robotid.findings import listed
 
 __all__ = ["COLUMNS", "Log", "Trajectory"]
 
-#: Attributes of a `Log` with a column per joint, by the name of these columns in files.
+#: Attributes of a `Log` with one column per joint, by the prefix of these columns in files.
 COLUMNS = {
     "q": "q",
     "dq": "v",
@@ -32,25 +32,25 @@ COLUMNS = {
     "dqref": "v_ref",
     "tauref": "tau_ref",
 }
-_SHORTEST = 1e-12  # [s] of a step, in the mean
+_SHORTEST = 1e-12  # [s] smallest mean time step
 _REQUIRED = ("q", "tau")
-_NO_TORQUE = "; without torques, give zeros and has_torque=False"
-_LARGEST = 1e30  # in any unit; what is computed from it is still a number
+_NO_TORQUE = "; without torques, pass zeros and has_torque=False"
+_LARGEST = 1e30  # in any unit, so that squares and products are finite
 
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """A recording, sample by sample, in SI units. The arrays cannot be written to.
+    """A recording, sample by sample, in SI units. The arrays are read-only.
 
     Attributes:
         t: Time stamps, strictly increasing, shape (N,) [s].
         q: Joint positions, shape (N, n) [rad or m].
-        tau: Joint torques, shape (N, n) [N m or N]; 0 without a torque.
+        tau: Joint torques, shape (N, n) [N m or N]; 0 if they were not recorded.
         joints: Names of the n joints, in the order of the columns.
         v: Measured velocities, shape (N, n) [rad/s or m/s], or None.
         a: Measured accelerations, shape (N, n) [rad/s^2 or m/s^2], or None.
-        path: The file it was read from; "" if it was made in memory.
-        notes: What the reader should know, as columns that were ignored.
+        path: The file of the log; "" if it was created in memory.
+        notes: Notes for the user, as columns that were ignored.
         q_ref: Commanded positions, shape (N, n) [rad or m], or None.
         v_ref: Commanded velocities, shape (N, n) [rad/s or m/s], or None.
         tau_ref: Commanded feed-forward torques, shape (N, n) [N m or N], or None.
@@ -78,16 +78,16 @@ class Log:
         _settle(self, where, {kind: getattr(self, name) for kind, name in COLUMNS.items()})
         if not self.has_torque and self.tau.any():
             raise DataError(
-                f"{where}: has_torque is False, but tau is not 0; leave has_torque out, or give "
+                f"{where}: has_torque is False, but tau is not 0; leave has_torque out, or pass "
                 "zeros"
             )
         if len(self.t) < 2:
-            raise DataError(f"{where} has {len(self.t)} rows, wanted at least 2")
+            raise DataError(f"{where} has {len(self.t)} rows, wanted at least 2; record longer")
         require_increasing(self.t, where)
 
     @property
     def name(self) -> str:
-        """Name of its file, "log" if it has none."""
+        """Name of the file, "log" if there is none."""
         return Path(self.path).name or "log"
 
     def __repr__(self) -> str:
@@ -97,11 +97,11 @@ class Log:
         """Return the log from start to end, both included.
 
         Args:
-            start: First time stamp kept, on the log's own clock [s]; None for the first row.
-            end: Last time stamp kept [s]; None for the last row.
+            start: First time stamp, on the log's own clock [s]; None for the first row.
+            end: Last time stamp [s]; None for the last row.
 
         Raises:
-            DataError: If fewer than two rows are left.
+            DataError: If fewer than two rows lie in this window.
         """
         for name, limit in (("start", start), ("end", end)):
             is_end = isinstance(limit, float | np.floating) and bool(np.isinf(limit))
@@ -115,14 +115,14 @@ class Log:
                 f"{self.name}: {len(rows)} rows lie between {first:g} s and {last:g} s; "
                 f"the log spans {self.t[0]:g} s to {self.t[-1]:g} s. Choose start and end inside it"
             )
-        kept = slice(rows[0], rows[-1] + 1)
-        return replace(self, t=self.t[kept], **{k: x[kept] for k, x in self._arrays().items()})
+        within = slice(rows[0], rows[-1] + 1)
+        return replace(self, t=self.t[within], **{k: x[within] for k, x in self._arrays().items()})
 
     def select(self, joints: Sequence[str]) -> "Log":
         """Return the log of some joints.
 
         Args:
-            joints: Names of the joints kept, in the order wanted.
+            joints: Names of these joints, in the required order.
 
         Raises:
             DataError: If a joint is not in the log.
@@ -133,12 +133,12 @@ class Log:
                     f"joint {name!r} is not in {self.name}; joints: {listed(self.joints)}"
                     f"{suggestion(name, self.joints)}"
                 )
-        kept = [self.joints.index(name) for name in joints]
-        cut = {name: x[:, kept] for name, x in self._arrays().items()}
-        return replace(self, joints=tuple(joints), **cut)
+        columns = [self.joints.index(name) for name in joints]
+        chosen = {name: x[:, columns] for name, x in self._arrays().items()}
+        return replace(self, joints=tuple(joints), **chosen)
 
     def turned(self, sign: Array) -> "Log":
-        """Return the log with the signs of some joints turned.
+        """Return the log with the signs of some joints reversed.
 
         Args:
             sign: 1 or -1 of each joint, shape (n,).
@@ -146,14 +146,14 @@ class Log:
         return replace(self, **{name: sign * x for name, x in self._arrays().items()})
 
     def _arrays(self) -> dict[str, Any]:
-        """Return the arrays with a column per joint, those that there are."""
+        """Return the existing arrays with one column per joint."""
         arrays = {name: getattr(self, name) for name in COLUMNS.values()}
         return {name: x for name, x in arrays.items() if x is not None}
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """A motion that is smooth within each segment, in SI units. The arrays cannot be written to.
+    """A motion that is smooth within each segment, in SI units. The arrays are read-only.
 
     Attributes:
         t: Time stamps, shape (N,) [s].
@@ -162,12 +162,12 @@ class Trajectory:
         a: Accelerations, shape (N, n) [rad/s^2 or m/s^2].
         tau: Torques, shape (N, n) [N m or N].
         joints: Names of the n joints, in the order of the columns.
-        rate: Rate of the uniform grid [Hz]; None if the rows are as recorded.
-        segment: Rows of one uninterrupted segment share a number, shape (N,), int.
-        direction: Sign of each speed that Coulomb friction follows, filtered as the torque is,
-            shape (N, c) [-], in the order of ``friction_speeds``; None: the speed's own sign.
-        memory: What drive parameters multiply that an instant alone does not show, shape (N, m),
-            in the order of ``ParameterLayout.remembering``; None if a robot has none.
+        rate: Rate of the uniform grid [Hz]; None if the rows are those of the log.
+        segment: Number of the segment without gaps of each row, shape (N,), int.
+        direction: Sign of each speed that determines Coulomb friction, filtered as the torque,
+            shape (N, c) [-], in the order of ``friction_speeds``; None: the sign of the speed.
+        memory: Regressor columns of drive parameters that depend on internal states, shape (N, m),
+            in the order of ``ParameterLayout.remembering``; None if there are none.
     """
 
     t: Array
@@ -198,7 +198,7 @@ class Trajectory:
             if direction.ndim != 2 or len(direction) != len(self.t):
                 raise DataError(
                     f"trajectory: direction has shape {direction.shape}, wanted ({len(self.t)}, c)"
-                    ": a column for each speed that Coulomb friction follows"
+                    ": a column for each speed that determines Coulomb friction"
                 )
             names = [f"direction {k}" for k in range(direction.shape[1])]
             require_finite(direction, self.t, names, "trajectory")
@@ -212,14 +212,14 @@ class Trajectory:
 
     @cached_property
     def derived(self) -> dict[str, Any]:
-        """What was computed of this motion and is kept with it, by name."""
+        """Cache of values computed from this motion, by name."""
         return {}
 
     def with_states(self, memory: Array | None) -> "Trajectory":
-        """Return the same motion with other memory, and what was computed of it.
+        """Return the same motion with other internal states of drives, and the same cache.
 
         Args:
-            memory: What drives remember, as of ``memory``.
+            memory: Columns of internal states, as of ``memory``.
         """
         same = copy(self)
         vars(same).update(memory=memory, derived=self.derived)
@@ -240,10 +240,10 @@ class Trajectory:
         return self.at(slice(start, stop))
 
     def every(self, step: int) -> "Trajectory":
-        """Return every so many samples, without a rate.
+        """Return every n-th sample, without a rate.
 
         Args:
-            step: How many samples one stands for.
+            step: The number n.
         """
         if step == 1:
             return self
@@ -252,7 +252,7 @@ class Trajectory:
         return thinned
 
     def at(self, rows: Array | slice) -> "Trajectory":
-        """Return some samples. Their values were checked when those of the motion were.
+        """Return some samples, without new checks of their values.
 
         Args:
             rows: Their numbers.
@@ -268,11 +268,11 @@ class Trajectory:
 
 
 def suggestion(name: str, known: Collection[str]) -> str:
-    """Return ". Did you mean 'x'?" of the nearest known name, or "" if none is near.
+    """Return ". Did you mean 'x'?" for the most similar known name, or "" if none is similar.
 
     Args:
-        name: The name that is not known.
-        known: The names that are.
+        name: The unknown name.
+        known: The known names.
     """
     near = difflib.get_close_matches(name, known, n=1)
     return f". Did you mean {near[0]!r}?" if near else ""
@@ -291,7 +291,7 @@ def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]
     """Check joints, shapes and values of the arrays, and replace them by read-only ones."""
     joints = _names(owner.joints, where)
     if twice := repeated(joints):
-        raise DataError(f"{where}: joints {listed(twice)} are named twice; name each joint once")
+        raise DataError(f"{where}: joints contains {listed(twice)} twice; name each joint once")
     t = real_numbers(owner.t, f"{where}: t")
     if t.ndim != 1:
         raise DataError(f"{where}: t has shape {t.shape}, wanted (N,)")
@@ -328,8 +328,8 @@ def real_numbers(values: ArrayLike | None, name: str, *, hint: str = "") -> Arra
 
     Args:
         values: The values.
-        name: What they are called.
-        hint: What else can be done where there are none.
+        name: Their name, for errors.
+        hint: Another remedy, for the error if they are None.
 
     Raises:
         DataError: If they are no real numbers, or rows have unequal lengths.
@@ -345,13 +345,13 @@ def real_numbers(values: ArrayLike | None, name: str, *, hint: str = "") -> Arra
         return _frozen(values)
     except (TypeError, ValueError, OverflowError) as error:
         raise DataError(
-            f"{name} is no array of real numbers ({str(error)[:100]}); wanted one of floats, with "
-            "rows of equal length"
+            f"{name} is not an array of real numbers ({str(error)[:100]}); wanted an array of "
+            "floats with rows of equal length"
         ) from error
 
 
 def _frozen(values: ArrayLike, dtype: type = np.float64) -> Array:
-    """Return the values as a read-only array; copied unless they cannot be written to already."""
+    """Return the values as a read-only array; copied unless they are read-only already."""
     array: Array = np.asarray(values, dtype=dtype)
     if array.flags.writeable:
         array = array.copy()
@@ -362,14 +362,14 @@ def _frozen(values: ArrayLike, dtype: type = np.float64) -> Array:
 def require_finite(
     values: Array, t: Array, names: Sequence[str], where: str, first: int = 0
 ) -> None:
-    """Refuse NaN, infinite values and those beyond 1e30, naming the first.
+    """Reject NaN, infinite values and values beyond 1e30; the error names the first.
 
     Args:
         values: Shape (N, k).
         t: Time stamps of the rows, shape (N,) [s].
         names: Names of the k columns.
-        where: What the log is called.
-        first: Number in its file of the first row.
+        where: Name of the log.
+        first: Number of the first row in its file.
 
     Raises:
         DataError: If a value is not finite, or so large that its square may not be.
@@ -380,7 +380,7 @@ def require_finite(
     row, column = (int(i) for i in np.argwhere(~is_fine)[0])
     value = values[row, column]
     found = "NaN" if np.isnan(value) else f"{value:g}" if np.isfinite(value) else str(value)
-    what = ", beyond any robot's," if np.isfinite(value) else ""
+    what = ", which is implausibly large," if np.isfinite(value) else ""
     at = f" (t = {t[row]:.6g} s)" if np.isfinite(t[row]) else ""
     raise DataError(
         f"{where}: {names[column]} is {found}{what} at row {first + row}{at}; remove the row or "
@@ -390,15 +390,15 @@ def require_finite(
 
 
 def require_increasing(t: Array, where: str, first: int = 0) -> None:
-    """Refuse time stamps that repeat or go back, naming the first.
+    """Reject time stamps that repeat or decrease; the error names the first.
 
     Args:
         t: Time stamps, shape (N,) [s].
-        where: What the log is called.
-        first: Number in its file of the first row.
+        where: Name of the log.
+        first: Number of the first row in its file.
 
     Raises:
-        DataError: If a time stamp is not after the one before, or they lie too close.
+        DataError: If a time stamp is not after the one before, or the time steps are too small.
     """
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back) == 0:
@@ -420,28 +420,30 @@ def require_increasing(t: Array, where: str, first: int = 0) -> None:
 
 
 def _check_rate(t: Array, where: str) -> None:
-    """Refuse time stamps that no clock has."""
+    """Reject time stamps with implausibly small steps."""
     if len(t) < 2:
         return
     step = float(t[-1] - t[0]) / (len(t) - 1)
     if step < _SHORTEST:
         raise DataError(
-            f"{where}: {len(t)} rows lie within {float(t[-1] - t[0]):.3g} s, {step:.3g} s from one "
-            f"to the next, wanted at least {_SHORTEST:g} s; correct the time stamps or their unit",
+            f"{where}: {len(t)} rows lie within {float(t[-1] - t[0]):.3g} s, so the mean time step "
+            f"is {step:.3g} s, wanted at least {_SHORTEST:g} s; correct the time stamps or their "
+            "unit",
             code="time_unit",
         )
 
 
 def _stamp(t: float) -> str:
-    """Return a time stamp with three decimals, or with as many as it has."""
+    """Return a time stamp with three decimals, or with more if it has more."""
     return f"{t:.3f}" if round(t, 3) == t else f"{t:.13g}"
 
 
 def _extent(motion: Log | Trajectory, rate: float | None = None) -> str:
-    """Return in words which joints are recorded, how long and how often."""
+    """Return a text with the joints, the duration and the rate of a motion."""
     t, joints = motion.t, motion.joints
-    often = 1.0 / float(np.median(np.diff(t))) if rate is None and len(t) > 1 else rate or np.nan
+    if rate is None:
+        rate = 1.0 / float(np.median(np.diff(t))) if len(t) > 1 else np.nan
     return (
         f"{len(t)} samples of {len(joints)} joints ({', '.join(joints)}) over "
-        f"{t[-1] - t[0] if len(t) else 0.0:.6g} s at {often:.4g} Hz"
+        f"{t[-1] - t[0] if len(t) else 0.0:.6g} s at {rate:.4g} Hz"
     )

@@ -1,7 +1,7 @@
-"""The filters of recorded signals: Butterworth's, run both ways, and local polynomials.
+"""Filters of recorded signals: a zero-phase Butterworth filter, and local polynomials.
 
-They do what ``sosfiltfilt(butter(...))`` and ``savgol_filter`` of scipy.signal do, to rounding: the
-import of that package takes longer than the doctor does.
+They equal ``sosfiltfilt(butter(...))`` and ``savgol_filter`` of scipy.signal to rounding; the
+import of that package takes longer than the doctor.
 """
 
 from math import factorial
@@ -16,7 +16,7 @@ __all__ = ["butterworth_poles", "local_polynomial", "zero_phase"]
 
 
 def butterworth_poles(order: int, cutoff: float, rate: float) -> Array:
-    """Return the poles of a digital low-pass filter of Butterworth, by the bilinear transform.
+    """Return the poles of a digital Butterworth low-pass filter, by the bilinear transform.
 
     Args:
         order: Number of poles.
@@ -24,7 +24,7 @@ def butterworth_poles(order: int, cutoff: float, rate: float) -> Array:
         rate: Rows per second.
 
     Returns:
-        Those on the real axis or above it, shape (ceil(order / 2),), complex.
+        The poles with an imaginary part >= 0, shape (ceil(order / 2),), complex.
     """
     angles = np.pi * (2 * np.arange((order + 1) // 2) + order + 1) / (2 * order)
     analog = np.tan(np.pi * cutoff / rate) * np.exp(1j * angles)
@@ -32,20 +32,20 @@ def butterworth_poles(order: int, cutoff: float, rate: float) -> Array:
 
 
 def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Array:
-    """Return signals after Butterworth's filter forwards and backwards, shape (N, ...).
+    """Return signals after a Butterworth filter forwards and backwards, shape (N, ...).
 
-    Each pass starts as if the first value had been there for ever; both ends are continued by the
-    signal turned about its end (Gustafsson 1996 compares such starts).
+    The initial state of each pass is the steady state for the first value; both ends are extended
+    by point reflection of the signal (Gustafsson 1996 compares such initial states).
 
     Args:
         x: Signals over time, shape (N, ...).
         order: Order of the filter.
         cutoff: Frequency of half the power in one pass [Hz].
         rate: Rows per second.
-        pad: Rows by which both ends are continued, below N.
+        pad: Rows by which both ends are extended, below N.
     """
     if not x.size:
-        return x  # LAPACK writes beyond what is empty
+        return x  # LAPACK would write beyond an empty array
     # (k, N): each signal in one piece of memory
     rows = np.ascontiguousarray(x.reshape(len(x), -1).T)
     first, last = rows[:, :1], rows[:, -1:]
@@ -62,7 +62,7 @@ def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Ar
 
 
 def _filter(x: Array, pole: complex) -> None:
-    """Filter signals in place, shape (k, N), by one pole, or a pair of conjugate ones, at rest.
+    """Filter signals in place, shape (k, N), by one pole or a conjugate pair, from state 0.
 
     With zeros at half the rate: y + a y' = g (x + x'), or y + a y' + b y'' = g (x + 2 x' + x'').
     """
@@ -70,7 +70,7 @@ def _filter(x: Array, pole: complex) -> None:
     a = np.array([1.0, -pole.real] if is_real else [1.0, -2 * pole.real, abs(pole) ** 2])
     for _ in a[1:]:
         x[:, 1:] += x[:, :-1]
-    x *= a.sum() / 2.0 ** (len(a) - 1)  # what is constant passes
+    x *= a.sum() / 2.0 ** (len(a) - 1)  # gain 1 for constant signals
     band = np.tile(a, (x.shape[1], 1)).T  # of the triangle whose solution is the recursion
     x[:] = dtbtrs(band, x.T, uplo="L", diag="U", overwrite_b=1)[0].T
 
@@ -78,16 +78,16 @@ def _filter(x: Array, pole: complex) -> None:
 def local_polynomial(
     x: Array, width: int, degree: int, *, derivative: int = 0, step: float = 1.0
 ) -> Array:
-    """Return signals as polynomials through the rows around each have them, shape (N, ...).
+    """Return signals smoothed by polynomials through the rows around each row, shape (N, ...).
 
-    At the ends the polynomial of the first and of the last ``width`` rows counts (Savitzky, Golay
+    At the ends the polynomial of the first and of the last ``width`` rows is used (Savitzky, Golay
     1964).
 
     Args:
         x: Signals over time, shape (N, ...).
-        width: Rows of each polynomial, odd, at most N.
+        width: Rows of each polynomial, not even, at most N.
         degree: Its degree, below ``width``.
-        derivative: Which of its derivatives is returned.
+        derivative: Order of the derivative that is returned.
         step: Time between rows [s].
     """
     half = width // 2

@@ -1,4 +1,4 @@
-"""Tables with columns that others named: those of PlotJuggler, and DataFrames."""
+"""Tables with column names of other programs: PlotJuggler's, and DataFrames."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,8 +17,8 @@ from robotid.logs.table import Place, RowReader, Table, choose, prefixes
 __all__ = ["Frame", "is_frame", "open_frame", "with_own_names"]
 
 _CLOCK = "__time"  # PlotJuggler's
-_COLUMNS = "its columns are named <topic>/<joint>/position and the like"
-_NAMED = re.compile(r"(.*)/([^/]+)/(position|velocity|acceleration|effort)")  # topic, joint, what
+_COLUMNS = "its columns have names as <topic>/<joint>/position"
+_NAMED = re.compile(r"(.*)/([^/]+)/(position|velocity|acceleration|effort)")  # topic, joint, kind
 
 
 class Frame(Protocol):
@@ -31,16 +31,16 @@ class Frame(Protocol):
 
 
 def is_frame(thing: object) -> TypeGuard[Frame]:
-    """Return whether a thing has named columns, as a DataFrame has.
+    """Return whether an object has named columns, as a DataFrame.
 
     Args:
-        thing: Anything.
+        thing: Any object.
     """
     return hasattr(thing, "columns") and hasattr(thing, "__getitem__")
 
 
 def open_frame(frame: Frame) -> Table:
-    """Return the table in a DataFrame; an index that has a name is a column.
+    """Return the table in a DataFrame; an index with a name becomes a column.
 
     Args:
         frame: The DataFrame.
@@ -61,24 +61,24 @@ def _numbers(values: Any, name: str) -> Array:  # noqa: ANN401
     except (TypeError, ValueError) as error:
         kind = getattr(values, "dtype", type(values).__name__)
         raise DataError(
-            f"log: column {name!r} holds {kind}, wanted numbers ({error}); convert it"
+            f"log: column {name!r} contains {kind}, wanted numbers ({error}); convert it"
         ) from error
 
 
 def with_own_names(table: Table, where: str, kind: str, source: LogSource) -> Table:
-    """Return a table whose columns that PlotJuggler named have names that are read.
+    """Return a table with the columns of PlotJuggler renamed to standard names.
 
-    ``/joint_states/elbow/position`` is ``position_elbow``, likewise velocity, acceleration and
-    effort, and ``__time`` is ``time``. A table with standard columns is left as it is.
+    ``/joint_states/elbow/position`` becomes ``position_elbow``, likewise velocity, acceleration and
+    effort, and ``__time`` becomes ``time``. A table with standard columns is not changed.
 
     Args:
         table: The table.
         where: Name of its file, for errors.
-        kind: What it is, as ".csv files".
-        source: Its topic, if it has joint states of several.
+        kind: Noun for its format, as ".csv files".
+        source: Its topic, if it has joint states of several topics.
 
     Raises:
-        DataError: If it has joint states of several topics and none, or another one, is stated.
+        DataError: If it has joint states of several topics and no topic, or another one, is stated.
     """
     topics: dict[str, dict[str, str]] = {}  # names in the file, by topic and own name
     standard = [name for name in table.names if name.startswith(prefixes()["q"])]
@@ -106,7 +106,7 @@ def with_own_names(table: Table, where: str, kind: str, source: LogSource) -> Ta
 
 
 def _topic(topics: Mapping[str, Mapping[str, str]], where: str, source: LogSource) -> str:
-    """Return the topic that is stated, or the only one, of those with efforts if there are any."""
+    """Return the stated topic, or the only one (with efforts, if any topic has efforts)."""
     if source.topic is not None:
         if source.topic not in topics:
             raise DataError(

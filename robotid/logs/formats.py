@@ -33,45 +33,46 @@ _LONGEST_NAME = 1000  # characters of a column
 
 
 def open_table(path: Path, source: LogSource) -> Table:
-    """Return the table in a file; what is wrong with a column is told when it is read.
+    """Return the table in a file; faults of a column are reported when it is read.
 
     Args:
         path: A file of a known suffix, or the folder of a ROS 2 bag or of a LeRobot dataset.
-        source: Where in the file.
+        source: Place of the log in the file.
 
     Raises:
         DataError: If the file is missing, of another suffix or broken, or its table is not found.
         MissingDependencyError: If a package that reads it is not installed.
-        SettingsError: If the source names the commands' topic, and the file is no bag.
+        SettingsError: If the source has a topic of the commands, and the file is no bag.
     """
     form = _format_of(path)
     if source.command is not None and not isinstance(form, BagFormat):
         raise SettingsError(
-            f"log.command is {source.command!r}, the topic of a bag, but {path.name} is none; its "
-            "commands are columns, as qref_<joint>"
+            f"log.command is {source.command!r}, the topic of a bag, but {path.name} is no bag; "
+            "write the commands to columns, as qref_<joint>"
         )
     table = form.open(path, source)
-    if isinstance(form, CsvFormat | ParquetFormat):  # which have no places in them
+    if isinstance(form, CsvFormat | ParquetFormat):  # with one table per file
         table = with_own_names(table, path.name, f"{path.suffix} files", source)
     for name in table.names:
         if len(name) > _LONGEST_NAME:
             raise DataError(
-                f"{path.name}: a column has a name of {len(name)} characters, {name[:40]!r}...; "
-                f"wanted at most {_LONGEST_NAME}"
+                f"{path.name}: a column has a name of {len(name)} characters, {name[:40]!r}..., "
+                f"wanted at most {_LONGEST_NAME}; rename it"
             )
     return table
 
 
 def _format_of(path: Path) -> Format:
-    """Return the format of a log, which is there."""
+    """Return the format of a log that exists."""
     if path.is_dir():
         is_dataset = (path / "meta" / "info.json").is_file()
         return LeRobotFormat() if is_dataset else BagFormat()
     suffix = path.suffix.lower()
     if suffix not in _FORMATS:
         raise DataError(
-            f"{path.name}: logs are {_listed(list(_FORMATS))} files, or the folder of a ROS 2 bag "
-            f"or of a LeRobot dataset, not {suffix!r}; convert it"
+            f"{path.name}: the suffix is {suffix!r}, wanted a log file of type "
+            f"{_listed(list(_FORMATS))}, or the folder of a ROS 2 bag or of a LeRobot dataset; "
+            "convert it"
         )
     if not path.is_file():
         raise DataError(missing_file(path, "log file"))
@@ -79,34 +80,34 @@ def _format_of(path: Path) -> Format:
 
 
 def write_columns(table: Mapping[str, Array], path: Path) -> None:
-    """Write columns to a file; reading them gives the same numbers, to the last bit.
+    """Write columns to a file; reading them returns exactly the same numbers.
 
-    The file is written beside its final place and then moved there: it is never half-written.
+    A temporary file in the same folder is written and then renamed, so the file is always complete.
 
     Args:
         table: Arrays of shape (N,) by name.
-        path: A file whose suffix names a format that is written; one that exists is replaced.
+        path: A file with the suffix of a writable format; an existing one is replaced.
 
     Raises:
-        DataError: If the file name ends otherwise, or the format cannot hold a name.
+        DataError: If the suffix is another one, or a name is not valid in the format.
         MissingDependencyError: If a package that writes it is not installed.
         OSError: If the folder cannot be written to.
     """
     form = _WRITTEN[check_suffix(path)]
-    with written_whole(path) as beside:
-        form.write(table, beside)
+    with written_whole(path) as temporary:
+        form.write(table, temporary)
 
 
 def check_suffix(path: Path, what: str = "logs", *, also: Sequence[str] = ()) -> str:
-    """Return the suffix of a file to write, as before the work that makes its content.
+    """Return the suffix of a file to write; used before its content is computed.
 
     Args:
         path: The file.
-        what: What is written, for errors.
-        also: Suffixes of further formats that it is written in, for errors.
+        what: Noun for the content, for errors.
+        also: Suffixes of further formats, for errors.
 
     Raises:
-        DataError: If its suffix names no format that is written.
+        DataError: If files with this suffix are not written.
     """
     suffix = path.suffix.lower()
     if suffix not in _WRITTEN:

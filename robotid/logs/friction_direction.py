@@ -1,4 +1,4 @@
-"""Which way Coulomb friction acts: the sign of the speed, and between two signs while it sticks."""
+"""The direction of Coulomb friction: the sign of the speed, and a transition during stiction."""
 
 from itertools import pairwise
 
@@ -8,26 +8,26 @@ from robotid._typing import Array
 
 __all__ = ["acting_directions"]
 
-_REST = 1e-6  # [rad/s] slower than this is rest: the sign of rounding is no direction
-# A drive that sticks is slow for so many times as long as its slopes at the edge of the band say.
-_REVERSAL = 2.0  # a straight line through zero has 1, a cubic that rests there 3
+_REST = 1e-6  # [rad/s] slower: at rest, because the sign is a rounding error
+# Least time of stiction in the band, over the time by the slopes at its edges.
+_REVERSAL = 2.0  # a straight line through zero has 1, a cubic that rests there has 3
 _RETURN = 4.0  # a parabola from zero to the far edge of the band has 2 to 4
 
 
 def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
     """Return the direction of Coulomb friction at each instant, between -1 and 1, shape (N, c).
 
-    It is the sign of the speed. A drive that sticks comes to rest at once and leaves again later:
-    its friction holds whatever torque there is, from one bound to the other, while a smooth speed
-    rings about zero. There the direction goes linearly in time from the sign before to that after.
-    A drive has stuck if it was in the band longer than its slopes where it entered and left say: by
-    a factor of two if it reverses, of four if it goes on as before.
+    It is the sign of the speed. In stiction, a drive stops abruptly and moves again later: its
+    friction balances the applied torque, from one bound to the other, while the filtered speed
+    oscillates about zero. There the direction changes linearly in time from the sign before to the
+    sign after. A drive was in stiction if it was in the band longer than the slopes at the edges
+    of the band indicate: by a factor of two if it reverses, of four if it does not.
 
     Args:
         t: Times, shape (N,) [s].
-        w: Smooth speeds, shape (N, c) [rad/s]; those of sliders as of ``friction_speeds``.
-        band: Speed from which the sign is sure [rad/s]; 0: everywhere.
-        longest: Longest time that a drive sticks; what is slow for longer keeps its signs [s].
+        w: Smooth speeds, shape (N, c) [rad/s]; of prismatic joints as in ``friction_speeds``.
+        band: Speed from which the sign is certain [rad/s]; 0: everywhere.
+        longest: Longest time of stiction [s]; in longer slow motion the signs are used.
 
     References:
         Karnopp (1985), Computer simulation of stick-slip friction in mechanical dynamic systems.
@@ -36,7 +36,7 @@ def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
     for x, direction in zip(w.T, directions.T, strict=True):
         edges = np.flatnonzero(np.diff(np.abs(x) < band)) + 1
         for i, k in pairwise(edges):
-            if abs(x[i]) >= band:  # fast from here on
+            if abs(x[i]) >= band:  # fast after this edge
                 continue
             before, after = np.sign(x[i - 1]), np.sign(x[k])
             enters = _crossing(t[i - 1 : i + 1], x[i - 1 : i + 1], before * band)
@@ -50,6 +50,6 @@ def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
 
 
 def _crossing(t: Array, x: Array, level: float) -> tuple[float, float]:
-    """Return when x is at the level between two instants, and how steep it is there."""
+    """Return the time at which x crosses the level between two instants, and its slope."""
     slope = (x[1] - x[0]) / (t[1] - t[0])
     return float(t[0] + (level - x[0]) / slope), float(abs(slope))

@@ -16,11 +16,11 @@ from robotid.findings import listed
 from robotid.logs.data import suggestion
 from robotid.logs.parquet_files import load_pyarrow
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Format, Table, choose, told
+from robotid.logs.table import Format, Table, choose, parsing
 
 __all__ = ["LeRobotFormat"]
 
-#: How the columns of each feature start, by what the names in it end with.
+#: Prefixes of the columns of each feature, by the endings of the names in it.
 _FEATURES: Mapping[str, Mapping[str, str]] = {
     "observation.state": {"": "q", "pos": "q", "q": "q", "vel": "dq", "dq": "dq",
                           "torque": "tau", "tau": "tau", "effort": "tau"},
@@ -30,26 +30,26 @@ _FEATURES: Mapping[str, Mapping[str, str]] = {
                "torque": "tauref", "tau": "tauref", "effort": "tauref"},
 }  # fmt: skip
 _NORMALISED = (
-    "the unit of LeRobot's positions is not in its files. By default they are normalised, -100 to "
-    "100 over the calibrated range of each joint (a gripper's always, 0 to 100), and those are no "
-    "angles: record with use_degrees = true, or convert them with the robot's calibration. If "
+    "the unit of positions is not in the files of LeRobot. By default they are normalised, -100 to "
+    "100 over the calibrated range of each joint (always 0 to 100 for a gripper), and are not "
+    "angles: record with use_degrees = true, or convert them with the calibration of the robot. If "
     'they are angles, state the unit: angle = "deg" or "rad" (job file table [units], CLI '
     '--angle-unit deg, Python units=LogUnits(angle="deg"))'
 )
 
 
 class LeRobotFormat(Format):
-    """LeRobot datasets: positions of ``observation.state``, commanded ones of ``action``.
+    """LeRobot datasets: positions in ``observation.state``, commanded positions in ``action``.
 
-    Time stamps are those of the episode, which LeRobot computes from the number of the frame. The
-    topic of the source is the episode, as ``episode_3``, where there are several.
+    LeRobot computes the time stamps of an episode from the numbers of the frames. The topic of the
+    source is the episode, as ``episode_3``, if there are several.
     """
 
     def open(self, path: Path, source: LogSource) -> Table:
         pa = load_pyarrow("reading LeRobot datasets")
         columns = _columns(path, _features(path))
         parts: dict[int, list[Path]] = {}  # files that hold an episode, by its number
-        with told(path, "LeRobot"):
+        with parsing(path, "LeRobot"):
             for file in sorted(path.glob("data/**/*.parquet")):
                 numbers = pa.parquet.read_table(file, columns=["episode_index"])
                 for number in np.unique(numbers.column(0).to_numpy()):
@@ -59,8 +59,8 @@ class LeRobotFormat(Format):
             ["time", *columns],
             partial(_read, path, parts[number], number, columns),
             notes=(
-                f"episode {number}; its time stamps are the numbers of the frames over their rate, "
-                "so what was sent and measured may be a frame apart",
+                f"episode {number}: its time stamps are frame numbers over the frame rate, so the "
+                "delay between commands and positions has an error of up to one frame",
             ),
             angle_unit=_NORMALISED,
         )
@@ -73,19 +73,19 @@ class _Column:
 
 
 def _features(path: Path) -> dict[str, Any]:
-    """Return what the dataset says of its columns."""
+    """Return the description of the columns of the dataset."""
     info = read_json(path / "meta" / "info.json", "description of a LeRobot dataset")
     features = info.get("features") if isinstance(info, dict) else None
     if not isinstance(features, dict) or not all(isinstance(x, dict) for x in features.values()):
         raise DataError(
-            f"{path.name}: meta/info.json is no description of a LeRobot dataset of version 2 or "
+            f"{path.name}: meta/info.json does not describe a LeRobot dataset of version 2 or "
             f"3: features is {str(features)[:80]}, wanted a table of tables"
         )
     return features
 
 
 def _columns(path: Path, features: Mapping[str, Any]) -> dict[str, _Column]:
-    """Return the columns of the motors that the dataset names, by standard name."""
+    """Return the columns of the motors of the dataset, by standard name."""
     columns: dict[str, _Column] = {}
     for feature, starts in _FEATURES.items():
         if feature not in features:
@@ -93,7 +93,7 @@ def _columns(path: Path, features: Mapping[str, Any]) -> dict[str, _Column]:
         names = _names(features[feature].get("names"))
         if not names:
             raise DataError(
-                f"{path.name}: meta/info.json gives no names of the motors in {feature}; add "
+                f"{path.name}: meta/info.json has no names of the motors in {feature}; add "
                 f"their names, in the order of its {features[feature].get('shape')} values"
             )
         for place, name in enumerate(names):
@@ -104,20 +104,21 @@ def _columns(path: Path, features: Mapping[str, Any]) -> dict[str, _Column]:
             if column in columns:
                 first = columns[column]
                 raise DataError(
-                    f"{path.name}: meta/info.json names {str(name)!r} of {feature}, number {place},"
-                    f" and number {first.place} of {first.feature} alike; give each motor a name "
-                    "of its own"
+                    f"{path.name}: meta/info.json has the same name for {str(name)!r} of "
+                    f"{feature}, number {place}, and number {first.place} of {first.feature}; give "
+                    "each motor another name"
                 )
             columns[column] = _Column(feature, place)
     if not columns:
         raise DataError(
-            f"{path.name} has neither observation.state nor action; features: {listed(features)}"
+            f"{path.name} has neither observation.state nor action, wanted one of them; features: "
+            f"{listed(features)}"
         )
     return columns
 
 
 def _names(stated: object) -> list[str]:
-    """Return the names of a feature's values; none if they are stated in no known way."""
+    """Return the names of a feature's values; none if their form is unknown."""
     groups = list(stated.values()) if isinstance(stated, dict) else [stated]
     lists = [group for group in groups if isinstance(group, list)]
     if len(lists) < len(groups):  # neither {"motors": [...]} nor a list
@@ -127,12 +128,12 @@ def _names(stated: object) -> list[str]:
 
 
 def _episode(path: Path, numbers: Sequence[int], wanted: str | None) -> int:
-    """Return the episode that is wanted, or the only one."""
+    """Return the number of the stated episode, or of the only one."""
     names = [f"episode_{number}" for number in numbers]
     if not names:
-        raise DataError(f"{path.name} has no episode: no data/**/*.parquet holds a row")
+        raise DataError(f"{path.name} has no episode: its files data/**/*.parquet have no rows")
     if wanted is None:
-        listing = f"each is a log of its own, {len(names)} in all"
+        listing = "each episode is a separate log"
         chosen = names[0] if len(names) == 1 else choose(path.name, names, "episodes", listing)
         return numbers[names.index(chosen)]
     found = re.fullmatch(r"(?:episode_)?0*([0-9]+)", wanted)
@@ -157,7 +158,7 @@ def _read(
     pa = load_pyarrow("reading LeRobot datasets")
     used = {columns[name].feature for name in wanted if name != "time"}
     names = ["timestamp", "episode_index", "frame_index", *sorted(used)]
-    with told(path, "LeRobot"):
+    with parsing(path, "LeRobot"):
         parts = [pa.parquet.read_table(file, columns=names) for file in files]
         table = pa.concat_tables(parts)
         rows = np.flatnonzero(table.column("episode_index").to_numpy() == number)
@@ -176,7 +177,7 @@ def _read(
         if values.ndim != 2 or column.place >= values.shape[1]:
             raise DataError(
                 f"{path.name}: {column.feature} has vectors of shape {values.shape[1:]}, but "
-                f"meta/info.json names at least {column.place + 1} motors in it"
+                f"meta/info.json has at least {column.place + 1} names of motors for it"
             )
         found[name] = values[:, column.place]
     return {name: found[name] for name in wanted}

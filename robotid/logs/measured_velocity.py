@@ -1,4 +1,4 @@
-"""What the measured velocities of a log are worth beside the derivative of its positions."""
+"""Checks of the measured velocities of a log against the derivatives of its positions."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from robotid.logs.data import Log
 
 __all__ = [
     "COARSE",
-    "LATE",
+    "LARGEST_LAG",
     "coarse_velocities",
     "is_timely",
     "is_trustworthy",
@@ -18,24 +18,26 @@ __all__ = [
     "velocity_lags",
 ]
 
-#: [s] A measured velocity that lags more than this is not used by "auto".
-LATE = 0.02
-#: A channel of fewer steps than this over its range is uninformative.
+#: [s] Largest lag of a measured velocity that "auto" uses.
+LARGEST_LAG = 0.02
+#: Least number of steps over the range of a channel with sufficient resolution.
 COARSE = 100
-_FEWEST = 8  # rows of a segment in which a lag is sought
-_LONGEST = 0.3  # [s] lags are sought up to this
-_GAP = 5  # a step longer than this many median steps is a gap
-_SEGMENT = 0.1  # [s] motion is compared over segments this long: noise averages out
-_UNLIKE = 0.5  # correlation below which a velocity is not that of its position
-_MOVED, _SPEED = 1e-3, 0.02  # [rad or m], [rad/s or m/s] less than this is at rest
+_FEWEST = 8  # least number of rows of a segment in which a lag is estimated
+_LONGEST = 0.3  # [s] largest lag that is tested
+_GAP = 5  # [median steps] a longer step is a gap
+_SEGMENT = 0.1  # [s] over which the motion is averaged against noise
+_UNLIKE = 0.5  # correlation below which a velocity is not the derivative of its position
+_MOVED, _SPEED = 1e-3, 0.02  # [rad or m], [rad/s or m/s] smaller values: at rest
 
 
 def is_trustworthy(log: Log, stated: float = 0.0) -> bool:
-    """Return whether the measured velocity of every joint is timely, fine and its position's own.
+    """Return whether the measured velocities have a small lag and a sufficient resolution.
+
+    They must also correlate with the derivatives of their positions.
 
     Args:
         log: A log with measured velocities.
-        stated: How late they are said to be, which is corrected [s].
+        stated: Their stated delay, which is corrected [s].
     """
     return is_timely(log, stated) and not coarse_velocities(log) and not unlike_velocities(log)
 
@@ -45,13 +47,13 @@ def is_timely(log: Log, stated: float = 0.0) -> bool:
 
     Args:
         log: A log with measured velocities.
-        stated: How late they are said to be, which is corrected [s].
+        stated: Their stated delay, which is corrected [s].
     """
-    return velocity_lag(log) - stated < LATE
+    return velocity_lag(log) - stated < LARGEST_LAG
 
 
 def velocity_lag(log: Log) -> float:
-    """Return how late the measured velocity is against the derivative of the position [s].
+    """Return the delay of the measured velocities relative to the derivatives of the positions [s].
 
     Args:
         log: A log with measured velocities.
@@ -63,17 +65,17 @@ def velocity_lag(log: Log) -> float:
 
 
 def velocity_lags(log: Log) -> tuple[float, Array]:
-    """Return how late measured velocities are against the derivatives of the positions [s].
+    """Return the delays of measured velocities relative to the derivatives of the positions [s].
 
-    The delay minimises the distance between the measured velocity and the delayed derivative;
-    found on a uniform grid in segments without gaps, and refined by a parabola. It is positive if
-    the measured velocity is late, and 0 if the joints are at rest.
+    The delay minimises the distance between the measured velocity and the delayed derivative. It is
+    found on a uniform grid in segments without gaps and refined by a parabola. It is positive if
+    the measured velocity lags, and 0 if the joints are at rest.
 
     Args:
         log: A log with measured velocities.
 
     Returns:
-        The delay by the distances summed over the joints, and that of each joint, shape (n,).
+        The common delay of all joints, and the delay of each joint, shape (n,).
 
     Raises:
         DataError: If the log has no velocities.
@@ -106,7 +108,7 @@ def velocity_lags(log: Log) -> tuple[float, Array]:
 
 
 def coarse_velocities(log: Log) -> tuple[str, ...]:
-    """Return the joints whose measured velocity moves in few steps, as that of an encoder does.
+    """Return the joints whose measured velocity is coarsely quantised, as from an encoder.
 
     Args:
         log: A log with measured velocities.
@@ -119,39 +121,39 @@ def coarse_velocities(log: Log) -> tuple[str, ...]:
 
 
 def unlike_velocities(log: Log) -> dict[str, float]:
-    """Return the joints whose measured velocity is not that of their position, however late.
+    """Return the joints whose measured velocity is not the derivative of their position at any lag.
 
     Args:
         log: A log with measured velocities.
 
     Returns:
-        The correlation of each with d(q)/dt at the lag where it is largest, by joint [-].
+        The largest correlation of each with d(q)/dt over the lags, by joint [-].
     """
     v, dt = _measured(log), np.diff(log.t)[:, None]
     median = float(np.median(dt))
-    usual = dt < _GAP * median
+    is_regular = dt < _GAP * median
     length = int(np.clip(round(_SEGMENT / median), 1, max(1, len(dt) // 4)))
-    moved = _means(np.where(usual, np.diff(np.unwrap(log.q, axis=0), axis=0), 0.0), length)
-    swept = _means(np.where(usual, dt * (v[1:] + v[:-1]) / 2, 0.0), length)
-    reach = min(round(_LONGEST / median), len(moved) // 2)
-    shifts = [k for k in range(-reach, reach + 1, max(length // 2, 1)) if abs(k) < len(moved) // 2]
+    moved = _means(np.where(is_regular, np.diff(np.unwrap(log.q, axis=0), axis=0), 0.0), length)
+    integral = _means(np.where(is_regular, dt * (v[1:] + v[:-1]) / 2, 0.0), length)
+    last = min(round(_LONGEST / median), len(moved) // 2)
+    shifts = [k for k in range(-last, last + 1, max(length // 2, 1)) if abs(k) < len(moved) // 2]
     found = {}
     for j, joint in enumerate(log.joints):
         speed = float(np.sqrt(np.mean(moved[:, j] ** 2))) / median
         if np.ptp(log.q[:, j]) < _MOVED or speed < _SPEED or np.ptp(v[:, j]) == 0:
             continue
-        alike = max(_alike(moved[:, j], swept[:, j], k) for k in [0, *shifts])
-        if alike < _UNLIKE:
-            found[joint] = alike
+        largest = max(_correlation(moved[:, j], integral[:, j], k) for k in [0, *shifts])
+        if largest < _UNLIKE:
+            found[joint] = largest
     return found
 
 
 def quantum(x: Array, *, repeats: bool = True) -> float:
-    """Return the step that all values are multiples of, 0 if there is none.
+    """Return the quantisation step of a channel, 0 if it is not quantised.
 
     Args:
         x: A channel, shape (N,).
-        repeats: Whether values must repeat, each twice on average.
+        repeats: Whether values must repeat, twice on average.
     """
     levels = np.unique(x)
     if len(levels) < 3 or (repeats and len(levels) > 0.5 * len(x)):
@@ -172,30 +174,30 @@ def _measured(log: Log) -> Array:
 
 
 def _means(steps: Array, length: int) -> Array:
-    """Return the means over each segment of so many consecutive rows."""
+    """Return the means over each segment of ``length`` consecutive rows."""
     total = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
     means: Array = (total[length:] - total[:-length]) / length
     return means
 
 
-def _alike(moved: Array, swept: Array, shift: int) -> float:
-    """Return the correlation of one with the other so many rows later, whatever its sign."""
+def _correlation(moved: Array, integral: Array, shift: int) -> float:
+    """Return the absolute correlation of one signal with the other shifted by some rows."""
     n = len(moved)
-    late, early = slice(max(shift, 0), n + min(shift, 0)), slice(max(-shift, 0), n - max(shift, 0))
-    a, b = moved[early], swept[late]  # not centred: a joint may turn at one speed
+    a = moved[max(-shift, 0) : n - max(shift, 0)]
+    b = integral[max(shift, 0) : n + min(shift, 0)]  # not centred: the speed may be constant
     size = float(np.sqrt((a @ a) * (b @ b)))
     return abs(float(a @ b)) / size if size > 0 else 0.0
 
 
 def _distances(slope: Array, v: Array, longest: int) -> Array:
     """Return the mean squares of v - slope delayed by -longest to longest samples."""
-    n, size = len(v), 1 << (len(v) + longest).bit_length()  # of a period, without overlap
+    n, size = len(v), 1 << (len(v) + longest).bit_length()  # of the transform, without overlap
     spectrum = np.fft.rfft(v, size) * np.fft.rfft(slope, size).conj()
     products = np.fft.irfft(spectrum, size)[np.arange(-longest, longest + 1)]
     of_v, of_slope = (np.append(0.0, np.cumsum(x**2)) for x in (v, slope))  # of the first rows
     k = np.arange(longest + 1)
-    late = of_v[n] - of_v[k] + of_slope[n - k]  # squares of what is compared k samples later
-    early = of_v[n - k] + of_slope[n] - of_slope[k]
-    squares = np.concatenate([early[:0:-1], late])
+    lag = of_v[n] - of_v[k] + of_slope[n - k]  # squares of the rows compared at a lag of k
+    lead = of_v[n - k] + of_slope[n] - of_slope[k]
+    squares = np.concatenate([lead[:0:-1], lag])
     distances: Array = (squares - 2 * products) / (n - np.abs(np.arange(-longest, longest + 1)))
     return distances

@@ -13,12 +13,12 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Place, RowReader, Table, WritableFormat, told
+from robotid.logs.table import Place, RowReader, Table, WritableFormat, parsing
 
 __all__ = ["ParquetFormat", "load_pyarrow"]
 
-_BATCH = 16384  # rows decoded at a time, where not all are wanted
-_BUFFER = 2**16  # bytes of each column read at a time there, not whole row groups
+_BATCH = 16384  # rows decoded together, if not all are required
+_BUFFER = 2**16  # bytes of each column read together in this case, not whole row groups
 
 
 class ParquetFormat(WritableFormat):
@@ -35,10 +35,10 @@ class ParquetFormat(WritableFormat):
 
 
 def load_pyarrow(purpose: str) -> ModuleType:
-    """Return pyarrow, with its parquet loaded.
+    """Return pyarrow, with pyarrow.parquet imported.
 
     Args:
-        purpose: What it is needed for, as "reading Parquet".
+        purpose: Its purpose, for the error, as "reading Parquet".
 
     Raises:
         MissingDependencyError: If it is not installed.
@@ -63,7 +63,7 @@ class _ParquetRows(RowReader):
     def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
         row = 0
         with _open(self.path, [name], _BUFFER) as file:
-            for group in range(file.num_row_groups):  # one by one: read ones stay in memory
+            for group in range(file.num_row_groups):  # one by one: groups stay in memory
                 for batch in self._batches(file, name, [group]):
                     yield _to_numpy(batch.column(0)), Place(row)
                     row += batch.num_rows
@@ -74,7 +74,7 @@ class _ParquetRows(RowReader):
             sizes = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
             edges = np.cumsum([0, *sizes])
             groups = np.flatnonzero((edges[:-1] < stop) & (edges[1:] > first)).tolist()
-            for name in wanted:  # one by one: each column read holds some pages in memory
+            for name in wanted:  # one by one: each column needs memory for some pages
                 row = int(edges[groups[0]])
                 for batch in self._batches(file, name, groups):
                     start, end = max(first - row, 0), min(stop - row, batch.num_rows)
@@ -95,16 +95,16 @@ class _ParquetRows(RowReader):
 
 @contextmanager
 def _open(path: Path, wanted: Sequence[str] = (), buffer: int = 0) -> Iterator[Any]:
-    """Open a Parquet file; columns that are wanted must hold numbers."""
+    """Open a Parquet file; the wanted columns must contain numbers."""
     pa = load_pyarrow("reading Parquet")
     with (
-        told(path, "Parquet"),
+        parsing(path, "Parquet"),
         pa.parquet.ParquetFile(path, buffer_size=buffer) as file,
     ):
         for name in wanted:
             kind = file.schema_arrow.field(name).type
             if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-                raise DataError(f"{path.name}: {name} holds {kind}, wanted numbers; convert it")
+                raise DataError(f"{path.name}: {name} contains {kind}, wanted numbers; convert it")
         yield file
 
 
@@ -117,7 +117,7 @@ def _read(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
 def _to_numpy(column: Any) -> Array:  # noqa: ANN401
     """Return a column of a table or of a batch; null becomes NaN."""
     chunks = column.chunks if hasattr(column, "chunks") else [column]
-    # to_numpy imports pandas if that is there, half a second; DLPack knows no null
+    # to_numpy imports pandas if it is installed, half a second; DLPack does not support null
     parts = [
         chunk.to_numpy(zero_copy_only=False) if chunk.null_count else np.from_dlpack(chunk)
         for chunk in chunks

@@ -1,9 +1,9 @@
 """Log files of every format: one row per sample and one column per quantity and joint.
 
 Columns are `time` [s], and for each joint `q_<joint>` [rad or m], optionally `dq_<joint>` and
-`ddq_<joint>`, and `tau_<joint>` [N m or N] or `current_<joint>` [A]; and what was commanded,
-`qref_<joint>`, optionally `dqref_<joint>` and `tauref_<joint>`. Aliases are read, too. With a
-transmission, `qm_<motor>`, `taum_<motor>` [N m] and the like of the motors stand for those.
+`ddq_<joint>`, and `tau_<joint>` [N m or N] or `current_<joint>` [A]. Commands are `qref_<joint>`,
+optionally `dqref_<joint>` and `tauref_<joint>`. Aliases are read, too. With a transmission,
+columns of the motors are read instead, as `qm_<motor>` and `taum_<motor>` [N m].
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -34,7 +34,7 @@ from robotid.logs.units import check_units
 
 __all__ = ["LogLayout", "Readable", "lay_out", "read_log", "read_logs", "write_log"]
 
-#: What is a log, or holds one: a file or a DataFrame with the columns of a log.
+#: A log, or a file or a DataFrame with the columns of a log.
 Readable = Log | str | Path | Frame
 
 
@@ -56,27 +56,27 @@ def read_log(
     transmissions: Sequence[Transmission] = (),
     needs: Needs = "torque",
 ) -> Log:
-    """Return the log in a file or a DataFrame, in SI units; its notes tell what was ignored.
+    """Return the log in a file or a DataFrame, in SI units; its notes list ignored columns.
 
     Args:
         path: A .csv, .parquet, .npz, .h5, .hdf5, .mat, .mcap, .db3 or .bag file, the folder of
             a ROS 2 bag or of a LeRobot dataset, or a DataFrame of pandas or polars with the same
             columns.
-        joints: Names of the joints wanted, in the order wanted.
+        joints: Names of the required joints, in the required order.
         gains: Torque per current of joints whose current is read [N m/A or N/A], by joint; a
             current with a gain is preferred to a torque column.
-        columns: Name in the file by standard name, as ``{"tau_elbow": "M2"}``, where they differ.
-        start: First time stamp kept, on the log's own clock [s].
-        end: Last time stamp kept [s].
+        columns: Name in the file by standard name, as ``{"tau_elbow": "M2"}``, if they differ.
+        start: First time stamp of the result, on the log's own clock [s].
+        end: Last time stamp of the result [s].
         units: Units of the file, if not SI.
-        prismatic: Names of prismatic joints; the others turn. Names that are not read are ignored.
-        source: Which topic of a bag or group of a file, names of joints in it, meaning of effort.
-        transmissions: The motors and gears, where the file has columns of motors.
-        needs: What is wanted beside positions, as of ``lay_out``.
+        prismatic: Names of prismatic joints; the others are revolute. Unknown names are ignored.
+        source: The topic of a bag or group of a file, names of joints in it, quantity of effort.
+        transmissions: The motors and gears, if the file has columns of motors.
+        needs: Quantities that are required besides positions, as of ``lay_out``.
 
     Raises:
-        DataError: If the file does not hold what is wanted, or looks like other units.
-        SettingsError: If gains, columns or the source name what is not read.
+        DataError: If a required column is missing, or the values look like other units.
+        SettingsError: If gains, columns or the source have names that are not read.
         MissingDependencyError: If a package that reads the file is not installed.
     """
     layout, table = lay_out(
@@ -95,16 +95,16 @@ def read_logs(
     prismatic: Collection[str] = (),
     needs: Needs = "torque",
 ) -> tuple[Log, ...]:
-    """Return the logs that a user gives, one or several, each read if it is not a ``Log``.
+    """Return the logs of a user, one or several; files and DataFrames are read.
 
     Args:
-        given: A log that has these joints, a path, a DataFrame, or a sequence of these.
-        joints: Names of the joints wanted, in the order wanted.
-        prismatic: Names of prismatic joints; the others turn.
-        needs: What is wanted beside positions, as of ``lay_out``.
+        given: A log with these joints, a path, a DataFrame, or a sequence of these.
+        joints: Names of the required joints, in the required order.
+        prismatic: Names of prismatic joints; the others are revolute.
+        needs: Quantities that are required besides positions, as of ``lay_out``.
 
     Raises:
-        DataError: If it is something else, or does not hold what is wanted.
+        DataError: If it is no log, or a required quantity is missing.
     """
     logs: list[Any]
     if isinstance(given, Log | str | Path | Mapping) or is_frame(given):
@@ -122,13 +122,13 @@ def read_logs(
 
 
 def _of_joints(log: Log, joints: Sequence[str], needs: Needs) -> Log:
-    """Return a log with its columns in the order of some joints, with all that is needed."""
+    """Return a log with its columns in the order of some joints, with all required quantities."""
     if not log.has_torque and (needs == "torque" or (needs == "any" and log.q_ref is None)):
         raise DataError(f"{log.name} has no torque. {without_torque(log.q_ref is not None)}")
     if needs == "commands" and log.q_ref is None:
         raise DataError(
-            f"{log.name} has no commanded positions; give them as Log(..., q_ref=...), an array "
-            "like q"
+            f"{log.name} has no commanded positions; pass them as Log(..., q_ref=...), an array "
+            "with the shape of q"
         )
     absent = [joint for joint in joints if joint not in log.joints]
     if absent:
@@ -138,14 +138,14 @@ def _of_joints(log: Log, joints: Sequence[str], needs: Needs) -> Log:
         if pairs:
             logged, spelt = (listed(names) for names in zip(*pairs, strict=True))
             raise DataError(
-                f"{log.name} has the joints {logged}, which the model spells {spelt}; rename them: "
+                f"{log.name} has the joints {logged}, which are {spelt} in the model; rename them: "
                 f"dataclasses.replace(log, joints={tuple(renamed)})"
             )
-        held = ", ".join(f"{joint!r}: 0.0" for joint in absent)
+        locked = ", ".join(f"{joint!r}: 0.0" for joint in absent)
         raise DataError(
             f"{log.name} has the joints {listed(log.joints)}, but not {listed(absent)}, which the "
-            "model has; record them, or if they was at rest, lock them where they stood: "
-            f"RobotModel.from_urdf(..., locked={{{held}}})"
+            "model has; record them, or if they were at rest, lock them at their positions: "
+            f"RobotModel.from_urdf(..., locked={{{locked}}})"
         )
     return log if log.joints == tuple(joints) else log.select(joints)
 
@@ -153,23 +153,23 @@ def _of_joints(log: Log, joints: Sequence[str], needs: Needs) -> Log:
 def _no_log(thing: object) -> DataError:
     return DataError(
         f"a log is a {type(thing).__name__}, wanted a robotid.Log, the path of a file, a "
-        "DataFrame, or a list of these; Log(t=t, q=q, tau=tau, joints=names) makes one of arrays"
+        "DataFrame, or a list of these; for arrays use Log(t=t, q=q, tau=tau, joints=names)"
     )
 
 
 @dataclass(frozen=True)
 class LogLayout:
-    """Which columns of a file make up a log, and how."""
+    """The columns of a file that are read, and their conversion to a log."""
 
     path: str
-    joints: tuple[str, ...]  # in the order wanted
+    joints: tuple[str, ...]  # in the required order
     columns: Mapping[str, Sequence[str]]  # names in the file of "time", "q", "tau", "dq", "ddq"
-    factors: tuple[float, ...]  # what makes each torque column a torque, by joint
+    factors: tuple[float, ...]  # from each torque column to a torque, by joint
     units: LogUnits  # of the file
     prismatic: tuple[str, ...]  # names of prismatic joints
-    source: LogSource  # where in the file
-    notes: tuple[str, ...]  # what the reader should know
-    motors: Mapping[str, tuple[bool, ...]]  # by kind: which columns are a motor's
+    source: LogSource  # place of the log in the file
+    notes: tuple[str, ...]  # for the user
+    motors: Mapping[str, tuple[bool, ...]]  # by kind: which columns are of motors
     gears: tuple[Transmission, ...]  # of the motors
     has_torque: bool  # whether the file has a torque or a current of any of the joints
 
@@ -187,11 +187,11 @@ class LogLayout:
         return values / PER_SECOND[self.units.time or "s"]
 
     def to_log(self, table: Mapping[str, Array], first: int = 0) -> Log:
-        """Return the log that columns of the file make up, in SI units.
+        """Return the log in SI units, from columns of the file.
 
         Args:
-            table: The wanted columns by name.
-            first: Number in the file of their first row.
+            table: The required columns by name.
+            first: Number of their first row in the file.
 
         Raises:
             DataError: If a value is not finite, or time does not increase.
@@ -200,21 +200,21 @@ class LogLayout:
             kind: np.stack([table[name] for name in names], axis=1)
             for kind, names in self.columns.items()
         }
-        slides = np.isin(self.joints, self.prismatic)
+        is_prismatic = np.isin(self.joints, self.prismatic)
         if "tau" in values:
             values["tau"] = values["tau"] * np.array(self.factors)
         for kind, is_motor in self.motors.items():
             if kind not in values:
                 continue
             if self.units.angle == "deg" and kind not in TORQUES:
-                is_length = slides & ~np.array(is_motor)
+                is_length = is_prismatic & ~np.array(is_motor)
                 values[kind] = values[kind] * np.where(is_length, 1.0, np.pi / 180)
             values[kind] = self._of_joints(kind, values[kind])
         t, where = self.stamps(values["time"][:, 0]), Path(self.path).name or "log"
         for kind, array in values.items():
             names = ["time"] if kind == "time" else [f"{kind}_{joint}" for joint in self.joints]
             require_finite(array, t, names, where, first)
-            array.flags.writeable = False  # so that the log need not copy it
+            array.flags.writeable = False  # so that the log does not copy it
         require_increasing(t, where, first)
         has_torque = "tau" in values
         if not has_torque:
@@ -226,7 +226,7 @@ class LogLayout:
         )  # fmt: skip
 
     def _of_joints(self, kind: str, values: Array) -> Array:
-        """Return values of joints: those of motors, in their places, through their gears."""
+        """Return values of joints; those of motors are converted by their transmission."""
         if not any(self.motors[kind]):
             return values
         values = values.copy()
@@ -254,25 +254,25 @@ def lay_out(
     transmissions: Sequence[Transmission] = (),
     needs: Needs = "torque",
 ) -> tuple[LogLayout, Table]:
-    """Return which columns of a file make up a log, before any is read, and its opened table.
+    """Return the layout of a log in a file, before its columns are read, and its open table.
 
     Args:
         path: The file, or a DataFrame.
-        joints: Names of the joints wanted, in the order wanted.
+        joints: Names of the required joints, in the required order.
         gains: As of ``read_log``.
         columns: As of ``read_log``.
         units: As of ``read_log``.
         prismatic: As of ``read_log``.
         source: As of ``read_log``.
         transmissions: As of ``read_log``.
-        needs: What is wanted beside positions: "torque", of every joint; "motion", nothing;
-            "commands", a commanded position of every joint, and torques and further commands if
-            every joint has them; "any", torques or commands, and both if every joint has them.
-            What is not wanted is ignored; torques not read are 0.
+        needs: Quantities that are required besides positions: "torque", of every joint;
+            "motion", none; "commands", a commanded position of every joint, and torques and other
+            commands if every joint has them; "any", torques or commands, and both if every joint
+            has them. Other quantities are ignored; torques that are not read are 0.
 
     Raises:
-        DataError: If the file does not hold what is wanted.
-        SettingsError: If gains, columns or the source name what is not read.
+        DataError: If a required column is missing.
+        SettingsError: If gains, columns or the source have names that are not read.
         MissingDependencyError: If a package that reads the file is not installed.
     """
     require_kind(needs, str, "needs", f"one of {listed(get_args(Needs))}")
@@ -327,16 +327,16 @@ def lay_out(
 
 
 def write_log(log: Log, path: str | Path) -> None:
-    """Write a log with standard column names; reading it gives the same numbers, to the last bit.
+    """Write a log with standard column names; reading it returns exactly the same numbers.
 
-    The file is written beside its final place and then moved there: it is never half-written.
+    A temporary file in the same folder is written and then renamed, so the file is always complete.
 
     Args:
         log: The log.
-        path: A .csv, .parquet, .npz, .h5, .hdf5 or .mat file; one that exists is replaced.
+        path: A .csv, .parquet, .npz, .h5, .hdf5 or .mat file; an existing one is replaced.
 
     Raises:
-        DataError: If the file name ends otherwise, or the format cannot hold a name.
+        DataError: If the suffix is another one, or a name is not valid in the format.
         MissingDependencyError: If a package that writes the format is not installed.
         OSError: If the folder cannot be written to.
     """

@@ -1,4 +1,4 @@
-"""How logs are read and become trajectories: the settings, checked."""
+"""Settings of reading and filtering logs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from robotid.exceptions import SettingsError
 
 __all__ = ["PER_SECOND", "LogSource", "LogUnits", "SignalSettings"]
 
-#: Divisors that turn a time unit into seconds.
+#: Number of each time unit in a second.
 PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _HZ = Range("0.001 to 1e6", lambda x: 1e-3 <= x <= 1e6)
 _MEASURED = ("auto", "measured", "differentiated")
@@ -24,12 +24,12 @@ def _load_cutoff(value: float | bool) -> float | None:
 
 @dataclass(frozen=True)
 class SignalSettings(Settings):
-    """How a log becomes a trajectory."""
+    """Settings that convert a log to a trajectory."""
 
     rate: float | None = setting(
         None,
-        "rate of the uniform grid [Hz]; if not stated, the log's median rate (and, without a "
-        "filter, the rows as they are)",
+        "rate of the uniform grid [Hz]; if not stated, the log's median rate (without a filter, "
+        "the rows of the log)",
         within=_HZ,
     )
     cutoff: float | None = setting(
@@ -47,56 +47,58 @@ class SignalSettings(Settings):
     )
     velocity: str = setting(
         "auto",
-        "measured, differentiated (from the position), or auto: measured if the log has it, it "
-        "is fine and that of its position, and predicts torque in segments that were not fitted "
-        "as well as differentiated",
+        "measured, differentiated (from the position), or auto: measured, if consistent with the "
+        "position, of sufficient resolution, and as good as differentiated in predicting the "
+        "torque of held-out segments",
         among=_MEASURED,
     )
     acceleration: str = setting(
         "auto",
-        "measured, differentiated (from the velocity used), or auto: measured if the log has it "
-        "and its velocity is used",
+        "measured, differentiated (from the velocity), or auto: measured, if the log has it and "
+        "the measured velocity is used",
         among=_MEASURED,
     )
     trim: float = setting(
-        0.2, "time cut at each end of each uninterrupted segment [s]", within=NOT_NEGATIVE
+        0.2, "time removed at each end of each segment without gaps [s]", within=NOT_NEGATIVE
     )
     min_velocity: float = setting(
         0.02,
-        "joint speed below which its rows are left out while Coulomb friction is identified "
-        "[rad/s], and within which a drive may stick; of a prismatic joint, that at which it "
-        "crosses its range (1 m if the URDF has none) in the time of a full turn; 0 keeps all rows",
+        "joint speed below which rows are not used to identify Coulomb friction and a drive may be "
+        "in stiction [rad/s]; a prismatic joint crosses its range (1 m if the URDF has none) in "
+        "the time of a full turn at this speed; 0 uses all rows",
         within=NOT_NEGATIVE,
     )
     friction_band: float = setting(
         0.0,
-        "speed from which Coulomb friction has its full size [rad/s], of prismatic joints as for "
-        "min_velocity: it changes linearly between that speed and its negative; 0: at once, as "
-        "Coulomb has it",
+        "speed from which Coulomb friction has its full value [rad/s], of prismatic joints as for "
+        "min_velocity; it changes linearly between the two signs of this speed; 0: sign of the "
+        "speed, the Coulomb model",
         within=Range("0, or 1e-9 or more", lambda x: x == 0 or x >= 1e-9),
     )
     max_gap: float | None = setting(
         None,
-        "a longer step between two rows is a gap [s]; if not stated, 2.5 median steps, or a "
-        "quarter of the filter's period if that is longer",
+        "a longer time step is a gap [s]; if not stated, 2.5 median steps, or a quarter of the "
+        "filter's period if that is longer",
         within=POSITIVE,
     )
     torque_delay: float = setting(
         0.0,
-        "how late the log has the torque against the position [s]; it is moved back",
+        "delay of the logged torque relative to the position [s], which is corrected",
         within=_DELAY,
     )
-    velocity_delay: float = setting(0.0, "the same of the measured velocity [s]", within=_DELAY)
+    velocity_delay: float = setting(
+        0.0, "delay of the measured velocity, likewise [s]", within=_DELAY
+    )
 
 
 @dataclass(frozen=True)
 class LogUnits(Settings):
-    """Units of a log file; None means SI, and is refused if the numbers look otherwise."""
+    """Units of a log file; None is SI, and an error if the numbers look like another unit."""
 
     _table: ClassVar[str] = "units"
 
     time: str | None = setting(
-        None, "unit of the time stamps; velocities stay per second", among=tuple(PER_SECOND)
+        None, "unit of the time stamps; velocities are per second", among=tuple(PER_SECOND)
     )
     angle: str | None = setting(
         None, "unit of q, dq and ddq of revolute joints", among=("rad", "deg")
@@ -105,7 +107,7 @@ class LogUnits(Settings):
 
 @dataclass(frozen=True)
 class LogSource(Settings):
-    """Where in a log file the signals are; the defaults fit files that leave no choice."""
+    """Place of the signals in a log file; the defaults are for files with one log."""
 
     _table: ClassVar[str] = "log"
 
@@ -116,19 +118,18 @@ class LogSource(Settings):
     )
     command: str | None = setting(
         None,
-        "the topic of a bag with joint states that were commanded, if its measured ones have "
-        "another",
+        "the topic of a bag with commanded joint states, if it is not the topic of the measured "
+        "ones",
     )
-    joints: Mapping[str, str] = setting({}, "name in the file by joint, where they differ")
+    joints: Mapping[str, str] = setting({}, "name in the file by joint, if they differ")
     effort: str = setting(
         "torque",
-        "what effort is: a torque [N m or N], or a current [A], which takes a gain",
+        "quantity of effort columns: torque [N m or N], or current [A], which needs a gain",
         among=("torque", "current"),
     )
     stamp: str = setting(
         "header",
-        "the clock of a bag's rows: header, the stamp in the message, or log, the time when it "
-        "was recorded",
+        "the time stamps of a bag: header, the stamp in the message, or log, the time of recording",
         among=("header", "log"),
     )
 

@@ -1,7 +1,7 @@
 """From a raw log to smooth motion: resample, filter, differentiate, trim. Log -> Trajectory.
 
-Nothing is filtered or differentiated across a gap, or from one log into the next. Every step can
-be switched off: with ``cutoff=None`` and no ``rate`` the rows stay as they were recorded.
+Signals are not filtered or differentiated across a gap or from one log to another. Every step can
+be switched off: with ``cutoff=None`` and no ``rate`` the rows are those of the log.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,24 +20,24 @@ from robotid.logs.smoothing import Segment, process_segments, too_short
 
 __all__ = ["decide", "process", "resolve", "turns_note", "unwrap"]
 
-_SLOWEST = 1e-6  # a cut-off over the rate
-_GAP_STEPS = 2.5  # a step longer than this many median steps may be a gap
-_GAP_CYCLES = 0.25  # ... if it is also longer than this share of the filter's period
+_SLOWEST = 1e-6  # smallest cut-off over the rate
+_GAP_STEPS = 2.5  # [median steps] a longer step may be a gap
+_GAP_CYCLES = 0.25  # [periods of the filter] ... if it is also longer than this
 
 
 def resolve(log: Log, settings: SignalSettings) -> SignalSettings:
-    """Return the settings with everything automatic decided for this log.
+    """Return the settings with the automatic values for this log.
 
     Args:
-        log: The log they are for.
-        settings: The settings as the user gave them.
+        log: The log.
+        settings: The settings of the user.
 
     Returns:
-        Settings with rate (unless rows stay as recorded), velocity, acceleration and max_gap
-        filled in.
+        Settings with values of rate (unless the rows of the log are used), velocity, acceleration
+        and max_gap.
 
     Raises:
-        DataError: If measured velocity or acceleration is asked for and the log has none.
+        DataError: If measured velocity or acceleration is required and the log has none.
         SettingsError: If the cut-off is not below half the rate.
     """
     return decide(
@@ -59,18 +59,18 @@ def decide(
     has_acceleration: bool,
     is_trusted: Callable[[], bool],
 ) -> SignalSettings:
-    """Return the settings as of ``resolve``, decided from a few facts of the log.
+    """Return the settings as of ``resolve``, from a few properties of the log.
 
     Args:
-        settings: The settings as the user gave them.
+        settings: The settings of the user.
         step: Median time step of the log [s].
-        where: What the log is called in errors.
+        where: Name of the log, for errors.
         has_velocity: Whether it has measured velocities.
         has_acceleration: Whether it has measured accelerations.
-        is_trusted: Returns whether measured velocities are to be used; called if that matters.
+        is_trusted: Returns whether measured velocities are used; called only if necessary.
 
     Raises:
-        DataError: If measured velocity or acceleration is asked for and the log has none.
+        DataError: If measured velocity or acceleration is required and the log has none.
         SettingsError: If the cut-off is not below half the rate.
     """
     rate, cutoff = settings.rate, settings.cutoff
@@ -83,8 +83,9 @@ def decide(
         )
     if cutoff is not None and rate is not None and cutoff < _SLOWEST * rate:
         raise SettingsError(
-            f"{where}: cutoff {cutoff:g} Hz is less than {_SLOWEST:g} of the rate {rate:g} Hz, at "
-            "which no filter is exact; raise the cutoff, lower rate, or correct the time stamps"
+            f"{where}: cutoff {cutoff:g} Hz is less than {_SLOWEST:g} of the rate {rate:g} Hz, so "
+            "the filter is not accurate; increase the cutoff, lower rate, or correct the time "
+            "stamps"
         )
     measured = {"velocity": ("dq", has_velocity), "acceleration": ("ddq", has_acceleration)}
     for quantity, (column, is_there) in measured.items():
@@ -106,13 +107,13 @@ def decide(
 
 
 def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> Trajectory:
-    """Return the smooth trajectory of a log, with a ``segment`` number per segment without a gap.
+    """Return the smooth trajectory of a log, with the number of the ``segment`` of each row.
 
     Args:
         log: The log.
-        settings: The settings; what is automatic in them is resolved first.
-        speeds: As of ``process_segments``; a model with Coulomb friction needs them wherever a
-            filter smears its torque.
+        settings: The settings; automatic values are resolved first.
+        speeds: As of ``process_segments``; required for a model with Coulomb friction if the
+            torque is filtered.
 
     Raises:
         DataError: If no segment is long enough.
@@ -133,37 +134,37 @@ def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> 
 
 
 def unwrap(log: Log, is_free: Array) -> Log:
-    """Return the log with jumps of a full turn taken out of joints that may turn without end.
+    """Return the log without jumps of a full turn of joints without limits.
 
     Args:
         log: The log.
-        is_free: Which joints may, shape (n,), bool: continuous, or revolute without limits. A
-            note names those that were changed.
+        is_free: Which joints are continuous, or revolute without limits, shape (n,), bool. The
+            changed ones are in a note.
 
     Raises:
         DataError: If a joint with limits jumps by a full turn.
     """
     jumps = np.abs(np.abs(np.diff(log.q, axis=0)) - 2 * np.pi) < 0.5  # [rad]
-    turned = jumps.any(axis=0)
-    for j in np.flatnonzero(turned & ~np.asarray(is_free, dtype=bool)):
+    has_jump = jumps.any(axis=0)
+    for j in np.flatnonzero(has_jump & ~np.asarray(is_free, dtype=bool)):
         k = int(np.argmax(jumps[:, j]))
         raise DataError(
             f"{log.path or 'log'}: q_{log.joints[j]} jumps by a full turn at t = "
-            f"{log.t[k + 1]:.6g} s, but the URDF limits this joint; correct the recording",
+            f"{log.t[k + 1]:.6g} s, but the joint has limits in the URDF; correct the recording",
             code="full_turn",
         )
-    if not turned.any():
+    if not has_jump.any():
         return log
     q = log.q.copy()
-    q[:, turned] = np.unwrap(q[:, turned], axis=0)
-    names = [log.joints[j] for j in np.flatnonzero(turned)]
+    q[:, has_jump] = np.unwrap(q[:, has_jump], axis=0)
+    names = [log.joints[j] for j in np.flatnonzero(has_jump)]
     return replace(log, q=q, notes=(*log.notes, turns_note(names)))
 
 
 def turns_note(joints: Sequence[str]) -> str:
-    """Return the note that full turns were taken out.
+    """Return the note that full turns were removed.
 
     Args:
         joints: Names of the joints.
     """
-    return f"full turns taken out of the angle of {listed(joints)}"
+    return f"full turns removed from the angle of {listed(joints)}"

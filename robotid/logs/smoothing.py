@@ -1,6 +1,6 @@
-"""Smooth motion of segments without gaps, of whole ones or part by part.
+"""Smooth motion of segments without gaps, as a whole or part by part.
 
-A part is resampled and filtered with rows around its own, which are cut off behind the filter.
+A part is resampled and filtered together with neighbouring rows, which are removed afterwards.
 """
 
 from collections.abc import Sequence
@@ -18,11 +18,11 @@ from robotid.logs.splines import cubic_spline
 
 __all__ = ["SPLINE", "Segment", "filter_reach", "low_pass", "process_segments", "too_short"]
 
-#: Rows after which nothing is left of an end of a cubic spline: it fades by half or more per row.
+#: Rows after which the end of a cubic spline has no effect: it decreases by half or more per row.
 SPLINE = 64
-_FORGOTTEN = 42.0  # e-folds after which nothing is left of a filter's transient: 6e-19
-_LONGEST = 8.0  # periods of the filter: what is slow for longer is not taken to stick
-_FINEST = 1000  # points of the uniform grid per row of the log, at most
+_SETTLED = 42.0  # [time constants] after which a filter's transient is negligible: 6e-19
+_LONGEST = 8.0  # [periods of the filter] longest time of stiction
+_FINEST = 1000  # largest number of points of the uniform grid per row of the log
 _ALL = slice(None)
 
 
@@ -51,24 +51,24 @@ def process_segments(
     own: slice = _ALL,
     speeds: Array | None = None,
 ) -> Trajectory:
-    """Return the smooth motion of uninterrupted segments, or of a part of them.
+    """Return the smooth motion of segments without gaps, or of a part of them.
 
-    A part is as smooth as if the whole had been processed, if the log has the rows of its
-    segments that are within ``filter_reach`` of its own rows.
+    The result for a part equals that for the whole, if the log has the rows of its segments
+    within ``filter_reach`` of the part.
 
     Args:
         log: Rows of the segments, all of them or a part.
         segments: The whole segments, in order.
         settings: The settings, resolved.
-        first: Row number that the log's first row has in the segments.
-        own: Rows wanted, numbered as in the segments; the log must have the row that follows.
-        speeds: Ratios of the speeds that Coulomb friction follows [rad/s] to those of the joints,
-            shape (c, n), as of ``friction_speeds``.
+        first: Number of the log's first row in the segments.
+        own: Rows of the part, numbered as in the segments; the log must have the row after it.
+        speeds: Ratios of the speeds that determine Coulomb friction [rad/s] to those of the
+            joints, shape (c, n), as of ``friction_speeds``.
 
     Returns:
-        The trajectory, of no samples if no segment is long enough; the segment numbers of its
-        samples are those of their segments. Its directions are those that Coulomb friction acts
-        in, behind the filter of the torque: None without speeds, and where they are plain signs.
+        The trajectory, without samples if no segment is long enough, with the numbers of the
+        segments. Its directions are those of Coulomb friction after the filter of the torque; None
+        without speeds, and if they are the signs of the speeds.
     """
     n = len(log.joints)
     is_sharp = settings.cutoff is None and settings.friction_band == 0
@@ -89,29 +89,29 @@ def process_segments(
 
 
 def filter_reach(settings: SignalSettings) -> float:
-    """Return how long before and after a row others count for its smooth value [s].
+    """Return the settling time of the filter, before and after a row [s].
 
-    That is more than twice as far as the filter reaches: the sign of a smooth speed depends on how
-    long a drive may stick, and is filtered once more.
+    It is more than twice the settling time of one filter: the sign of a smooth speed depends on
+    the longest time of stiction, and is filtered a second time.
 
     Args:
         settings: The settings, resolved.
 
     Returns:
-        The time, delays included; some rows must be added to it for splines and differences.
+        The time, including delays; some rows must be added for splines and differences.
     """
-    late = max(abs(settings.torque_delay), abs(settings.velocity_delay))
+    delay = max(abs(settings.torque_delay), abs(settings.velocity_delay))
     if settings.cutoff is None or settings.rate is None:
-        return late
+        return delay
     order, cutoff, rate = settings.order, settings.cutoff, settings.rate
     poles = butterworth_poles(order, cutoff, rate)
     digital = 1 / (-np.log(np.abs(poles).max()) * rate)
     analog = 1 / (2 * np.pi * cutoff * np.sin(np.pi / (2 * order)))  # on a finer grid
-    return late + 2.0 * _FORGOTTEN * float(max(digital, analog)) + _LONGEST / cutoff
+    return delay + 2.0 * _SETTLED * float(max(digital, analog)) + _LONGEST / cutoff
 
 
 def low_pass(values: Array, rate: float, settings: SignalSettings) -> Array:
-    """Return values after the zero-phase Butterworth filter, same shape; as they are without one.
+    """Return values after the zero-phase Butterworth filter, same shape; unchanged without one.
 
     Args:
         values: Values over time, shape (N, ...).
@@ -128,12 +128,12 @@ def too_short(where: str, segments: int, settings: SignalSettings) -> DataError:
     """Return the error of a log without a segment that is long enough.
 
     Args:
-        where: What the log is called.
-        segments: How many uninterrupted segments it has.
+        where: Name of the log.
+        segments: Number of its segments without gaps.
         settings: The settings.
     """
     return DataError(
-        f"{where}: none of its {segments} uninterrupted segments is long "
+        f"{where}: none of its {segments} segments without gaps is long "
         f"enough for the filter and a trim of {settings.trim:g} s at each end; record longer, "
         "or lower trim",
         code="too_short",
@@ -149,14 +149,14 @@ def _process_part(
     own: slice,
     speeds: Array,
 ) -> tuple[Array, Array, Array, Array, Array, Array] | None:
-    """Return t, q, v, a, tau and direction of the own rows, None if none is left."""
+    """Return t, q, v, a, tau and direction of the own rows, None if there are none."""
     t = log.t[rows]
     if segment.rows < 5 or segment.end - segment.start <= 2 * settings.trim:
         return None
     grid = _Grid.of(segment, settings)
     if grid.count < 5:
         return None
-    local = rows.start + first - segment.first  # number in the segment of the first row here
+    local = rows.start + first - segment.first  # number of the first row in the segment
     numbers = grid.numbers(t, local, is_last=rows.stop + first == segment.stop)
     times = t if grid.step is None else grid.at(numbers)
     channels = {"q": log.q, "tau": log.tau}
@@ -164,41 +164,41 @@ def _process_part(
         channels["v"] = log.v
     if settings.acceleration == "measured" and log.a is not None:
         channels["a"] = log.a
-    late = {"tau": settings.torque_delay, "v": settings.velocity_delay}
+    delay = {"tau": settings.torque_delay, "v": settings.velocity_delay}
     smooth = {
-        name: low_pass(_resample(t - late.get(name, 0.0), x[rows], times), grid.rate, settings)
+        name: low_pass(_resample(t - delay.get(name, 0.0), x[rows], times), grid.rate, settings)
         for name, x in channels.items()
     }
     v = smooth["v"] if "v" in smooth else np.gradient(smooth["q"], times, axis=0)
     a = smooth["a"] if "a" in smooth else np.gradient(v, times, axis=0)
-    # through the torque's filter before any row is left out
+    # filtered as the torque, before rows are left out
     direction = low_pass(_acting(times, v @ speeds.T, settings), grid.rate, settings)
     inside = (times >= grid.start + settings.trim) & (times <= grid.last - settings.trim)
-    if grid.keep_every > 1:
-        inside &= (numbers - grid.number_of(grid.start + settings.trim)) % grid.keep_every == 0
+    if grid.decimation > 1:
+        inside &= (numbers - grid.number_of(grid.start + settings.trim)) % grid.decimation == 0
     if own.start is not None and own.start > segment.first:
         inside &= times >= log.t[own.start - first]
     if own.stop is not None and own.stop < segment.stop:
         inside &= times < log.t[own.stop - first]
-    kept = np.flatnonzero(inside)
-    if len(kept) == 0:
+    chosen = np.flatnonzero(inside)
+    if len(chosen) == 0:
         return None
-    q, tau = smooth["q"][kept], smooth["tau"][kept]
-    return times[kept], q, v[kept], a[kept], tau, direction[kept]
+    q, tau = smooth["q"][chosen], smooth["tau"][chosen]
+    return times[chosen], q, v[chosen], a[chosen], tau, direction[chosen]
 
 
 @dataclass(frozen=True)
 class _Grid:
-    """The times that a segment is filtered on: ``count`` points, every so many of them kept.
+    """The ``count`` times at which a segment is filtered, and the decimation afterwards.
 
-    Without a step, they are the rows as recorded.
+    Without a step, they are the rows of the log.
     """
 
     start: float
     last: float
     step: float | None
     count: int
-    keep_every: int = 1
+    decimation: int = 1
 
     @classmethod
     def of(cls, segment: Segment, settings: SignalSettings) -> "_Grid":
@@ -207,15 +207,15 @@ class _Grid:
             return cls(segment.start, segment.end, None, segment.rows)
         native = (segment.rows - 1) / (segment.end - segment.start)
         # a rate below the log's is reached by decimation after the filter, against aliasing
-        keep_every = max(1, round(native / settings.rate)) if settings.cutoff is not None else 1
-        step = 1.0 / (settings.rate * keep_every)
+        decimation = max(1, round(native / settings.rate)) if settings.cutoff is not None else 1
+        step = 1.0 / (settings.rate * decimation)
         count = int(np.floor((segment.end - segment.start) / step * (1 + 1e-12))) + 1
         if count > _FINEST * segment.rows:
             raise SettingsError(
                 f"{segment.rows} rows over {segment.end - segment.start:.6g} s would become "
-                f"{count} at {1 / step:.6g} Hz; lower rate, or max_gap if the clock jumps"
+                f"{count} rows at {1 / step:.6g} Hz; lower rate, or max_gap if the clock jumps"
             )
-        return cls(segment.start, segment.start + step * (count - 1), step, count, keep_every)
+        return cls(segment.start, segment.start + step * (count - 1), step, count, decimation)
 
     @property
     def rate(self) -> float:
@@ -233,7 +233,7 @@ class _Grid:
         return int(k[np.argmax(self.at(k) >= t)])
 
     def numbers(self, t: Array, first: int, *, is_last: bool) -> Array:
-        """Return the points among rows t, numbered from ``first``, of the segment."""
+        """Return the numbers of the grid points within rows t, the first of which is ``first``."""
         if self.step is None:
             return np.arange(first, first + len(t))
         start = 0 if first == 0 else self.number_of(float(t[0]))
@@ -241,7 +241,7 @@ class _Grid:
 
 
 def _acting(t: Array, w: Array, settings: SignalSettings) -> Array:
-    """Return the direction that Coulomb friction acts in, before any filter."""
+    """Return the direction of Coulomb friction, before any filter."""
     if settings.friction_band > 0:
         linear: Array = np.clip(w / settings.friction_band, -1.0, 1.0)
         return linear
@@ -253,5 +253,5 @@ def _resample(t: Array, values: Array, grid: Array) -> Array:
     """Return the values on the grid, by cubic splines through the true time stamps."""
     if len(grid) == len(t) and np.array_equal(grid, t):
         return values
-    # of a channel moved in time nothing is known beyond its own ends
+    # a channel with a delay is constant beyond its ends
     return cubic_spline(t, values, np.clip(grid, t[0], t[-1]))

@@ -1,7 +1,7 @@
 """Cubic splines through signals over time.
 
-They are what CubicSpline of scipy.interpolate gives, to rounding: the import of that package takes
-longer than all splines of a job.
+They equal CubicSpline of scipy.interpolate to rounding; the import of that package takes longer
+than all splines of a job.
 """
 
 import numpy as np
@@ -15,8 +15,8 @@ __all__ = ["cubic_spline"]
 def cubic_spline(t: Array, x: Array, at: Array) -> Array:
     """Return signals at other times, by the cubic spline through all of their rows.
 
-    At its second and its last but one row the third derivative is continuous, too ("not a knot"):
-    two rows give a straight line, three a parabola. Beyond its ends the outer polynomials go on.
+    The third derivative is continuous at the second and the last but one row ("not a knot"): two
+    rows give a straight line, three a parabola. The outer polynomials extrapolate.
 
     Args:
         t: Time stamps, increasing, shape (N,) with N >= 2 [s].

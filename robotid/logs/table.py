@@ -1,4 +1,4 @@
-"""What each file format gives: named columns, read whole or row by row."""
+"""The common form of all file formats: named columns, read as a whole or row by row."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,9 +18,9 @@ __all__ = [
     "Table",
     "WritableFormat",
     "choose",
+    "parsing",
     "prefixes",
     "quantity_of",
-    "told",
 ]
 
 _PREFIXES: dict[str, tuple[str, ...]] = {
@@ -34,7 +34,7 @@ _COMMANDED = ("ref", "reference", "des", "desired", "cmd", "command", "target")
 
 
 def _commanded(kind: str) -> tuple[str, ...]:
-    """Return how columns of a commanded quantity start, as qref_, q_des_, position_command_."""
+    """Return the prefixes of a commanded quantity, as qref_, q_des_, position_command_."""
     stems = [prefix.removesuffix("_") for prefix in _PREFIXES[kind]]
     return (
         *(f"{kind}{word}_" for word in ("ref", "des", "cmd")),
@@ -53,11 +53,11 @@ _PREFIXES |= {f"{kind}m": (f"{kind}m_",) for kind in _PREFIXES}  # motors'
 
 @dataclass(frozen=True)
 class Place:
-    """Where in a file a row starts."""
+    """The start of a row in a file."""
 
     row: int = 0  # its number
-    line: int = 0  # number of its line, of a text file
-    offset: int = 0  # bytes before it, of a text file
+    line: int = 0  # number of its line in a text file
+    offset: int = 0  # bytes before it in a text file
 
 
 class RowReader(ABC):
@@ -65,7 +65,7 @@ class RowReader(ABC):
 
     @abstractmethod
     def count(self) -> int:
-        """Return about how many rows there are, without reading them."""
+        """Return the approximate number of rows, without reading them."""
 
     @abstractmethod
     def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
@@ -86,7 +86,7 @@ class RowReader(ABC):
             wanted: Names of the columns.
             first: First row.
             stop: Row after the last one.
-            near: A place that ``scan`` told, at or before the first row.
+            near: A place that ``scan`` returned, at or before the first row.
         """
 
 
@@ -94,24 +94,24 @@ class RowReader(ABC):
 class Table:
     """The columns of one file."""
 
-    names: list[str]  # in the file's order
-    read: Callable[[Sequence[str]], dict[str, Array]]  # some by name, (N,); NaN where missing
-    notes: tuple[str, ...] = ()  # what the reader should know
-    rows: RowReader | None = None  # reads row by row; None if the format is only read whole
-    renamed: Mapping[str, str] = field(default_factory=dict)  # to the names above, from the file's
-    angle_unit: str = ""  # why the unit of angles must be stated; "" if it need not be
+    names: list[str]  # in the order of the file
+    read: Callable[[Sequence[str]], dict[str, Array]]  # returns columns by name, (N,); NaN: missing
+    notes: tuple[str, ...] = ()  # for the user
+    rows: RowReader | None = None  # reads row by row; None if the format is read as a whole
+    renamed: Mapping[str, str] = field(default_factory=dict)  # names above by name in the file
+    angle_unit: str = ""  # why the unit of angles must be stated; "" if it is known
 
 
 class Format(ABC):
-    """How one format of files is read."""
+    """Reader of one file format."""
 
     @abstractmethod
     def open(self, path: Path, source: LogSource) -> Table:
-        """Return the table in a file; what is wrong with a column is told when it is read.
+        """Return the table in a file; faults of a column are reported when it is read.
 
         Args:
             path: The file.
-            source: Which topic, group or struct of it, and which clock.
+            source: The topic, group or struct of it, and the clock.
 
         Raises:
             DataError: If the file is broken, or its table is missing or one of several.
@@ -131,16 +131,16 @@ class WritableFormat(Format):
             path: The file.
 
         Raises:
-            DataError: If the format cannot hold a name.
+            DataError: If a name is not valid in this format.
             MissingDependencyError: If a package that writes it is not installed.
         """
 
 
 def prefixes(effort: str = "torque") -> dict[str, tuple[str, ...]]:
-    """Return how columns start, by quantity: the standard prefix first, then its aliases.
+    """Return the prefixes of columns by quantity: the standard prefix first, then its aliases.
 
     Args:
-        effort: What effort is: "torque" or "current".
+        effort: Quantity of effort columns: "torque" or "current".
     """
     if effort == "torque":
         return dict(_PREFIXES)
@@ -152,11 +152,11 @@ def prefixes(effort: str = "torque") -> dict[str, tuple[str, ...]]:
 
 
 def quantity_of(name: str, effort: str = "torque") -> tuple[str, str] | None:
-    """Return quantity and joint that a column names, or None: "q_des_elbow" is qref of elbow.
+    """Return quantity and joint of a column, or None: "q_des_elbow" is qref of elbow.
 
     Args:
         name: The column.
-        effort: What effort is: "torque" or "current".
+        effort: Quantity of effort columns: "torque" or "current".
     """
     starts = [
         (start, kind)
@@ -171,13 +171,13 @@ def quantity_of(name: str, effort: str = "torque") -> tuple[str, str] | None:
 
 
 def choose(where: str, found: Sequence[str], noun: str, listing: str) -> str:
-    """Return the only one of several places, or refuse to guess.
+    """Return the only one of the possible places of a log in a file.
 
     Args:
         where: Name of the file, for errors.
-        found: The places that would do, at least one.
-        noun: What they are, as "topics of ...".
-        listing: What the file holds, for the error.
+        found: The possible places, at least one.
+        noun: A noun for them, as "topics of ...".
+        listing: Content of the file, for the error.
 
     Raises:
         DataError: If there are several.
@@ -186,21 +186,21 @@ def choose(where: str, found: Sequence[str], noun: str, listing: str) -> str:
         return found[0]
     names = sorted(found)
     raise DataError(
-        f"{where} holds {len(names)} {noun}: {listed(names)}; {listing}. State one: topic = "
+        f"{where} has {len(names)} {noun}: {listed(names)}; {listing}. State one: topic = "
         f'"{names[0]}" (job file table [log], CLI --topic, Python source=LogSource(topic=...))'
     )
 
 
 @contextmanager
-def told(path: Path, kind: str) -> Iterator[None]:
-    """Tell in our words what a reader says of a broken file.
+def parsing(path: Path, kind: str) -> Iterator[None]:
+    """Convert the exceptions of a parser to a DataError.
 
     Args:
         path: The file.
         kind: Name of its format.
 
     Raises:
-        DataError: In the place of what it raises.
+        DataError: Instead of any exception of the parser.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""The time stamps of a log of any length: checked, in a temporary file mapped into memory."""
+"""Time stamps of a log of any length, checked and stored in a memory-mapped temporary file."""
 
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -10,15 +10,15 @@ from robotid.logs.data import require_finite, require_increasing
 
 __all__ = ["blocks_of", "map_stamps", "median_step"]
 
-_BLOCK = 2**17  # stamps looked at together
+_BLOCK = 2**17  # stamps processed together
 
 
 def map_stamps(blocks: Iterable[Array], where: str) -> Array:
-    """Return the time stamps of a log, shape (N,) [s], in a file that ends with the array.
+    """Return the time stamps of a log, shape (N,) [s], in a file that exists as long as the array.
 
     Args:
         blocks: The stamps, a block of rows at a time [s].
-        where: What the log is called.
+        where: Name of the log.
 
     Raises:
         DataError: If a stamp is not finite, or not after the one before.
@@ -35,7 +35,7 @@ def map_stamps(blocks: Iterable[Array], where: str) -> Array:
 
 
 def blocks_of(t: Array) -> Iterator[tuple[int, Array]]:
-    """Yield time stamps in blocks that share a stamp with the one before.
+    """Yield time stamps in blocks; each block shares a stamp with the block before.
 
     Args:
         t: The stamps, shape (N,) [s].

@@ -1,4 +1,4 @@
-"""Motors behind gears: what motor columns of a log say of the joints."""
+"""Transmissions: conversion of motor columns of a log to joint columns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, replace
@@ -14,7 +14,7 @@ from robotid.logs.data import repeated
 
 __all__ = ["Transmission", "check_transmissions"]
 
-_SINGULAR = 1e-9  # smallest singular value over the largest, rows over their own size
+_SINGULAR = 1e-9  # smallest singular value over the largest, for rows of length 1
 
 
 def _load_matrix(value: Any) -> Any:  # noqa: ANN401
@@ -39,31 +39,31 @@ class Transmission(Settings):
     joints: tuple[str, ...] = setting(MISSING, "the joints that the motors drive, by name")
     matrix: Any = setting(
         MISSING,
-        "turns of each motor per turn of each joint [-, or rad/m], a row per motor; or a list of "
+        "angle of each motor per angle of each joint [-, or rad/m], a row per motor; or a list of "
         "gear ratios, if each motor drives one joint; or urdf: the joints' mechanicalReduction",
         reads=(list, str),
         load=_load_matrix,
         dump=_dump_matrix,
     )
     motors: tuple[str, ...] = setting(
-        (), "names of as many motors, as their columns have them; those of the joints if not stated"
+        (), "names of the motors in the columns, one per joint; names of the joints if not stated"
     )
     efficiency: tuple[float, ...] = setting(
-        (), "share of each motor's torque that passes its gears [-]; 1 if not stated"
+        (), "efficiency of each motor's gear [-], 1 if not stated"
     )
     offset: tuple[float, ...] = setting(
-        (), "positions of the joints where the motors' are 0 [rad or m]; 0 if not stated"
+        (), "positions of the joints at motor position 0 [rad or m]; 0 if not stated"
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         count = len(self.joints)
         if not count:
-            raise SettingsError("transmission: joints is empty, wanted the names of those driven")
+            raise SettingsError("transmission: joints is empty, wanted the names of driven joints")
         for noun in ("joints", "motors"):
             if twice := repeated(getattr(self, noun)):
                 raise SettingsError(
-                    f"transmission: {noun} names {listed(twice)} twice; name each once"
+                    f"transmission: {noun} contains {listed(twice)} twice; name each once"
                 )
         for key in ("motors", "efficiency", "offset"):
             if (given := len(getattr(self, key))) not in (0, count):
@@ -74,8 +74,8 @@ class Transmission(Settings):
         for motor, share in zip(self.names, self.efficiency, strict=False):
             if not 0 < share <= 1:
                 raise SettingsError(
-                    f"transmission: efficiency of {motor!r} is {share:g}, wanted a share above 0 "
-                    "and at most 1"
+                    f"transmission: efficiency of {motor!r} is {share:g}, wanted more than 0 and "
+                    "at most 1"
                 )
         if not isinstance(self.matrix, str):
             self._check_matrix()
@@ -98,27 +98,26 @@ class Transmission(Settings):
 
     @property
     def to_torque(self) -> Array:
-        """What makes joint torques of motor torques, T^T diag(efficiency), shape (n, n)."""
-        passed: Array = self.T.T * (self.efficiency or 1.0)
-        return passed
+        """Matrix from motor torques to joint torques, T^T diag(efficiency), shape (n, n)."""
+        matrix: Array = self.T.T * (self.efficiency or 1.0)
+        return matrix
 
     @property
     def shared(self) -> dict[str, tuple[tuple[str, float], ...]]:
-        """Ratios of the motors that turn with several joints, over their largest ones.
+        """Ratios of the motors that several joints move, over the largest ratio of the motor.
 
-        By the joint in whose place the motor's drive stands, in pairs of joint and ratio.
+        The key is the joint whose drive parameters are those of the motor; the value is pairs of
+        joint and ratio.
         """
-        turns = np.abs(self.T) > 0
-        alone = turns.sum(axis=1) == 1
-        taken = turns[alone].any(axis=0)  # joints with a motor of their own
-        places = [
-            joint for joint, is_selected in zip(self.joints, taken, strict=True) if not is_selected
-        ]
+        is_coupled = np.abs(self.T) > 0
+        alone = is_coupled.sum(axis=1) == 1
+        has_own = is_coupled[alone].any(axis=0)  # joints with a motor of their own
+        places = [joint for joint, is_own in zip(self.joints, has_own, strict=True) if not is_own]
         shared = np.flatnonzero(~alone).tolist()
         return {
             place: tuple(
                 (self.joints[j], float(self.T[i, j] / self._ratio(i)))
-                for j in np.flatnonzero(turns[i])
+                for j in np.flatnonzero(is_coupled[i])
             )
             for i, place in zip(shared, places, strict=True)
         }
@@ -138,7 +137,7 @@ class Transmission(Settings):
         return float(self.T[i, np.argmax(np.abs(self.T[i]))])
 
     def stated(self, reductions: Mapping[str, float]) -> "Transmission":
-        """Return the transmission with the gear ratios that a URDF states, if it asks for them.
+        """Return the transmission with the gear ratios of the URDF, if its matrix is "urdf".
 
         Args:
             reductions: Gear ratios of the URDF's joints, by name.
@@ -151,7 +150,7 @@ class Transmission(Settings):
         if missing := [joint for joint in self.joints if joint not in reductions]:
             raise SettingsError(
                 f"transmission: matrix is 'urdf', but the URDF has no <transmission> with a "
-                f"<mechanicalReduction> of {listed(missing)} alone; it has one of "
+                f"<mechanicalReduction> only for {listed(missing)}; it has one for "
                 f"{listed(reductions) or 'no joint'}. State the gear ratios: matrix = [...]"
             )
         return replace(self, matrix=tuple(reductions[joint] for joint in self.joints))
@@ -171,21 +170,21 @@ class Transmission(Settings):
         sizes = np.linalg.svd(self.T / np.where(size > 0, size, 1.0), compute_uv=False)
         if not sizes[-1] > _SINGULAR * sizes[0]:
             raise SettingsError(
-                f"transmission of {listed(self.joints)}: matrix {shown} is singular, so the motors "
-                "do not tell where the joints are. Each row is a motor, as [0, 32, 32] for one "
-                "that turns 32 times with either of the last two joints; no row may be a sum of "
-                "others"
+                f"transmission of {listed(self.joints)}: matrix {shown} is singular, so the motor "
+                "positions do not determine the joint positions. Each row is a motor, as "
+                "[0, 32, 32] for a motor with a ratio of 32 to each of the last two joints; no row "
+                "may be a linear combination of others"
             )
 
 
 def check_transmissions(
     transmissions: Sequence[Transmission], joints: Sequence[str] | None = None
 ) -> None:
-    """Refuse joints and motors that are in several transmissions, and joints that are not read.
+    """Reject joints and motors that are in several transmissions, and joints that are not read.
 
     Args:
         transmissions: The transmissions.
-        joints: The joints that are identified, if they are known.
+        joints: The joints that are identified, if known.
 
     Raises:
         SettingsError: If there is one.
@@ -195,8 +194,8 @@ def check_transmissions(
     for noun, names in (("joints", driven), ("motors", motors)):
         if twice := repeated(names):
             raise SettingsError(
-                f"several transmissions name the {noun} {listed(twice)}; put what turns together "
-                "into one, with a row of the matrix per motor"
+                f"several transmissions contain the {noun} {listed(twice)}; write coupled joints "
+                "in one transmission, with a row of the matrix per motor"
             )
     if joints is not None and (others := [joint for joint in driven if joint not in joints]):
         raise SettingsError(

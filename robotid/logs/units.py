@@ -1,4 +1,4 @@
-"""Units of a log: stated, or suspected and refused; never guessed."""
+"""Units of a log: stated by the user, or checked; never guessed."""
 
 from collections.abc import Collection
 
@@ -15,37 +15,37 @@ __all__ = ["check_reach", "check_units"]
 _TIME_NAMES = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 _DEGREES = 180 / np.pi  # degrees in a radian
 _EPOCHS = 6e8, 5e9  # [s] since 1970: dates from 1989 to 2128
-_SLOWEST = 0.1  # [s] a longer median step is taken for another unit
-_FARTHEST = 4 * np.pi  # [rad] joints beyond two turns are taken for degrees
-_SEGMENT = 0.1  # [s] motion is compared over segments this long: noise and jitter average out
-_GAP = 5  # a step longer than this many median steps is a gap
-_ALIKE = 0.9  # correlation from which two signals are one but for a factor
-_NEAR = 0.1  # relative tolerance on that factor
+_SLOWEST = 0.1  # [s] a longer median step has another unit
+_FARTHEST = 4 * np.pi  # [rad] a joint beyond two revolutions is in degrees
+_SEGMENT = 0.1  # [s] over which the motion is averaged against noise and jitter
+_GAP = 5  # [median steps] a longer step is a gap
+_ALIKE = 0.9  # correlation from which two signals are proportional
+_NEAR = 0.1  # relative tolerance of the factor between them
 
 
 def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> None:
-    """Refuse a log whose numbers look like another unit than SI, unless the unit was stated.
+    """Reject a log whose numbers look like another unit than SI, unless the unit is stated.
 
     The measured velocity is compared with the position over short segments: the factor between
     the integral of dq and the change of q is 1 if both are in SI units.
 
     Args:
         log: The log.
-        units: The units that were stated; what is stated is not suspected.
-        prismatic: Names of the prismatic joints; the others turn.
+        units: The stated units; a stated unit is not checked.
+        prismatic: Names of the prismatic joints; the others are revolute.
 
     Raises:
-        DataError: If time, angle or the sign of the velocity is suspect.
+        DataError: If the unit of time or angle, or the sign of the velocity, is implausible.
     """
-    turns = np.array([name not in prismatic for name in log.joints])
-    factor = _velocity_factor(log)  # (n,), NaN where a joint tells nothing
+    is_revolute = np.array([name not in prismatic for name in log.joints])
+    factor = _velocity_factor(log)  # (n,), NaN for a joint that does not determine it
     if units.time is None:
         _check_step(float(np.median(np.diff(log.t))), float(log.t[0]), log.name)
         _check_clock(log, factor)
     if units.angle is None:
         check_reach(log, units, prismatic)
-        _check_degrees(log, np.where(turns, factor, np.nan))
-        _check_commands(log, turns)
+        _check_degrees(log, np.where(is_revolute, factor, np.nan))
+        _check_commands(log, is_revolute)
     for j in np.flatnonzero(_is_near(factor, -1.0)):
         raise DataError(
             f"{log.name}: dq_{log.joints[j]} has the opposite sign of d(q)/dt of "
@@ -55,12 +55,12 @@ def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
 
 
 def _check_step(step: float, start: float, where: str) -> None:
-    """Refuse a median time step that is too long for seconds, and dates that are in none."""
+    """Reject a median time step that is too long for seconds, and dates in other units."""
     epoch = [unit for unit in _TIME_NAMES if _EPOCHS[0] < start / PER_SECOND[unit] < _EPOCHS[1]]
     if not epoch and step <= _SLOWEST * (1 + 1e-6):
         return
     unit = epoch[0] if epoch else "ms" if step <= 1e2 else "us" if step <= 1e5 else "ns"
-    since = f", the first of them {start:.13g} since 1970" if epoch else ""
+    since = f", the first time stamp {start:.13g} since 1970" if epoch else ""
     raise DataError(
         f"{where}: median step {step:.6g} looks like {_TIME_NAMES[unit]}{since} "
         f"({PER_SECOND[unit] / step:.4g} Hz); in seconds it would be {1 / step:.3g} Hz. "
@@ -71,7 +71,7 @@ def _check_step(step: float, start: float, where: str) -> None:
 
 
 def _check_clock(log: Log, factor: Array) -> None:
-    """Refuse time stamps that make the measured velocity wrong by a power of 1000."""
+    """Reject time stamps with which the measured velocity is wrong by a power of 1000."""
     for power, unit in ((1, "ms"), (2, "us"), (3, "ns"), (-1, "s"), (-2, "s"), (-3, "s")):
         for j in np.flatnonzero(_is_near(np.abs(factor), 1000.0**power)):
             looks = f"; the time looks like {_TIME_NAMES[unit]}" if power > 0 else ""
@@ -83,45 +83,45 @@ def _check_clock(log: Log, factor: Array) -> None:
 
 
 def check_reach(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> None:
-    """Refuse revolute joints too far for radians, unless the unit was stated.
+    """Reject revolute joints with angles too large for radians, unless the unit is stated.
 
     Args:
         log: The log, or rows of it.
-        units: The units that were stated.
+        units: The stated units.
         prismatic: Names of the prismatic joints.
 
     Raises:
-        DataError: If a joint turns too far.
+        DataError: If an angle is too large.
     """
     if units.angle is not None:
         return
-    turns = np.array([name not in prismatic for name in log.joints])
+    is_revolute = np.array([name not in prismatic for name in log.joints])
     for kind, values in (("q", log.q), ("qref", log.q_ref)):
         if values is None:
             continue
-        reach = np.where(turns, np.abs(values).max(axis=0), 0.0)  # (n,)
-        j = int(np.argmax(reach))
-        if reach[j] > _FARTHEST:
+        largest = np.where(is_revolute, np.abs(values).max(axis=0), 0.0)  # (n,)
+        j = int(np.argmax(largest))
+        if largest[j] > _FARTHEST:
             raise DataError(
-                f"{log.name}: {kind}_{log.joints[j]} reaches {reach[j]:.4g}, which "
-                f"looks like degrees (in radians {reach[j] / (2 * np.pi):.1f} turns). "
+                f"{log.name}: {kind}_{log.joints[j]} reaches {largest[j]:.4g}, which looks like "
+                f"degrees (in radians {largest[j] / (2 * np.pi):.1f} revolutions). "
                 f"{_how_to_state('angle', 'deg', 'rad')}",
                 code="angle_unit",
             )
 
 
-def _check_commands(log: Log, turns: Array) -> None:
-    """Refuse joints of which only one of position and commanded position is in degrees."""
+def _check_commands(log: Log, is_revolute: Array) -> None:
+    """Reject joints with only one of position and commanded position in degrees."""
     if log.q_ref is None:
         return
     q, wanted = log.q - log.q.mean(axis=0), log.q_ref - log.q_ref.mean(axis=0)
     both = np.einsum("kj,kj->j", q, wanted)
     sizes = np.linalg.norm(q, axis=0), np.linalg.norm(wanted, axis=0)
-    follows = turns & (both > _ALIKE * sizes[0] * sizes[1])
+    follows = is_revolute & (both > _ALIKE * sizes[0] * sizes[1])
     factor = sizes[1] / np.where(follows, sizes[0], np.nan)
     for j in np.flatnonzero(_is_near(factor, _DEGREES) | _is_near(factor, 1 / _DEGREES)):
         raise DataError(
-            f"{log.name}: qref_{log.joints[j]} moves {factor[j]:.3g} times as far as "
+            f"{log.name}: the motion of qref_{log.joints[j]} is {factor[j]:.3g} times that of "
             f"q_{log.joints[j]}: one of them looks like degrees, the other like radians. Convert "
             f"one of them in the recording. {_how_to_state('angle', 'deg', 'rad', both=True)}",
             code="angle_unit",
@@ -129,7 +129,7 @@ def _check_commands(log: Log, turns: Array) -> None:
 
 
 def _check_degrees(log: Log, factor: Array) -> None:
-    """Refuse joints of which only one of position and velocity is in degrees."""
+    """Reject joints with only one of position and velocity in degrees."""
     for wrong, ratio in (("velocity", _DEGREES), ("position", 1 / _DEGREES)):
         for j in np.flatnonzero(_is_near(np.abs(factor), ratio)):
             raise DataError(
@@ -149,12 +149,12 @@ def _how_to_state(kind: str, unit: str, si: str, both: bool = False) -> str:
         f'Python units=LogUnits({kind}="{stated}"))'
     )
     if stated == si:
-        return f"To read it as it is, state {ways}"
-    return f'State {ways}, or likewise "{si}" if that is right'
+        return f"To read the values without conversion, state {ways}"
+    return f'State {ways}, or "{si}" if this is the unit'
 
 
 def _velocity_factor(log: Log) -> Array:
-    """Return f with dq = f d(q)/dt for each joint, shape (n,); NaN where they are not alike."""
+    """Return f with dq = f d(q)/dt for each joint, shape (n,); NaN if they do not correlate."""
     factor = np.full(len(log.joints), np.nan)
     if log.v is None:
         return factor
@@ -166,22 +166,22 @@ def _velocity_factor(log: Log) -> Array:
         jump = _is_near(np.abs(step), 2 * np.pi) | _is_near(np.abs(step), 360.0)  # a full turn
         broken = (dt > _GAP * median) | jump
         moved = _sums(np.where(broken, 0.0, step), length)
-        swept = _sums(np.where(broken, 0.0, dt * (v[1:] + v[:-1]) / 2), length)
-        both = float(moved @ swept)
-        size = float(np.sqrt((moved @ moved) * (swept @ swept)))
+        integral = _sums(np.where(broken, 0.0, dt * (v[1:] + v[:-1]) / 2), length)
+        both = float(moved @ integral)
+        size = float(np.sqrt((moved @ moved) * (integral @ integral)))
         if len(dt) >= 10 and abs(both) > _ALIKE * size:
-            factor[j] = np.copysign(np.sqrt((swept @ swept) / (moved @ moved)), both)
+            factor[j] = np.copysign(np.sqrt((integral @ integral) / (moved @ moved)), both)
     return factor
 
 
 def _sums(steps: Array, length: int) -> Array:
-    """Return the sums over each segment of so many consecutive steps."""
+    """Return the sums over each segment of ``length`` consecutive steps."""
     total = np.concatenate([[0.0], np.cumsum(steps)])
     sums: Array = total[length:] - total[:-length]
     return sums
 
 
 def _is_near(values: Array, wanted: float) -> NDArray[np.bool_]:
-    """Return which values are within the tolerance of the one wanted."""
+    """Return which values are within the tolerance of the wanted one."""
     near: NDArray[np.bool_] = np.abs(values / wanted - 1) < _NEAR
     return near

@@ -128,7 +128,7 @@ def test_the_command_refuses_by_name_and_leaves_what_was_there(tmp_path, bag, ca
     target = tmp_path / "run.csv"
     target.write_text("precious")
     assert main(["convert", str(bag), str(target)]) == 1
-    assert f"bag holds 2 topics of {JOINT_STATE}: /arm, /other" in capsys.readouterr().err
+    assert f"bag has 2 topics of {JOINT_STATE}: /arm, /other" in capsys.readouterr().err
     assert main(["convert", str(bag), str(target), "--topic", "/arm", "--effort", "x"]) == 2
     assert "log: effort is 'x', wanted one of" in capsys.readouterr().err
     assert main(["convert", str(bag), str(tmp_path / "run.mcap"), "--topic", "/arm"]) == 1

@@ -64,6 +64,6 @@ def test_errors_and_findings_alone_lead_to_it_in_three_commands_with_one_error(u
     follows(user)
     (error,) = user.errors
     assert "have currents but no gain" in error
-    assert "lock them where they stood" in error
+    assert "lock them at their positions" in error
     assert len(user.commands) == 3
     assert user.result()["verdict"]["status"] == "good"

@@ -129,7 +129,7 @@ def test_an_inertia_that_no_body_can_have_is_named_and_a_negative_mass_is_refuse
     (finding,) = [w for w in warnings if w["code"] == "not_positive_definite"]
     assert finding["where"] == "link link_2"
     assert "are not all positive" in finding["message"]
-    assert "takes the nearest possible body" in finding["message"]
+    assert "uses the nearest possible body" in finding["message"]
 
 
 @pytest.fixture

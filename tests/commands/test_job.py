@@ -149,7 +149,7 @@ WRONG = {
     "no matrix": ("matrix = [[32, 0], [45, 45]]", "", "a [[transmission]] has no key 'matrix'"),
     "matrix of text": ("[45, 45]]", '["a", 45]]', "matrix is [[32, 0], ['a', 45]], wanted"),
     "singular": ("[45, 45]]", "[45, 0]]", "matrix [[32, 0], [45, 0]] is singular"),
-    "motor twice": ('["m", "n"]', '["m", "m"]', "motors names m twice"),
+    "motor twice": ('["m", "n"]', '["m", "m"]', "motors contains m twice"),
     "ignore": ("[output]", "[doctor]\nignore = [1]\n[output]", "ignore[0] is 1, wanted"),
     "ignore text": ("[output]", '[doctor]\nignore = "a"\n[output]', "ignore is 'a', wanted a list"),
     "rate too high": ("rate = 200.0", "rate = 1e9", "rate is 1000000000.0, wanted 0.001 to 1e6"),

@@ -60,7 +60,7 @@ def test_torques_of_a_gravity_compensated_channel_are_named(name):
     findings = diagnose(model, [clean_log(weightless, 0)], [], SIGNALS)
     (found,) = [f for f in findings if f.severity == "error"]
     assert found.code == "gravity_compensated"
-    assert "the torques hold no gravity" in found.message
+    assert "the torques contain no gravity" in found.message
 
 
 def test_a_load_is_not_taken_for_another_gravity():

@@ -107,7 +107,7 @@ def test_the_delay_of_a_velocity_is_told_beyond_what_is_stated(stated):
     late = np.column_stack([np.interp(log.t - 0.03, log.t, v) for v in log.v.T])
     (found,) = found_of(replace(log, v=late), "velocity_delay", velocity_delay=stated)
     assert found.evidence["delay"] == pytest.approx(0.03 - stated, abs=1e-3)
-    assert "state [signals] velocity_delay = 0.0300" in found.message
+    assert "set [signals] velocity_delay = 0.0300" in found.message
     assert found_of(log, "velocity_delay") == []
 
 

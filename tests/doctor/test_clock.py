@@ -37,7 +37,7 @@ def test_rate_and_jitter_are_those_of_the_steps():
     assert found["rate"].evidence == {
         "rate": pytest.approx(100.0), "samples": 901, "duration": pytest.approx(9.0)
     }  # fmt: skip
-    assert found["rate"].message.startswith("run.csv: 901 rows in 9 s, 100 Hz in the median")
+    assert found["rate"].message.startswith("run.csv: 901 rows in 9 s, median rate 100 Hz")
     spread = np.sqrt(2.0 / 3.0) * 0.2
     assert found["jitter"].evidence == {
         "relative_spread": pytest.approx(spread),

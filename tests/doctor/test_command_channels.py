@@ -48,7 +48,7 @@ def waves(amplitudes, speeds):
 def test_a_good_chirp_gives_notes_alone(log):
     note, loops = check_commands(log)
     assert (note.code, note.severity, note.where) == ("no_torque", "note", "log")
-    assert "as ratios to the gains of its controller" in note.message
+    assert "as ratios to the gains of the controller" in note.message
     assert (loops.code, loops.severity, loops.where) == ("loops", "note", "log")
     for servo, joint in zip(GOOD, log.joints, strict=True):
         # of exp(-s T) k / (s^2 + d s + k): phase T + d / k at rest, 0.707 at sqrt(k) for d = 1.4
@@ -75,7 +75,7 @@ def test_a_log_without_commands_shows_nothing():
     log = Log(t, np.zeros((100, 1)), np.zeros((100, 1)), ("a",))
     assert list(check_commands(log)) == []
     (note,) = check_commands(replace(log, has_torque=False))
-    assert "neither torque nor commands" in note.message
+    assert "neither torques nor commands" in note.message
 
 
 def test_a_gap_and_a_joint_that_is_told_to_stand_are_no_fault(log):
@@ -107,7 +107,7 @@ def test_one_slow_joint_is_named():
     slow = found(record(lambda t: told(t) * [1, 0] + waves([0, 0.3], [0, 3.0])(t), GOOD))
     assert list(slow) == ["slow_command"]
     assert slow["slow_command"].where == "log: joint_1"
-    assert "the command of joint_1 is too slow for their delays: up to " in (
+    assert "the command of joint_1 is too slow to identify the delay: " in (
         slow["slow_command"].message
     )
 
@@ -201,7 +201,7 @@ def test_a_command_that_the_drive_had_before_is_an_error(log, early):
         ("error", "log: joint_0"),
         ("error", "log: joint_1"),
     }
-    assert "before its command: this is not the command that its drive was given" in (
+    assert "before its command: the logged command is not the command of the drive" in (
         errors[0].message
     )
     assert errors[0].evidence["lag"] < -early / 2
@@ -212,7 +212,7 @@ def test_a_command_that_is_held_is_noted():
     assert list(held) == ["repeated_command"]
     assert held["repeated_command"].severity == "note"
     assert held["repeated_command"].evidence == {"rows": 4.0, "period": pytest.approx(0.02)}
-    assert "50 times a second in the mean, and held for 20 ms" in held["repeated_command"].message
+    assert "at 50 Hz on average, and is constant for 20 ms" in held["repeated_command"].message
 
 
 # --- recordings -----------------------------------------------------------------------------------
@@ -271,7 +271,7 @@ def test_a_log_without_torque_is_examined(ur5, tmp_path, capsys):
         )
         == 0
     )
-    assert "no_torque: run.csv: it has no torque" in " ".join(capsys.readouterr().out.split())
+    assert "no_torque: run.csv: the log has no torque" in " ".join(capsys.readouterr().out.split())
 
 
 def test_what_is_in_the_file_is_examined(ur5, tmp_path):
@@ -287,7 +287,7 @@ def test_what_is_in_the_file_is_examined(ur5, tmp_path):
         assert (read.q_ref is None) == (needed == "torque")
     half = dict(list(table.items())[:9])  # two joints have a command, none a torque
     write_columns(half, tmp_path / "half.parquet")
-    with pytest.raises(DataError, match=r"commanded positions, but none of elbow_joint, wrist_1"):
+    with pytest.raises(DataError, match=r"no commanded positions of elbow_joint, wrist_1"):
         read_log(tmp_path / "half.parquet", log.joints, needs="any")
     with pytest.raises(DataError, match="has no torque"):
         check_logs(ur5, replace(log, q_ref=None))

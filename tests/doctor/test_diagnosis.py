@@ -121,7 +121,7 @@ def test_where_names_the_joint_and_the_evidence_says_how_much(spoilt):
     _, findings = spoilt("two torque columns swapped")
     (found,) = [f for f in findings if f.code == "torque_order"]
     assert found.where == "run.csv: shoulder_lift_joint, wrist_1_joint"
-    assert "tau_wrist_1_joint is that of shoulder_lift_joint" in found.message
+    assert "tau_wrist_1_joint is the torque of shoulder_lift_joint" in found.message
 
 
 def test_delays_are_measured_and_corrected_only_on_request(spoilt):

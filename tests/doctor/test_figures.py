@@ -52,7 +52,7 @@ def test_spikes_are_counted_by_their_share_of_what_varies():
         "rows": 3.0, "largest": pytest.approx(120.0, abs=0.2), "first": pytest.approx(6.1),
         "energy_share": pytest.approx(share, rel=0.01),
     }  # fmt: skip
-    assert "tau of b jumps by up to 120 for 3 rows, the first at t = 6.1 s" in found.message
+    assert "tau of b has spikes of up to 120 in 3 rows, the first at t = 6.1 s" in found.message
 
 
 @pytest.mark.parametrize("rows", [3, 5, 6])
@@ -65,9 +65,9 @@ def test_a_held_torque_is_late_by_half_of_what_it_is_held_less_a_row(rows):
     late = own.mean() * 0.01
     assert found.where == "run.csv: b"
     assert found.evidence == {"rows": rows, "delay": pytest.approx(late)}
-    told = f"held for {rows} rows: it is updated at {100 / rows:.3g} Hz and logged at 100 Hz"
+    told = f"is constant for {rows} rows: it is updated at {100 / rows:.3g} Hz and logged at 100 Hz"
     assert told in found.message
-    assert f"{1e3 * late:.2g} ms late on average" in found.message
+    assert f"mean delay of {1e3 * late:.2g} ms" in found.message
     assert f"torque_delay = {late:.4f} (--torque-delay {late:.4f})" in found.message
     assert f"a cutoff below {25 / rows:.2g} Hz" in found.message
 
@@ -101,7 +101,7 @@ def test_impossible_inertias_are_told_with_their_moments():
     assert broken.evidence == pytest.approx(
         {"smallest": 1.0, "middle": 2.5, "largest": 4.0, "triangle": -0.5}
     )
-    assert "the two smaller ones add up to 3.5, wanted more than 4" in broken.message
+    assert "the sum of the two smaller ones is 3.5, wanted more than 4" in broken.message
     [negative] = found(1.0, 2.0, 0.0, 1.0, 0.0, 2.5)  # -1, 2.5, 3
     assert "moments of inertia -1, 2.5, 3 kg m^2 are not all positive" in negative.message
     assert "(-1 is not)" in negative.message
@@ -128,7 +128,7 @@ def test_a_payload_is_told_with_its_moments(mass, severity):
     }  # fmt: skip
     assert (found.where, found.severity) == ("run.csv: low", severity)
     sign = "more" if mass > 0 else "less"
-    assert f"low carries about {abs(mass):.2g} +- 0.05 kg {sign} than the URDF" in found.message
+    assert f"low carries about {abs(mass):.2g} +- 0.05 kg {sign} than in the URDF" in found.message
     assert list(_payload(SimpleNamespace(model=model), np.array([0.14, 0, 0, 0]), 0.05, "x")) == []
 
 
@@ -166,9 +166,9 @@ def test_held_commands_are_told_with_their_period():
     log = log_of(q_ref=log_of().q[held])
     [found] = _held(log, [_Loop(log, j) for j in range(2)])
     assert found.evidence == {"rows": 5.0, "period": pytest.approx(0.05)}
-    assert "of a, b is updated every 5 rows, 20 times a second in the mean" in found.message
-    assert "held for 50 ms" in found.message
-    assert "or 25 ms are taken for the drive's own delay" in found.message
+    assert "of a, b is updated every 5 rows, at 20 Hz on average" in found.message
+    assert "is constant for 50 ms" in found.message
+    assert "else 25 ms are added to the identified delay of the drive" in found.message
 
 
 def test_a_lag_is_the_slope_of_the_phase_with_the_error_of_a_weighted_mean():

@@ -50,7 +50,7 @@ def found(job):
 def test_a_joint_that_stands_elsewhere_is_named_with_its_position(job, stated):
     (finding,) = found(replace(job(None), locked={stated: 0.5}))
     assert (finding.severity, finding.where) == ("error", f"run.csv: {HELD}")
-    assert "holds wrist_3_joint at 0.5, but the log" in finding.message
+    assert "wrist_3_joint is locked at 0.5 but is at 0.7" in finding.message
     assert f"state locked = {{ {HELD} = 0.7 }}" in finding.message
 
 
@@ -85,7 +85,7 @@ def test_logs_that_disagree_of_a_joint_place_it_nowhere(job, tmp_path):
     write_log(replace(log, q=log.q + 0.1 * (np.arange(6) == 5), a=None), tmp_path / "two.csv")
     two = replace(one, validation=(LogEntry(tmp_path / "two.csv"),))
     assert [f.where for f in found(two)] == [f"run.csv: {HELD}", f"two.csv: {HELD}"]
-    assert "at 0, unasked, but" in found(two)[0].message
+    assert "at 0 by default but is" in found(two)[0].message
 
 
 def test_a_joint_that_moves_is_named_and_leads_the_verdict(job, tmp_path):

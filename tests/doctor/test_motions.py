@@ -55,7 +55,7 @@ def test_the_share_that_repeats_is_that_of_the_log_that_has_most_of_it(motions):
         assert (found.code, found.severity) == ("repeated_motion", "warning")
         assert found.evidence["share"] == pytest.approx(old / (old + new), abs=0.005)
         assert (
-            f"{100 * found.evidence['share']:.0f} % of this motion is in a fitted log, too"
+            f"{100 * found.evidence['share']:.0f} % of this validation motion is in a fitted log"
             in found.message
         )
     assert list(check_repeated_motion([second], kept, "kept.csv")) == []
@@ -85,4 +85,6 @@ def test_excitation_is_that_of_the_weighted_rows_of_all_motions(planar, motions)
     assert (found.evidence["rank"], found.evidence["base"]) == (b, b)
     assert found.severity == "note"
     assert found.message.startswith(f"one, other: the motion determines {b} of {b} base parameters")
-    assert f"(condition number {found.evidence['condition']:.3g}); nothing needs" in found.message
+    assert (
+        f"(condition number {found.evidence['condition']:.3g}); no action needed" in found.message
+    )

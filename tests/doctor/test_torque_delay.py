@@ -144,13 +144,13 @@ def test_one_joint_with_a_delay_of_its_own_is_named_and_does_not_count_for_the_o
     own, common = found(ur5, replace(log, tau=tau))
     assert own.where == "run.csv: wrist_2_joint"
     assert own.evidence["delay"] == pytest.approx(0.09, abs=0.006)
-    assert "the other joints by 2" in own.message
+    assert "the other joints lag it by 2" in own.message
     assert common.evidence["delay"] == pytest.approx(clean[0].evidence["delay"] + 0.03, abs=3e-3)
     tau = log.tau.copy()
     tau[:, 2] = delayed(log, -0.1).tau[:, 2]
     own, _ = found(ur5, replace(log, tau=tau))
     assert own.where == "run.csv: elbow_joint"
-    assert "100 ms or more early" in own.message
+    assert "leads the position by 100 ms or more" in own.message
 
 
 def test_the_error_of_a_delay_counts_friction_beside_the_scatter(ur5, monkeypatch):
@@ -226,5 +226,5 @@ def test_a_delay_of_one_joint_is_beside_that_of_the_others(rng):
         for x in (common, without)
     )
     assert own.explained == pytest.approx(1 - then / now, abs=2e-3)
-    assert own.is_sure
-    assert not misfit.own_delay(0).is_sure
+    assert own.is_significant
+    assert not misfit.own_delay(0).is_significant

@@ -94,11 +94,11 @@ def test_a_moving_link_without_inertial_is_named(tmp_path):
                           '<child link="x"/></joint></robot>'))  # fmt: skip
     (finding,) = found(massless, "missing_inertial")
     assert (finding["link"], finding["severity"]) == ("lower", "warning")
-    assert "its body counts as massless; add an estimate" in finding["message"]
+    assert "Its body is massless; add estimates" in finding["message"]
     frame = inspected(tmp_path, ("</robot>", TOOL.format(inertial="")))
     (finding,) = found(frame, "missing_inertial")
     assert (finding["link"], finding["severity"]) == ("tool", "note")
-    assert "the mass of its body is in lower" in finding["message"]
+    assert "The mass of its body is in lower" in finding["message"]
 
 
 def test_masses_of_zero_and_less_are_named(tmp_path):
@@ -117,8 +117,8 @@ def test_masses_of_zero_and_less_are_named(tmp_path):
 def test_an_impossible_inertia_is_named_with_what_it_breaks(tmp_path):
     (finding,) = found(inspected(tmp_path, ('izz="0.11"', 'izz="0.23"')), "not_positive_definite")
     assert (finding["link"], finding["severity"]) == ("upper", "error")
-    assert "break the triangle inequality" in finding["message"]
-    assert "add up to 0.22, wanted more than 0.23" in finding["message"]
+    assert "violate the triangle inequality" in finding["message"]
+    assert "the sum of the two smaller ones is 0.22, wanted more than 0.23" in finding["message"]
     assert finding["evidence"]["triangle"] == pytest.approx(-0.01)
     (finding,) = found(inspected(tmp_path, ('ixy="0"', 'ixy="0.2"')), "not_positive_definite")
     assert "are not all positive, wanted > 0 (-0.09" in finding["message"]
@@ -145,7 +145,7 @@ def test_a_joint_without_a_range_is_named(tmp_path, limit, said):
     stated = '<limit lower="-1" upper="1" effort="9" velocity="2"/>'
     (finding,) = found(inspected(tmp_path, (stated, limit)), "no_limits")
     assert (finding["joint"], finding["severity"]) == ("shoulder", "warning")
-    assert f"is {said}, wanted lower < upper" in finding["message"]
+    assert f"limits are {said}, wanted lower < upper" in finding["message"]
     half = inspected(tmp_path, ('lower="-1" ', ""))  # a missing bound is 0
     assert found(half, "no_limits") == []
 
@@ -157,14 +157,14 @@ def test_negative_friction_is_named(tmp_path, key, old):
     )
     assert (finding["joint"], finding["severity"]) == ("shoulder", "warning")
     assert f"has {key} -{old}, wanted 0 or more" in finding["message"]
-    assert ("Pinocchio refuses" in finding["message"]) == (key == "friction")
+    assert ("Pinocchio rejects" in finding["message"]) == (key == "friction")
 
 
 def test_a_rounded_angle_is_named_with_its_exact_value(tmp_path):
     # the axes stay parallel: the number of parameters does not suffer
     (finding,) = found(inspected(tmp_path, ('rpy="0 0 0"', 'rpy="0 -3.1416 0.1"')), "rounded_rpy")
     assert (finding["joint"], finding["severity"]) == ("shoulder", "note")
-    assert f"write {-math.pi!r} for -3.1416; the identifiable" in finding["message"]
+    assert f"write {-math.pi!r} for -3.1416. The identifiable" in finding["message"]
 
 
 def test_a_rounded_angle_that_robotid_can_leave_out_is_a_note(tmp_path):
@@ -176,7 +176,7 @@ def test_a_rounded_angle_that_robotid_can_leave_out_is_a_note(tmp_path):
     exact = inspected(tmp_path, (tilted[0], tilted[1].replace("3.1416", repr(math.pi))))
     assert found(exact, "rounded_rpy") == []
     assert rounded.structure.base == exact.structure.base
-    assert "more parameters look identifiable" in finding["message"]
+    assert "more parameters seem identifiable" in finding["message"]
 
 
 def test_angles_that_are_exact_or_meant_are_not_named(tmp_path):
@@ -193,7 +193,7 @@ def test_a_rounded_angle_of_a_frame_is_a_note(tmp_path):
     assert severity == {"hold": "note", "elbow": "note"}
     model = RobotModel.from_urdf(tmp_path / "two.urdf")
     (finding,) = rounded_robot(model, structural_mapping(model))  # of those that move or carry
-    assert finding.message.startswith("two.urdf rounds angles of the joints elbow: ")
+    assert finding.message.startswith("two.urdf rounds angles of the joints elbow. ")
     assert finding.evidence == {"joints": 1.0}
 
 
@@ -202,9 +202,9 @@ def test_rounded_angles_of_several_joints_are_one_note():
     (finding,) = found(inspection, "rounded_rpy")
     assert finding["severity"] == "note"
     joints = ", ".join(f"joint{k}" for k in range(2, 8))
-    assert f"the joints {joints} have rounded angles in rpy: write " in finding["message"]
+    assert f"the joints {joints} have rounded angles in rpy; write " in finding["message"]
     quarter = math.pi / 2
-    assert f"write {-quarter!r} for -1.5708, {quarter!r} for 1.5708; the" in finding["message"]
+    assert f"write {-quarter!r} for -1.5708, {quarter!r} for 1.5708. " in finding["message"]
 
 
 COARSE = ('<origin xyz="0.5 0 0"/>', '<origin xyz="0.5 0 0" rpy="3.14 0 0"/>')
@@ -217,7 +217,8 @@ def test_a_coarsely_rounded_angle_changes_the_base_and_snapping_mends_it(tmp_pat
     more = rounded.structure.base, exact.structure.base
     assert (finding["joint"], finding["severity"]) == ("elbow", "warning")
     assert more[0] > more[1]
-    assert f"makes {more[0]} base parameters of {more[1]}, and only noise" in finding["message"]
+    counts = f"there are {more[0]} base parameters instead of {more[1]}, and noise determines"
+    assert counts in finding["message"]
     assert "snap_angles = true (--snap-angles) takes the exact angles" in finding["message"]
     inspected(tmp_path, COARSE)
     snapped = RobotModel.from_urdf(tmp_path / "two.urdf", snap_angles=True)
@@ -235,7 +236,7 @@ def test_the_doctor_names_rounded_angles_that_matter_once(tmp_path, rng):
         if findings:
             severity = {"3.14": "warning", "3.1416": "note"}[angle]
             assert (findings[0].severity, findings[0].where) == (severity, "two.urdf")
-            assert "rounds angles of the joints elbow: the file" in findings[0].message
+            assert "rounds angles of the joints elbow. With the rounding" in findings[0].message
         snapped = RobotModel.from_urdf(tmp_path / "two.urdf", snap_angles=True)
         assert not [f for f in check_logs(snapped, [log]) if f.code == "rounded_rpy"]
 
@@ -249,14 +250,14 @@ def test_a_mimic_joint_is_named(tmp_path):
     lost = mimic.replace("shoulder", "nobody")
     (finding,) = found(inspected(tmp_path, ("</joint>\n</robot>", lost)), "mimic_joint")
     assert finding["severity"] == "warning"
-    assert "mimics 'nobody', which is no other movable joint" in finding["message"]
+    assert "mimics 'nobody', which is not another movable joint" in finding["message"]
 
 
 def test_lumped_links_are_named(tmp_path):
     tool = TOOL.format(inertial=INERTIAL.format(m=0.3))
     (finding,) = found(inspected(tmp_path, ("</robot>", tool)), "fixed_lumped")
     assert (finding["link"], finding["severity"]) == ("lower", "note")
-    assert "is one body with tool, joined to it by fixed joints" in finding["message"]
+    assert "is one body with tool, attached by fixed joints" in finding["message"]
     to_world = ("</robot>", tool.replace('parent link="lower"', 'parent link="base"'))
     assert found(inspected(tmp_path, to_world), "fixed_lumped") == []
 
@@ -355,5 +356,5 @@ def test_a_chain_whose_last_joints_are_hardly_felt_is_named(tmp_path):
     assert inspection.structure.base_inertial == 7 * 60 - 8
     weak, base = finding["evidence"]["faint"], inspection.structure.base
     assert weak > 0
-    assert f"{weak:.0f} parameters load the joints less than 1e-4 as much" in finding["message"]
+    assert f"{weak:.0f} parameters have less than 1e-4 of the effect" in finding["message"]
     assert f"left out of the {base} base parameters" in finding["message"]

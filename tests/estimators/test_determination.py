@@ -245,7 +245,7 @@ def test_doctor_result_report_and_refusal_say_the_same(ur5, case, request):
     assert finding.severity == "warning"
     assert finding.evidence["rank"] == known.rank
     assert known.described() in finding.message
-    assert "nothing needs doing" not in finding.message
+    assert "no action needed" not in finding.message
 
 
 def test_few_rows_of_a_long_motion_tell_the_doctor_the_same(ur5, monkeypatch):
@@ -255,7 +255,7 @@ def test_few_rows_of_a_long_motion_tell_the_doctor_the_same(ur5, monkeypatch):
     def weakest():
         (finding,) = check_excitation(ur5, mapping, [motion], EXACT, "run.csv")
         assert finding.severity == "note"
-        assert finding.message.endswith("nothing needs doing")
+        assert finding.message.endswith("no action needed")
         return finding.evidence["weakest"]
 
     whole = weakest()
@@ -268,9 +268,12 @@ def test_an_ill_conditioned_motion_is_not_passed_over(ur5, monkeypatch):
     motion, mapping = process(log, resolve(log, EXACT)), structural_mapping(ur5)
     monkeypatch.setattr("robotid.doctor.motions._ILL_CONDITIONED", 1.0)
     (finding,) = check_excitation(ur5, mapping, [motion], EXACT, "run.csv")
-    assert "nothing needs doing" not in finding.message
+    assert "no action needed" not in finding.message
     assert finding.severity == "note"
-    assert "% of its plausible spread: a richer motion, of all joints" in finding.message
+    assert (
+        "% of its prior standard deviation; to determine it better, record a motion of all joints"
+        in finding.message
+    )
 
 
 def test_what_is_lost_in_the_noise_of_a_rich_motion_is_a_note(ur5):
@@ -280,7 +283,7 @@ def test_what_is_lost_in_the_noise_of_a_rich_motion_is_a_note(ur5):
     assert finding.severity == "note"
     assert finding.evidence["rank"] < 58
     assert finding.evidence["condition"] < 100
-    assert "is lost in the noise: faster motion would show more" in finding.message
+    assert "not identifiable above the noise; a faster motion determines more" in finding.message
 
 
 def test_too_few_rows_are_said(ur5):

@@ -36,7 +36,7 @@ def test_what_was_done_to_a_log_is_what_the_doctor_says(ran):
     late = [f for f in documents["late"]["findings"] if f["code"] == "torque_delay"]
     for finding in late:  # by 40 ms, of which 12 are stated
         size, error = re.search(
-            r"torque is ([\d.]+) \+- ([\d.]+) ms late", finding["message"]
+            r"torque lags the position by ([\d.]+) \+- ([\d.]+) ms", finding["message"]
         ).groups()
         assert abs(float(size) - 28) < 3 * float(error)
     assert ("torque_order", "error") in codes("swapped")

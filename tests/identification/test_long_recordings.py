@@ -239,4 +239,4 @@ def test_a_long_log_without_motion_long_enough_is_refused_as_in_memory(
             run_job(replace(job, rows_in_memory=held), tmp_path)
         messages.append(str(found.value))
     assert messages[0] == messages[1]
-    assert "none of its 1 uninterrupted segments is long enough" in messages[0]
+    assert "none of its 1 segments without gaps is long enough" in messages[0]

@@ -444,7 +444,7 @@ def test_spikes_in_torques_do_not_condemn_a_robust_fit(ur5):
         return replace(log, tau=tau)
 
     plain = found_of(ur5, spoil)
-    assert "jumps by up to" in plain.verdict.reasons[0]
+    assert "has spikes of up to" in plain.verdict.reasons[0]
     assert plain.log_errors
     robust = found_of(ur5, spoil, robust="tukey")
     assert robust.verdict.status == "good", robust.verdict.reasons

@@ -184,16 +184,16 @@ def test_a_half_command_names_the_joints():
     with pytest.raises(DataError) as error:
         read_log(frame(qref_elbow=None), JOINTS, needs="commands")
     assert str(error.value) == (
-        "log has commanded positions, but none of elbow: no column 'qref_elbow'; found: "
-        "qref_shoulder. Record or rename what is missing, pass columns={'qref_<joint>': ...}, or "
-        "lock joints that was at rest"
+        "log has no commanded positions of elbow: no column 'qref_elbow'; found: qref_shoulder. "
+        "Record them, rename the columns, pass columns={'qref_<joint>': ...}, or lock joints that "
+        "were at rest"
     )
     with pytest.raises(DataError) as error:
         read_log(frame(qref_elbow=None, qref_shoulder=None), JOINTS, needs="commands")
     assert str(error.value) == (
         "log has no commanded position, as 'qref_shoulder', of any joint read; columns of "
-        "commanded positions found: none. Record what the controller was told, rename the columns, "
-        "or pass columns={'qref_<joint>': ...}"
+        "commanded positions found: none. Record the commands of the controller, rename the "
+        "columns, or pass columns={'qref_<joint>': ...}"
     )
 
 
@@ -229,7 +229,7 @@ def test_half_of_the_rest_is_noted():
     log = read_log(frame(dqref_elbow=part, tau_elbow=part), JOINTS, needs="commands")
     assert (log.v_ref, log.has_torque) == (None, False)
     assert log.notes == (
-        "torques ignored: shoulder have none, nor a current with a gain",
+        "torques ignored: shoulder have no torque, and no current with a gain",
         "dqref_elbow ignored: shoulder have no commanded velocity",
         "columns ignored: tau_elbow",
     )
@@ -260,7 +260,7 @@ def test_a_log_without_torque_is_told_what_it_can_do():
         read_logs(make_log(), JOINTS)
     assert str(error.value) == f"log has no torque. Its commands are {WITHOUT}"
     assert read_logs(make_log(), JOINTS[::-1], needs="commands")[0].joints == JOINTS[::-1]
-    with pytest.raises(DataError, match=r"log has no commanded positions; give them as Log\("):
+    with pytest.raises(DataError, match=r"log has no commanded positions; pass them as Log\("):
         read_logs(make_log(q_ref=None), JOINTS, needs="commands")
 
 
@@ -277,7 +277,7 @@ def test_a_log_without_torque_has_none():
 
 def test_commands_in_other_units_than_positions_are_refused():
     log = make_log()
-    with pytest.raises(DataError, match=r"qref_elbow moves 57\.3 times as far as q_elbow"):
+    with pytest.raises(DataError, match=r"the motion of qref_elbow is 57\.3 times that of q_elbow"):
         read_log(frame(qref_elbow=np.rad2deg(0.1 * log.q_ref[:, 1]), q_elbow=0.1 * log.q[:, 1]),
                  JOINTS, needs="commands")  # fmt: skip
     with pytest.raises(DataError, match=r"qref_elbow reaches 57\.3, which looks like degrees"):
@@ -291,8 +291,8 @@ def test_a_size_without_sign_is_named_and_not_read():
     log = read_log(frame(**sizes), JOINTS, needs="commands")
     assert not log.has_torque
     assert log.notes == (
-        "loadsize_shoulder, loadsize_elbow ignored: the size of a load without its sign is no "
-        "torque; it does not tell a drive that pushes from one that brakes",
+        "loadsize_shoulder, loadsize_elbow ignored: the absolute value of a load does not "
+        "determine the direction of the torque",
     )
     chosen = {f"tau_{joint}": f"loadsize_{joint}" for joint in JOINTS}
     assert read_log(frame(**sizes), JOINTS, columns=chosen).notes == (
@@ -352,7 +352,7 @@ def test_a_controller_beside_joint_states_is_named(tmp_path):
     path = write_controller(tmp_path / "run", log, "new", states=list(messages_of(log)))
     note = (
         "commands are in topics that are not read: /arm_controller/state; topic = "
-        '"/arm_controller/state" reads them and what was measured with them'
+        '"/arm_controller/state" reads them and their measured positions'
     )
     assert read_log(path, JOINTS).notes == (note,)
     with pytest.raises(DataError, match=r"no commanded position.* commands are in topics that"):
@@ -367,7 +367,9 @@ def test_a_bag_without_the_controllers_definition_says_what_to_do(tmp_path):
     with sqlite3.connect(next(path.glob("*.db3"))) as file:
         file.execute("DELETE FROM message_definitions")
     file.close()
-    with pytest.raises(DataError, match=r"^run does not hold the definition of control_msgs/msg/"):
+    with pytest.raises(
+        DataError, match=r"^run does not contain the definition of control_msgs/msg/"
+    ):
         read_log(path, JOINTS, needs="commands")
 
 
@@ -394,8 +396,9 @@ def test_two_topics_of_joint_states_are_joined_by_holding_the_last_command(tmp_p
     np.testing.assert_array_equal(back.v, log.v[5:])
     assert (back.v_ref, back.has_torque) == (None, False)
     assert back.notes == (
-        "commands of topic '/joint_commands' are held until the next one, 20 ms later in the "
-        "median; messages before the first one, left out: 5; messages after the last one: 1",
+        "a zero-order hold is applied to the commands of topic '/joint_commands', with a median "
+        "interval of 20 ms; messages before the first command, left out: 5; messages after the "
+        "last command: 1",
     )
     only = LogSource(command="/joint_commands")
     assert_same(read_log(path, JOINTS, needs="commands", source=only), back)
@@ -416,13 +419,16 @@ def test_topics_of_commands_that_cannot_be_are_refused(tmp_path):
     path = write_bag2(tmp_path / "bag", paired(driven()), others=["/chatter"])
     for source, text in (
         (LogSource(command="/joint_comands"), "bag has no topic '/joint_comands'; topics: "),
-        (LogSource(command="/chatter"), "bag: topic '/chatter' holds std_msgs/msg/String, wanted"),
+        (
+            LogSource(command="/chatter"),
+            "bag: topic '/chatter' has messages of std_msgs/msg/String, wanted",
+        ),
         (replace(COMMANDS, topic="/joint_commands"), "bag: topic and command are both '/joint_co"),
     ):
         with pytest.raises(DataError, match=text):
             read_log(path, JOINTS, needs="commands", source=source)
     write_log(make_log(), tmp_path / "run.csv")
-    with pytest.raises(SettingsError, match=r"the topic of a bag, but run\.csv is none"):
+    with pytest.raises(SettingsError, match=r"the topic of a bag, but run\.csv is no bag"):
         read_log(tmp_path / "run.csv", JOINTS, needs="commands", source=COMMANDS)
 
 
@@ -451,8 +457,8 @@ def test_an_episode_of_lerobot_is_read(tmp_path, version):
     np.testing.assert_allclose(back.q_ref, log.q_ref, atol=1e-6)
     assert (back.has_torque, back.v_ref) == (False, None)
     assert back.notes == (
-        "episode 0; its time stamps are the numbers of the frames over their rate, so what was "
-        "sent and measured may be a frame apart",
+        "episode 0: its time stamps are frame numbers over the frame rate, so the delay "
+        "between commands and positions has an error of up to one frame",
     )
 
 
@@ -475,7 +481,7 @@ def test_frames_of_an_episode_are_in_their_order_whatever_that_of_the_rows_and_f
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_one_episode_of_several_is_stated(tmp_path, version):
     path = dataset(tmp_path, version, episodes=(0, 3, 12))
-    with pytest.raises(DataError, match=r"arm holds 3 episodes: episode_0, episode_12, episode_3"):
+    with pytest.raises(DataError, match=r"arm has 3 episodes: episode_0, episode_12, episode_3"):
         read_log(path, JOINTS, needs="commands", units=DEGREES)
     for topic in ("episode_3", "3", "episode_000003"):
         source = LogSource(topic=topic)
@@ -506,7 +512,7 @@ def test_normalised_positions_are_no_angles(tmp_path):
         read_log(dataset(tmp_path), JOINTS, needs="commands")
     assert error.value.code == "angle_unit"
     assert str(error.value).startswith(
-        "arm: the unit of LeRobot's positions is not in its files. By default they are normalised"
+        "arm: the unit of positions is not in the files of LeRobot. By default they are normalised"
     )
 
 
@@ -517,8 +523,11 @@ def test_normalised_positions_are_no_angles(tmp_path):
             lambda info: info["features"]["action"].update(names=None),
             "no names of the motors in ac",
         ),
-        (lambda info: info["features"]["action"].update(names=["a", *JOINTS]), "at least 3 motors"),
-        (lambda info: info.pop("features"), "is no description of a LeRobot dataset of version 2"),
+        (
+            lambda info: info["features"]["action"].update(names=["a", *JOINTS]),
+            "at least 3 names of motors",
+        ),
+        (lambda info: info.pop("features"), "does not describe a LeRobot dataset of version 2"),
         (lambda info: info.update(features={"image": {}}), "neither observation.state nor action"),
         (lambda info: info.update(features=None), "features is None, wanted a table of tables"),
         (lambda info: info.update(features={"action": 5}), "wanted a table of tables"),
@@ -527,11 +536,11 @@ def test_normalised_positions_are_no_angles(tmp_path):
         (lambda info: info["features"]["action"].update(names=[["a"], 5]), "no names of the motor"),
         (
             lambda info: info["features"]["action"].update(names=[JOINTS[0], JOINTS[0]]),
-            f"names '{JOINTS[0]}' of action, number 1, and number 0 of action alike",
+            f"the same name for '{JOINTS[0]}' of action, number 1, and number 0 of action",
         ),
         (
             lambda info: info["features"]["action"].update(names=[f"{JOINTS[0]}.pos", JOINTS[0]]),
-            "number 1, and number 0 of action alike; give each motor a name of its own",
+            "number 1, and number 0 of action; give each motor another name",
         ),
     ],
 )

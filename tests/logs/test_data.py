@@ -126,12 +126,12 @@ def test_shapes_that_do_not_fit_are_refused():
 
 
 def test_fewer_than_two_rows_are_refused():
-    with refused("log has 1 rows, wanted at least 2"):
+    with refused("log has 1 rows, wanted at least 2; record longer"):
         Log(t=[0.0], q=[[0.0]], tau=[[0.0]], joints=("elbow",))
 
 
 def test_joints_are_names_each_once():
-    with refused("run3.csv: joints elbow are named twice; name each joint once"):
+    with refused("run3.csv: joints contains elbow twice; name each joint once"):
         make_log(joints=("elbow", "elbow"))
     with refused("run3.csv: joints is 'ab', wanted at least one name in a tuple"):
         make_log(joints="ab")
@@ -281,7 +281,7 @@ def test_suspected_time_tells_how_to_state_it():
     with refused(
         "run3.csv: median step 10 looks like milliseconds (100 Hz); in seconds it would be 0.1 Hz. "
         'State units time = "ms" (job file table [units], CLI --time-unit ms, Python '
-        'units=LogUnits(time="ms")), or likewise "s" if that is right. To convert it, multiply by '
+        'units=LogUnits(time="ms")), or "s" if this is the unit. To convert it, multiply by '
         "0.001"
     ):
         check_units(make_log(t=make_log().t * 1e3), LogUnits())
@@ -308,9 +308,9 @@ def test_positions_beyond_two_turns_are_suspected():
     q = make_log().q * [1.0, 90.0]
     log = make_log(q=q, v=None)
     with refused(
-        "run3.csv: q_elbow reaches 90, which looks like degrees (in radians 14.3 turns). State "
-        'units angle = "deg" (job file table [units], CLI --angle-unit deg, Python '
-        'units=LogUnits(angle="deg")), or likewise "rad" if that is right'
+        "run3.csv: q_elbow reaches 90, which looks like degrees (in radians 14.3 revolutions). "
+        'State units angle = "deg" (job file table [units], CLI --angle-unit deg, Python '
+        'units=LogUnits(angle="deg")), or "rad" if this is the unit'
     ):
         check_units(make_log(q=spoil(q, 157, 1, 90.0), v=None), LogUnits())
     check_units(log, LogUnits(), prismatic=("elbow",))
@@ -322,9 +322,9 @@ def test_velocity_in_degrees_is_suspected():
     log = make_log(v=np.degrees(make_log().v))
     with refused(
         "run3.csv: dq_shoulder is 57.3 times d(q)/dt: the velocity looks like degrees, the other "
-        "like radians. Convert one of them in the recording. To read it as it is, state units "
-        'angle = "rad" (job file table [units], CLI --angle-unit rad, Python '
-        'units=LogUnits(angle="rad"))'
+        "like radians. Convert one of them in the recording. To read the values without "
+        'conversion, state units angle = "rad" (job file table [units], CLI --angle-unit rad, '
+        'Python units=LogUnits(angle="rad"))'
     ):
         check_units(log, LogUnits())
     check_units(log, LogUnits(angle="rad"))

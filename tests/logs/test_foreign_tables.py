@@ -75,7 +75,9 @@ def test_of_several_topics_that_with_efforts_is_taken_and_of_two_such_one_must_b
     ghost = juggled("/ghost", words={"position": LOG.q + 1.0})
     assert_same(read_log(given(juggled("/joint_states") | ghost), JOINTS))
     both = given(juggled("/left") | juggled("/right", scale=2.0))
-    with pytest.raises(DataError, match="2 topics of joint states: /left, /right; its columns are"):
+    with pytest.raises(
+        DataError, match="2 topics of joint states: /left, /right; its columns have"
+    ):
         read_log(both, JOINTS)
     np.testing.assert_array_equal(
         read_log(both, JOINTS, source=LogSource(topic="/right")).tau, 2.0 * LOG.tau
@@ -154,7 +156,7 @@ def test_what_is_wrong_with_a_data_frame_is_told():
     with pytest.raises(DataError, match=r"log: q_elbow is NaN at row 4 \(t = 0.08 s\); remove"):
         read_log(spoilt, JOINTS)
     words = frame.assign(**{"/joint_states/elbow/effort": "much"})
-    with pytest.raises(DataError, match="log: column '/joint_states/elbow/effort' holds str, want"):
+    with pytest.raises(DataError, match="log: column '/joint_states/elbow/effort' contains str"):
         read_log(words, JOINTS)
 
 
@@ -220,8 +222,9 @@ def test_names_that_differ_in_case_alone_are_to_be_renamed(ur5, rng):
         read_logs(other, ur5.joints)
     said = str(refusal.value)
     assert said.startswith(
-        "log has the joints SHOULDER_PAN_JOINT, SHOULDER_LIFT_JOINT, which the model spells "
-        "shoulder_pan_joint, shoulder_lift_joint; rename them: dataclasses.replace(log, joints="
+        "log has the joints SHOULDER_PAN_JOINT, SHOULDER_LIFT_JOINT, which are "
+        "shoulder_pan_joint, shoulder_lift_joint in the model; rename them: "
+        "dataclasses.replace(log, joints="
     )
     renamed = eval(said.rpartition("rename them: ")[2], {"dataclasses": dataclasses, "log": other})
     (back,) = read_logs(renamed, ur5.joints)
@@ -235,7 +238,7 @@ def test_a_log_is_taken_by_the_names_of_its_joints(ur5, rng):
     np.testing.assert_array_equal(back.tau, log.tau)
     with refused(
         "log has the joints elbow_joint, but not wrist_1_joint, which the model has; record them, "
-        "or if they was at rest, lock them where they stood: RobotModel.from_urdf(..., "
+        "or if they were at rest, lock them at their positions: RobotModel.from_urdf(..., "
         "locked={'wrist_1_joint': 0.0})"
     ):
         read_logs(log.select(["elbow_joint"]), ["elbow_joint", "wrist_1_joint"])

@@ -144,8 +144,8 @@ def test_names_with_slashes_survive(tmp_path, suffix):
 
 def test_names_that_matlab_cannot_hold_are_refused_and_nothing_is_written(tmp_path):
     with refused(
-        "MATLAB has no variable called 'q_joint-1' (letters, digits and _, at most 63); write "
-        "another format"
+        "'q_joint-1' is not a valid name of a MATLAB variable (letters, digits and _, at most 63 "
+        "characters); write another format"
     ):
         write_log(make_log(joints=("joint-1", "elbow")), tmp_path / "run.mat")
     assert list(tmp_path.iterdir()) == []
@@ -167,7 +167,7 @@ def test_headers_that_were_never_stamped_are_refused(tmp_path):
     unstamped = [(0.0, *message[1:]) for message in messages_of(log)]
     path = write_bag2(tmp_path / "bag", {"/joint_states": unstamped}, delay=1.0)
     with refused(
-        "bag, topic '/joint_states': the stamps in the headers of all 60 messages are 0. To use "
+        "bag, topic '/joint_states': the header stamps of all 60 messages are 0. To use "
         'the time of recording, state stamp = "log" (job file table [log], CLI --stamp log, '
         'Python source=LogSource(stamp="log"))'
     ):
@@ -195,23 +195,25 @@ def test_the_topic_must_be_stated_if_several_would_do(tmp_path):
         f"topics: {{'/arm': '{STATE}', '/chatter': 'std_msgs/msg/String', '/ghost': '{STATE}'}}"
     )
     with refused(
-        f'bag holds 2 topics of {STATE}: /arm, /ghost; {listing}. State one: topic = "/arm" {HOW}'
+        f'bag has 2 topics of {STATE}: /arm, /ghost; {listing}. State one: topic = "/arm" {HOW}'
     ):
         read_log(path, JOINTS)
     assert_same(read_log(path, JOINTS, source=LogSource(topic="/arm")), log)
     with refused(f"bag has no topic '/arn'; {listing}. Did you mean '/arm'?"):
         read_log(path, JOINTS, source=LogSource(topic="/arn"))
     kinds = f"{STATE} or control_msgs/msg/JointTrajectoryControllerState"
-    with refused(f"bag: topic '/chatter' holds std_msgs/msg/String, wanted {kinds}; {listing}"):
+    with refused(
+        f"bag: topic '/chatter' has messages of std_msgs/msg/String, wanted {kinds}; {listing}"
+    ):
         read_log(path, JOINTS, source=LogSource(topic="/chatter"))
 
 
 def test_a_bag_without_joint_states_lists_what_it_holds(tmp_path):
     path = write_bag2(tmp_path / "bag", {"/joint_states": []}, others=["/chatter"])
     listing = f"topics: {{'/chatter': 'std_msgs/msg/String', '/joint_states': '{STATE}'}}"
-    with refused(f"bag holds no message of {STATE}; {listing}"):
+    with refused(f"bag has no message of {STATE}; {listing}"):
         read_log(path, JOINTS)
-    with refused(f"bag: topic '/joint_states' holds no message; {listing}"):
+    with refused(f"bag: topic '/joint_states' has no message; {listing}"):
         read_log(path, JOINTS, source=LogSource(topic="/joint_states"))
 
 
@@ -236,9 +238,10 @@ def test_joints_missing_in_some_messages_are_refused(tmp_path):
         messages[k] = (t, [*names[:i], *names[i + 1 :]], *(np.delete(x, i) for x in rows))
     path = write_mcap(tmp_path / "run.mcap", messages)
     with refused(
-        "run.mcap, topic '/joint_states': 2 of 60 messages lack some of what is read, the first "
-        "(message 7) position_elbow, effort_elbow, velocity_elbow. A row is one message: "
-        "read only joints that are always published together, and leave out the others"
+        "run.mcap, topic '/joint_states': 2 of 60 messages lack some of the required "
+        "values, the first (message 7) lacks position_elbow, effort_elbow, velocity_elbow. A row "
+        "is one message; read only joints that are always published together, and leave out the "
+        "others"
     ):
         read_log(path, JOINTS)
     np.testing.assert_array_equal(read_log(path, ["shoulder"]).q, make_log().q[:, :1])
@@ -274,7 +277,7 @@ def test_effort_is_a_current_if_stated(tmp_path):
     back = read_log(path, JOINTS, source=current, gains={"shoulder": 2.0, "elbow": 3.0})
     np.testing.assert_array_equal(back.tau, log.tau * [2.0, 3.0])
     with refused(
-        "run.mcap: joints shoulder, elbow have currents but no gain; give it in N m/A: "
+        "run.mcap: joints shoulder, elbow have currents but no gain; state it in N m/A: "
         "gains={'shoulder': ..., ...} (job file table [torque], key gains; CLI --gain "
         "shoulder=... --gain elbow=...)"
     ):
@@ -285,7 +288,7 @@ def test_messages_that_do_not_fit_together_are_refused(tmp_path):
     messages = list(messages_of(make_log()))
     t, names, q, v, tau = messages[5]
     wrong = {
-        "holds 1 values of velocity": (t, names, q, v[:1], tau),
+        "has 1 values of velocity": (t, names, q, v[:1], tau),
         "names elbow twice": (t, ["elbow", "elbow"], q, v, tau),
     }
     for number, (text, message) in enumerate(wrong.items()):
@@ -296,8 +299,8 @@ def test_messages_that_do_not_fit_together_are_refused(tmp_path):
 
 def test_a_folder_that_is_no_bag_is_refused(tmp_path):
     with refused(
-        f"{tmp_path.name} is a folder without metadata.yaml, so not a ROS 2 bag, and without "
-        "meta/info.json, so not a LeRobot dataset; name the .mcap or "
+        f"{tmp_path.name} is a folder without metadata.yaml, so it is not a ROS 2 bag, and "
+        "without meta/info.json, so it is not a LeRobot dataset; give the .mcap or "
         ".db3 file in it, or restore it with 'ros2 bag reindex'"
     ):
         read_log(tmp_path, JOINTS)
@@ -364,7 +367,7 @@ def test_groups_are_chosen_like_topics(tmp_path):
                 file[f"{group}/{name}"] = values
     with pytest.raises(DataError) as caught:
         read_log(path, JOINTS)
-    assert str(caught.value).startswith("run.h5 holds 2 groups with a time: left, right; ")
+    assert str(caught.value).startswith("run.h5 has 2 groups with a time: left, right; ")
     assert str(caught.value).endswith(f'. State one: topic = "left" {HOW}')
     assert_same(read_log(path, JOINTS, source=LogSource(topic="/left/")), log)
     with refused("run.h5 has no group 'lefd'; groups found: left, right. Did you mean "
@@ -395,12 +398,12 @@ def test_one_joint_needs_no_second_axis(tmp_path):
     [
         (
             {"tau": np.zeros((59, 2))},
-            "run.npz: tau_shoulder has 59 samples, time has 60; a row needs both",
+            "run.npz: tau_shoulder has 59 samples, time has 60; record the same number of samples",
         ),
         (
             {"tau": np.zeros((60, 3))},
-            "run.npz: tau has shape (60, 3), but the file names 2 joints: shoulder, elbow; "
-            "give each joint one column",
+            "run.npz: tau has the shape (60, 3), but the file names 2 joints: shoulder, elbow; "
+            "write one column per joint",
         ),
         (
             {"time": None},
@@ -450,7 +453,7 @@ def test_joints_may_have_other_names_in_the_file(tmp_path):
     with refused(
         "run.csv has no column 'q_M3'; position columns found: q_M1, q_M2. Rename it, or "
         "pass columns={'q_elbow': ...}; if 'elbow' was at rest, leave it out of joints and lock it "
-        "where it stood, as with --joints shoulder --lock elbow=0; in Python "
+        "at its position, as with --joints shoulder --lock elbow=0; in Python "
         "RobotModel.from_urdf(..., locked={'elbow': 0})"
     ):
         read_log(path, JOINTS, source=LogSource(joints={"shoulder": "M1", "elbow": "M3"}))

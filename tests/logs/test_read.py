@@ -136,7 +136,7 @@ def test_missing_column_is_named_with_those_of_its_kind(run):
     with refused(
         f"{path.name} has no column 'tau_elbow'; torque or current columns found: "
         "tau_shoulder. Rename it, or pass columns={'tau_elbow': ...}; "
-        "if 'elbow' was at rest, leave it out of joints and lock it where it stood, as with "
+        "if 'elbow' was at rest, leave it out of joints and lock it at its position, as with "
         "--joints shoulder --lock elbow=0; in Python RobotModel.from_urdf(..., "
         "locked={'elbow': 0})"
     ):
@@ -154,7 +154,7 @@ def test_misspelt_column_is_suggested(run):
     with refused(
         f"{path.name} has no column 'q_elbow'; position columns found: q_shoulder, q_elbow2. "
         "Did you mean 'q_elbow2'? Rename it, or pass columns={'q_elbow': 'q_elbow2'}; "
-        "if 'elbow' was at rest, leave it out of joints and lock it where it stood, as with "
+        "if 'elbow' was at rest, leave it out of joints and lock it at its position, as with "
         "--joints shoulder --lock elbow=0; in Python RobotModel.from_urdf(..., "
         "locked={'elbow': 0})"
     ):
@@ -169,7 +169,7 @@ def test_the_column_of_another_joint_is_not_suggested(run):
     with refused(
         f"{path.name} has no column 'tau_joint_2'; torque or current columns found: "
         "tau_joint_1. Rename it, or pass columns={'tau_joint_2': ...}; "
-        "if 'joint_2' was at rest, leave it out of joints and lock it where it stood, as with "
+        "if 'joint_2' was at rest, leave it out of joints and lock it at its position, as with "
         "--joints joint_1 --lock joint_2=0; in Python RobotModel.from_urdf(..., "
         "locked={'joint_2': 0})"
     ):
@@ -191,13 +191,13 @@ def test_columns_must_name_what_is_read(run):
     with pytest.raises(SettingsError) as caught:
         read_log(path, JOINTS, columns={"tau_elbw": "tau_elbow"})
     assert str(caught.value) == (
-        "columns: 'tau_elbw' is not the standard name of a column that is read, as 'time' or "
+        "columns: 'tau_elbw' is not a standard name of a column, as 'time' or "
         "'tau_shoulder'. Did you mean 'tau_elbow'?"
     )
     with pytest.raises(DataError) as caught:
         read_log(path, JOINTS, columns={"tau_elbow": "tau_elbo"})
     assert str(caught.value).startswith(
-        f"{path.name} has no column 'tau_elbo', which columns gives for 'tau_elbow'; columns found:"
+        f"{path.name} has no column 'tau_elbo', which is stated for 'tau_elbow' in columns; columns"
     )
     assert str(caught.value).endswith("Did you mean 'tau_elbow'?")
 
@@ -263,7 +263,7 @@ def test_current_times_gain_is_torque(run, prefix):
 def test_current_without_gain_is_refused(run):
     path = run(make_table(tau_elbow=None, i_elbow=np.ones(300)))
     with refused(
-        f"{path.name}: joint 'elbow' has the current 'i_elbow' but no gain; give it in N m/A: "
+        f"{path.name}: joint 'elbow' has the current 'i_elbow' but no gain; state it in N m/A: "
         "gains={'elbow': ...} (job file table [torque], key gains; CLI --gain elbow=...)"
     ):
         read_log(path, JOINTS)
@@ -274,10 +274,10 @@ def test_joints_without_gain_and_those_without_torque_are_all_named_at_once(run)
     names = ["q_a", "q_b", "q_finger", "i_a", "i_b", "q_c", "tau_c"]
     path = run({"time": one, **dict.fromkeys(names, one)})
     with refused(
-        f"{path.name}: joints a, b have currents but no gain; give it in N m/A: "
+        f"{path.name}: joints a, b have currents but no gain; state it in N m/A: "
         "gains={'a': ..., ...} (job file table [torque], key gains; CLI --gain a=... --gain "
-        "b=...). There is no torque of finger either; if they was at rest, lock them where they "
-        "stood, as with --lock finger=0"
+        "b=...). No torque of finger was found; if at rest, lock them at their positions, as "
+        "with --lock finger=0"
     ):
         read_log(path, ("a", "b", "c", "finger"))
 
@@ -394,13 +394,13 @@ def test_whole_numbers_and_single_precision_are_read(tmp_path):
 def test_parquet_columns_that_are_no_numbers_are_refused(tmp_path):
     stamps = pa.array([0, 1, 2], pa.timestamp("ns"))
     path = save(tmp_path / "run.parquet", {"time": stamps, "q_a": [0, 1, 2], "tau_a": [0, 1, 2]})
-    with refused("run.parquet: time holds timestamp[ns], wanted numbers; convert it"):
+    with refused("run.parquet: time contains timestamp[ns], wanted numbers; convert it"):
         read_log(path, ["a"])
 
 
 def test_fewer_than_two_rows_are_refused(run):
     path = run({"t": [0.0], "q_a": [0.0], "tau_a": [0.0]})
-    with refused(f"{path.name} has 1 rows, wanted at least 2"):
+    with refused(f"{path.name} has 1 rows, wanted at least 2; record longer"):
         read_log(path, ["a"])
 
 
@@ -492,9 +492,8 @@ def test_other_suffixes_are_refused(tmp_path):
     known = ".csv, .parquet, .npz, .h5, .hdf5, .mat"
     for path in (tmp_path / "run.xlsx", "run.xlsx"):
         with refused(
-            f"run.xlsx: logs are {known}, .mcap, .db3 or .bag files, or the folder of a ROS 2 bag "
-            "or of a LeRobot dataset, "
-            "not '.xlsx'; convert it"
+            f"run.xlsx: the suffix is '.xlsx', wanted a log file of type {known}, .mcap, .db3 or "
+            ".bag, or the folder of a ROS 2 bag or of a LeRobot dataset; convert it"
         ):
             read_log(path, ["a"])
     written = known.replace(", .mat", " or .mat")

@@ -162,7 +162,7 @@ def test_full_turns_are_taken_out_of_free_joints_only():
     log = Log(t=t, q=wrapped, tau=angle, joints=("a", "b"))
     out = unwrap(log, np.array([True, False]))
     np.testing.assert_allclose(out.q, angle, atol=1e-12)
-    assert out.notes == ("full turns taken out of the angle of a",)
+    assert out.notes == ("full turns removed from the angle of a",)
     with pytest.raises(DataError, match=r"q_a jumps by a full turn at t = 1.58 s"):
         unwrap(log, np.array([False, False]))
 
@@ -203,7 +203,7 @@ def test_a_log_without_velocity_cannot_use_it():
 
 
 def test_a_log_too_short_for_its_trim_is_refused():
-    with pytest.raises(DataError, match="none of its 1 uninterrupted segments is long enough"):
+    with pytest.raises(DataError, match="none of its 1 segments without gaps is long enough"):
         process(sine_log(np.arange(0, 0.3, 0.01)), SignalSettings(trim=0.2))
 
 

@@ -134,7 +134,7 @@ def test_points_of_a_grid_are_numbered_from_its_start():
     segment = Segment(first=3, stop=904, start=1234.5, end=1243.5, number=2)
     grid = _Grid.of(segment, SignalSettings(rate=30.0, cutoff=5.0))
     # 100 rows a second are decimated after the filter: every third of 90 points a second
-    assert (grid.keep_every, grid.count) == (3, 811)
+    assert (grid.decimation, grid.count) == (3, 811)
     assert grid.rate == pytest.approx(90.0)
     assert (grid.start, grid.last) == (1234.5, pytest.approx(1243.5))
     for k in (0, 1, 7, 400, 810):
@@ -146,6 +146,6 @@ def test_points_of_a_grid_are_numbered_from_its_start():
             k + 1,
         ]
     coarse = _Grid.of(segment, SignalSettings(rate=30.0, cutoff=None))
-    assert (coarse.keep_every, coarse.count, coarse.rate) == (1, 271, pytest.approx(30.0))
+    assert (coarse.decimation, coarse.count, coarse.rate) == (1, 271, pytest.approx(30.0))
     rows = _Grid.of(segment, SignalSettings(rate=None, cutoff=None))
     assert (rows.step, rows.count, rows.start, rows.last) == (None, 901, 1234.5, 1243.5)

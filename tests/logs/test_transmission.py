@@ -126,16 +126,16 @@ def refused(text, kind=DataError):
         (
             {"matrix": ((1.0, 1.0), (2.0, 2.0))},
             "transmission of elbow, wrist: matrix [[1.0, 1.0], [2.0, 2.0]] is singular, so the "
-            "motors do not tell where the joints are. Each row is a motor",
+            "motor positions do not determine the joint positions. Each row is a motor",
         ),
         ({"matrix": (10.0, 0.0)}, "transmission of elbow, wrist: matrix [10.0, 0.0] is singular"),
         (
             {"matrix": ((1.0, 1.0),)},
             "transmission of elbow, wrist: matrix is [[1.0, 1.0]], wanted 2 rows of 2 numbers",
         ),
-        ({"motors": ("m2", "m2")}, "transmission: motors names m2 twice"),
+        ({"motors": ("m2", "m2")}, "transmission: motors contains m2 twice"),
         ({"motors": ("m2",)}, "transmission of elbow, wrist: motors has 1 entries, wanted 2"),
-        ({"efficiency": (0.9, 1.2)}, "transmission: efficiency of 'm3' is 1.2, wanted a share"),
+        ({"efficiency": (0.9, 1.2)}, "transmission: efficiency of 'm3' is 1.2, wanted more than 0"),
         ({"matrix": "file"}, "transmission: matrix is 'file', wanted rows of numbers"),
     ],
 )
@@ -148,7 +148,7 @@ def test_both_sides_of_one_joint_are_refused(tmp_path, motion):
     path = save(tmp_path / "run.csv", motor_side(motion) | {"q_wrist": motion["q"][:, 2]})
     text = (
         "run.csv has 'qm_m2' of a motor and 'q_wrist' of a joint that it drives, two position "
-        "columns of one transmission; remove one side"
+        "columns of one transmission; remove the columns of the motors"
     )
     with refused(text):
         read_log(path, JOINTS, transmissions=MOTORS)
@@ -157,7 +157,7 @@ def test_both_sides_of_one_joint_are_refused(tmp_path, motion):
 def test_motor_columns_without_gears_and_gears_without_a_motor_column_are_named(tmp_path, motion):
     table = motor_side(motion)
     path = save(tmp_path / "run.csv", table)
-    with pytest.raises(DataError, match=r"Columns of motors, as qm_m1, need the gears: \[\[trans"):
+    with pytest.raises(DataError, match=r"For columns of motors, as qm_m1, state \[\[trans"):
         read_log(path, JOINTS)
     del table["taum_m2"]
     with pytest.raises(DataError, match=r"^run.csv has no column 'taum_m2'; torque or current"):
@@ -168,7 +168,7 @@ def test_a_motor_or_joint_in_two_transmissions_is_refused(tmp_path, motion):
     path = save(tmp_path / "run.csv", motor_side(motion))
     for noun, other in (("motors m3", ("a", "m3")), ("joints wrist", ("wrist", "m4"))):
         more = Transmission(joints=other[:1], motors=other[1:], matrix=(1.0,))
-        with refused(f"several transmissions name the {noun}", SettingsError):
+        with refused(f"several transmissions contain the {noun}", SettingsError):
             read_log(path, JOINTS, transmissions=[*MOTORS, more])
 
 
@@ -181,7 +181,7 @@ def test_gear_ratios_of_the_urdf_are_used_only_if_asked_for():
     assert stated.stated({"wrist": 9.0}) is stated
     with refused(
         "transmission: matrix is 'urdf', but the URDF has no <transmission> with a "
-        "<mechanicalReduction> of elbow alone; it has one of wrist. State",
+        "<mechanicalReduction> only for elbow; it has one for wrist. State",
         SettingsError,
     ):
         asked.stated({"wrist": 80.0})

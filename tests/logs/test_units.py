@@ -111,5 +111,5 @@ def test_a_command_in_degrees_is_told_from_one_that_goes_far_along_a_slider(fact
     """Only a revolute joint has degrees."""
     far = log(q=0.5 * Q, q_ref=0.5 * Q * [1.0, factor], v=None)
     check_units(far, LogUnits(), prismatic=["b"])
-    with pytest.raises(DataError, match=r"qref_b moves \S+ times as far as q_b: one of them"):
+    with pytest.raises(DataError, match=r"qref_b is \S+ times that of q_b: one of them"):
         check_units(far, LogUnits(), prismatic=["a"])
