@@ -50,24 +50,24 @@ def tinted(text: str, word: str, tone: str, stream: TextIO) -> str:
     return text.replace(word, f"\x1b[{_TONES[tone]}m{word}\x1b[0m", 1)
 
 
-def wrapped(text: str, width: int | None, hang: str = "") -> str:
+def wrapped(text: str, width: int | None, indent: str = "") -> str:
     """Return text in lines no longer than a width; no word, path or number with unit is broken.
 
     Args:
         text: The text; its own lines stay, with their indentation.
         width: Characters of a line; None for as many as it has.
-        hang: What a line that goes on begins with, behind the indentation of its first.
+        indent: Further indentation of continued lines, after the indentation of the first line.
     """
     if width is None:
         return text
     lines = []
     whole = _PATH.sub(lambda found: found.group().replace(" ", "\0"), _UNIT.sub("\0", text))
     for line in whole.split("\n"):
-        indent = line[: len(line) - len(line.lstrip())] + hang
+        indentation = line[: len(line) - len(line.lstrip())] + indent
         lines += textwrap.wrap(
             line,
-            max(width, 2 * len(indent), 20),
-            subsequent_indent=indent,
+            max(width, 2 * len(indentation), 20),
+            subsequent_indent=indentation,
             break_long_words=False,
             break_on_hyphens=False,
         ) or [""]

@@ -1,4 +1,4 @@
-"""robotid compare: several results side by side."""
+"""robotid compare: compare several results."""
 
 import argparse
 import sys
@@ -7,13 +7,13 @@ from typing import Any
 
 from robotid._text import columns, in_digits_of, tinted
 from robotid.cli.flags import add_json
-from robotid.cli.printing import say, window_name
+from robotid.cli.printing import echo, window_name
 from robotid.cli.running import show_found
 from robotid.findings import listed
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "several results side by side"
+SUMMARY = "compare several results"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -52,10 +52,10 @@ def _show(content: dict[str, Any]) -> None:
     labels = [result["label"] for result in results]
     for result in results:
         verdict = result["verdict"]["status"]
-        said = f"{result['label']}  {verdict:7} {result['estimator']:10} "
-        print(tinted(f"{said}{result['path']}", verdict, verdict, sys.stdout))
+        line = f"{result['label']}  {verdict:7} {result['estimator']:10} {result['path']}"
+        print(tinted(line, verdict, verdict, sys.stdout))
     for note in content["notes"]:
-        say(f"- {note}", "  ")
+        echo(f"- {note}", "  ")
     alike = "" if content["fitted_alike"] else "; other recordings, not comparable"
     tables = [
         (f"not fitted: {window_name(entry['name'], entry)}, error %", entry["per_joint"])
@@ -64,23 +64,23 @@ def _show(content: dict[str, Any]) -> None:
     tables.append((f"fitted recordings of each, error %{alike}", content["fitted"]))
     for title, per_joint in tables:
         rows = [[e["joint"], *map(cell, e["relative_error_pct"])] for e in per_joint]
-        say(f"\n{title}", "  ")
+        echo(f"\n{title}", "  ")
         print("\n".join(columns(["joint", *labels], rows)))
     _print_base_parameters(content, labels)
     for key in ("settings", "versions"):
         for row in content[key]:
-            say(f"{key}: {row['name']}: {' | '.join(v or '-' for v in row['values'])}", "  ")
+            echo(f"{key}: {row['name']}: {' | '.join(v or '-' for v in row['values'])}", "  ")
     for row in content["inputs"]:
         if not all(row["in"]):
             read = listed(label for label, has in zip(labels, row["in"], strict=True) if has)
             name = row["path"] if row["start"] is None else window_name(row["path"], row)
-            say(f"only {read} read {name} ({row['role']})", "  ")
+            echo(f"only {read} read {name} ({row['role']})", "  ")
 
 
 def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) -> None:
-    say(
+    echo(
         "\nbase parameters to the second digit of their standard errors; last columns: difference "
-        f"to {labels[0]} over the combined standard error, the largest first"
+        f"to {labels[0]} divided by the combined standard error, in descending order"
     )
     rows = []
     for entry in content["base_parameters"]:

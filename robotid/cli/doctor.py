@@ -1,4 +1,4 @@
-"""robotid doctor: what is wrong with logs: JOB.toml, or URDF LOG ...."""
+"""robotid doctor: check logs for faults: JOB.toml, or URDF LOG ...."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from robotid.findings import Finding, grouped
 
 __all__ = ["SUMMARY", "add_flags", "run", "show"]
 
-SUMMARY = "what is wrong with logs: JOB.toml, or URDF LOG ..."
+SUMMARY = "check logs for faults: JOB.toml, or URDF LOG ..."
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def show(content: dict[str, Any], *, is_verbose: bool) -> None:
-    """Print what the doctor found.
+    """Print the findings of the doctor.
 
     Args:
         content: Findings and joints, as ``--json`` prints them.
@@ -55,7 +55,7 @@ def show(content: dict[str, Any], *, is_verbose: bool) -> None:
 
 
 def _worst_of(findings: Sequence[Mapping[str, Any]], joints: Sequence[str]) -> str:
-    """Return the joint that most errors are about, then warnings, then the gravest by figure."""
+    """Return the joint with the most errors, then the most warnings, then the largest figure."""
     ranks = dict.fromkeys(joints, (0, 0, 0.0))
     for finding in findings:
         (cause,) = grouped([Finding(**as_finding(finding))], joints)

@@ -143,7 +143,7 @@ def test_inspect_says_what_it_found_first_and_a_missing_file_once(tmp_path, caps
     assert main(["inspect", str(urdf)]) == 1
     printed = capsys.readouterr()
     assert printed.out.startswith("planar_2r: 2 joints: joint_1, joint_2\nerror: negative_mass: ")
-    assert printed.err == f"robotid: no model can be built from {urdf}; see the findings\n"
+    assert printed.err == f"robotid: {urdf} does not give a valid model; see the findings\n"
 
 
 def test_inspect_shows_base_parameters_where_they_are_asked_for(tmp_path, capsys):
@@ -229,7 +229,7 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
     doctor.show({"findings": wrong, "joints": joints}, is_verbose=False)
     assert capsys.readouterr().out.splitlines()[-1].endswith("worst: arm_6"), "two errors"
     doctor.show({"findings": [], "joints": joints}, is_verbose=False)
-    assert capsys.readouterr().out == "nothing was found\n"
+    assert capsys.readouterr().out == "no findings\n"
 
 
 CLOSED = {"no output": ">&-", "no errors": "2>&-", "neither": ">&- 2>&-"}

@@ -89,7 +89,7 @@ def test_columns_of_no_joint_are_left_out_and_named(tmp_path, log, capsys):
     assert done.ignored == ("temperature",)
     assert_same(read_log(tmp_path / "run.csv", JOINTS), log)
     assert main(["convert", str(tmp_path / "run.npz"), str(tmp_path / "run.csv")]) == 0
-    assert capsys.readouterr().out.endswith("\n  not of a joint, left out: temperature\n")
+    assert capsys.readouterr().out.endswith("\n  not written, not of a joint: temperature\n")
 
 
 @pytest.mark.parametrize(

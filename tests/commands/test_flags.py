@@ -89,7 +89,7 @@ def test_gains_are_stated_for_all_joints_or_by_joint():
 def test_a_command_without_a_log_names_what_it_wants(command, wanted):
     parser = argparse.ArgumentParser()
     command.add_flags(parser)
-    with pytest.raises(SettingsError, match=f"no .* was given; wanted {wanted}"):
+    with pytest.raises(SettingsError, match=f"no .* is given; wanted {wanted}"):
         job_from_flags(parser.parse_args(["robot.urdf"]))
 
 
@@ -97,7 +97,7 @@ def test_a_flag_of_zero_is_a_flag_beside_a_job_file(tmp_path):
     parser = argparse.ArgumentParser()
     identify.add_flags(parser)
     options = parser.parse_args([str(tmp_path / "job.toml"), "--min-velocity", "0"])
-    with pytest.raises(SettingsError, match="leave out"):
+    with pytest.raises(SettingsError, match="Remove --min-velocity"):
         job_from_flags(options)
 
 

@@ -191,7 +191,7 @@ def test_a_track_gives_parameters_over_time_and_marks_the_load(panda, tmp_path, 
 def test_flags_that_a_result_states_are_refused(folder, capsys):
     code, _ = run(folder, folder / "log.csv", folder / "out", "--rate", "100")
     assert code == 2
-    assert "a RESULT says how its logs are read; leave out --rate" in capsys.readouterr().err
+    assert "a RESULT states how its logs are read; remove --rate" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def test_identify_finds_the_truth_that_stands_beside_the_log(folder, ur5, capsys
     assert code == 0
     said = capsys.readouterr().out
     assert "written" in said
-    assert "no noise was added to the torques" in said
+    assert "the torques have no noise" in said
     log = read_log(folder / "log.parquet", ur5.joints)
     assert (len(log.t), truth["samples"], truth["duration"]) == (1601, 1601, 8.0)
     found = identify(ur5, [log], friction="viscous+coulomb", doctor=False)
@@ -193,7 +193,7 @@ def test_a_plant_file_is_checked_key_by_key(folder, capsys):
         ("[sensor]\nnoise = 1", "sensor is not a known key; did you mean 'sensors'?"),
         ("[sensors.noise]\nq = 'much'", "sensors.noise.q is 'much', wanted a number"),
         ("[actuator]\nbacklash = 0.1", "backlash is of elastic gears; state their stiffness too"),
-        ("[drives]\nelbow_joint = ['stribeck']", "a plant states its terms with their shapes"),
+        ("[drives]\nelbow_joint = ['stribeck']", "wanted a term with its shape"),
         ("rate = ", "is not valid TOML"),
     ):
         (folder / "wrong.toml").write_text(text)
