@@ -45,7 +45,7 @@ def check_path(path: str | Path) -> None:
         raw = b"\0"
     if b"\0" in raw or len(raw) > _LONGEST_PATH:
         raise SettingsError(
-            f"{str(path)[:_SHOWN]!r} cannot name a file: wanted UTF-8 without NUL, at most "
+            f"{str(path)[:_SHOWN]!r} is not a valid path, wanted UTF-8 without NUL, at most "
             f"{_LONGEST_PATH} bytes"
         )
     name = max(raw.split(os.fsencode(os.sep)), key=len)

@@ -92,7 +92,7 @@ def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
             "jerk of 'wrist_1_joint' is 1e+300, wanted",
         ),
         (["--box", "post=0,0,0,1,1,nan"], "the lower and the upper corner [m], within 1000 m"),
-        (["--criterion", "widest"], "criterion is widest, which is about what logs have told"),
+        (["--criterion", "widest"], "criterion is widest, which needs an earlier result"),
     ],
 )
 def test_bad_flags_are_refused_before_anything_is_written(tmp_path, capsys, words, message):

@@ -110,7 +110,7 @@ def test_help_shows_the_flags_that_do_something(command, without):
     command.add_flags(parser)
     shown = " ".join(parser.format_help().split())
     assert not [flag for flag in without if flag in shown]
-    assert "auto: what held-out segments of the fitted logs ask for" in shown
+    assert "auto: selected per joint by the error on held-out segments of the fitted logs" in shown
     assert all(family in shown for family in FAMILIES)
 
 
@@ -118,7 +118,7 @@ def test_help_names_each_estimator_once():
     parser = argparse.ArgumentParser()
     identify.add_flags(parser)
     words = parser.format_help().replace("\n", " ")
-    names = words.split("which estimator: ")[1].split("--")[0].replace("(default)", "").split(",")
+    names = words.split("estimator: ")[1].split("--")[0].replace("(default)", "").split(",")
     names = [name.strip() for name in names]
     assert sorted(names) == sorted(ESTIMATORS)
     assert parser.parse_args(["robot.urdf", "--no-report", "--dynamics"]).no_report is False

@@ -133,10 +133,10 @@ def test_what_is_missing_is_named(files, capsys):
     said = asked(capsys, loaded, "--reference", files / "out", "--cutoff", "5", code=2)
     assert "a RESULT states how its logs are read; remove --cutoff" in said
     said = asked(capsys, loaded, "--reference", files / "out", "--reference", bare, code=2)
-    assert "one result is a reference by itself" in said
+    assert "wanted one result alone, or logs" in said
     said = asked(capsys, loaded, "--reference", bare, "--mass", "heavy", code=2)
     assert "--mass 'heavy': wanted KG or LINK=KG" in said
-    with pytest.raises(SettingsError, match=r"of which of the links a, b\?"):
+    with pytest.raises(SettingsError, match=r"the link is ambiguous, wanted one of a, b"):
         stated_masses(["2"], ["a", "b"])
     content = bare.read_bytes()
     try:
@@ -144,7 +144,7 @@ def test_what_is_missing_is_named(files, capsys):
         said = asked(capsys, loaded, "--reference", files / "out", code=1)
     finally:
         bare.write_bytes(content)
-    assert "is not there any more or was changed; give a log without the payload" in said
+    assert "is missing or was changed; give a log without the payload" in said
 
 
 def test_friction_that_the_reference_shows_is_that_of_the_payload_s_logs(upright, tmp_path, capsys):

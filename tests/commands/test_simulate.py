@@ -169,7 +169,7 @@ def test_a_sampled_motion_is_the_one_it_was_sampled_from(ur5):
 
 
 ERRORS = {
-    "duration is 9 s, but the motion lasts 8 s": ["--duration", "9"],
+    "duration is 9 s, wanted at most the 8 s of the motion": ["--duration", "9"],
     "logs are written as .csv": ["--out", "log.txt"],
     "controller: kind is 'pid', wanted one of feedforward, pd": ["--controller", "pid"],
     "there is no file of a plant": ["--plant", "nowhere.toml"],

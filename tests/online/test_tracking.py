@@ -102,7 +102,7 @@ def test_a_log_without_motion_is_refused(panda, tmp_path):
 
 def test_a_filter_is_needed(panda, log_file, tmp_path, capsys):
     assert main([*words(panda, log_file, str(tmp_path)), "--cutoff", "false"]) == 2
-    assert "it needs a cutoff" in capsys.readouterr().err
+    assert "state a cutoff in Hz" in capsys.readouterr().err
 
 
 def test_real_recordings_are_tracked_without_a_false_alarm(recordings, monkeypatch):
