@@ -101,7 +101,7 @@ def test_a_file_in_place_of_the_folder_is_refused_before_the_fit(arm, tmp_path):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b'{"schema_version":1,"verdict":{}}', "has no entry 'robotid': it is not whole"),
+        (b'{"schema_version":1,"verdict":{}}', "has no entry 'robotid': the file is incomplete"),
         (b"\xff\xfe", "is not JSON"),
     ],
 )

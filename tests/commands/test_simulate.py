@@ -207,7 +207,7 @@ def test_a_robot_that_cannot_be_a_urdf_leaves_no_file(folder, capsys):
     words = ["--controller", "perfect", "--perturb", "5", "--lock", "elbow_joint=0.5"]
     code, _ = simulated(folder, *words, "--urdf", f"{folder}/never.urdf", out="never.csv")
     assert code == 1
-    assert "would be no possible body" in " ".join(capsys.readouterr().err.split())
+    assert "would be physically impossible" in " ".join(capsys.readouterr().err.split())
     assert not list(folder.glob("never*"))
 
 
