@@ -109,7 +109,7 @@ def test_a_result_that_must_not_be_used_is_not_exported(result, tmp_path, capsys
 def test_a_place_that_cannot_be_written_is_named(result, tmp_path, capsys):
     code, _, err = export(result, "mjcf", tmp_path / "none" / "a.xml", capsys)
     assert code == 1
-    assert "there is no folder" in err
+    assert "does not exist; create it" in err
     code, _, err = export(result, "sdf", tmp_path, capsys)
     assert code == 2
     assert "is a folder, wanted a file to write" in err

@@ -66,7 +66,9 @@ def test_each_format_is_read_back_by_its_consumer(kind, result, tmp_path):
 
 
 def test_the_pages_name_each_format():
-    readme, page = (path.read_text() for path in (ROOT / "README.md", DOCS / "simulators.md"))
+    readme, page = (
+        path.read_text() for path in (ROOT / "README.md", DOCS / "reference" / "export_formats.md")
+    )
     for kind in FORMATS:
         assert re.search(rf"`{kind}`|--format {kind} ", readme)
         assert f"--format {kind} --out" in page
