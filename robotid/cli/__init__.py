@@ -17,6 +17,7 @@ from robotid.cli.console import (
     shown_log,
     terminations_raised,
 )
+from robotid.cli.parser import CommandParser
 from robotid.exceptions import RobotIdError, SettingsError
 from robotid.versions import __version__
 
@@ -29,7 +30,8 @@ _OBJECTS = 50_000
 _MMAP_THRESHOLD, _LARGE = -3, 2**25  # [bytes], the maximum that glibc accepts
 _TRIM_THRESHOLD, _SPARE = -1, 2**26  # [bytes]
 
-#: The commands in the order of the help. Each is a module with SUMMARY, add_flags and run.
+#: The commands in the order of the help. Each is a module with SUMMARY, add_flags and run; one with
+#: many flags also has MAIN_FLAGS and EXAMPLES, for its short help.
 COMMANDS = (
     "demo", "paper", "inspect", "identify", "track", "excite", "preview", "replay", "doctor",
     "validate", "payload", "report", "compare", "export", "simulate", "convert", "schema",
@@ -107,7 +109,7 @@ def _complete() -> None:
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     """Return the parser of a command line; it has one command if the line starts with a command."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="robotid",
         description="Identify a robot's inertial and drive parameters from its URDF and motion "
         "logs.",
@@ -122,4 +124,6 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
         command.set_defaults(run=module.run)
         if name == chosen:
             module.add_flags(command)
+            if hasattr(module, "MAIN_FLAGS"):
+                command.shorten_help(module.MAIN_FLAGS, module.EXAMPLES)
     return parser

@@ -1,12 +1,12 @@
 """robotid compare: compare several results."""
 
 import argparse
-import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
-from robotid._text import columns, in_digits_of, tinted
-from robotid.cli.flags import add_json
+from robotid._text import columns, in_digits_of
+from robotid.cli.flags import add_json, add_verbose
 from robotid.cli.printing import echo, window_name
 from robotid.cli.running import show_found
 from robotid.findings import listed
@@ -14,6 +14,7 @@ from robotid.findings import listed
 __all__ = ["SUMMARY", "add_flags", "run"]
 
 SUMMARY = "compare several results"
+_SHOWN = 12  # base parameters in the table, so that two results fit a screen
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -26,6 +27,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("results", nargs="+", metavar="RESULT.json")
     add("--out", metavar="FILE.html", help="page to write")
     add_json(parser)
+    add_verbose(parser, "print all base parameters")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -40,12 +42,12 @@ def run(options: argparse.Namespace) -> None:
         content = write_comparison(options.results, options.out)
     else:
         content = compare_results(options.results)
-    show_found(content, options, _show)
+    show_found(content, options, partial(_show, is_verbose=options.verbose))
     if options.out and not options.json:
         print(f"\nwritten to {options.out}")
 
 
-def _show(content: dict[str, Any]) -> None:
+def _show(content: dict[str, Any], *, is_verbose: bool = False) -> None:
     from robotid.identification.summary import cell
 
     results = content["results"]
@@ -53,7 +55,7 @@ def _show(content: dict[str, Any]) -> None:
     for result in results:
         verdict = result["verdict"]["status"]
         line = f"{result['label']}  {verdict:7} {result['estimator']:10} {result['path']}"
-        print(tinted(line, verdict, verdict, sys.stdout))
+        echo(line, "   ", verdict)
     for note in content["notes"]:
         echo(f"- {note}", "  ")
     alike = "" if content["fitted_alike"] else "; other recordings, not comparable"
@@ -66,7 +68,7 @@ def _show(content: dict[str, Any]) -> None:
         rows = [[e["joint"], *map(cell, e["relative_error_pct"])] for e in per_joint]
         echo(f"\n{title}", "  ")
         print("\n".join(columns(["joint", *labels], rows)))
-    _print_base_parameters(content, labels)
+    _print_base_parameters(content, labels, None if is_verbose else _SHOWN)
     for key in ("settings", "versions"):
         for row in content[key]:
             echo(f"{key}: {row['name']}: {' | '.join(v or '-' for v in row['values'])}", "  ")
@@ -77,13 +79,16 @@ def _show(content: dict[str, Any]) -> None:
             echo(f"only {read} read {name} ({row['role']})", "  ")
 
 
-def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) -> None:
+def _print_base_parameters(
+    content: Mapping[str, Any], labels: Sequence[str], limit: int | None
+) -> None:
     echo(
         "\nbase parameters to the second digit of their standard errors; last columns: difference "
         f"to {labels[0]} divided by the combined standard error, in descending order"
     )
     rows = []
-    for entry in content["base_parameters"]:
+    entries = content["base_parameters"]
+    for entry in entries[:limit]:
         pairs = zip(entry["values"], entry["std_errors"], strict=True)
         values = ["-" if x is None else in_digits_of(x, error)[0] for x, error in pairs]
         differences = [
@@ -92,3 +97,5 @@ def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) ->
         rows.append([entry["name"], *values, entry["unit"], *differences])
     heads = ["", *labels, "", *[f"{label}-{labels[0]}" for label in labels[1:]]]
     print("\n".join(columns(heads, rows, left=(0, len(labels) + 1))))
+    if len(entries) > len(rows):
+        echo(f"  {len(entries) - len(rows)} more with smaller differences: --verbose", "  ")

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 from robotid.cli.flags import add_job, job_from_flags
-from robotid.cli.printing import as_finding, print_causes
+from robotid.cli.printing import as_finding, echo, print_causes
 from robotid.cli.running import progress_of, show_found
 from robotid.findings import Finding, grouped
 
@@ -39,19 +39,24 @@ def run(options: argparse.Namespace) -> int:
         model = job.model()
         findings = examine(job, model, progress=progress)
     content = findings_to_dict(findings) | {"joints": list(model.joints)}
-    show_found(content, options, partial(show, is_verbose=options.verbose))
+    logs = len({entry.path for entry in (*job.identification, *job.validation)})
+    show_found(content, options, partial(show, is_verbose=options.verbose, logs=logs))
     return 1 if blocking(findings, job.ignore) else 0
 
 
-def show(content: dict[str, Any], *, is_verbose: bool) -> None:
-    """Print the findings of the doctor.
+def show(content: dict[str, Any], *, is_verbose: bool, logs: int) -> None:
+    """Print the findings of the doctor, or that there is no fault.
 
     Args:
         content: Findings and joints, as ``--json`` prints them.
         is_verbose: Whether to print notes, too.
+        logs: Number of examined logs.
     """
     findings, joints = content["findings"], content["joints"]
-    print_causes(findings, joints, is_verbose=is_verbose, worst=_worst_of(findings, joints))
+    worst = _worst_of(findings, joints)
+    print_causes(findings, joints, is_verbose=is_verbose, worst=worst, none="")
+    if all(finding["severity"] == "note" for finding in findings):
+        echo(f"no fault found in {logs} {'log' if logs == 1 else 'logs'}")
 
 
 def _worst_of(findings: Sequence[Mapping[str, Any]], joints: Sequence[str]) -> str:

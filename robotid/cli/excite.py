@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from robotid._settings import Settings
 from robotid.cli.console import terminal_progress
 from robotid.cli.flags import JOB, ROBOT, Flags, add_json, add_progress, job_from_flags
-from robotid.cli.printing import echo
+from robotid.cli.printing import echo, print_files
 from robotid.cli.running import show_found
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
@@ -17,9 +17,17 @@ if TYPE_CHECKING:
     from robotid.excitation.settings import MotionSettings
 
 
-__all__ = ["SUMMARY", "add_flags", "run"]
+__all__ = ["EXAMPLES", "MAIN_FLAGS", "SUMMARY", "add_flags", "run"]
 
 SUMMARY = "design an excitation trajectory within the robot's limits"
+MAIN_FLAGS = (
+    "--out", "--report", "--given", "--kind", "--link", "--mass", "--duration", "--share",
+    "--clearance", "--floor", "--joints", "--lock",
+)  # fmt: skip
+EXAMPLES = (
+    "robotid excite robot.urdf --out motion.csv --report motion.html",
+    "robotid excite robot.urdf --kind payload --link tool0 --mass 2 --out m.csv",
+)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -60,8 +68,8 @@ def run(options: argparse.Namespace) -> None:
             given=options.given, report=options.report, progress=progress,
         )  # fmt: skip
     show_found(found, options, _show)
-    if options.report and not options.json:
-        print(f"\nwritten to {options.report}")
+    if not options.json:
+        print_files("", [options.out, *([options.report] if options.report else [])])
 
 
 def motion_settings(options: argparse.Namespace) -> "MotionSettings":

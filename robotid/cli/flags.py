@@ -246,7 +246,8 @@ def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
         parser: The parser.
         folder: The default.
     """
-    parser.add_argument("--out", default=folder, metavar="DIR", help="folder to write to")
+    words = f"folder to write to; default: {folder}"
+    parser.add_argument("--out", default=folder, metavar="DIR", help=words)
 
 
 def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> None:

@@ -17,9 +17,17 @@ from robotid.cli.printing import (
 )
 from robotid.cli.running import progress_of, show_found
 
-__all__ = ["SUMMARY", "add_flags", "run", "show_result"]
+__all__ = ["EXAMPLES", "MAIN_FLAGS", "SUMMARY", "add_flags", "run", "show_result"]
 
 SUMMARY = "identify a robot: JOB.toml, or URDF LOG [LOG ...]"
+MAIN_FLAGS = (
+    "--validate", "--out", "--estimator", "--friction", "--gain", "--joints", "--lock", "--cutoff",
+    "--verbose", "--json",
+)  # fmt: skip
+EXAMPLES = (
+    "robotid identify robot.urdf first.csv --validate second.csv --out result",
+    "robotid identify job.toml --out result",
+)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:

@@ -88,7 +88,7 @@ def print_causes(
         is_verbose: Whether notes are printed.
         worst: The worst joint, with its figure.
         printed: Messages that are printed elsewhere.
-        none: The text if there is no finding.
+        none: The text if there is no finding; no line if it is empty.
     """
     shown = [f for f in findings if is_verbose or f["severity"] != "note"]
     causes = grouped([Finding(**as_finding(f)) for f in shown], joints)
@@ -101,7 +101,8 @@ def print_causes(
     if shown:
         count = f"{_some(len(shown), 'finding')}, {_some(len(causes), 'cause')}"
         notes = count + (f"; worst: {worst}" if worst else "") + (f"; {notes}" if notes else "")
-    echo(notes or none)
+    if summary := notes or none:
+        echo(summary)
 
 
 def as_finding(found: Mapping[str, Any]) -> dict[str, Any]:

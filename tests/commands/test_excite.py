@@ -69,6 +69,7 @@ def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
     assert "collision" not in said
     assert "1 start in " in said
     assert "not converged: increase --seconds" in " ".join(said.split())
+    assert said.endswith(f"\nwritten:\n  {tmp_path / 'motion.yaml'}\n")
     assert (tmp_path / "motion.yaml").read_text().startswith("joint_names: [wrist_1_joint, ")
 
 
