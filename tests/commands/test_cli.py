@@ -72,6 +72,7 @@ def test_result_json_has_the_promised_shape(identified, logs):
         "poorly_excited": False,
         "undetermined": [],
         "indistinguishable": [],
+        "not_told_apart": [],  # the former name
     }
     assert len(result["base_parameters"]) == 58
     assert set(result["base_parameters"][0]) == {
@@ -396,7 +397,7 @@ def test_inspect_of_an_unusable_urdf_says_why(capsys, tmp_path):
     assert main(["inspect", str(example_urdf("ur3.urdf")), "--json"]) == 1
     printed = capsys.readouterr()
     assert json.loads(printed.out)["structure"] is None
-    assert "no model can be built" in printed.err
+    assert "does not give a valid model; see the findings" in printed.err
 
 
 def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys):
