@@ -73,9 +73,7 @@ def main():
             if name != "wls" and (DATA is None or "simulated" not in title):
                 (shorts if "short" in title else ratios)[name].append((ratio, seconds))
     print("\n### Error divided by that of WLS, geometric mean over joints and recordings\n")
-    print(
-        "| fit | segments | short segments | worst segment | worst short one | s per identification |"
-    )
+    print("| fit | segments | short segments | worst segment | worst short one | s per fit |")
     print("|---|---|---|---|---|---|")
     for name in names:
         cells = [summary(ratios[name], mean), summary(shorts[name], mean)]

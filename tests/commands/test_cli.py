@@ -376,7 +376,7 @@ def test_rounded_angles_are_named_and_snapped_where_asked(tmp_path, rng, capsys)
 
 def test_no_log_is_wrong_usage(capsys):
     assert main(["identify", URDF]) == 2
-    assert "no log was given" in capsys.readouterr().err
+    assert "no log is given" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         main(["identfy"])
 
