@@ -181,8 +181,8 @@ def _expected(
     t = np.arange(round(design.duration * settings.points) + 1) / settings.points
     q, v, a = design.motion.evaluate(np.minimum(t, design.duration))
     log = Log(t, q, np.zeros_like(q), model.joints, v, a, path)
-    held = hold_log(model, log, job.signals)
-    return preview_logs(model, [held], job.estimator, noise=settings.noise, run=run)
+    in_memory = hold_log(model, log, job.signals)
+    return preview_logs(model, [in_memory], job.estimator, noise=settings.noise, run=run)
 
 
 def _content(

@@ -387,7 +387,7 @@ def test_a_log_without_commands_is_refused(leg):
     bare = replace(log, q_ref=None)
     with pytest.raises(DataError, match=r"has no commands, which the estimator 'simulation'"):
         identify_loops(robot.model, [bare], [], stated(robot), SETTINGS)
-    with pytest.raises(DataError, match="no log is given"):
+    with pytest.raises(DataError, match="no log was given"):
         identify_loops(robot.model, [], [], stated(robot), SETTINGS)
 
 

@@ -112,7 +112,7 @@ def test_data_that_excite_too_little_are_refused_by_least_squares_only(ur5, rng)
 
 
 def test_no_log_and_too_few_rows_are_refused(ur5, rng):
-    with pytest.raises(DataError, match="no log is given"):
+    with pytest.raises(DataError, match="no log was given"):
         identify(ur5, [])
     short = exact_log(ur5, truth(ur5), rng, samples=9)
     with pytest.raises(DataError, match="54 torque rows for 58 parameters"):

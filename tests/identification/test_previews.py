@@ -416,5 +416,5 @@ def test_a_static_model_is_previewed_too(motion):
 
 
 def test_nothing_to_preview_is_refused(ur5):
-    with pytest.raises(DataError, match="no motion is given"):
+    with pytest.raises(DataError, match="no motion was given"):
         preview(ur5, [])

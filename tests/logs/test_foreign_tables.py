@@ -188,7 +188,7 @@ def test_identify_takes_paths_and_frames_and_finds_what_it_finds_in_logs(ur5, tm
     assert [f.code for f in robotid.check_logs(ur5, tmp_path / "first.csv")] == [
         f.code for f in robotid.check_logs(ur5, [first])
     ]
-    with pytest.raises(DataError, match="no log is given; at least one is needed"):
+    with pytest.raises(DataError, match="no log was given; at least one is needed"):
         robotid.identify(ur5, [])
     with pytest.raises(ModelError, match="model is a NoneType, wanted a RobotModel or the path"):
         robotid.identify(None, first)
