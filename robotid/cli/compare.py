@@ -88,6 +88,8 @@ def _print_base_parameters(
     )
     rows = []
     entries = content["base_parameters"]
+    if limit is not None and len(entries) == limit + 1:  # a row is as long as its replacement
+        limit = None
     for entry in entries[:limit]:
         pairs = zip(entry["values"], entry["std_errors"], strict=True)
         values = ["-" if x is None else in_digits_of(x, error)[0] for x, error in pairs]
