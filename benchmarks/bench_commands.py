@@ -95,27 +95,35 @@ SO101_JOINTS = {
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="few runs of one robot: a try-out")
-    parser.add_argument("--go2", action="store_true", help="a quadruped, beside mujoco.sysid")
+    parser.add_argument("--quick", action="store_true", help="few runs of one robot, as a trial")
+    parser.add_argument(
+        "--go2", action="store_true", help="a quadruped, compared with mujoco.sysid"
+    )
     parser.add_argument("--so101", action="store_true", help="an arm of six servos")
-    parser.add_argument("--arms", action="store_true", help="arms that their torque drives")
-    parser.add_argument("--rollouts", action="store_true", help="speed, beside MuJoCo")
+    parser.add_argument("--arms", action="store_true", help="arms whose input is the logged torque")
+    parser.add_argument("--rollouts", action="store_true", help="speed, compared with MuJoCo")
     parser.add_argument(
-        "--coverage", type=int, metavar="RUNS", help="intervals beside a known truth"
+        "--coverage", type=int, metavar="RUNS", help="coverage of intervals for a known truth"
     )
     parser.add_argument(
-        "--robots", nargs="+", default=["planar", "leg", "arm"], help="of --coverage"
+        "--robots", nargs="+", default=["planar", "leg", "arm"], help="for --coverage"
     )
     parser.add_argument(
-        "--with-torque", action="store_true", help="of --coverage, again with logged torques"
+        "--with-torque", action="store_true", help="for --coverage, also with logged torques"
     )
     parser.add_argument(
-        "--driven", action="store_true", help="of --coverage, again driven by the logged torque"
+        "--driven", action="store_true", help="for --coverage, also with the logged torque as input"
     )
-    parser.add_argument("--held", type=int, metavar="RUNS", help="the same of held commands")
-    parser.add_argument("--bits", type=int, default=14, help="of the encoders of --held, a turn")
-    parser.add_argument("--sysid-steps", type=int, default=30, help="most steps; 0: as published")
-    parser.add_argument("--out", type=Path, help="folder that bench_commands.json is written to")
+    parser.add_argument(
+        "--held", type=int, metavar="RUNS", help="coverage for commands with a zero-order hold"
+    )
+    parser.add_argument(
+        "--bits", type=int, default=14, help="bits per revolution of the encoders, for --held"
+    )
+    parser.add_argument(
+        "--sysid-steps", type=int, default=30, help="maximum number of steps; 0: as published"
+    )
+    parser.add_argument("--out", type=Path, help="folder for bench_commands.json")
     options = parser.parse_args()
     parts = {
         "go2": options.go2 and (lambda: go2(options.sysid_steps)),
@@ -197,7 +205,7 @@ def go2(sysid_steps):
         theirs, count, steps, their_time = sysid_fit(found, sysid_steps)
         beside.insert(0, (f"mujoco.sysid, {count} parameters, {steps} steps here", theirs))
     joints = found.model.joints
-    print(f"| open loop on the rest of the chirp, error in mrad | {' | '.join(joints)} | ratio |")
+    print(f"| simulated position error, rest of the chirp, mrad | {' | '.join(joints)} | ratio |")
     print("|---" * (len(joints) + 2) + "|")
     count_of_ours = len(found.fit.estimate.theta)
     table = [(f"robotid, {count_of_ours} parameters", ours), *beside]
@@ -205,10 +213,8 @@ def go2(sysid_steps):
         ratio = "" if errors is ours else f"{geometric_mean(ours / errors):.3f}"
         print(f"| {who} | {' | '.join(f'{e:.1f}' for e in errors)} | {ratio} |")
     times = {"robotid": took} | ({"mujoco.sysid": their_time} if sysid_steps else {})
-    said = [
-        f"{who} {t[0]:.0f} s of the wall, {t[1]:.0f} s of processor" for who, t in times.items()
-    ]
-    print(f"\nRatio: geometric mean of robotid's error over theirs. {'; '.join(said)}.")
+    said = [f"{who} {t[0]:.0f} s wall clock, {t[1]:.0f} s of processor" for who, t in times.items()]
+    print(f"\nRatio: geometric mean of robotid's error divided by theirs. {'; '.join(said)}.")
     print(f"{found.fit.estimate.message}.\n", flush=True)
     return {
         "errors_mrad": {who: list(errors) for who, errors in table},
@@ -338,7 +344,9 @@ def so101():
         f"[controller.groups]\nservo = [{groups}]\n[columns]\n{columns}"
         + "".join(f'[[{what}]]\nlog = "{folder / name}.parquet"\n' for what, name in entries)
     )
-    print(f"| validation motion, error in mrad | {' | '.join(found.model.joints)} | ratio |")
+    print(
+        f"| validation motion, position error in mrad | {' | '.join(found.model.joints)} | ratio |"
+    )
     print("|---" * (len(found.model.joints) + 2) + "|")
     ratios, rows = [], {}
     for (name, plain), run in zip(SO101_PLAIN.items(), found.validation, strict=True):
@@ -351,14 +359,14 @@ def so101():
     by_joint = [geometric_mean(own) for own in np.array(ratios).T]
     whole = geometric_mean(ratios)
     print(f"| ratio | {' | '.join(f'{x:.2f}' for x in by_joint)} | {whole:.3f} |")
-    print(f"\n{took[0]:.0f} s of the wall, {took[1]:.0f} s of processor; "
+    print(f"\n{took[0]:.0f} s wall clock, {took[1]:.0f} s of processor; "
           f"{found.fit.estimate.message}.\n", flush=True)  # fmt: skip
     return {"errors_mrad": rows, "ratio": whole, "by_joint": by_joint, "seconds": list(took)}
 
 
 def arms():
-    """Print what rows of torque, roll-outs and both make of validation logs; return the figures."""
-    print("| robot | fitted to | torque missed, N m | 0.5 s position missed, mrad "
+    """Print validation errors of fits to torque rows, simulations and both; return the figures."""
+    print("| robot | fitted to | torque error, N m | position error over 0.5 s, mrad "
           "| torque, ratio | position, ratio | processor, s |")  # fmt: skip
     print("|---" * 7 + "|")
     found = {}
@@ -380,7 +388,7 @@ def arms():
     found["simulated"] = arm_rows(
         "simulated UR5", plant.model, logs[:1], logs[1:], signals, drive_pi(plant)
     )
-    print("\nRatio: geometric mean over the joints of the error over that of torque rows alone.\n")
+    print("\nRatio: geometric mean over joints of the error divided by that of torque rows.\n")
     return found
 
 
@@ -443,10 +451,10 @@ def torque_mismatch(model, pi, logs, signals):
 
 
 def rollouts(seconds):
-    """Print how many roll-outs of a second are done in a second; return the figures."""
-    print("| robot, 1 kHz | roll-outs in a second: robotid, 1 thread | 2 threads "
+    """Print the simulations of 1 s per second; return the figures."""
+    print("| robot, 1 kHz | simulations per second: robotid, 1 thread | 2 threads "
           "| MuJoCo, 1 thread | 2 threads "
-          "| robotid over MuJoCo | gradient, roll-outs | by parameters |")  # fmt: skip
+          "| robotid over MuJoCo | gradient, simulations | by parameters |")  # fmt: skip
     print("|---" * 8 + "|")
     rows = []
     for name in ("arm", "quadruped"):
@@ -521,9 +529,10 @@ def drive_pi(plant):
 def coverage(
     robots, runs, seconds=DURATION, *, with_torque=False, driven=False, bits=None
 ):  # fmt: skip
-    """Print how well intervals hold the truth, by robot and kind of parameter; return the rows."""
-    print(f"| robot, {runs} runs | parameter | values | mean error over scatter | error said over "
-          "scatter | 95 % intervals hold | said, over no torque's | error, likewise |")  # fmt: skip
+    """Print the coverage of intervals, by robot and kind of parameter; return the rows."""
+    print(f"| robot, {runs} runs | parameter | values | mean error / scatter | stated error / "
+          "scatter | 95 % interval coverage | stated / without torque "
+          "| error / without torque |")  # fmt: skip
     print("|---" * 8 + "|")
     rows = []
     for name in robots:

@@ -1,4 +1,4 @@
-"""One start of a design: how fast it settles, and what it leaves of limits.
+"""One start of a design: its time to converge, and its margins to limits.
 
     python benchmarks/bench_designs.py [--quick]
 
@@ -76,7 +76,7 @@ def gradient_row(name, task, repeats):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="one robot, few motions: a try-out")
+    parser.add_argument("--quick", action="store_true", help="one robot, few motions, as a trial")
     options = parser.parse_args()
     cases, count, seeds = (CASES[1:], 20, 1) if options.quick else (CASES, 500, 5)
     initialised = time.process_time()
@@ -84,8 +84,8 @@ def main():
     start = time.process_time() - initialised
     tasks = {name: designer(name) for name in cases}
     print(
-        f"| robot | best of {count} random | design | condition | better than those after "
-        "| settled: median of some seeds | margin: position | velocity | torque | distance |"
+        f"| robot | best of {count} random | design | condition | better than random after "
+        "| converged: median of some seeds | margin: position | velocity | torque | distance |"
     )
     print("|---" * 10 + "|")
     for name, task in tasks.items():
@@ -97,7 +97,7 @@ def main():
     print("|---" * 6 + "|")
     for name, task in tasks.items():
         print(gradient_row(name, task, 3 if options.quick else 20))
-    print(f"\nTo import Numba: {start:.1f} s.\n\n{setting.machine()}")
+    print(f"\nImport of Numba: {start:.1f} s.\n\n{setting.machine()}")
 
 
 if __name__ == "__main__":

@@ -74,7 +74,7 @@ def clean(seeds):
 
 
 def spoilt(seeds):
-    print(f"\nspoilt logs of a UR5, {len(seeds)} seeds each\n")
+    print(f"\ncorrupted logs of a UR5, {len(seeds)} seeds each\n")
     print("| corruption | wanted | found | other findings above a note |\n|---|---|---|---|")
     model = robot("ur5")
     tables = [table_of(clean_log(model, seed)) for seed in seeds]
@@ -88,7 +88,7 @@ def spoilt(seeds):
         hits += found
         side = ", ".join(f"{code} {count}/{len(seeds)}" for code, count in other.most_common())
         print(f"| {name} | {', '.join(case.codes)} | {found}/{len(seeds)} | {side or '-'} |")
-    print(f"\nfound by their own code: {hits} of {len(CASES) * len(seeds)}")
+    print(f"\nfound with the right code: {hits} of {len(CASES) * len(seeds)}")
 
 
 def examine_table(case, table):
@@ -122,7 +122,7 @@ def payload(seeds):
             found += "payload" in loud(findings)
             estimates += [f.evidence["mass"] for f in findings if f.code == "payload"]
         mean = f"{sum(estimates) / len(estimates):.2f}" if estimates else "-"
-        print(f"| {mass:g} kg beside the 1.2 kg tool | {found}/{len(seeds)} | {mean} |")
+        print(f"| {mass:g} kg in addition to the 1.2 kg tool | {found}/{len(seeds)} | {mean} |")
 
 
 def loaded_log(model, seed, mass):

@@ -202,13 +202,15 @@ def against_time(name, task, budgets, count):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--robots", action="store_true", help="twelve robots to the end, too")
-    parser.add_argument("--quick", action="store_true", help="little time and one robot: a try-out")
+    parser.add_argument("--robots", action="store_true", help="also twelve robots to convergence")
+    parser.add_argument(
+        "--quick", action="store_true", help="short times and one robot, as a trial"
+    )
     options = parser.parse_args()
     cases = CASES[1:] if options.quick else CASES
     budgets, count = ((1,), 10) if options.quick else ((1, 10, 60), 500)
     tasks = {name: designer(name) for name in cases}
-    print("| robot | after | design (taken) | SLSQP | best random |")
+    print("| robot | after | design (selected) | SLSQP | best random |")
     print("|---" * 5 + "|")
     for name, task in tasks.items():
         against_time(name, task, budgets, count)

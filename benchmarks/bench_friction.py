@@ -47,9 +47,13 @@ ARM = "panda"
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one recording of each kind")
-    parser.add_argument("--recordings", type=int, default=100, help="simulated ones")
-    parser.add_argument("--estimator", default="wls", help="of the simulated recordings")
-    parser.add_argument("--min-velocity", type=float, default=0.02, help="of these [rad/s]")
+    parser.add_argument(
+        "--recordings", type=int, default=100, help="number of simulated recordings"
+    )
+    parser.add_argument("--estimator", default="wls", help="estimator of the simulated recordings")
+    parser.add_argument(
+        "--min-velocity", type=float, default=0.02, help="their min_velocity [rad/s]"
+    )
     options = parser.parse_args()
     if "ROBOTID_DATA" in os.environ:
         real_recordings(
@@ -160,7 +164,7 @@ def coverage(recordings, estimator, signals):
     print(f"| all parameters | {' | '.join(f'{100 * np.mean(x):.1f} %' for x in sums)} |")
     joints = recordings * len(TRUTH)
     print(f"| the truth's family is chosen | {right} of {joints} joints | |")
-    print(f"| another is chosen where there is none | {beside} of {joints} joints | |")
+    print(f"| a family is chosen where there is none | {beside} of {joints} joints | |")
     print(f"| a misfit is named on the joint | | {named} of {joints} joints |", flush=True)
 
 

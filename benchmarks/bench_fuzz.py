@@ -39,10 +39,10 @@ COUNTS = ["inputs", "tracebacks", "aborts", "half-written", "hangs"]
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--inputs", type=int, default=3000, help="of each kind")
+    parser.add_argument("--inputs", type=int, default=3000, help="inputs of each kind")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", default="", help="kinds whose name holds this")
-    parser.add_argument("--verbose", action="store_true", help="show on stderr what broke")
+    parser.add_argument("--only", default="", help="kinds whose name contains this")
+    parser.add_argument("--verbose", action="store_true", help="print failing inputs on stderr")
     parser.add_argument("--quick", action="store_true", help="30 inputs of each kind")
     parser.add_argument("--work", help=argparse.SUPPRESS)  # the kind that this process tries
     options = parser.parse_args()

@@ -41,7 +41,7 @@ FITS = 2_000_000  # rows that fit into memory here
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="short logs, few rows in memory")
-    parser.add_argument("--write", nargs=2, metavar=("LOG", "ROWS"), help="only write a log")
+    parser.add_argument("--write", nargs=2, metavar=("LOG", "ROWS"), help="write a log only")
     options = parser.parse_args()
     if options.write:
         write(Path(options.write[0]), int(options.write[1]))

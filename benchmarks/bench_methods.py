@@ -42,13 +42,13 @@ METHODS = {
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="one run of 2 s: a try-out")
+    parser.add_argument("--quick", action="store_true", help="one run of 2 s, as a trial")
     parser.add_argument("--runs", type=int, default=4)
     options = parser.parse_args()
     runs, seconds = (1, 2.0) if options.quick else (options.runs, SECONDS)
-    print(f"| loops, {runs} runs | compared | median error over truth: armature | viscous "
-          "| coulomb | error said over scatter | 95 % intervals hold | steps | left by a step "
-          "| s |")  # fmt: skip
+    print(f"| controller, {runs} runs | fitted to | median error over truth: armature | viscous "
+          "| coulomb | stated error / scatter | 95 % interval coverage | steps "
+          "| remaining after a step | s |")  # fmt: skip
     print("|---" * 10 + "|")
     for case, (kp, kd, highest) in CASES.items():
         found = {method: [] for method in METHODS}
@@ -60,8 +60,9 @@ def main():
                 found[method].append(one_fit(plant, log, changes))
         for method, fits in found.items():
             print(row(case, method, fits), flush=True)
-    print("\nMedians of runs; s: of processor, a fit. Left: the largest share of what a step "
-          "should correct that it leaves, as it neglects that the motion changes.\n")  # fmt: skip
+    print("\nMedians of runs; s: processor time per fit. Remaining: the largest share of its "
+          "correction that a step does not achieve, because it neglects the change of "
+          "motion.\n")  # fmt: skip
     print(f"{setting.machine()}, mujoco {mujoco.__version__}")
 
 

@@ -50,7 +50,9 @@ def misfits(model, seed, effect=None, joint=0, **options):
 
 
 def spoilt(seeds):
-    print("| term | finding | named first on its joint | said of other joints | share, median |")
+    print(
+        "| term | finding | named first on its joint | findings on other joints | share, median |"
+    )
     print("|---|---|---|---|---|")
     model = robot("ur5")
     for name, effect in EFFECTS.items():
@@ -68,7 +70,7 @@ def spoilt(seeds):
 
 
 def clean(seeds):
-    print("\n| clean robot | noise forgets after | joints | terms named | of them warnings |")
+    print("\n| clean robot | correlation time | joints | terms named | of them warnings |")
     print("|---|---|---|---|---|")
     for name in ("ur5", "panda"):
         model = robot(name)

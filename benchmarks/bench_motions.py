@@ -90,8 +90,8 @@ def cuts(folder, robot, first, seed):
 
 def second_motions(seeds):
     """Print what second motions add; return it by robot, first and second."""
-    print("| robot | first motion | the widest quarter is cut by: " + " | ".join(SECOND) + " | "
-          "--given beats fresh |")  # fmt: skip
+    print("| robot | first motion | widest quarter reduced by: " + " | ".join(SECOND) + " | "
+          "--given better than without |")  # fmt: skip
     print("|---" * (len(SECOND) + 3) + "|")
     all_of_them = {}
     for robot in NEXT:
@@ -166,9 +166,9 @@ def payload_row(folder, robot, options, seeds):
 
 
 def payloads(seeds):
-    print("| robot | joints that move | mass of 2 kg, standard error expected of 1 % noise, kg | "
+    print("| robot | joints that move | mass of 2 kg, expected standard error at 1 % noise, kg | "
           "stated, kg | largest error, kg | in its 95 % interval | largest error of the centre, mm "
-          "| inertia told |")  # fmt: skip
+          "| inertia determined |")  # fmt: skip
     print("|---" * 8 + "|")
     for robot, options in PAYLOADS.items():
         with tempfile.TemporaryDirectory() as folder:
@@ -177,8 +177,10 @@ def payloads(seeds):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--picture", action="store_true", help="draw what second motions add, too")
-    parser.add_argument("--quick", action="store_true", help="one seed: a try-out")
+    parser.add_argument(
+        "--picture", action="store_true", help="also draw the gain of second motions"
+    )
+    parser.add_argument("--quick", action="store_true", help="one seed, as a trial")
     options = parser.parse_args()
     found = second_motions(1 if options.quick else 5)
     if options.picture:

@@ -1,4 +1,4 @@
-"""Are the intervals of a payload true, where runs and joints differ?
+"""Coverage of the intervals of a payload, for different runs and joints.
 
     python benchmarks/bench_payload.py [--runs 20] [--quick]
 
@@ -100,9 +100,9 @@ def row(name, case, runs):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=20)
-    parser.add_argument("--quick", action="store_true", help="one pair of one robot: a try-out")
+    parser.add_argument("--quick", action="store_true", help="one pair of one robot, as a trial")
     options = parser.parse_args()
-    print("| robot | runs | mass held [%] | centre held [%] | error [g] | standard error [g] |")
+    print("| robot | runs | mass coverage [%] | centre coverage [%] | error [g] | std. error [g] |")
     print("|---|---|---|---|---|---|")
     for name in ["UR5"] if options.quick else ARMS:
         for case in ["gains"] if options.quick else CASES:

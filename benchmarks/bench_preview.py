@@ -140,8 +140,10 @@ def cells(ratios):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--more", action="store_true", help="coloured noise, and a near URDF, too")
-    parser.add_argument("--quick", action="store_true", help="few runs of one robot: a try-out")
+    parser.add_argument(
+        "--more", action="store_true", help="also coloured noise, and a URDF close to the truth"
+    )
+    parser.add_argument("--quick", action="store_true", help="few runs of one robot, as a trial")
     options = parser.parse_args()
     runs = 3 if options.quick else options.runs
     cases = [("UR10", "white", "plausible"), ("panda", "white", "plausible")]
@@ -151,14 +153,14 @@ def main():
     if options.quick:
         cases, names = cases[:1], names[-1:]
     middle = "median | 10-90 % | in 0.8-1.25"
-    print(f"{runs} runs each; expected over found\n")
+    print(f"{runs} runs each; expected / achieved\n")
     print(f"| robot | noise | truth | estimator | error: {middle} | reported: {middle} |")
     print("|---" * 10 + "|")
     for name, kind, urdf in cases:
         for key, *both in monte_carlo(name, kind, urdf, runs):
             shown = " | ".join(map(cells, both))
             print(f"| {name} | {kind} | {urdf} | {key} | {shown} |", flush=True)
-    print(f"\n| recording | estimator | noise | found over expected: {middle} |")
+    print(f"\n| recording | estimator | noise | achieved / expected: {middle} |")
     print("|---" * 6 + "|")
     for name in names:
         for key, what, found, ahead in recorded(name):

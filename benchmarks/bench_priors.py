@@ -51,7 +51,9 @@ QUICK = [name for name in FITS if not name.startswith("entropic, ")]
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="few cases, no entropic prior")
-    parser.add_argument("--weights", action="store_true", help="the chosen weight, fixed ones")
+    parser.add_argument(
+        "--weights", action="store_true", help="the selected weight and fixed weights"
+    )
     options = parser.parse_args()
     if options.weights:
         weights()
@@ -70,10 +72,8 @@ def main():
             print(f"| {name} | {shown} | {row(error)} | {ratio:.2f} |")
             if name != "wls" and (DATA is None or "simulated" not in title):
                 (shorts if "short" in title else ratios)[name].append((ratio, seconds))
-    print("\n### Error over that of WLS, geometric mean over joints and recordings\n")
-    print(
-        "| fit | segments | short ones | worst segment | worst short one | s per identification |"
-    )
+    print("\n### Error divided by that of WLS, geometric mean over joints and recordings\n")
+    print("| fit | segments | short segments | worst segment | worst short one | s per fit |")
     print("|---|---|---|---|---|---|")
     for name in names:
         cells = [summary(ratios[name], mean), summary(shorts[name], mean)]
@@ -85,7 +85,7 @@ def main():
 
 def weights():
     """Print validation errors with the chosen and with fixed weights, for each job file."""
-    print("| job | weight | error per joint [%] | over the best fixed one | worst joint |")
+    print("| job | weight | error per joint [%] | over the best fixed weight | worst joint |")
     print("|---|---|---|---|---|")
     for path in sorted(JOBS.glob("*.toml")):
         job, errors = read_job(path), {}

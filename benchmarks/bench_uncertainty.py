@@ -211,9 +211,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--robots", nargs="+")
-    parser.add_argument("--quick", action="store_true", help="few runs of one robot: a try-out")
+    parser.add_argument("--quick", action="store_true", help="few runs of one robot, as a trial")
     parser.add_argument("--encoders", action="store_true", help="encoders of 12, 14 and 18 bits")
-    parser.add_argument("--uncorrected", action="store_true", help="of encoders: as before")
+    parser.add_argument(
+        "--uncorrected", action="store_true", help="encoders without the correction"
+    )
     parser.add_argument("--bits", type=int, nargs="+", default=[12, 14, 18])
     parser.add_argument("--friction", nargs="+", default=["viscous+coulomb", "auto"])
     options = parser.parse_args()

@@ -88,7 +88,7 @@ def main():
     parser.add_argument("--robots", nargs="+", choices=ROBOTS)
     parser.add_argument("--cases", nargs="+", choices=CASES)
     parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument("--list", type=Path, help="add every answer to this file, as JSON lines")
+    parser.add_argument("--list", type=Path, help="append each answer to this file, as JSON lines")
     options = parser.parse_args()
     robots, cases = QUICK if options.quick else (ROBOTS, CASES)
     pairs = itertools.product(options.robots or robots, options.cases or cases)
@@ -186,8 +186,8 @@ def summary(answers, seed):
     print(f"| right verdict | 95 % | {share(a.is_right for a in shown)} |")
     told = [a for a in faults if CASES[a.case].names]
     print(f"| cause named | 90 % | {share(a.is_named for a in told)} |")
-    print(f"| false alarms on clean recordings | <= 2 % | {share(a.is_alarm for a in clean)} |")
-    print(f"| hidden faults of which it warns | | {share(a.is_right for a in hidden)} |")
+    print(f"| false warnings on clean recordings | <= 2 % | {share(a.is_alarm for a in clean)} |")
+    print(f"| hidden faults with a warning | | {share(a.is_right for a in hidden)} |")
     for case in dict.fromkeys(a.case for a in clean):
         inside = [a.held for a in clean if a.case == case and np.isfinite(a.held)]
         if inside:
@@ -208,7 +208,7 @@ def table(title, answers):
     is_clean = CASES[answers[0].case].right == GOOD
     print(f"\n### {title}\n")
     second = "no warning" if is_clean else "cause named"
-    print(f"| case | right verdict | {second} | in their intervals | what else is said |")
+    print(f"| case | right verdict | {second} | interval coverage | other findings |")
     print("|---|---|---|---|---|")
     for case in dict.fromkeys(a.case for a in answers):
         of_case = [a for a in answers if a.case == case]

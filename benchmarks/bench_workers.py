@@ -44,7 +44,9 @@ def main():
         path = Path(folder) / "run.parquet"
         subprocess.run([sys.executable, WRITE, "--write", path, str(rows)], check=True)
         pieces = survey(path, 2**14 if options.quick else 2**17)
-        print("| workers | with start, s | ratio | running, s | ratio | samples/s | same bits |")
+        print(
+            "| workers | including start, s | ratio | running, s | ratio | samples/s | same bits |"
+        )
         print("|" + "---|" * 7)
         first = None
         for workers in options.workers:

@@ -137,7 +137,9 @@ def main():
     parser.add_argument("after", type=Path, nargs="?", default=HERE)
     parser.add_argument("--only", nargs="+", default=[], help="names of runs")
     parser.add_argument("--tolerance", type=float, default=1e-12, help="relative")
-    parser.add_argument("--most", type=int, default=9, help="differences named of a file")
+    parser.add_argument(
+        "--most", type=int, default=9, help="maximum number of listed differences per file"
+    )
     options = parser.parse_args()
     largest, gone = 0.0, 0
     with tempfile.TemporaryDirectory() as made:
@@ -147,7 +149,7 @@ def main():
         files = {f.relative_to(folder) for folder in folders for f in folder.rglob("*.*")}
         for file in sorted(f for f in files if f.suffix in (".json", *TEXTS)):
             if not all((folder / file).is_file() for folder in folders):
-                print(f"{file}: in one tree only")
+                print(f"{file}: only in one of the two trees")
                 gone += 1
                 continue
             old, new = (read(folder / file, folder) for folder in folders)
@@ -157,12 +159,12 @@ def main():
             other = sorted((k for k in changes if changes[k] > options.tolerance), key=changes.get)
             print(
                 f"{file}: {len(new)} figures, {len(new.keys() - old.keys())} of them new, "
-                f"largest relative difference {worst:.1g}; gone: {len(odd)}",
+                f"largest relative difference {worst:.1g}; missing: {len(odd)}",
                 *odd[: options.most],
                 *(f"\n  {k}: {old[k]} -> {new[k]}" for k in other[::-1][: options.most]),
             )
             largest, gone = max(largest, worst), gone + len(odd)
-    print(f"largest relative difference {largest:.1g}; figures gone: {gone}")
+    print(f"largest relative difference {largest:.1g}; missing figures: {gone}")
     return int(largest > options.tolerance or gone > 0)
 
 

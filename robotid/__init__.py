@@ -61,7 +61,7 @@ __all__ = [
     "write_urdf",
 ]
 
-_HOMES = {
+_MODULES = {
     "commands.identify": ["run_job", "save_result"],
     "commands.in_memory": ["identify"],
     "commands.job": ["read_job"],
@@ -90,13 +90,13 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401
-    """Import a public name when it is first used: ``robotid --help`` needs none of them."""
-    for home, names in _HOMES.items():
+    """Import a public name at its first use, because ``robotid --help`` needs none of them."""
+    for module, names in _MODULES.items():
         if name in names:
-            return getattr(import_module(f"robotid.{home}"), name)
+            return getattr(import_module(f"robotid.{module}"), name)
     raise AttributeError(f"module 'robotid' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    """Return the public names alone, whichever rooms have been loaded."""
+    """Return the public names only, for any loaded packages."""
     return __all__

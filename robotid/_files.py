@@ -1,4 +1,4 @@
-"""Files: written beside their target and put in place whole; known by their hash."""
+"""Files: written to a temporary name and renamed when complete; identified by their hash."""
 
 import hashlib
 import json
@@ -31,13 +31,13 @@ __all__ = [
 
 
 def check_path(path: str | Path) -> None:
-    """Refuse what no file system takes as the path of a file or folder.
+    """Refuse a path that no file system accepts.
 
     Args:
         path: The path.
 
     Raises:
-        SettingsError: If it is no UTF-8, has a NUL, or is, or has a name that is, too long.
+        SettingsError: If it is not UTF-8, has a NUL, or the path or a name in it is too long.
     """
     try:
         raw = os.fsencode(path)
@@ -45,19 +45,19 @@ def check_path(path: str | Path) -> None:
         raw = b"\0"
     if b"\0" in raw or len(raw) > _LONGEST_PATH:
         raise SettingsError(
-            f"{str(path)[:_SHOWN]!r} cannot name a file: wanted UTF-8 without NUL, at most "
+            f"{str(path)[:_SHOWN]!r} is not a valid path, wanted UTF-8 without NUL, at most "
             f"{_LONGEST_PATH} bytes"
         )
     name = max(raw.split(os.fsencode(os.sep)), key=len)
     if len(name) > _LONGEST:
         raise SettingsError(
             f"the name '{os.fsdecode(name)[:_SHOWN]}...' of a file has {len(name)} bytes, wanted "
-            f"at most {_LONGEST}; name a shorter one (names of results begin with that of the URDF)"
+            f"at most {_LONGEST}; shorten it (names of results start with that of the URDF)"
         )
 
 
 def check_file(target: Path) -> None:
-    """Refuse a place where no file can be written, as before the work that makes its content.
+    """Refuse a path where no file can be written, before its content is computed.
 
     Args:
         target: The file.
@@ -68,59 +68,61 @@ def check_file(target: Path) -> None:
     """
     check_path(target)
     if not target.parent.is_dir():
-        raise DataError(f"there is no folder {str(target.parent)!r} to write {target.name} in")
+        raise DataError(
+            f"the folder {str(target.parent)!r} of {target.name} does not exist; create it"
+        )
     if target.is_dir():
         raise SettingsError(
-            f"{str(target)!r} is a folder, wanted a file to write; remove it, or name another"
+            f"{str(target)!r} is a folder, wanted a file to write; remove it, or name another file"
         )
 
 
 def check_folder(target: Path, names: Iterable[str] = ()) -> None:
-    """Refuse a place where no results can be written, as before the work that makes them.
+    """Refuse a folder where no results can be written, before the results are computed.
 
     Args:
-        target: The folder; it need not exist.
-        names: Names of the files to be written in it.
+        target: The folder; it may be missing.
+        names: Names of the files to write in it.
 
     Raises:
         SettingsError: If it, or a folder above it, is a file or not writable, or if one of its
             files is a folder or has a name that is too long.
     """
     check_path(target)
-    there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
-    if not there.is_dir():
+    existing = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
+    if not existing.is_dir():
         raise SettingsError(
-            f"{str(there)!r} is a file, wanted a folder for the results; name another"
+            f"{str(existing)!r} is a file, wanted a folder for the results; name another folder"
         )
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise SettingsError(f"the folder {str(there)!r} is not writable; name another")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise SettingsError(f"the folder {str(existing)!r} is not writable; name another folder")
     for name in names:
         check_path(name)
-        if there == target:
+        if existing == target:
             check_file(target / name)
 
 
 _LONGEST = 255  # bytes of a file's name
 _LONGEST_PATH = 4095  # bytes of a whole path
-_HIDDEN = 32  # bytes that the name of a hidden file has beside it
+_HIDDEN = 32  # further bytes in the name of a hidden file
 _SHOWN = 60  # characters of a name in a message
 
 
 @contextmanager
 def written_whole(target: str | Path) -> Iterator[Path]:
-    """Give a hidden name beside a file; what is written there is then put in its place.
+    """Provide a hidden name in the folder of a file; the written file then replaces the target.
 
-    After an error the target is as it was, and nothing is left beside it. A device, a pipe or
-    ``/dev/stdout`` is not replaced: it gets the content, when that is complete.
+    After an error the target is unchanged, and no hidden file remains. A device, a pipe or
+    ``/dev/stdout`` is not replaced: it receives the content when that is complete.
 
     Args:
         target: The file.
 
     Yields:
-        Where to write.
+        The path to write.
 
     Raises:
-        DataError: If its folder does not exist, or the reader of a pipe has left.
+        DataError: If its folder does not exist, or the reader of a pipe has closed it.
         SettingsError: If it is a folder.
     """
     path = Path(target)
@@ -132,28 +134,28 @@ def written_whole(target: str | Path) -> Iterator[Path]:
                 with Path(folder, path.name).open("rb") as made, path.open("wb") as stream:
                     shutil.copyfileobj(made, stream)
             except BrokenPipeError as error:
-                raise DataError(f"the reader of {str(path)!r} left before its end") from error
+                raise DataError(f"the reader of {str(path)!r} closed it before the end") from error
         return
-    beside = path.with_name(_hidden(path.name))
+    hidden = path.with_name(_hidden(path.name))
     try:
-        yield beside
-        os.replace(beside, path)
-    except OSError as error:  # most do not say which file
+        yield hidden
+        os.replace(hidden, path)
+    except OSError as error:  # most messages do not name the file
         error.add_note(f"while writing {str(path)!r}")
         raise
     finally:
-        beside.unlink(missing_ok=True)
+        hidden.unlink(missing_ok=True)
 
 
 def _hidden(name: str) -> str:
-    """Return the name of a file while it is written; that of a long name has its hash."""
-    known = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
-    kept = name if len(os.fsencode(name)) <= _LONGEST - _HIDDEN else known
-    return f".{kept}.{os.getpid()}"
+    """Return the temporary name of a file; a long name is replaced by its hash."""
+    digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+    short = name if len(os.fsencode(name)) <= _LONGEST - _HIDDEN else digest
+    return f".{short}.{os.getpid()}"
 
 
 def _is_stream(path: Path) -> bool:
-    """Whether what is written to a path goes on from there, so that it must not be replaced."""
+    """Return whether a path is a device or a pipe, which must not be replaced."""
     is_special = path.exists() and not path.is_file()
     shown = path.absolute().parts[1:2]  # /dev/stdout, /dev/fd/1, /proc/self/fd/1
     return is_special or (path.is_symlink() and shown in (("dev",), ("proc",)))
@@ -161,16 +163,16 @@ def _is_stream(path: Path) -> bool:
 
 @contextmanager
 def folder_beside(target: Path) -> Iterator[Path]:
-    """Give a hidden folder in a folder; the files made there are then put in place, by name.
+    """Provide a hidden folder in a folder; its files are then moved to the folder.
 
-    After an error none of them is, those of the same names are as they were, and the hidden
-    folder is gone.
+    After an error no file is moved, existing files are unchanged, and the hidden folder is
+    removed.
 
     Args:
         target: The folder; it must exist.
 
     Yields:
-        Where to write.
+        The folder to write in.
 
     Raises:
         SettingsError: If a file to be replaced is a folder.
@@ -193,7 +195,7 @@ def folder_beside(target: Path) -> Iterator[Path]:
 
 
 def _put_back(names: Iterable[str], new: Path, old: Path, target: Path) -> None:
-    """Undo what was done of a replacement of files."""
+    """Undo an incomplete replacement of files."""
     for name in names:
         if os.path.lexists(old / name):
             os.replace(old / name, target / name)
@@ -202,7 +204,7 @@ def _put_back(names: Iterable[str], new: Path, old: Path, target: Path) -> None:
 
 
 def write_text(text: str, target: str | Path) -> Path:
-    """Write a page, whole or not at all, and return its path.
+    """Write a text file completely or not at all, and return its path.
 
     Args:
         text: Its content.
@@ -213,16 +215,16 @@ def write_text(text: str, target: str | Path) -> Path:
         SettingsError: If it is a folder.
     """
     path = Path(target)
-    with written_whole(path) as beside:
-        beside.write_text(text, encoding="utf-8")
+    with written_whole(path) as hidden:
+        hidden.write_text(text, encoding="utf-8")
     return path
 
 
 def write_json(content: Mapping[str, Any], target: str | Path) -> None:
-    """Write JSON, whole or not at all.
+    """Write a JSON file completely or not at all.
 
     Args:
-        content: What to write; non-finite numbers are refused.
+        content: Its content; non-finite numbers are refused.
         target: The file.
 
     Raises:
@@ -233,7 +235,7 @@ def write_json(content: Mapping[str, Any], target: str | Path) -> None:
 
 
 def finite(value: float) -> float | None:
-    """Return a number as JSON has it: None if it is not finite.
+    """Return a number for JSON: None if it is not finite.
 
     Args:
         value: The number.
@@ -242,28 +244,28 @@ def finite(value: float) -> float | None:
 
 
 def missing_file(path: Path, what: str) -> str:
-    """Return what is wrong with a path that is no file.
+    """Return the message for a path that is not a regular file.
 
     Args:
         path: The path.
-        what: What it should be, as "log file".
+        what: The expected kind of file, as "log file".
     """
     if path.is_dir():
         return f"{str(path)!r} is a folder, wanted a {what}"
     if path.exists():
-        return f"{str(path)!r} is a pipe or a device, wanted a {what}; copy it to one"
+        return f"{str(path)!r} is a pipe or a device, wanted a {what}; copy it to a file"
     return f"there is no {what} {str(path)!r}"
 
 
 def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
-    """Return the content of a JSON file: finite numbers, text that UTF-8 can hold, few levels.
+    """Return the content of a JSON file with finite numbers, valid Unicode and few levels.
 
     Args:
         path: The file.
-        what: What it is, for errors.
+        what: The kind of file, for errors.
 
     Raises:
-        DataError: If it is missing or holds something else.
+        DataError: If it is missing or has other content.
     """
     source = Path(path)
     if not source.is_file():
@@ -280,7 +282,7 @@ def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
         ]
         inside = [x for entries in lists for x in entries]
     if inside:
-        raise DataError(f"{source.name} is nested deeper than {_DEEPEST} levels: it is no {what}")
+        raise DataError(f"{source.name} has more than {_DEEPEST} levels: it is not a {what}")
     return content
 
 
@@ -291,7 +293,7 @@ def file_sha256(path: str | Path) -> str:
         path: The file, or the folder of a bag.
 
     Raises:
-        DataError: If it is a pipe or a device, which has no end or another content each time.
+        DataError: If it is a pipe or a device, whose content changes or does not end.
     """
     source = Path(path)
     if source.exists() and not source.is_file() and not source.is_dir():
@@ -309,16 +311,16 @@ _DEEPEST = 40  # levels of tables and lists
 
 @lru_cache(maxsize=1024)
 def _sha256(path: Path, *_state: int) -> str:
-    """Return the SHA-256 of a file, which is read once as long as its state is the same."""
+    """Return the SHA-256 of a file; it is read again only if its state has changed."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def source_entry(path: str) -> dict[str, Any]:
-    """Return the path of an input and the hash of its file, None of what is in no file.
+    """Return the path of an input and the hash of its file, None for an input in memory.
 
     Args:
-        path: The file; "" for what was in memory.
+        path: The file; "" for an input in memory.
     """
     is_file = bool(path) and Path(path).exists()
     return {"path": str(path), "sha256": file_sha256(path) if is_file else None}

@@ -1,7 +1,7 @@
-"""Settings declared once: a field of a table says what it is, what it may be and how it is written.
+"""Settings, declared once: the field of a table states meaning, permitted values and file format.
 
-The keys of a job file, the checks of their values, the flags' help, the page of the job file and
-the settings in result.json all come from these fields.
+The keys of a job file, the checks of their values, the help of flags, the page of the job file and
+the settings in result.json are derived from these fields.
 """
 
 import difflib
@@ -34,32 +34,32 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Range:
-    """Which values a setting may have."""
+    """The permitted values of a setting."""
 
-    words: str  # as an error names it
+    words: str  # description in errors
     holds: Callable[[Any], bool]
 
 
 @dataclass(frozen=True)
 class Entries:
-    """A list or a table of a job file whose entries are of one kind."""
+    """A list or a table of a job file whose entries have one type."""
 
     outer: type  # list or dict
-    inner: tuple[type, ...]  # of each entry
-    count: int | None = None  # how many there are; any number if None
+    inner: tuple[type, ...]  # types of each entry
+    count: int | None = None  # number of entries; any number if None
 
 
 def require_kind(value: object, kind: type | tuple[type, ...], name: str, wanted: str) -> None:
-    """Refuse an argument of another kind than a function takes.
+    """Refuse an argument of the wrong type.
 
     Args:
         value: The argument.
-        kind: What it may be.
-        name: What it is called.
-        wanted: What is wanted, in words.
+        kind: Its permitted types.
+        name: Its name.
+        wanted: Description of the permitted types.
 
     Raises:
-        SettingsError: If it is something else.
+        SettingsError: If it has another type.
     """
     if not isinstance(value, kind):
         raise SettingsError(f"{name} is {_shown(value)}, a {type(value).__name__}, wanted {wanted}")
@@ -68,16 +68,16 @@ def require_kind(value: object, kind: type | tuple[type, ...], name: str, wanted
 def require_each(
     values: object, kind: type | tuple[type, ...], name: str, wanted: str
 ) -> list[Any]:
-    """Return the entries of a list that a function takes, or refuse what is no list of such.
+    """Return the entries of an argument that is a list, or refuse the argument.
 
     Args:
         values: The argument: a list, a tuple, a set or an array of one dimension.
-        kind: What its entries may be.
-        name: What it is called.
-        wanted: What is wanted, in words.
+        kind: The permitted types of its entries.
+        name: Its name.
+        wanted: Description of the permitted types.
 
     Raises:
-        SettingsError: If it is something else: text, or a table, is no list.
+        SettingsError: If it has another type; text or a table is not a list.
     """
     is_list = isinstance(values, Collection) and not isinstance(values, str | bytes | Mapping)
     entries = list(values) if is_list and getattr(values, "ndim", 1) == 1 else [None]  # type: ignore[call-overload]
@@ -89,7 +89,7 @@ def require_each(
 
 
 def is_number(value: object) -> bool:
-    """Return whether a value is one finite number, of Python or of NumPy; True and False are none.
+    """Return whether a value is a finite number of Python or NumPy; a boolean is not.
 
     Args:
         value: The value.
@@ -98,25 +98,25 @@ def is_number(value: object) -> bool:
         return False
     try:
         return math.isfinite(value)
-    except OverflowError:  # a whole number that no float is as large as
+    except OverflowError:  # an integer larger than any float
         return False
 
 
 def require_flag(value: object, name: str) -> None:
-    """Refuse an argument that is neither True nor False, of Python or of NumPy.
+    """Refuse an argument that is not a boolean of Python or NumPy.
 
     Args:
         value: The argument.
-        name: What it is called.
+        name: Its name.
 
     Raises:
-        SettingsError: If it is something else.
+        SettingsError: If it has another type.
     """
     if type(value).__name__ not in ("bool", "bool_"):
         require_kind(value, bool, name, "True or False")
 
 
-#: Keys that a table in a list of tables must have, if it may have them.
+#: Keys that are required in a table of a list of tables, if its schema has them.
 REQUIRED = ("log", "name", "ratios", "joints", "matrix")
 POSITIVE = Range("a positive number", lambda x: x > 0)
 NOT_NEGATIVE = Range("0 or a positive number", lambda x: x >= 0)
@@ -124,31 +124,30 @@ NOT_NEGATIVE = Range("0 or a positive number", lambda x: x >= 0)
 
 @dataclass(frozen=True)
 class Key:
-    """What a field says of itself."""
+    """The description of a setting."""
 
-    text: str  # what the setting is, with its unit
-    among: Sequence[str] = ()  # the words that it may be
-    within: Range | None = None  # the range of its numbers
-    at: str = ""  # where a job file has it, with dots between; the field's name if empty
-    # what a job file holds there: types, a table of keys, or [a table]; what the annotation says
-    # if None
+    text: str  # meaning of the setting, with its unit
+    among: Sequence[str] = ()  # permitted words
+    within: Range | None = None  # range of its numbers
+    at: str = ""  # its path in a job file, separated by dots; the field's name if empty
+    # type in the job file: types, a table of keys, or [a table]; that of the annotation if None
     reads: Any = None
-    load: Callable[[Any], Any] | None = None  # makes the value from what a job file holds
-    dump: Callable[[Any], Any] | None = None  # makes what result.json holds from the value
+    load: Callable[[Any], Any] | None = None  # converts the entry of a job file to the value
+    dump: Callable[[Any], Any] | None = None  # converts the value to the entry of result.json
 
     @property
     def words(self) -> str:
-        """What the setting is, with the words that it may be if they do not occur in that."""
-        is_told = all(word in self.text for word in self.among)
-        return self.text if is_told else f"{self.text}: {', '.join(self.among)}"
+        """The meaning of the setting, with its permitted words if the text does not have them."""
+        has_words = all(word in self.text for word in self.among)
+        return self.text if has_words else f"{self.text}: {', '.join(self.among)}"
 
 
 def setting(default: Any, text: str, **about: Any) -> Any:  # noqa: ANN401
     """Declare a setting, as a field of a ``Settings``.
 
     Args:
-        default: Its value if none is stated; MISSING if it must be.
-        text: What it is, with its unit.
+        default: Its default; MISSING if it is required.
+        text: Its meaning, with its unit.
         about: The other attributes of ``Key``.
     """
     metadata = {"key": Key(text, **about)}
@@ -159,9 +158,9 @@ def setting(default: Any, text: str, **about: Any) -> Any:  # noqa: ANN401
 
 @dataclass(frozen=True)
 class Settings:
-    """A table of settings; its fields are checked as it is made."""
+    """A table of settings; its fields are checked at construction."""
 
-    _table: ClassVar[str] = ""  # named by errors
+    _table: ClassVar[str] = ""  # its name in errors
 
     def __init_subclass__(cls) -> None:
         own = {name: f.metadata["key"] for name, f in vars(cls).items() if isinstance(f, Field)}
@@ -177,13 +176,13 @@ class Settings:
 
     @classmethod
     def entries(cls) -> list[tuple[Field[Any], Key, list[str]]]:
-        """Return each field, what it says of itself, and its path in a job file."""
+        """Return each field, its description, and its path in a job file."""
         about = [(f, f.metadata["key"]) for f in fields(cls)]
         return [(f, key, (key.at or f.name).split(".")) for f, key in about]
 
     @classmethod
     def schema(cls) -> dict[str, Any]:
-        """Return the keys that a job file may have here: a type or types, a table, or [a table]."""
+        """Return the permitted keys of a job file: a type or types, a table, or [a table]."""
         found: dict[str, Any] = {}
         for f, key, (*tables, last) in cls.entries():
             table_in(found, tables)[last] = _read_type(f.type if key.reads is None else key.reads)
@@ -191,7 +190,7 @@ class Settings:
 
     @classmethod
     def paths(cls) -> dict[str, Key]:
-        """Return what each key says of itself, those of tables inside with a dot between."""
+        """Return the description of each key; keys of inner tables have a dotted path."""
         found: dict[str, Key] = {}
         for f, key, path in cls.entries():
             inside = f.type.paths() if _is_table(f.type) else {"": key}
@@ -200,10 +199,10 @@ class Settings:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
-        """Return the settings that a table of a job file states.
+        """Return the settings of a table of a job file.
 
         Args:
-            table: The table, of keys and types of the ``schema``.
+            table: The table, with keys and types of the ``schema``.
 
         Raises:
             SettingsError: If a value is not usable.
@@ -218,7 +217,7 @@ class Settings:
         return cls(**given)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the settings as plain values, in the shape of the job file; none is left out."""
+        """Return all settings as plain values, in the form of the job file."""
         found: dict[str, Any] = {}
         for f, key, (*tables, last) in self.entries():
             inside, value = table_in(found, tables), getattr(self, f.name)
@@ -229,11 +228,11 @@ class Settings:
 
 
 def table_in(table: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """Return a table inside tables, made if it is missing.
+    """Return an inner table; it is created if it is missing.
 
     Args:
-        table: The outermost.
-        names: Its name in each, from the outside.
+        table: The outermost table.
+        names: The path to the inner table.
     """
     for name in names:
         table = table.setdefault(name, {})
@@ -243,13 +242,13 @@ def table_in(table: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
 def check_keys(
     table: Mapping[str, Any], schema: Mapping[str, Any], where: str, section: str = ""
 ) -> None:
-    """Refuse keys that are not in the schema and values of another type.
+    """Refuse keys that are not in the schema and values of the wrong type.
 
     Args:
-        table: What was given.
+        table: The table.
         schema: The known keys, as of ``Settings.schema``.
         where: Name of its source, for errors.
-        section: Table that it is in, with a dot at its end, for errors.
+        section: Path of the table with a dot at its end, for errors.
 
     Raises:
         SettingsError: If a key is unknown or missing, or its value has another type.
@@ -307,10 +306,10 @@ def _check_type(value: object, kinds: tuple[type, ...], at: str) -> None:
 
 
 def _shown(value: object) -> str:
-    """Return a value as a message shows it, in one line."""
+    """Return a value as text of one line, for a message."""
     try:
         text = " ".join(repr(value).split())
-    except ValueError:  # Python writes no number of more than 4300 digits
+    except ValueError:  # Python does not print integers of more than 4300 digits
         return "a number of thousands of digits"
     return text if len(text) <= 80 else f"{text[:60]}...{text[-17:]}"
 
@@ -331,7 +330,7 @@ def _check_value(value: Any, key: Key, name: str) -> None:  # noqa: ANN401
 
 
 def _is_so(holds: Callable[[], Any]) -> bool:
-    """Return whether a check holds; of a value that it cannot be made of it does not."""
+    """Return whether a check holds; it does not if it raises for a value."""
     try:
         return bool(holds())
     except (TypeError, ValueError):
@@ -339,7 +338,7 @@ def _is_so(holds: Callable[[], Any]) -> bool:
 
 
 _NUMBER = (int, float)
-_LARGEST = 10**30  # no setting is larger, and what is computed from it is still a number
+_LARGEST = 10**30  # settings are smaller; results of larger values may overflow
 _WORDS = {str: "text", bool: "true or false", list: "a list", dict: "a table"}
 _ALSO = {bool: "false", str: "text", list: "a list"}
 
@@ -355,9 +354,9 @@ def _is_table(kind: Any) -> TypeGuard[type[Settings]]:  # noqa: ANN401
 
 
 def _read_type(kind: Any) -> Any:  # noqa: ANN401
-    """Return what a job file holds where a field is annotated so."""
+    """Return the type in a job file for the annotation of a field."""
     if isinstance(kind, dict | list | tuple | Entries):
-        return kind.copy() if isinstance(kind, dict) else kind  # other fields may join the table
+        return kind.copy() if isinstance(kind, dict) else kind  # other fields may add keys
     if _is_table(kind):
         return kind.schema()
     origin, inner = get_origin(kind), get_args(kind)
@@ -388,7 +387,7 @@ def _load(value: Any, key: Key, kind: Any) -> Any:  # noqa: ANN401
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401
-    """Return a value as TOML and JSON have it."""
+    """Return a value for TOML and JSON."""
     if isinstance(value, Settings):
         return value.to_dict()
     if isinstance(value, Mapping):

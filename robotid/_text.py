@@ -1,4 +1,4 @@
-"""Text for people: lines that fit the terminal, columns in line, digits that mean something."""
+"""Text output: lines that fit the terminal, aligned columns, significant digits."""
 
 import json
 import math
@@ -24,25 +24,25 @@ _UNIT = re.compile(r"(?<=\d) (?=%|(?:m?s|kg|N|m|Hz|rad)\b)")  # between a number
 _PLAIN = (-3, 6)  # powers of ten that are written without an exponent
 _GAP = 2  # blanks between columns
 _NARROWEST = 40
-_YAML_WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")  # no text in YAML 1.1
+_YAML_WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")  # not text in YAML 1.1
 _TONES = {"good": 32, "usable": 33, "poor": 31, "error": 31, "warning": 33}  # of ANSI terminals
 
 
 def terminal_width() -> int:
-    """Return how many characters a line of the terminal has, 80 where that is not known."""
+    """Return the characters per line of the terminal, 80 if unknown."""
     return max(shutil.get_terminal_size((80, 24)).columns, _NARROWEST)
 
 
 def tinted(text: str, word: str, tone: str, stream: TextIO) -> str:
-    """Return text with its first occurrence of a word in colour, if a stream is to show some.
+    """Return text with the first occurrence of a word in colour, for a terminal with colours.
 
-    It is if it is a terminal with colours and the environment variable NO_COLOR is not set.
+    The text is unchanged for other streams, or if the environment variable NO_COLOR is set.
 
     Args:
         text: The text.
         word: The word.
-        tone: What it means: "good", "usable", "poor", "error" or "warning"; others have no colour.
-        stream: Where the text goes.
+        tone: "good", "usable", "poor", "error" or "warning"; other tones have no colour.
+        stream: The stream of the text.
     """
     has_codes = "WT_SESSION" in os.environ if os.name == "nt" else os.getenv("TERM") != "dumb"
     if tone not in _TONES or os.environ.get("NO_COLOR") or not (has_codes and stream.isatty()):
@@ -50,24 +50,24 @@ def tinted(text: str, word: str, tone: str, stream: TextIO) -> str:
     return text.replace(word, f"\x1b[{_TONES[tone]}m{word}\x1b[0m", 1)
 
 
-def wrapped(text: str, width: int | None, hang: str = "") -> str:
-    """Return text in lines no longer than a width; no word, path or number with unit is broken.
+def wrapped(text: str, width: int | None, indent: str = "") -> str:
+    """Return text in lines of at most a width; words, paths and numbers with units stay together.
 
     Args:
-        text: The text; its own lines stay, with their indentation.
-        width: Characters of a line; None for as many as it has.
-        hang: What a line that goes on begins with, behind the indentation of its first.
+        text: The text; its line ends and their indentation are retained.
+        width: Characters per line; None for unlimited.
+        indent: Further indentation of continued lines, after the indentation of the first line.
     """
     if width is None:
         return text
     lines = []
     whole = _PATH.sub(lambda found: found.group().replace(" ", "\0"), _UNIT.sub("\0", text))
     for line in whole.split("\n"):
-        indent = line[: len(line) - len(line.lstrip())] + hang
+        indentation = line[: len(line) - len(line.lstrip())] + indent
         lines += textwrap.wrap(
             line,
-            max(width, 2 * len(indent), 20),
-            subsequent_indent=indent,
+            max(width, 2 * len(indentation), 20),
+            subsequent_indent=indentation,
             break_long_words=False,
             break_on_hyphens=False,
         ) or [""]
@@ -85,12 +85,12 @@ def columns(
     """Return the lines of a table, indented by two.
 
     Args:
-        heads: Heads of the columns, each of as many lines.
+        heads: Heads of the columns, all with the same number of lines.
         rows: Cells.
-        width: Characters of a line; None for as many as it takes.
-        needed: How many columns are shown in any case; all if None. A last line names those that
-            are left out since the lines would be longer than ``width``.
-        left: Which columns are aligned to the left.
+        width: Characters per line; None for unlimited.
+        needed: Number of columns that are always shown; all if None. A last line names the columns
+            that do not fit into ``width``.
+        left: Columns that are left-aligned.
     """
     table = [*zip(*(head.split("\n") for head in heads), strict=True), *rows]
     sizes = [max(map(len, column)) for column in zip(*table, strict=True)]
@@ -113,18 +113,18 @@ def columns(
 
 
 def in_digits_of(value: float, error: float | None) -> tuple[str, str]:
-    """Return a value to the second digit of its error, and the error.
+    """Return a value rounded to the second digit of its error, and the error.
 
     Args:
         value: The value.
-        error: Its standard error; the value has four digits where there is none.
+        error: Its standard error; without one the value has four digits.
 
     Returns:
-        Both, with the same power of ten, as "8.562" and "0.023"; a dash for no error.
+        Both, with the same power of ten, as "8.562" and "0.023"; a dash without an error.
     """
     if error is None or not (math.isfinite(error) and error > 0):
         return f"{value:.4g}", "-"
-    error = float(f"{error:.1e}")  # 0.0996 is 0.10, whose second digit is another
+    error = float(f"{error:.1e}")  # 0.0996 rounds to 0.10, which moves the second digit
     last = math.floor(math.log10(error)) - 1
     value = round(value, -last) + 0.0  # no "-0.0"
     top = max(math.floor(math.log10(abs(value))) if value else last, last + 1)
@@ -134,7 +134,7 @@ def in_digits_of(value: float, error: float | None) -> tuple[str, str]:
 
 
 def yaml_name(text: str) -> str:
-    """Return a name as YAML has it in one line, quoted unless it is a plain word.
+    """Return a name for YAML in one line, quoted unless it is a plain word.
 
     Args:
         text: The name.
@@ -144,7 +144,7 @@ def yaml_name(text: str) -> str:
 
 
 def yaml_plain(entry: Any) -> str:  # noqa: ANN401
-    """Return a plain value as YAML has it; characters that end a line of YAML are escaped.
+    """Return a plain value for YAML; characters that end a line of YAML are escaped.
 
     Args:
         entry: Text, which is quoted, a number, a boolean or None.

@@ -1,4 +1,4 @@
-"""The alias of every array, whose shapes stand in docstrings; and how progress is reported."""
+"""The type of arrays, whose shapes are in docstrings, and the report of progress."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
@@ -9,21 +9,21 @@ Array: TypeAlias = NDArray[Any]
 
 __all__ = ["STAGES", "Array", "ProgressCallback", "ignore_progress", "report_stage"]
 
-#: What an identification does, from files to files; one of logs in memory begins at the second.
+#: The stages of an identification from files; one of logs in memory starts with the second.
 STAGES = ("reading logs", "checking logs", "fitting", "errors and intervals", "writing")
 
 
-#: Called with what is being done, how many units are done, how many there are, and their name.
+#: Called with the name of the work, the units done, the total units, and their name.
 ProgressCallback: TypeAlias = Callable[[str, int, int, str], None]
 
 
 def ignore_progress(what: str, done: int, total: int, unit: str) -> None:
-    """Take a report of progress and show nothing.
+    """Ignore a report of progress.
 
     Args:
-        what: What is being done.
-        done: How many units are done.
-        total: How many there are.
+        what: The name of the work.
+        done: The units done.
+        total: The total units.
         unit: Their name.
     """
 
@@ -31,12 +31,12 @@ def ignore_progress(what: str, done: int, total: int, unit: str) -> None:
 def report_stage(
     progress: ProgressCallback | None, name: str, stages: Sequence[str] = STAGES
 ) -> None:
-    """Report that a stage of a longer work begins: its name, those done, those in all, "stages".
+    """Report the start of a stage: its name, the stages done, their number, "stages".
 
     Args:
-        progress: What to call, if anything.
+        progress: The function to call, if any.
         name: The stage.
-        stages: All of them, in order.
+        stages: All stages, in order.
     """
     if progress is not None:
         progress(name, stages.index(name), len(stages), "stages")

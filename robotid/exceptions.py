@@ -1,4 +1,4 @@
-"""The errors of the package: each keeps its facts as attributes and says what to do next."""
+"""The errors of the package; each has its data as attributes and states the remedy."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,21 +16,21 @@ __all__ = [
 
 
 class RobotIdError(Exception):
-    """Base class of all errors that robotid raises on purpose; they travel between processes."""
+    """Base class of all errors of robotid; they can be sent between processes."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restore, (type(self), self.args, vars(self))
 
 
 class ModelError(RobotIdError, ValueError):
-    """The URDF or the model built from it does not allow what was asked."""
+    """The URDF, or the model built from it, is not usable for the request."""
 
 
 class DataError(RobotIdError, ValueError):
-    """A log or an array does not hold what it must.
+    """A log or an array lacks required data or has invalid data.
 
     Attributes:
-        code: A fixed word for what is wrong.
+        code: A fixed word for the fault.
     """
 
     def __init__(self, message: str, code: str = "unusable_log") -> None:
@@ -47,7 +47,7 @@ class RankDeficientError(RobotIdError):
 
     Attributes:
         rank: Number of parameters that the data determine.
-        undetermined: Names of the parameters they leave open.
+        undetermined: Names of the other parameters.
         total: Number of parameters.
     """
 
@@ -57,9 +57,9 @@ class RankDeficientError(RobotIdError):
         self.total = total
         super().__init__(
             f"the data excite {rank} of {total} base parameters; undetermined: "
-            f"{', '.join(self.undetermined)}{f' ({words})' if words else ''}. Record a richer "
-            "trajectory, or use the 'consistent' estimator, which keeps the URDF's value where the "
-            "data say nothing"
+            f"{', '.join(self.undetermined)}{f' ({words})' if words else ''}. Record a motion with "
+            "more excitation, or use the estimator 'consistent', which uses the URDF's value for "
+            "undetermined parameters"
         )
 
 
@@ -67,7 +67,7 @@ class NotConvergedError(RobotIdError):
     """An iteration or a solver stopped without a solution.
 
     Attributes:
-        status: What the solver said.
+        status: The status of the solver.
     """
 
     def __init__(self, message: str, status: str) -> None:
@@ -76,7 +76,7 @@ class NotConvergedError(RobotIdError):
 
 
 class WorkerError(RobotIdError):
-    """A worker process or a cluster could not do its part."""
+    """A worker process or a cluster failed."""
 
 
 class MissingDependencyError(RobotIdError, ImportError):
@@ -97,7 +97,7 @@ class MissingDependencyError(RobotIdError, ImportError):
 def _restore(
     kind: type[RobotIdError], args: tuple[Any, ...], facts: dict[str, Any]
 ) -> RobotIdError:
-    """Return an error as it was, without the arguments that its message was made of."""
+    """Return an error with its message and attributes, without the arguments of its class."""
     error = kind.__new__(kind, *args)
     vars(error).update(facts)
     return error

@@ -1,4 +1,4 @@
-"""What a user should know of logs, of a robot or of a result."""
+"""Findings about logs, a robot or a result."""
 
 import json
 import re
@@ -17,7 +17,7 @@ __all__ = [
     "toml_key",
 ]
 
-#: Codes that had other names before version 0.2, and what they are now.
+#: Codes that had other names before version 0.2, and their current names.
 FORMER_CODES: Mapping[str, str] = {
     "beyond_seen": "beyond_range",
     "bound_binds": "active_bound",
@@ -37,7 +37,7 @@ FORMER_CODES: Mapping[str, str] = {
 _RANK = {"error": 0, "warning": 1, "note": 2}
 _NUMBER = r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w|\.\w)"
 _RANGE = rf"{_NUMBER}(?: to {_NUMBER})?"
-#: What a user types: a flag with its value, or a key of a job file with its own.
+#: Text for a user to type: a flag with its value, or a key of a job file with its value.
 _TYPED = (
     r"--[a-z][a-z-]* [^\s,;)]+"
     r"|(?<![\w.])[\w.-]{3,} = (?:\[[^\]]*\]|\{[^}]*\}|\"[^\"]*\"|[-+]?\d[\d.]*(?:e[-+]?\d+)?)"
@@ -46,14 +46,14 @@ _TYPED = (
 
 @dataclass(frozen=True)
 class Finding:
-    """Something a user must know.
+    """A fault or a property that a user must know.
 
     Attributes:
         code: A fixed word for programs.
         severity: "note", "warning" or "error".
-        where: What it is about: a link, a joint, a parameter or a file.
-        message: What was found, what was wanted, what to do.
-        evidence: The figures it depends on, by name.
+        where: Its subject: a link, a joint, a parameter or a file.
+        message: The fault, the value found, the value expected, the remedy.
+        evidence: The numbers it depends on, by name.
     """
 
     code: str
@@ -65,14 +65,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class Cause:
-    """Findings of one code, which one thing most likely explains.
+    """Findings of one code, which probably have a common cause.
 
     Attributes:
         code: The code.
-        severity: That of the gravest.
-        joints: The joints that they are about, in the order of the robot; none: about all of it.
-        messages: What they say; those that differ in names and figures only are one sentence.
-        findings: The findings, the gravest first.
+        severity: The highest severity of the findings.
+        joints: The joints concerned, in the order of the robot; none: the whole robot.
+        messages: Their messages; those that differ only in names and numbers are one sentence.
+        findings: The findings, by descending severity.
     """
 
     code: str
@@ -85,15 +85,15 @@ class Cause:
 def log_finding(
     log: str, code: str, severity: str, message: str, part: str = "", /, **evidence: float
 ) -> Finding:
-    """Return what was found in a log.
+    """Return a finding about a log.
 
     Args:
-        log: Name of the log, which the message is made to begin with.
+        log: Name of the log; the message is prefixed with it.
         code: A fixed word for programs.
         severity: "note", "warning" or "error".
-        message: What was found, what was wanted, what to do.
-        part: Joint, link or channel that it is about; the whole log if empty.
-        evidence: The figures it depends on, by name.
+        message: The fault, the value found, the value expected, the remedy.
+        part: Joint, link or channel concerned; the whole log if empty.
+        evidence: The numbers it depends on, by name.
 
     Returns:
         The finding.
@@ -104,7 +104,7 @@ def log_finding(
 
 
 def current_code(code: str) -> str:
-    """Return the code that a finding has now, of a code that may be a former one.
+    """Return the current name of a code, which may be a former one.
 
     Args:
         code: The code.
@@ -113,11 +113,11 @@ def current_code(code: str) -> str:
 
 
 def listed(names: Iterable[object], limit: int | None = None) -> str:
-    """Return names as a sentence holds them, "a, b and 12 more".
+    """Return names as text, "a, b and 12 more".
 
     Args:
         names: The names.
-        limit: How many of them are named; all if None.
+        limit: Maximum number of names in the text; all if None.
 
     Returns:
         The names with commas; "none" if there is none.
@@ -129,7 +129,7 @@ def listed(names: Iterable[object], limit: int | None = None) -> str:
 
 
 def toml_key(name: str) -> str:
-    """Return a name as a key of a job file, in quotes where it needs them.
+    """Return a name as a key of a job file, in quotes if required.
 
     Args:
         name: The name, as of a joint.
@@ -142,7 +142,7 @@ def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return findings with the errors first, then warnings, then notes.
 
     Args:
-        findings: The findings; those of one severity keep their order.
+        findings: The findings; the order within a severity is retained.
 
     Returns:
         The same, sorted.
@@ -151,7 +151,7 @@ def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def grouped(findings: Iterable[Finding], joints: Sequence[str] = ()) -> tuple[Cause, ...]:
-    """Return findings by their cause, the gravest first.
+    """Return findings by cause, by descending severity.
 
     Args:
         findings: The findings.
@@ -173,16 +173,16 @@ def grouped(findings: Iterable[Finding], joints: Sequence[str] = ()) -> tuple[Ca
 
 
 def _joints_of(finding: Finding, joints: Sequence[str]) -> set[str]:
-    """Return the joints that a finding's place names, by themselves, a channel or a parameter."""
+    """Return the joints in the subject of a finding: a joint, a channel or a parameter."""
     parts = finding.where.rpartition(": ")[2].split(", ")
     names = {x for p in parts for x in (p, p.partition("_")[2], p.rpartition(".")[0])}
     return names.intersection(joints)
 
 
 def _merged(findings: Sequence[Finding], joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the messages, one for all that differ in names of joints and logs, and figures.
+    """Return the messages; those that differ only in names of joints or logs and numbers are one.
 
-    What is to be typed keeps one value: a range of values cannot be typed.
+    Text to type has one value, because a user cannot type a range of values.
     """
     logs = {finding.where.rpartition(": ")[0] or finding.where for finding in findings}
     names = sorted({name for name in (*joints, *logs) if name}, key=len, reverse=True)
@@ -201,7 +201,7 @@ def _merged(findings: Sequence[Finding], joints: Sequence[str]) -> tuple[str, ..
 
 
 def _in_one(values: list[str]) -> str:
-    """Return names with commas, the range of numbers, or what is typed for all of them."""
+    """Return names with commas, the range of numbers, or the text to type for all of them."""
     if len(values) == 1:
         return values[0]
     if all(re.fullmatch(_TYPED, value) for value in values):
@@ -213,7 +213,7 @@ def _in_one(values: list[str]) -> str:
 
 
 def _typed_once(values: list[str]) -> str:
-    """Return settings, of those that differ in their figures only the middle one."""
+    """Return settings; of settings that differ only in their numbers, the middle one."""
     alike: dict[str, list[str]] = {}
     for value in values:
         alike.setdefault(re.sub(_NUMBER, "", value), []).append(value)

@@ -1,4 +1,4 @@
-"""What runs: the versions that a result depends on."""
+"""The versions of the software that a result depends on."""
 
 import platform
 from functools import cache
@@ -18,23 +18,23 @@ _PACKAGES = {
 
 
 def code_versions() -> dict[str, str]:
-    """Return the versions that decide what work gives, to the last bit.
+    """Return the versions that determine results to the last bit.
 
     Returns:
-        Versions of this package, of what it computes with and of Python, by name; "not installed
-        by pip" where no package of that name is recorded.
+        Versions of this package, of its numerical packages and of Python, by name; "not installed
+        by pip" if no package of that name is recorded.
     """
     found = {name: _installed(package) for name, package in _PACKAGES.items()}
     return {"robotid": __version__, **found, "python": platform.python_version()}
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what runs: ``code_versions`` and the platform."""
+    """Return all versions: ``code_versions`` and the platform."""
     return code_versions() | {"platform": _platform()}
 
 
 def _platform() -> str:
-    """Return platform.platform(), which starts a process to ask Linux for its processor's name."""
+    """Return the text of platform.platform(), which would start a process on Linux."""
     system = platform.uname()
     if system.system != "Linux":
         return platform.platform()
@@ -42,7 +42,7 @@ def _platform() -> str:
     return "-".join([system.system, system.release, system.machine, "with", libc]).rstrip("-")
 
 
-@cache  # each reads all that its package says of itself
+@cache  # each call reads the metadata of a package
 def _installed(package: str) -> str:
     try:
         return version(package)

@@ -85,7 +85,7 @@ def test_places_where_nothing_can_be_written_are_refused(tmp_path):
     with pytest.raises(SettingsError, match="file' is a file, wanted a folder for the results"):
         check_folder(tmp_path / "file" / "below")
     check_folder(tmp_path / "not" / "yet", ["result.json"])
-    with pytest.raises(DataError, match=r"there is no folder '.*not' to write x in"):
+    with pytest.raises(DataError, match=r"the folder '.*not' of x does not exist"):
         write_text("", tmp_path / "not" / "x")
 
 
@@ -114,7 +114,7 @@ def test_a_pipe_gets_the_content_and_a_reader_that_leaves_is_named(tmp_path):
 
     reader = threading.Thread(target=leave)
     reader.start()
-    with pytest.raises(DataError, match=r"the reader of '.*pipe' left before its end"):
+    with pytest.raises(DataError, match=r"the reader of '.*pipe' closed it before the end"):
         write_text("page" * 2**20, pipe)
     reader.join()
 
@@ -145,7 +145,7 @@ def test_a_file_whose_name_is_as_long_as_can_be_is_written(tmp_path, name):
 
 
 def test_a_name_that_no_file_system_takes_is_refused_before_the_work(tmp_path):
-    words = "has 256 bytes, wanted at most 255; name a shorter one"
+    words = "has 256 bytes, wanted at most 255; shorten it"
     for refuse in (
         lambda: check_file(tmp_path / ("x" * 256)),
         lambda: check_file(tmp_path / ("é" * 128)),

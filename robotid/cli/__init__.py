@@ -11,24 +11,27 @@ from importlib import import_module
 
 from robotid.cli.console import (
     Terminated,
+    closed_output_ignored,
     open_closed_streams,
     print_error,
     shown_log,
     terminations_raised,
-    unheard_in_silence,
 )
+from robotid.cli.parser import CommandParser
 from robotid.exceptions import RobotIdError, SettingsError
 from robotid.versions import __version__
 
 __all__ = ["COMMANDS", "main"]
 
-_OBJECTS = 50_000  # made between two collections: a command makes many, and hardly a cycle of them
-# Parameters of glibc's mallopt: what is freed goes back to the system from this size of one array
-# on, and from this size in all. To have every array's pages anew takes a tenth of a run.
-_MMAP_THRESHOLD, _LARGE = -3, 2**25  # [bytes], the largest that glibc takes
+# Objects made between two garbage collections. A command makes many, and almost no cycles.
+_OBJECTS = 50_000
+# Parameters of glibc's mallopt. Only freed memory above these sizes, of one array and in total,
+# goes back to the system. Without them, new pages for every array cost a tenth of a run.
+_MMAP_THRESHOLD, _LARGE = -3, 2**25  # [bytes], the maximum that glibc accepts
 _TRIM_THRESHOLD, _SPARE = -1, 2**26  # [bytes]
 
-#: The commands in the order of the help; each is a module: SUMMARY, add_flags and run.
+#: The commands in the order of the help. Each is a module with SUMMARY, add_flags and run; one with
+#: many flags also has MAIN_FLAGS and EXAMPLES, for its short help.
 COMMANDS = (
     "demo", "paper", "inspect", "identify", "track", "excite", "preview", "replay", "doctor",
     "validate", "payload", "report", "compare", "export", "simulate", "convert", "schema",
@@ -42,25 +45,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The words after ``robotid``; those of the process if None.
 
     Returns:
-        Exit code: 0 done, 1 the data or the model do not allow it or the doctor found an error
-        that is not ignored, 2 wrong usage, 129 SIGHUP, 130 Ctrl-C, 143 SIGTERM.
+        Exit code: 0 success; 1 the data or the model do not allow the command, or the doctor found
+        an error that is not ignored; 2 wrong usage; 129 SIGHUP; 130 Ctrl-C; 143 SIGTERM.
     """
     code = 0
     gc.set_threshold(_OBJECTS)
     open_closed_streams()
-    if isinstance(sys.stdout, io.TextIOWrapper):  # whose encoding may lack what a name has
+    if isinstance(sys.stdout, io.TextIOWrapper):  # its encoding may lack characters of a name
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        with unheard_in_silence():
+        with closed_output_ignored():
             code = _run(sys.argv[1:] if arguments is None else arguments)
-    except OSError as error:  # the standard output cannot be written to
+    except OSError as error:  # the standard output is not writable
         print_error(error)
         return 1
     return code
 
 
 def _run(words: Sequence[str]) -> int:
-    """Run a command line, tell what stops it, and return its exit code."""
+    """Run a command line, print its error if it fails, and return its exit code."""
     _complete()
     options = _parser(words).parse_args(words, argparse.Namespace(words=words))
     _keep_pages()
@@ -86,7 +89,7 @@ def _run(words: Sequence[str]) -> int:
 
 
 def _keep_pages() -> None:
-    """Keep the memory of small arrays for the next ones, where the C library is glibc."""
+    """Reuse the memory of small arrays instead of returning it, where the C library is glibc."""
     if sys.platform != "linux":
         return
     set_option = getattr(ctypes.CDLL(None), "mallopt", None)
@@ -96,7 +99,7 @@ def _keep_pages() -> None:
 
 
 def _complete() -> None:
-    """Print what may follow and end, if a shell asks for it as of argcomplete."""
+    """Print the possible completions and exit, if a shell asks for them through argcomplete."""
     if "_ARGCOMPLETE" in os.environ:
         import argcomplete
 
@@ -105,8 +108,8 @@ def _complete() -> None:
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
-    """Return the parser of a command line, for its own command alone if it begins with one."""
-    parser = argparse.ArgumentParser(
+    """Return the parser of a command line; it has one command if the line starts with a command."""
+    parser = CommandParser(
         prog="robotid",
         description="Identify a robot's inertial and drive parameters from its URDF and motion "
         "logs.",
@@ -121,4 +124,6 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
         command.set_defaults(run=module.run)
         if name == chosen:
             module.add_flags(command)
+            if hasattr(module, "MAIN_FLAGS"):
+                command.shorten_help(module.MAIN_FLAGS, module.EXAMPLES)
     return parser

@@ -1,19 +1,20 @@
-"""robotid compare: several results side by side."""
+"""robotid compare: compare several results."""
 
 import argparse
-import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
-from robotid._text import columns, in_digits_of, tinted
-from robotid.cli.flags import add_json
-from robotid.cli.printing import say, window_name
+from robotid._text import columns, in_digits_of
+from robotid.cli.flags import add_json, add_verbose
+from robotid.cli.printing import echo, window_name
 from robotid.cli.running import show_found
 from robotid.findings import listed
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "several results side by side"
+SUMMARY = "compare several results"
+_SHOWN = 12  # base parameters in the table, so that two results fit a screen
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -26,6 +27,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("results", nargs="+", metavar="RESULT.json")
     add("--out", metavar="FILE.html", help="page to write")
     add_json(parser)
+    add_verbose(parser, "print all base parameters")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -40,22 +42,22 @@ def run(options: argparse.Namespace) -> None:
         content = write_comparison(options.results, options.out)
     else:
         content = compare_results(options.results)
-    show_found(content, options, _show)
+    show_found(content, options, partial(_show, is_verbose=options.verbose))
     if options.out and not options.json:
         print(f"\nwritten to {options.out}")
 
 
-def _show(content: dict[str, Any]) -> None:
+def _show(content: dict[str, Any], *, is_verbose: bool = False) -> None:
     from robotid.identification.summary import cell
 
     results = content["results"]
     labels = [result["label"] for result in results]
     for result in results:
         verdict = result["verdict"]["status"]
-        said = f"{result['label']}  {verdict:7} {result['estimator']:10} "
-        print(tinted(f"{said}{result['path']}", verdict, verdict, sys.stdout))
+        line = f"{result['label']}  {verdict:7} {result['estimator']:10} {result['path']}"
+        echo(line, "   ", verdict)
     for note in content["notes"]:
-        say(f"- {note}", "  ")
+        echo(f"- {note}", "  ")
     alike = "" if content["fitted_alike"] else "; other recordings, not comparable"
     tables = [
         (f"not fitted: {window_name(entry['name'], entry)}, error %", entry["per_joint"])
@@ -64,26 +66,31 @@ def _show(content: dict[str, Any]) -> None:
     tables.append((f"fitted recordings of each, error %{alike}", content["fitted"]))
     for title, per_joint in tables:
         rows = [[e["joint"], *map(cell, e["relative_error_pct"])] for e in per_joint]
-        say(f"\n{title}", "  ")
+        echo(f"\n{title}", "  ")
         print("\n".join(columns(["joint", *labels], rows)))
-    _print_base_parameters(content, labels)
+    _print_base_parameters(content, labels, None if is_verbose else _SHOWN)
     for key in ("settings", "versions"):
         for row in content[key]:
-            say(f"{key}: {row['name']}: {' | '.join(v or '-' for v in row['values'])}", "  ")
+            echo(f"{key}: {row['name']}: {' | '.join(v or '-' for v in row['values'])}", "  ")
     for row in content["inputs"]:
         if not all(row["in"]):
             read = listed(label for label, has in zip(labels, row["in"], strict=True) if has)
             name = row["path"] if row["start"] is None else window_name(row["path"], row)
-            say(f"only {read} read {name} ({row['role']})", "  ")
+            echo(f"only {read} read {name} ({row['role']})", "  ")
 
 
-def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) -> None:
-    say(
+def _print_base_parameters(
+    content: Mapping[str, Any], labels: Sequence[str], limit: int | None
+) -> None:
+    echo(
         "\nbase parameters to the second digit of their standard errors; last columns: difference "
-        f"to {labels[0]} over the combined standard error, the largest first"
+        f"to {labels[0]} divided by the combined standard error, in descending order"
     )
     rows = []
-    for entry in content["base_parameters"]:
+    entries = content["base_parameters"]
+    if limit is not None and len(entries) == limit + 1:  # a row is as long as its replacement
+        limit = None
+    for entry in entries[:limit]:
         pairs = zip(entry["values"], entry["std_errors"], strict=True)
         values = ["-" if x is None else in_digits_of(x, error)[0] for x, error in pairs]
         differences = [
@@ -92,3 +99,5 @@ def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) ->
         rows.append([entry["name"], *values, entry["unit"], *differences])
     heads = ["", *labels, "", *[f"{label}-{labels[0]}" for label in labels[1:]]]
     print("\n".join(columns(heads, rows, left=(0, len(labels) + 1))))
+    if len(entries) > len(rows):
+        echo(f"  {len(entries) - len(rows)} more with smaller differences: --verbose", "  ")

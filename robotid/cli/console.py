@@ -1,4 +1,4 @@
-"""Errors and progress on a terminal, and how a command that is told to end does."""
+"""Errors and progress on a terminal, and the end of a command after a signal."""
 
 import errno
 import logging
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Terminated",
+    "closed_output_ignored",
     "open_closed_streams",
     "print_error",
     "shown_log",
     "terminal_progress",
     "terminations_raised",
-    "unheard_in_silence",
 ]
 
 
@@ -36,7 +36,7 @@ _ENDS = tuple(getattr(signal, n) for n in ("SIGTERM", "SIGHUP") if hasattr(signa
 
 
 class Terminated(KeyboardInterrupt):
-    """The process was told to end, by SIGTERM or SIGHUP: what Ctrl-C undoes is undone.
+    """The process received SIGTERM or SIGHUP: it cleans up as after Ctrl-C.
 
     Attributes:
         number: The signal.
@@ -48,7 +48,7 @@ class Terminated(KeyboardInterrupt):
 
 
 def open_closed_streams() -> None:
-    """Open a standard stream that is closed, as by ``2>&-``: what is written there is lost.
+    """Open a standard stream that is closed, as by ``2>&-``; text written to it is discarded.
 
     Otherwise the next file that is opened gets the number of the stream.
     """
@@ -57,12 +57,12 @@ def open_closed_streams() -> None:
     os.close(number)
     for name in ("stdout", "stderr"):
         if not _is_open(getattr(sys, name)):
-            lost = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - to the process' end
-            setattr(sys, name, lost)
+            null = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - open until the end
+            setattr(sys, name, null)
 
 
 def _is_open(stream: TextIO | None) -> bool:
-    """Return whether a stream can be written to; one without a number can."""
+    """Return whether a stream is writable; a stream without a number is."""
     try:
         number = -1 if stream is None else stream.fileno()
     except (OSError, ValueError):  # it is in memory
@@ -76,10 +76,10 @@ def _is_open(stream: TextIO | None) -> bool:
 
 @contextmanager
 def terminations_raised() -> Iterator[None]:
-    """Raise ``Terminated`` at SIGTERM and SIGHUP while the context lasts; once, the next is late.
+    """Raise ``Terminated`` at SIGTERM and SIGHUP in the context; later signals are ignored.
 
-    A signal that is ignored stays so, as SIGHUP under nohup. Only the main thread hears signals:
-    elsewhere nothing changes.
+    A signal that is ignored already stays ignored, as SIGHUP under nohup. Only the main thread
+    receives signals: the function has no effect in other threads.
     """
     numbers = [number for number in _ENDS if signal.getsignal(number) is signal.SIG_DFL]
     if threading.current_thread() is not threading.main_thread():
@@ -100,11 +100,11 @@ def terminations_raised() -> Iterator[None]:
 
 
 @contextmanager
-def unheard_in_silence() -> Iterator[None]:
-    """Say no more if nobody reads the standard output on, as before ``| head``: that is no error.
+def closed_output_ignored() -> Iterator[None]:
+    """Discard further output if the reader of the standard output has closed it, as ``| head``.
 
     Raises:
-        OSError: If it cannot be written to for another reason, as a full disk.
+        OSError: If the standard output is not writable for another reason, as a full disk.
     """
     try:
         try:
@@ -112,34 +112,34 @@ def unheard_in_silence() -> Iterator[None]:
         finally:
             sys.stdout.flush()
     except OSError as error:
-        # what is left is not tried again at the end of the process
+        # the rest is not written again at the end of the process
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):
             raise
 
 
 def print_error(error: BaseException, words: str = "") -> None:
-    """Print an error on the standard error stream, with what was noted on its way.
+    """Print an error on the standard error stream, with its notes.
 
     Args:
         error: The error.
-        words: What to say of it, if it does not say so itself.
+        words: Its text, if the message of the error is not to be used.
     """
     notes = getattr(error, "__notes__", ())
     separator = "; " if words else "\n  "
     text = f"robotid: {separator.join([words or str(error), *notes])}"
-    with suppress(BrokenPipeError):  # the exit code says it, too
-        if sys.stderr.isatty():  # in a file, a line is looked for
+    with suppress(BrokenPipeError):  # the exit code states the failure, too
+        if sys.stderr.isatty():  # in a file, one line is easier to search
             text = wrapped(text, terminal_width(), "  ")
         print(tinted(text, "robotid:", "error", sys.stderr), file=sys.stderr)
 
 
 @contextmanager
 def shown_log(*, is_verbose: bool) -> Iterator[None]:
-    """Show warnings of the logger "robotid" on the standard error stream while the context lasts.
+    """Show warnings of the logger "robotid" on the standard error stream in the context.
 
     Args:
-        is_verbose: Whether to show what is merely worth knowing, too.
+        is_verbose: Whether to show messages of the level "info", too.
     """
     logger, handler = logging.getLogger("robotid"), _EachOnce()
     level = logger.level
@@ -153,21 +153,21 @@ def shown_log(*, is_verbose: bool) -> Iterator[None]:
 
 
 class _EachOnce(logging.Handler):
-    """Prints a message where the standard error stream then is, once for all its figures.
+    """Prints a message on the standard error stream once; its figures make no difference.
 
-    Each piece of a long log would say the same again of its own number of samples.
+    Otherwise each piece of a long log repeats the message with its own number of samples.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self._said: set[str] = set()
+        self._printed: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
         text = record.getMessage()
         words = re.sub(r"[0-9]+", "#", text)
-        if words not in self._said:
-            self._said.add(words)
-            with suppress(BrokenPipeError):  # nobody reads on, and the work is worth ending
+        if words not in self._printed:
+            self._printed.add(words)
+            with suppress(BrokenPipeError):  # the work is completed without a reader
                 print(f"robotid: {text}", file=sys.stderr)
 
 
@@ -175,17 +175,16 @@ class _EachOnce(logging.Handler):
 def terminal_progress(
     *, quiet: bool = False, force: bool = False, is_verbose: bool = False
 ) -> "Iterator[ProgressCallback | None]":
-    """Show progress on the standard error stream while the context lasts, if it is a terminal.
+    """Show progress on the standard error stream in the context, if it is a terminal.
 
     Args:
-        quiet: Show none even on a terminal, as beside JSON.
-        force: Show it in any case.
+        quiet: Show no progress on a terminal either, as with JSON output.
+        force: Show progress in any case.
         is_verbose: Whether to print a line per stage where there is no terminal.
 
     Yields:
-        What to call with the name of the work, units done, units in all and their name; None if
-        nothing is shown. A new name begins a new bar; "stages" stay, with what they consist of
-        below them.
+        A function of the name of the work, the units done, the total units and their name; None if
+        nothing is shown. A new name starts a new bar. "stages" remain, with their parts below.
     """
     if force or not (quiet or not sys.stderr.isatty()):
         with _bars(force=force) as show:
@@ -195,13 +194,13 @@ def terminal_progress(
 
 
 def _stage_lines() -> "ProgressCallback":
-    """Return what prints a line as a stage begins."""
-    said: list[str] = []
+    """Return a function that prints a line at the start of each stage."""
+    printed: list[str] = []
 
     def show(what: str, done: int, total: int, unit: str) -> None:
-        if unit == "stages" and what not in said:
-            said.append(what)
-            with suppress(BrokenPipeError):  # nobody reads on, and the work is worth ending
+        if unit == "stages" and what not in printed:
+            printed.append(what)
+            with suppress(BrokenPipeError):  # the work is completed without a reader
                 print(f"robotid: {done + 1}/{total} {what}", file=sys.stderr, flush=True)
 
     return show
@@ -209,7 +208,7 @@ def _stage_lines() -> "ProgressCallback":
 
 @contextmanager
 def _bars(*, force: bool) -> "Iterator[ProgressCallback]":
-    """Show a bar of the stage, and below it one of its work; both are gone at the end."""
+    """Show a bar of the stage and below it a bar of its work; both are removed at the end."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
     from rich.progress import TimeElapsedColumn as Elapsed
@@ -220,7 +219,7 @@ def _bars(*, force: bool) -> "Iterator[ProgressCallback]":
         TextColumn("{task.description}"),
         BarColumn(bar_width=20),
         Elapsed(),
-        TextColumn("{task.fields[said]}"),
+        TextColumn("{task.fields[state]}"),
         Remaining(),
     )
     tasks: dict[str, TaskID] = {}
@@ -236,18 +235,18 @@ def _bars(*, force: bool) -> "Iterator[ProgressCallback]":
                 words = f"    {what}" if stage else what
                 if unit == "stages":
                     stage, words = what, f"{done + 1}/{total} {what}"
-                tasks[what] = bars.add_task(words, total=None, said="")
+                tasks[what] = bars.add_task(words, total=None, state="")
                 first[what] = done
             if unit != "stages":
                 elapsed = next(t for t in bars.tasks if t.id == tasks[what]).elapsed or 0.0
-                said = _share_and_rate(done, total, done - first[what], elapsed, unit)
-                bars.update(tasks[what], completed=done, total=total, said=said)
+                state = _share_and_rate(done, total, done - first[what], elapsed, unit)
+                bars.update(tasks[what], completed=done, total=total, state=state)
 
         yield show
 
 
 def _share_and_rate(done: int, total: int, made: int, elapsed: float, unit: str) -> str:
-    """Return how far a work is and how fast it goes, as "50 %  1,200 samples/s"."""
+    """Return the share of the work that is done and its rate, as "50 %  1,200 samples/s"."""
     share = f"{100 * done / max(total, 1):3.0f} %"
     if not (made and elapsed > 0):
         return share

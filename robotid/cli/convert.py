@@ -4,7 +4,7 @@ import argparse
 from typing import Any
 
 from robotid.cli.flags import JOB, SOURCE, add_json
-from robotid.cli.printing import say
+from robotid.cli.printing import echo
 from robotid.cli.running import show_found
 
 __all__ = ["SUMMARY", "add_flags", "run"]
@@ -19,8 +19,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         parser: Its parser.
     """
     add = parser.add_argument
-    add("log", metavar="IN", help="a log of any format, or a bag's folder")
-    add("out", metavar="OUT", help="file to write; its suffix says the format")
+    add("log", metavar="IN", help="log of any format, or the folder of a bag")
+    add("out", metavar="OUT", help="file to write; its suffix determines the format")
     add("--joints", metavar="A,B,...", help="joints to write; default: all")
     JOB.add(parser, SOURCE)
     add_json(parser)
@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def source_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the settings of a ``LogSource`` that were given, by name.
+    """Return the settings of a ``LogSource`` that the flags state, by name.
 
     Args:
         options: The flags of the command "convert".
@@ -54,6 +54,6 @@ def source_settings(options: argparse.Namespace) -> dict[str, Any]:
 
 def _show(done: dict[str, Any]) -> None:
     print(f"{done['path']}: {done['samples']} samples of {len(done['joints'])} joints")
-    say(f"  columns {', '.join(done['columns'])}", "  ")
+    echo(f"  columns {', '.join(done['columns'])}", "  ")
     if done["ignored"]:
-        say(f"  not of a joint, left out: {', '.join(done['ignored'])}", "  ")
+        echo(f"  not written, not of a joint: {', '.join(done['ignored'])}", "  ")

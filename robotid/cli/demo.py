@@ -1,15 +1,15 @@
-"""robotid demo: simulate a UR5, identify it, report: needs no input."""
+"""robotid demo: simulate a UR5, identify it and write a report; no input is needed."""
 
 import argparse
 
 from robotid.cli.console import terminal_progress
 from robotid.cli.flags import add_out
 from robotid.cli.identify import show_result
-from robotid.cli.printing import print_files, say
+from robotid.cli.printing import echo, print_files
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "simulate a UR5, identify it, report: needs no input"
+SUMMARY = "simulate a UR5, identify it and write a report; no input is needed"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -29,11 +29,11 @@ def run(options: argparse.Namespace) -> None:
     """
     from robotid.commands.demo import run_demo
 
-    say("simulating a UR5 whose masses, armature and friction its URDF does not know ...")
+    echo("simulating a UR5 whose masses, armature and friction differ from its URDF ...")
     with terminal_progress() as progress:
         identification, result, truth = run_demo(options.out, progress=progress)
     show_result(result)
     error = identification.base - truth
     within = sum(abs(error) < 3 * identification.base_error)
-    say(f"\n{within} of {len(truth)} base parameters lie within 3 standard errors of the truth")
+    echo(f"\n{within} of {len(truth)} base parameters lie within 3 standard errors of the truth")
     print_files(options.out, [*result["outputs"].values(), "result.json", "replay.html"])

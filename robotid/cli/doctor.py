@@ -1,4 +1,4 @@
-"""robotid doctor: what is wrong with logs: JOB.toml, or URDF LOG ...."""
+"""robotid doctor: check logs for faults: JOB.toml, or URDF LOG ...."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -6,13 +6,13 @@ from functools import partial
 from typing import Any
 
 from robotid.cli.flags import add_job, job_from_flags
-from robotid.cli.printing import as_finding, print_causes
+from robotid.cli.printing import as_finding, echo, print_causes
 from robotid.cli.running import progress_of, show_found
 from robotid.findings import Finding, grouped
 
 __all__ = ["SUMMARY", "add_flags", "run", "show"]
 
-SUMMARY = "what is wrong with logs: JOB.toml, or URDF LOG ..."
+SUMMARY = "check logs for faults: JOB.toml, or URDF LOG ..."
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -39,23 +39,28 @@ def run(options: argparse.Namespace) -> int:
         model = job.model()
         findings = examine(job, model, progress=progress)
     content = findings_to_dict(findings) | {"joints": list(model.joints)}
-    show_found(content, options, partial(show, is_verbose=options.verbose))
+    logs = len({entry.path for entry in (*job.identification, *job.validation)})
+    show_found(content, options, partial(show, is_verbose=options.verbose, logs=logs))
     return 1 if blocking(findings, job.ignore) else 0
 
 
-def show(content: dict[str, Any], *, is_verbose: bool) -> None:
-    """Print what the doctor found.
+def show(content: dict[str, Any], *, is_verbose: bool, logs: int) -> None:
+    """Print the findings of the doctor, or that there is no fault.
 
     Args:
         content: Findings and joints, as ``--json`` prints them.
         is_verbose: Whether to print notes, too.
+        logs: Number of examined logs.
     """
     findings, joints = content["findings"], content["joints"]
-    print_causes(findings, joints, is_verbose=is_verbose, worst=_worst_of(findings, joints))
+    worst = _worst_of(findings, joints)
+    print_causes(findings, joints, is_verbose=is_verbose, worst=worst, none="")
+    if all(finding["severity"] == "note" for finding in findings):
+        echo(f"no fault found in {logs} {'log' if logs == 1 else 'logs'}")
 
 
 def _worst_of(findings: Sequence[Mapping[str, Any]], joints: Sequence[str]) -> str:
-    """Return the joint that most errors are about, then warnings, then the gravest by figure."""
+    """Return the joint with the most errors, then the most warnings, then the largest figure."""
     ranks = dict.fromkeys(joints, (0, 0, 0.0))
     for finding in findings:
         (cause,) = grouped([Finding(**as_finding(finding))], joints)

@@ -1,4 +1,4 @@
-"""robotid excite: design the motion to record, within the robot's limits."""
+"""robotid excite: design an excitation trajectory within the robot's limits."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from robotid._settings import Settings
 from robotid.cli.console import terminal_progress
 from robotid.cli.flags import JOB, ROBOT, Flags, add_json, add_progress, job_from_flags
-from robotid.cli.printing import say
+from robotid.cli.printing import echo, print_files
 from robotid.cli.running import show_found
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
@@ -17,9 +17,17 @@ if TYPE_CHECKING:
     from robotid.excitation.settings import MotionSettings
 
 
-__all__ = ["SUMMARY", "add_flags", "run"]
+__all__ = ["EXAMPLES", "MAIN_FLAGS", "SUMMARY", "add_flags", "run"]
 
-SUMMARY = "design the motion to record, within the robot's limits"
+SUMMARY = "design an excitation trajectory within the robot's limits"
+MAIN_FLAGS = (
+    "--out", "--report", "--given", "--kind", "--link", "--mass", "--duration", "--share",
+    "--clearance", "--floor", "--joints", "--lock",
+)  # fmt: skip
+EXAMPLES = (
+    "robotid excite robot.urdf --out motion.csv --report motion.html",
+    "robotid excite robot.urdf --kind payload --link tool0 --mass 2 --out m.csv",
+)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -32,8 +40,9 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("source", metavar="JOB.toml | URDF")
     words = "motion to write: .csv, .parquet, .yaml (ROS 2 JointTrajectory) or .script (UR)"
     add("--out", metavar="FILE", required=True, help=words)
-    add("--given", metavar="RESULT", help="a result.json or its folder: what its logs have told")
-    words = "page to write about the motion: its limits over time, what it will tell"
+    words = "result.json or its folder: the information of its logs is added"
+    add("--given", metavar="RESULT", help=words)
+    words = "page to write about the motion: limits over time, expected standard errors"
     add("--report", metavar="PAGE.html", help=words)
     _MOTION.add(parser)
     add_json(parser)
@@ -59,12 +68,12 @@ def run(options: argparse.Namespace) -> None:
             given=options.given, report=options.report, progress=progress,
         )  # fmt: skip
     show_found(found, options, _show)
-    if options.report and not options.json:
-        print(f"\nwritten to {options.report}")
+    if not options.json:
+        print_files("", [options.out, *([options.report] if options.report else [])])
 
 
 def motion_settings(options: argparse.Namespace) -> "MotionSettings":
-    """Return what motion is wanted.
+    """Return the settings of the motion.
 
     Args:
         options: The flags of the command "excite".
@@ -83,7 +92,7 @@ def _boxes(words: Sequence[str], flag: str) -> tuple["Box", ...]:
     """Return boxes that are stated as NAME=x0,y0,z0,x1,y1,z1, two corners [m].
 
     Raises:
-        SettingsError: If a word is another one.
+        SettingsError: If a word has another form.
     """
     from robotid.excitation.clearance import Box
     from robotid.excitation.settings import FARTHEST
@@ -129,8 +138,8 @@ def _motion() -> Settings:
     return MotionSettings()
 
 
-_COM = "--com {!r}: wanted X,Y,Z [m], three numbers, and --mass beside it"
-#: Flags of the motion that is wanted.
+_COM = "--com {!r}: wanted three numbers X,Y,Z [m], together with --mass"
+#: Flags of the settings of the motion.
 _MOTION = Flags(
     _motion,
     {
@@ -164,38 +173,39 @@ def _show(content: dict[str, Any]) -> None:
     if content["starts"]:
         plural = "start" if content["starts"] == 1 else "starts"
         done = f"{content['starts']} {plural} {done}, "
-        done += "settled" if content["converged"] else "not settled: more --seconds may improve it"
+        done += "converged" if content["converged"] else "not converged: increase --seconds"
     condition = content["condition_number"]
-    say(
+    echo(
         f"{content['robot']}: a motion of {content['duration']:g} s for {len(content['joints'])} "
         f"joints, condition number {'infinite' if condition is None else format(condition, '.0f')};"
         f" {done}"
     )
     if "widest" in content:
         names = content["widest"]
-        say(f"made for what the logs given know the least: {listed(names, 5)}", "  ")
-    print("\nwhat it leaves of each limit, least where")
+        echo(f"designed for the parameters with the widest intervals: {listed(names, 5)}", "  ")
+    print("\nsmallest margin to each limit")
     for name, margin in content["limits"].items():
-        say(f"  {name:13} {_margin(name, margin)}", 16 * " ")
+        echo(f"  {name:13} {_margin(name, margin)}", 16 * " ")
     if "payload" in content:
         print()
         for words in content["payload"]["words"]:
-            say(words)
+            echo(words)
 
 
 def _margin(name: str, margin: Mapping[str, Any]) -> str:
-    """Return in words what a motion leaves of a limit."""
+    """Return the smallest margin of a motion to a limit, as text."""
     if name != "collision":
         return f"{100 * margin['margin']:5.1f} %  {margin['where']}"
-    said = "no links or obstacles come near each other"
+    text = "no pair of links or obstacles comes close"
     if margin["margin"] is not None:
-        apart, time = 1e3 * margin["margin"], margin["time"]
-        kept = 1e3 * margin["kept"]
-        said = f"{apart:5.1f} mm beyond {kept:.0f} mm, {margin['where']} at {time:.2f} s"
+        distance, time = 1e3 * margin["margin"], margin["time"]
+        clearance = 1e3 * margin["kept"]
+        where = f"{margin['where']} at {time:.2f} s"
+        text = f"{distance:5.1f} mm above the clearance of {clearance:.0f} mm, {where}"
     if margin["unread"]:
-        said += f"; not looked at, since no shape can be read: {listed(margin['unread'])}"
+        text += f"; not checked, shapes not readable: {listed(margin['unread'])}"
     if margin["left_alone"]:
-        said += f"; made to touch and not looked at: {listed(margin['left_alone'])}"
+        text += f"; not checked, in contact by design: {listed(margin['left_alone'])}"
     if margin["built_near"]:
-        said += f"; built near each other, kept apart by: {listed(margin['built_near'])}"
-    return said
+        text += f"; smaller clearance, close by design: {listed(margin['built_near'])}"
+    return text

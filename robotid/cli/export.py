@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from robotid.cli.flags import add_json
-from robotid.cli.printing import say
+from robotid.cli.printing import echo
 from robotid.cli.running import show_found
 from robotid.export.formats import FORMATS, options_of
 
@@ -32,14 +32,14 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         if first.among:
             about = {"choices": first.among}
         add(f"--{name.replace('_', '-')}", help=_by_format(words), **about)
-    without = "deprecated, without effect: friction that a format lacks is always projected"
+    without = "deprecated, no effect: friction terms that a format lacks are always projected"
     add("--mean-friction", action="store_true", help=without)
     add_json(parser)
 
 
 def _by_format(words: Mapping[str, str]) -> str:
-    """Return words of formats as the help shows them."""
-    return "; ".join(f"{kind}: {said}" for kind, said in words.items()).replace("%", "%%")
+    """Return the help text of a flag, format by format."""
+    return "; ".join(f"{kind}: {text}" for kind, text in words.items()).replace("%", "%%")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -58,4 +58,4 @@ def run(options: argparse.Namespace) -> None:
 def _show(done: dict[str, Any]) -> None:
     print(f"written: {', '.join(done['files'])}")
     for note in done["not_stated"]:
-        say(f"  {note}", "  ")
+        echo(f"  {note}", "  ")

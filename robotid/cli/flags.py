@@ -1,4 +1,4 @@
-"""Flags that commands share, and the job that a command line names or describes."""
+"""Flags that commands share, and the job that a command line names or states."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
@@ -74,14 +74,14 @@ def _number_or_false(word: str, flag: str) -> float | bool:
 
 @dataclass(frozen=True)
 class Flags:
-    """Flags that state settings, whose fields say their types, their help and their defaults.
+    """Flags that state settings; types, help and defaults come from the fields of the settings.
 
     Attributes:
-        defaults: Returns the settings that hold if no flag is given; it imports them.
-        keys: Of each flag the key that it states, as a job file has it, and what stands for its
-            value in the help; of a switch its own help, where that of the key is another; nothing
-            where the words that it may be stand for it.
-        read: How what is given becomes the value, where the type does not say it.
+        defaults: Returns the default settings; it imports their module.
+        keys: For each flag the key of the job file and the placeholder of its value in the help.
+            A switch has its own help text in place of the placeholder, if it differs from that of
+            the key. A flag with a list of permitted words has an empty placeholder.
+        read: For flags whose value the type does not determine, the conversion of the words.
     """
 
     defaults: Callable[[], Settings]
@@ -100,38 +100,38 @@ class Flags:
         for flag in wanted or self.keys:
             at, shown = self.keys[flag]
             kinds, key, value = _in(schema, at), about[at], _in(values, at)
-            words, said = key.words, dict[str, Any](metavar=shown)
+            words, about_flag = key.words, dict[str, Any](metavar=shown)
             if kinds == (bool,):
                 words = shown or words
-                said = {"action": "store_const", "const": not flag.startswith("--no-")}
+                about_flag = {"action": "store_const", "const": not flag.startswith("--no-")}
             elif not shown:
-                words, said = key.text, {"choices": key.among}
+                words, about_flag = key.text, {"choices": key.among}
             elif _is_repeated(kinds):
-                words += "; may be given again"
-                said["action"] = "append"
+                words += "; repeatable"
+                about_flag["action"] = "append"
             elif flag not in self.read and bool not in kinds:
-                said["type"] = float if float in kinds else kinds[0]
+                about_flag["type"] = float if float in kinds else kinds[0]
             if type(value) in (int, float) and 0 < value < float("inf"):
                 words += f"; default: {value:g}"
-            parser.add_argument(flag, help=words.replace("%", "%%"), **said)
+            parser.add_argument(flag, help=words.replace("%", "%%"), **about_flag)
 
     def given(self, options: argparse.Namespace) -> list[str]:
         """Return the flags that are given.
 
         Args:
-            options: The flags of the command, which need not have all.
+            options: The flags of the command; it may lack some of these.
         """
         return [flag for flag in self.keys if getattr(options, _name(flag), None) is not None]
 
     def stated(self, options: argparse.Namespace, wanted: Sequence[str] = ()) -> dict[str, Any]:
-        """Return what flags state, as a table of a job file.
+        """Return the settings that flags state, as a table of a job file.
 
         Args:
-            options: The flags of the command, which need not have all.
+            options: The flags of the command; it may lack some of these.
             wanted: Which flags; all if none is named.
 
         Raises:
-            SettingsError: If what is given is no value of its type.
+            SettingsError: If a value has the wrong type.
         """
         schema, table = self.defaults().schema(), dict[str, Any]()
         for flag in self.given(options):
@@ -145,7 +145,7 @@ class Flags:
 
 
 def _in(table: Mapping[str, Any], at: str) -> Any:  # noqa: ANN401
-    """Return what tables inside tables have at a key, None if they have nothing."""
+    """Return the entry of nested tables at a dotted key, None if there is none."""
     found: Any = table
     for name in at.split("."):
         found = found.get(name) if isinstance(found, Mapping) else None
@@ -153,12 +153,12 @@ def _in(table: Mapping[str, Any], at: str) -> Any:  # noqa: ANN401
 
 
 def _is_repeated(kinds: Any) -> bool:  # noqa: ANN401
-    """Return whether a setting has entries, each of which a flag may give."""
+    """Return whether a setting has several entries, so that its flag may be repeated."""
     return kinds.count is None if isinstance(kinds, Entries) else dict in kinds
 
 
 def _reader(kinds: Any) -> Callable[[Any, str], Any]:  # noqa: ANN401
-    """Return how what is given becomes a setting of some kinds, as of ``Settings.schema``."""
+    """Return the conversion from words to a setting of given types, as of ``Settings.schema``."""
     if isinstance(kinds, Entries):
         return pairs if kinds.outer is dict else _listed
     if dict in kinds:
@@ -212,13 +212,13 @@ JOB = Flags(
 )
 #: Flags of the estimator.
 FIT = ("--estimator", "--kp", "--kd")
-#: Flags that say which robot it is and how its logs are read.
+#: Flags of the robot and of the reading of its logs.
 LOG = tuple(
     flag for flag, (key, _) in JOB.keys.items() if flag not in FIT and not key.startswith("output.")
 )
 #: Flags of the files that "identify" writes.
 OUTPUT = ("--dynamics", "--no-report")
-#: Flags that a tracked or replayed log has a use for.
+#: Flags of a tracked or replayed log.
 ONLINE = tuple(
     flag
     for flag, (key, _) in JOB.keys.items()
@@ -227,16 +227,16 @@ ONLINE = tuple(
 )
 #: Flags of a bag or of foreign tables.
 SOURCE = ("--topic", "--command-topic", "--effort", "--stamp")
-#: Flags that say which robot it is, and how a table is read.
+#: Flags of the robot and of the units of a table.
 ROBOT = ("--joints", "--lock", "--snap-angles", "--time-unit", "--angle-unit")
-#: Flags that a motion without torques has a use for.
+#: Flags of a motion without torques.
 MOTION = tuple(
     flag
     for flag, (key, _) in JOB.keys.items()
     if flag in LOG and not key.startswith(("torque.", "doctor."))
     if flag not in ("--effort", "--torque-delay")
 )
-_VERBOSE = "print notes, too; say on stderr the stages, what is chosen, and why"
+_VERBOSE = "print notes, too; print stages and choices with their reasons on stderr"
 
 
 def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
@@ -246,21 +246,22 @@ def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
         parser: The parser.
         folder: The default.
     """
-    parser.add_argument("--out", default=folder, metavar="DIR", help="folder to write to")
+    words = f"folder to write to; default: {folder}"
+    parser.add_argument("--out", default=folder, metavar="DIR", help=words)
 
 
 def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> None:
-    """Add the flag that has JSON printed.
+    """Add the flag for JSON output.
 
     Args:
         parser: The parser.
-        what: What is printed.
+        what: The content of the output.
     """
     parser.add_argument("--json", action="store_true", help=f"print {what}")
 
 
 def add_verbose(parser: argparse.ArgumentParser, words: str = _VERBOSE) -> None:
-    """Add the flag that has more printed.
+    """Add the flag for more output.
 
     Args:
         parser: The parser.
@@ -270,12 +271,12 @@ def add_verbose(parser: argparse.ArgumentParser, words: str = _VERBOSE) -> None:
 
 
 def add_progress(parser: argparse.ArgumentParser) -> None:
-    """Add the flag that shows progress in any case.
+    """Add the flag for progress in any case.
 
     Args:
         parser: The parser.
     """
-    words = "show progress on stderr although it is no terminal, or beside --json"
+    words = "show progress on stderr even if it is no terminal, or with --json"
     parser.add_argument("--progress", action="store_true", help=words)
 
 
@@ -294,22 +295,22 @@ def add_serve(parser: argparse.ArgumentParser, words: str) -> None:
 
     Args:
         parser: The parser.
-        words: What is shown.
+        words: The help of ``--serve``.
     """
     parser.add_argument("--serve", nargs="?", const=0, type=int, metavar="PORT", help=words)
-    speed = "of --serve; 0: as fast as it can"
+    speed = "speed of --serve, relative to real time; 0: as fast as possible; default: 1"
     parser.add_argument("--speed", type=float, default=1.0, metavar="X", help=speed)
 
 
 def add_job(
     parser: argparse.ArgumentParser, json_: str = "one JSON object", output: Sequence[str] = ()
 ) -> None:
-    """Add a job file, or the flags that say what it says.
+    """Add a job file, or the flags in place of one.
 
     Args:
         parser: The parser.
-        json_: What ``--json`` prints.
-        output: Flags of files that are written.
+        json_: The content of the output of ``--json``.
+        output: Flags of the files to write.
     """
     parser.add_argument("source", metavar="JOB.toml | URDF")
     parser.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
@@ -321,11 +322,11 @@ def add_job(
 
 
 def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "Job":
-    """Return the job that a command line names or describes.
+    """Return the job that a command line names or states.
 
     Args:
         options: The flags of the command.
-        needs_logs: Whether it is of no use without a log.
+        needs_logs: Whether at least one log is required.
 
     Raises:
         SettingsError: If a job file is given with flags, or a flag is not usable.
@@ -336,60 +337,60 @@ def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "
         given = _given(options)
         if options.logs or given:
             raise SettingsError(
-                f"{options.source} is a job file, which states its logs and settings itself; "
-                f"leave out {listed(options.logs or given)}"
+                f"{options.source} is a job file; it states the logs and settings. "
+                f"Remove {listed(options.logs or given)}"
             )
         return read_job(options.source)
     if not options.logs and needs_logs:
         kind = "motion" if hasattr(options, "given") else "log"  # of preview
         one = kind.upper()
-        raise SettingsError(f"no {kind} was given; wanted URDF {one} [{one} ...], or JOB.toml")
-    kept = getattr(options, "validate", None) or ()
+        raise SettingsError(f"no {kind} is given; wanted URDF {one} [{one} ...], or JOB.toml")
+    validation = getattr(options, "validate", None) or ()
     table = {
         "urdf": options.source,
         "identification": [{"log": log} for log in options.logs],
-        "validation": [{"log": log} for log in kept],
+        "validation": [{"log": log} for log in validation],
         **JOB.stated(options),
     }
     return job_from_settings(table, "command line", Path())
 
 
 def source_words(words: Sequence[str]) -> tuple[str, ...]:
-    """Return the words of a command line that say what is identified, and how.
+    """Return the words of a command line that determine the identification.
 
     Args:
         words: The words after ``robotid``.
 
     Returns:
-        Those after the name of the command but for ``--out`` and what is only shown.
+        The words after the name of the command, without ``--out`` and flags of the output.
     """
     _, *rest = words
-    kept, shown = list[str](), ("--json", "--progress", "--verbose", "--resume")
+    source, shown = list[str](), ("--json", "--progress", "--verbose", "--resume")
     for before, word in zip(words, rest, strict=False):
         if before != "--out" and word not in (*shown, "--out") and not word.startswith("--out="):
-            kept.append(word)
-    return tuple(kept)
+            source.append(word)
+    return tuple(source)
 
 
 def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
-    """Refuse the flags that say how logs are read.
+    """Refuse the flags of the reading of logs.
 
     Args:
         options: The flags of the command.
-        why: What is in their place.
+        why: The reason, which states what is used in their place.
 
     Raises:
         SettingsError: If one is given.
     """
     if given := _given(options):
-        raise SettingsError(f"{why}; leave out {listed(given)}")
+        raise SettingsError(f"{why}; remove {listed(given)}")
 
 
 def _given(options: argparse.Namespace) -> list[str]:
-    kept = ["--validate"] if getattr(options, "validate", None) is not None else []
-    return kept + JOB.given(options)
+    validate = ["--validate"] if getattr(options, "validate", None) is not None else []
+    return validate + JOB.given(options)
 
 
 def _name(flag: str) -> str:
-    """Return what argparse calls a flag."""
+    """Return the name of a flag in argparse."""
     return flag[2:].replace("-", "_")

@@ -8,18 +8,26 @@ from typing import Any
 from robotid._text import columns, terminal_width, wrapped
 from robotid.cli.flags import OUTPUT, add_job, add_out, add_progress, job_from_flags, source_words
 from robotid.cli.printing import (
+    echo,
     print_block,
     print_causes,
     print_steps,
     print_verdict,
     recordings_of,
-    say,
 )
 from robotid.cli.running import progress_of, show_found
 
-__all__ = ["SUMMARY", "add_flags", "run", "show_result"]
+__all__ = ["EXAMPLES", "MAIN_FLAGS", "SUMMARY", "add_flags", "run", "show_result"]
 
 SUMMARY = "identify a robot: JOB.toml, or URDF LOG [LOG ...]"
+MAIN_FLAGS = (
+    "--validate", "--out", "--estimator", "--friction", "--gain", "--joints", "--lock", "--cutoff",
+    "--verbose", "--json",
+)  # fmt: skip
+EXAMPLES = (
+    "robotid identify robot.urdf first.csv --validate second.csv --out result",
+    "robotid identify job.toml --out result",
+)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -70,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
-    """Print what was identified.
+    """Print an identification.
 
     Args:
         result: The content of result.json.
@@ -79,12 +87,13 @@ def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
     from robotid.identification.summary import error_lines
 
     width, wls = terminal_width(), result.get("wls")
-    say(f"\n{result['robot']}: {len(result['joints'])} joints, {_found(result)}")
-    fitted, kept = (recordings_of(result["inputs"], of) for of in ("identification", "validation"))
-    say(f"\nfitted: {', '.join(fitted)}", "  ")
+    echo(f"\n{result['robot']}: {len(result['joints'])} joints, {_found(result)}")
+    roles = ("identification", "validation")
+    fitted, validation = (recordings_of(result["inputs"], role) for role in roles)
+    echo(f"\nfitted: {', '.join(fitted)}", "  ")
     print("\n".join(error_lines(result["identification"], wls and wls["identification"], width)))
-    for k, (name, ours) in enumerate(zip(kept, result["validation"], strict=True)):
-        say(f"\nnot fitted: {name}", "  ")
+    for k, (name, ours) in enumerate(zip(validation, result["validation"], strict=True)):
+        echo(f"\nnot fitted: {name}", "  ")
         print("\n".join(error_lines(ours, wls and wls["validation"][k], width)))
     if lines := _drive_lines(result):
         print_block(*(wrapped(line, width, "  ") for line in lines))
@@ -95,20 +104,20 @@ def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
         result["joints"],
         is_verbose=is_verbose,
         worst="" if verdict["status"] == "good" else _worst(result),
-        said=verdict["reasons"],
+        printed=verdict["reasons"],
     )
     print_verdict(verdict)
 
 
 def _found(result: Mapping[str, Any]) -> str:
-    """Return in words how much was found."""
+    """Return the number of parameters and their conditioning, as text."""
     if "simulation" in result:
         from robotid.closed_loop.evaluation import DRIFTS  # imports numpy
 
         fit, kind = (result["simulation"][key] for key in ("fit", "controller"))
         over = f" over {DRIFTS:g} s" if kind["kind"] == "torque" else ""
-        said = f"{fit['parameters']} unknowns; {fit['message']}; errors are those of positions"
-        return said + over
+        text = f"{fit['parameters']} free parameters; {fit['message']}; errors are position errors"
+        return text + over
     structure, (before, after, _) = result["structure"], result["scale_check"]["masses"]
     return (
         f"{structure['base']} base parameters ({structure['base_inertial']} inertial), condition "
@@ -117,7 +126,7 @@ def _found(result: Mapping[str, Any]) -> str:
 
 
 def _drive_lines(result: Mapping[str, Any]) -> list[str]:
-    """Return the friction that was chosen; of a simulation all parameters of drives and loops."""
+    """Return the friction terms, or all parameters of drives and controllers of a simulation."""
     from robotid.identification.summary import friction_lines
 
     if "simulation" not in result:
@@ -131,7 +140,7 @@ def _drive_lines(result: Mapping[str, Any]) -> list[str]:
 
 
 def _worst(result: Mapping[str, Any]) -> str:
-    """Return the joint that is predicted worst, and how much of it is missed."""
+    """Return the joint with the largest prediction error, and that error."""
     is_motion = "simulation" in result
     errors = [
         (m["relative_error_pct"], joint)
@@ -142,15 +151,15 @@ def _worst(result: Mapping[str, Any]) -> str:
     if not errors:
         return ""
     error, joint = max(errors)
-    return f"{joint}, {error:.1f} % of its {'motion' if is_motion else 'torque'} is missed"
+    return f"{joint}, {'position' if is_motion else 'torque'} error {error:.1f} %"
 
 
 def _add_work(parser: argparse.ArgumentParser) -> None:
-    """Add the flags that say who reduces long logs; they never change a result."""
-    flags = parser.add_argument_group("long logs; the result has the same bits in any case")
-    words = "worker processes; default: that of the job file, else one per core for long logs"
+    """Add the flags of the reduction of long logs; they never change a result."""
+    flags = parser.add_argument_group("long logs; these flags do not change a bit of the result")
+    words = "worker processes; default: as in the job file, or one per core for long logs"
     flags.add_argument("--workers", type=int, metavar="N", help=words)
-    words = "of a Dask cluster, as tcp://host:8786"
+    words = "address of a Dask cluster, as tcp://host:8786"
     flags.add_argument("--scheduler", metavar="ADDRESS", help=words)
-    words = "go on from where an interrupted run in --out ended"
+    words = "continue an interrupted run in --out"
     flags.add_argument("--resume", action="store_true", help=words)

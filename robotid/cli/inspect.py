@@ -1,17 +1,17 @@
-"""robotid inspect: joints, parameters and faults of a URDF."""
+"""robotid inspect: list joints, parameters and faults of a URDF."""
 
 import argparse
 from functools import partial
 from typing import Any
 
 from robotid.cli.flags import add_json, add_verbose
-from robotid.cli.printing import print_causes, say
+from robotid.cli.printing import echo, print_causes
 from robotid.cli.running import show_found
 from robotid.findings import listed
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "joints, parameters and faults of a URDF"
+SUMMARY = "list joints, parameters and faults of a URDF"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +22,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     """
     add = parser.add_argument
     add("urdf", metavar="URDF")
-    add("--free-flyer", action="store_true", help="the base floats")
+    add("--free-flyer", action="store_true", help="floating base")
     add("--base", action="store_true", help="print the base parameters, too")
     add_json(parser)
     add_verbose(parser, "print notes, too")
@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> None:
         raise ModelError(content["findings"][0]["message"])
     show_found(content, options, partial(_show, is_verbose=options.verbose, with_base=options.base))
     if content["structure"] is None:
-        raise ModelError(f"no model can be built from {options.urdf}; see the findings")
+        raise ModelError(f"{options.urdf} does not give a valid model; see the findings")
 
 
 def _show(content: dict[str, Any], *, is_verbose: bool, with_base: bool) -> None:
@@ -52,9 +52,9 @@ def _show(content: dict[str, Any], *, is_verbose: bool, with_base: bool) -> None
         for finding in content["findings"]
     ]
     if content["robot"]:
-        say(f"{content['robot']}: {len(joints)} joints: {listed(joints)}", "  ")
+        echo(f"{content['robot']}: {len(joints)} joints: {listed(joints)}", "  ")
     if structure:
-        say(
+        echo(
             f"{structure['standard']} standard inertial parameters, {structure['base_inertial']} "
             f"base; with drives {structure['base']}"
         )
@@ -63,6 +63,6 @@ def _show(content: dict[str, Any], *, is_verbose: bool, with_base: bool) -> None
     if with_base:
         print("\nbase parameters, inertial")
         for group in content["base_groups"]:
-            say(f"  {group}", "    ")
+            echo(f"  {group}", "    ")
     elif structure:
-        say("the base parameters: --base")
+        echo("list of base parameters: --base")

@@ -1,4 +1,4 @@
-"""robotid paper: the paper's simulation: figures, tables, numbers."""
+"""robotid paper: repeat the simulation of the paper: figures, tables, numbers."""
 
 import argparse
 from typing import Any
@@ -8,7 +8,7 @@ from robotid.cli.running import progress_of, show_found
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "the paper's simulation: figures, tables, numbers"
+SUMMARY = "repeat the simulation of the paper: figures, tables, numbers"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -20,7 +20,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_out(parser, "robotid-paper")
     add_json(parser, "paper.json")
-    add("--quick", action="store_true", help="few iterations and motions: a try-out")
+    add("--quick", action="store_true", help="few iterations and motions, as a trial")
     add_progress(parser)
 
 
@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _show(result: dict[str, Any]) -> None:
     cases = {"disturbed": "disturbed", "noisy": "noisy", "on_program": "on program"}
-    print("relative error of the parameters; the last three cases at the end")
+    print("relative error of the parameters; the last three columns at the last iteration")
     print("  model       start   after 1   at end   " + "  ".join(cases.values()) + "   NA")
     for name, model in result["models"].items():
         errors = model["relative_error"]

@@ -1,4 +1,4 @@
-"""robotid payload: what hangs on a link: a log with it against one without."""
+"""robotid payload: identify a payload from a log with it and a log without it."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -6,13 +6,13 @@ from typing import Any
 
 from robotid._text import columns, in_digits_of
 from robotid.cli.flags import JOB, LOG, add_json, job_from_flags, refuse_log_flags
-from robotid.cli.printing import say
+from robotid.cli.printing import echo
 from robotid.cli.running import progress_of, show_found
 from robotid.findings import listed
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "what hangs on a link: a log with it against one without"
+SUMMARY = "identify a payload from a log with it and a log without it"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -24,17 +24,17 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("source", metavar="URDF")
     add("logs", nargs="+", metavar="LOG", help="logs with the payload")
-    words = "log without the payload, or a result.json or its folder; may be given again"
+    words = "log without the payload, or a result.json or its folder; repeatable"
     again: dict[str, Any] = {"action": "append", "default": []}
     add("--reference", required=True, metavar="LOG | RESULT", help=words, action="append")
-    words = "link that it hangs on; default: the last moving one; may be given again"
+    words = "link that carries the payload; default: the last moving link; repeatable"
     add("--link", metavar="NAME", help=words, **again)
-    words = "its mass, if it is known; of several: LINK=KG"
+    words = "mass of the payload, if it is known; for several payloads LINK=KG"
     add("--mass", metavar="KG", help=words, **again)
-    words = "find the gains of logged currents that no --gain states, from a known mass"
+    words = "from a known mass, estimate the gains of logged currents without --gain"
     add("--gains", action="store_true", help=words)
     add_json(parser)
-    JOB.add(parser.add_argument_group("the logs, unless a RESULT says it"), LOG)
+    JOB.add(parser.add_argument_group("the logs, unless a RESULT is given"), LOG)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
     from robotid.commands.payload import is_result, measure_payload
 
     if any(map(is_result, options.reference)):
-        refuse_log_flags(options, "a RESULT says how its logs are read")
+        refuse_log_flags(options, "a RESULT states how its logs are read")
     with progress_of(options) as progress:
         found = measure_payload(
             job_from_flags(options),
@@ -65,7 +65,7 @@ def _show(content: dict[str, Any]) -> None:
     for found in content["payloads"]:
         _print_one_payload(found)
     errors = [f"{joint} {cell(x)} %" for joint, x in content["relative_error_pct"].items()]
-    say(f"torque left unexplained: {listed(errors)}", "  ")
+    echo(f"torque prediction error: {listed(errors)}", "  ")
     if "gains" in content:
         print("\n[torque.gains]")
         for joint, gain in content["gains"].items():
@@ -82,9 +82,9 @@ def _print_one_payload(found: Mapping[str, Any]) -> None:
         print(f"  mass {found['mass']:g} kg, stated")
     else:
         low, high = (in_digits_of(end, found["mass_std_error"])[0] for end in (low, high))
-        say(
-            f"  mass {mass} kg (95 % interval {low} to {high}, in the scale of the torques: gains "
-            "that are too large make it too large)",
+        echo(
+            f"  mass {mass} kg (95 % interval {low} to {high}). It is proportional to the torque "
+            "scale: torque gains that are too large give a mass that is too large",
             "  ",
         )
     if found["com"] is not None:
@@ -99,7 +99,7 @@ def _print_one_payload(found: Mapping[str, Any]) -> None:
             ("its centre of mass", "inertia"),
             (f"the origin of {link}", "inertia_at_link"),
         ):
-            say(f"  inertia about {where}, axes of {link} [kg m^2]", "  ")
+            echo(f"  inertia about {where}, axes of {link} [kg m^2]", "  ")
             errors = found["inertia_std_error"] if key == "inertia" else None
             rows = [
                 [f"I{'xyz'[i]}{'xyz'[j]}", *_with_error(found[key][i][j], errors and errors[i][j])]
@@ -109,11 +109,11 @@ def _print_one_payload(found: Mapping[str, Any]) -> None:
             _print_values(rows)
     for name, reason in found["reasons"].items():
         what = "centre of mass" if name == "com" else name
-        say(f"  {what}: not determined; {reason}", "  ")
+        echo(f"  {what}: not determined; {reason}", "  ")
 
 
 def _with_error(value: float, error: float | None) -> list[str]:
-    """Return a value in the digits of its error, and that error, as cells."""
+    """Return a value in the digits of its error, and the error, as cells."""
     shown, half = in_digits_of(value, error)
     return [shown, "" if half == "-" else f"+- {half}"]
 

@@ -1,4 +1,4 @@
-"""robotid preview: what a motion will tell, before it is recorded."""
+"""robotid preview: compute the expected standard errors of a motion before it is recorded."""
 
 import argparse
 import re
@@ -15,14 +15,14 @@ from robotid.cli.flags import (
     pairs,
     refuse_log_flags,
 )
-from robotid.cli.printing import recordings_of, say
+from robotid.cli.printing import echo, recordings_of
 from robotid.cli.running import show_found
 from robotid.findings import listed
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "what a motion will tell, before it is recorded"
-_TERM = re.compile(r" [+-] ")  # what stands before each further term of an expression
+SUMMARY = "compute the expected standard errors of a motion before it is recorded"
+_TERM = re.compile(r" [+-] ")  # the sign before each further term of an expression
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -34,15 +34,15 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("source", metavar="JOB.toml | URDF")
     add("logs", nargs="*", metavar="MOTION", help="motions or logs; only positions are read")
-    words = "a result.json or its folder: what its logs have said, and their noise"
+    words = "result.json or its folder: the information of its logs is added; its noise is used"
     add("--given", metavar="RESULT", help=words)
-    words = "standard deviation of a joint's torque [N m or N]; may be given again; default: that "
+    words = "standard deviation of a joint's torque [N m or N]; repeatable; default: that "
     words += "of RESULT, or 1 %% of the joint's largest torque"
     add("--noise", metavar="JOINT=N_M", action="append", default=[], help=words)
-    words = "time over which that is correlated [s]; 0: from sample to sample; default: 0.1"
+    words = "correlation time of the noise [s]; 0: uncorrelated samples; default: 0.1"
     add("--correlation", metavar="S", type=float, help=words)
     add_json(parser)
-    words = "print standard parameters and whole expressions, too; say on stderr what is chosen"
+    words = "print standard parameters and whole expressions, too; print choices on stderr"
     parser.add_argument("--verbose", action="store_true", help=words)
     flags = parser.add_argument_group("instead of a job file or a RESULT, with URDF MOTION")
     JOB.add(flags, ("--estimator", *MOTION))
@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> None:
     from robotid.commands.preview import preview_job
 
     if options.given:
-        refuse_log_flags(options, "a RESULT says how its logs are read")
+        refuse_log_flags(options, "a RESULT states how its logs are read")
     stated = {"noise": stated_noise(options), "correlation": options.correlation}
     show_found(
         preview_job(job_from_flags(options), options.given, **stated),
@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def stated_noise(options: argparse.Namespace) -> dict[str, float]:
-    """Return the noise that was stated, by joint [N m or N].
+    """Return the noise that the flags state, by joint [N m or N].
 
     Args:
         options: The flags of the command "preview".
@@ -81,8 +81,8 @@ def stated_noise(options: argparse.Namespace) -> dict[str, float]:
 def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
     motions = recordings_of(content["motions"], "motion")
     count = f"{content['structure']['base']} base parameters, by {content['estimator']}"
-    say(f"{content['robot']}: {', '.join(motions)}; {count}", "  ")
-    say("\nbase parameters: standard errors to be expected, and the share of the plausible spread")
+    echo(f"{content['robot']}: {', '.join(motions)}; {count}", "  ")
+    echo("\nbase parameters: expected standard errors, and their share of the plausible spread")
     keys = {"std_error_before": "before", "gain": "gain", "achieved_std_error": "achieved",
             "ratio": "ratio"}  # fmt: skip
     keys = {key: head for key, head in keys.items() if key in content["base_parameters"][0]}
@@ -98,7 +98,7 @@ def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
     parameters = [*content["standard_parameters"], *content["drive_parameters"]]
     sources = [entry["source"] for entry in parameters]
     counts = [f"{sources.count(source)} {source}" for source in dict.fromkeys(sources)]
-    say(f"\nstandard parameters, given the URDF: by {listed(counts)}", "  ")
+    echo(f"\nstandard parameters, given the URDF: by {listed(counts)}", "  ")
     if is_verbose:
         rows = [
             [e["name"], f"{e['prior']:.4g}", _two_digits(e["std_error"]), e["unit"], e["source"]]
@@ -106,24 +106,24 @@ def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
         ]
         print("\n".join(columns(["", "prior", "+-", "", "by"], rows, left=(0, 3, 4))))
     else:
-        say("each of them, and what is in each base parameter: --verbose")
+        echo("each standard parameter, and the terms of each base parameter: --verbose")
     _print_expected_torque(content)
-    say(f"\n{content['words']}", "  ")
+    echo(f"\n{content['words']}", "  ")
     if "achieved" in content:
         achieved = content["achieved"]
-        say(
-            f"\nthese logs were identified: {achieved['count']} standard errors became "
-            "{:.2f} to {:.2f} times what was expected, eight of ten; median {:.2f}".format(
+        echo(
+            f"\nthese logs were identified: of {achieved['count']} achieved standard errors, 80 % "
+            "are {:.2f} to {:.2f} times the expected ones; median {:.2f}".format(
                 *achieved["range_80"], achieved["median"]
             )
         )
 
 
 def _print_expected_torque(content: Mapping[str, Any]) -> None:
-    """Print each joint's torque with its band, and the noise that all depends on."""
-    say(
-        "\ntorque of the motion, 95 % band of a measurement about its prediction, and the part of "
-        "that which is due to the parameters"
+    """Print each joint's torque with its band, and the assumed or stated noise."""
+    echo(
+        "\nRMS torque of the motion, half width of the 95 % prediction band, and the part of it "
+        "that the uncertainty of the parameters causes"
     )
     rows, noises = [], content["noise"].values()
     found = ["achieved"] if all("achieved" in noise for noise in noises) else []
@@ -135,10 +135,10 @@ def _print_expected_torque(content: Mapping[str, Any]) -> None:
     heads = ["joint", "torque", "band", "part", "noise", *found, "", "over", ""]
     print("\n".join(columns(heads, rows, left=(0, len(heads) - 3, len(heads) - 1))))
     if any(noise["is"] == "assumed" for noise in noises):
-        say(
-            "assumed noise is 1 % of the URDF's effort limit, or of the bodies' largest torque "
-            "where there is none. Standard errors are in proportion to it: state it with --noise "
-            "JOINT=N_M, or take it from a run before with --given RESULT",
+        echo(
+            "assumed noise: 1 % of the URDF's effort limit, or of the largest torque of the bodies "
+            "where there is no limit. Standard errors are proportional to the noise. State it with "
+            "--noise JOINT=N_M, or use that of an earlier run with --given RESULT",
             "  ",
         )
 

@@ -1,4 +1,4 @@
-"""Text of what commands found: lines that fit the terminal, findings, recordings, verdicts."""
+"""Text output of commands: lines that fit the terminal, findings, recordings, verdicts."""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -14,34 +14,34 @@ if TYPE_CHECKING:
 
 __all__ = [
     "as_finding",
+    "echo",
     "print_block",
     "print_causes",
     "print_files",
     "print_steps",
     "print_verdict",
     "recordings_of",
-    "say",
     "window_name",
 ]
 
 
-def say(text: str, hang: str = "", tone: str = "") -> None:
-    """Print text in lines that the terminal holds.
+def echo(text: str, indent: str = "", tone: str = "") -> None:
+    """Print text in lines that fit the terminal.
 
     Args:
         text: The text.
-        hang: What a line that goes on begins with.
-        tone: A word of it that is shown in its colour, as "error" is, on a terminal that has some;
-            the environment variable NO_COLOR ends it.
+        indent: Indentation of continued lines.
+        tone: A word of the text to be coloured, as "error", on a terminal with colours, unless the
+            environment variable NO_COLOR is set.
     """
-    print(tinted(wrapped(text, terminal_width(), hang), tone, tone, sys.stdout))
+    print(tinted(wrapped(text, terminal_width(), indent), tone, tone, sys.stdout))
 
 
 def print_files(folder: str, names: Sequence[str]) -> None:
-    """Print which files were written, each on a line of its own.
+    """Print the files that were written, one per line.
 
     Args:
-        folder: Where.
+        folder: Their folder.
         names: Their names.
     """
     print("\nwritten:")
@@ -50,20 +50,20 @@ def print_files(folder: str, names: Sequence[str]) -> None:
 
 
 def print_steps(steps: "Sequence[Step]") -> None:
-    """Print what to do next, each step with what to type, on lines to copy.
+    """Print the next steps, each with its commands on separate lines, for copying.
 
     Args:
         steps: The steps.
     """
-    print("\ndo next:")
+    print("\nnext steps:")
     for number, step in enumerate(steps, start=1):
-        say(f"  {number}. {step.words}", "   ")
+        echo(f"  {number}. {step.words}", "   ")
         for block in step.blocks:
             print("\n".join(f"       {line}" for line in block.split("\n")))
 
 
 def print_block(*lines: str) -> None:
-    """Print lines after an empty one.
+    """Print lines after an empty line.
 
     Args:
         lines: The lines.
@@ -77,36 +77,39 @@ def print_causes(
     *,
     is_verbose: bool,
     worst: str = "",
-    said: Sequence[str] = (),
+    printed: Sequence[str] = (),
+    none: str = "no findings",
 ) -> None:
-    """Print findings by their cause, then how many there are; notes only where they are wanted.
+    """Print findings by cause, then their number.
 
     Args:
-        findings: As a command has them, with code, severity, message and where.
-        joints: Names, of joints or links, that findings may be about.
+        findings: Findings with code, severity, message and where, as in JSON.
+        joints: Names of joints or links that findings may concern.
         is_verbose: Whether notes are printed.
-        worst: What is worst off.
-        said: Messages that are printed elsewhere.
+        worst: The worst joint, with its figure.
+        printed: Messages that are printed elsewhere.
+        none: The text if there is no finding; no line if it is empty.
     """
     shown = [f for f in findings if is_verbose or f["severity"] != "note"]
     causes = grouped([Finding(**as_finding(f)) for f in shown], joints)
     for cause in causes:
         for message in cause.messages:
-            if message not in said:
-                say(f"{cause.severity}: {cause.code}: {message}", "  ", cause.severity)
+            if message not in printed:
+                echo(f"{cause.severity}: {cause.code}: {message}", "  ", cause.severity)
     hidden = len(findings) - len(shown)
     notes = f"{_some(hidden, 'note')} hidden (--verbose)" if hidden else ""
     if shown:
         count = f"{_some(len(shown), 'finding')}, {_some(len(causes), 'cause')}"
         notes = count + (f"; worst: {worst}" if worst else "") + (f"; {notes}" if notes else "")
-    say(notes or "nothing was found")
+    if summary := notes or none:
+        echo(summary)
 
 
 def as_finding(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what ``Finding`` takes of a finding in JSON.
+    """Return the attributes of a ``Finding`` from a finding in JSON.
 
     Args:
-        found: The finding, of more keys.
+        found: The finding; it may have further keys.
     """
     return {key: found[key] for key in ("code", "severity", "where", "message")}
 
@@ -116,10 +119,10 @@ def _some(count: int, what: str) -> str:
 
 
 def recordings_of(inputs: Sequence[Mapping[str, Any]], role: str) -> list[str]:
-    """Return the file of each recording of a role, with its path if others have its name.
+    """Return the file of each recording of a role, with its path if names occur more than once.
 
     Args:
-        inputs: Inputs, as result.json has them.
+        inputs: Inputs, as in result.json.
         role: The role.
     """
     paths = {Path(entry["path"]) for entry in inputs}
@@ -133,7 +136,7 @@ def recordings_of(inputs: Sequence[Mapping[str, Any]], role: str) -> list[str]:
 
 
 def window_name(name: str, entry: Mapping[str, Any]) -> str:
-    """Return the name of a recording with the part of its log.
+    """Return the name of a recording with its window of the log.
 
     Args:
         name: The name.
@@ -151,7 +154,7 @@ def print_verdict(verdict: Mapping[str, Any]) -> None:
     from robotid.identification.summary import verdict_lines
 
     first, *others = verdict_lines(verdict)
-    say(f"\n{first}", tone=verdict["status"])
+    echo(f"\n{first}", tone=verdict["status"])
     for line in others:
         status = line.partition(": ")[2].partition(":")[0]
-        say(line, "  ", "" if line.startswith("  - ") else status)
+        echo(line, "  ", "" if line.startswith("  - ") else status)

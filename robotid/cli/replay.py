@@ -1,4 +1,4 @@
-"""robotid replay: play a log in the browser: robot, torques, what was identified."""
+"""robotid replay: play a log in the browser: robot, torques, identified parameters."""
 
 import argparse
 import sys
@@ -17,7 +17,7 @@ from robotid.cli.running import serve
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "play a log in the browser: robot, torques, what was identified"
+SUMMARY = "play a log in the browser: robot, torques, identified parameters"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -32,8 +32,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("results", nargs="*", metavar="RESULT", help=results)
     add("--html", metavar="FILE", help="page to write; default: replay.html")
     add("--ghost", metavar="LOG", help="second motion, shown as a ghost")
-    add_serve(parser, "track the log again, in true time, and show it as it goes")
-    group = parser.add_argument_group("the log, unless a RESULT says it")
+    add_serve(parser, "track the log again in real time, and show it in the browser")
+    group = parser.add_argument_group("the log, unless a RESULT is given")
     JOB.add(group, ONLINE)
 
 
@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> None:
     if findings.settings is None:
         job = job_from_flags(options)
     else:
-        refuse_log_flags(options, "a RESULT says how its logs are read")
+        refuse_log_flags(options, "a RESULT states how its logs are read")
         job = stated_job(findings, options.source, options.logs[0])
     if options.html or options.serve is None:
         check_file(Path(options.html or "replay.html"))

@@ -1,4 +1,4 @@
-"""robotid report: write the report of a result again, from its inputs."""
+"""robotid report: write the report of a result again from its inputs."""
 
 import argparse
 from typing import Any
@@ -8,7 +8,7 @@ from robotid.cli.running import progress_of, show_found
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "write the report of a result again, from its inputs"
+SUMMARY = "write the report of a result again from its inputs"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -19,7 +19,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     """
     add = parser.add_argument
     add("result", metavar="RESULT", help="result.json or its folder")
-    add("--out", metavar="FILE", help="page to write; default: report.html beside it")
+    add("--out", metavar="FILE", help="page to write; default: report.html in the folder of RESULT")
     add_json(parser)
     add_verbose(parser)
     add_progress(parser)

@@ -1,4 +1,4 @@
-"""What the commands share as they run: progress, what is shown, a live page."""
+"""Shared parts of running commands: progress, output, a live page."""
 
 import argparse
 import json
@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from robotid.cli.console import Terminated, terminal_progress, unheard_in_silence
+from robotid.cli.console import Terminated, closed_output_ignored, terminal_progress
 from robotid.cli.printing import print_files
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ __all__ = ["progress_of", "serve", "show_found"]
 
 
 def progress_of(options: argparse.Namespace) -> "AbstractContextManager[ProgressCallback | None]":
-    """Return the progress that the flags of a command ask for.
+    """Return the progress display that the flags of a command select.
 
     Args:
         options: The flags.
@@ -37,15 +37,15 @@ def show_found(
     show: Callable[[dict[str, Any]], None],
     files: Sequence[str] = (),
 ) -> None:
-    """Print what a command found and which files it wrote, or its JSON alone.
+    """Print the result of a command and the files that it wrote, or the JSON alone.
 
     Args:
-        content: What was found.
+        content: The result.
         options: The flags of the command.
-        show: Prints it as text.
+        show: Prints the result as text.
         files: Names of the files in the folder ``--out``.
     """
-    with unheard_in_silence():
+    with closed_output_ignored():
         if options.json:
             print(json.dumps(content, allow_nan=False))
             return
@@ -64,14 +64,14 @@ def serve(
 
     Args:
         job: The robot and its log.
-        folder: Where to write what was found; None: nowhere.
+        folder: Folder of the results; None: nothing is written.
         options: The flags of the command.
-        finished: Called with what was found at the end of the log.
+        finished: Called with the result at the end of the log.
     """
     from robotid.commands.track import serve_track
 
     def announce(url: str) -> None:
-        print(f"live: {url}  (Ctrl-C ends it)", file=sys.stderr, flush=True)
+        print(f"live: {url}  (stop with Ctrl-C)", file=sys.stderr, flush=True)
 
     settings = {"port": options.serve, "speed": options.speed}
     try:
@@ -79,4 +79,4 @@ def serve(
     except Terminated:
         raise
     except KeyboardInterrupt:
-        print("\nended", file=sys.stderr)
+        print("\nstopped", file=sys.stderr)

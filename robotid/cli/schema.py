@@ -1,4 +1,4 @@
-"""robotid schema: the JSON schema of job files, for editors."""
+"""robotid schema: print the JSON schema of job files, for editors."""
 
 import argparse
 import json
@@ -9,13 +9,13 @@ SUMMARY = "print the JSON schema of job files, for editors"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command: it has none.
+    """Add nothing but an example: the command has no flags.
 
     Args:
         parser: Its parser.
     """
     parser.epilog = (
-        "robotid schema > job.schema.json; then `#:schema job.schema.json` in a job file"
+        "robotid schema > job.schema.json; then write `#:schema job.schema.json` in the job file"
     )
 
 

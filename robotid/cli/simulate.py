@@ -1,4 +1,4 @@
-"""robotid simulate: a log of a motion by a robot whose truth is known."""
+"""robotid simulate: simulate a log of a motion with a robot of known parameters."""
 
 import argparse
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from robotid._settings import Settings
 from robotid.cli.console import terminal_progress
 from robotid.cli.flags import JOB, ROBOT, Flags, add_json
-from robotid.cli.printing import print_files, say
+from robotid.cli.printing import echo, print_files
 from robotid.cli.running import show_found
 from robotid.exceptions import SettingsError
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "a log of a motion by a robot whose truth is known"
+SUMMARY = "simulate a log of a motion with a robot of known parameters"
 
 
 def _simulation() -> Settings:
@@ -52,13 +52,15 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("source", metavar="URDF")
     add("motion", metavar="MOTION", help="table of time and q_<joint>, as a log or a design")
-    add("--out", required=True, metavar="LOG", help="log to write; its truth goes beside it")
-    add("--urdf", metavar="FILE", help="URDF of the true robot to write, too")
+    words = "log to write; the true parameters are written next to it"
+    add("--out", required=True, metavar="LOG", help=words)
+    add("--urdf", metavar="FILE", help="file for the URDF of the true robot")
     words = "TOML file of the true robot, its controller, actuators, sensors and payload"
     add("--plant", metavar="FILE", help=words)
-    add("--cutoff", type=float, metavar="HZ", help="smooth MOTION, a recorded one, to this")
+    words = "cutoff frequency of the low-pass filter of a recorded MOTION"
+    add("--cutoff", type=float, metavar="HZ", help=words)
     add_json(parser)
-    _PLANT.add(parser.add_argument_group("instead of, or over, the same in --plant"))
+    _PLANT.add(parser.add_argument_group("these take precedence over --plant"))
     JOB.add(parser.add_argument_group("the robot"), ROBOT)
 
 
@@ -87,7 +89,7 @@ def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation
         options: The flags of the command "simulate".
 
     Raises:
-        SettingsError: If the file of the plant cannot be used, or a flag is not usable.
+        SettingsError: If the file of the plant, or a flag, is not usable.
     """
     from robotid.commands.job import job_from_settings
     from robotid.simulation.settings import read_simulation
@@ -96,10 +98,10 @@ def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation
     for joint, entries in drives.items():
         if named := [entry for entry in entries if isinstance(entry, str)]:
             raise SettingsError(
-                f"{options.plant}: drives.{joint} has {named[0]!r}; a plant states its terms with "
-                "their shapes, as { term = 'Stribeck', speed = 0.1 }"
+                f"{options.plant}: drives.{joint} has {named[0]!r}, wanted a term with its shape, "
+                "as { term = 'Stribeck', speed = 0.1 }"
             )
-    if options.plant:  # whose name errors about its drives have
+    if options.plant:  # errors of its drives then name this file
         job_from_settings({"urdf": options.source, "drives": drives}, options.plant, Path())
     table = {"urdf": options.source, "drives": drives, **JOB.stated(options, ROBOT)}
     return job_from_settings(table, "command line", Path()), settings
@@ -112,17 +114,17 @@ def _show(content: dict[str, Any]) -> None:
     )
     noise = content["settings"].get("sensors", {}).get("noise", {})
     if not any(noise.get(kind) for kind in ("tau", "torque")):
-        say(
-            "no noise was added to the torques: errors of parameters from this log are smaller "
-            "than those of a recorded one, and than those of a preview, which takes noise into "
-            "account; state it with --torque-noise 0.02, a share of the torque"
+        echo(
+            "the torques have no noise: errors of parameters from this log are smaller than those "
+            "from a recorded log, and than those of a preview, which assumes noise. Add noise with "
+            "--torque-noise 0.02, a share of the torque"
         )
-    head = "error of the position"
+    head = "position error"
     width = max(len(head), *(len(joint) for joint in content["joints"]))
     print(f"\n{head:{width}}  rms, largest")
     for joint in content["following"]:
         line = f"{joint['joint']:{width}}  {joint['rms']:.2g}, {joint['largest']:.2g}"
         line += f" {joint['unit']}"
         if joint["at_limit"] > 0:
-            line += f"; at its effort limit for {100 * joint['at_limit']:.2g} % of the time"
+            line += f"; at the effort limit for {100 * joint['at_limit']:.2g} % of the time"
         print(line)

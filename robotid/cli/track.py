@@ -1,4 +1,4 @@
-"""robotid track: run over a log as if live: history, step changes."""
+"""robotid track: run the online estimator over a log: history, step changes."""
 
 import argparse
 import sys
@@ -15,12 +15,12 @@ from robotid.cli.flags import (
     add_verbose,
     job_from_flags,
 )
-from robotid.cli.printing import say
+from robotid.cli.printing import echo
 from robotid.cli.running import serve, show_found
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "run over a log as if live: history, step changes"
+SUMMARY = "run the online estimator over a log: history, step changes"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +34,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add_json(parser, "track.json")
     JOB.add(parser.add_argument_group("the log"), ONLINE)
     add_verbose(parser)
-    add_serve(parser, "show it in the browser while it runs, in true time")
+    add_serve(parser, "show the run in the browser, in real time")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -60,16 +60,16 @@ def run(options: argparse.Namespace) -> None:
 def _show(found: dict[str, Any]) -> None:
     converged = found["converged_at"]
     when = "not converged" if converged is None else f"converged at {converged:.2f} s"
-    say(
-        f"{found['robot']}: {found['samples']} samples, estimate {1e3 * found['delay']:.0f} ms "
-        f"behind, {when}, excitation {found['excitation']:.2f}"
+    echo(
+        f"{found['robot']}: {found['samples']} samples, delay of the estimate "
+        f"{1e3 * found['delay']:.0f} ms, {when}, excitation {found['excitation']:.2f}"
     )
     for change in found["changes"]:
         load = change["payload"]
         mass, error = in_digits_of(load["mass"], load["std_error"])
-        say(
-            f"step change at {change['onset']:.2f} s, flagged at {change['flagged']:.2f} s; as a "
-            f"load on {load['body']}: {mass} +- {error} kg",
+        echo(
+            f"step change at {change['onset']:.2f} s, detected at {change['flagged']:.2f} s; "
+            f"equivalent payload on {load['body']}: {mass} +- {error} kg",
             "  ",
         )
     rows = []

@@ -1,16 +1,16 @@
-"""robotid validate: measure a result's prediction on other logs."""
+"""robotid validate: compute a result's prediction error on other logs."""
 
 import argparse
 from typing import Any
 
 from robotid._text import terminal_width
 from robotid.cli.flags import add_json
-from robotid.cli.printing import print_verdict, say
+from robotid.cli.printing import echo, print_verdict
 from robotid.cli.running import show_found
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "measure a result's prediction on other logs"
+SUMMARY = "compute a result's prediction error on other logs"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -39,8 +39,8 @@ def run(options: argparse.Namespace) -> None:
 def _show(found: dict[str, Any]) -> None:
     from robotid.identification.summary import error_lines
 
-    say(f"predicted with {found['predicted_with']}")
+    echo(f"predicted with {found['predicted_with']}")
     for recording in found["validation"]:
-        say(f"\n{recording['name']}", "  ")
+        echo(f"\n{recording['name']}", "  ")
         print("\n".join(error_lines(recording, width=terminal_width())))
     print_verdict(found["verdict"])

@@ -1,3 +1,3 @@
-"""One module per command: files in, files out."""
+"""One module per command: from input files to output files."""
 
 __all__: list[str] = []

@@ -1,4 +1,4 @@
-"""Conversion of log files: any format that is read to any that is written, numbers unchanged."""
+"""Conversion of log files from any readable to any writable format; numbers are unchanged."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ _WHOLE = LogSource()
 
 @dataclass(frozen=True)
 class Conversion:
-    """What a conversion wrote."""
+    """The content of a converted file."""
 
     path: str
     samples: int
-    columns: tuple[str, ...]  # of standard names
+    columns: tuple[str, ...]  # with standard names
     joints: tuple[str, ...]
-    ignored: tuple[str, ...]  # columns of the file read that are no joint's quantity
+    ignored: tuple[str, ...]  # columns of the source file that are not a quantity of a joint
 
 
 def convert(
@@ -35,18 +35,18 @@ def convert(
     joints: Sequence[str] | None = None,
     source: LogSource = _WHOLE,
 ) -> Conversion:
-    """Write a log in another format, with standard column names; the robot need not be known.
+    """Write a log in another format, with standard column names; no robot model is required.
 
-    Numbers and their units stay as they are; what they mean is judged when the log is read.
+    Numbers and units are unchanged. They are checked when the log is read with a robot.
 
     Args:
         path: The log to read.
         target: The file to write, .csv, .parquet, .npz, .h5, .hdf5 or .mat; replaced if it exists.
-        joints: Names of the joints to write; all that are found if None.
-        source: Which topic or group, names of joints in the file, meaning of effort.
+        joints: Names of the joints to write; all joints of the file if None.
+        source: Topic or group, names of joints in the file, meaning of effort.
 
     Raises:
-        DataError: If the file cannot be read, has no time, or does not hold a joint.
+        DataError: If the file cannot be read, has no time, or lacks a joint.
         MissingDependencyError: If a package that reads or writes a format is not installed.
         SettingsError: If the target is a folder.
     """
@@ -60,8 +60,8 @@ def convert(
                 f"{file.name} has no joint {joint!r}; joints found: {listed(by_joint)}"
                 f"{suggestion(joint, by_joint)}"
             )
-    kept = tuple(by_joint) if joints is None else tuple(joints)
-    chosen = ["time", *(name for joint in kept for name in by_joint[joint])]
+    wanted = tuple(by_joint) if joints is None else tuple(joints)
+    chosen = ["time", *(name for joint in wanted for name in by_joint[joint])]
     columns = [name for name in found if name in chosen]
     table = opened.read([found[name] for name in columns])
     write_columns({name: table[found[name]] for name in columns}, Path(target))
@@ -69,7 +69,7 @@ def convert(
         path=str(target),
         samples=len(table[found["time"]]),
         columns=tuple(columns),
-        joints=kept,
+        joints=wanted,
         ignored=tuple(name for name in opened.names if name not in found.values()),
     )
 
@@ -91,14 +91,16 @@ def _standard_names(
     if twice := repeated([key for key, _ in pairs]):
         both = [name for key, name in pairs if key == twice[0]]
         raise DataError(
-            f"{where} has {listed(both)}, several names of {twice[0]!r}; remove all but one"
+            f"{where} has several columns for {twice[0]!r}: {listed(both)}; keep one of them"
         )
     standard = dict(pairs)
     if "time" not in standard:
-        raise DataError(f"{where} has no column 'time'; columns found: {listed(names)}. Rename it")
+        raise DataError(
+            f"{where} has no column 'time'; columns found: {listed(names)}. Rename the time column"
+        )
     if not by_joint:
         raise DataError(
             f"{where} has no column of a joint, as 'q_<joint>'; columns found: {listed(names)}. "
-            "Rename them"
+            "Rename the columns of the joints"
         )
     return standard, by_joint

@@ -1,4 +1,4 @@
-"""The demonstration: simulate a UR5 that its URDF does not describe, and identify it."""
+"""The demonstration: simulate a UR5 that differs from its URDF, and identify it."""
 
 from pathlib import Path
 from typing import Any, cast
@@ -30,14 +30,14 @@ _NOISE = Noise(q=2e-5, v=2e-4, tau=0.02)  # encoder [rad], its rate [rad/s], 2 %
 def run_demo(
     folder: str | Path, *, progress: ProgressCallback | None = None
 ) -> tuple[Identification, dict[str, Any], Array]:
-    """Simulate, identify, validate, and write everything.
+    """Simulate, identify, validate, and write all files.
 
-    The simulated robot has other masses than its URDF, a tool that the URDF does not know, and
+    The simulated robot has other masses than its URDF, a tool that is not in the URDF, and
     armature and friction in every joint.
 
     Args:
-        folder: Where to write; made if it is missing.
-        progress: Called as each stage of the identification begins, as of ``identify``.
+        folder: Folder of the results; created if it is missing.
+        progress: Called at the start of each stage of the identification, as by ``identify``.
 
     Returns:
         The identification, the content of result.json, and the true base parameters, shape (b,).

@@ -1,4 +1,4 @@
-"""A motion to record: designed for a robot within its limits, and written."""
+"""An excitation trajectory: designed for a robot within its limits, and written to a file."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -46,20 +46,20 @@ def design_motion(
 
     Args:
         job: The robot.
-        settings: What motion is wanted.
+        settings: The settings of the motion.
         target: The file, as of ``write_motion``.
-        given: A result.json, or its folder: the motion tells what its logs did not.
-        report: A page to write about it, if any.
-        progress: Told which start is followed.
+        given: A result.json, or its folder: the motion adds to the information of its logs.
+        report: The page to write about the motion, if any.
+        progress: Called with the index of each start.
 
     Returns:
-        What ``robotid excite --json`` prints.
+        The output of ``robotid excite --json``.
 
     Raises:
-        DataError: If collisions cannot be looked at, the result's logs are gone, or motions are
-            not written in the target's format.
-        ModelError: If the URDF cannot be used.
-        SettingsError: If a setting does not fit, or nothing keeps the limits.
+        DataError: If collisions cannot be checked, the logs of the result are missing, or the
+            format of the target is not one for motions.
+        ModelError: If the URDF is not usable.
+        SettingsError: If a setting is not usable, or no motion satisfies the limits.
     """
     for file in (target, *([] if report is None else [report])):
         check_file(Path(file))
@@ -67,7 +67,7 @@ def design_motion(
     designer, run = _designer(job, settings, given)
     model = designer.information.model
 
-    def told(start: int, _: float) -> None:
+    def show_start(start: int, _: float) -> None:
         if progress is not None:
             progress("designing", start, settings.starts, "starts")
 
@@ -76,17 +76,17 @@ def design_motion(
         carried = design_payload(
             designer, np.random.default_rng(settings.seed), settings.payload,
             moving=settings.moving, starts=settings.starts, seconds=settings.seconds,
-            progress=told,
+            progress=show_start,
         )  # fmt: skip
         designer, design = carried.designer, carried.design
     else:
-        design = _designed(designer, settings, told)
+        design = _designed(designer, settings, show_start)
     design = replace(design, seconds=time.monotonic() - initialised)
     course = Course.of_design(designer, design)
     if settings.kind in ROUTES:
         _check_jerk(course, model.joints)
     expected: Preview | list[str] | None = None
-    if report is not None:  # before anything is written: a motion may be too short for it
+    if report is not None:  # computed before any file is written: the motion may be too short
         expected = (
             _expected(job, model, design, settings, run, str(target))
             if carried is None
@@ -103,14 +103,14 @@ def design_motion(
 
 
 def _basis(settings: MotionSettings) -> Basis:
-    """Return the functions that the motion is a sum of."""
+    """Return the basis functions of the motion."""
     if settings.kind == "bspline":
         return BSplineBasis(settings.duration, 2 * settings.harmonics)
     return FourierBasis(settings.duration, settings.harmonics)
 
 
 def _designer(job: Job, settings: MotionSettings, given: str | None) -> tuple[Designer, Run | None]:
-    """Return what looks for the motion, and what was recorded before."""
+    """Return the designer of the motion, and the logs of an earlier result."""
     model, run = job.model(), None
     if given is not None:
         _, _, model, run = result_run(job, given)
@@ -119,8 +119,8 @@ def _designer(job: Job, settings: MotionSettings, given: str | None) -> tuple[De
         name = "D" if run is None or settings.kind == "payload" else "widest"
     elif name == "widest" and (run is None or settings.kind == "payload"):
         raise SettingsError(
-            "criterion is widest, which is about what logs have told of the robot: wanted --given "
-            "RESULT, and another kind than payload; or another criterion"
+            "criterion is widest, which needs an earlier result: wanted --given RESULT, and a kind "
+            "other than payload; or another criterion"
         )
     limits = MotionLimits.of_model(
         model,
@@ -154,18 +154,18 @@ def _designed(
 
 
 def _check_jerk(course: Course, joints: Sequence[str]) -> None:
-    """Refuse a motion from place to place that is too jerky: it is not designed for jerk.
+    """Refuse a motion between poses that exceeds the jerk limit; its design ignores that limit.
 
     Raises:
-        SettingsError: If it is.
+        SettingsError: If it does.
     """
     used = course.largest[LIMITS.index("jerk")]
     joint = int(np.argmax(used))
     if used[joint] > 1.0:
         raise SettingsError(
             f"{joints[joint]} needs {100 * used[joint]:.0f} % of its jerk limit at "
-            f"{course.peak('jerk', joint):.2f} s: sweeps and stands do not follow jerk; raise "
-            "--max-jerk or lower --share"
+            f"{course.peak('jerk', joint):.2f} s, wanted at most 100 %: the design of a motion "
+            "between poses ignores jerk limits. Increase --max-jerk or reduce --share"
         )
 
 
@@ -177,18 +177,18 @@ def _expected(
     run: Run | None,
     path: str,
 ) -> Preview:
-    """Return what is to be expected of a log of the motion, beside what is known already."""
+    """Return the expected standard errors of a log of the motion, with those of earlier logs."""
     t = np.arange(round(design.duration * settings.points) + 1) / settings.points
     q, v, a = design.motion.evaluate(np.minimum(t, design.duration))
     log = Log(t, q, np.zeros_like(q), model.joints, v, a, path)
-    held = hold_log(model, log, job.signals)
-    return preview_logs(model, [held], job.estimator, noise=settings.noise, run=run)
+    in_memory = hold_log(model, log, job.signals)
+    return preview_logs(model, [in_memory], job.estimator, noise=settings.noise, run=run)
 
 
 def _content(
     designer: Designer, design: Design, course: Course, settings: MotionSettings
 ) -> dict[str, Any]:
-    """Return what was designed, for people and programs."""
+    """Return the design as plain values."""
     model, names = designer.information.model, designer.information.mapping.base_names
     margins: dict[str, Any] = {}
     limits, clearance = course.limits, course.clearance

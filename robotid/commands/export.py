@@ -1,4 +1,4 @@
-"""A written result in the formats that other programs read."""
+"""Export of a written result to the formats of other programs."""
 
 from importlib import import_module
 from pathlib import Path
@@ -16,25 +16,26 @@ __all__ = ["export_result"]
 def export_result(
     path: str | Path, kind: str, target: str | Path, **options: float | str | None
 ) -> dict[str, Any]:
-    """Write what an identification found in another format.
+    """Write a result in another format.
+
+    Friction terms that a format lacks are projected on those that it has, see
+    ``project_friction``.
 
     Args:
-        path: A result.json, or its folder, with the URDF and sidecar beside it.
+        path: A result.json, or its folder, with the URDF and sidecar in the same folder.
         kind: The format, one of ``FORMATS``.
         target: The file to write.
-        options: Options of the format, by name; None: as if not stated.
-
-    Friction that a format has no place for is projected on that it has, see ``project_friction``.
+        options: Options of the format, by name; None: not stated.
 
     Returns:
-        {"result", "format", "files", "not_stated": what the files do not state, a sentence each,
+        {"result", "format", "files", "not_stated": properties that the files lack, a sentence each,
         "projected": {drive: {"replaced", the parameters written, "error", "torque"}}}.
 
     Raises:
         DataError: If the result has no URDF, or no ranges or gains that the format needs, or the
             folder does not exist.
-        ModelError: If the URDF was changed, or a link of it is impossible.
-        SettingsError: If the target is a folder, or there is no such format, or option of it.
+        ModelError: If the URDF was changed, or one of its links is impossible.
+        SettingsError: If the target is a folder, or the format or an option is unknown.
     """
     if kind not in FORMATS:
         raise SettingsError(f"format is {kind!r}, wanted one of {listed(FORMATS)}")
@@ -43,8 +44,8 @@ def export_result(
     for name in stated:
         if kind not in having.get(name, {}):
             raise SettingsError(
-                f"--{name.replace('_', '-')} is for the formats {listed(having.get(name, {}))}, "
-                f"not for {kind}: leave it out"
+                f"--{name.replace('_', '-')} is an option of {listed(having.get(name, {}))}, "
+                f"not of {kind}; remove it"
             )
     module = import_module(f"robotid.export.{kind}")
     written: Written = module.export(load_result(path), Path(target), **stated)

@@ -1,4 +1,4 @@
-"""A job from its files to the folder of results."""
+"""A job: from its files to the folder of results."""
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
@@ -59,15 +59,15 @@ def run_job(
 ) -> tuple["Identification | LoopIdentification", dict[str, Any]]:
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
-    A job may want no report, and an impossible result has no URDF. Every file is made in a folder
-    of its own first and put in place when all are complete.
+    The settings may exclude the report, and an impossible result has no URDF. All files are first
+    written to a temporary folder and moved when they are complete.
 
     Args:
-        job: What to do.
-        folder: Where to write; made if it is missing.
-        plan: Who works on long logs; as the job says, in this process, if None.
-        source: What follows ``robotid identify`` to run it again, for the report.
-        beside: Further files that the folder will hold, by what they are, for the report.
+        job: The job.
+        folder: Folder of the results; created if it is missing.
+        plan: Workers for long logs; if None those of the job, in this process.
+        source: The words after ``robotid identify`` that repeat the run, for the report.
+        beside: Further files of the folder, by their content, for the report.
 
     Returns:
         The identification and the content of result.json.
@@ -75,11 +75,12 @@ def run_job(
     Raises:
         DataError: If a log cannot be used.
         MissingDependencyError: If the estimator is "simulation" and Numba is not installed.
-        ModelError: If the URDF cannot be used.
-        NotConvergedError: If a solver fails, or loops cannot be simulated.
-        RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
-        SettingsError: If a setting does not fit.
-        WorkerError: If a worker ends before its work.
+        ModelError: If the URDF is not usable.
+        NotConvergedError: If a solver fails, or the closed loop cannot be simulated.
+        RankDeficientError: If the estimator is "ols" or "wls" and the data do not determine all
+            base parameters.
+        SettingsError: If a setting is not usable.
+        WorkerError: If a worker ends before its work is done.
     """
     require_kind(job, Job, "job", "a Job, as robotid.read_job returns it")
     require_kind(folder, (str, Path), "folder", "the path of a folder")
@@ -109,24 +110,24 @@ def save_result(
     *,
     report: bool = True,
 ) -> Path:
-    """Write what ``robotid identify`` writes: result.json, report, URDF with its sidecar.
+    """Write the files of ``robotid identify``: result.json, report, URDF with its sidecar.
 
-    ``robotid.load_result(folder)``, ``robotid validate`` and ``robotid replay`` read it. Every file
-    is made in a folder of its own first and put in place when all are complete. A result that
-    cannot be right has no URDF. Logs in files are named, with their hashes; how their columns were
-    read by hand (gains, units, names) is not known to it.
+    ``robotid.load_result(folder)``, ``robotid validate`` and ``robotid replay`` read them. All
+    files are first written to a temporary folder and moved when they are complete. An impossible
+    result has no URDF. Logs in files are listed with their hashes. Gains, units and column names
+    with which the logs were read in Python are not recorded.
 
     Args:
-        identification: What was found.
-        folder: Where to write; made if it is missing.
+        identification: The identification.
+        folder: Folder of the results; created if it is missing.
         report: Whether report.html is written.
 
     Returns:
         Path of the result.json.
 
     Raises:
-        ModelError: If the URDF that the robot was read from is gone.
-        SettingsError: If the folder is a file, or cannot be written to.
+        ModelError: If the URDF of the robot no longer exists.
+        SettingsError: If the folder is a file, or is not writable.
     """
     require_kind(folder, (str, Path), "folder", "the path of a folder")
     require_kind(report, bool, "report", "True or False")
@@ -176,9 +177,9 @@ def _write(
 
 
 def _job_of(identification: "Identification | LoopIdentification") -> Job:
-    """Return the job that an identification comes from, made in Python as far as it is known.
+    """Return the job of an identification; one made in Python gets an equivalent job.
 
-    Logs in memory have no file, and gains, units and names of columns are not in a ``Log``.
+    Logs in memory have no file, and a ``Log`` has no gains, units or names of columns.
     """
     model, asked = identification.model, identification.asked
     if isinstance(asked.job, Job):
@@ -231,38 +232,38 @@ def _entries(runs: "Sequence[Evaluation | OpenLoop]") -> tuple[LogEntry, ...]:
 
 
 def _remove_stale(files: Iterable[Path]) -> None:
-    """Remove the files that an earlier run left, for they are not of this result."""
+    """Remove files of an earlier run that are not part of this result."""
     for stale in files:
         if stale.exists():
-            _log.warning("%s is of an earlier run and was removed: this one wrote none", stale)
+            _log.warning("removed %s of an earlier run: this run did not write it", stale)
             stale.unlink()
 
 
 def identify_job(
     job: Job, model: RobotModel, plan: WorkPlan, folder: Path | None = None
 ) -> tuple[Identification, Checkpoint | None]:
-    """Identify from a job's logs, and write nothing but finished pieces of long ones.
+    """Identify from a job's logs; only finished pieces of long logs are written.
 
     Args:
-        job: What to do.
+        job: The job.
         model: Its robot.
-        plan: Who works on long logs.
-        folder: Where finished pieces are kept, until the checkpoint is removed; nowhere if None.
+        plan: Workers for long logs.
+        folder: Folder of the checkpoint, which stores finished pieces; none if None.
 
     Raises:
         DataError, ModelError, NotConvergedError, RankDeficientError, SettingsError, WorkerError:
             As of ``run_job``.
     """
     check_ignored(job.ignore)
-    fitted, kept = survey_logs(job, model, job.identification, job.validation)
+    fitted, validation = survey_logs(job, model, job.identification, job.validation)
     if not fitted:
-        raise DataError("no log was given; at least one is needed to identify anything")
+        raise DataError("no log is given, wanted at least one to identify from")
     report_stage(plan.progress, "checking logs")
-    there = locked_as_logged(job, model, fitted, kept)
-    job, model, fitted, kept = there.job, there.model, there.fitted, there.kept
+    placed = locked_as_logged(job, model, fitted, validation)
+    job, model, fitted, validation = placed.job, placed.model, placed.fitted, placed.validation
     locked = locked_findings(model, job.placed(model))
-    found = [*locked, *examine_logs(job, model, fitted, kept)]
-    recordings = Recordings(model, structural_mapping(model), fitted, kept)
+    found = [*locked, *examine_logs(job, model, fitted, validation)]
+    recordings = Recordings(model, structural_mapping(model), fitted, validation)
     checkpoint = None
     if not recordings.is_held:
         if folder is not None:
@@ -272,8 +273,8 @@ def identify_job(
         recordings = replace(recordings, plan=plan, checkpoint=checkpoint)
     elif plan.is_asked_for:
         _log.warning(
-            "the logs have no more than %d rows and are read at once: workers, scheduler and "
-            "resume have nothing to do; lower rows_in_memory in [reduction] to cut them",
+            "the logs have at most %d rows and are read whole: workers, scheduler and resume have "
+            "no effect. Reduce rows_in_memory in [reduction] to read the logs in pieces",
             job.rows_in_memory,
         )
     with plan, released_on_error(checkpoint):
@@ -286,11 +287,12 @@ def identify_job(
             progress=plan.progress,
         )
     asked = replace(concluded.asked, job=job)
-    return replace(concluded, asked=asked, findings=(*there.notes, *concluded.findings)), checkpoint
+    findings = (*placed.notes, *concluded.findings)
+    return replace(concluded, asked=asked, findings=findings), checkpoint
 
 
 def _loop_stages() -> Sequence[str]:
-    """Return the stages of a simulation, whose modules other jobs do not wait for."""
+    """Return the stages of a simulation; other jobs do not import its modules."""
     from robotid.closed_loop.fit import STAGES as stages
 
     return stages
@@ -299,18 +301,18 @@ def _loop_stages() -> Sequence[str]:
 def _identify_loops(
     job: Job, model: RobotModel, progress: ProgressCallback | None
 ) -> "LoopIdentification":
-    """Identify by simulation, from commands or logged torques, and write nothing."""
+    """Identify by simulation, from commands or logged torques; no file is written."""
     from robotid.closed_loop.identify import identify_loops
 
     assert isinstance(job.estimator, SimulationSettings)
     check_ignored(job.ignore)
-    logs, kept = (
+    logs, validation = (
         [job.read(entry, model, needs=needed_of(job)) for entry in entries]
         for entries in (job.identification, job.validation)
     )
     found = identify_loops(
-        model, logs, kept, job.controller, job.estimator, signals=job.signals,
-        chooses=AUTO in job.terms, examined=diagnose(model, logs, kept, job.signals),
+        model, logs, validation, job.controller, job.estimator, signals=job.signals,
+        chooses=AUTO in job.terms, examined=diagnose(model, logs, validation, job.signals),
         ignore=job.ignore, progress=progress or ignore_progress,
     )  # fmt: skip
     return replace(found, asked=replace(found.asked, job=job))

@@ -1,4 +1,4 @@
-"""identify() of Python: from torques, or by simulation."""
+"""identify() for Python: from torques, or by simulation."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -72,32 +72,34 @@ def identify(
     """Identify a robot's parameters from motion logs, as the command line does.
 
     Args:
-        model: The robot; or the path of its URDF, all of whose joints move.
-        logs: Recordings to fit: a ``Log`` that has the model's joints, the path of a file, a
-            DataFrame with the columns of such a file, or several of these. Files are read whole,
-            as by ``read_log``; ``robotid.run_job`` reads long ones in pieces.
-        validation: Validation Recordings to measure the prediction with, likewise.
-        signals: How logs become trajectories; the defaults if None.
-        estimator: Name or settings of the estimator. With "simulation" the robot is simulated on
-            the commands of the logs, or on their torques.
-        controller: What is known of the loops that follow the commands, the keys of the job file's
-            table ``[controller]``; of the estimator "simulation" alone.
-        friction: What friction joints have beside viscous and Coulomb's, as of
-            ``wanted_families``: "auto" has it chosen. Simulation chooses that of all joints, or
+        model: The robot, or the path of its URDF with all joints free.
+        logs: Logs to fit: a ``Log`` with the model's joints, the path of a file, a DataFrame with
+            the columns of such a file, or several of these. Files are read whole, as by
+            ``read_log``; ``robotid.run_job`` reads long files in pieces.
+        validation: Logs for validation, of the same types.
+        signals: Settings of the signal processing; the defaults if None.
+        estimator: Name or settings of the estimator. "simulation" simulates the robot on the
+            commands, or on the torques, of the logs.
+        controller: Known properties of the position controllers, with the keys of the table
+            ``[controller]`` of a job file; only for the estimator "simulation".
+        friction: Friction terms in addition to viscous and Coulomb friction, as of
+            ``wanted_families``; "auto" selects them. Simulation selects those of all joints, or
             of none.
-        doctor: Whether the doctor looks at the logs first; the verdict counts what it finds.
-        ignore: Codes of errors and doubts that you know better.
-        progress: Called as each stage begins: its name, stages done, in all, "stages"; and in
-            between with the name of a work, units done, in all, and what they are.
+        doctor: Whether the doctor checks the logs first; its findings count in the verdict.
+        ignore: Codes of errors and warnings to ignore.
+        progress: Called at the start of each stage with its name, the stages done, their number
+            and "stages"; in between with the name of a work, the units done, their number and
+            their name.
 
     Returns:
-        What was found; of the estimator "simulation" a ``LoopIdentification``.
+        The identification; for the estimator "simulation" a ``LoopIdentification``.
 
     Raises:
-        DataError: If a log cannot be read, does not fit the model or is too short.
-        ModelError: If the model is no model, nor the path of a URDF that can be used.
-        RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
-        NotConvergedError: If a solver fails, or loops cannot be simulated.
+        DataError: If a log cannot be read, does not match the model or is too short.
+        ModelError: If the model is neither a model nor the path of a usable URDF.
+        RankDeficientError: If the estimator is "ols" or "wls" and the data do not determine all
+            base parameters.
+        NotConvergedError: If a solver fails, or the closed loop cannot be simulated.
         SettingsError: If a setting is out of range, or a code to ignore is unknown.
     """
     require_kind(
@@ -107,8 +109,8 @@ def identify(
     if not isinstance(choice, SimulationSettings):
         if controller is not None:
             raise SettingsError(
-                f"controller is of the estimator 'simulation', but the estimator is "
-                f"{choice.name!r}; leave controller out, or set estimator='simulation'"
+                f"controller is given, but the estimator is {choice.name!r}, wanted 'simulation'; "
+                "remove controller, or set estimator='simulation'"
             )
         return pipeline.identify(
             model, logs, validation=validation, signals=signals, estimator=choice,
@@ -128,16 +130,16 @@ def identify(
     wanted = wanted_families(friction, model.joints).values()
     if any(wanted) or len({names is None for names in wanted}) > 1:
         raise SettingsError(
-            "friction is stated joint by joint or by families, but simulation chooses that of all "
-            "joints, or of none: take 'auto' or 'viscous+coulomb', and state terms in the model"
+            "friction is stated by joint or with families, but simulation selects the terms of all "
+            "joints, or of none; wanted 'auto' or 'viscous+coulomb'. State terms in the model"
         )
     needs: Literal["torque", "commands"] = "torque" if loop.kind == "torque" else "commands"
-    fitted, kept = (
+    fitted, held_out = (
         read_logs(some, model.joints, prismatic=model.layout.prismatic, needs=needs)
         for some in (logs, validation)
     )
     return identify_loops(
-        model, fitted, kept, loop, choice, signals=settings, chooses=None in wanted,
-        examined=diagnose(model, fitted, kept, settings) if doctor else (), ignore=ignore,
+        model, fitted, held_out, loop, choice, signals=settings, chooses=None in wanted,
+        examined=diagnose(model, fitted, held_out, settings) if doctor else (), ignore=ignore,
         progress=progress or ignore_progress,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The job: which robot, which logs, which settings; read from TOML with every key checked."""
+"""The job: robot, logs and settings, read from TOML; every key is checked."""
 
 import os
 import tomllib
@@ -50,8 +50,8 @@ def _load_terms(table: Mapping[str, Any]) -> tuple[str, ...]:
         for name in names:
             if name not in known:
                 raise SettingsError(
-                    f"friction is {friction!r}, wanted auto, none, or some of {listed(known)} with "
-                    "+ between them"
+                    f"friction is {friction!r}, wanted auto, none, or some of {listed(known)}, "
+                    "separated by +"
                 )
     switched = [name for name in TERMS if name not in _PLAIN and table.get(name, True)]
     common = [name for name in TERMS if name in (*names, *switched)]
@@ -70,7 +70,7 @@ def _load_drives(table: Mapping[str, Sequence[Any]]) -> dict[str, tuple[str | Dr
             if isinstance(entry, str) and entry not in FAMILIES:
                 raise SettingsError(
                     f"drives.{joint} has {entry!r}, wanted some of {listed(FAMILIES)}, or a table "
-                    "of a term with its shape"
+                    "with the shape of a term"
                 )
     return {joint: tuple(_load_term(joint, e) for e in entries) for joint, entries in table.items()}
 
@@ -109,7 +109,7 @@ def _dump_couplings(couplings: Sequence[Coupling]) -> list[dict[str, Any]]:
 
 
 def _motors(gear: Transmission) -> list[Coupling]:
-    """Return the drives of a transmission's motors that turn with several joints."""
+    """Return the drives of a transmission's motors that move several joints."""
     return [Coupling(joint, ratios, replaces=True) for joint, ratios in gear.shared.items()]
 
 
@@ -124,28 +124,30 @@ class LogEntry(Settings):
 
 @dataclass(frozen=True)
 class Job(Settings):
-    """Everything that is needed to run an identification."""
+    """The robot, logs and settings of an identification."""
 
     urdf: Path = setting(MISSING, "the URDF file", **_FILE)
     joints: tuple[str, ...] | None = setting(
-        None, "joints to identify, in order; all movable ones if not stated"
+        None, "joints to identify, in order; all movable joints if not stated"
     )
     locked: Mapping[str, float] = setting(
-        {}, 'positions of joints held still, `"*"` that of all others [rad or m]'
+        {}, 'positions of locked joints, `"*"` for all other joints [rad or m]'
     )
     gravity: tuple[float, float, float] = setting(
         (0.0, 0.0, -9.81), "gravity in the root link's frame [m/s^2]"
     )
-    free_flyer: bool = setting(False, "whether the base floats; no log format has its motion yet")
+    free_flyer: bool = setting(
+        False, "whether the base floats; no log format has the motion of a base yet"
+    )
     mimic: str = setting(
         "independent", "independent, or coupled: a mimic joint moves with its leader"
     )
     snap_angles: bool = setting(
         False,
-        "whether rounded angles of the URDF's joints, 3.1416, become the multiple of pi/12 that "
-        "they round",
+        "whether rounded angles of the URDF's joints, as 3.1416, are replaced by the nearest "
+        "multiple of pi/12",
     )
-    signals: SignalSettings = setting(SignalSettings(), "how logs become trajectories")
+    signals: SignalSettings = setting(SignalSettings(), "signal processing of the logs")
     terms: tuple[str, ...] = setting(
         (*DRIVE_TERMS, AUTO),
         "drive terms to identify",
@@ -156,16 +158,16 @@ class Job(Settings):
     )
     model_dynamics: str = setting(
         "full",
-        "full; or static, for logs of poses and slow sweeps: velocities and accelerations are not "
-        "used but for the sign of friction, and gravity (masses, first moments), Coulomb friction "
-        "and offsets are identified; the rest keeps the URDF's values",
+        "full; or static, for logs of poses and slow sweeps: velocities determine only the sign of "
+        "friction, accelerations are not used; gravity parameters (masses, first moments), Coulomb "
+        "friction and offsets are identified, the others have the URDF's values",
         at="model.dynamics",
         among=DYNAMICS,
     )
     drives: Mapping[str, tuple[str | DriveTerm, ...]] = setting(
         {},
-        "further friction of single joints, by joint: names as of friction, whose shape is found, "
-        "or a term with its shape, as { term = 'Harmonic', order = 101.0 }",
+        "further friction of single joints, by joint: names as of friction, whose shape is "
+        "identified, or a term with its shape, as { term = 'Harmonic', order = 101.0 }",
         reads=Entries(dict, (list,)),
         load=_load_drives,
         dump=_dump_drives,
@@ -175,8 +177,8 @@ class Job(Settings):
     )
     couplings: tuple[Coupling, ...] = setting(
         (),
-        "drives that turn with several joints, each with a name and its ratios by joint [-]; with "
-        "replaces = true in the place of the drive of the joint whose name it has",
+        "drives that move several joints, each with a name and its ratios by joint [-]; with "
+        "replaces = true it replaces the drive of the joint of that name",
         at="coupling",
         reads=[{"name": (str,), "ratios": Entries(dict, (int, float)), "replaces": (bool,)}],
         load=_load_couplings,
@@ -188,19 +190,17 @@ class Job(Settings):
     columns: Mapping[str, str] = setting(
         {}, "column names in the logs that differ from the standard ones"
     )
-    source: LogSource = setting(LogSource(), "where in the log files the signals are", at="log")
+    source: LogSource = setting(LogSource(), "location of the signals in the log files", at="log")
     units: LogUnits = setting(LogUnits(), "units of the logs, if not SI")
-    estimator: EstimatorSettings = setting(
-        ConsistentSettings(), "which estimator, and its own settings"
-    )
+    estimator: EstimatorSettings = setting(ConsistentSettings(), "estimator and its settings")
     controller: LoopSettings = setting(
         LoopSettings(),
-        "the loop of the drives, for the estimator 'simulation'",
+        "position controller of the drives, for the estimator 'simulation'",
         dump=lambda loop: None if loop == LoopSettings() else loop.to_dict(),
     )
     dynamics: bool = setting(
         False,
-        "whether the written URDF's <dynamics> also get the identified friction",
+        "whether the identified friction is also written to <dynamics> of the URDF",
         at="output.dynamics",
     )
     report: bool = setting(
@@ -211,30 +211,30 @@ class Job(Settings):
     identification: tuple[LogEntry, ...] = setting((), "logs to fit")
     validation: tuple[LogEntry, ...] = setting((), "validation logs")
     ignore: tuple[str, ...] = setting(
-        (), "codes of the doctor's errors that you know better", at="doctor.ignore"
+        (), "codes of the doctor's findings to ignore", at="doctor.ignore"
     )
     rows_in_memory: int = setting(
         2**17,
-        "rows of all logs together above which they are read in pieces",
+        "total number of rows of all logs above which they are read in pieces",
         at="reduction.rows_in_memory",
         within=Range("a positive number", lambda x: x >= 1),
     )
     workers: int | None = setting(
         None,
-        "processes that work on the pieces; one per core for long logs if not stated",
+        "worker processes for the pieces; one per core for long logs if not stated",
         at="reduction.workers",
         within=Range("1 to 1024", lambda x: 1 <= x <= 1024),
     )
 
     @classmethod
     def paths(cls) -> dict[str, Key]:
-        """Return what each key says of itself, those too that no field of their own has."""
+        """Return the description of each key, also of keys without a field of their own."""
         friction = Key(
-            "auto: what held-out segments of the fitted logs ask for, joint by joint (default); "
-            f"none; or some of these with + between them: {', '.join([*_PLAIN, *FAMILIES])}"
+            "auto: selected per joint by the error on held-out segments of the fitted logs "
+            f"(default); none; or some of these, separated by +: {', '.join([*_PLAIN, *FAMILIES])}"
         )
         others = ", ".join(name for name in ESTIMATORS if name != "consistent")
-        name = Key(f"which estimator: consistent (default), {others}", among=tuple(ESTIMATORS))
+        name = Key(f"estimator: consistent (default), {others}", among=tuple(ESTIMATORS))
         return super().paths() | {"model.friction": friction, "estimator.name": name}
 
     def __post_init__(self) -> None:
@@ -243,13 +243,13 @@ class Job(Settings):
         is_looped = isinstance(self.estimator, SimulationSettings)
         if self.controller != LoopSettings() and not is_looped:
             raise SettingsError(
-                f"[controller] is stated, which the estimator {self.estimator.name!r} does not "
-                "read; set [estimator] name = 'simulation', or leave it out"
+                f"[controller] is stated, but the estimator is {self.estimator.name!r}, wanted "
+                "'simulation'; set [estimator] name = 'simulation', or remove [controller]"
             )
         if self.free_flyer:
             raise SettingsError(
                 "free_flyer is true, but no log format that robotid reads has the pose and motion "
-                "of a floating base; fix the base (free_flyer = false), or make the rows yourself, "
+                "of a floating base. Set free_flyer = false, or compute the regressor in Python, "
                 "joint_torque_regressor(RobotModel.from_urdf(..., free_flyer=True), q, v, a)"
             )
 
@@ -281,7 +281,7 @@ class Job(Settings):
         )
 
     def placed(self, model: "RobotModel") -> tuple[str, ...]:
-        """Return the locked joints of the model that stand where the job says.
+        """Return the locked joints of the model whose position the job states.
 
         Args:
             model: The job's robot.
@@ -293,7 +293,7 @@ class Job(Settings):
 
     @property
     def friction(self) -> dict[str, str]:
-        """Friction beside viscous and Coulomb's, by joint, "*" for all others: names, or "auto"."""
+        """Friction in addition to viscous and Coulomb, by joint, "*" for the others; or "auto"."""
         everywhere = "+".join(term for term in self.terms if term not in TERMS)
         stated = {
             joint: "+".join(entry for entry in entries if isinstance(entry, str))
@@ -305,12 +305,12 @@ class Job(Settings):
         """Return one log of the job, of the model's joints in its order.
 
         Args:
-            entry: Which log.
+            entry: The log.
             model: The job's robot.
-            needs: What is wanted beside positions, as of ``lay_out``.
+            needs: Signals required in addition to positions, as of ``lay_out``.
 
         Raises:
-            DataError: If the file cannot be used.
+            DataError: If the file is not usable.
         """
         stated = self._reading(model) | {"start": entry.start, "end": entry.end}
         return read_log(entry.path, needs=needs, **stated)
@@ -318,15 +318,15 @@ class Job(Settings):
     def lay_out(
         self, entry: LogEntry, model: "RobotModel", *, needs: Needs = "torque"
     ) -> tuple[LogLayout, Table]:
-        """Return which columns of a log's file are read, before any is, and the opened file.
+        """Return the columns of a log to read, and the opened file; no column is read yet.
 
         Args:
-            entry: Which log.
+            entry: The log.
             model: The job's robot.
-            needs: What is wanted beside positions, as of ``lay_out``.
+            needs: Signals required in addition to positions, as of ``lay_out``.
 
         Raises:
-            DataError: If the file cannot be used.
+            DataError: If the file is not usable.
         """
         return lay_out(entry.path, needs=needs, **self._reading(model))
 
@@ -346,11 +346,11 @@ def read_job(path: str | Path) -> Job:
     """Read a job file.
 
     Args:
-        path: The TOML file; paths in it are relative to it, and ``$NAME`` in them is filled in
-            from the environment.
+        path: The TOML file. Paths in it are relative to its folder; ``$NAME`` in a path is replaced
+            by the environment variable.
 
     Raises:
-        SettingsError: If the file is missing, is no TOML, or a key or a value is wrong.
+        SettingsError: If the file is missing, is not TOML, or a key or a value is wrong.
     """
     require_kind(path, (str, Path), "path", "the path of a job file")
     check_path(path)
@@ -359,13 +359,13 @@ def read_job(path: str | Path) -> Job:
         raise SettingsError(missing_file(source, "job file"))
     try:
         table = tomllib.loads(source.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:  # no UTF-8, numbers too long, tables too deep
+    except (ValueError, RecursionError) as error:  # not UTF-8, numbers too long, tables too deep
         raise SettingsError(f"{source.name} is not valid TOML: {error}") from error
     return job_from_settings(table, source.name, source.parent)
 
 
 def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job:
-    """Return the job that a table describes.
+    """Return the job that a table states.
 
     Args:
         table: The keys of a job file.
@@ -389,11 +389,11 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
 
 
 def _path(text: str, where: str, folder: Path) -> Path:
-    """Return a path relative to a folder, with $VARIABLES of the environment filled in."""
+    """Return a path relative to a folder, with $VARIABLES of the environment replaced."""
     is_unicode = not any("\ud800" <= character <= "\udfff" for character in text)
     if "\0" in text or len(text) > _LONGEST_PATH or not is_unicode:
         raise SettingsError(
-            f"{where}: {text[:80]!r} cannot name a file: wanted UTF-8 without NUL, at most "
+            f"{where}: {text[:80]!r} is not a valid path, wanted UTF-8 without NUL, at most "
             f"{_LONGEST_PATH} characters"
         )
     expanded = os.path.expandvars(text)

@@ -1,4 +1,4 @@
-"""The logs of a job: each opened once, examined, and told from others by what made them."""
+"""The logs of a job: opened once, examined, and identified by their inputs."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -42,9 +42,9 @@ __all__ = [
     "survey_logs",
 ]
 
-_PIECES = 8  # pieces that the rows in memory are cut into: smoothing a piece takes some room
+_PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of its own
 _SHORTEST = 256  # rows of a piece
-_NO_MATTER = ("validation", "estimator", "output", "doctor")  # to the reductions of the logs
+_IRRELEVANT = ("validation", "estimator", "output", "doctor")  # for the reductions of the logs
 
 
 def survey_logs(
@@ -54,22 +54,21 @@ def survey_logs(
     refuse: Callable[[LogEntry, DataError], None] | None = None,
     needs: Needs = "torque",
 ) -> tuple[tuple[SurveyedLog, ...], ...]:
-    """Return the logs of each group of a job's, ready to be read.
+    """Return the logs of each group, ready to be read.
 
-    They are kept in memory if all their files together have no more rows than may be, or if the
-    model is static; files of
-    formats that are only read whole count as nothing. Otherwise each is cut into pieces of a fixed
-    number of rows: an eighth of those in memory.
+    The logs are in memory if all their files together have at most the permitted number of rows,
+    or if the model is static. Files of formats that are only read whole do not count. Otherwise
+    each log is divided into pieces of a fixed number of rows: an eighth of the permitted number.
 
     Args:
         job: The job.
         model: The robot whose joints are read.
-        groups: The logs: those to fit, those kept apart.
-        refuse: Called with a log that cannot be used, and why; if None, the error is raised.
-        needs: What is wanted of the logs beside positions, as of ``lay_out``.
+        groups: The logs: those to fit, those for validation.
+        refuse: Called with a log that is not usable and its error; if None, the error is raised.
+        needs: Signals required in addition to positions, as of ``lay_out``.
 
     Raises:
-        DataError: If a file cannot be used.
+        DataError: If a file is not usable.
         SettingsError: If a setting does not fit a log.
     """
     paths = dict.fromkeys(entry.path for entry in chain(*groups))
@@ -103,11 +102,11 @@ def examine(
 
     Args:
         job: The job. A log that cannot be read gives a finding, not an error.
-        model: Its robot; made of its URDF if None.
-        progress: Called as its two stages begin.
+        model: Its robot; built from its URDF if None.
+        progress: Called at the start of each of the two stages.
 
     Raises:
-        ModelError: If the URDF cannot be used.
+        ModelError: If the URDF is not usable.
         SettingsError: If a setting does not fit, or a code to ignore is unknown.
     """
     check_ignored(job.ignore)
@@ -119,99 +118,99 @@ def examine(
 
     report_stage(progress, "reading logs", STAGES[:2])
     groups = job.identification, job.validation
-    fitted, kept = survey_logs(job, model, *groups, refuse=refuse, needs="any")
+    fitted, validation = survey_logs(job, model, *groups, refuse=refuse, needs="any")
     report_stage(progress, "checking logs", STAGES[:2])
-    there = locked_as_logged(job, model, fitted, kept)
-    found = examine_logs(there.job, there.model, there.fitted, there.kept)
-    return by_severity([*refused, *there.notes, *found])
+    placed = locked_as_logged(job, model, fitted, validation)
+    found = examine_logs(placed.job, placed.model, placed.fitted, placed.validation)
+    return by_severity([*refused, *placed.notes, *found])
 
 
 @dataclass(frozen=True, eq=False)
 class LockedLogs:
-    """A job whose joints are locked where its logs have them.
+    """A job whose joints are locked at their positions in the logs.
 
     Attributes:
         job: The job.
         model: Its robot.
         fitted: Its logs to fit.
-        kept: Its validation logs.
-        notes: The joints that were locked so and their positions, if there are any.
+        validation: Its validation logs.
+        notes: The joints that were locked so with their positions, if there are any.
     """
 
     job: Job
     model: RobotModel
     fitted: tuple[SurveyedLog, ...]
-    kept: tuple[SurveyedLog, ...]
+    validation: tuple[SurveyedLog, ...]
     notes: tuple[Finding, ...] = ()
 
 
 def locked_as_logged(
-    job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], kept: Sequence[SurveyedLog]
+    job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], validation: Sequence[SurveyedLog]
 ) -> LockedLogs:
-    """Return the job with joints locked where the logs have them, unless it says where.
+    """Return the job with joints locked at their positions in the logs, unless it states them.
 
-    A joint that moves, or stands elsewhere in another log, is left to ``check_locked``.
+    A joint that moves, or has another position in another log, is left to ``check_locked``.
 
     Args:
         job: The job.
         model: Its robot.
         fitted: Its logs to fit.
-        kept: Its validation logs.
+        validation: Its validation logs.
     """
-    there, logs = {}, (*fitted, *kept)
+    logged, logs = {}, (*fitted, *validation)
     for joint in [joint for joint in model.locked if joint not in job.placed(model)]:
         found = [log.held[joint] for log in logs if joint in log.held]
         if found and np.ptp(np.concatenate(found)) <= STILL:
-            there[joint] = float(np.median(np.concatenate(found)))
-    if not there:
-        return LockedLogs(job, model, tuple(fitted), tuple(kept))
-    shown = ", ".join(f"{joint} = {position:.4g}" for joint, position in there.items())
+            logged[joint] = float(np.median(np.concatenate(found)))
+    if not logged:
+        return LockedLogs(job, model, tuple(fitted), tuple(validation))
+    shown = ", ".join(f"{joint} = {position:.4g}" for joint, position in logged.items())
     message = (
-        f"locked where the logs have them: {shown}. State other positions with locked = {{ joint "
-        "= position }"
+        f"joints are locked at their positions in the logs: {shown}. State other positions with "
+        "locked = { joint = position }"
     )
-    note = Finding("locked_as_logged", "note", ", ".join(there), message, there)
-    job = replace(job, locked={**job.locked, **there})
+    note = Finding("locked_as_logged", "note", ", ".join(logged), message, logged)
+    job = replace(job, locked={**job.locked, **logged})
     model = job.model()
-    first, second = (tuple(replace(x, model=model) for x in logs) for logs in (fitted, kept))
+    first, second = (tuple(replace(x, model=model) for x in logs) for logs in (fitted, validation))
     return LockedLogs(job, model, first, second, notes=(note,))
 
 
 def examine_logs(
-    job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], kept: Sequence[SurveyedLog]
+    job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], validation: Sequence[SurveyedLog]
 ) -> tuple[Finding, ...]:
-    """Examine surveyed logs: the joints that the job holds still, then the logs' windows.
+    """Examine surveyed logs: the locked joints of the job, then the windows of the logs.
 
     Args:
         job: The job.
         model: Its robot.
         fitted: Its logs to fit.
-        kept: Its validation logs.
+        validation: Its validation logs.
 
     Raises:
         SettingsError: If a setting does not fit a log.
     """
     findings: list[Finding] = []
-    for log in (*fitted, *kept):
+    for log in (*fitted, *validation):
         name = Path(log.path).name
         findings += check_locked(model, log.held, name, job.placed(model))
-        if len(log.windows) > 1:  # the windows have no notes of their own
+        if len(log.windows) > 1:  # windows have no notes
             notes = log.head.notes
             findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in notes]
-    first, second = ([look for log in logs for look in log.looks] for logs in (fitted, kept))
+    first, second = ([look for log in logs for look in log.looks] for logs in (fitted, validation))
     return (*findings, *diagnose(model, first, second, job.signals))
 
 
 def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[LogEntry]]:
-    """Return a job with the settings of a result, and the logs that this one fitted.
+    """Return a job with the settings of a result, and the logs that the result was fitted to.
 
     Args:
-        job: The robot and logs of their own.
+        job: The job that states the robot and the logs.
         path: A result.json, or its folder.
-        advice: What to do if a log is gone.
+        advice: The remedy if a log is missing.
 
     Raises:
-        DataError: If a log that was fitted is gone or was changed.
+        DataError: If a fitted log is missing or was changed.
         SettingsError: If the settings in the result are not usable.
     """
     result = load_result(path).content
@@ -221,31 +220,30 @@ def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[Lo
     for entry in stated.identification:
         if not entry.path.exists() or file_sha256(entry.path) not in hashes:
             raise DataError(
-                f"{entry.path}, which {path} was fitted to, is not there any more or was changed; "
-                f"{advice}"
+                f"{entry.path}, a fitted log of {path}, is missing or was changed; {advice}"
             )
     wanted = replace(stated, urdf=job.urdf, identification=job.identification)
     return wanted, list(stated.identification)
 
 
 def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotModel, "Run"]:
-    """Return what the logs of a result have said.
+    """Return the information of the logs of a result.
 
     Args:
-        job: The robot and logs of their own.
+        job: The job that states the robot and the logs.
         path: A result.json, or its folder.
 
     Returns:
-        The job with the settings of the result, the logs that this one fitted, the robot with the
-        friction that it found, and what the logs have said.
+        The job with the settings of the result, the logs that the result was fitted to, the robot
+        with the identified friction terms, and the information of the logs.
 
     Raises:
-        DataError: If a log that was fitted is gone or was changed.
+        DataError: If a fitted log is missing or was changed.
         SettingsError: If the settings in the result are not usable.
     """
     from robotid.identification.previews import Run
 
-    job, fitted = job_of_result(job, path, "give a result whose logs are there")
+    job, fitted = job_of_result(job, path, "give a result whose logs exist")
     result = load_result(path).content
     model = stated_model(result, job.model())
     (logs,) = survey_logs(job, model, fitted)
@@ -255,9 +253,9 @@ def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotMo
 
 
 def checkpoint_inputs(job: Job) -> dict[str, Any]:
-    """Return all that determines what the logs of a job come down to, as plain values.
+    """Return all inputs that determine the reduction of the logs of a job, as plain values.
 
-    A log is told from others by path, size and time of change: hashing it takes as long as reading.
+    Path, size and time of change identify a log: a hash takes as long as reading.
 
     Args:
         job: The job.
@@ -265,7 +263,7 @@ def checkpoint_inputs(job: Job) -> dict[str, Any]:
     Raises:
         OSError: If a file does not exist.
     """
-    settings = {key: value for key, value in job.to_dict().items() if key not in _NO_MATTER}
+    settings = {key: value for key, value in job.to_dict().items() if key not in _IRRELEVANT}
     settings["reduction"] = {"rows_in_memory": job.rows_in_memory}
     return {
         "versions": code_versions(),
@@ -296,24 +294,24 @@ def _open(
 
 
 def _count(found: tuple[LogLayout, Table] | DataError) -> int:
-    """Return about how many rows a file has, if it can be read by rows."""
+    """Return the approximate number of rows of a file, 0 if it is only read whole."""
     if isinstance(found, DataError) or found[1].rows is None:
         return 0
     return found[1].rows.count()
 
 
 def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
-    """Return a log of commands as its robot hears them, the controller's own torque included.
+    """Return a log with the inputs of the simulated robot, gravity compensation included.
 
-    Where its torque drives the robot, that is what it hears.
+    The input is the command; it is the torque where the logged torque drives the robot.
 
     Args:
         job: The job of the result.
-        entry: Which log.
-        result: What the job has found.
+        entry: The log.
+        result: The result of the job.
 
     Raises:
-        DataError: If the file cannot be used, or has no commands.
+        DataError: If the file is not usable, or has no commands.
     """
     log = job.read(entry, result.robot, needs=needed_of(job))
     if job.controller.kind == "torque":
@@ -328,7 +326,7 @@ def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
 
 
 def needed_of(job: Job) -> Needs:
-    """Return what a log of a job that simulates must have beside positions.
+    """Return the signals that a simulation requires of a log in addition to positions.
 
     Args:
         job: The job.

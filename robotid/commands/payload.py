@@ -1,4 +1,4 @@
-"""Payloads from two runs: logs with them, and logs or a result without."""
+"""Payloads from two runs: logs with them, and logs or a result without them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -22,7 +22,7 @@ _STAGES = ("reading logs", "fitting")
 
 
 def is_result(path: str | Path) -> bool:
-    """Return whether a reference is a result, or its folder, and no log.
+    """Return whether a reference is a result or its folder, not a log.
 
     Args:
         path: The reference.
@@ -35,17 +35,18 @@ def stated_masses(words: Sequence[str], links: Sequence[str]) -> dict[str, float
 
     Args:
         words: "2.8" for the only link, or "tool0=2.8".
-        links: The links that are named; "" stands for the one that is not.
+        links: The links that carry a payload.
 
     Raises:
-        SettingsError: If a mass is no number, or it is not said of which link.
+        SettingsError: If a mass is not a number, or its link is ambiguous.
     """
     masses = {}
     for word in words:
         link, _, number = word.rpartition("=")
         if not link and len(links) > 1:
             raise SettingsError(
-                f"--mass {word}: of which of the links {listed(links)}? Write --mass LINK=KG"
+                f"--mass {word}: the link is ambiguous, wanted one of {listed(links)}. "
+                "Write --mass LINK=KG"
             )
         try:
             masses[link or next(iter(links), "")] = float(number)
@@ -63,31 +64,34 @@ def measure_payload(
     find_gains: bool = False,
     progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
-    """Identify what hangs on links in the logs of a job and not in the references.
+    """Identify the payloads of the logs of a job, relative to references without payloads.
 
     Args:
-        job: The logs with the payloads, and how logs are read.
-        references: Logs without them; or one result, whose logs are read again as it says.
-        links: Links that the payloads hang on; the last moving one if empty.
-        masses: Masses that are known, as of ``stated_masses``.
-        find_gains: Whether the gains that the job does not state are found, too.
-        progress: Called as its two stages begin.
+        job: The logs with the payloads, and the settings for reading logs.
+        references: Logs without payloads; or one result, whose logs are read again with its
+            settings.
+        links: Links that carry the payloads; the last moving link if empty.
+        masses: Known masses, as of ``stated_masses``.
+        find_gains: Whether gains that the job does not state are estimated, too.
+        progress: Called at the start of each of the two stages.
 
     Returns:
-        What ``robotid payload --json`` prints.
+        The output of ``robotid payload --json``.
 
     Raises:
-        DataError: If a log cannot be used, the logs of a result are gone, or the motion does not
-            show a mass.
-        ModelError: If the URDF cannot be used, or a link is not in it.
-        SettingsError: If settings do not fit.
+        DataError: If a log is not usable, a log of the result is missing, or the motion does not
+            determine a mass.
+        ModelError: If the URDF is not usable, or has no such link.
+        SettingsError: If settings are not usable.
     """
     entries = [LogEntry(Path(path)) for path in references]
     if any(map(is_result, references)):
         if len(references) > 1:
-            raise SettingsError(f"one result is a reference by itself; found {listed(references)}")
+            raise SettingsError(
+                f"references are {listed(references)}, wanted one result alone, or logs"
+            )
         job, entries = job_of_result(
-            job, references[0], "give a log without the payload instead: --reference LOG"
+            job, references[0], "give a log without the payload: --reference LOG"
         )
     report_stage(progress, "reading logs", _STAGES)
     model = job.model()
@@ -111,7 +115,7 @@ def measure_payload(
 def _chosen_terms(
     job: Job, model: RobotModel, entries: Sequence[LogEntry]
 ) -> Mapping[str, tuple[DriveTerm, ...]]:
-    """Return the friction that the reference shows beside viscous and Coulomb's, by drive."""
+    """Return the friction terms of the reference beyond viscous and Coulomb, by drive."""
     if not any(job.friction.values()):
         return {}
     (surveyed,) = survey_logs(job, model, entries)

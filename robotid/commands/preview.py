@@ -1,4 +1,4 @@
-"""What motions will tell before they are recorded, and how that compares with what they told."""
+"""Expected standard errors of motions before they are recorded, compared with achieved ones."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -25,28 +25,28 @@ def preview_job(
     noise: Mapping[str, float] | None = None,
     correlation: float | None = None,
 ) -> dict[str, Any]:
-    """Preview the logs of a job by their positions alone.
+    """Preview the logs of a job from their positions alone.
 
-    A result that is given adds what its logs have said, and its noise. If one of the motions is a
-    log of that result, all of these are previewed, beside what the result found.
+    A given result adds the information of its logs, and its noise. If one of the motions is a log
+    of that result, all logs of the result are previewed and compared with its standard errors.
 
     Args:
-        job: The motions, and how logs are read.
-        given: A result.json, or its folder; how logs are read is then its own.
-        noise: Standard deviation of the torque's noise by joint [N m or N].
+        job: The motions, and the settings for reading logs.
+        given: A result.json, or its folder; its settings for reading logs are then used.
+        noise: Standard deviation of the torque noise by joint [N m or N].
         correlation: As of ``preview_logs``.
 
     Returns:
-        What ``robotid preview --json`` prints.
+        The output of ``robotid preview --json``.
 
     Raises:
-        DataError: If a motion cannot be used, or logs of the result are gone.
-        ModelError: If the URDF cannot be used.
-        SettingsError: If a setting does not fit.
+        DataError: If a motion is not usable, or a log of the result is missing.
+        ModelError: If the URDF is not usable.
+        SettingsError: If a setting is not usable.
     """
     stated: dict[str, Any] = {"noise": noise, "correlation": correlation}
     if not job.identification:
-        raise DataError("no motion was given; at least one is needed to preview anything")
+        raise DataError("no motion is given, wanted at least one to preview")
     if given is None:
         model = job.model()
         motions = _motions(job, model, job.identification)
@@ -73,7 +73,7 @@ def _motions(job: Job, model: RobotModel, entries: Sequence[LogEntry]) -> list[S
 
 
 def _with_achieved(content: dict[str, Any], result: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a preview with what a result of the same logs found beside it."""
+    """Return a preview with the achieved standard errors of a result of the same logs."""
     found = {entry["name"]: entry["std_error"] for entry in result["base_parameters"]}
     ratios = []
     for entry in content["base_parameters"]:

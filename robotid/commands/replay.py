@@ -1,4 +1,4 @@
-"""A replay from files: the log, what results predict of it, what a tracker saw, a ghost."""
+"""A replay from files: the log, predictions of results, a tracker's history, a ghost."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,10 +32,10 @@ from robotid.viewer.unexplained import find_unexplained
 __all__ = ["Findings", "read_findings", "replay_files", "replay_identified", "stated_job"]
 
 
-#: Columns that say where a floating base was: position [m] and turn in the world.
+#: Columns of the pose of a floating base in the world: position [m] and quaternion.
 _BASE = ("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw")
 
-#: What is read of a track.json.
+#: The entries of a track.json that are read.
 _TRACK = {
     "settings": TABLE,
     "history": FILE,
@@ -46,28 +46,28 @@ _TRACK = {
 
 @dataclass(frozen=True)
 class Findings:
-    """What identifications and a tracker found, as read from their files."""
+    """Results of identifications and of a tracker, as read from their files."""
 
     results: Mapping[str, Mapping[str, Any]]  # contents of result.json, by label
-    commanded: Mapping[str, Result] = field(default_factory=dict)  # those of drives with gains
+    commanded: Mapping[str, Result] = field(default_factory=dict)  # results with gains of drives
     track: Mapping[str, Any] | None = None  # content of a track.json
-    folder: Path = Path()  # of the track.json, which its history is in
+    folder: Path = Path()  # of the track.json and its history
 
     @property
     def settings(self) -> Mapping[str, Any] | None:
-        """The job that the first of them ran, None without any."""
+        """The settings of the first of them, None if there is none."""
         found = [content for content in (*self.results.values(), self.track) if content]
         return dict(found[0]["settings"]) if found else None
 
 
 def read_findings(paths: Sequence[str | Path]) -> Findings:
-    """Read results to show; a result is called by its folder.
+    """Read results to show; the label of a result is the name of its folder.
 
     Args:
         paths: Each a result.json, a track.json, or a folder with one or both.
 
     Raises:
-        DataError: If a file cannot be used, or there are two tracks.
+        DataError: If a file is not usable, or there are two tracks.
     """
     results: dict[str, Mapping[str, Any]] = {}
     commanded: dict[str, Result] = {}
@@ -78,7 +78,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
             files = [path / name for name in ("result.json", "track.json")]
             files = [file for file in files if file.is_file()]
             if not files:
-                raise DataError(f"there is no result.json or track.json in {str(path)!r}")
+                raise DataError(f"{str(path)!r} has no result.json and no track.json")
         for file in files:
             track = _track(file)
             if track is not None:
@@ -91,13 +91,13 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
             if loaded.commanded:
                 commanded[label] = loaded
     if len(tracks) > 1:
-        raise DataError(f"{len(tracks)} tracks were given; a replay shows one")
+        raise DataError(f"{len(tracks)} tracks are given, wanted at most one")
     folder, content = tracks[0] if tracks else (Path(), None)
     return Findings(results, commanded, content, folder)
 
 
 def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
-    """Return the job whose results are shown, with a URDF and a log of its own.
+    """Return the job of the shown results, with another URDF and log.
 
     Args:
         findings: At least one result or track.
@@ -105,28 +105,28 @@ def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
         log: The log to play.
 
     Raises:
-        SettingsError: If the settings in the file cannot be used, or there is none.
+        SettingsError: If the settings in the file are not usable, or there is no result.
     """
     settings = findings.settings
     if settings is None:
-        raise SettingsError("there is no result whose settings could be used")
+        raise SettingsError("no result is given, wanted one for its settings")
     table = {key: value for key, value in settings.items() if value != {}}
     job = job_from_settings(table, "settings of the result", Path())
     return replace(job, urdf=Path(urdf), identification=(LogEntry(Path(log)),), validation=())
 
 
 def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = None) -> Replay:
-    """Return the replay of a log: the page, to be written.
+    """Return the replay of a log, a page to write.
 
     Args:
-        job: The robot, its one log, and how logs are read.
-        findings: What to show beside it.
+        job: The robot, its one log, and the settings for reading logs.
+        findings: Results to show with the log.
         ghost: A second log, of a designed or a simulated motion, to show as a ghost.
 
     Raises:
-        DataError: If a log or a result cannot be used.
-        ModelError: If the URDF cannot be used, or a result is of another robot.
-        SettingsError: If a setting does not fit.
+        DataError: If a log or a result is not usable.
+        ModelError: If the URDF is not usable, or a result is of another robot.
+        SettingsError: If a setting is not usable.
     """
     model = job.model()
     (entry,) = job.identification
@@ -142,18 +142,18 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         ghosts[Path(ghost).name] = (shadow.t, shadow.q)
     torques, marks, notes = None, _payloads(findings.track), [f"Motion: {entry.path.name}."]
     if is_motion:
-        used, said = _limits_used(job, motion, model)
-        marks, notes = [*marks, *used], [*notes, *said]
+        used, further = _limits_used(job, motion, model)
+        marks, notes = [*marks, *used], [*notes, *further]
     else:
         torques = replace(_torques(job, motion, model, robots), noise=_noise(findings, model))
         marks += _contacts(torques, model)
-    n = model.layout.n_inertial  # the result's drives may have terms that the job's have not
+    n = model.layout.n_inertial  # drives of the result may have further terms
     masses = {"URDF": model.standard_parameters(), **bodies} if bodies else {}
     masses = {label: pi[:n] for label, pi in masses.items()}
     shown, q = model, motion.q
     base = None if ghosts else _base_poses(job, entry, motion)
-    if base is not None:  # the same robot, whose first body is the trunk
-        shown, q = _afloat(job, model), np.hstack([base, q])
+    if base is not None:  # the same robot with the trunk as first body
+        shown, q = _floating(job, model), np.hstack([base, q])
         trunk = shown.standard_parameters()[:10]
         masses = {label: np.r_[trunk, pi] for label, pi in masses.items()}
     return replay(
@@ -170,17 +170,17 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
 
 
 def replay_identified(identification: Identification) -> Replay:
-    """Return the replay of an identification: its last recording, kept apart if there is one.
+    """Return the replay of an identification: its last validation log, or its last fitted one.
 
     Args:
-        identification: What was found.
+        identification: The identification.
 
     Returns:
         The page: measured and predicted torque, masses before and after.
     """
     shown = (*identification.fitted, *identification.validation)[-1]
     motion = shown.recording.trajectory
-    predicted = _sure(shown.torques["estimate"], shown.recording.mask)
+    predicted = _of_moving(shown.torques["estimate"], shown.recording.mask)
     return replay(
         identification.model,
         motion.t,
@@ -196,7 +196,7 @@ def replay_identified(identification: Identification) -> Replay:
 def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path | None) -> Replay:
     """Return the replay of a log of commands: measured, commanded and simulated robot.
 
-    Poses are those of the URDF's joints, whose zero need not be the encoders'.
+    Poses are those of the URDF's joints, whose zero may differ from that of the encoders.
     """
     (entry,) = job.identification
     first = next(iter(results.values()))
@@ -206,7 +206,7 @@ def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path
     simulated = {label: result.follow_commands(log) for label, result in results.items()}
     names = ["simulated"] if len(simulated) == 1 else [f"simulated: {x}" for x in simulated]
     shown = dict(zip(names, simulated.values(), strict=True)) | {"commanded": q_ref}
-    ghosts = {label: _known(log.t, q + zero) for label, q in shown.items()}
+    ghosts = {label: _finite_rows(log.t, q + zero) for label, q in shown.items()}
     if ghost is not None:
         other = job.read(LogEntry(Path(ghost)), model, needs="motion")
         ghosts[Path(ghost).name] = (other.t, other.q + zero)
@@ -220,20 +220,20 @@ def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path
         torques=Torques(log.t, log.q, shown, error, "position"),
         ghosts=ghosts,
         notes=[
-            f"Motion: {entry.path.name}, as measured; ghosts on its commands.",
-            f"Position missed in open loop, rms [mrad or mm]: {listed(worst, 3)}.",
+            f"Motion: {entry.path.name}, as measured; ghosts: command and simulation.",
+            f"Simulated position error, RMS [mrad or mm]: {listed(worst, 3)}.",
         ],
     )
 
 
-def _known(t: Array, q: Array) -> tuple[Array, Array]:
-    """Return the rows that are numbers."""
+def _finite_rows(t: Array, q: Array) -> tuple[Array, Array]:
+    """Return the rows without NaN."""
     rows = np.isfinite(q).all(axis=1)
     return t[rows], q[rows]
 
 
-def _afloat(job: Job, model: RobotModel) -> RobotModel:
-    """Return a job's robot with a base that moves."""
+def _floating(job: Job, model: RobotModel) -> RobotModel:
+    """Return a job's robot with a floating base."""
     return RobotModel.from_urdf(
         job.urdf,
         joints=model.joints,
@@ -245,7 +245,7 @@ def _afloat(job: Job, model: RobotModel) -> RobotModel:
 
 
 def _base_poses(job: Job, entry: LogEntry, log: Log) -> Array | None:
-    """Return where a floating base was, shape (N, 7) as x y z qx qy qz qw; None if unsaid."""
+    """Return the poses of a floating base, (N, 7) as x y z qx qy qz qw; None without columns."""
     table = open_table(entry.path, job.source)
     time = [name for name in ("time", "t") if name in table.names]
     if not time or not {*_BASE} <= {*table.names}:
@@ -256,12 +256,12 @@ def _base_poses(job: Job, entry: LogEntry, log: Log) -> Array | None:
     length = np.linalg.norm(pose[:, 3:], axis=1)
     if not known.any() or np.abs(length[known] - 1.0).max() > 0.01:
         raise DataError(
-            f"{entry.path.name}: {_BASE[3]} to {_BASE[6]} must be the four numbers of a turn, "
-            "whose squares add up to 1; leave these columns out to hold the base fixed"
+            f"{entry.path.name}: {_BASE[3]} to {_BASE[6]} is not a unit quaternion, wanted a norm "
+            "of 1; remove these columns for a fixed base"
         )
     pose = pose[known]
-    turns = (pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1) < 0  # a turn has two quaternions
-    pose[1:, 3:] *= np.where(np.cumsum(turns) % 2, -1.0, 1.0)[:, None]
+    flips = (pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1) < 0  # q and -q are the same rotation
+    pose[1:, 3:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
     t = columns[time[0]][known]
     at = np.column_stack([np.interp(log.t, t, column) for column in pose.T])
     at[:, 3:] /= np.linalg.norm(at[:, 3:], axis=1, keepdims=True)
@@ -269,7 +269,7 @@ def _base_poses(job: Job, entry: LogEntry, log: Log) -> Array | None:
 
 
 def _noise(findings: Findings, model: RobotModel) -> Array | None:
-    """Return the residual's rms of each joint where the first result was identified."""
+    """Return the RMS residual of each joint on the fitted logs of the first result."""
     for result in findings.results.values():
         fitted = result["identification"]["per_joint"]
         if all(fitted.get(joint, {}).get("rmse") for joint in model.joints):
@@ -279,7 +279,7 @@ def _noise(findings: Findings, model: RobotModel) -> Array | None:
 
 
 def _track(path: Path) -> Mapping[str, Any] | None:
-    """Return the content of a track.json; None if the file is another one."""
+    """Return the content of a track.json; None for another file."""
     content = read_json(path, "result")
     if not (isinstance(content, dict) and {"history", "changes"} <= set(content)):
         return None
@@ -288,19 +288,19 @@ def _track(path: Path) -> Mapping[str, Any] | None:
 
 
 def _torques(job: Job, log: Log, model: RobotModel, robots: Mapping[str, RobotModel]) -> Torques:
-    """Return measured torques, and those of robots loaded by their own parameters."""
+    """Return measured torques, and those of robots with the parameters of each result."""
     shown, motion = {}, None
     for label, robot in robots.items():
         rows = hold_log(robot, log, job.signals).whole
         motion = rows.trajectory
-        shown[label] = _sure(predict(robot, [robot.carried_by], motion)[0], rows.mask)
+        shown[label] = _of_moving(predict(robot, [robot.carried_by], motion)[0], rows.mask)
     if motion is not None:
         shown["URDF"] = predict(model, [model.standard_parameters()], motion)[0]
     return Torques(log.t, log.tau) if motion is None else Torques(motion.t, motion.tau, shown)
 
 
-def _sure(torque: Array, mask: Array) -> Array:
-    """Return a prediction without the rows of joints at rest: friction has no sign."""
+def _of_moving(torque: Array, mask: Array) -> Array:
+    """Return a prediction without the rows of joints at rest: friction has no sign there."""
     return np.where(mask, torque, np.nan)
 
 
@@ -312,7 +312,7 @@ def _bands(track: Mapping[str, Any], folder: Path) -> Bands:
     wanted = ["time", *names, *errors]
     missing = [name for name in wanted if name not in table.names]
     if missing:
-        raise DataError(f"{track['history']} has no column {missing[0]!r}; track the log again")
+        raise DataError(f"{track['history']} has no column {missing[0]!r}; run robotid track again")
     columns = table.read(wanted)
     return Bands(
         t=columns["time"],
@@ -333,18 +333,18 @@ def _payloads(track: Mapping[str, Any] | None) -> list[Mark]:
 
 
 def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], list[str]]:
-    """Return marks where a motion uses the most of each limit and is nearest to a collision.
+    """Return marks at the smallest margin to each limit and at the smallest distance, and notes.
 
-    Beside them what cannot be marked, and why: the URDF may state no limits, or have no shapes.
+    The notes state what cannot be marked and why: the URDF may lack limits or shapes.
     """
     v = np.gradient(motion.q, motion.t, axis=0) if motion.v is None else motion.v
     a = np.gradient(v, motion.t, axis=0) if motion.a is None else motion.a
     torque = predict_instants(model, model.standard_parameters(), motion.q, v, a)
-    marks, notes = [], ["It has no torques; the most that it uses of the URDF's limits is marked."]
+    marks, notes = [], ["The motion has no torques. Marks: largest use of each limit of the URDF."]
     try:
         limits = MotionLimits.of_model(model, share=1.0)
     except SettingsError as error:
-        return [], [f"It has no torques. Limits are not marked: {error}."]
+        return [], [f"The motion has no torques. Limits are not marked: {error}."]
     course = Course.of_motion(motion.t, (motion.q, v, a, torque), limits)
     for kind, used in zip(LIMITS, course.largest, strict=True):
         joint = int(np.argmax(used))
@@ -355,25 +355,25 @@ def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], 
     try:
         course = replace(course, clearance=Clearance(model))
     except DataError as error:
-        return marks, [*notes, f"Collisions are not looked at: {error}."]
+        return marks, [*notes, f"Collisions are not checked: {error}."]
     if course.nearest is not None:
         near = course.nearest
-        apart = f"are nearest, {1e3 * near.distance:.0f} mm"
-        said = apart if near.distance > 0 else "overlap, as convex hulls"
-        marks.append(Mark(near.time, f"{near.first} and {near.second} {said}"))
+        gap = f"smallest distance {1e3 * near.distance:.0f} mm"
+        text = gap if near.distance > 0 else "convex hulls overlap"
+        marks.append(Mark(near.time, f"{near.first} and {near.second}: {text}"))
     return marks, notes
 
 
 def _contacts(torques: Torques, model: RobotModel) -> list[Mark]:
-    """Return marks where the first result does not explain the torque."""
+    """Return marks at large torque residuals of the first result."""
     if not torques.predicted:
         return []
     predicted = next(iter(torques.predicted.values()))
     units = dict(zip(model.joints, model.row_units, strict=True))
     marks = []
     for found in find_unexplained(torques.t, torques.measured, predicted, model.joints):
-        size = f"{found.residual:.2g} {units[found.joint]} on average"
-        label = f"unexplained torque, most at {found.joint} ({size}, for "
+        size = f"mean {found.residual:.2g} {units[found.joint]}"
+        label = f"unexplained torque, largest at {found.joint} ({size}, for "
         label += f"{found.end - found.start:.1f} s): contact or load?"
         marks.append(Mark(found.start, label, "contact", found.joint))
     return marks

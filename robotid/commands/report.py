@@ -1,4 +1,4 @@
-"""The report of a written result, made anew from its inputs; nothing else is written."""
+"""The report of a written result, computed again from its inputs; nothing else is written."""
 
 from collections.abc import Mapping, Sequence
 from itertools import chain
@@ -23,31 +23,31 @@ from robotid.workers.plan import WorkPlan
 
 __all__ = ["rewrite_report"]
 
-_SHARE = 1e-6  # of a base parameter ...
-_PART = 0.01  # ... or of its standard error, which is rounding: solvers stop somewhere
+_SHARE = 1e-6  # permitted difference over a base parameter, for rounding ...
+_PART = 0.01  # ... or over its standard error, for the tolerance of solvers
 
 
 def rewrite_report(
     path: str | Path, target: str | Path | None = None, *, progress: ProgressCallback | None = None
 ) -> dict[str, Any]:
-    """Write the report of a result again, as this version of robotid shows it.
+    """Write the report of a result again, in the form of this version of robotid.
 
-    The fit is made again, from the inputs and with the settings that the result names; of drives
-    that follow commands the result is simulated instead.
+    The fit is repeated with the inputs and settings of the result. A result of the estimator
+    "simulation" is simulated, not fitted.
 
     Args:
         path: A result.json, or its folder.
-        target: The page to write; report.html beside the result if None. A page that is there is
-            replaced, another file is not.
-        progress: Called as each stage begins, as of ``identify``.
+        target: The page to write; report.html in the folder of the result if None. An existing
+            page is replaced, another file is not.
+        progress: Called at the start of each stage, as by ``identify``.
 
     Returns:
         {"result", "report"}: the files that were read and written.
 
     Raises:
-        DataError: If the result or an input cannot be used, an input is missing or was changed
-            since, or the fit gives other base parameters than the result has.
-        SettingsError: If the settings cannot be used, or the target is another kind of file.
+        DataError: If the result or an input is not usable, an input is missing or was changed, or
+            the fit gives other base parameters than those of the result.
+        SettingsError: If the settings are not usable, or the target is another kind of file.
     """
     loaded = load_result(path)
     content, folder = loaded.content, loaded.path.parent
@@ -71,14 +71,14 @@ def rewrite_report(
     }
     origin = Origin((), str(folder))
     if found is None:
-        kept, fitted = (
+        validation, fitted = (
             [loaded.open_loop(log_of_commands(job, entry, loaded)) for entry in entries]
             for entries in (job.validation, job.identification)
         )
         model = job.model()
         pi, bodies = model.standard_parameters(), slice(model.layout.n_inertial)
         pi[bodies] = loaded.parameters[bodies]
-        shown = shown_positions(content, fitted, kept, origin, (model, pi))
+        shown = shown_positions(content, fitted, validation, origin, (model, pi))
         write_text(page_of(shown, files), goal)
     else:
         write_report(found, goal, files=files, origin=origin)
@@ -86,28 +86,28 @@ def rewrite_report(
 
 
 def _check_target(goal: Path) -> None:
-    """Refuse to write where something else than a page is."""
+    """Refuse to replace a file that is not a page."""
     check_file(goal)
-    if not goal.is_file():  # a pipe gets the page
+    if not goal.is_file():  # a pipe receives the page
         return
     with goal.open("rb") as file:
         is_page = file.read(15).lower().startswith(b"<!doctype html")
     if not is_page:
         raise SettingsError(
-            f"{str(goal)!r} is there and is no page; it would be lost: name another --out"
+            f"{str(goal)!r} exists and is not an HTML page; it is not replaced. Name another --out"
         )
 
 
 def _check_inputs(job: Job, content: Mapping[str, Any], name: str) -> None:
-    """Refuse to go on without the very files that were read."""
+    """Refuse inputs that differ from those of the result."""
     inputs = {
         role: [entry for entry in content["inputs"] if entry["role"] == role]
         for role in ("urdf", "identification", "validation")
     }
     if not all(entry["path"] for entries in inputs.values() for entry in entries):
         raise DataError(
-            f"{name} was made from a log in memory, which is gone; write its report in Python, "
-            "robotid.write_report(found, ...)"
+            f"{name} has a log in memory as input, which no longer exists; write the report in "
+            "Python, robotid.write_report(found, ...)"
         )
     logs = [entry.path for entry in (*job.identification, *job.validation)]
     _check_counts(inputs, job, name)
@@ -115,39 +115,39 @@ def _check_inputs(job: Job, content: Mapping[str, Any], name: str) -> None:
         what, wanted = "URDF" if entry["role"] == "urdf" else "log", entry["sha256"]
         if not path.exists():
             raise DataError(
-                f"the {what} {str(path)!r}, which {name} was made from, is not there; put it back, "
-                "or identify again"
+                f"the {what} {str(path)!r}, an input of {name}, does not exist; restore it, or "
+                "identify again"
             )
         if not wanted:
             raise DataError(
-                f"{name} states no SHA-256 of the {what} {str(path)!r}, which it was made from, so "
-                "nobody knows whether it is the same; identify again"
+                f"{name} states no SHA-256 of its input, the {what} {str(path)!r}; changes of the "
+                "file cannot be detected. Identify again"
             )
         if (found := file_sha256(path)) != wanted:
             raise DataError(
-                f"the {what} {str(path)!r} was changed since {name} was made from it: its SHA-256 "
-                f"begins with {found[:12]}, wanted {wanted[:12]}; put the old file back, or "
-                "identify again"
+                f"the {what} {str(path)!r} has changed since {name} was written: its SHA-256 "
+                f"starts with {found[:12]}, wanted {wanted[:12]}; restore the file, or identify "
+                "again"
             )
 
 
 def _check_counts(inputs: Mapping[str, Sequence[Any]], job: Job, name: str) -> None:
-    """Refuse a result whose inputs are not those of its settings."""
+    """Refuse a result with another number of inputs than its settings state."""
     stated = {"urdf": [job.urdf], "identification": job.identification}
     for role, entries in (stated | {"validation": job.validation}).items():
         if len(inputs[role]) != len(entries):
             raise DataError(
                 f"{name} has {len(inputs[role])} inputs of the role {role!r}, but its settings "
-                f"name {len(entries)}: it was changed since it was written; identify again"
+                f"name {len(entries)}: the file was edited. Identify again"
             )
 
 
 def _require_same(found: Identification, content: Mapping[str, Any], name: str) -> None:
-    """Refuse a fit that is not the one that the result states."""
+    """Refuse a fit whose base parameters differ from those of the result."""
     stated = {entry["name"]: entry for entry in content["base_parameters"]}
     fitted = dict(zip(found.mapping.base_names, found.base.tolist(), strict=True))
     if lacking := sorted(stated.keys() ^ fitted.keys()):
-        said = f"the parameters {listed(lacking, 5)} are in one of them only"
+        text = f"only one of the two has the parameters {listed(lacking, 5)}"
     else:
         pairs = [(stated[key], value) for key, value in fitted.items()]
         other = [
@@ -158,11 +158,11 @@ def _require_same(found: Identification, content: Mapping[str, Any], name: str) 
         ]
         if not other:
             return
-        said = f"{len(other)} of {len(pairs)} base parameters differ: {listed(other, 3)}"
+        text = f"{len(other)} of {len(pairs)} base parameters differ: {listed(other, 3)}"
     now = {"robotid": content["robotid"], **content.get("versions", {})}
     changed = [f"{k} {now[k]} -> {v}" for k, v in versions().items() if now.get(k, v) != v]
-    why = f"; versions since: {listed(changed)}" if changed else ""
+    why = f"; changed versions: {listed(changed)}" if changed else ""
     raise DataError(
-        f"the fit made again is not that of {name}: {said}{why}. No report was written; identify "
-        "again to have result and report of one fit"
+        f"the repeated fit differs from {name}: {text}{why}. No report is written; identify again "
+        "to get result and report of one fit"
     )

@@ -1,4 +1,4 @@
-"""The JSON schema of job files, with which editors complete and check them."""
+"""The JSON schema of job files, for completion and checks in editors."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -22,7 +22,7 @@ _TABLES: Mapping[str, type[Settings]] = {
 
 
 def job_schema() -> dict[str, Any]:
-    """Return the JSON schema of a job file: every key, its kinds of values and what it is.
+    """Return the JSON schema of a job file: every key, its types and its description.
 
     References:
         JSON Schema, draft 2020-12.
@@ -46,23 +46,23 @@ def _table(schema: Mapping[str, Any], keys: Mapping[str, Key], at: str) -> dict[
 def _value(kind: Any, keys: Mapping[str, Key], at: str) -> dict[str, Any]:  # noqa: ANN401
     """Return the schema of what a key holds, as of ``Settings.schema``."""
     key = keys.get(at)
-    said: dict[str, Any] = {} if key is None else {"description": key.words}
+    about: dict[str, Any] = {} if key is None else {"description": key.words}
     if isinstance(kind, Mapping):
-        return _table(kind, keys, f"{at}.") | said
+        return _table(kind, keys, f"{at}.") | about
     if isinstance(kind, list):
         required = [name for name in REQUIRED if name in kind[0]]
         return {"type": "array", "items": _table(kind[0], keys, f"{at}.") | {"required": required}}
     if isinstance(kind, Entries):
         inner = {"type": _types(kind.inner)}
         if kind.outer is dict:
-            return {"type": "object", "additionalProperties": inner} | said
+            return {"type": "object", "additionalProperties": inner} | about
         count = {} if kind.count is None else {"minItems": kind.count, "maxItems": kind.count}
-        return {"type": "array", "items": inner, **count} | said
+        return {"type": "array", "items": inner, **count} | about
     if key is not None and key.among and str in kind:
         others = [other for other in kind if other is not str]
         words: dict[str, Any] = {"enum": list(key.among)}
-        return ({"anyOf": [words, {"type": _types(tuple(others))}]} if others else words) | said
-    return {"type": _types(kind)} | said
+        return ({"anyOf": [words, {"type": _types(tuple(others))}]} if others else words) | about
+    return {"type": _types(kind)} | about
 
 
 def _types(kinds: tuple[type, ...]) -> list[str]:

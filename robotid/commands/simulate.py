@@ -1,4 +1,4 @@
-"""A simulated log of a motion, with the truth that it was made from beside it."""
+"""A simulated log of a motion, with a file of the true parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,13 +34,13 @@ _SCHEMA_VERSION = 1
 
 @dataclass(frozen=True)
 class SimulatedFiles:
-    """What a simulation reads and writes.
+    """The files that a simulation reads and writes.
 
     Attributes:
         motion: The motion to follow: a table of time and positions.
-        log: The log to write; its truth goes beside it, as ``<log stem>.truth.json``.
-        urdf: A URDF of the true robot to write, too, or None.
-        cutoff: Cut-off of the filter that smooths a recorded motion [Hz]; None: it is as it is.
+        log: The log to write; the true parameters are in ``<log stem>.truth.json``.
+        urdf: File for the URDF of the true robot, or None.
+        cutoff: Cutoff frequency of the low-pass filter of a recorded motion [Hz]; None: no filter.
     """
 
     motion: Path
@@ -50,7 +50,7 @@ class SimulatedFiles:
 
     @property
     def truth(self) -> Path:
-        """The file of the truth."""
+        """The file of the true parameters."""
         return self.log.with_name(f"{self.log.stem}.truth.json")
 
 
@@ -61,20 +61,20 @@ def simulate_log(
     *,
     progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
-    """Simulate a robot that follows a motion; write its log and the truth.
+    """Simulate a robot that follows a motion; write its log and its true parameters.
 
     Args:
         job: The robot: its URDF, its joints and the terms of its drives.
-        files: What is read and written.
-        settings: What differs from the URDF, what drives the robot, and what its sensors do.
-        progress: Told of the seconds that are done.
+        files: The files to read and write.
+        settings: Differences from the URDF, controller, actuators and sensors.
+        progress: Called with the simulated seconds.
 
     Returns:
-        The content of the truth's file.
+        The content of the file of the true parameters.
 
     Raises:
-        DataError: If a file cannot be used, or the simulation diverges.
-        ModelError: If the URDF cannot be used.
+        DataError: If a file is not usable, or the simulation diverges.
+        ModelError: If the URDF is not usable.
         SettingsError: If a setting does not fit the robot or the motion.
     """
     for path in (files.log, files.truth, *([files.urdf] if files.urdf else [])):
@@ -85,8 +85,8 @@ def simulate_log(
     duration = motion.duration if settings.duration is None else settings.duration
     if duration > motion.duration + 1e-9:
         raise SettingsError(
-            f"duration is {duration:g} s, but the motion lasts {motion.duration:g} s; state less, "
-            "or give a longer motion"
+            f"duration is {duration:g} s, wanted at most the {motion.duration:g} s of the motion; "
+            "reduce it, or give a longer motion"
         )
     rng = np.random.default_rng(settings.seed)
     pi = draw_parameters(model, settings.truth, rng)
@@ -94,14 +94,13 @@ def simulate_log(
         model, pi, motion, rate=settings.rate, duration=duration, settings=settings,
         progress=progress or ignore_progress,
     )  # fmt: skip
-    late = delay(model, pi, settings)
-    log = measure(run, settings.sensors, model.joints, rng, delay=late)
+    log = measure(run, settings.sensors, model.joints, rng, delay=delay(model, pi, settings))
     content = _truth(model, pi, settings, run, log) | {
         "urdf": str(job.urdf),
         "motion": {"path": str(files.motion), "sha256": file_sha256(files.motion)},
         "outputs": [str(path) for path in (files.log, files.truth, files.urdf) if path],
     }
-    if files.urdf:  # what cannot be a URDF is refused before any file is written
+    if files.urdf:  # an impossible URDF is refused before any file is written
         with TemporaryDirectory(prefix="robotid-") as folder:
             write_urdf(model, pi, Path(folder, files.urdf.name), dynamics=True)
     write_log(log, files.log)
@@ -124,7 +123,7 @@ def _motion(job: Job, model: RobotModel, files: SimulatedFiles) -> SampledMotion
 def _truth(
     model: RobotModel, pi: Array, settings: Simulation, run: Run, log: Log
 ) -> dict[str, Any]:
-    """Return what the log was made from, and how well the robot followed."""
+    """Return the true parameters and settings of the log, and the tracking errors."""
     layout, size = model.layout, model.layout.n_inertial
     urdf = model.standard_parameters()
     mapping = structural_mapping(model)

@@ -1,4 +1,4 @@
-"""Track a recorded log as if it came in live: history in files, or a live page."""
+"""Run the online estimator over a recorded log: history in files, or a live page."""
 
 import time
 from collections.abc import Callable
@@ -28,32 +28,35 @@ __all__ = ["run_track", "serve_track"]
 
 _SCHEMA = 1
 _RATE = 25.0  # [Hz] messages per second of the log
-_SLOWEST = 1e-3  # [-] speed of the log that is still worth waiting for
+_SLOWEST = 1e-3  # [-] smallest speed, relative to real time
 
 
 def run_track(
     job: Job, folder: str | Path | None, *, observer: Observer | None = None
 ) -> dict[str, Any]:
-    """Track the one log of a job, write the history and track.json, return what that holds.
+    """Track the one log of a job, write the history and track.json, and return its content.
 
     Args:
-        job: The robot, the log and the signals' settings.
-        folder: Where to write; made if it is missing. Nothing is written if None.
+        job: The robot, the log and the settings of the signals.
+        folder: Folder of the results; created if it is missing. Nothing is written if None.
         observer: Called after each sample with its row of the log and the identifier.
 
     Raises:
-        DataError: If the log cannot be used.
-        ModelError: If the URDF cannot be used.
-        SettingsError: If a setting does not fit.
+        DataError: If the log is not usable.
+        ModelError: If the URDF is not usable.
+        SettingsError: If a setting is not usable.
     """
     model, history = job.model(), _history_name()
     if folder is not None:
         check_folder(Path(folder), [history, "track.json"])
     if len(job.identification) != 1:
-        raise SettingsError(f"track takes one log, found {len(job.identification)}")
+        raise SettingsError(f"{len(job.identification)} logs are given, wanted one to track")
     log = job.read(job.identification[0], model)
     if job.signals.cutoff is None:
-        raise SettingsError("tracking differentiates positions as they come: it needs a cutoff")
+        raise SettingsError(
+            "the cutoff is disabled, but the online estimator differentiates positions; state a "
+            "cutoff in Hz"
+        )
     step = float(np.median(np.diff(log.t)))
     settings = OnlineSettings(
         rate=job.signals.rate or 1.0 / step,
@@ -116,7 +119,7 @@ def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
 
 
 def _change(identifier: OnlineIdentifier, index: int) -> dict[str, Any]:
-    """Return a change, and the load that would explain it, by the end of the log."""
+    """Return a change with its equivalent payload, estimated up to the end of the log."""
     change, load = identifier.changes[index], identifier.payload(index)
     return {
         "flagged": change.flagged,
@@ -139,28 +142,28 @@ def serve_track(
     finished: Callable[[dict[str, Any]], None] | None = None,
     linger: bool = True,
 ) -> dict[str, Any]:
-    """Track the one log of a job, show it in a live page as it goes, return as ``run_track``.
+    """Track the one log of a job, show it in a live page, and return as ``run_track``.
 
     Args:
-        job: The robot, the log and the signals' settings.
-        folder: Where the history is written; nowhere if None.
-        port: Port of the page on 127.0.0.1; any free one if 0.
-        speed: How fast the log passes, 1 is true time; 0 is as fast as the tracker can.
+        job: The robot, the log and the settings of the signals.
+        folder: Folder of the history; nothing is written if None.
+        port: Port of the page on 127.0.0.1; any free port if 0.
+        speed: Speed relative to real time; 0 is as fast as possible.
         announce: Called with the address of the page.
-        finished: Called with the content of track.json when the log has ended.
-        linger: Whether the page is served on after the end, until KeyboardInterrupt.
+        finished: Called with the content of track.json at the end of the log.
+        linger: Whether the page remains available after the end, until KeyboardInterrupt.
 
     Raises:
-        DataError: If the log cannot be used.
-        KeyboardInterrupt: If the user ends it.
-        ModelError: If the URDF cannot be used.
-        OSError: If the port is taken.
-        SettingsError: If a setting does not fit, or port or speed are out of their ranges.
+        DataError: If the log is not usable.
+        KeyboardInterrupt: If the user stops it.
+        ModelError: If the URDF is not usable.
+        OSError: If the port is in use.
+        SettingsError: If a setting is not usable, or port or speed is out of its range.
     """
     if not (speed == 0 or speed >= _SLOWEST):
         raise SettingsError(f"speed is {speed}, wanted 0, or {_SLOWEST} or more")
     if not 0 <= port < 2**16:
-        raise SettingsError(f"port is {port}, wanted 1 to 65535, or 0 for any free one")
+        raise SettingsError(f"port is {port}, wanted 1 to 65535, or 0 for any free port")
     model = job.model()
     log = job.read(job.identification[0], model)
     mapping = structural_mapping(model)
@@ -168,7 +171,7 @@ def serve_track(
     html = live_page(model, mapping.base_names, units, log.q, model.standard_parameters())
     with LivePage(html, port) as live:
         announce(live.url)
-        content = run_track(job, folder, observer=_Teller(live, model, log, speed))
+        content = run_track(job, folder, observer=_LiveFeed(live, model, log, speed))
         live.finish()
         if finished is not None:
             finished(content)
@@ -177,13 +180,13 @@ def serve_track(
     return content
 
 
-class _Teller:
-    """Tells a live page what a tracker sees, no faster than the log's time passes."""
+class _LiveFeed:
+    """Sends the estimates of a tracker to a live page, no faster than the time of the log."""
 
     def __init__(self, live: LivePage, model: RobotModel, log: Log, speed: float) -> None:
         self._live, self._model, self._log, self._speed = live, model, log, speed
         self._due, self._marks = -np.inf, 0
-        self._began = time.monotonic()
+        self._started = time.monotonic()
 
     def __call__(self, k: int, identifier: OnlineIdentifier) -> None:
         t, start = float(self._log.t[k]), float(self._log.t[0])
@@ -191,7 +194,7 @@ class _Teller:
             return
         self._due = t + 1.0 / _RATE
         if self._speed > 0:
-            ahead = (t - start) / self._speed - (time.monotonic() - self._began)
+            ahead = (t - start) / self._speed - (time.monotonic() - self._started)
             time.sleep(max(ahead, 0.0))
         message = {
             "t": t,
@@ -208,7 +211,7 @@ class _Teller:
             }
         self._live.send(message)
         for change in identifier.changes[self._marks :]:
-            label = f"step change, flagged at {change.flagged:.2f} s"
+            label = f"step change, detected at {change.flagged:.2f} s"
             mark = {"t": change.onset, "label": label, "kind": "payload"}
             self._live.send({"mark": mark})
         self._marks = len(identifier.changes)

@@ -1,4 +1,4 @@
-"""Validation of a written result on other logs, and whether it shows a prediction."""
+"""Validation of a written result on other logs, with a verdict."""
 
 from collections.abc import Collection, Mapping, Sequence
 from itertools import compress
@@ -39,10 +39,10 @@ __all__ = ["validate_result"]
 
 
 def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, Any]:
-    """Measure the prediction of a written result on other logs.
+    """Compute the prediction error of a written result on other logs.
 
-    Where the result has a URDF, that file and its sidecar predict; they are what a user ships. The
-    doctor examines the logs, and those that hold fitted rows show no prediction.
+    If the result has a URDF, the prediction uses that file and its sidecar, as a user does. The
+    doctor examines the logs. Logs that contain fitted rows do not count as validation.
 
     Args:
         path: A result.json.
@@ -52,7 +52,7 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
         {"result", "predicted_with", "validation": [...], "verdict": {...}}, as in result.json.
 
     Raises:
-        DataError: If the result or a log cannot be used.
+        DataError: If the result or a log is not usable.
         ModelError: If the URDF is missing or was changed.
         SettingsError: If the settings in the result are not usable.
     """
@@ -69,10 +69,10 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
         model, pi = source, stated_parameters(result, source)
     prior = source.standard_parameters()
     entries, parameters = [LogEntry(Path(log)) for log in logs], {"estimate": pi}
-    (kept,) = survey_logs(job, model, entries)
+    (surveyed,) = survey_logs(job, model, entries)
     driven = stated_urdf_with_drives(result, source)
-    _, evaluations = evaluate_logs((), kept, parameters, prior, driven)
-    verdict = _verdict(job, source, result, evaluations, kept)
+    _, evaluations = evaluate_logs((), surveyed, parameters, prior, driven)
+    verdict = _verdict(job, source, result, evaluations, surveyed)
     return {
         "result": str(path),
         "predicted_with": result["outputs"].get("urdf", "base parameters of result.json"),
@@ -82,7 +82,7 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
 
 
 def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) -> dict[str, Any]:
-    """Measure how far the open loops of a result run from other logs of commands."""
+    """Compute the simulated position errors of a result on other logs of commands."""
     model = loaded.robot
     logs = [log_of_commands(job, entry, loaded) for entry in entries]
     runs = [loaded.open_loop(log) for log in logs]
@@ -113,12 +113,12 @@ def _errors_of(model: RobotModel, run: OpenLoop) -> dict[str, Any]:
 def _fitted_logs(
     job: Job, model: RobotModel, hashes: Collection[str]
 ) -> tuple[list[Log], list[str]]:
-    """Return the logs that were fitted, windows of long ones, and names of those that are gone."""
-    is_there = [e.path.exists() and file_sha256(e.path) in hashes for e in job.identification]
+    """Return the fitted logs, windows of long ones, and the names of missing ones."""
+    exists = [e.path.exists() and file_sha256(e.path) in hashes for e in job.identification]
     missing = [
-        e.path.name for e, there in zip(job.identification, is_there, strict=True) if not there
+        e.path.name for e, found in zip(job.identification, exists, strict=True) if not found
     ]
-    (surveyed,) = survey_logs(job, model, list(compress(job.identification, is_there)))
+    (surveyed,) = survey_logs(job, model, list(compress(job.identification, exists)))
     return [look for log in surveyed for look in log.looks], missing
 
 
@@ -127,17 +127,17 @@ def _verdict(
     model: RobotModel,
     result: Mapping[str, Any],
     evaluations: Sequence[Evaluation],
-    kept: Sequence[SurveyedLog],
+    logs: Sequence[SurveyedLog],
 ) -> Verdict:
-    """Return the verdict on logs that may be fitted ones, faulty, or of a motion seen before."""
+    """Return the verdict on logs, which may be fitted, faulty, or repeat a fitted motion."""
     hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
     fitted, missing = _fitted_logs(job, model, hashes)
     again = [
         file_sha256(log.path) in hashes or any(_share(a, b) for a in log.looks for b in fitted)
-        for log in kept
+        for log in logs
     ]
     is_new = [not is_refitted for is_refitted in again]
-    looks = [look for log in compress(kept, is_new) for look in log.looks]
+    looks = [look for log in compress(logs, is_new) for look in log.looks]
     names = list(dict.fromkeys(Path(log.path).name for log in looks))
     found = [
         finding
@@ -178,20 +178,20 @@ def _warnings(
     names: Sequence[str],
     missing: Sequence[str],
 ) -> list[VerdictWarning]:
-    """Return the doubts of the result, but for its own validation, and those of the new logs."""
+    """Return the warnings of the result, without those of its validation, and of the new logs."""
     own = [VerdictWarning(d["code"], d["joint"], d["message"]) for d in stated.get("warnings", ())]
     is_robust = job.estimator.is_robust
-    warnings = [doubt for doubt in own if doubt.code != "repeated_motion"]
+    warnings = [warning for warning in own if warning.code != "repeated_motion"]
     warnings += warnings_of(found, model.joints, names, is_robust=is_robust)
     if missing:
         message = (
-            f"the fitted logs {listed(missing)} are not where they were, or were changed: whether "
-            "these recordings hold fitted rows was not looked at"
+            f"the fitted logs {listed(missing)} are missing or were changed: rows of these "
+            "recordings were not compared with fitted rows"
         )
         warnings.append(VerdictWarning("fitted_logs_missing", "", message))
     return warnings
 
 
 def _share(one: Log, other: Log) -> bool:
-    """Return whether one of two logs holds rows of the other, as a cut or thinned copy does."""
+    """Return whether one of two logs contains rows of the other, as a cut or thinned copy."""
     return shares_rows(one, other) or shares_rows(other, one)

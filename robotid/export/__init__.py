@@ -1,3 +1,3 @@
-"""What programs read: the URDF with its sidecar, and result.json."""
+"""Files for other programs: the URDF with its sidecar, result.json, and models of simulators."""
 
 __all__: list[str] = []

@@ -1,4 +1,4 @@
-"""Drives that follow position commands, as an identification from commands found them."""
+"""Drives with position controllers, as identified from position commands."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,30 +22,30 @@ __all__ = [
     "loops_of",
 ]
 
-#: Parameters of a joint's controller, 0 where a result has none.
+#: Parameters of a joint's controller, 0 if a result lacks them.
 _OF_CONTROLLER = ("kd", "delay", "zero")
 _OF_DRIVE = ("armature", "viscous", "coulomb", "offset")
 
 
 @dataclass(frozen=True)
 class CommandedDrive:
-    """A joint whose drive follows a position command.
+    """A joint whose drive has a position controller.
 
-    The drive gives tau = kp (q_ref(t - delay) - q) - kd v, within +-effort_limit, and moves the
-    bodies with tau - armature a - viscous v - coulomb sign(v) - offset. Its encoder reads
-    q = q_urdf - zero.
+    The torque of the controller is tau = kp (q_ref(t - delay) - q) - kd v, within +-effort_limit.
+    The torque on the bodies is tau - armature a - viscous v - coulomb sign(v) - offset. The
+    encoder reads q = q_urdf - zero.
 
     Attributes:
         joint: Its name.
-        kp: Torque per error [N m/rad or N/m].
-        kd: Torque per speed [N m s/rad or N s/m].
-        delay: How late a command acts [s].
-        zero: Position of the URDF at which the encoder reads 0 [rad or m].
-        armature: Inertia of the rotor behind its gear [kg m^2 or kg].
+        kp: Proportional gain [N m/rad or N/m].
+        kd: Derivative gain [N m s/rad or N s/m].
+        delay: Delay of the command [s].
+        zero: Position of the URDF's joint at which the encoder reads 0 [rad or m].
+        armature: Inertia of the rotor, reflected to the joint [kg m^2 or kg].
         viscous: Viscous friction [N m s/rad or N s/m].
         coulomb: Coulomb friction [N m or N].
         offset: Constant torque [N m or N].
-        effort_limit: The most that it gives, inf if the controller states none [N m or N].
+        effort_limit: Torque limit of the controller, inf if it has none [N m or N].
     """
 
     joint: str
@@ -63,7 +63,7 @@ class CommandedDrive:
 def commanded_drives(
     model: RobotModel, pi: Array, content: Mapping[str, Any], name: str
 ) -> tuple[CommandedDrive, ...]:
-    """Return the drives of a result that has gains, joint by joint; none if it has no gains.
+    """Return the drives of a result with gains, in the order of the joints; none without gains.
 
     Args:
         model: The identified robot.
@@ -80,8 +80,8 @@ def commanded_drives(
     missing = [joint for joint in model.joints if f"{joint}.kp" not in stated]
     if missing:
         raise DataError(
-            f"{name} has gains of some joints and no kp of {listed(missing)}; identify again with "
-            "[controller] gains of every joint"
+            f"{name} has gains of some joints, but no kp of {listed(missing)}; identify again with "
+            "gains of all joints in [controller]"
         )
     for joint in model.joints:
         for term, wanted, is_right in (
@@ -110,13 +110,13 @@ def commanded_drives(
 def loops_of(
     model: RobotModel, pi: Array, drives: Sequence[CommandedDrive], rate: float | None = None
 ) -> "Loops":
-    """Return bodies, drives and loops as roll-outs take them.
+    """Return bodies, drives and controllers for simulation.
 
     Args:
         model: The identified robot.
         pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
         drives: Its drives; armature, friction and offset are those of pi.
-        rate: Ticks per second of a controller with a clock [Hz]; None: it has none.
+        rate: Sampling rate of a discrete-time controller [Hz]; None: continuous time.
     """
     from robotid.simulation.loops import open_loops
 
@@ -129,10 +129,10 @@ def loops_of(
 
 
 def limit_of(drive: CommandedDrive, joint: Joint) -> float:
-    """Return the most that a drive gives: what both controller and URDF allow, inf if anything.
+    """Return the torque limit of a drive, the smaller of controller and URDF; inf without limits.
 
     Args:
         drive: The drive.
-        joint: Its joint as the URDF describes it.
+        joint: Its joint in the URDF.
     """
     return min(drive.effort_limit, joint.effort if joint.effort > 0 else np.inf)

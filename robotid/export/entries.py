@@ -1,4 +1,4 @@
-"""What result.json holds of an identification, and of a preview."""
+"""Content of result.json for an identification and for a preview."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -43,12 +43,12 @@ def build_result(
     settings: Mapping[str, Any],
     outputs: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Return the content of result.json, plain values only and all of them finite.
+    """Return the content of result.json: plain values, all numbers finite.
 
     Args:
-        found: What was identified.
-        settings: The job, in the shape of its file.
-        outputs: Files written beside it, by kind.
+        found: The identification.
+        settings: The job, in the form of its file.
+        outputs: Further files in the same folder, by kind.
     """
     model, (bodies, drives) = found.model, parameter_entries(found)
     if isinstance(found, Identification):
@@ -88,7 +88,7 @@ def build_result(
 
 
 def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what result.json has of an identification from torques, and of no other."""
+    """Return the entries of result.json that only an identification from torques has."""
     return {
         "structure": _determined(found),
         "uncertainty": {
@@ -117,16 +117,16 @@ def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[
 
 
 def build_preview(preview: "Preview") -> dict[str, Any]:
-    """Return what a preview tells, plain values only and all of them finite.
+    """Return the content of a preview: plain values, all numbers finite.
 
     Args:
         preview: The preview.
     """
     found, noise = preview.expected, preview.noise
     bodies, drives = parameter_entries(found)
-    kept = ("name", "expression", "std_error", "unit")
+    keys = ("name", "expression", "std_error", "unit")
     base = [
-        {key: entry[key] for key in kept} | {"plausible": float(spread)}
+        {key: entry[key] for key in keys} | {"plausible": float(spread)}
         for entry, spread in zip(_base_parameters(found), preview.plausible, strict=True)
     ]
     if preview.before is not None and preview.gain is not None:
@@ -158,40 +158,40 @@ def build_preview(preview: "Preview") -> dict[str, Any]:
 
 
 def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
-    """Return the metrics of one recording as result.json has them.
+    """Return the metrics of one recording for result.json.
 
     Args:
         evaluation: The recording.
-        name: Which parameters predict.
+        name: Name of the parameters of the prediction.
     """
     recording = evaluation.recording
     return {"log": recording.log.path, "name": recording.name, **evaluation.metrics[name].to_dict()}
 
 
 def _friction(found: Identification, drive: DriveChoice) -> dict[str, Any]:
-    """Return what friction a joint has, and what was tried."""
+    """Return the friction terms of a joint, and the terms that were tried."""
     own = [term for term in found.model.layout.terms if TERMS[term].is_friction]
-    told = drive.to_dict()
+    choice = drive.to_dict()
     return {
         "terms": [*own, *drive.families],
-        **told,
+        **choice,
         **_curve(found, drive.joint),
         "on_misfit": [name for name in found.on_misfit if name.startswith(f"{drive.joint}.")],
-        "tried": [{"terms": [*own, *tried["families"]], **tried} for tried in told["tried"]],
+        "tried": [{"terms": [*own, *tried["families"]], **tried} for tried in choice["tried"]],
     }
 
 
 def _curve(found: Identification, joint: str) -> dict[str, Any]:
-    """Return the friction of a joint against its speed; nothing of one that was never seen move."""
+    """Return the friction of a joint over its speed; nothing if no log moves it."""
     row = found.model.row_names.index(joint)
-    seen = [e.recording.trajectory.v[e.recording.mask[:, row], row] for e in found.fitted]
-    if not np.any(np.concatenate(seen)):
+    speeds = [e.recording.trajectory.v[e.recording.mask[:, row], row] for e in found.fitted]
+    if not np.any(np.concatenate(speeds)):
         return {}
     return {"curve": typical_friction(found, joint).to_dict()}
 
 
 def _structure(found: Identified) -> dict[str, Any]:
-    """Return how many parameters there are, and which the data leave open."""
+    """Return the numbers of parameters, and the undetermined ones."""
     return {
         "standard": found.model.layout.n_inertial,
         "base_inertial": len(structural_mapping(found.model, inertial_only=True).K),
@@ -201,7 +201,7 @@ def _structure(found: Identified) -> dict[str, Any]:
 
 
 def _determined(found: Identification) -> dict[str, Any]:
-    """Return how many base parameters torques determine, and which only together."""
+    """Return the number of base parameters that torques determine, and indistinguishable ones."""
     return {
         "rank": found.determination.rank,
         "condition": finite(found.wls.condition),
@@ -211,12 +211,12 @@ def _determined(found: Identification) -> dict[str, Any]:
 
 
 def _without_value(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a parameter's entry without what only data tell."""
+    """Return a parameter's entry without the keys that require data."""
     return {key: x for key, x in entry.items() if key not in ("value", "at_bound")}
 
 
 def _expected_torque(preview: "Preview") -> dict[str, dict[str, Any]]:
-    """Return size and 95 % band of each joint's torque on the motions, root mean squares."""
+    """Return RMS torque and RMS half width of the 95 % band of each joint on the motions."""
     found, bands = preview.expected, preview.bands
     torque = np.vstack([e.recording.trajectory.tau for e in found.fitted])
     of_parameters = QUANTILE * np.sqrt(
@@ -237,10 +237,10 @@ def _expected_torque(preview: "Preview") -> dict[str, dict[str, Any]]:
 
 
 def input_entries(found: "Identification | LoopIdentification") -> list[dict[str, Any]]:
-    """Return the files that were read, as result.json has them, the URDF first.
+    """Return the files that were read, for result.json, the URDF first.
 
     Args:
-        found: What was identified.
+        found: The identification.
     """
     inputs = [{"role": "urdf", **source_entry(found.model.tree.path)}]
     if not isinstance(found, Identification):
@@ -279,7 +279,7 @@ def _base_parameters(found: Identified) -> list[dict[str, Any]]:
 
 
 def _motors(found: Identification, settings: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Return gear ratio and inertia at the motor, armature / ratio^2, of drives behind gears."""
+    """Return gear ratio and motor inertia, armature / ratio^2, of geared drives."""
     model, gears = found.model, dict[str, float]()
     for table in settings.get("transmission", ()):
         gears |= Transmission.from_dict(table).stated(model.tree.reductions).gears
@@ -298,7 +298,7 @@ def _motors(found: Identification, settings: Mapping[str, Any]) -> dict[str, dic
 
 
 def _consistency(found: Identified) -> dict[str, Any]:
-    """Return whether the bodies can be, and their masses."""
+    """Return whether the bodies are physically consistent, and their masses."""
     layout = found.model.layout
     J = pseudo_inertia(found.standard[: layout.n_inertial])
     smallest = np.linalg.eigvalsh(J)[:, 0]
@@ -313,9 +313,9 @@ def _consistency(found: Identified) -> dict[str, Any]:
 
 
 def _band(identification: Identification, evaluation: Evaluation) -> dict[str, Any]:
-    """Return the 95 % band of the predicted torque: its half width, and what lies in it."""
+    """Return the 95 % band of the predicted torque: its half width, and its coverage."""
     recording, band = evaluation.recording, identification.band(evaluation)
-    held = band.held(recording.trajectory.tau, evaluation.torques["estimate"], recording.mask)
+    covered = band.held(recording.trajectory.tau, evaluation.torques["estimate"], recording.mask)
     return {
         row: {
             "half_width": float(QUANTILE * np.sqrt(np.mean(total**2))),
@@ -323,6 +323,6 @@ def _band(identification: Identification, evaluation: Evaluation) -> dict[str, A
             "coverage_pct": finite(100 * share),
         }
         for row, total, parameters, share in zip(
-            identification.model.row_names, band.total.T, band.parameters.T, held, strict=True
+            identification.model.row_names, band.total.T, band.parameters.T, covered, strict=True
         )
     }

@@ -1,4 +1,4 @@
-"""A written result as a format takes it: with friction projected on the drive terms it has."""
+"""A written result in the drive terms of a format: friction is projected on these terms."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,23 +18,22 @@ if TYPE_CHECKING:
 __all__ = ["Exported", "Written", "unstated_terms"]
 
 _GRAVITY = (
-    "the controller adds the torque of gravity by the URDF, for which there is no place; add it to "
-    "what the actuators give (in MuJoCo, gravcomp = 1 of each body is near it)"
+    "the controller compensates gravity with the URDF's model, which the file cannot state; add "
+    "this torque to that of the actuators (in MuJoCo, gravcomp = 1 of each body is close to it)"
 )
 _RATE = (
-    "the controller reads its joints {rate:g} times a second and holds its torque between; the "
-    "actuators follow at each step of the simulator. Where it matters, let a loop of your own set "
-    "torques at that rate"
+    "the controller runs at {rate:g} Hz with a zero-order hold; the actuators run at each step of "
+    "the simulator. If the difference matters, compute the torques at that rate in your own loop"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """A result, and its drives in the terms of a format.
+    """A result with its drives in the terms of a format.
 
     Attributes:
         result: The result.
-        projection: Its robot and parameters, friction projected on those terms.
+        projection: Its robot and parameters, with friction projected on those terms.
     """
 
     result: "Result"
@@ -66,32 +65,32 @@ class Exported:
 
     @cached_property
     def commanded(self) -> tuple[CommandedDrive, ...]:
-        """Its drives that follow position commands; none of a result without gains."""
+        """Its drives with position controllers; none for a result without gains."""
         return commanded_drives(self.model, self.pi, self.result.content, self.result.path.name)
 
     @property
     def original(self) -> str | None:
-        """The URDF that was identified, beside which meshes are."""
+        """The URDF that was identified; paths of meshes are relative to it."""
         inputs = self.result.content["inputs"]
         return next((entry["path"] for entry in inputs if entry["role"] == "urdf"), None)
 
     @property
     def notes(self) -> list[str]:
-        """What is to be said of any file of it, a sentence each."""
-        said = [*map(str, self.projection.drives)]
+        """Notes that apply to each exported file, a sentence each."""
+        notes = [*map(str, self.projection.drives)]
         controller = self.result.content["settings"].get("controller", {})
         if self.commanded and controller.get("gravity_compensation"):
-            said.append(_GRAVITY)
+            notes.append(_GRAVITY)
         if self.commanded and self.result.rate is not None:
-            said.append(_RATE.format(rate=self.result.rate))
-        return said
+            notes.append(_RATE.format(rate=self.result.rate))
+        return notes
 
     def written(self, *files: Path, notes: Sequence[str] = ()) -> "Written":
-        """Return what was written of it.
+        """Return the written files with their notes.
 
         Args:
             files: The files.
-            notes: What they do not state, a sentence each.
+            notes: Properties that the files do not state, a sentence each.
         """
         drives = {drive.name: drive.to_dict() for drive in self.projection.drives}
         return Written(files, notes, drives)
@@ -99,12 +98,12 @@ class Exported:
 
 @dataclass(frozen=True)
 class Written:
-    """What was written of a result.
+    """The written files of a result.
 
     Attributes:
         files: The files.
-        notes: What they do not state, a sentence each.
-        projected: How friction was projected, by drive.
+        notes: Properties that the files do not state, a sentence each.
+        projected: The projection of friction, by drive.
     """
 
     files: Sequence[Path]
@@ -115,14 +114,14 @@ class Written:
 def unstated_terms(
     model: RobotModel, pi: Array, name: str, terms: Collection[str], *, has_couplings: bool = False
 ) -> list[str]:
-    """Return a sentence on the drive parameters that a format has no place for, if any.
+    """Return a sentence on the drive parameters that a format cannot state, if any.
 
     Args:
         model: The robot.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
         name: The format.
-        terms: The drive terms that it states.
-        has_couplings: Whether it states drives that turn with several joints.
+        terms: The drive terms of the format.
+        has_couplings: Whether it states drives that move several joints.
     """
     layout = model.layout
     drives = zip(layout.drive_parameters, layout.drive_names, pi[layout.n_inertial :], strict=True)
@@ -132,5 +131,5 @@ def unstated_terms(
         if value != 0.0
         and not (term.name in terms and (has_couplings or layout.drives[d] not in layout.couplings))
     ]
-    sentence = f"{name} has no place for {listed(missing)}; the sidecar of the URDF has them"
+    sentence = f"{name} cannot state {listed(missing)}; the sidecar of the URDF has them"
     return [sentence] if missing else []

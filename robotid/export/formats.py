@@ -1,4 +1,4 @@
-"""The formats that a result is written in: each is a module of this room, and its entry here."""
+"""The export formats: each has a module in this package and an entry here."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,13 +8,13 @@ __all__ = ["DELAYS", "FORMATS", "Format", "Option", "options_of"]
 
 @dataclass(frozen=True)
 class Option:
-    """What may be stated of how a format is written.
+    """An option of a format.
 
     Attributes:
-        words: What it is, with its default.
-        metavar: What stands for its value in the help.
+        words: Its description, with its default.
+        metavar: Placeholder of its value in the help.
         kind: Type of its value.
-        among: The words that it may be; any if there are none.
+        among: Permitted words; any value if empty.
     """
 
     words: str
@@ -25,13 +25,13 @@ class Option:
 
 @dataclass(frozen=True)
 class Format:
-    """A format. Its module, ``robotid.export.<name>``, writes it by ``export``.
+    """A format. The function ``export`` of its module, ``robotid.export.<name>``, writes it.
 
     Attributes:
-        words: What is written.
-        suffix: What follows the robot's name in the name of a file of it.
-        use: What it is advised for, of any result; "" if it is not.
-        use_of_gains: The same of a result that has gains of drives.
+        words: Its content.
+        suffix: Suffix after the robot's name in the name of its file.
+        use: The advice for any result; "" without advice.
+        use_of_gains: The advice for a result with gains of drives.
         options: Its options, by name.
     """
 
@@ -42,19 +42,19 @@ class Format:
     options: Mapping[str, Option] = field(default_factory=dict)
 
 
-#: How the delay of a command may be stated in MJCF.
+#: Models of the delay of a command in MJCF.
 DELAYS = ("history", "filter")
 #: The formats by name.
 FORMATS: dict[str, Format] = {
     "urdf": Format("URDF with <dynamics>, and its sidecar", ".urdf"),
     "mjcf": Format(
-        "model of MuJoCo",
+        "MuJoCo model",
         ".xml",
-        use="Use it: the identified URDF is written; this makes a model for MuJoCo of it.",
+        use="Use the result: the identified URDF is written; this command writes a MuJoCo model.",
         use_of_gains="Simulate it in MuJoCo, gains and delays included.",
         options={
             "step": Option("time step [s], default 0.001", "S", float),
-            "delay": Option("how commands are delayed, default history, which needs MuJoCo 3.5",
+            "delay": Option("model of the command delay, default history, which needs MuJoCo 3.5",
                             "HOW", among=DELAYS),
         },
     ),
@@ -62,19 +62,19 @@ FORMATS: dict[str, Format] = {
     "isaac": Format(
         "YAML of Isaac Lab's actuators",
         "_actuators.yaml",
-        use_of_gains="Train with it in Isaac Lab.",
-        options={"step": Option("time step that counts delays [s], default 0.005", "S", float)},
+        use_of_gains="Use it for training in Isaac Lab.",
+        options={"step": Option("time step, the unit of delays [s], default 0.005", "S", float)},
     ),
     "ranges": Format(
         "YAML of 95 % intervals, for domain randomisation",
         "_ranges.yaml",
-        use_of_gains="Draw its drives at random, within their intervals.",
+        use_of_gains="Randomise the drives within their intervals.",
     ),
 }  # fmt: skip
 
 
 def options_of(formats: Mapping[str, Format]) -> dict[str, dict[str, Option]]:
-    """Return the options of formats, by name: which formats have it, each with its words.
+    """Return the options of formats, by name: the formats that have it, with its description.
 
     Args:
         formats: The formats by name.

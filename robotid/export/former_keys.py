@@ -1,6 +1,6 @@
 """Keys of result.json that had other names before version 0.2.
 
-They are written under both names for one minor version, and read under either.
+For one minor version they are written under both names and read under either name.
 """
 
 from collections.abc import Iterator, Mapping
@@ -29,30 +29,30 @@ FORMER: Mapping[str, str] = {
 
 
 def with_former_keys(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of result.json with each renamed key under its former name, too.
+    """Return the content of result.json with each renamed key also under its former name.
 
     Args:
         content: The content, with current names.
     """
     result: dict[str, Any] = _copied(content)
     for path, former in FORMER.items():
-        *way, name = path.split(".")
-        for table in _tables(result, way):
+        *parts, name = path.split(".")
+        for table in _tables(result, parts):
             if name in table:
                 table[former] = table[name]
     return result
 
 
 def from_former_keys(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a result.json with current names alone.
+    """Return the content of a result.json with current names only.
 
     Args:
         content: The content as read: with current names, former names, or both.
     """
     result: dict[str, Any] = _copied(content)
     for path, former in FORMER.items():
-        *way, name = path.split(".")
-        for table in _tables(result, way):
+        *parts, name = path.split(".")
+        for table in _tables(result, parts):
             if former in table:
                 table.setdefault(name, table.pop(former))
                 table.pop(former, None)
@@ -62,13 +62,13 @@ def from_former_keys(content: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _tables(content: Any, way: list[str]) -> Iterator[dict[str, Any]]:  # noqa: ANN401
-    """Yield the tables at the end of a way."""
-    if not way:
+def _tables(content: Any, path: list[str]) -> Iterator[dict[str, Any]]:  # noqa: ANN401
+    """Yield the tables at a path."""
+    if not path:
         if isinstance(content, dict):
             yield content
         return
-    first, rest = way[0], way[1:]
+    first, rest = path[0], path[1:]
     if first == "*":
         values = content.values() if isinstance(content, dict) else content
         inside = list(values) if isinstance(content, (dict, list)) else []
@@ -79,7 +79,7 @@ def _tables(content: Any, way: list[str]) -> Iterator[dict[str, Any]]:  # noqa: 
 
 
 def _copied(content: Any) -> Any:  # noqa: ANN401
-    """Return tables and lists copied, so that what is renamed is not the caller's."""
+    """Return a copy of tables and lists, so that the caller's are not changed."""
     if isinstance(content, Mapping):
         return {key: _copied(value) for key, value in content.items()}
     return [_copied(value) for value in content] if isinstance(content, list) else content

@@ -1,4 +1,4 @@
-"""Write drives that follow commands as actuators of Isaac Lab, which need not be installed."""
+"""Write drives with position controllers as actuators of Isaac Lab, without its package."""
 
 import json
 import math
@@ -21,7 +21,7 @@ from robotid.versions import __version__
 
 __all__ = ["export", "isaac_actuators", "write_isaac"]
 
-# the drive terms that Isaac Lab's actuators have, the offset by a sentence of its own.
+# drive terms of Isaac Lab's actuators; a note of its own states the offset
 _TERMS = ("armature", "viscous", "coulomb", "offset")
 _STEP = 0.005  # [s]
 _HEAD = """\
@@ -33,9 +33,9 @@ robotid {version}. N m, N m s/rad, kg m^2, rad/s; N, N s/m, kg, m/s of prismatic
   groups = yaml.safe_load(open("{file}"))["actuators"]
   actuators = {{name: DelayedPDActuatorCfg(**group) for name, group in groups.items()}}
 
-Delays are the nearest steps of physics_dt, which sim.dt must be; where min_delay is less than
-max_delay, Isaac Lab draws one for each robot at each reset. Friction is Coulomb's, at rest and
-moving.
+Delays are rounded to steps of physics_dt; sim.dt must be equal to it. If min_delay is less than
+max_delay, Isaac Lab draws a delay for each robot at each reset. Friction is Coulomb friction, at
+rest and in motion.
 """
 
 
@@ -58,27 +58,27 @@ def export(result: Result, target: Path, *, step: float = _STEP) -> Written:
 def isaac_actuators(
     model: RobotModel, commanded: Sequence[CommandedDrive], physics_dt: float
 ) -> dict[str, Any]:
-    """Return the groups of joints that have the same drives, as Isaac Lab's fields name them.
+    """Return the groups of joints with equal drives, with the names of Isaac Lab's fields.
 
     Args:
-        model: The robot, whose URDF has limits of speeds and of what has no other limit.
+        model: The robot; its URDF has the speed limits, and torque limits of drives without one.
         commanded: The drives of its joints.
-        physics_dt: Time step of the simulator, in which delays are counted [s].
+        physics_dt: Time step of the simulator, the unit of delays [s].
 
     Returns:
         {"physics_dt", "actuators": {group: fields of ``DelayedPDActuatorCfg``}}; a limit that is
-        not stated is None, for which Isaac Lab takes that of its own model of the robot.
+        not stated is None. Isaac Lab then uses the limit of its own model of the robot.
 
     Raises:
-        DataError: If there are no drives that follow commands.
+        DataError: If there are no drives with position controllers.
         SettingsError: If physics_dt is not positive.
     """
     if not 0 < physics_dt < math.inf:
         raise SettingsError(f"step is {physics_dt:g} s, wanted a positive time")
     if not commanded:
         raise DataError(
-            "the result has no gains of drives, which Isaac Lab's actuators need: identify a log "
-            'with commands, with [controller] and [estimator] name = "simulation"'
+            "the result has no gains of drives, which Isaac Lab's actuators require; identify from "
+            'a log with commands, with [controller] and [estimator] name = "simulation"'
         )
     groups: dict[str, tuple[dict[str, Any], list[str]]] = {}
     for drive, joint in zip(commanded, model.limits, strict=True):
@@ -102,39 +102,39 @@ def write_isaac(
     step: float = _STEP,
     notes: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Write drives that follow commands as the YAML of Isaac Lab's actuators.
+    """Write drives with position controllers as the YAML of Isaac Lab's actuators.
 
     Args:
         model: The robot.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
         commanded: Its drives.
         target: The file to write.
-        step: Time step of the simulator, in which delays are counted [s].
-        notes: What else is to be said of the file.
+        step: Time step of the simulator, the unit of delays [s].
+        notes: Further notes on the file.
 
     Returns:
-        What the file does not state, a sentence each; its head has them, too.
+        Properties that the file does not state, a sentence each; its head has them, too.
 
     Raises:
-        DataError: If there are no drives that follow commands, or the folder does not exist.
+        DataError: If there are no drives with position controllers, or the folder does not exist.
         SettingsError: If step is not positive, or the target is a folder.
     """
     content = isaac_actuators(model, commanded, step)
-    said = [*notes, *unstated_terms(model, pi, "Isaac Lab", _TERMS)]
-    for key, words in (
-        ("offset", "the offset, which may be subtracted from the effort target"),
-        ("zero", "the encoder's zero, which the simulator's position and command have more"),
+    every = [*notes, *unstated_terms(model, pi, "Isaac Lab", _TERMS)]
+    for key, words, remedy in (
+        ("offset", "the torque offset", "subtract it from the effort target"),
+        ("zero", "the encoder's zero", "the simulator's position is the encoder's plus the zero"),
     ):
         values = [f"{drive.joint} {x:.4g}" for drive in commanded if (x := getattr(drive, key))]
         if values:
-            said.append(f"Isaac Lab has no place for {words}: {listed(values)}")
+            every.append(f"Isaac Lab cannot state {words} ({listed(values)}); {remedy}")
     head = _HEAD.format(robot=json.dumps(model.name), version=__version__, file=Path(target).name)
-    write_text(yaml_text(content, "\n".join([head, *said]) if said else head), target)
-    return tuple(said)
+    write_text(yaml_text(content, "\n".join([head, *every]) if every else head), target)
+    return tuple(every)
 
 
 def _fields(drive: CommandedDrive, joint: Joint, physics_dt: float) -> dict[str, Any]:
-    """Return the fields of one joint's actuator but for its name."""
+    """Return the fields of one joint's actuator without its name."""
     steps = round(drive.delay / physics_dt)
     return {
         "effort_limit": _limit(limit_of(drive, joint)),

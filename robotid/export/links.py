@@ -1,4 +1,4 @@
-"""An identified robot as simulators want it: where its links sit, how they move and look."""
+"""An identified robot in the form of simulators: poses, motion and shapes of its links."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -24,20 +24,20 @@ from robotid.versions import __version__
 
 __all__ = ["WORLD", "SimulatedLink", "XmlFormat", "own_drives", "write_model"]
 
-#: What simulators call the frame that does not move.
+#: Name of the fixed frame in simulators.
 WORLD = "world"
-_NAMED = 6  # meshes left out
-_ROUNDING = 1e-12  # of the largest eigenvalue of a pseudo-inertia: a smaller one below 0 is 0
+_NAMED = 6  # missing meshes that are listed
+_ROUNDING = 1e-12  # a negative eigenvalue of a pseudo-inertia below this share of the largest is 0
 
 
 @dataclass(frozen=True)
 class XmlFormat:
-    """What a simulator's format can state.
+    """The capabilities of a simulator's format.
 
     Attributes:
         name: Its name.
-        terms: The drive terms of a joint that it states.
-        has_couplings: Whether it states them of drives that turn with several joints, too.
+        terms: Drive terms of a joint that it can state.
+        has_couplings: Whether it can state them for drives that move several joints, too.
         is_readable: Whether the simulator reads a mesh.
     """
 
@@ -53,16 +53,16 @@ class SimulatedLink:
 
     Attributes:
         name: Its name.
-        parent: Link that it hangs on, or "world".
-        pose: Its pose in the parent's frame, joints at 0 but for locked ones.
-        joint: The joint that it hangs on; None if it is the root.
+        parent: Its parent link, or "world".
+        pose: Its pose in the parent's frame, with all joints at 0 except locked ones.
+        joint: Its parent joint; None if it is the root.
         moves: Whether that joint moves it; if not, it is fixed or locked.
-        leader: Joint that this one follows, ratio, offset; None if it leads itself.
+        leader: Joint that this one follows, ratio, offset; None if it is independent.
         floats: Whether it is the floating base.
-        inertial: Its inertial parameters, shape (10,); None if it has none of its own, as where
-            those of the link that it is fixed to hold it.
-        shapes: What it looks like, "visual", and touches with, "collision": shape, pose in the
-            link's frame, path of the mesh.
+        inertial: Its inertial parameters, shape (10,); None if it has none, as a link whose inertia
+            is included in that of the link that it is fixed to.
+        shapes: Its shapes of the kinds "visual" and "collision": kind, shape, pose in the link's
+            frame, path of the mesh.
     """
 
     name: str
@@ -91,17 +91,17 @@ def write_model(
         model: The robot.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
         target: The file to write.
-        original: A URDF beside which meshes are looked for, the model's own aside.
+        original: A further URDF to which paths of meshes may be relative.
         to: The format.
-        build: Returns the file's content of links, parents first, and parameters by name.
-        notes: What else is to be said of it.
+        build: Returns the file's content from links, parents first, and parameters by name.
+        notes: Further notes on the file.
 
     Returns:
-        What the file does not state, a sentence each; its head has them, too.
+        Properties that the file does not state, a sentence each; its head has them, too.
 
     Raises:
         DataError: If pi does not have p finite entries, or the folder does not exist.
-        ModelError: If a link or a drive would be physically impossible, or has the world's name.
+        ModelError: If a link or a drive would be physically impossible, or is named "world".
         SettingsError: If the target is a folder.
     """
     require_kind(target, (str, Path), "target", "the path of a file to write")
@@ -114,20 +114,20 @@ def write_model(
     top = build(_links(model, inertials, shapes), values)
     unstated = unstated_terms(model, pi, to.name, to.terms, has_couplings=to.has_couplings)
     names = listed(sorted(Path(mesh).name for mesh in meshes), _NAMED)
-    left_out = f"meshes left out, not found or of a kind that {to.name} has not: {names}"
-    said = (*unstated, *([left_out] if meshes else []), *notes)
+    left_out = f"meshes not exported, missing or in a format that {to.name} cannot read: {names}"
+    every = (*unstated, *([left_out] if meshes else []), *notes)
     head = f"{model.name}, identified from {Path(model.tree.path).name}; robotid {__version__}"
-    comment = "\n    ".join([head, *said])
-    while "--" in comment:  # which would end it
+    comment = "\n    ".join([head, *every])
+    while "--" in comment:  # not permitted in a comment
         comment = comment.replace("--", "- -")
     top.insert(0, ET.Comment(f" {comment} "))
     ET.indent(top)
     write_text(ET.tostring(top, encoding="unicode") + "\n", target)
-    return said
+    return every
 
 
 def own_drives(model: RobotModel, values: Mapping[str, float]) -> dict[str, float]:
-    """Return parameters without those of drives that turn with several joints.
+    """Return parameters without those of drives that move several joints.
 
     Args:
         model: The robot.
@@ -146,10 +146,11 @@ def _links(
     arriving = {joint.child: joint for joint in model.tree.joints}
     if WORLD in arriving or (model.free_flyer and model.tree.root == WORLD):
         raise ModelError(
-            f"a link that moves is named {WORLD!r}, the name of what does not move; rename it"
+            f"a moving link is named {WORLD!r}, the name of the fixed frame in simulators; "
+            "rename the link"
         )
     links, names = [], [model.tree.root]
-    for name in names:  # which grows by the children of each
+    for name in names:  # the list grows by the children of each link
         names += [joint.child for joint in model.tree.joints if joint.parent == name]
         if name == WORLD:
             continue
@@ -166,7 +167,7 @@ def _links(
 
 
 def _leader(model: RobotModel, joint: Joint) -> tuple[str, float, float]:
-    """Return the joint that another one follows, the ratio and the offset."""
+    """Return the joint that a mimic joint follows, the ratio and the offset."""
     row = model.pin_model.joints[model.pin_model.getJointId(joint.name)].idx_v
     ratios = model.velocity_map[row, -len(model.joints) :]
     leader = int(np.abs(ratios).argmax())
@@ -176,14 +177,14 @@ def _leader(model: RobotModel, joint: Joint) -> tuple[str, float, float]:
 def _pose(joint: Joint, position: float) -> Array:
     """Return the pose of a joint's child in its parent."""
     R, axis = Rotation.from_euler("xyz", joint.rpy), np.array(joint.axis)
-    way = position * axis / np.linalg.norm(axis)
+    displacement = position * axis / np.linalg.norm(axis)
     if joint.type == "prismatic":
-        return np.append(joint.xyz + R.apply(way), R.as_quat())
-    return np.append(joint.xyz, (R * Rotation.from_rotvec(way)).as_quat())
+        return np.append(joint.xyz + R.apply(displacement), R.as_quat())
+    return np.append(joint.xyz, (R * Rotation.from_rotvec(displacement)).as_quat())
 
 
 def _inertials(model: RobotModel, pi: Array) -> dict[str, Array]:
-    """Return the parameters, shape (10,), of the links that have an inertial of their own."""
+    """Return the parameters, shape (10,), of the links with an inertial."""
     found = link_parameters(model, pi)
     for place in link_places(model):
         stated = model.tree.inertials.get(place.link)
@@ -193,10 +194,10 @@ def _inertials(model: RobotModel, pi: Array) -> dict[str, Array]:
         eigenvalues = np.linalg.eigvalsh(pseudo_inertia(values)[0])
         if eigenvalues[0] >= -_ROUNDING * abs(eigenvalues[-1]) and values[0] > 0:
             found[place.link] = values
-        elif place.body >= 0 and values.any():  # one that is fixed to the world changes nothing
+        elif place.body >= 0 and values.any():  # a link fixed to the world has no effect
             raise ModelError(
-                f"link {place.link!r}, behind a locked joint, has an impossible inertial, which no "
-                "simulator reads; correct it in the URDF, and identify again"
+                f"link {place.link!r}, beyond a locked joint, has a physically impossible "
+                "inertial, which no simulator reads; correct it in the URDF, and identify again"
             )
     return found
 
@@ -204,7 +205,7 @@ def _inertials(model: RobotModel, pi: Array) -> dict[str, Array]:
 def _shapes(
     model: RobotModel, to: XmlFormat, urdfs: Sequence[str | Path], left_out: set[str]
 ) -> dict[str, list[tuple[str, Shape, Array, Path | None]]]:
-    """Return the shapes of each link, and put what the URDF calls meshes left out into a set."""
+    """Return the shapes of each link, and add the URDF's names of unusable meshes to a set."""
     found: dict[str, list[tuple[str, Shape, Array, Path | None]]] = {}
     for tag in ("visual", "collision"):
         for shape in read_shapes(model.tree.robot, tag):

@@ -1,4 +1,4 @@
-"""What result.json holds of an identification by simulation, and of no other."""
+"""Entries of result.json that only an identification by simulation has."""
 
 import dataclasses
 import math
@@ -15,10 +15,10 @@ __all__ = ["loop_entries", "loop_inputs", "open_loop_entry"]
 
 
 def loop_entries(found: LoopIdentification) -> dict[str, Any]:
-    """Return what result.json has of it beside what it has of all identifications.
+    """Return the entries of result.json that only an identification by simulation has.
 
     Args:
-        found: What was identified.
+        found: The identification.
     """
     model, estimate = found.model, found.estimate
     runs = {"identification": found.fitted, "validation": found.validation}
@@ -58,10 +58,10 @@ def loop_entries(found: LoopIdentification) -> dict[str, Any]:
 
 
 def loop_inputs(found: LoopIdentification) -> list[dict[str, Any]]:
-    """Return the logs that were read, as result.json has them.
+    """Return the logs that were read, for result.json.
 
     Args:
-        found: What was identified.
+        found: The identification.
     """
     every = {"identification": found.fitted, "validation": found.validation}
     return [
@@ -75,7 +75,7 @@ def loop_inputs(found: LoopIdentification) -> list[dict[str, Any]]:
 
 
 def _loop_parameters(found: LoopIdentification) -> list[dict[str, Any]]:
-    """Return gains, delay, limit and zero of each joint, those that were stated without error."""
+    """Return gains, delay, limit and zero of each joint; stated ones have no standard error."""
     if found.loop.kind == "torque":
         return []
     loops, estimate = found.fit.loops, found.fit.estimate
@@ -88,10 +88,10 @@ def _loop_parameters(found: LoopIdentification) -> list[dict[str, Any]]:
     }
     entries = []
     for j, joint in enumerate(found.model.limits):
-        force, way = ("N", "m") if joint.type == "prismatic" else ("N m", "rad")
+        force, length = ("N", "m") if joint.type == "prismatic" else ("N m", "rad")
         units = {
-            "kp": f"{force}/{way}", "kd": f"{force} s/{way}", "delay": "s", "limit": force,
-            "zero": way,
+            "kp": f"{force}/{length}", "kd": f"{force} s/{length}", "delay": "s", "limit": force,
+            "zero": length,
         }  # fmt: skip
         for what, unit in units.items():
             value = float(getattr(loops, what)[j])
@@ -106,21 +106,21 @@ def _loop_parameters(found: LoopIdentification) -> list[dict[str, Any]]:
 
 
 def _controller(found: LoopIdentification) -> dict[str, Any]:
-    """Return what was stated of the controller beside gains and delay."""
+    """Return kind, torque limits and sampling rate of the controller."""
     limits = dict(zip(found.model.joints, found.fit.loops.limit.tolist(), strict=True))
     stated = {joint: x for joint, x in limits.items() if math.isfinite(x)} or None
     return {"kind": found.loop.kind, "effort_limit": stated, "rate": found.loop.rate}
 
 
 def open_loop_entry(model: RobotModel, run: OpenLoop) -> dict[str, Any]:
-    """Return the errors of open loops on one log, joint by joint and by horizon.
+    """Return the simulated position errors on one log, by joint and by horizon.
 
-    The errors of going on at its speed, and of the fit of torques alone, stand there if the logged
-    torque drives the robot.
+    If the logged torque drives the robot, the errors of two baselines are included: constant speed,
+    and the fit of torques alone.
 
     Args:
         model: The robot.
-        run: The open loops beside the log.
+        run: The open-loop simulation of the log.
     """
     units = position_units(model)
     return {

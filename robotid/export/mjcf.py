@@ -1,4 +1,4 @@
-"""Write an identified robot as MJCF, the format of MuJoCo, which need not be installed."""
+"""Write an identified robot as MJCF, the format of MuJoCo, without its package."""
 
 import math
 import xml.etree.ElementTree as ET
@@ -26,25 +26,26 @@ from robotid.robot.tree import Joint
 
 __all__ = ["export", "write_mjcf"]
 
-#: Attribute of a joint, or of a tendon over several, that states a term of a drive.
+#: Attribute of a joint, or of a tendon over several joints, for each term of a drive.
 _ATTRIBUTES = {
     "armature": "armature",
     "viscous": "damping",
     "coulomb": "frictionloss",
     "spring": "stiffness",
 }
-_OFFSET = "offset"  # stated by the actuator's bias
+_OFFSET = "offset"  # the bias of the actuator states it
 _TERMS = (*_ATTRIBUTES, _OFFSET)
-#: Sizes of a geom over those of a shape in a URDF: MuJoCo states half lengths.
+#: Sizes of a geom divided by those of a shape in a URDF: MuJoCo uses half lengths.
 _SIZES = {"box": (0.5,), "sphere": (1.0,), "cylinder": (1.0, 0.5)}
-_DATA_RANGE = {"group": "2"}  # what the viewer shows by default
-#: What is only seen, and what touches the world but not the robot itself.
+_VISIBLE = {"group": "2"}  # the viewer shows this group by default
+#: Visual geoms have no contacts; collision geoms touch the world, but not the robot.
 _GEOMS = {
-    "visual": _DATA_RANGE | {"contype": "0", "conaffinity": "0"},
+    "visual": _VISIBLE | {"contype": "0", "conaffinity": "0"},
     "collision": {"group": "3", "contype": "1", "conaffinity": "0"},
 }
-#: How friction gives way: with MuJoCo's 0.9 a light joint creeps under less than its friction, and
-#: with its 0.02 s friction is less than Fc for 10 ms about each reversal; the least is 2 steps.
+#: Softness of the friction constraint. With MuJoCo's 0.9 a joint of small inertia creeps at torques
+#: below its friction. With its 0.02 s friction is below Fc for 10 ms around each reversal; the
+#: minimum is 2 steps.
 _STIFF = {"solimpfriction": "0.999 0.999 0.001 0.5 2", "solreffriction": "1e-5 1"}
 _COMPILER = {
     "angle": "radian", "autolimits": "true", "inertiafromgeom": "false", "balanceinertia": "false",
@@ -52,8 +53,8 @@ _COMPILER = {
 }  # fmt: skip
 _MOST_FACES = 200_000  # of a mesh that MuJoCo reads
 _STEP = 0.001  # [s]
-_EXACT = 1e-9  # of a step: a delay that is so close to whole steps has that many
-_STL_HEAD, _STL_FACE = 84, 50  # bytes; MuJoCo reads no STL written as text
+_EXACT = 1e-9  # of a step: a delay so close to whole steps is rounded to them
+_STL_HEAD, _STL_FACE = 84, 50  # bytes; MuJoCo does not read STL in text form
 
 
 def export(result: Result, target: Path, *, step: float = _STEP, delay: str = "history") -> Written:
@@ -78,10 +79,10 @@ def export(result: Result, target: Path, *, step: float = _STEP, delay: str = "h
 
 @dataclass(frozen=True)
 class _Servos:
-    """The joints that follow commands, by name, and how they are stated.
+    """The joints with position controllers, by name, and the model of their delay.
 
-    A step changes v by a force at its beginning and then moves q with the new v, so that a force
-    acts half a step early: commands are read half a step later, linearly between steps.
+    A step changes v by the force at its start and then q by the new v, so that a force acts half a
+    step early. Commands are therefore read half a step later, with linear interpolation.
     """
 
     of: Mapping[str, CommandedDrive]
@@ -90,26 +91,26 @@ class _Servos:
 
     @property
     def notes(self) -> list[str]:
-        """What is to be said of them."""
+        """Notes on these joints."""
         if not self.of:
             return []
-        said = ["controls are position commands, positions what the encoders read [rad, m]"]
-        late = {name: drive.delay for name, drive in self.of.items() if drive.delay}
-        if late and self.delay == "filter":
-            said.append(
-                "delays are filters of first order with the delay as time constant; they start at "
-                "0 unless act states them"
+        notes = ["controls are position commands, joint positions are encoder readings [rad, m]"]
+        delays = {name: drive.delay for name, drive in self.of.items() if drive.delay}
+        if delays and self.delay == "filter":
+            notes.append(
+                "delays are first-order filters with the delay as time constant; their initial "
+                "value is 0 unless act states it"
             )
-        elif late:
-            said.append(
-                f"delays have half a step of {self.step:g} s more, by which a step's force acts "
-                "early; they need MuJoCo 3.5, and commands before the start are 0 unless "
-                "mj_initCtrlHistory states them"
+        elif delays:
+            notes.append(
+                f"delays are increased by half a step of {self.step:g} s, because the force of a "
+                "step acts half a step early; they need MuJoCo 3.5; commands before the start are "
+                "0 unless mj_initCtrlHistory states them"
             )
-        short = [name for name in late if late[name] < 0.5 * self.step]
+        short = [name for name in delays if delays[name] < 0.5 * self.step]
         if short and self.delay == "history":
-            said.append(f"delays below half a step are half a step: {listed(short)}")
-        return said
+            notes.append(f"delays below half a step are half a step: {listed(short)}")
+        return notes
 
     def actuator(self, joint: Joint, offset: float) -> dict[str, str]:
         """Return the attributes of a joint's actuator: kp (ctrl(t - delay) - q) - kd v - offset."""
@@ -124,9 +125,9 @@ class _Servos:
         if drive.delay and self.delay == "filter":
             at |= {"dyntype": "filterexact", "dynprm": numbers_text([drive.delay, 0.0, 0.0])}
         elif drive.delay:
-            late = max(drive.delay + 0.5 * self.step, self.step)  # the least that MuJoCo can
-            samples = str(math.ceil(late / self.step - _EXACT))
-            at |= {"delay": numbers_text([late]), "nsample": samples, "interp": "linear"}
+            delay = max(drive.delay + 0.5 * self.step, self.step)  # MuJoCo's minimum is a step
+            samples = str(math.ceil(delay / self.step - _EXACT))
+            at |= {"delay": numbers_text([delay]), "nsample": samples, "interp": "linear"}
         return at
 
 
@@ -143,28 +144,28 @@ def write_mjcf(
 ) -> tuple[str, ...]:
     """Write standard parameters as an MJCF file.
 
-    Every link is a body; the one that a joint moves has the inertial of all that are fixed to it.
+    Every link is a body. The inertial of a moving link includes those of all links fixed to it.
     Armature, viscous and Coulomb friction are the joint's armature, damping and frictionloss, or
-    those of a tendon over the joints that a drive turns with. The torque offset is the bias of the
+    those of a tendon over the joints that a drive moves. The torque offset is the bias of the
     joint's actuator, whose control is the drive's torque. A frictionloss is a soft constraint:
-    ``mj_inverse`` gives Fc sign(v) where the joint moves, and less where it hardly does.
+    ``mj_inverse`` gives Fc sign(v) for a moving joint, and less near zero speed.
 
-    The control of a joint that follows commands is its position command. Its delay is a history of
-    commands, which MuJoCo has since 3.5, or a filter of first order that is as late at low
-    frequencies. The position of such a joint is what its encoder reads (``ref``).
+    The control of a joint with a position controller is its position command. Its delay is a
+    history of commands, which needs MuJoCo 3.5, or a first-order filter with the same delay at low
+    frequencies. The position of such a joint is the reading of its encoder (``ref``).
 
     Args:
         model: The robot.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
         target: The file to write.
-        original: The URDF that the model's was made of, beside which meshes are looked for, too.
-        commanded: The joints that follow position commands, with the friction of pi.
-        step: Time step that the file states if a joint follows commands [s].
-        delay: How the delay of a command is stated, "history" or "filter".
-        notes: What else is to be said of the file.
+        original: A further URDF to which paths of meshes may be relative.
+        commanded: The joints with position controllers, with the friction of pi.
+        step: Time step in the file if there are position controllers [s].
+        delay: Model of the command delay, "history" or "filter".
+        notes: Further notes on the file.
 
     Returns:
-        What the file does not state, a sentence each; its head has them, too.
+        Properties that the file does not state, a sentence each; its head has them, too.
 
     Raises:
         DataError: If pi does not have p finite entries, or the folder does not exist.
@@ -189,7 +190,7 @@ def write_mjcf(
 
 
 def _is_readable(mesh: Path) -> bool:
-    """Whether MuJoCo reads a mesh: OBJ, or STL in binary with a typical number of faces."""
+    """Return whether MuJoCo reads a mesh: OBJ, or binary STL with a permitted number of faces."""
     if mesh.suffix.lower() != ".stl":
         return mesh.suffix.lower() == ".obj"
     with mesh.open("rb") as stream:
@@ -214,8 +215,8 @@ def _mjcf(
     default, assets = ET.SubElement(top, "default"), ET.SubElement(top, "asset")
     for tag in ("joint", "tendon"):
         ET.SubElement(default, tag, _STIFF)
-    for name, conduct in _GEOMS.items():
-        ET.SubElement(ET.SubElement(default, "default", {"class": name}), "geom", conduct)
+    for name, contacts in _GEOMS.items():
+        ET.SubElement(ET.SubElement(default, "default", {"class": name}), "geom", contacts)
     own, bodies = own_drives(model, values), {WORLD: ET.SubElement(top, "worldbody")}
     for link in links:
         at = {"name": link.name} | _pose(link.pose)
@@ -232,7 +233,7 @@ def _add_motion(
     """Add the inertial of a link, and the joint that moves it."""
     if link.inertial is not None:
         moments, axes = principal_moments(link.inertial)
-        x, y, z = np.maximum(moments, 0.0)  # sums of them are possible to the last bit
+        x, y, z = np.maximum(moments, 0.0)  # their sums are possible moments in any rounding
         pose = np.append(
             link.inertial[1:4] / link.inertial[0], Rotation.from_matrix(axes).as_quat()
         )
@@ -252,16 +253,16 @@ def _add_motion(
 
 
 def _add_geoms(body: ET.Element, link: SimulatedLink, assets: ET.Element) -> None:
-    """Add the shapes of a link; what it touches with is shown if nothing else can be."""
-    is_seen = any(tag == "visual" for tag, *_ in link.shapes)
+    """Add the shapes of a link; collision shapes are visible if it has no visual ones."""
+    has_visual = any(tag == "visual" for tag, *_ in link.shapes)
     for tag, shape, pose, mesh in link.shapes:
-        at = {"class": tag} | ({} if is_seen else _DATA_RANGE) | _pose(pose)
+        at = {"class": tag} | ({} if has_visual else _VISIBLE) | _pose(pose)
         if mesh is None:
             sizes = numbers_text(np.multiply(shape.size, _SIZES[shape.kind]))
             at |= {"type": shape.kind, "size": sizes}
         else:
             at |= {"type": "mesh", "mesh": f"{mesh.stem}_{len(assets)}"}
-            # as a shell: many of what is only looked at enclose no volume
+            # as a shell: many visual meshes do not enclose a volume
             asset = {"name": at["mesh"], "file": str(mesh), "scale": numbers_text(shape.size)}
             ET.SubElement(assets, "mesh", asset | {"inertia": "shell"})
         if shape.rgba is not None:
@@ -294,7 +295,7 @@ def _add_drives(
         at = {"name": limits.name, "joint": limits.name}
         if limits.name not in servos.of and 0.0 < limits.effort < np.inf:
             at["ctrlrange"] = numbers_text([-limits.effort, limits.effort])
-        offset = sum(  # does not reach the joint
+        offset = sum(  # this torque does not reach the joint
             ratio * values.get(f"{drive.name}.{_OFFSET}", 0.0)
             for drive in model.layout.drives
             for joint, ratio in drive.ratios

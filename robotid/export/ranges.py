@@ -1,7 +1,7 @@
-"""Ranges for domain randomisation: what a simulator may draw each parameter from, and why.
+"""Ranges for domain randomisation: the interval of each parameter, and its source.
 
-A body is drawn as its mass, its centre, and its second moments of mass about the centre along
-fixed axes: any of them above 0 make a possible body, so each may be drawn by itself.
+A body is described by its mass, its centre, and its second moments of mass about the centre along
+fixed axes. Any positive values give a possible body, so each may be drawn independently.
 """
 
 import json
@@ -45,32 +45,32 @@ __all__ = [
     "write_ranges",
 ]
 
-#: The terms of drives that simulators have.
+#: Drive terms of simulators.
 _SIMULATED = ("viscous", "coulomb", "offset")
-#: Parameters of drives that cannot be below 0.
+#: Parameters of drives that cannot be negative.
 _NOT_NEGATIVE = {"kd", "delay", *(name for name, term in TERMS.items() if term.is_nonnegative)}
 _HEAD = """\
 Ranges for domain randomisation of {robot}, by robotid {version}. kg, m, kg m^2, in a link's frame.
 
-nominal is the identified value, low to high its 95 % interval, cut to what is possible. Low ends of
-what must be more than 0 are those of its logarithm. source says what the interval depends on:
+nominal is the identified value, low to high its 95 % interval, limited to possible values. The low
+end of a positive parameter is computed from its logarithm. source is the source of the interval:
   data   the motion;
-  prior  the motion says nothing, and it is how wrong the URDF may plausibly be;
-  mixed  both, or in sums with others;
-  bound  physics holds the value where it is; a drive at 0 has no known interval: no low, no high;
-  stated the job said it, and it was not identified: no low, no high.
+  prior  the plausible error of the URDF: the motion does not determine the parameter;
+  mixed  both, or the motion determines only sums with other parameters;
+  bound  the value is at a physical bound; a drive at 0 has no interval: no low, no high;
+  stated the job stated the value, it was not identified: no low, no high.
 
 second_moments are the integrals of x^2, y^2, z^2 dm about the centre of mass along the principal
-axes, whose quaternion w x y z turns them into the link's. The principal moments of inertia are
+axes; the quaternion w x y z rotates these axes into the link's. Their principal moments of inertia
   Ixx = y + z,  Iyy = z + x,  Izz = x + y
-of them, which is possible for any draw; draws of principal_moments themselves need not be.
+are possible for any draw; draws of principal_moments need not be possible.
 
-Values drawn one by one change the torque more than the data allow, since it is sums of parameters
-that the motion determines. undetermined names the sums that it leaves open.
-projected_drives has the friction that exports state for drives whose own has more terms: viscous
-and Coulomb friction and an offset, nearest to it over the fitted rows. Drive parameters are those
-of the joint, gear included: gains kp and kd, delay of commands and zero of the encoder, too, if
-commands were identified.
+Independent draws change the torque more than the data allow, because the motion determines sums of
+parameters. undetermined lists the sums that the motion does not determine.
+projected_drives has the friction of exports for drives with further terms: viscous and Coulomb
+friction and an offset, fitted to the identified friction over the fitted rows. Drive parameters
+are those of the joint, gear included. If the result was identified from commands, they include the
+gains kp and kd, the delay of commands and the zero of the encoder.
 """
 
 
@@ -82,26 +82,24 @@ def export(result: "Result", target: Path) -> Written:
         target: The file to write.
 
     Raises:
-        DataError: If the result has no URDF, since it is wrong, or no ranges.
+        DataError: If the result has no URDF, because it is wrong, or no ranges.
         SettingsError: If the target is a folder.
     """
-    model, pi = result.identified  # of a result that may be used
+    model, pi = result.identified  # raises for a result without URDF
     has_gains = bool(commanded_drives(model, pi, result.content, result.path.name))
     if "ranges" not in result.content and not has_gains:
-        raise DataError(
-            f"{result.path.name} has no ranges: an earlier version wrote it; identify again"
-        )
+        raise DataError(f"{result.path.name} of an earlier version has no ranges; identify again")
     write_text(ranges_text(stated_ranges(result.content)), target)
     return Written((target,), (), {})
 
 
 def parameter_ranges(found: Identified) -> dict[str, Any]:
-    """Return the ranges of the parameters of links and drives, plain values only.
+    """Return the ranges of the parameters of links and drives, as plain values.
 
-    The intervals of centre and moments are to first order in those of the parameters.
+    The intervals of centre and moments are first-order functions of those of the parameters.
 
     Args:
-        found: What was identified.
+        found: The identification.
 
     Returns:
         {"robot", "confidence", "bodies": {link: {"mass", "com", "principal_axes",
@@ -134,14 +132,14 @@ def parameter_ranges(found: Identified) -> dict[str, Any]:
 def body_ranges(
     model: RobotModel, standard: Array, covariance: Array, sources: Sequence[str], quantile: Array
 ) -> dict[str, dict[str, Any]]:
-    """Return the ranges of links, without ends where a link was not identified.
+    """Return the ranges of links; a link that was not identified has no ends.
 
     Args:
         model: The robot.
         standard: Standard parameters, shape (p,), SI units.
-        covariance: Of them, shape (p, p); 0 of what was not identified.
-        sources: What determined each.
-        quantile: How many standard errors the interval of each reaches, shape (p,).
+        covariance: Their covariance, shape (p, p); 0 for parameters that were not identified.
+        sources: The source of each.
+        quantile: Half width of each interval in standard errors, shape (p,).
 
     Raises:
         ModelError: If a link or a drive would be physically impossible.
@@ -156,13 +154,13 @@ def body_ranges(
 
 
 def projected_ranges(found: Identified) -> dict[str, Any]:
-    """Return the ranges of friction as exports for MuJoCo state it, of drives that need it.
+    """Return the ranges of projected friction, as in exports for MuJoCo, of drives with more terms.
 
     Args:
-        found: What was identified.
+        found: The identification.
 
     Returns:
-        {"projected_drives": {drive: {term: range}}}, or nothing if no drive needs it.
+        {"projected_drives": {drive: {term: range}}}, or nothing without such drives.
     """
     moments = found.moments if found.model.layout.own else {}
     drives = project_friction(found.model, found.standard, moments, _SIMULATED).drives
@@ -186,13 +184,13 @@ def projected_ranges(found: Identified) -> dict[str, Any]:
 
 
 def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the ranges that a result states, gains, delays and zeros of its drives among them.
+    """Return the ranges of a result, including gains, delays and zeros of its drives.
 
     Args:
         content: Content of a result.json.
 
     Returns:
-        As of ``parameter_ranges``; of what was stated and not found, "nominal" and "source" alone.
+        As of ``parameter_ranges``; a stated parameter has only "nominal" and "source".
     """
     drives: dict[str, dict[str, Any]] = {}
     for entry in content["drive_parameters"]:
@@ -214,10 +212,10 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_ranges(found: Identification, target: str | Path) -> None:
-    """Write the ranges of what was identified as YAML.
+    """Write the ranges of an identification as YAML.
 
     Args:
-        found: What was identified.
+        found: The identification.
         target: The file to write.
 
     Raises:
@@ -231,20 +229,20 @@ def write_ranges(found: Identification, target: str | Path) -> None:
 
 
 def ranges_text(ranges: Mapping[str, Any]) -> str:
-    """Return ranges as YAML, with a head that says what they are.
+    """Return ranges as YAML, with an explanation in the head.
 
     Args:
-        ranges: As ``parameter_ranges`` returns them, and result.json has them.
+        ranges: As of ``parameter_ranges`` and in result.json.
     """
     head = _HEAD.format(robot=json.dumps(ranges["robot"]), version=__version__)
     return yaml_text(ranges, head)
 
 
 def _body(pi: Array, covariance: Array, sources: Sequence[str], quantile: float) -> dict[str, Any]:
-    """Return the ranges of a link of ten parameters, shape (10,), with covariance (10, 10)."""
+    """Return the ranges of a link from ten parameters, shape (10,), and covariance (10, 10)."""
     m, c = pi[0], pi[1:4] / pi[0]
     moments, V = principal_moments(pi)
-    # moments = diag(P J P^T) with J linear in pi; what c changes of it is of second order
+    # moments = diag(P J P^T) with J linear in pi; the effect of c on them is of second order
     P = V.T @ np.column_stack([np.eye(3), -c])  # (3, 4)
     d_moments = np.einsum("ka,iab,kb->ki", P, pseudo_inertia_basis(), P)
     d_com = (np.eye(10)[1:4] - np.outer(c, np.eye(10)[0])) / m
@@ -270,12 +268,12 @@ def _body(pi: Array, covariance: Array, sources: Sequence[str], quantile: float)
 
 
 def _joint_source(sources: Sequence[str]) -> str:
-    """Return what a figure of several parameters depends on."""
+    """Return the source of a function of several parameters."""
     return sources[0] if len(set(sources)) == 1 else "mixed"
 
 
 def source_of(entry: Mapping[str, Any]) -> str:
-    """Return what a parameter of a result depends on, of results that do not state it, too.
+    """Return the source of a parameter of a result, also for results that do not state it.
 
     Args:
         entry: The parameter, as in result.json.
@@ -293,7 +291,7 @@ def _range(
     least: float = -math.inf,
     quantile: float = QUANTILE,
 ) -> dict[str, Any]:
-    """Return the range of a figure; without ends if its standard error is not known."""
+    """Return the range of a value; without ends if its standard error is infinite."""
     nominal, half = float(value), quantile * float(error)
     if not math.isfinite(half):
         return {"nominal": nominal, "source": source}

@@ -1,4 +1,4 @@
-"""result.json: what an identification found, in the schema that other programs read."""
+"""result.json: the result of an identification, in a schema for other programs."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -57,7 +57,7 @@ _RECORDING = {
     **dict.fromkeys(("start", "end", "rows_used"), NUMBER),
     "signals": TABLE,
 }
-#: What is read of a result.json.
+#: The entries of a result.json that are read.
 _SHAPE = {
     "robotid": TEXT,
     "robot": TEXT,
@@ -99,11 +99,11 @@ _SHAPE = {
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What an identification wrote: a result.json, and the URDF and sidecar beside it.
+    """A written identification: result.json, with URDF and sidecar in the same folder.
 
     Attributes:
         path: The result.json.
-        content: What it holds.
+        content: Its content.
     """
 
     path: Path
@@ -118,7 +118,7 @@ class Result:
 
     @property
     def has_urdf(self) -> bool:
-        """Whether the identified URDF was written: none is of a result that cannot be right."""
+        """Whether the identified URDF was written; an impossible result has none."""
         return "urdf" in self.content["outputs"]
 
     @cached_property
@@ -126,7 +126,7 @@ class Result:
         """The robot of the identified URDF with its sidecar, and its standard parameters."""
         if not self.has_urdf:
             raise DataError(
-                f"{self.path.name} has no URDF, for its parameters are wrong or impossible: "
+                f"{self.path.name} has no URDF, because its parameters are wrong or impossible: "
                 f"{self.verdict['reasons'][0]}"
             )
         outputs, folder = self.content["outputs"], self.path.parent
@@ -134,7 +134,7 @@ class Result:
 
     @property
     def robot(self) -> RobotModel:
-        """The robot as identified."""
+        """The identified robot."""
         return self.identified[0]
 
     @property
@@ -144,42 +144,44 @@ class Result:
 
     @cached_property
     def commanded(self) -> tuple[CommandedDrive, ...]:
-        """The drives that follow position commands, joint by joint; none without gains."""
+        """The drives with position controllers, in the order of the joints; none without gains."""
         if "simulation" not in self.content:
             return ()
         return commanded_drives(*self.identified, self.content, self.path.name)
 
     @property
     def rate(self) -> float | None:
-        """Ticks per second of the controller of those drives [Hz]; None if it has no clock."""
+        """Sampling rate of the controller of those drives [Hz]; None for continuous time."""
         stated: float | None = self.content["simulation"]["controller"].get("rate")
         return stated
 
     def follow_commands(self, log: Log) -> Array:
-        """Return the positions that the robot takes on the commands of a log, in open loop.
+        """Return the positions of the robot simulated on the commands of a log.
 
         Args:
-            log: The log, of its joints in its order, with commands.
+            log: The log, with commands; its joints are those of the robot in the same order.
 
         Returns:
-            Positions that encoders would read, shape (N, n) [rad or m].
+            Simulated encoder readings, shape (N, n) [rad or m].
 
         Raises:
             DataError: If the result has no gains of drives, or the log no commands.
         """
         if not self.commanded:
-            raise DataError(f"{self.path.name} has no gains of drives: it cannot follow commands")
+            raise DataError(
+                f"{self.path.name} has no gains of drives, which a simulation on commands requires"
+            )
         if log.q_ref is None:
             raise DataError(f"{log.name} has no commands, columns qref_ of each joint")
         return self._signs * self.open_loop(log, horizons=()).q
 
     def open_loop(self, log: Log, *, horizons: Sequence[float] | None = None) -> "OpenLoop":
-        """Return a log beside the positions simulated for it, in the URDF's sense of the joints.
+        """Return a log with the positions simulated for it, in the URDF's sense of the joints.
 
-        Its commands move the robot; of a result without gains, its fed-forward torque.
+        The inputs are its commands; for a result without gains, its feed-forward torques.
 
         Args:
-            log: The log, of its joints in its order, with commands.
+            log: The log, with commands; its joints are those of the robot in the same order.
             horizons: Horizons of errors [s]; those of result.json if None.
 
         Raises:
@@ -192,8 +194,9 @@ class Result:
 
         (model, pi), drives = self.identified, self.commanded
         loops = loops_of(model, pi, drives, self.rate) if drives else open_loops(model, pi)
-        far = HORIZONS if horizons is None else horizons
-        return run_open_loop(ClosedLoopRobot(model), loops, log.turned(self._signs), horizons=far)
+        times = HORIZONS if horizons is None else horizons
+        turned = log.turned(self._signs)
+        return run_open_loop(ClosedLoopRobot(model), loops, turned, horizons=times)
 
     @property
     def _signs(self) -> Array:
@@ -208,25 +211,25 @@ class Result:
 
         Args:
             q: Positions, shape (n,) or (N, n) [rad, m].
-            v: Velocities, likewise [rad/s, m/s]; None: at rest.
-            a: Accelerations, likewise [rad/s^2, m/s^2]; None: 0.
+            v: Velocities, same shape [rad/s, m/s]; None: at rest.
+            a: Accelerations, same shape [rad/s^2, m/s^2]; None: 0.
 
         Returns:
-            Torques, likewise [N m, N].
+            Torques, same shape [N m, N].
 
         Raises:
-            DataError: If a shape does not fit, or the result has no URDF.
+            DataError: If a shape is wrong, or the result has no URDF.
         """
         return predict_instants(*self.identified, q, v, a)
 
     def friction(self, joint: str) -> FrictionCurve:
-        """Return friction and offset of a joint against its speed, as it was in the fitted logs.
+        """Return friction and offset of a joint over its speed, in the range of the fitted logs.
 
         Args:
             joint: The joint.
 
         Raises:
-            DataError: If the result states none of it.
+            DataError: If the result has no friction curve of the joint.
         """
         require_kind(joint, str, "joint", "the name of a joint")
         curves = {
@@ -236,7 +239,7 @@ class Result:
         }
         if joint not in curves:
             raise DataError(
-                f"{self.path.name} states no friction curve of {joint!r}; joints with one: "
+                f"{self.path.name} has no friction curve of {joint!r}; joints with a curve: "
                 f"{listed(curves)}{suggestion(joint, curves)}"
             )
         curve = curves[joint]
@@ -251,7 +254,7 @@ class Result:
 
     @property
     def drive_moments(self) -> dict[str, DriveMoments]:
-        """What projects friction on simpler terms, by drive that has terms of its own."""
+        """Moments for the projection of friction on simpler terms, of drives with further terms."""
         tables = self.content.get("drive_moments", {})
         return {name: DriveMoments.from_dict(table) for name, table in tables.items()}
 
@@ -265,28 +268,28 @@ class Result:
 
     @property
     def verdict(self) -> Mapping[str, Any]:
-        """How far to trust it: "status", "reasons" and "per_joint"."""
+        """The verdict: "status", "reasons" and "per_joint"."""
         verdict: Mapping[str, Any] = self.content["verdict"]
         return verdict
 
     @property
     def metrics(self) -> dict[str, Mapping[str, Any]]:
-        """Metrics by joint: of the "fitted" rows, and of each validation log, by its file."""
-        kept = {entry["log"]: entry["per_joint"] for entry in self.content["validation"]}
-        return {"fitted": self.content["identification"]["per_joint"], **kept}
+        """Metrics by joint: for the "fitted" rows, and for each validation log, by its file."""
+        logs = {entry["log"]: entry["per_joint"] for entry in self.content["validation"]}
+        return {"fitted": self.content["identification"]["per_joint"], **logs}
 
 
 def load_result(path: str | Path) -> Result:
-    """Load what an identification wrote.
+    """Load a written identification.
 
     Args:
-        path: A result.json, or its folder; the URDF beside it is read when it is asked for.
+        path: A result.json, or its folder. The URDF in that folder is read at its first use.
 
     Returns:
-        The result: ``robot``, ``parameters``, ``verdict``, ``metrics``, and all of its content.
+        The result: ``robot``, ``parameters``, ``verdict``, ``metrics``, and its whole content.
 
     Raises:
-        DataError: If it is missing, no JSON, or of another schema.
+        DataError: If it is missing, not JSON, or of another schema.
     """
     require_kind(path, (str, Path), "path", "the path of a result.json or of its folder")
     check_path(path)
@@ -302,7 +305,7 @@ def read_result(path: str | Path) -> dict[str, Any]:
         path: The file.
 
     Raises:
-        DataError: If it is missing, no JSON, or not of the schema of a result.
+        DataError: If it is missing, not JSON, or not of the schema of a result.
     """
     name, result = Path(path).name, read_json(path, "result")
     if isinstance(result, dict):
@@ -316,42 +319,42 @@ def read_result(path: str | Path) -> dict[str, Any]:
     check_shape(result, _SHAPE, name)
     recordings = [entry for entry in result["inputs"] if entry["role"] != "urdf"]
     check_shape(recordings, [_RECORDING], f"{name}.inputs")
-    kept = [entry for entry in recordings if entry["role"] == "validation"]
-    if len(kept) != len(result["validation"]):
+    validation = [entry for entry in recordings if entry["role"] == "validation"]
+    if len(validation) != len(result["validation"]):
         raise DataError(
-            f"{name} has {len(kept)} validation recordings among its inputs and errors of "
-            f"{len(result['validation'])}: it is not whole; identify again"
+            f"{name} has {len(validation)} validation recordings among its inputs, but errors of "
+            f"{len(result['validation'])}: the file is incomplete. Identify again"
         )
     return dict(result)
 
 
 def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:
-    """Return what speaks for the scale of a result, if it says so.
+    """Return the scale check of a result, if it has one.
 
     Args:
         result: Content of a result.json.
 
     Raises:
-        DataError: If figures of it are missing.
+        DataError: If a list of it has the wrong length.
     """
     stated = result.get("scale_check")
     if stated is None:
         return None
     for name, size in (("unexplained", 2), ("masses", 3)):
         if len(stated[name]) != size:
-            raise DataError(f"witness.{name} has {len(stated[name])} numbers, wanted {size}")
+            raise DataError(f"scale_check.{name} has {len(stated[name])} numbers, wanted {size}")
     return ScaleCheck(**{each.name: stated[each.name] for each in dataclasses.fields(ScaleCheck)})
 
 
 def stated_urdf_with_drives(result: Mapping[str, Any], model: RobotModel) -> Array | None:
-    """Return the URDF's bodies with the drives that fit best beside them, if a result states them.
+    """Return the URDF's bodies with the drives fitted to them, if a result states them.
 
     Args:
         result: Content of a result.json.
         model: The robot.
 
     Raises:
-        DataError: If there are more or fewer of them than the robot has.
+        DataError: If their number differs from that of the robot.
     """
     drives = [entry.get("with_urdf") for entry in result["drive_parameters"]]
     if None in drives:
@@ -359,7 +362,9 @@ def stated_urdf_with_drives(result: Mapping[str, Any], model: RobotModel) -> Arr
     pi = model.standard_parameters()
     if len(drives) != len(pi) - model.layout.n_inertial:
         wanted = len(pi) - model.layout.n_inertial
-        raise DataError(f"drive_parameters has {len(drives)} entries, the robot {wanted}")
+        raise DataError(
+            f"drive_parameters has {len(drives)} entries, wanted the {wanted} of the robot"
+        )
     pi[model.layout.n_inertial :] = drives
     return pi
 
@@ -384,17 +389,17 @@ def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
     missing = [name for name in model.layout.names if name not in stated]
     if missing:
         raise ModelError(
-            f"the result has no value of {listed(missing, 5)}: the URDF has changed since"
+            f"the result has no value of {listed(missing, 5)}: the URDF has changed; identify again"
         )
     return np.array([stated[name] for name in model.layout.names])
 
 
 def stated_model(result: Mapping[str, Any], model: RobotModel) -> RobotModel:
-    """Return the robot with the friction that a result has found, loaded by its bodies.
+    """Return the robot with the friction terms and parameters of a result.
 
     Args:
         result: Content of a result.json.
-        model: Its robot, as its job describes it.
+        model: Its robot, as its job states it.
 
     Raises:
         ModelError: If a parameter of the robot is not in it.

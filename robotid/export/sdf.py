@@ -23,7 +23,7 @@ __all__ = ["export", "write_sdf"]
 _VERSION, _VERSION_OF_MIMIC = "1.9", "1.11"
 #: Element of a joint's ``<dynamics>`` that states a term of its drive.
 _DYNAMICS = {"viscous": "damping", "coulomb": "friction"}
-_ROTOR = "armature"  # stated by an element of Drake's own
+_ROTOR = "armature"  # stated by an element of Drake
 _TERMS = (*_DYNAMICS, _ROTOR)
 _MESHES = (".dae", ".stl", ".obj", ".glb", ".gltf")
 _SIZES = {"sphere": ("radius",), "cylinder": ("radius", "length")}
@@ -54,19 +54,19 @@ def write_sdf(
 ) -> tuple[str, ...]:
     """Write standard parameters as an SDF file of one model.
 
-    A link that a joint moves has the inertial of all that are fixed to it, which are frames; links
-    behind locked joints keep their own. Viscous and Coulomb friction are the joint's damping and
-    friction; the armature is Drake's rotor inertia, which Gazebo has no place for.
+    The inertial of a moving link includes those of all links fixed to it, which are frames. Links
+    beyond locked joints have their own inertial. Viscous and Coulomb friction are the joint's
+    damping and friction; the armature is Drake's rotor inertia, which Gazebo does not read.
 
     Args:
         model: The robot.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
         target: The file to write.
-        original: The URDF that the model's was made of, beside which meshes are looked for, too.
-        notes: What else is to be said of the file.
+        original: A further URDF to which paths of meshes may be relative.
+        notes: Further notes on the file.
 
     Returns:
-        What the file does not state, a sentence each; its head has them, too.
+        Properties that the file does not state, a sentence each; its head has them, too.
 
     Raises:
         DataError: If pi does not have p finite entries, or the folder does not exist.
@@ -76,20 +76,21 @@ def write_sdf(
     require_kind(model, RobotModel, "model", "a robotid.RobotModel")
     require_kind(notes, (list, tuple), "notes", "a list of sentences")
     gravity = numbers_text(model.pin_model.gravity.linear)
-    said = [
+    every = [
         *notes,
-        "Drake reads armature (drake:rotor_inertia), not friction; Gazebo the reverse",
-        f"gravity is the world's to state: <gravity>{gravity}</gravity> was identified with",
+        "Drake reads armature (drake:rotor_inertia), not friction; Gazebo reads friction, not "
+        "armature",
+        f"gravity is a property of the world; the identification used <gravity>{gravity}</gravity>",
     ]
     to = XmlFormat("SDF", _TERMS, False, lambda mesh: mesh.suffix.lower() in _MESHES)
-    return write_model(model, pi, target, original, to, partial(_sdf, model.name), said)
+    return write_model(model, pi, target, original, to, partial(_sdf, model.name), every)
 
 
 def _sdf(name: str, links: Sequence[SimulatedLink], values: Mapping[str, float]) -> ET.Element:
     version = _VERSION_OF_MIMIC if any(link.leader for link in links) else _VERSION
     top = ET.Element("sdf", {"version": version, "xmlns:drake": "drake.mit.edu"})
     robot = ET.SubElement(top, "model", name=name)
-    holders: dict[str, ET.Element] = {}  # the element that shows what a link looks like
+    holders: dict[str, ET.Element] = {}  # the element with the shapes of a link
     for link in links:
         is_frame = not (link.moves or link.floats) and link.inertial is None
         if is_frame and link.parent in holders:

@@ -1,8 +1,8 @@
-"""The shape of JSON that is read back: one schema per kind of file, checked before anything else.
+"""Schemas of the JSON files that are read, one per kind of file; checked before any use.
 
-A schema is a type or a tuple of types, a ``Range`` of words, ``[schema]`` of a list's entries,
-``{key: schema}`` of a table, where ``"key?"`` may be missing, or ``{...: schema}`` of a table whose
-keys are names. Keys that a schema does not have are left alone.
+A schema is a type or a tuple of types, a ``Range`` of words, ``[schema]`` for the entries of a
+list, ``{key: schema}`` for a table, where ``"key?"`` is optional, or ``{...: schema}`` for a table
+whose keys are names. Keys that are not in the schema are ignored.
 """
 
 from collections.abc import Mapping
@@ -15,22 +15,22 @@ from robotid.exceptions import DataError
 __all__ = ["FILE", "FLAG", "MAYBE", "NUMBER", "TABLE", "TEXT", "check_shape"]
 
 TEXT, NUMBER, FLAG, TABLE = (str,), (int, float), (bool,), (dict,)
-FILE = Range("the name of a file beside it", lambda x: Path(x).name == x and "\0" not in x)
+FILE = Range("the name of a file in the same folder", lambda x: Path(x).name == x and "\0" not in x)
 MAYBE = (int, float, type(None))
-_LARGEST = 1e100  # no figure of a robot is larger, and what is computed from it is still a number
+_LARGEST = 1e100  # values of a robot are smaller; results of larger values may overflow
 _NAMES = {str: "text", int: "a number", bool: "true or false", dict: "a table", list: "a list"}
 
 
 def check_shape(value: Any, wanted: Any, at: str) -> None:  # noqa: ANN401
-    """Refuse a value that is not of a schema.
+    """Refuse a value that does not match a schema.
 
     Args:
-        value: What JSON holds.
+        value: The content of JSON.
         wanted: The schema.
-        at: What the value is called, for errors.
+        at: Name of the value, for errors.
 
     Raises:
-        DataError: If a key is missing, or a value is of another type or out of its range.
+        DataError: If a key is missing, or a value has another type or is out of its range.
     """
     if isinstance(wanted, Mapping):
         _check_type(value, (dict,), at)
@@ -41,7 +41,9 @@ def check_shape(value: Any, wanted: Any, at: str) -> None:  # noqa: ANN401
             if name in value:
                 check_shape(value[name], inner, f"{at}.{name[:80]}")
             elif name == key:
-                raise DataError(f"{at} has no entry {name!r}: it is not whole; make it anew")
+                raise DataError(
+                    f"{at} has no entry {name!r}: the file is incomplete. Write it again"
+                )
     elif isinstance(wanted, list):
         _check_type(value, (list,), at)
         for k, entry in enumerate(value):

@@ -1,7 +1,8 @@
-"""Write an identified model as a URDF with a sidecar, and read the pair back.
+"""Write an identified model as a URDF with a sidecar, and read the pair.
 
-Only the inertials of the original file change, every other byte stays. What a URDF has no place
-for, armature and friction of coupled drives above all, goes into ``<name>.drive.json`` beside it.
+Only the inertials of the original file change; all other bytes are unchanged. The sidecar
+``<name>.drive.json`` has the parameters that a URDF cannot state, as armature and friction of
+coupled drives.
 """
 
 import difflib
@@ -23,6 +24,7 @@ from robotid.export import xml_splice
 from robotid.export.exported import Exported, Written, unstated_terms
 from robotid.export.shape import FLAG, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.xml_splice import Document, Edit
+from robotid.findings import listed
 from robotid.regressor.friction_projection import Projection
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import (
@@ -54,7 +56,7 @@ __all__ = [
     "write_urdf",
 ]
 
-#: The drive terms that ``<dynamics>`` has.
+#: The drive terms of ``<dynamics>``.
 DYNAMICS_TERMS = tuple(name for name, term in TERMS.items() if term.dynamics)
 _SCHEMA_VERSION = 1
 _SHAPE = {
@@ -73,35 +75,35 @@ _SHAPE = {
 }
 _HUNK = re.compile(r"@@ -(\d+)")
 _OWNER = re.compile(r"""<(?:link|joint)\s[^>]*?\bname\s*=\s*["']([^"']*)""")
-_UNCHANGED = 1e-12  # relative difference below which a parameter is that of the original
-_ROUNDING = 1e-12  # of the size of a link, below which a figure is 0
+_UNCHANGED = 1e-12  # relative difference below which a parameter counts as unchanged
+_ROUNDING = 1e-12  # of the size of a link, below which a number is 0
 _STATES = 64  # random states at which the written file must give the same torque
-_SAME = 1e-6  # largest relative difference of a row's torque over them
+_SAME = 1e-6  # largest relative difference of a row's torque over these states
 
 
 def write_urdf(
     model: RobotModel, pi: Array, target: str | Path, *, dynamics: Projection | bool = False
 ) -> Path:
-    """Write standard parameters into a copy of the model's URDF, and a sidecar beside it.
+    """Write standard parameters into a copy of the model's URDF, and a sidecar in the same folder.
 
-    The link that a body's joint moves gets the body's inertial; links joined to it by fixed
-    joints lose theirs, since the sum holds it; links behind locked joints keep theirs. Angles that
-    the model has in exact form (``snap_angles``) are written so. Both files
-    are read back and must give the torque of pi before they are put in place.
+    The moving link of a body gets the inertial of the body. The inertials of links fixed to it are
+    removed, because the body includes them. Links beyond locked joints are unchanged. Angles that
+    the model has in exact form (``snap_angles``) are written in this form. Both files are read
+    again, and must give the torque of pi, before they replace existing files.
 
     Args:
-        model: The robot; the file it was read from is the one that is copied.
+        model: The robot; a copy of its file is edited.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        target: The URDF to write; never the original itself.
-        dynamics: Whether viscous and Coulomb friction also go into ``<dynamics>``: those of a
-            projection, which the sidecar then states, or those of pi.
+        target: The URDF to write; not the original.
+        dynamics: Whether viscous and Coulomb friction are also written to ``<dynamics>``: those of
+            a projection, which the sidecar then states, or those of pi.
 
     Returns:
         Path of the sidecar, ``<target stem>.drive.json``.
 
     Raises:
         DataError: If pi does not have p finite entries.
-        ModelError: If a link or a drive would be physically impossible, the original is gone or
+        ModelError: If a link or a drive would be physically impossible, the original is missing or
             cannot be edited, the target is not usable, or the written file differs from pi.
     """
     require_kind(model, RobotModel, "model", "a robotid.RobotModel")
@@ -147,16 +149,16 @@ def export(result: "Result", target: Path) -> Written:
 
 
 def urdf_changes(model: RobotModel, pi: Array, *, dynamics: Projection | bool = False) -> list[str]:
-    """Return how the URDF that ``write_urdf`` writes differs from the original, line by line.
+    """Return the differences of the URDF of ``write_urdf`` from the original, line by line.
 
     Args:
-        model: The robot; the file it was read from is compared.
+        model: The robot; its file is compared.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
         dynamics: As of ``write_urdf``.
 
     Returns:
         A unified diff without context, each segment with the name of its link or joint; empty if
-        the original is gone.
+        the original is missing.
 
     Raises:
         DataError: If pi does not have p finite entries.
@@ -186,14 +188,14 @@ def read_sidecar(path: str | Path) -> dict[str, Any]:
         path: The ``.drive.json`` file.
 
     Raises:
-        DataError: If it is missing, no JSON, or not of the schema of a sidecar.
+        DataError: If it is missing, not JSON, or not of the schema of a sidecar.
     """
     source, content = Path(path), read_json(path, "sidecar")
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != _SCHEMA_VERSION:
         raise DataError(
-            f"{source.name} has schema_version {version!r}, wanted {_SCHEMA_VERSION}: the sidecar "
-            "that write_urdf puts beside a URDF"
+            f"{source.name} has schema_version {version!r}, wanted {_SCHEMA_VERSION} of a sidecar "
+            "written by write_urdf"
         )
     check_shape(content, _SHAPE, source.name)
     return dict(content)
@@ -207,9 +209,9 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
         sidecar: Its ``.drive.json``.
 
     Raises:
-        DataError: If the sidecar cannot be used.
-        ModelError: If the URDF is missing, is not the one the sidecar was written with, or does
-            not hold the joints that the sidecar names.
+        DataError: If the sidecar is not usable.
+        ModelError: If the URDF is missing, is not the one of the sidecar, or lacks a joint of the
+            sidecar.
     """
     facts, path = read_sidecar(sidecar), Path(urdf)
     if not path.is_file():
@@ -217,8 +219,8 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
     found = _digest(path.read_bytes())
     if found != facts["urdf_sha256"]:
         raise ModelError(
-            f"{path.name} has changed since {Path(sidecar).name} was written: its sha256 is "
-            f"{found[:12]}..., wanted {facts['urdf_sha256'][:12]}...; restore the file, or write "
+            f"{path.name} has changed since {Path(sidecar).name} was written: its SHA-256 starts "
+            f"with {found[:12]}, wanted {facts['urdf_sha256'][:12]}; restore the file, or write "
             "both again"
         )
     couplings = [
@@ -242,13 +244,13 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
 
 
 def terms_from_facts(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
-    """Return the further terms of single drives, by name, of their plain values.
+    """Return the further terms of single drives, by name, from their plain values.
 
     Args:
         tables: Their values, as of ``RobotModel.options``.
 
     Raises:
-        SettingsError: If there is no such term.
+        SettingsError: If a term is unknown.
     """
     return {name: [term_from_dict(term) for term in terms] for name, terms in tables.items()}
 
@@ -261,7 +263,7 @@ def _content(
     *,
     dynamics: Projection | bool,
 ) -> bytes:
-    """Return the original URDF with the parameters of its links, written, and of its drives."""
+    """Return the original URDF with new parameters of links and drives."""
     document = xml_splice.parse(original, Path(model.tree.path).name)
     changed = {
         link: pi
@@ -281,7 +283,7 @@ def _digest(content: bytes) -> str:
 
 
 def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[str, Any]:
-    """Return what a URDF has no place for: how the model is built from it, and the drives."""
+    """Return the content of a sidecar: options of the model, and parameters of the drives."""
     layout, first = model.layout, model.layout.n_inertial
     units = dict(zip(layout.names[first:], layout.units[first:], strict=True))
     values: dict[str, dict[str, float]] = {drive.name: {} for drive in layout.drives}
@@ -298,12 +300,12 @@ def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[st
             for c in layout.couplings
         ],
         "lumped": _lumped(model, places),
-        "units": {"gravity": "m/s^2", "locked": "rad, or m if it slides", "ratios": "-", **units},
+        "units": {"gravity": "m/s^2", "locked": "rad, or m if prismatic", "ratios": "-", **units},
     }
 
 
 def _projected_facts(dynamics: Projection | bool) -> dict[str, Any]:
-    """Return how ``<dynamics>`` differs from the drives, if friction was projected on it."""
+    """Return the projection of friction on ``<dynamics>``, if there is one."""
     if not isinstance(dynamics, Projection) or not dynamics.drives:
         return {}
     return {"projected_dynamics": {drive.name: drive.to_dict() for drive in dynamics.drives}}
@@ -338,17 +340,17 @@ def _check_parameters(model: RobotModel, pi: Array) -> None:
 
 def _check_target(source: Path, target: Path) -> None:
     if not source.is_file():
-        raise ModelError(f"the model's URDF {str(source)!r}, which is copied, is gone; restore it")
+        raise ModelError(f"the model's URDF {str(source)!r} no longer exists; restore it")
     if not target.parent.is_dir():
-        raise ModelError(f"there is no folder {str(target.parent)!r} to write to; make it first")
+        raise ModelError(f"the folder {str(target.parent)!r} does not exist; create it")
     if target.is_dir():
-        raise ModelError(f"the target {str(target)!r} is a folder; name a file in it")
+        raise ModelError(f"the target {str(target)!r} is a folder, wanted a file")
     if target.exists() and target.samefile(source):
         raise ModelError(f"the target {str(target)!r} is the original URDF; choose another name")
 
 
 def link_parameters(model: RobotModel, pi: Array) -> dict[str, Array]:
-    """Return the ten parameters of each link that a joint moves, in its frame, links held apart.
+    """Return the ten parameters of each moving link in its frame, without locked links.
 
     Args:
         model: The robot.
@@ -363,15 +365,15 @@ def link_parameters(model: RobotModel, pi: Array) -> dict[str, Array]:
     """
     _check_parameters(model, pi)
     layout = model.layout
-    advice = "identify with the 'consistent' estimator, which keeps bodies and drives possible"
+    advice = "identify with the estimator 'consistent', whose bodies and drives are possible"
     own = pi[: layout.n_inertial] - held_parameters(model)
     for link, J in zip(layout.bodies, pseudo_inertia(own), strict=True):
         smallest = float(np.linalg.eigvalsh(J)[0])
         if not smallest > 0:
-            held = f" without the links behind {list(model.locked)}" if model.locked else ""
+            others = f", without links beyond {listed(model.locked)}," if model.locked else ""
             raise ModelError(
-                f"link {link!r}{held} would be no possible body: the smallest eigenvalue of its "
-                f"pseudo-inertia is {smallest:.3g}, wanted > 0; {advice}"
+                f"link {link!r}{others} would be physically impossible: the smallest eigenvalue of "
+                f"its pseudo-inertia is {smallest:.3g}, wanted > 0; {advice}"
             )
     for i in np.flatnonzero(layout.is_nonnegative() & (pi < 0)):
         raise ModelError(
@@ -397,7 +399,7 @@ def _inertial_edits(
 
 
 def _angle_edits(document: Document, model: RobotModel) -> list[Edit]:
-    """Return the changes that write the angles of joints which the model has in exact form."""
+    """Return the edits of joint angles that the model has in exact form."""
     used = {j.get("name"): j.find("origin") for j in model.tree.robot.findall("joint")}
     edits: list[Edit] = []
     for joint in document.root.find_all("joint"):
@@ -410,7 +412,7 @@ def _angle_edits(document: Document, model: RobotModel) -> list[Edit]:
 
 
 def _is_as_stated(parameters: Array, stated: Inertial | None) -> bool:
-    """Return whether a link's parameters, shape (10,), are those of its ``<inertial>``."""
+    """Return whether a link's parameters, shape (10,), equal those of its ``<inertial>``."""
     if stated is None:
         return False
     before = inertial_parameters(stated)
@@ -437,7 +439,7 @@ def _inertial(parameters: Array) -> list[str]:
 
 
 def numbers_text(values: Iterable[float]) -> str:
-    """Return numbers as an attribute of an XML file has them, to the last bit.
+    """Return numbers as the value of an XML attribute, exact to the last bit.
 
     Args:
         values: The numbers.
@@ -448,7 +450,7 @@ def numbers_text(values: Iterable[float]) -> str:
 def _dynamics_edits(document: Document, model: RobotModel, pi: Array) -> list[Edit]:
     attributes = {name: term.dynamics for name, term in TERMS.items() if term.dynamics}
     values = dict(zip(model.layout.names, pi, strict=True))
-    shared = {coupling.name for coupling in model.layout.couplings}  # they load others, too
+    shared = {coupling.name for coupling in model.layout.couplings}  # they load other joints, too
     edits: list[Edit] = []
     for joint in document.root.find_all("joint"):
         name, found = joint.attributes.get("name", ""), joint.find_all("dynamics")
@@ -465,10 +467,12 @@ def _dynamics_edits(document: Document, model: RobotModel, pi: Array) -> list[Ed
 
 
 def _check_torque(model: RobotModel, pi: Array, urdf: Path, sidecar: Path) -> None:
-    """Raise if the files, read back, do not give the torque of pi in every row."""
+    """Raise if the files do not give the torque of pi in every row."""
     loaded, read_back = load_identified(urdf, sidecar)
     if loaded.layout != model.layout:
-        raise ModelError(f"{urdf.name} was not written: read back, it has other bodies or joints")
+        raise ModelError(
+            f"{urdf.name} is not written: in the test reading, it has other bodies or joints"
+        )
     wanted, found = (
         (random_regressor(robot, _STATES, np.random.default_rng(0)) @ x).reshape(_STATES, -1)
         for robot, x in ((model, pi), (loaded, read_back))
@@ -477,7 +481,7 @@ def _check_torque(model: RobotModel, pi: Array, urdf: Path, sidecar: Path) -> No
     off = np.flatnonzero(difference > _SAME * np.linalg.norm(wanted, axis=0))
     if off.size:
         raise ModelError(
-            f"{urdf.name} was not written: read back, it gives another torque than the parameters "
-            f"at {[model.row_names[i] for i in off]}; has {model.tree.path} changed since the "
-            "model was read?"
+            f"{urdf.name} is not written: in the test reading, its torque differs from that of the "
+            f"parameters at {listed(model.row_names[i] for i in off)}. If {model.tree.path} has "
+            "changed since the model was read, read the model again"
         )

@@ -1,7 +1,7 @@
-"""Edits of an XML file that leave every other byte as it was.
+"""Edits of an XML file that do not change any other byte.
 
-The elements are located by the byte they start at; a change is a span of bytes and what replaces
-it. Nothing is ever written from a tree, so comments, order, quotes and line ends survive.
+Elements are located by their first byte. An edit is a range of bytes and its replacement. The file
+is not written from a tree, so comments, order, quotes and line ends are unchanged.
 """
 
 import codecs
@@ -14,7 +14,7 @@ from robotid.exceptions import ModelError
 
 __all__ = ["Document", "Edit", "apply", "insert", "parse", "remove", "replace", "set_attributes"]
 
-# the tag at the start of an element; an attribute's value may hold ">"
+# the tag at the start of an element; the value of an attribute may contain ">"
 _TAG = re.compile(rb"<[^\s/>]+(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 _ATTRIBUTE = re.compile(rb"\s([^\s=/>]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
 _BOMS = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
@@ -22,7 +22,7 @@ _BOMS = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 
 @dataclass(frozen=True)
 class Element:
-    """One element and the bytes it takes."""
+    """One element and its range of bytes."""
 
     tag: str  # as written, with the prefix
     attributes: Mapping[str, str]
@@ -47,19 +47,19 @@ class Element:
 
 @dataclass(frozen=True)
 class Document:
-    """An XML file, read."""
+    """The content of an XML file."""
 
-    data: bytes  # its text in UTF-8; the offsets of the elements count these bytes
-    root: Element  # the outermost one
-    codec: str  # that of the file itself
+    data: bytes  # its text in UTF-8; offsets of elements count these bytes
+    root: Element  # the outermost element
+    codec: str  # the encoding of the file
 
 
 @dataclass(frozen=True)
 class Edit:
-    """A span of bytes and what comes in its place."""
+    """A range of bytes and its replacement."""
 
     start: int  # first byte replaced
-    stop: int  # first byte kept again; equal to start to insert
+    stop: int  # first byte after the range; equal to start for an insertion
     text: bytes
 
 
@@ -67,34 +67,34 @@ def parse(data: bytes, where: str) -> Document:
     """Locate the elements of an XML file.
 
     Args:
-        data: Content of the file, in any encoding that XML names.
+        data: Content of the file, in any encoding of XML.
         where: Name of the file, for errors.
 
     Raises:
-        ModelError: If it is not well-formed, or an element comes out of an entity.
+        ModelError: If it is not well-formed, or an element is inside an entity.
     """
     codec = _codec(data, where)
     try:
         text = data.decode(codec).encode("utf-8")
     except UnicodeDecodeError as error:
-        raise ModelError(f"{where} is not {codec} as it says: {error}") from error
+        raise ModelError(f"{where} declares {codec}, but has other bytes: {error}") from error
     return Document(text, _root(text, where), codec)
 
 
 def apply(document: Document, edits: Iterable[Edit]) -> bytes:
-    """Return the file with spans replaced, in its own encoding.
+    """Return the file with its edits, in its own encoding.
 
     Args:
         document: The file.
-        edits: The changes; spans must not overlap.
+        edits: The edits; their ranges must not overlap.
 
     Raises:
-        ModelError: If two spans overlap.
+        ModelError: If two ranges overlap.
     """
     pieces, at = [], 0
     for edit in sorted(edits, key=lambda e: (e.start, e.stop)):
         if edit.start < at:
-            raise ModelError(f"two changes of the XML overlap at byte {edit.start}")
+            raise ModelError(f"two edits of the XML overlap at byte {edit.start}")
         pieces += [document.data[at : edit.start], edit.text]
         at = edit.stop
     text = b"".join([*pieces, document.data[at:]])
@@ -102,24 +102,24 @@ def apply(document: Document, edits: Iterable[Edit]) -> bytes:
 
 
 def replace(document: Document, element: Element, lines: Sequence[str]) -> Edit:
-    """Return the change that writes something else in the place of an element.
+    """Return the edit that replaces an element.
 
     Args:
         document: The file.
-        element: What is replaced.
-        lines: The new element, line by line: first, inner ones, last. They are indented like the
-            file where the element starts a line of its own, and joined to one line elsewhere.
+        element: The element to replace.
+        lines: The new element, line by line: first, inner ones, last. They are indented as the
+            file if the element starts a line, and joined to one line otherwise.
     """
     text = _layout(document, lines, _indent(document, element))
     return Edit(element.start, element.end, text)
 
 
 def remove(document: Document, element: Element) -> Edit:
-    """Return the change that takes an element out, with its lines if nothing else is on them.
+    """Return the edit that removes an element, with its lines if they have no other content.
 
     Args:
         document: The file.
-        element: What is removed.
+        element: The element to remove.
     """
     indent = _indent(document, element)
     rest = re.compile(rb"[ \t]*(\r\n|\n|\r)").match(document.data, element.end)
@@ -129,11 +129,11 @@ def remove(document: Document, element: Element) -> Edit:
 
 
 def insert(document: Document, parent: Element, lines: Sequence[str]) -> Edit:
-    """Return the change that puts a new element behind the last one inside another.
+    """Return the edit that inserts a new element as the last child of another.
 
     Args:
         document: The file.
-        parent: Where it goes.
+        parent: The parent element.
         lines: The new element, as for ``replace``.
     """
     outer = _indent(document, parent)
@@ -149,12 +149,12 @@ def insert(document: Document, parent: Element, lines: Sequence[str]) -> Edit:
 
 
 def set_attributes(document: Document, element: Element, values: Mapping[str, str]) -> list[Edit]:
-    """Return the changes that give attributes of an element new values.
+    """Return the edits that set attributes of an element.
 
     Args:
         document: The file.
         element: The element.
-        values: New values by attribute; one that the element lacks is added behind the others.
+        values: New values by attribute; a missing attribute is added after the others.
     """
     edits, missing = [], dict(values)
     for match in _ATTRIBUTE.finditer(document.data, element.start, element.inside):
@@ -170,7 +170,7 @@ def set_attributes(document: Document, element: Element, values: Mapping[str, st
 
 
 def _root(data: bytes, where: str) -> Element:
-    """Return the outermost element, put together from the events of expat."""
+    """Return the outermost element, built from the events of expat."""
     parser = expat.ParserCreate("utf-8")
     top: list[Element] = []
     inner = [top]  # children of the open elements
@@ -181,8 +181,8 @@ def _root(data: bytes, where: str) -> Element:
         match = _TAG.match(data, start)
         if match is None or not data.startswith(b"<" + tag.encode(), start):
             raise ModelError(
-                f"{where}: <{tag}> near byte {start} comes out of an entity, where it cannot "
-                "be edited; expand the entities of the file first: xmllint --noent"
+                f"{where}: <{tag}> near byte {start} is inside an entity and cannot be edited; "
+                "expand the entities of the file with xmllint --noent"
             )
         opened.append((attributes, start, match.end()))
         inner.append([])
@@ -217,7 +217,7 @@ def _codec(data: bytes, where: str) -> str:
 
 
 def _indent(document: Document, element: Element) -> bytes | None:
-    """Return the blanks in front of an element that starts a line, None for any other."""
+    """Return the blanks before an element that starts a line, None for other elements."""
     data, start = document.data, element.start
     line = 1 + max(data.rfind(b"\n", 0, start), data.rfind(b"\r", 0, start))
     blanks = data[line:start]
@@ -225,13 +225,13 @@ def _indent(document: Document, element: Element) -> bytes | None:
 
 
 def _unit(document: Document) -> bytes:
-    """Return by how much the file indents: that of the first element inside the outermost one."""
+    """Return the unit of indentation: that of the first child of the outermost element."""
     indents = (_indent(document, child) for child in document.root.children)
     return next((indent for indent in indents if indent), b"  ")
 
 
 def _line_break(document: Document, indent: bytes | None) -> bytes:
-    """Return what starts a line as the file does, nothing without an indent."""
+    """Return the line end of the file with an indentation, nothing without one."""
     found = re.search(rb"\r\n|\n|\r", document.data)
     return b"" if indent is None else (found[0] if found else b"\n") + indent
 

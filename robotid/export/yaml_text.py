@@ -1,4 +1,4 @@
-"""YAML of plain values, written by hand so that no reader of YAML need be installed."""
+"""YAML of plain values, without a YAML package."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -11,18 +11,18 @@ _WIDEST = 120  # characters of a table in one line
 
 
 def yaml_text(table: Mapping[str, Any], head: str) -> str:
-    """Return a table as YAML, below a comment.
+    """Return a table as YAML after a comment.
 
     Args:
         table: Tables, lists, text, numbers, booleans and None.
-        head: The comment's lines.
+        head: The lines of the comment.
     """
     lines = [f"# {line}".rstrip() for line in head.splitlines()]
     return "\n".join([*lines, *_lines(table, "")]) + "\n"
 
 
 def _lines(value: Mapping[str, Any], indent: str) -> Iterator[str]:
-    """Yield the lines of a table: one for each that holds no other table and fits a line."""
+    """Yield the lines of a table; a table without tables that fits a line has one line."""
     for key, entry in value.items():
         name = f"{indent}{yaml_plain(key)}:"
         if isinstance(entry, Mapping) and (
@@ -35,7 +35,7 @@ def _lines(value: Mapping[str, Any], indent: str) -> Iterator[str]:
 
 
 def _flow(entry: Any) -> str:  # noqa: ANN401
-    """Return a figure, a name, a list or a table in one line."""
+    """Return a number, a text, a list or a table in one line."""
     if isinstance(entry, Mapping):
         return "{" + ", ".join(f"{yaml_name(key)}: {_flow(x)}" for key, x in entry.items()) + "}"
     if isinstance(entry, list):

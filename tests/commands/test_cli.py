@@ -341,7 +341,7 @@ def test_a_job_file_states_its_logs_itself(arm_logs, tmp_path, capsys):
     assert main(["identify", str(job), "--out", str(tmp_path / "out")]) == 0
     assert "verdict: good" in capsys.readouterr().out
     assert main(["identify", str(job), "--cutoff", "5"]) == 2
-    assert "is a job file, which states its logs and settings itself" in capsys.readouterr().err
+    assert "is a job file; it states the logs and settings" in capsys.readouterr().err
 
 
 def test_rounded_angles_are_named_and_snapped_where_asked(tmp_path, rng, capsys):
@@ -376,7 +376,7 @@ def test_rounded_angles_are_named_and_snapped_where_asked(tmp_path, rng, capsys)
 
 def test_no_log_is_wrong_usage(capsys):
     assert main(["identify", URDF]) == 2
-    assert "no log was given" in capsys.readouterr().err
+    assert "no log is given" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         main(["identfy"])
 
@@ -397,7 +397,7 @@ def test_inspect_of_an_unusable_urdf_says_why(capsys, tmp_path):
     assert main(["inspect", str(example_urdf("ur3.urdf")), "--json"]) == 1
     printed = capsys.readouterr()
     assert json.loads(printed.out)["structure"] is None
-    assert "no model can be built" in printed.err
+    assert "does not give a valid model; see the findings" in printed.err
 
 
 def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys):

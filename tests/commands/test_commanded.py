@@ -125,7 +125,8 @@ def test_what_was_found_is_printed_with_its_values(folder, result, capsys, tmp_p
             error, *others = [f"{own[key]:.1f}" for key in keys]
             assert row[1:] == [error, f"{own['rmse']:#.3g}", "rad", *others]
     fit = result["simulation"]["fit"]
-    assert f"go2_description: 3 joints, {fit['parameters']} unknowns; " in " ".join(printed.split())
+    first = f"go2_description: 3 joints, {fit['parameters']} free parameters; "
+    assert first in " ".join(printed.split())
     table = printed.partition("\n  parameter ")[2].partition("\n\n")[0].splitlines()[1:]
     lines = {line.split()[0]: line.split()[1:] for line in table}
     for entry in result["drive_parameters"]:

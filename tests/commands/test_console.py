@@ -18,7 +18,7 @@ from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid._typing import STAGES
-from robotid.cli import doctor, main
+from robotid.cli import compare, doctor, main, printing
 from robotid.cli.console import terminal_progress
 from robotid.identification.pipeline import identify
 from robotid.logs.read import write_log
@@ -143,7 +143,7 @@ def test_inspect_says_what_it_found_first_and_a_missing_file_once(tmp_path, caps
     assert main(["inspect", str(urdf)]) == 1
     printed = capsys.readouterr()
     assert printed.out.startswith("planar_2r: 2 joints: joint_1, joint_2\nerror: negative_mass: ")
-    assert printed.err == f"robotid: no model can be built from {urdf}; see the findings\n"
+    assert printed.err == f"robotid: {urdf} does not give a valid model; see the findings\n"
 
 
 def test_inspect_shows_base_parameters_where_they_are_asked_for(tmp_path, capsys):
@@ -168,12 +168,15 @@ def test_logs_of_one_name_are_named_by_their_paths(arm_logs, tmp_path, capsys):
     assert re.search(rf"fitted: {arm_logs}/fit.csv 0-7.99 s, {other} 0-7.99 s", said)
 
 
-def test_compare_keeps_columns_apart_and_files_of_one_name_too(arm_logs, tmp_path, capsys):
+def test_compare_keeps_columns_apart_and_files_of_one_name_too(
+    arm_logs, tmp_path, capsys, monkeypatch
+):
     words = ["identify", ARM, str(arm_logs / "fit.csv"), "--validate", str(arm_logs / "keep.csv")]
     for cutoff in ("8", "9"):
         out = ["--cutoff", cutoff, "--estimator", "wls", "--no-report", "--friction", "viscous"]
         assert main([*words, *out, "--out", str(tmp_path / cutoff)]) == 0
     capsys.readouterr()
+    monkeypatch.setenv("COLUMNS", "300")
     results = [str(tmp_path / cutoff / "result.json") for cutoff in ("8", "9")]
     assert main(["compare", *results]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -209,14 +212,14 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
         finding("arm_1", "noise", 1, "note"),
     ]
     content = {"findings": findings, "joints": joints}
-    doctor.show(content, is_verbose=False)
+    doctor.show(content, is_verbose=False, logs=2)
     assert capsys.readouterr().out.splitlines() == [
         "warning: stepped: run.csv: 20 % of arm_6, arm_7's torque is odd",
         "warning: odd: run.csv: 37 to 68 % of arm_6, arm_7's torque is odd",
         "4 findings, 2 causes; worst: arm_7; 1 note hidden (--verbose)",
     ]
     findings.append(finding("arm_1", "reversed", 1, "error"))  # graver than any two warnings
-    doctor.show(content, is_verbose=True)
+    doctor.show(content, is_verbose=True, logs=2)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "error: reversed: run.csv: 1 % of arm_1's torque is odd"
     assert lines[-2:] == [
@@ -226,10 +229,50 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
     wrong = [finding("arm_6", code, 1, "error") for code in ("one", "two")]
     wrong += [finding("arm_7", code, 9) for code in ("three", "four")]
     wrong.append(finding("arm_7", "five", 9, "error"))
-    doctor.show({"findings": wrong, "joints": joints}, is_verbose=False)
+    doctor.show({"findings": wrong, "joints": joints}, is_verbose=False, logs=2)
     assert capsys.readouterr().out.splitlines()[-1].endswith("worst: arm_6"), "two errors"
-    doctor.show({"findings": [], "joints": joints}, is_verbose=False)
-    assert capsys.readouterr().out == "nothing was found\n"
+
+
+def test_a_clean_doctor_states_the_number_of_logs(capsys):
+    doctor.show({"findings": [], "joints": ["a"]}, is_verbose=False, logs=2)
+    assert capsys.readouterr().out == "no fault found in 2 logs\n"
+    note = {"findings": [finding("a", "noise", 1, "note")], "joints": ["a"]}
+    doctor.show(note, is_verbose=False, logs=1)
+    assert capsys.readouterr().out == "1 note hidden (--verbose)\nno fault found in 1 log\n"
+
+
+def test_the_verdict_has_its_colour_on_a_terminal_only(monkeypatch, capsys):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    verdict = {"status": "poor", "reasons": [], "per_joint": {"a": {"status": "poor"}}}
+    printing.print_verdict(verdict | {"per_joint": {}})
+    assert "verdict: \x1b[31mpoor\x1b[0m" in capsys.readouterr().out
+    monkeypatch.setenv("NO_COLOR", "1")
+    printing.print_verdict(verdict | {"per_joint": {}})
+    assert "\x1b" not in capsys.readouterr().out
+
+
+def test_compare_shows_the_largest_differences_and_fits_eighty_columns(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    entry = {"values": [-1.2345e-5, 1.3], "std_errors": [0.012, 0.12], "unit": "N m s/rad"}
+    name = "shoulder_lift_joint.harmonic2_cos"
+    result = {"label": "A", "verdict": {"status": "good"}, "estimator": "consistent"}
+    content = {
+        "results": [result | {"path": "folder/" * 12 + "result.json"}] * 2,
+        "notes": ["another robot"], "fitted_alike": True, "validation": [], "fitted": [],
+        "base_parameters": [
+            entry | {"name": f"{name}_{k}", "differences": [20.0 - k]} for k in range(15)
+        ],
+        "settings": [], "versions": [], "inputs": [],
+    }  # fmt: skip
+    compare._show(content)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(len(line) for line in lines if "folder/" not in line) <= 80
+    assert [line.split()[0] for line in lines if name in line] == [f"{name}_{k}" for k in range(12)]
+    assert lines[-1] == "  3 more with smaller differences: --verbose"
+    compare._show(content, is_verbose=True)
+    assert f"{name}_14" in capsys.readouterr().out
 
 
 CLOSED = {"no output": ">&-", "no errors": "2>&-", "neither": ">&- 2>&-"}

@@ -68,7 +68,8 @@ def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
     assert "a motion of 4 s for 3 joints, condition number" in said
     assert "collision" not in said
     assert "1 start in " in said
-    assert "not settled: more --seconds may improve it" in " ".join(said.split())
+    assert "not converged: increase --seconds" in " ".join(said.split())
+    assert said.endswith(f"\nwritten:\n  {tmp_path / 'motion.yaml'}\n")
     assert (tmp_path / "motion.yaml").read_text().startswith("joint_names: [wrist_1_joint, ")
 
 
@@ -92,7 +93,7 @@ def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
             "jerk of 'wrist_1_joint' is 1e+300, wanted",
         ),
         (["--box", "post=0,0,0,1,1,nan"], "the lower and the upper corner [m], within 1000 m"),
-        (["--criterion", "widest"], "criterion is widest, which is about what logs have told"),
+        (["--criterion", "widest"], "criterion is widest, which needs an earlier result"),
     ],
 )
 def test_bad_flags_are_refused_before_anything_is_written(tmp_path, capsys, words, message):
@@ -204,8 +205,8 @@ def test_a_payload_is_found_by_a_motion_of_the_few_joints_that_show_it(tmp_path,
         (["--mass", "2"], "a payload or joints that move are stated, but kind is 'fourier'"),
         (["--kind", "payload", "--moving", "elbow"], "elbow cannot move wrist_3_link; joints that"),
         (["--kind", "payload", "--mass", "-1"], "mass"),
-        (["--kind", "payload", "--com", "1,2,3"], "--com '1,2,3': wanted X,Y,Z [m], three numbers"),
-        (["--kind", "payload", "--mass", "1", "--com", "1,2"], "--com '1,2': wanted X,Y,Z [m]"),
+        (["--kind", "payload", "--com", "1,2,3"], "--com '1,2,3': wanted three numbers"),
+        (["--kind", "payload", "--mass", "1", "--com", "1,2"], "--com '1,2': wanted three"),
         (["--kind", "payload", "--link", "tool"], "link 'tool' is not in ur10_robot.urdf"),
     ],
 )
@@ -227,7 +228,7 @@ def test_after_a_result_a_motion_is_made_for_what_it_knows_the_least(tmp_path, c
     assert main(["identify", robot[0], log, *robot[1:], "--out", out, *plain]) == 0
     capsys.readouterr()
     assert main([*WORDS, "--out", motion, "--given", out]) == 0
-    assert "made for what the logs given know the least: " in " ".join(
+    assert "designed for the parameters with the widest intervals: " in " ".join(
         capsys.readouterr().out.split()
     )
     assert main([*WORDS, "--out", motion, "--given", out, "--json"]) == 0
@@ -261,7 +262,7 @@ def test_a_robot_without_links_to_keep_apart_moves_too(tmp_path, kind, capsys):
     urdf.write_text(PAN_TILT.replace("</link>", SHAPE))
     words = ["--duration", "2", "--seconds", "0.5", "--starts", "1", "--kind", kind]
     assert main(["excite", str(urdf), "--out", str(out), *words]) == 0
-    assert "no links or obstacles come near each other" in " ".join(capsys.readouterr().out.split())
+    assert "no pair of links or obstacles comes close" in " ".join(capsys.readouterr().out.split())
     q = np.loadtxt(out, delimiter=",", skiprows=1)[:, 1:3]
     assert (np.ptp(q, axis=0) > 0.2).all()
     assert (np.abs(q) <= [2.0, 1.0]).all()
@@ -369,7 +370,7 @@ def test_a_format_that_motions_are_not_written_in_is_refused_before_the_design(t
 
 
 def test_every_flag_states_its_setting():
-    """Each with a value that is not the default, two where it may be given again."""
+    """Each with a value that is not the default, two where the flag is repeatable."""
     words = {
         "kind": "bspline", "duration": "4", "harmonics": "3", "criterion": "E", "share": "0.5",
         "clearance": "0.1", "floor": "-0.2", "seed": "7", "starts": "2", "seconds": "9",

@@ -56,7 +56,7 @@ def test_each_format_is_written_and_what_it_does_not_state_is_said(result, tmp_p
     has_place = [f"{j}.{t}" for j in ("joint_1", "joint_2") for t in ("armature", "offset")]
     missing = ", ".join(name for name in has_place if values[name])
     said = " ".join(line.strip() for line in lines[1:])
-    assert said == f"URDF has no place for {missing}; the sidecar of the URDF has them"
+    assert said == f"URDF cannot state {missing}; the sidecar of the URDF has them"
     dynamics = read_with_yourdfpy(tmp_path / "a.urdf").joints[-1].dynamics
     assert float(dynamics.damping) == values["joint_2.viscous"]
     _, again = load_identified(tmp_path / "a.urdf", tmp_path / "a.drive.json")
@@ -68,7 +68,7 @@ def test_each_format_is_written_and_what_it_does_not_state_is_said(result, tmp_p
         "result": str(result / "result.json"),
         "format": "mjcf",
         "files": [str(tmp_path / "a.xml")],
-        "not_stated": ["meshes left out, not found or of a kind that MJCF has not: no.dae"],
+        "not_stated": ["meshes not exported, missing or in a format that MJCF cannot read: no.dae"],
         "projected": {},
     }
     robot = mujoco.MjModel.from_xml_path(str(tmp_path / "a.xml"))
@@ -97,7 +97,7 @@ def test_a_result_that_must_not_be_used_is_not_exported(result, tmp_path, capsys
     for kind in ("urdf", "mjcf", "sdf", "ranges"):
         code, _, err = export(tmp_path / "bad", kind, tmp_path / "a", capsys)
         assert code == 1
-        assert "for its parameters are wrong or impossible" in err
+        assert "because its parameters are wrong or impossible" in err
     ranges["robot"] = 3
     (tmp_path / "bad" / "result.json").write_text(json.dumps(content | {"ranges": ranges}))
     code, _, err = export(tmp_path / "bad", "ranges", tmp_path / "a", capsys)
@@ -109,7 +109,7 @@ def test_a_result_that_must_not_be_used_is_not_exported(result, tmp_path, capsys
 def test_a_place_that_cannot_be_written_is_named(result, tmp_path, capsys):
     code, _, err = export(result, "mjcf", tmp_path / "none" / "a.xml", capsys)
     assert code == 1
-    assert "there is no folder" in err
+    assert "does not exist; create it" in err
     code, _, err = export(result, "sdf", tmp_path, capsys)
     assert code == 2
     assert "is a folder, wanted a file to write" in err

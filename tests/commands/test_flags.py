@@ -89,7 +89,7 @@ def test_gains_are_stated_for_all_joints_or_by_joint():
 def test_a_command_without_a_log_names_what_it_wants(command, wanted):
     parser = argparse.ArgumentParser()
     command.add_flags(parser)
-    with pytest.raises(SettingsError, match=f"no .* was given; wanted {wanted}"):
+    with pytest.raises(SettingsError, match=f"no .* is given; wanted {wanted}"):
         job_from_flags(parser.parse_args(["robot.urdf"]))
 
 
@@ -97,7 +97,7 @@ def test_a_flag_of_zero_is_a_flag_beside_a_job_file(tmp_path):
     parser = argparse.ArgumentParser()
     identify.add_flags(parser)
     options = parser.parse_args([str(tmp_path / "job.toml"), "--min-velocity", "0"])
-    with pytest.raises(SettingsError, match="leave out"):
+    with pytest.raises(SettingsError, match="Remove --min-velocity"):
         job_from_flags(options)
 
 
@@ -110,7 +110,7 @@ def test_help_shows_the_flags_that_do_something(command, without):
     command.add_flags(parser)
     shown = " ".join(parser.format_help().split())
     assert not [flag for flag in without if flag in shown]
-    assert "auto: what held-out segments of the fitted logs ask for" in shown
+    assert "auto: selected per joint by the error on held-out segments of the fitted logs" in shown
     assert all(family in shown for family in FAMILIES)
 
 
@@ -118,7 +118,7 @@ def test_help_names_each_estimator_once():
     parser = argparse.ArgumentParser()
     identify.add_flags(parser)
     words = parser.format_help().replace("\n", " ")
-    names = words.split("which estimator: ")[1].split("--")[0].replace("(default)", "").split(",")
+    names = words.split("estimator: ")[1].split("--")[0].replace("(default)", "").split(",")
     names = [name.strip() for name in names]
     assert sorted(names) == sorted(ESTIMATORS)
     assert parser.parse_args(["robot.urdf", "--no-report", "--dynamics"]).no_report is False

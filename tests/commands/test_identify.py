@@ -61,7 +61,7 @@ def test_files_of_an_earlier_run_do_not_stay_beside_a_new_result(arm, rng, tmp_p
     _, result = run_job(replace(job, estimator=EstimatorSettings("wls"), report=False), out)
     assert result["outputs"] == {}
     assert not any(path.exists() for path in written)
-    assert "is of an earlier run and was removed" in caplog.text
+    assert "of an earlier run: this run did not write it" in caplog.text
 
 
 def test_each_log_is_hashed_once_and_opened_once(arm, rng, tmp_path, monkeypatch):
@@ -101,7 +101,7 @@ def test_a_file_in_place_of_the_folder_is_refused_before_the_fit(arm, tmp_path):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b'{"schema_version":1,"verdict":{}}', "has no entry 'robotid': it is not whole"),
+        (b'{"schema_version":1,"verdict":{}}', "has no entry 'robotid': the file is incomplete"),
         (b"\xff\xfe", "is not JSON"),
     ],
 )

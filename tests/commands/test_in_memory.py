@@ -101,9 +101,13 @@ def test_what_is_stated_reaches_the_simulation(arm, monkeypatch):
 
 def test_what_does_not_fit_it_is_refused(arm):
     model, log, _ = arm
-    with pytest.raises(SettingsError, match="controller is of the estimator 'simulation', but"):
+    with pytest.raises(
+        SettingsError, match="controller is given, but the estimator is 'consistent', wanted 'sim"
+    ):
         robotid.identify(model, log, controller={"kp": 20.0})
-    with pytest.raises(SettingsError, match="simulation chooses that of all joints, or of none"):
+    with pytest.raises(
+        SettingsError, match="simulation selects the terms of all joints, or of none"
+    ):
         robotid.identify(model, log, estimator="simulation", friction="stribeck")
     with pytest.raises(SettingsError, match="controller: kind"):
         robotid.identify(model, log, estimator="simulation", controller={"kind": "none"})

@@ -179,8 +179,8 @@ WRONG = {
     "seed": ('"wls"', '"log_cholesky"\nseed = -1', "seed is -1, wanted x >= 0"),
     "seed of text": ('"wls"', '"log_cholesky"\nseed = "a"', "seed is 'a', wanted a whole number"),
     "deep": ("locked = { c = 0.8 }", f"locked = {'[' * 5000}", "is not valid TOML"),
-    "NUL in a path": ('"robot.urdf"', '"robot\\u0000.urdf"', "cannot name a file"),
-    "long path": ('"robot.urdf"', f'"{"r" * 5000}"', "cannot name a file: wanted UTF-8"),
+    "NUL in a path": ('"robot.urdf"', '"robot\\u0000.urdf"', "is not a valid path"),
+    "long path": ('"robot.urdf"', f'"{"r" * 5000}"', "is not a valid path, wanted UTF-8"),
     "misspelt topic": ("topic =", "topics =", "topics is not a known key; did you mean 'topic'?"),
     "no TOML": ("[signals]", "[signals", "is not valid TOML"),
 }  # fmt: skip
@@ -208,7 +208,7 @@ def test_gravity_and_drive_terms_default_to_those_of_the_model():
 
 def test_a_controller_that_the_estimator_does_not_read_is_refused(tmp_path):
     table = {"urdf": "arm.urdf", "controller": {"kp": 20.0}, "estimator": {"name": "wls"}}
-    with pytest.raises(SettingsError, match=r"'wls' does not read; set \[estimator\] name"):
+    with pytest.raises(SettingsError, match=r"'wls', wanted 'simulation'; set \[estimator\] name"):
         job_from_settings(table, "job.toml", tmp_path)
     table["estimator"] = {"name": "simulation"}
     assert job_from_settings(table, "job.toml", tmp_path).controller.kp == 20.0

@@ -142,7 +142,7 @@ def test_a_joint_is_locked_at_the_median_of_all_logs_if_it_stands_there_in_each(
     (note,) = found.notes
     assert (note.code, note.severity) == ("locked_as_logged", "note")
     assert "jc = 0.3001, jd = 0.1." in note.message
-    assert {log.model for log in (*found.fitted, *found.kept)} == {found.model}
+    assert {log.model for log in (*found.fitted, *found.validation)} == {found.model}
     found = locked_as_logged(hand, model, [first, far], [second])
     assert found.job.locked == {"jc": pytest.approx(0.3001)}
     stated = replace(hand, locked={"jc": 0.0, "jd": 0.2})

@@ -197,9 +197,7 @@ def test_a_filter_or_a_robot_that_changed_since_is_refused_by_name(
 def test_short_logs_have_no_use_of_workers_and_it_is_said(logs, tmp_path, capsys):
     words = ["identify", URDF, str(logs / "keep.csv"), "--out", str(tmp_path), "--workers", "2"]
     assert main([*words, "--no-report"]) == 0
-    assert (
-        "read at once: workers, scheduler and resume have nothing to do" in capsys.readouterr().err
-    )
+    assert "read whole: workers, scheduler and resume have no effect" in capsys.readouterr().err
 
 
 def test_no_workers_are_wrong_usage(job, tmp_path, capsys):

@@ -72,10 +72,10 @@ def test_a_log_and_a_result_are_references_alike(files, capsys):
 def test_a_mass_is_said_to_be_in_the_scale_of_the_torques(files, capsys):
     said = asked(capsys, files / "loaded.csv", "--reference", files / "bare.csv", "--link", "tool0")
     mass, low, high = re.search(
-        r"mass ([.\d]+) kg \(95 % interval ([.\d]+) to ([.\d]+),", said
+        r"mass ([.\d]+) kg \(95 % interval ([.\d]+) to ([.\d]+)\)\.", said
     ).groups()
     assert float(low) < float(mass) < float(high)
-    assert "in the scale of the torques" in " ".join(said.split())
+    assert "It is proportional to the torque scale" in " ".join(said.split())
 
 
 def test_the_text_says_what_a_controller_asks_for(files, capsys):
@@ -131,12 +131,12 @@ def test_what_is_missing_is_named(files, capsys):
     said = asked(capsys, bare, "--reference", loaded, "--link", "tool0", code=1)
     assert "less than in the reference" in said
     said = asked(capsys, loaded, "--reference", files / "out", "--cutoff", "5", code=2)
-    assert "a RESULT says how its logs are read; leave out --cutoff" in said
+    assert "a RESULT states how its logs are read; remove --cutoff" in said
     said = asked(capsys, loaded, "--reference", files / "out", "--reference", bare, code=2)
-    assert "one result is a reference by itself" in said
+    assert "wanted one result alone, or logs" in said
     said = asked(capsys, loaded, "--reference", bare, "--mass", "heavy", code=2)
     assert "--mass 'heavy': wanted KG or LINK=KG" in said
-    with pytest.raises(SettingsError, match=r"of which of the links a, b\?"):
+    with pytest.raises(SettingsError, match=r"the link is ambiguous, wanted one of a, b"):
         stated_masses(["2"], ["a", "b"])
     content = bare.read_bytes()
     try:
@@ -144,7 +144,7 @@ def test_what_is_missing_is_named(files, capsys):
         said = asked(capsys, loaded, "--reference", files / "out", code=1)
     finally:
         bare.write_bytes(content)
-    assert "is not there any more or was changed; give a log without the payload" in said
+    assert "is missing or was changed; give a log without the payload" in said
 
 
 def test_friction_that_the_reference_shows_is_that_of_the_payload_s_logs(upright, tmp_path, capsys):

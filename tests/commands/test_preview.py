@@ -107,7 +107,7 @@ def test_what_was_achieved_stands_beside_what_was_expected(files, capsys):
     for joint, noise in content["noise"].items():
         assert noise["achieved"] == result["identification"]["per_joint"][joint]["rmse"]
         assert noise["achieved"] == pytest.approx(noise["std"], rel=0.1)
-    assert "times what was expected" in " ".join(asked(capsys, *words).split())
+    assert "times the expected ones" in " ".join(asked(capsys, *words).split())
 
 
 def test_of_each_motion_its_window_is_previewed(files):
@@ -163,7 +163,7 @@ def test_noise_that_is_stated_is_that_of_every_preview(monkeypatch, given, is_ow
 
 def test_the_text_says_what_it_rests_on(files, capsys):
     text = " ".join(asked(capsys, files / "log_motion.csv").split())
-    assert "assumed noise is 1 % of the URDF's effort limit" in text
+    assert "assumed noise: 1 % of the URDF's effort limit" in text
     assert "log_motion.csv: the motion determines " in text
     assert "standard parameters, given the URDF: by " in text
     assert "shoulder_link.Izz + 13 more" in text
@@ -178,7 +178,7 @@ def test_wrong_words_are_answered(files, capsys):
     assert "Did you mean 'elbow_joint'" in error
     assert "wanted JOINT=NUMBER" in asked(capsys, motion, "--noise", "elbow_joint", code=2)
     error = asked(capsys, motion, "--given", files / "out", "--cutoff", "5", code=2)
-    assert "a RESULT says how its logs are read" in error
+    assert "a RESULT states how its logs are read" in error
     write_columns({"time": np.arange(9.0), "q_a": np.zeros(9)}, files / "other_robot.csv")
     error = asked(capsys, files / "other_robot.csv", code=1)
     assert "has no column 'q_shoulder_pan_joint'" in error

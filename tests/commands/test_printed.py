@@ -47,15 +47,15 @@ def test_excite(shown):
         "payload": {"words": ["a word", "another"]},
     }  # fmt: skip
     assert shown(excite._show, content) == [
-        "arm: a motion of 4.5 s for 2 joints, condition number 123; 3 starts in 2.3 s, settled",
-        "made for what the logs given know the least: p1, p2",
+        "arm: a motion of 4.5 s for 2 joints, condition number 123; 3 starts in 2.3 s, converged",
+        "designed for the parameters with the widest intervals: p1, p2",
         "",
-        "what it leaves of each limit, least where",
+        "smallest margin to each limit",
         "  position       12.3 %  two",
         "  velocity       -2.0 %  one",
-        "  collision      12.3 mm beyond 50 mm, hand and post at 3.46 s; not looked at, since no",
-        "                  shape can be read: a.stl; made to touch and not looked at: b, c; built",
-        "                  near each other, kept apart by: d",
+        "  collision      12.3 mm above the clearance of 50 mm, hand and post at 3.46 s; not",
+        "                  checked, shapes not readable: a.stl; not checked, in contact by",
+        "                  design: b, c; smaller clearance, close by design: d",
         "",
         "a word",
         "another",
@@ -63,7 +63,7 @@ def test_excite(shown):
     other = content | {"starts": 1, "converged": False, "condition_number": None}
     assert shown(excite._show, other)[:2] == [
         "arm: a motion of 4.5 s for 2 joints, condition number infinite; 1 start in 2.3 s, not",
-        "settled: more --seconds may improve it",
+        "converged: increase --seconds",
     ]
 
 
@@ -78,17 +78,17 @@ def test_simulate(shown):
     }  # fmt: skip
     assert shown(simulate._show, content) == [
         "arm: 801 samples over 4.5 s, seed 7",
-        "no noise was added to the torques: errors of parameters from this log are smaller than",
-        "those of a recorded one, and than those of a preview, which takes noise into account;",
-        "state it with --torque-noise 0.02, a share of the torque",
+        "the torques have no noise: errors of parameters from this log are smaller than those",
+        "from a recorded log, and than those of a preview, which assumes noise. Add noise with",
+        "--torque-noise 0.02, a share of the torque",
         "",
-        "error of the position  rms, largest",
-        "one                    0.012, 0.046 rad; at its effort limit for 12 % of the time",
-        "slide                  0.0002, 0.003 m",
+        "position error  rms, largest",
+        "one             0.012, 0.046 rad; at the effort limit for 12 % of the time",
+        "slide           0.0002, 0.003 m",
     ]
     for kind in ("tau", "torque"):
         noisy = content | {"settings": {"seed": 7, "sensors": {"noise": {kind: 0.02}}}}
-        assert shown(simulate._show, noisy)[1:3] == ["", "error of the position  rms, largest"]
+        assert shown(simulate._show, noisy)[1:3] == ["", "position error  rms, largest"]
 
 
 def test_payload(shown):
@@ -111,8 +111,8 @@ def test_payload(shown):
     }
     assert shown(payload._show, content) == [
         "payload on tool",
-        "  mass 2.012 kg (95 % interval 1.911 to 2.136, in the scale of the torques: gains that",
-        "    are too large make it too large)",
+        "  mass 2.012 kg (95 % interval 1.911 to 2.136). It is proportional to the torque scale:",
+        "    torque gains that are too large give a mass that is too large",
         "  centre of mass in the frame of tool [m]",
         "    x  0.0100  +- 0.0010",
         "    y  -0.020  +- 0.020",
@@ -135,7 +135,7 @@ def test_payload(shown):
         "  mass 3.25 kg, stated",
         "  centre of mass: not determined; it hardly turns",
         "  inertia: not determined; it is light",
-        "torque left unexplained: one 1.2 %, two 12.3 %",
+        "torque prediction error: one 1.2 %, two 12.3 %",
         "",
         "[torque.gains]",
         "one = 14.12  # 95 % interval 13.7 to 14.55",
@@ -175,43 +175,43 @@ def test_preview(shown):
     assert shown(preview._show, content, is_verbose=False) == [
         "arm: m.csv 0.5-7.25 s; 2 base parameters, by wls",
         "",
-        "base parameters: standard errors to be expected, and the share of the plausible spread",
+        "base parameters: expected standard errors, and their share of the plausible spread",
         "                   +-      left  before  gain  achieved  ratio",
         "  a.m + 2 more  0.012  kg  25 %     0.2     4      0.03    2.5",
         "  b.m               -  kg  open     0.2     4      0.03    2.5",
         "",
         "standard parameters, given the URDF: by 2 data, 1 prior",
-        "each of them, and what is in each base parameter: --verbose",
+        "each standard parameter, and the terms of each base parameter: --verbose",
         "",
-        "torque of the motion, 95 % band of a measurement about its prediction, and the part of",
-        "that which is due to the parameters",
+        "RMS torque of the motion, half width of the 95 % prediction band, and the part of it",
+        "that the uncertainty of the parameters causes",
         "  joint  torque   band   part  noise        over",
         "  one      10.1  0.568  0.123   0.25  N m  0.1 s  assumed",
         "  two        20    1.5   0.75    0.5  N    0.2 s  stated",
-        "assumed noise is 1 % of the URDF's effort limit, or of the bodies' largest torque where",
-        "  there is none. Standard errors are in proportion to it: state it with --noise",
-        "  JOINT=N_M, or take it from a run before with --given RESULT",
+        "assumed noise: 1 % of the URDF's effort limit, or of the largest torque of the bodies",
+        "  where there is no limit. Standard errors are proportional to the noise. State it with",
+        "  --noise JOINT=N_M, or use that of an earlier run with --given RESULT",
         "",
         "so it is",
         "",
-        "these logs were identified: 2 standard errors became 0.50 to 1.50 times what was",
-        "expected, eight of ten; median 0.90",
+        "these logs were identified: of 2 achieved standard errors, 80 % are 0.50 to 1.50 times",
+        "the expected ones; median 0.90",
     ]
     assert shown(preview._show, content, is_verbose=True)[12:] == [
         "",
-        "torque of the motion, 95 % band of a measurement about its prediction, and the part of",
-        "that which is due to the parameters",
+        "RMS torque of the motion, half width of the 95 % prediction band, and the part of it",
+        "that the uncertainty of the parameters causes",
         "  joint  torque   band   part  noise        over",
         "  one      10.1  0.568  0.123   0.25  N m  0.1 s  assumed",
         "  two        20    1.5   0.75    0.5  N    0.2 s  stated",
-        "assumed noise is 1 % of the URDF's effort limit, or of the bodies' largest torque where",
-        "  there is none. Standard errors are in proportion to it: state it with --noise",
-        "  JOINT=N_M, or take it from a run before with --given RESULT",
+        "assumed noise: 1 % of the URDF's effort limit, or of the largest torque of the bodies",
+        "  where there is no limit. Standard errors are proportional to the noise. State it with",
+        "  --noise JOINT=N_M, or use that of an earlier run with --given RESULT",
         "",
         "so it is",
         "",
-        "these logs were identified: 2 standard errors became 0.50 to 1.50 times what was",
-        "expected, eight of ten; median 0.90",
+        "these logs were identified: of 2 achieved standard errors, 80 % are 0.50 to 1.50 times",
+        "the expected ones; median 0.90",
     ]
 
 
@@ -300,8 +300,7 @@ def test_identify(shown):
         "  one: tanh + load (held-out error 9.0 -> 5.0 %)",
         "",
         "warning: slow: one: it is slow",
-        "1 finding, 1 cause; worst: one, 150.0 % of its torque is missed; 1 note hidden",
-        "(--verbose)",
+        "1 finding, 1 cause; worst: one, torque error 150.0 %; 1 note hidden (--verbose)",
         "",
         "verdict: poor",
         "  one: good",
@@ -377,7 +376,7 @@ def test_inspect(shown):
         "20 standard inertial parameters, 8 base; with drives 16",
         "warning: light: hand: 1 g",
         "1 finding, 1 cause; 1 note hidden (--verbose)",
-        "the base parameters: --base",
+        "list of base parameters: --base",
     ]
     assert shown(inspect._show, content, is_verbose=True, with_base=True) == [
         "arm: 2 joints: one, two",
@@ -403,7 +402,7 @@ def test_export_and_convert(shown):
     assert shown(convert._show, done) == [
         "o.csv: 7 samples of 2 joints",
         "  columns q, tau",
-        "  not of a joint, left out: x",
+        "  not written, not of a joint: x",
     ]
 
 
@@ -417,7 +416,7 @@ def test_paper(shown):
     }
     found = {"printed": {"converged": 3, "runs": 5}, "corrected": {"converged": 4, "runs": 5}}
     assert shown(paper._show, {"models": models, "trajectories": found, **cases}) == [
-        "relative error of the parameters; the last three cases at the end",
+        "relative error of the parameters; the last three columns at the last iteration",
         "  model       start   after 1   at end   disturbed  noisy  on program   NA",
         "  printed         0.5     0.25     0.05    0.001    0.002    0.003   10",
         "  corrected       0.6      0.3     0.01    0.001    0.002    0.003   11",
@@ -440,8 +439,9 @@ def test_track(shown):
         ],
     }  # fmt: skip
     assert shown(track._show, content) == [
-        "arm: 3000 samples, estimate 47 ms behind, converged at 4.57 s, excitation 0.88",
-        "step change at 10.01 s, flagged at 10.25 s; as a load on hand: 2.013 +- 0.021 kg",
+        "arm: 3000 samples, delay of the estimate 47 ms, converged at 4.57 s, excitation 0.88",
+        "step change at 10.01 s, detected at 10.25 s; equivalent payload on hand: 2.013 +-",
+        "  0.021 kg",
         "  a.m    1.234  +- 0.012  kg",
         "  b.mcx  -0.50  +- 0.25   kg m",
     ]
@@ -486,7 +486,7 @@ def test_compare(shown):
         "  one    1.2   4.6",
         "",
         "base parameters to the second digit of their standard errors; last columns: difference",
-        "to r1 over the combined standard error, the largest first",
+        "to r1 divided by the combined standard error, in descending order",
         "          r1    r2      r2-r1",
         "  a.m  1.234  1.30  kg    0.5",
         "  b.m   2.00     -  kg      -",

@@ -80,10 +80,10 @@ def test_an_input_that_was_changed_or_is_gone_is_named(out, capsys, name, what):
     path.write_bytes(path.read_bytes() + b"\n")
     assert main(["report", str(out)]) == 1
     said = capsys.readouterr().err
-    assert f"the {what} '{path}' was changed since result.json was made from it" in said
+    assert f"the {what} '{path}' has changed since result.json was written" in said
     path.unlink()
     assert main(["report", str(out)]) == 1
-    assert f"the {what} '{path}', which result.json was made from, is not there" in (
+    assert f"the {what} '{path}', an input of result.json, does not exist" in (
         capsys.readouterr().err
     )
     assert contents(out) == before
@@ -105,7 +105,7 @@ def test_an_input_without_a_hash_is_named(out, capsys):
     content["inputs"][1]["sha256"] = None
     path.write_text(json.dumps(content))
     assert main(["report", str(out)]) == 1
-    said = f"result.json states no SHA-256 of the log '{out.parent / 'fit.csv'}'"
+    said = f"result.json states no SHA-256 of its input, the log '{out.parent / 'fit.csv'}'"
     assert said in capsys.readouterr().err
 
 
@@ -151,7 +151,7 @@ def test_a_result_that_the_fit_does_not_give_again_has_no_page(out, capsys):
     said = capsys.readouterr().err
     count = len(content["base_parameters"])
     assert f"1 of {count} base parameters differ: {entry['name']} is {true:.6g}, " in said
-    assert "versions since: numpy 1.0 -> " in said
+    assert "changed versions: numpy 1.0 -> " in said
     assert contents(out) == before
     entry["value"] = true + 0.005 * entry["std_error"]  # as solvers round
     path.write_text(json.dumps(content))
@@ -162,7 +162,7 @@ def test_what_is_no_page_is_not_written_over(out, capsys):
     before = contents(out)
     for target in ("result.json", "arm.identified.urdf"):
         assert main(["report", str(out), "--out", str(out / target)]) == 2
-        assert "is there and is no page; it would be lost" in capsys.readouterr().err
+        assert "exists and is not an HTML page; it is not replaced" in capsys.readouterr().err
     assert contents(out) == before
 
 
@@ -235,8 +235,8 @@ def test_the_fit_is_the_same_within_a_hundredth_of_each_error_or_a_millionth():
     for name, x in (("a", 2.0051), ("b", 300.00031), ("c", -4.0000041)):
         with pytest.raises(DataError, match=f"1 of 3 base parameters differ: {name} is "):
             fitted(**{name: x})
-    with pytest.raises(DataError, match="the parameters d are in one of them only"):
+    with pytest.raises(DataError, match="only one of the two has the parameters d"):
         fitted(d=1.0)
     del content["base_parameters"][1]
-    with pytest.raises(DataError, match="the parameters b are in one of them only"):
+    with pytest.raises(DataError, match="only one of the two has the parameters b"):
         fitted()

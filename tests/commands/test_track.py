@@ -95,14 +95,14 @@ def test_a_live_page_is_told_what_is_known_at_each_moment_in_the_time_of_the_log
     known = {}
     monkeypatch.setattr(module, "time", Clock)
     monkeypatch.setattr(module, "LivePage", Page)
-    told = module._Teller.__call__
+    told = module._LiveFeed.__call__
 
     def noted(self, k, identifier):
         if identifier.is_ready:
             known[k] = identifier.reading, *identifier.compared
         told(self, k, identifier)
 
-    monkeypatch.setattr(module._Teller, "__call__", noted)
+    monkeypatch.setattr(module._LiveFeed, "__call__", noted)
     job = Job(Path(arm.tree.path), identification=(LogEntry(arm_logs / "fit.csv"),))
     stated = {"port": 7, "speed": 4.0, "linger": False}
     content = serve_track(job, None, announce=heard.append, **stated)

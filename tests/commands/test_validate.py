@@ -109,7 +109,7 @@ def test_without_the_fitted_logs_nobody_knows(here):
     (folder / "run.csv").unlink()
     found = verdict(folder, other)
     assert found["status"] == "usable"
-    assert "the fitted logs run.csv are not where they were" in found["reasons"][0]
+    assert "the fitted logs run.csv are missing or were changed" in found["reasons"][0]
     # the file itself is known by its hash
     assert "contain fitted samples" in verdict(folder, first)["reasons"][0]
 

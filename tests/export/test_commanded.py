@@ -116,7 +116,7 @@ def test_a_filter_stands_for_the_delay_where_it_is_asked_for(tmp_path):
     leg = plant("leg", np.random.default_rng(0), delay=0.02)
     pi = leg.model.standard_parameters()
     notes = write_mjcf(leg.model, pi, tmp_path / "a.xml", commanded=leg.drives, delay="filter")
-    assert any("filters of first order" in note for note in notes)
+    assert any("first-order filters" in note for note in notes)
     robot = mujoco.MjModel.from_xml_path(str(tmp_path / "a.xml"))
     assert not robot.actuator_delay.any()
     data = mujoco.MjData(robot)
@@ -193,7 +193,7 @@ def test_a_result_with_a_clock_follows_by_it_and_its_export_says_so(result, tmp_
     for at, says in ((held, True), (folder, False)):
         code, out, _ = export(at, "mjcf", tmp_path / "a.xml", capsys)
         assert code == 0
-        assert ("reads its joints 100 times a second and holds its torque" in out) is says
+        assert ("the controller runs at 100 Hz with a zero-order hold" in out) is says
 
 
 def test_encoders_that_count_the_other_way_are_heard_and_answered_in_their_sense(result):
@@ -223,7 +223,7 @@ def test_impossible_drives_are_refused(result, tmp_path):
         return load_result(tmp_path)
 
     one = f"{LEG[1]}.kp"
-    with pytest.raises(DataError, match=f"has gains of some joints and no kp of {LEG[1]}"):
+    with pytest.raises(DataError, match=f"has gains of some joints, but no kp of {LEG[1]}"):
         _ = with_entries(lambda e: None if e["name"] == one else e).commanded
     for name, wrong, wanted in ((one, 0.0, "more than 0"), (f"{LEG[1]}.delay", -1e-3, "0 or more")):
         changed = with_entries(
@@ -282,7 +282,7 @@ def test_mjcf_of_a_result_has_the_nearest_friction_and_says_so(result, tmp_path,
     assert "offset 0.1; error" in out
     written = " ".join((tmp_path / "a.xml").read_text().split())
     assert f"{LEG[2]}: coulomb_q1, coulomb_q2 projected on viscous" in written
-    assert "no place" not in out
+    assert "cannot state" not in out
     np.testing.assert_allclose(robot.dof_frictionloss, [0.2, 0.2, 0.4 + mean], rtol=1e-4)
 
 
@@ -294,9 +294,9 @@ def test_a_controller_that_carries_the_weight_is_named(tmp_path, capsys):
     for kind in ("mjcf", "isaac"):
         code, out, _ = export(folder, kind, tmp_path / "a", capsys)
         assert code == 0
-        assert "the controller adds the torque of gravity by the URDF" in out
+        assert "the controller compensates gravity with the URDF's model" in out
         said = " ".join((tmp_path / "a").read_text().split())
-        assert "adds the torque of gravity by the URDF" in said
+        assert "compensates gravity with the URDF's model" in said
 
 
 def test_the_motion_of_a_log_is_that_of_its_positions_between_gaps():
@@ -317,11 +317,11 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
     assert code == 0
     assert f"{LEG[2]}: coulomb_q1, coulomb_q2 projected on viscous" in out
     assert (
-        f"the encoder's zero, which the simulator's position and command have more: "
-        f"{LEG[0]} 0.02, {LEG[1]} 0.02, {LEG[2]} 0.02" in out
+        f"the encoder's zero ({LEG[0]} 0.02, {LEG[1]} 0.02, {LEG[2]} 0.02); the simulator's "
+        "position is the encoder's plus the zero" in out
     )
     text = (tmp_path / "a.yaml").read_text()
-    assert "# Isaac Lab has no place for the offset" in text
+    assert "# Isaac Lab cannot state the torque offset" in text
     content = yaml.safe_load(text)
     loaded_result = load_result(folder)
     drives, model = loaded_result.commanded, loaded_result.robot
@@ -403,7 +403,7 @@ def test_options_of_other_formats_and_results_without_gains_are_refused(result, 
     ):  # fmt: skip
         code, _, err = export(folder, kind, tmp_path / "a", capsys, *flags)
         assert code == 2
-        assert f"{flags[0]} is for the formats mjcf" in err or "--delay is for" in err
+        assert f"{flags[0]} is an option of mjcf" in err or "--delay is an option of" in err
     code, _, err = export(folder, "isaac", tmp_path / "a", capsys, "--step", "0")
     assert code == 2
     assert "step is 0 s, wanted a positive time" in err

@@ -83,7 +83,7 @@ def test_each_option_goes_to_the_formats_that_have_it_alone(result, tmp_path):
     }
     assert {kind for kind, _ in refused} == {"urdf", "sdf", "isaac", "ranges"}
     for kind, name in refused:
-        with pytest.raises(SettingsError, match=rf"--{name} is for the formats .*mjcf.* not for"):
+        with pytest.raises(SettingsError, match=rf"--{name} is an option of .*mjcf.*, not of"):
             export_result(result, kind, tmp_path / "a", **{name: 1})
     with pytest.raises(SettingsError, match="format is 'obj', wanted one of urdf, mjcf"):
         export_result(result, "obj", tmp_path / "a")

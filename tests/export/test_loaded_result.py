@@ -81,7 +81,7 @@ def test_a_result_without_a_urdf_says_why_there_is_no_robot(written, tmp_path):
     result = robotid.load_result(path)
     del result.content["outputs"]["urdf"]
     assert result.verdict["status"]
-    with pytest.raises(DataError, match=r"result.json has no URDF, for its parameters are wrong"):
+    with pytest.raises(DataError, match=r"result.json has no URDF, because its parameters are"):
         _ = result.robot
 
 

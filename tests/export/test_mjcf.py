@@ -127,7 +127,7 @@ def test_limits_shapes_and_meshes(tmp_path):
     pi = possible_parameters(model, np.random.default_rng(0))
     pi[model.layout.names.index("k.offset")] = 0.0
     notes = write_mjcf(model, pi, tmp_path / "robot.xml")
-    assert notes == ("meshes left out, not found or of a kind that MJCF has not: a.stl",)
+    assert notes == ("meshes not exported, missing or in a format that MJCF cannot read: a.stl",)
     robot, _ = load(tmp_path / "robot.xml")
     np.testing.assert_array_equal(robot.jnt_range, [[-1, 2], [0, 0]])
     np.testing.assert_allclose(robot.jnt_axis, [[0, 0.6, 0.8], [1, 0, 0]])
@@ -205,7 +205,7 @@ def test_a_term_that_mjcf_has_no_place_for_is_named(tmp_path):
     data.qpos = [0.0, 0.4]
     mujoco.mj_forward(robot, data)
     np.testing.assert_allclose(data.qfrc_passive, [0.0, -stiffness * 0.4])
-    assert notes[0] == "MJCF has no place for k.cubic; the sidecar of the URDF has them"
+    assert notes[0] == "MJCF cannot state k.cubic; the sidecar of the URDF has them"
     parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))
     comment = ET.parse(tmp_path / "robot.xml", parser).getroot()[0].text
     assert notes[0] in comment
@@ -216,10 +216,12 @@ def test_a_term_that_mjcf_has_no_place_for_is_named(tmp_path):
 def test_what_no_simulator_reads_is_refused_before_anything_is_written(tmp_path):
     model = small(tmp_path, last="world")
     pi = possible_parameters(model, np.random.default_rng(0))
-    with pytest.raises(ModelError, match="a link that moves is named 'world'"):
+    with pytest.raises(ModelError, match="a moving link is named 'world'"):
         write_mjcf(model, pi, tmp_path / "robot.xml")
     model = small(tmp_path, held=".5", joints=["j"])
     pi = model.standard_parameters()  # the sum of both links, of which one is impossible
-    with pytest.raises(ModelError, match="link 'lower', behind a locked joint, has an impossible"):
+    with pytest.raises(
+        ModelError, match="link 'lower', beyond a locked joint, has a physically impossible"
+    ):
         write_mjcf(model, pi, tmp_path / "robot.xml")
     assert not (tmp_path / "robot.xml").exists()

@@ -259,7 +259,9 @@ def test_results_that_are_not_whole_are_refused(result, identified, tmp_path):
     with pytest.raises(DataError, match=r"^result\.json has schema_version 2, wanted 1 of a"):
         read_result(path)
     path.write_text(json.dumps({k: v for k, v in result.items() if k != "inputs"}))
-    with pytest.raises(DataError, match=r"^result\.json has no entry 'inputs': it is not whole"):
+    with pytest.raises(
+        DataError, match=r"^result\.json has no entry 'inputs': the file is incomplete"
+    ):
         read_result(path)
     short = {**result, "drive_parameters": result["drive_parameters"][1:]}
     with pytest.raises(ModelError, match=r"^the result has no value of shoulder_pan_joint\.arm"):

@@ -90,7 +90,7 @@ def test_mass_matrix_and_forces_are_pinocchios(name, tmp_path):
         force += M @ a + pin.rnea(read_back, data, q, v, a)
         M += np.triu(pin.crba(read_back, data, q)) + np.triu(data.M, 1).T
         M, force, largest = P.T @ M @ P, P.T @ force, abs(state.M).max()
-        if model.layout.couplings:  # which an SDF has no place for
+        if model.layout.couplings:  # which an SDF cannot state
             apart = [state.columns[joint] for joint, _ in model.layout.couplings[0].ratios]
             M, state.M = np.delete(M, apart, axis=0), np.delete(state.M, apart, axis=0)
             force, state.tau = np.delete(force, apart), np.delete(state.tau, apart)
@@ -106,7 +106,7 @@ def test_limits_friction_mimic_and_what_is_not_stated(tmp_path):
     text = (tmp_path / "robot.sdf").read_text()
     assert all(note in text for note in notes)
     offsets = ", ".join(f"{joint}.offset" for joint in model.joints)
-    assert notes[0] == f"SDF has no place for {offsets}; the sidecar of the URDF has them"
+    assert notes[0] == f"SDF cannot state {offsets}; the sidecar of the URDF has them"
     assert "<gravity>0.0 0.0 -9.81</gravity>" in notes[-1]
     top = ET.parse(tmp_path / "robot.sdf").getroot()
     assert top.get("version") == "1.11"  # the first with <mimic>

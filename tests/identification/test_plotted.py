@@ -133,5 +133,5 @@ def test_a_notebook_shows_the_page_that_is_written(identified, tmp_path):
     assert repr(plot) == (
         "<Plot of Friction of elbow_joint against speed; .write('plot.html') keeps it>"
     )
-    with pytest.raises(DataError, match="there is no folder"):
+    with pytest.raises(DataError, match="does not exist; create it"):
         plot.write(tmp_path / "none" / "friction.html")

@@ -109,7 +109,7 @@ def test_a_curve_shows_its_speeds_torques_and_band(found):
 def test_another_joint_is_refused_by_name(found, loaded):
     with pytest.raises(DataError, match=r"'elbow' is no drive of ur5.*; drives: shoulder_lift_joi"):
         found.friction("elbow")
-    with pytest.raises(DataError, match="states no friction curve of 'elbow_joint '; joints with"):
+    with pytest.raises(DataError, match="has no friction curve of 'elbow_joint '; joints with"):
         loaded.friction("elbow_joint ")
 
 

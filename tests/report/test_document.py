@@ -331,7 +331,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_beside_it(found, tmp_path, mo
 
 
 def test_a_missing_folder_is_named(found, tmp_path):
-    with pytest.raises(DataError, match=r"there is no folder '.*nowhere' to write r\.html in"):
+    with pytest.raises(DataError, match=r"the folder '.*nowhere' of r\.html does not exist"):
         write_report(found, tmp_path / "nowhere" / "r.html")
 
 

@@ -408,5 +408,5 @@ def test_a_rate_that_is_not_positive_is_refused(arm, motion):
 
 
 def test_a_missing_folder_is_named(arm, motion, tmp_path):
-    with pytest.raises(DataError, match=r"there is no folder '.*nowhere' to write r\.html in"):
+    with pytest.raises(DataError, match=r"the folder '.*nowhere' of r\.html does not exist"):
         replay(arm, *motion).write(tmp_path / "nowhere" / "r.html")

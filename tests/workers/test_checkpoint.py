@@ -170,7 +170,7 @@ def test_a_run_whose_checkpoint_is_gone_does_not_promise_to_resume_it(tmp_path):
     assert promise in kept.value.__notes__
     checkpoint.release()
     checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces)
-    with pytest.raises(DataError, match="there is no folder") as gone:
+    with pytest.raises(DataError, match="does not exist; create it") as gone:
         reduce_all(
             pieces, checkpoint=checkpoint, progress=lambda *_: shutil.rmtree(checkpoint.folder)
         )

@@ -1,0 +1,82 @@
+"""The parser of a command line: suggestions for misspelt words, and a short help with examples."""
+
+import argparse
+import difflib
+from collections.abc import Sequence
+from typing import Any
+
+__all__ = ["CommandParser"]
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser that suggests the nearest choice, and whose help may show its main flags only.
+
+    Attributes:
+        main_flags: Flags of the short help; all flags are shown if it is empty.
+        examples: Command lines at the end of the short help.
+    """
+
+    main_flags: Sequence[str] = ()
+    examples: Sequence[str] = ()
+
+    def shorten_help(self, main_flags: Sequence[str], examples: Sequence[str]) -> None:
+        """Show only the main flags and examples by ``--help``, and all flags by ``--help-all``.
+
+        Args:
+            main_flags: The main flags.
+            examples: Command lines.
+        """
+        self.main_flags, self.examples = main_flags, examples
+        self.add_argument("--help-all", action=_HelpAll, help="show all flags and exit")
+
+    def format_usage(self) -> str:
+        """Return the usage; the short one lists the arguments only."""
+        return self._usage() if self.main_flags else super().format_usage()
+
+    def format_help(self) -> str:
+        """Return the help: the main flags and examples if there are any, else all flags."""
+        if not self.main_flags:
+            return super().format_help()
+        formatter = self._get_formatter()
+        arguments = [action for action in self._actions if not action.option_strings]
+        shown = ("--help-all", *self.main_flags)
+        flags = [a for a in self._actions if {*shown} & {*a.option_strings}]
+        for title, actions in (("arguments", arguments), ("main flags", flags)):
+            formatter.start_section(title)
+            formatter.add_arguments(actions)
+            formatter.end_section()
+        examples = "\n".join(f"  {line}" for line in self.examples)
+        return f"{self._usage()}\n{formatter.format_help()}\nexamples:\n{examples}\n"
+
+    def _usage(self) -> str:
+        arguments = []
+        for action in self._actions:
+            if not action.option_strings:
+                name = str(action.metavar or action.dest)
+                arguments.append(f"[{name} ...]" if action.nargs == "*" else name)
+            elif action.required:
+                arguments.append(f"{action.option_strings[0]} {action.metavar}")
+        return f"usage: {self.prog} {' '.join(arguments)} [flags]\n"
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:  # noqa: ANN401
+        """Refuse a word that is not among the choices of an argument, with the nearest choice."""
+        if action.choices is None or value in action.choices:
+            return
+        known = [str(choice) for choice in action.choices]
+        near = difflib.get_close_matches(str(value), known, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else "."
+        wanted = ", ".join(known)
+        raise argparse.ArgumentError(action, f"{value!r} is unknown{hint} Known: {wanted}")
+
+
+class _HelpAll(argparse.Action):
+    """Print the help with all flags, and exit."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str) -> None:
+        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        if isinstance(parser, CommandParser):
+            parser.main_flags = ()
+        parser.print_help()
+        parser.exit()
