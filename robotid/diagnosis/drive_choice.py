@@ -239,7 +239,7 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
         chosen = list(range(len(own)))
         before = every.left(chosen)
     choice = _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
-    return replace(choice, doubted=_terms(drive, doubted))
+    return replace(choice, undecided=_terms(drive, doubted))
 
 
 def _beside(every: _Options, chosen: Sequence[int], known: int) -> dict[int, list[int]]:

@@ -177,7 +177,7 @@ def conclude(
     beside = settled(with_known_springs(before, fit), of_fit)
     beside = rejected(beside, result.predictions, result.scale_check)
     log_errors = blocking(beside, ignore, is_robust=is_robust)
-    heads = [log.head for log in (*recordings.fitted, *recordings.kept)]
+    heads = [log.head for log in (*recordings.fitted, *recordings.validation)]
     findings = [*log_findings(heads), *impossible_inertials(model), *beside]
     findings += unwritten(fit, log_errors)
     ignored = {current_code(code) for code in ignore}

@@ -438,7 +438,7 @@ def _errors(
     fit = replace(consistent_fit(settings, known), plausible_weight=plausible)
     C = fit.programme.covariance(weight, fit.rows(factors, said.sigma))
     R, meat = factors.weighted(said.sigma)[:-1, :-1], said.meat(K, said.sigma)
-    covariance = about_prior(C, K, said.share**2 * meat, R, said.share, fit.pull)
+    covariance = about_prior(C, K, said.share**2 * meat, R, said.share, fit.weight_ratio)
     estimate = replace(
         plain, theta=known.pi, covariance=covariance, names=known.mapping.names,
         prior_std=fit.spread_before,

@@ -426,7 +426,7 @@ def test_the_load_of_the_gears_is_that_of_the_bodies_found(plain, estimator, tmp
 def test_a_load_that_does_not_settle_is_refused(plain, cases, monkeypatch):
     monkeypatch.setattr("robotid.fitting.fit._SETTLED", -1.0)
     monkeypatch.setattr("robotid.fitting.fit._MOST_LOADS", 3)
-    with pytest.raises(NotConvergedError, match="load of the gears still changes after 3 fits"):
+    with pytest.raises(NotConvergedError, match="joint load torque has not converged after 3 fits"):
         fitted_in(plain, [cases("load")[2]], friction={ELBOW: "load"}, estimator="wls")
 
 
@@ -483,7 +483,7 @@ def test_what_is_nearly_chosen_widens_the_intervals_it_would_move(plain):
         found = found_in(plain, [log], estimator="wls")
         (choice,) = (c for c in found.drives if c.joint == ELBOW)
         assert all(x.p_value < 0.015 for x in choice.tried if x.is_selected and x.families)
-        if choice.families or [t.name for t in choice.doubted] != ["load"]:
+        if choice.families or [t.name for t in choice.undecided] != ["load"]:
             continue
         seen += 1
         alone = found_in(plain, [log], friction="none", estimator="wls")

@@ -28,9 +28,9 @@ def test_each_parameter_has_its_own_error():
 
 
 def test_intervals_reach_students_quantile():
-    np.testing.assert_allclose(ESTIMATE.reach, 1.959964, rtol=1e-6)
+    np.testing.assert_allclose(ESTIMATE.quantile, 1.959964, rtol=1e-6)
     few = replace(ESTIMATE, details={"freedom": np.array([12.0, 4.0, np.inf])})
-    np.testing.assert_allclose(few.reach, [2.178813, 2.776445, 1.959964], rtol=1e-6)
+    np.testing.assert_allclose(few.quantile, [2.178813, 2.776445, 1.959964], rtol=1e-6)
 
 
 def test_text_states_value_and_error_of_each_parameter():

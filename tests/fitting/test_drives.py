@@ -13,11 +13,11 @@ def choice():
     names = ("stribeck.speed", "lugre.displacement", "lugre.speed", "lugre.excess")
     flat = [size for own in SIZES for size in own]
     shapes = tuple(FoundShape(n, x, 0.0, "-", False) for n, x in zip(names, flat, strict=True))
-    return DriveChoice("a", ("stribeck", "lugre"), (), shapes=shapes, sizes=SIZES, seen=SEEN)
+    return DriveChoice("a", ("stribeck", "lugre"), (), shapes=shapes, sizes=SIZES, data_range=SEEN)
 
 
 def terms(speed, *own):
-    return Stribeck(seen=SEEN["v"], speed=speed), LuGre(
+    return Stribeck(data_range=SEEN["v"], speed=speed), LuGre(
         displacement=own[0], speed=own[1], excess=own[2]
     )
 

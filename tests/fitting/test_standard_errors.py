@@ -64,7 +64,7 @@ def test_standard_errors_are_the_scatter_of_many_recordings(W, colour):
         found, basis = estimate(W, W @ TRUTH + noise(rng, colour))
         errors.append(found.theta - TRUTH)
         reported.append(found.std_error)
-        held.append(np.abs(errors[-1]) <= basis.reach * found.std_error)
+        held.append(np.abs(errors[-1]) <= basis.quantile * found.std_error)
     scattered = np.sqrt(np.mean(np.square(errors), axis=0))
     ratio = np.sqrt(np.mean(np.square(reported), axis=0)) / scattered
     # 150 runs know their own scatter to 6 %
@@ -72,7 +72,9 @@ def test_standard_errors_are_the_scatter_of_many_recordings(W, colour):
     assert 0.92 < np.mean(held) < 0.98
 
 
-@pytest.mark.parametrize(("samples", "basis"), [(1600, "16 segments"), (800, "filter's band")])
+@pytest.mark.parametrize(
+    ("samples", "basis"), [(1600, "16 segments"), (800, "bandwidth of the filter")]
+)
 def test_behind_the_filter_errors_are_the_scatter_and_those_of_independent_rows_are_not(
     samples, basis
 ):

@@ -188,10 +188,10 @@ def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
 
 def test_the_information_of_all_segments_but_one_counts_the_share_that_is_independent(case):
     fit, problem = case
-    fit, segments = replace(fit, independent_share=0.25), cut(problem, 3)
-    segments = Segments.of(fit, segments, NOISE)
+    fit, folds = replace(fit, independent_share=0.25), cut(problem, 3)
+    segments = Segments.of(fit, folds, NOISE)
     for k, rows in enumerate(segments.others):
-        others = fit.rows(merge([s for i, s in enumerate(segments) if i != k]), NOISE)
+        others = fit.rows(merge([s for i, s in enumerate(folds) if i != k]), NOISE)
         np.testing.assert_allclose(rows.T @ rows, others.T @ others, rtol=1e-9, atol=1e-6)
 
 
@@ -214,7 +214,7 @@ def test_the_noise_level_is_that_of_the_whole_regressor(case):
 
 def test_one_stretch_is_too_few(case):
     fit, problem = case
-    with pytest.raises(DataError, match="cannot be chosen from 1 segment"):
+    with pytest.raises(DataError, match="needs at least 2 segments, found 1"):
         choose_weight(fit, Segments.of(fit, [compress(problem)]), "cv")
 
 
@@ -323,7 +323,7 @@ def test_an_extent_is_contradicted_by_four_errors_two_percent_and_two_errors_of_
         return left, []
 
     monkeypatch.setattr("robotid.estimators.consistent.weighting.held_out_errors", held_out)
-    segments = SimpleNamespace(rows=None, kept=[None] * 8)
+    segments = SimpleNamespace(rows=None, folds=[None] * 8)
     assert contradicted_extents(fit, segments) == named
 
 
