@@ -120,7 +120,7 @@ def test_a_motion_of_stated_joints_says_what_it_leaves_open(designer):
     assert few.determination.rank == 3
     assert not few.fewer
     words = " ".join(few.described())
-    assert "It leaves open: of tool0.m, tool0.mcz, " in words
+    assert "It leaves open: tool0.m, tool0.mcz, " in words
     assert "Standard errors" not in words
 
 
