@@ -189,7 +189,7 @@ def test_noise_levels_that_settle_slowly_on_few_rows_do_not_stop_it(ur5, monkeyp
     assert "after 40 iterations, remaining relative change" in found.estimate.message
     assert found.errors.segments < 12
     monkeypatch.setattr(batch, "_MAX_ITERATIONS", 20)
-    with pytest.raises(NotConvergedError, match=r"still change by 3\.\de-04 after 20 iterations"):
+    with pytest.raises(NotConvergedError, match=r"relative change 3\.\de-04 after 20 iterations"):
         fit(ur5, [log], estimator="wls")
 
 
