@@ -238,7 +238,7 @@ class _Part(PieceTask):
 def _parts(log: SurveyedLog) -> list[_Part]:
     last = len(log.pieces) - 1
     shown = {0: slice(_SHOWN), (last + 1) // 2: slice(_SHOWN), last: slice(-_SHOWN, None)}
-    if log.is_held:
+    if log.is_in_memory:
         shown = {0: slice(None)}
     every = _sampled_every(log.stop - log.first)
     return [

@@ -48,9 +48,9 @@ class Recordings:
     weights: tuple[Array, ...] | None = None
 
     @property
-    def is_held(self) -> bool:
+    def is_in_memory(self) -> bool:
         """Whether all logs are in memory."""
-        return all(log.is_held for log in (*self.fitted, *self.validation))
+        return all(log.is_in_memory for log in (*self.fitted, *self.validation))
 
     @property
     def share(self) -> float:
@@ -92,7 +92,7 @@ class Recordings:
         Raises:
             DataError: If a row cannot be used, or no segment of a log is long enough.
         """
-        if self.is_held:
+        if self.is_in_memory:
             for log in (*self.fitted, *self.validation):  # raises errors before any fit
                 keep_inertial_rows(self.model, log.whole.trajectory)
             reduced = self._segments if is_cut else self._whole
@@ -119,7 +119,7 @@ class Recordings:
         Returns:
             The base problem. Logs in files are read again, in blocks, in each pass.
         """
-        if self.is_held:
+        if self.is_in_memory:
             motions = [log.whole.trajectory for log in self.fitted]
             return concatenate([self._problem(k, x, with_mass) for k, x in enumerate(motions)])
 

@@ -361,7 +361,7 @@ def _repeated(linear: Array) -> Array:
 
 def _in_memory(recordings: Recordings) -> Recordings:
     """Return the fitted logs in memory; for logs in files, their windows in memory."""
-    if all(log.is_held for log in recordings.fitted):
+    if all(log.is_in_memory for log in recordings.fitted):
         return recordings
     windows = [
         hold_log(log.model, window, log.signals)

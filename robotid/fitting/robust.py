@@ -104,7 +104,7 @@ def reweigh(recordings: Recordings, loss: str, prior: Array) -> tuple[Recordings
         NotConvergedError: If the weights do not converge.
         SettingsError: If the recordings are not in memory.
     """
-    if not recordings.is_held:
+    if not recordings.is_in_memory:
         raise SettingsError(
             f"robust = {loss!r} needs all rows in memory, for several passes; increase "
             "rows_in_memory in [reduction], shorten the log with start and end, or set "

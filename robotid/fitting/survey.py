@@ -195,7 +195,7 @@ class SurveyedLog:
         first: First row of the log in the file.
         stop: The row after the last one.
         windows: Ranges of rows that were checked: all rows, or the first, middle and last ones.
-        held: Positions of locked joints in the windows, if the file has them, by name [rad or m].
+        locked: Positions of locked joints in the windows, if the file has them, by name [rad or m].
         length: Rows per piece.
         places: Positions in the file at which blocks of rows start.
     """
@@ -207,7 +207,7 @@ class SurveyedLog:
     first: int
     stop: int
     windows: tuple[Log, ...]
-    held: Mapping[str, Array] = field(default_factory=dict)
+    locked: Mapping[str, Array] = field(default_factory=dict)
     length: int = PIECE
     places: Sequence[Place] = (Place(),)
 
@@ -217,7 +217,7 @@ class SurveyedLog:
         return self.source.path
 
     @property
-    def is_held(self) -> bool:
+    def is_in_memory(self) -> bool:
         """Whether it is in memory."""
         return isinstance(self.source, Log)
 
@@ -290,7 +290,7 @@ class SurveyedLog:
             model: The robot, with the same bodies, joints and couplings.
         """
         other = replace(self, model=model, asked=self.signals)
-        if self.is_held and np.array_equal(
+        if self.is_in_memory and np.array_equal(
             friction_speeds(model.layout), friction_speeds(self.model.layout)
         ):
             for piece, own in zip(other.pieces, self.pieces, strict=True):
@@ -343,7 +343,7 @@ class SurveyedLog:
 
 
 def hold_log(
-    model: RobotModel, log: Log, signals: SignalSettings, held: Mapping[str, Array] | None = None
+    model: RobotModel, log: Log, signals: SignalSettings, locked: Mapping[str, Array] | None = None
 ) -> SurveyedLog:
     """Return a log in memory as one piece; errors of its data are raised when it is read.
 
@@ -351,7 +351,7 @@ def hold_log(
         model: The robot.
         log: The log, with the model's joints in its order.
         signals: Settings of the processing to a trajectory.
-        held: Positions of locked joints, if the log has them, by name [rad or m].
+        locked: Positions of locked joints, if the log has them, by name [rad or m].
     """
     count = len(log.t)
     if model.is_static:  # means of segments replace filters
@@ -359,7 +359,7 @@ def hold_log(
             signals, cutoff=None, rate=None, velocity="differentiated",
             acceleration="differentiated",
         )  # fmt: skip
-    return SurveyedLog(model, log, signals, log.t, 0, count, (log,), held or {}, count)
+    return SurveyedLog(model, log, signals, log.t, 0, count, (log,), locked or {}, count)
 
 
 def survey_log(
@@ -389,15 +389,15 @@ def survey_log(
         DataError: If time does not increase, the window contains fewer than two rows, or units are
             implausible.
     """
-    held = _locked_columns(layout, table, model)
-    wanted = list(dict.fromkeys([*layout.wanted, *held.values()]))
+    locked = _locked_columns(layout, table, model)
+    wanted = list(dict.fromkeys([*layout.wanted, *locked.values()]))
     if length is None:
         columns = table.read(wanted)
         log = layout.to_log(columns)
         check_units(log, layout.units, layout.prismatic)
         used = log if window == (None, None) else log.window(*window)
         inside = slice(*np.searchsorted(log.t, [used.t[0], np.nextafter(used.t[-1], np.inf)]))
-        positions = _positions(held, [columns], layout, model, inside)
+        positions = _positions(locked, [columns], layout, model, inside)
         return hold_log(model, used, signals, positions)
     reader, places, where = _reader(table, wanted), list[Place](), Path(layout.path).name
     stamps = map_stamps(_stamps(reader, layout, places), where)
@@ -407,7 +407,7 @@ def survey_log(
     windows = tuple(_log_of(layout, x, i) for x, (i, _) in zip(found, ranges, strict=True))
     for log in windows:
         check_units(log, layout.units, layout.prismatic)
-    positions = _positions(held, found, layout, model)
+    positions = _positions(locked, found, layout, model)
     if table.rows is None:
         length = max(stop - first, 1)
     return SurveyedLog(
@@ -500,7 +500,7 @@ def _locked_columns(layout: LogLayout, table: Table, model: RobotModel) -> dict[
 
 
 def _positions(
-    held: Mapping[str, str],
+    names: Mapping[str, str],
     windows: Sequence[Mapping[str, Array]],
     layout: LogLayout,
     model: RobotModel,
@@ -509,7 +509,7 @@ def _positions(
     """Return the positions of locked joints in the rows read, by joint [rad or m]."""
     revolute = {joint.name for joint in model.tree.movable if joint.type != "prismatic"}
     positions = {}
-    for joint, column in held.items():
+    for joint, column in names.items():
         q = np.concatenate([columns[column] for columns in windows])[inside]
         q = q[np.isfinite(q)]
         if joint in revolute and layout.units.angle == "deg":

@@ -445,7 +445,7 @@ def test_logs_in_files_choose_as_in_memory(plain, cases, tmp_path, workers):
     job = job_from_settings(table, "job", tmp_path)
     fitted, kept = survey_logs(job, plain, job.identification, job.validation)
     recordings = Recordings(plain, structural_mapping(plain), fitted, kept)
-    assert not recordings.is_held
+    assert not recordings.is_in_memory
     found = with_drives(recordings, EstimatorSettings("wls"), wanted_families(AUTO, JOINTS))
     assert chosen(found) == chosen(held) == {ELBOW: ("presliding",)}
     ((shape,), (alike,)) = ([s for c in x.drives for s in c.shapes] for x in (found, held))

@@ -359,7 +359,7 @@ def column_scale(problem: Problem, sigma: Array) -> Array:
         squares += row_weight @ np.where(row_weight[:, None] > 0, W, 0.0) ** 2
         count += len(W) // n
     if not np.isfinite(squares).all():
-        raise DataError("the problem holds a row that is not finite; check the trajectory")
+        raise DataError("the problem has a row that is not finite; check the trajectory")
     rms = np.sqrt(squares / max(count, 1))
     return np.where(rms > _SILENT * rms.max(initial=0.0), rms, 1.0)
 
