@@ -131,7 +131,7 @@ class TwoRuns:
         gain = np.ones(len(self._logged.rows)) if gain is None else gain
         return self._minimum(self._both(gain), self._level(gain))
 
-    def held_together(self, theta: Array) -> Array:
+    def residual_ratios(self, theta: Array) -> Array:
         """Return the joint residual of both runs over that of separate fits, shape (n,) [-].
 
         Args:
@@ -148,7 +148,7 @@ class TwoRuns:
         ratio: Array = together / np.maximum(self._own_squares, 1e-300)
         return ratio
 
-    def held_by_scales(self, free: int) -> Array:
+    def residual_ratios_by_scales(self, free: int) -> Array:
         """Return these ratios if the runs differ by the scale of torques instead of x.
 
         Args:
@@ -171,7 +171,7 @@ class TwoRuns:
             A = R[:, :-1] @ explained[own]
             left[j] += np.sum((R[:, -1] - A @ np.linalg.lstsq(A, R[:, -1], rcond=None)[0]) ** 2)
         of_each: Array = left / np.maximum(self._own_squares, 1e-300)
-        return min(scaled.held_together(scaled.compare().theta), of_each, key=np.mean)
+        return min(scaled.residual_ratios(scaled.compare().theta), of_each, key=np.mean)
 
     def _level(self, gain: Array) -> Array:
         """Return noise levels for rows treated as independent, shape (n,) [N m or N]."""

@@ -291,7 +291,7 @@ def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Gro
     if choice.allows_for_noise:
         return ground
     level, theta = ground.rough.sigma, ground.rough.theta
-    sigma = np.ones_like(level) if choice.weighs_alike else level
+    sigma = np.ones_like(level) if choice.has_equal_weights else level
     noise = find_regressor_noise(ground.recordings, ground.whole, theta, sigma, level)
     if noise is None:
         return ground

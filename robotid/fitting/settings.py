@@ -43,7 +43,7 @@ _FINITE = Range("a positive, finite number", lambda x: 0 < x < math.inf)
 
 @dataclass(frozen=True)
 class ConstraintSettings(Settings):
-    """Bounds beside physical consistency, by name of the link that a joint moves."""
+    """Bounds in addition to physical consistency, by name of the link that a joint moves."""
 
     mass: Mapping[str, Any] = setting(
         {}, "mass, or smallest and largest mass, of a link with all links fixed to it [kg]"
@@ -144,11 +144,11 @@ class EstimatorSettings(Settings):
     error.
 
     Attributes:
-        weighs_alike: Whether all rows have the same weight, whatever the noise of their joints.
+        has_equal_weights: Whether all rows have equal weights, whatever the noise of their joints.
         allows_for_noise: Whether the estimator itself accounts for noise of the regressor.
     """
 
-    weighs_alike: ClassVar[bool] = False
+    has_equal_weights: ClassVar[bool] = False
     allows_for_noise: ClassVar[bool] = False
 
     name: str = setting("consistent", "name of the estimator")
@@ -207,7 +207,7 @@ class EstimatorSettings(Settings):
 
     @property
     def bounds(self) -> ConstraintSettings:
-        """The bounds beside physical consistency."""
+        """The bounds in addition to physical consistency."""
         return ConstraintSettings(**getattr(self, "constraints", {}))
 
 
@@ -301,7 +301,7 @@ class DescentSettings(RecursiveSettings):
 class OLSSettings(EstimatorSettings):
     """Settings of ordinary least squares: none."""
 
-    weighs_alike: ClassVar[bool] = True
+    has_equal_weights: ClassVar[bool] = True
 
     name: str = _called("ols", "ordinary least squares")
 

@@ -430,7 +430,7 @@ def _errors(
         _least_squares(said, known, sigma) for sigma in (said.sigma, np.ones_like(said.sigma))
     )
     if not isinstance(choice, ConsistentSettings):
-        return (alike if choice.weighs_alike else plain), plain
+        return (alike if choice.has_equal_weights else plain), plain
     stated = choice.prior_weight
     weight, plausible = usual if isinstance(stated, str) else (stated, 1.0)
     bounds = {**choice.constraints, "extent": "none"}
