@@ -435,7 +435,7 @@ class PRXSettings(DescentSettings):
     )
     metric: str = setting(
         "noise",
-        "metric of the residual for the exact step: noise levels, mass matrix, or rows",
+        "metric of the residual for the exact step: noise (levels), mass (matrix), or rows",
         among=("noise", "mass", "rows"),
     )
 

@@ -326,13 +326,13 @@ class SurveyedLog:
         """Its pieces, in order, each with the rows that are read before and after it."""
         stamps, segments, window = self.stamps, self.segments, (self.first, self.stop)
         header = _Header(self.model, self.source, self.signals, self.stop - self.first)
-        reach = filter_reach(self.signals)
+        settling = filter_reach(self.signals)
         firsts, found = [segment.first for segment in segments], list[LogPiece]()
         for first in range(*window, self.length):
             stop = min(first + self.length, window[1])
             mine = segments[bisect_right(firsts, first) - 1 : bisect_right(firsts, stop - 1)]
-            before = int(np.searchsorted(stamps, stamps[first] - reach)) - SPLINE
-            after = int(np.searchsorted(stamps, stamps[stop - 1] + reach)) + SPLINE
+            before = int(np.searchsorted(stamps, stamps[first] - settling)) - SPLINE
+            after = int(np.searchsorted(stamps, stamps[stop - 1] + settling)) + SPLINE
             span = max(before, mine[0].first), min(after, mine[-1].stop)
             if span[1] - span[0] < 2:  # a single row: add one, a log needs two
                 low = max(span[0] - 1, window[0])
