@@ -79,7 +79,7 @@ def solve_recordings(
             data contradict are tested on held-out segments; False for intermediate fits.
 
     Raises:
-        DataError, RankDeficientError, NotConvergedError: As ``fit_recordings``.
+        DataError, RankDeficientError, NotConvergedError: As in ``fit_recordings``.
     """
     recordings = _under_own_load(recordings, choice)
     ground = _ground(recordings, choice, is_last=is_last)

@@ -291,7 +291,7 @@ class Programme:
             rows: Rows of the data in base parameters, shape (k, b + 1).
             weight: Weight of the penalty [-].
             pi: The point, shape (p,).
-            is_exact: As of ``minimise``.
+            is_exact: As in ``minimise``.
             within: The inequalities; None: those that can be active.
 
         Raises:

@@ -199,7 +199,7 @@ class Consistent(BatchEstimator):
         """Return the objective of the fit; see ``Programme.objective``.
 
         Args:
-            rows: Rows of the data, shape (k, b + 1), as of ``rows``.
+            rows: Rows of the data, shape (k, b + 1), from ``rows``.
             pi: Standard parameters, shape (p,).
         """
         return self.programme.objective(rows, pi, self.prior_weight)
@@ -262,7 +262,7 @@ class Consistent(BatchEstimator):
         See ``determine``. The metric and the weight of the prior have no effect.
 
         Args:
-            rows: Rows of the data, shape (k, b + 1), as of ``rows``.
+            rows: Rows of the data, shape (k, b + 1), from ``rows``.
             base_names: Names of the base parameters.
         """
         known = self.layout.owned_by(self.constraints.pinned)

@@ -134,7 +134,7 @@ class LogCholesky(BatchEstimator):
         f + 1/(2 s) sum_i max(0, l_i - s g_i)^2, g_i = tr(J Q_i) of ``slabs``.
 
         Args:
-            rows: Rows of the data, shape (k, b + 1), as of ``Consistent.rows``.
+            rows: Rows of the data, shape (k, b + 1), from ``Consistent.rows``.
             z: Ten log-Cholesky parameters per body, then those of the drives, shape (p,).
             price: Multipliers l of the extents, at least 0.
             stiffness: The s.
@@ -149,7 +149,7 @@ class LogCholesky(BatchEstimator):
         """Return gradient, shape (p,), and Hessian, shape (p, p), of ``objective`` by coordinates.
 
         Args:
-            rows: Rows of the data, shape (k, b + 1), as of ``Consistent.rows``.
+            rows: Rows of the data, shape (k, b + 1), from ``Consistent.rows``.
             z: Ten log-Cholesky parameters per body, then those of the drives, shape (p,).
             price: Multipliers of the extents.
             stiffness: Stiffness of the augmented Lagrangian.

@@ -231,7 +231,7 @@ def pull_back_metric(J: Array) -> Array:
         J: Pseudo-inertias, shape (n, 4, 4), positive definite.
 
     References:
-        Lee, Wensing, Park (2019), as of ``make_penalty``, (22).
+        Lee, Wensing, Park (2019), cited in ``make_penalty``, (22).
     """
     S = metric_root(np.linalg.cholesky(J))
     metric: Array = S.transpose(0, 2, 1) @ S

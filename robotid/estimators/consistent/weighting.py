@@ -34,7 +34,7 @@ class Segments:
     Attributes:
         folds: Factors of the K segments.
         sigma: Noise level per joint, shape (n,) [N m or N].
-        rows: Rows of all segments, shape (b + 1, b + 1), as of ``Consistent.rows``.
+        rows: Rows of all segments, shape (b + 1, b + 1), from ``Consistent.rows``.
         share: Share of independent rows [-].
     """
 
@@ -196,7 +196,7 @@ def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
 
     Args:
         fit: The fit; its own weight is not used.
-        rows: Rows of the data, shape (k, b + 1), as of ``Consistent.rows``.
+        rows: Rows of the data, shape (k, b + 1), from ``Consistent.rows``.
 
     Returns:
         The function of the weight [-].
