@@ -244,7 +244,7 @@ def ghosts(*arrays):
 REFUSED = {
     "start is ": lambda m, log: log.window(log.q, 1.0),
     "end is ": lambda m, log: log.window(0.0, 10**400),
-    "constraints has 'weight', wanted some of mass": lambda m, log: robotid.EstimatorSettings(
+    "constraints has the key 'weight', wanted keys": lambda m, log: robotid.EstimatorSettings(
         constraints={"weight": 1.0}
     ),
     "joint 'joint_2' is locked at": lambda m, log: RobotModel.from_urdf(

@@ -265,7 +265,7 @@ def identify_job(
     found = [*locked, *examine_logs(job, model, fitted, validation)]
     recordings = Recordings(model, structural_mapping(model), fitted, validation)
     checkpoint = None
-    if not recordings.is_held:
+    if not recordings.is_in_memory:
         if folder is not None:
             checkpoint = Checkpoint.open(
                 folder, checkpoint_inputs(job), recordings.pieces, resume=plan.resume

@@ -159,7 +159,7 @@ def locked_as_logged(
     """
     logged, logs = {}, (*fitted, *validation)
     for joint in [joint for joint in model.locked if joint not in job.placed(model)]:
-        found = [log.held[joint] for log in logs if joint in log.held]
+        found = [log.locked[joint] for log in logs if joint in log.locked]
         if found and np.ptp(np.concatenate(found)) <= STILL:
             logged[joint] = float(np.median(np.concatenate(found)))
     if not logged:
@@ -193,8 +193,8 @@ def examine_logs(
     findings: list[Finding] = []
     for log in (*fitted, *validation):
         name = Path(log.path).name
-        findings += check_locked(model, log.held, name, job.placed(model))
-        if len(log.windows) > 1:  # windows have no notes
+        findings += check_locked(model, log.locked, name, job.placed(model))
+        if len(log.windows) > 1:  # the windows have no notes of their own
             notes = log.head.notes
             findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in notes]
     first, second = ([look for log in logs for look in log.looks] for logs in (fitted, validation))

@@ -240,7 +240,7 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
         chosen = list(range(len(own)))
         before = every.left(chosen)
     choice = _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
-    return replace(choice, doubted=_terms(drive, undecided))
+    return replace(choice, undecided=_terms(drive, undecided))
 
 
 def _retained(every: _Options, chosen: Sequence[int], known: int) -> dict[int, list[int]]:

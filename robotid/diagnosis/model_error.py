@@ -177,18 +177,18 @@ def settled_shapes(found: Solution) -> "tuple[DriveChoice, ...] | None":
 def _of_undecided(found: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
     """Yield the uncertain parts of terms that were nearly selected."""
     for choice in found.drives:
-        if not choice.doubted:
+        if not choice.undecided:
             continue
         j = sample.joints.index(choice.joint)
         columns = [
-            np.column_stack([term.column(motion.of(j)) for term in choice.doubted])[rows]
+            np.column_stack([term.column(motion.of(j)) for term in choice.undecided])[rows]
             for motion, rows in zip(motions, sample.taken, strict=True)
         ]
         Z = np.concatenate(columns)
         whole = Trials(sample.of_joint(j), Z[:, None]).whole
-        theta = whole.parameters(list(range(len(choice.doubted))))
+        theta = whole.parameters(list(range(len(choice.undecided))))
 
-        torque = partial(_of_terms, choice.doubted, theta)
+        torque = partial(_of_terms, choice.undecided, theta)
         yield _Move(choice.joint, -whole.T[:, :-1] @ theta, torque)
 
 

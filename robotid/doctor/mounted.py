@@ -153,8 +153,8 @@ def check_payload_change(
     half_width = -float(scipy.special.stdtrit(found.freedom[-10], _P_VALUE)) * error
     if not max(half_width, _NOTHING * size[0]) < abs(mass) < size[0]:
         return
-    left = runs.held_together(found.theta) - 1.0
-    by_scales = runs.held_by_scales(runs.D.shape[1] - 10) - 1.0
+    left = runs.residual_ratios(found.theta) - 1.0
+    by_scales = runs.residual_ratios_by_scales(runs.D.shape[1] - 10) - 1.0
     if _CLEARLY * left.mean() > by_scales.mean():
         return  # the logs differ by another effect
     link = layout.bodies[-1]

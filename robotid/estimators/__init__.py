@@ -39,7 +39,7 @@ __all__ = [
     "save_state",
 ]
 
-_HOMES = {
+_MODULES = {
     "consistent.log_cholesky": ["LogCholesky"],
     "output_error": ["OutputError"],
     "recursive.base": ["RecursiveEstimator", "fold", "load_state", "save_state"],
@@ -49,8 +49,8 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401
-    """Import an estimator that few jobs ask for when it is first used."""
-    for home, names in _HOMES.items():
+    """Import a rarely used estimator at its first use."""
+    for module, names in _MODULES.items():
         if name in names:
-            return getattr(import_module(f"robotid.estimators.{home}"), name)
+            return getattr(import_module(f"robotid.estimators.{module}"), name)
     raise AttributeError(f"module 'robotid.estimators' has no attribute {name!r}")

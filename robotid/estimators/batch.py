@@ -1,4 +1,4 @@
-"""Least squares on triangular factors: ordinary, weighted, and total for a noisy regressor."""
+"""Ordinary, weighted and total least squares on triangular factors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,30 +15,30 @@ from robotid.regressor.factors import Factors
 
 __all__ = ["OLS", "TLS", "WLS", "Solution", "mixed_tls", "solve_factor"]
 
-_RANK = 1e-7  # singular values below this share of the largest, of unit columns, count as 0
-_SILENT = 1e-6  # columns smaller than this share of the largest carry no information
-_OPEN = 1e-2  # a parameter with a larger share in an undetermined direction is undetermined
-_FLOOR = 1e-9  # smallest noise level, as a share of the torque: noise-free data have none
+_RANK = 1e-7  # relative singular value below which the rank is reduced, columns of unit norm
+_SILENT = 1e-6  # relative norm below which a column has no information
+_OPEN = 1e-2  # share in undetermined directions above which a parameter is undetermined
+_FLOOR = 1e-9  # smallest noise level over the torque, for noise-free data
 _TOLERANCE = 1e-8  # relative change of the noise levels at which WLS has converged
 _MAX_ITERATIONS = 200
-_SETTLED = 1e-5  # ... and at which it is good enough after so many iterations
+_SETTLED = 1e-5  # relative change that is sufficient after the largest number of iterations
 _TLS_ITERATIONS = 100
-_TLS_TOLERANCE = 1e-12  # change of the torque, relative to all of it
-_ALONE = 1e-6  # relative gap of the two smallest singular values below which neither is meant
+_TLS_TOLERANCE = 1e-12  # change of the torque relative to its norm
+_ALONE = 1e-6  # relative gap of the two smallest singular values below which they are equal
 
 
 @dataclass(frozen=True)
 class OLS(BatchEstimator):
     """Ordinary least squares: minimise |tau - W theta|^2.
 
-    The covariance allows for a noise level of its own on each joint,
+    The covariance has a separate noise level for each joint,
     ``(W^T W)^-1 (sum_j sigma_j^2 W_j^T W_j) (W^T W)^-1``.
 
     Attributes:
-        prior: Parameters kept where the data say nothing, shape (c,); None: data that leave
-            something open are refused.
-        independent_share: Share of the rows that count as independent, 2 cutoff / rate for rows
-            behind a low-pass filter: the covariance grows by its inverse.
+        prior: Parameter values for directions that are not identifiable, shape (c,); None: an error
+            is raised if there are any.
+        independent_share: Share of independent rows [-], 2 cutoff / rate for low-pass filtered
+            rows. The covariance is divided by it.
 
     References:
         Gautier (1997), Dynamic identification of robots with power model, section II.
@@ -63,13 +63,13 @@ class OLS(BatchEstimator):
 class WLS(BatchEstimator):
     """Weighted least squares: minimise sum_j |tau_j - W_j theta|^2 / sigma_j^2.
 
-    The noise level sigma_j of each joint comes from its own residual, with the degrees of freedom
-    its rows spend, and is iterated to convergence. Of few rows it may settle slowly; the message
-    of the estimate says so.
+    The noise level sigma_j of each joint is computed from its residual and the effective degrees of
+    freedom of its rows, and is iterated to convergence. With few rows it may converge slowly; the
+    message of the estimate has the remaining change.
 
     Attributes:
-        prior: As of ``OLS``.
-        independent_share: As of ``OLS``.
+        prior: As in ``OLS``.
+        independent_share: As in ``OLS``.
 
     References:
         Gautier (1997), Dynamic identification of robots with power model, section II.
@@ -83,41 +83,41 @@ class WLS(BatchEstimator):
         sigma = _noise(factors, start.theta, factors.leverages(start.covariance))
         for iteration in range(1, _MAX_ITERATIONS + 1):
             solution = solve_factor(factors, sigma, self.prior)
-            spent = factors.leverages(solution.covariance) / sigma**2
-            updated = _noise(factors, solution.theta, spent)
+            used = factors.leverages(solution.covariance) / sigma**2
+            updated = _noise(factors, solution.theta, used)
             change = np.max(np.abs(updated - sigma) / sigma)
             sigma = updated
             is_last = iteration == _MAX_ITERATIONS
             if change < (_SETTLED if is_last else _TOLERANCE):
                 covariance = solution.covariance / self.independent_share
-                message = f"noise levels settled after {iteration} iterations"
+                message = f"noise levels converged after {iteration} iterations"
                 if is_last:
-                    message += f", where they still change by {change:.1e}"
+                    message += f", remaining relative change {change:.1e}"
                 return solution.estimate(factors.names, covariance, sigma, iteration, message)
         raise NotConvergedError(
-            f"the noise levels of WLS still change by {change:.1e} after {_MAX_ITERATIONS} "
-            f"iterations with {int(factors.rows.sum())} rows for {len(factors.names)} parameters; "
-            "record more, or look for a joint that is fitted exactly",
+            f"the noise levels of WLS have not converged: relative change {change:.1e} after "
+            f"{_MAX_ITERATIONS} iterations, wanted less than {_SETTLED:g}, with "
+            f"{int(factors.rows.sum())} rows for {len(factors.names)} parameters; record more "
+            "data, or check whether a joint has a residual of 0",
             "max_iterations",
         )
 
 
 @dataclass(frozen=True)
 class TLS(BatchEstimator):
-    """Total least squares with exact columns, rows weighted as by WLS.
+    """Total least squares with exact columns, rows weighted as in WLS.
 
     Finds the smallest corrections E of the regressor and e of the torque with
-    (W + E) theta = tau - e, where the noise of a column is ``regressor_noise`` times its root mean
-    square and columns of constants have none. It is right where positions are noisy and their
-    derivatives more so, and wrong where the residual is what the model lacks: it then blames the
-    regressor for it. With ``regressor_noise`` towards 0 it is WLS, whose covariance it states. It
-    refuses data of which no single solution is smallest, and a regressor's noise larger than the
-    residual allows (``DataError``).
+    (W + E) theta = tau - e. The noise of a column is ``regressor_noise`` times its RMS; constant
+    columns have none. The method is appropriate if positions and their derivatives are noisy. It is
+    biased if the residual is a model error, which it attributes to noise of the regressor. For
+    ``regressor_noise`` towards 0 it is WLS, whose covariance it returns. A ``DataError`` is raised
+    if the smallest solution is not unique, or if the regressor's noise exceeds the residual.
 
     Attributes:
-        regressor_noise: Noise of the columns over their root mean square [-].
-        exact: Columns without noise, by the last word of their names.
-        independent_share: As of ``OLS``.
+        regressor_noise: RMS noise of the columns over their RMS [-].
+        exact: Columns without noise, by the last part of their names.
+        independent_share: As in ``OLS``.
 
     References:
         Golub, Hoffman, Stewart (1987), A generalization of the Eckart-Young-Mirsky matrix
@@ -147,17 +147,18 @@ class TLS(BatchEstimator):
         )
 
     def _split(self, R: Array, noise: Array, theta: Array) -> tuple[Array, float]:
-        """Return the parameters and the share of the residual that the regressor's noise makes.
+        """Return the parameters and the share of the residual due to the regressor's noise.
 
-        The residual of WLS, 1 in these units, is the torque's noise and the regressor's seen
-        through theta; how much is whose follows from theta, and theta from that.
+        The residual of WLS, 1 in these units, is the sum of the torque's noise and the regressor's
+        noise times theta. The share depends on theta and theta on the share: both are iterated.
         """
         for _ in range(_TLS_ITERATIONS):
             share = float(((noise * theta) ** 2).sum())
             if share >= 1.0:
                 raise DataError(
-                    f"regressor_noise {self.regressor_noise:g} alone would make "
-                    f"{np.sqrt(share):.3g} times the residual that there is; lower it"
+                    f"regressor_noise = {self.regressor_noise:g} corresponds to "
+                    f"{np.sqrt(share):.3g} times the actual residual, wanted less than 1; reduce "
+                    "regressor_noise"
                 )
             found = mixed_tls(R, noise / np.sqrt(1.0 - share))
             change = np.linalg.norm(R[:, :-1] @ (found - theta)) / np.linalg.norm(R[:, -1])
@@ -165,7 +166,7 @@ class TLS(BatchEstimator):
             if change < _TLS_TOLERANCE:
                 return theta, share
         raise NotConvergedError(
-            f"total least squares does not settle in {_TLS_ITERATIONS} steps; lower "
+            f"total least squares has not converged after {_TLS_ITERATIONS} steps; reduce "
             "regressor_noise",
             "max_iterations",
         )
@@ -173,14 +174,14 @@ class TLS(BatchEstimator):
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The minimiser of a weighted problem, and what its factor says of it.
+    """The minimiser of a weighted problem, with its covariance and rank.
 
     Attributes:
         theta: Parameters, shape (c,).
         covariance: (W^T S^-1 W)^+, shape (c, c).
-        rank: Number of directions that the data determine.
+        rank: Number of identifiable directions.
         columns: Factor of the columns scaled to unit norm, shape (c + 1, c).
-        undetermined: Names of the parameters that the data leave open.
+        undetermined: Names of the parameters that are not identifiable.
     """
 
     theta: Array
@@ -198,14 +199,14 @@ class Solution:
     def estimate(
         self, names: tuple[str, ...], covariance: Array, sigma: Array, n_iter: int, message: str
     ) -> Estimate:
-        """Return the estimate; what the data leave open has infinite variance.
+        """Return the estimate; parameters that are not identifiable have infinite variance.
 
         Args:
             names: Names of the parameters.
-            covariance: Covariance of the others, shape (c, c).
+            covariance: Covariance of the parameters, shape (c, c).
             sigma: Standard deviation of the torque residual per joint, shape (n,) [N m or N].
             n_iter: Number of iterations.
-            message: What the estimator says of its run.
+            message: Summary of the run of the estimator.
         """
         is_open = np.isin(names, self.undetermined)
         covariance = covariance.copy()
@@ -225,26 +226,27 @@ class Solution:
 
 
 def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solution:
-    """Solve the weighted problem; directions that the data leave open keep the prior.
+    """Solve the weighted problem; directions that are not identifiable have the prior's values.
 
     Args:
         factors: The factors.
         sigma: Noise level per joint, shape (n,) [N m or N].
-        prior: Parameters kept where the data say nothing, shape (c,); None: refuse such data.
+        prior: Parameter values for directions that are not identifiable, shape (c,); None: an error
+            is raised if there are any.
 
     Raises:
-        RankDeficientError: If the data leave parameters open and there is no prior.
+        RankDeficientError: If parameters are not identifiable and there is no prior.
     """
     R = factors.weighted(sigma)
     c = len(factors.names)
     A, d = R[:, :c], R[:, c]
     norms = np.linalg.norm(A, axis=0)
-    heard = norms > _SILENT * norms.max()
-    scale = np.where(heard, norms, 1.0)
-    X = np.where(heard, A / scale, 0.0)
+    is_excited = norms > _SILENT * norms.max()
+    scale = np.where(is_excited, norms, 1.0)
+    X = np.where(is_excited, A / scale, 0.0)
     inverse, is_singular = scipy.linalg.lapack.dtrtri(A[:c])
-    # the product of Frobenius' norms of X, c^(1/2), and of its inverse bounds its condition
-    if heard.all() and not is_singular and _RANK * np.linalg.norm(scale * inverse.T) < c**-0.5:
+    # the product of the Frobenius norms of X, c^(1/2), and of its inverse bounds its condition
+    if is_excited.all() and not is_singular and _RANK * np.linalg.norm(scale * inverse.T) < c**-0.5:
         return Solution(inverse @ d[:c], inverse @ inverse.T, c, X, ())
     U, s, Vt = np.linalg.svd(X)
     rank = int(np.sum(s > _RANK * s[0])) if s[0] > 0 else 0
@@ -259,12 +261,12 @@ def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solutio
     return Solution(start + step / scale, basis @ basis.T, rank, X, undetermined)
 
 
-def _noise(factors: Factors, theta: Array, spent: Array) -> Array:
-    """Return the standard deviation of each joint's residual, never quite zero.
+def _noise(factors: Factors, theta: Array, used: Array) -> Array:
+    """Return the standard deviation of each joint's residual, above 0, shape (n,) [N m or N].
 
-    As many of its rows are spent as parameters that they determine: the trace of their leverage.
+    The degrees of freedom are the rows minus ``used``, the trace of their leverage.
     """
-    freedom = np.maximum(factors.rows - spent, 1.0)
+    freedom = np.maximum(factors.rows - used, 1.0)
     sigma = np.sqrt(factors.residual_squares(theta) / freedom)
     torque = np.sqrt(factors.torque_squares() / np.maximum(factors.rows, 1))
     floor = _FLOOR * np.where(torque > 0, torque, 1.0)
@@ -273,14 +275,14 @@ def _noise(factors: Factors, theta: Array, spent: Array) -> Array:
 
 
 def mixed_tls(rows: Array, noise: Array) -> Array:
-    """Return the parameters, shape (c,), that mixed total least squares finds.
+    """Return the parameters of mixed total least squares, shape (c,).
 
     Args:
         rows: Rows [W tau] in units of the torque's noise, or their factor, shape (k, c + 1).
-        noise: Noise of each column in the same units, shape (c,); 0 of columns without.
+        noise: Noise of each column in the same units, shape (c,); 0 for columns without noise.
 
     Raises:
-        DataError: If no single solution is smallest.
+        DataError: If the smallest solution is not unique.
     """
     c = len(noise)
     exact, noisy = np.flatnonzero(noise == 0), np.flatnonzero(noise > 0)
@@ -295,8 +297,9 @@ def mixed_tls(rows: Array, noise: Array) -> Array:
     is_alone = len(s) == 1 or s[-2] - s[-1] > _ALONE * s[0]
     if not is_alone or abs(v[-1]) < _ALONE:
         raise DataError(
-            "total least squares has no single smallest solution: its smallest singular values are "
-            f"{s[-2:].tolist()}; the data say too little, or regressor_noise is too large"
+            "the solution of total least squares is not unique: the smallest singular values are "
+            f"{s[-2:].tolist()}, wanted one clearly below the other; record a motion with more "
+            "excitation, or reduce regressor_noise"
         )
     theta = np.empty(c)
     theta[noisy] = -v[:-1] / v[-1] / scale[:-1]

@@ -1,7 +1,7 @@
-"""Which base parameters data determine: by themselves, in sums with others only, or not at all.
+"""Identifiability of base parameters: individually, only in sums with others, or not at all.
 
-One criterion for everything that speaks of it: a direction in the space of base parameters is
-determined if the data shrink its spread against what is plausible before them.
+One criterion is used everywhere: a direction in the space of base parameters is identifiable if the
+data reduce its standard deviation in comparison with the prior.
 """
 
 from collections.abc import Sequence
@@ -16,24 +16,24 @@ from robotid.exceptions import RankDeficientError
 
 __all__ = ["Combination", "Determination", "Group", "base_spread", "determine"]
 
-_PRIOR_LED = 0.9  # a direction whose spread shrinks by less than this is weak
-_LED_IN_PART = 0.3  # a parameter that keeps this share of its spread in weak directions is one's
-_COUPLED = 0.5  # ... or that moves with an open one by this share of their spreads
-_JOINED = 0.05  # smaller coefficients, in units of the spreads, are left out of words
-_TERM = 1e-3  # ... and smaller ones still are no term of a sum
-_TIE = 0.95  # of coefficients nearly as large as the largest the first leads
-_TERMS = 4  # of a sum, as far as words go
-_DIGITS = 3  # of a coefficient in words
-_NAMED = 5  # parameters, and half as many sums, that words name of one group
-_GROUPS = 2  # groups of which a sentence names the sums
+_PRIOR_LED = 0.9  # ratio of the spreads after and before the data above which a direction is weak
+_LED_IN_PART = 0.3  # share of a parameter's spread in weak directions that makes it a group member
+_COUPLED = 0.5  # ... or its coefficient relative to another member, in units of the spreads
+_JOINED = 0.05  # relative coefficient below which a term is not printed, in units of the spreads
+_TERM = 1e-3  # ... and below which it is not a term of the sum
+_TIE = 0.95  # coefficients above this share of the largest are equal to it: the first one leads
+_TERMS = 4  # largest number of printed terms of a sum
+_DIGITS = 3  # printed digits of a coefficient
+_NAMED = 5  # largest number of parameters of a group, and half as many sums, that are printed
+_GROUPS = 2  # largest number of groups whose sums are printed
 
 
 @dataclass(frozen=True)
 class Combination:
-    """A sum of base parameters that the data determine, though not each term of it.
+    """A sum of base parameters that is identifiable, while its terms are not.
 
     Attributes:
-        names: Base parameters in it, in their order.
+        names: Base parameters in the sum, in their order.
         coefficients: Factor of each, SI units; that of the leading one is 1.
         shares: The same in units of the spreads [-]; that of the leading one is the largest.
     """
@@ -47,21 +47,21 @@ class Combination:
         leading = self.coefficients.index(1.0)
         order = [i for i in np.argsort(-shares, kind="stable") if i != leading]
         terms = [i for i in order if shares[i] > _JOINED * shares[leading]]
-        said = self.names[leading]
+        text = self.names[leading]
         for i in terms[: _TERMS - 1]:
             sign = "-" if self.coefficients[i] < 0 else "+"
             size = f"{abs(self.coefficients[i]):.{_DIGITS}g}"
-            said += f" {sign} {self.names[i]}" if size == "1" else f" {sign} {size} {self.names[i]}"
-        return said + (" + ..." if len(terms) >= _TERMS else "")
+            text += f" {sign} {self.names[i]}" if size == "1" else f" {sign} {size} {self.names[i]}"
+        return text + (" + ..." if len(terms) >= _TERMS else "")
 
 
 @dataclass(frozen=True)
 class Group:
-    """Base parameters that the data do not tell apart.
+    """Base parameters that cannot be distinguished from the data.
 
     Attributes:
         names: The base parameters.
-        combinations: What of them is determined; fewer than there are names.
+        combinations: Their identifiable sums, fewer than there are names.
     """
 
     names: tuple[str, ...]
@@ -69,29 +69,28 @@ class Group:
 
     def __str__(self) -> str:
         if not self.combinations:
-            return f"of {_and(self.names)} nothing is determined"
+            return f"{_and(self.names)} {'is' if len(self.names) == 1 else 'are'} not identifiable"
         count = len(self.combinations)
         if len(self.names) > _NAMED or count > _NAMED // 2:
             return (
-                f"of the {len(self.names)} parameters {self.names[0]} ... {self.names[-1]} only "
-                f"{count} sum{'s' * (count > 1)} "
-                f"{'is' if count == 1 else 'are'} determined, as {self.combinations[0]}"
+                f"the {len(self.names)} parameters {self.names[0]} ... {self.names[-1]} are "
+                f"identifiable only in {count} sum{'s' * (count > 1)}, as {self.combinations[0]}"
             )
         sums = _and([str(combination) for combination in self.combinations])
-        return f"of {_and(self.names)} only {sums} {'is' if count == 1 else 'are'} determined"
+        return f"{_and(self.names)} are identifiable only as {sums}"
 
 
 @dataclass(frozen=True, eq=False)
 class Determination:
-    """What data say about the base parameters.
+    """Identifiability of the base parameters from data.
 
     Attributes:
         names: Names of the b base parameters.
-        spread: Plausible spread of each before the data, shape (b,), SI units; 0 for known ones.
-        shrinkage: Spread after over spread before of b orthogonal directions in units of the
-            spread, ascending, shape (b,) [-]; known ones count 0.
+        spread: Prior standard deviation (spread) of each, shape (b,), SI units; 0 for known ones.
+        shrinkage: Standard deviation after the data over that before them, for b orthogonal
+            directions in units of the spread, ascending, shape (b,) [-]; 0 for known ones.
         weak: The weak directions, in units of the spread, orthonormal, shape (b, b - rank).
-        groups: Base parameters that the data do not tell apart.
+        groups: Base parameters that cannot be distinguished from the data.
     """
 
     names: tuple[str, ...]
@@ -107,42 +106,42 @@ class Determination:
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Names of the base parameters that are not determined by themselves, in their order."""
+        """Names of the base parameters that are not identifiable individually, in their order."""
         listed = {name for group in self.groups for name in group.names}
         return tuple(name for name in self.names if name in listed)
 
     @property
     def merged(self) -> tuple[Group, ...]:
-        """The groups, all of which nothing is determined in one, the last."""
+        """The groups; those without an identifiable sum are merged into the last one."""
         sums = tuple(group for group in self.groups if group.combinations)
         alone = [name for group in self.groups if not group.combinations for name in group.names]
         return (*sums, Group(tuple(alone), ())) if alone else sums
 
     def described(self) -> str:
-        """Return what is determined of the rest, as "of a and b only a + b is determined".
+        """Return a description of the groups, as "a and b are identifiable only as a + b".
 
         Returns:
-            One line, of the first groups; empty if everything is determined.
+            One line with the first groups; empty if every parameter is identifiable.
         """
         sums = [str(group) for group in self.merged if group.combinations]
-        said = sums[:_GROUPS]
+        texts = sums[:_GROUPS]
         if len(sums) > _GROUPS:
             more = len(sums) - _GROUPS
-            said.append(f"{more} more such group{'s' * (more > 1)}")
-        return "; ".join(said + [str(group) for group in self.merged if not group.combinations])
+            texts.append(f"{more} more group{'s' * (more > 1)} of this kind")
+        return "; ".join(texts + [str(group) for group in self.merged if not group.combinations])
 
     def refusal(self, error: RankDeficientError) -> RankDeficientError:
-        """Return the refusal in words of this criterion; as it was if only rounding is open.
+        """Return the error of least squares with the groups of this criterion.
 
         Args:
-            error: What least squares said, by its own numerical rank.
+            error: Error by the numerical rank of least squares; returned if there are no groups.
         """
         if not self.groups:
             return error
         return RankDeficientError(self.rank, self.undetermined, len(self.names), self.described())
 
     def to_list(self) -> list[dict[str, Any]]:
-        """Return the groups as plain values, as result.json has them.
+        """Return the groups as plain values, as they are written to result.json.
 
         Returns:
             Per group {"parameters": [names], "determined": [{"text", "terms": {name: coefficient}}]
@@ -161,11 +160,11 @@ class Determination:
 
 
 def base_spread(K: Array, spread: Array, known: Sequence[bool] | Array = ()) -> Array:
-    """Return how far each base parameter may plausibly lie from its prior, shape (b,); 0 if known.
+    """Return the prior standard deviation of each base parameter, shape (b,); 0 if known.
 
     Args:
         K: Map to the base parameters, shape (b, p).
-        spread: Spread of each standard parameter, shape (p,), SI units.
+        spread: Prior standard deviation of each standard parameter, shape (p,), SI units.
         known: Whether each standard parameter is known, shape (p,); none if empty.
     """
     free = spread * ~np.asarray(known, dtype=bool) if len(known) else spread
@@ -174,18 +173,18 @@ def base_spread(K: Array, spread: Array, known: Sequence[bool] | Array = ()) -> 
 
 
 def determine(names: Sequence[str], rows: Array, spread: Array) -> Determination:
-    """Return which directions the data determine, and in words what they leave.
+    """Return which directions are identifiable, and the groups of parameters that are not.
 
-    In units of the spread, the rows A have singular values s_i; along their right singular
-    vectors data shrink the spread to 1 / sqrt(1 + s_i^2). Those that hardly shrink, V_w, span
-    what the data leave open. Solved for as many base parameters f, x_p = V_p V_f^-1 x_f along
-    them, so that each x_p - V_p V_f^-1 x_f is determined.
+    In units of the spread, the rows A have singular values s_i. Along their right singular vectors
+    the data reduce the spread to 1 / sqrt(1 + s_i^2). Directions that are hardly reduced, V_w, span
+    the space that is not identifiable. Solved for as many base parameters f, x_p = V_p V_f^-1 x_f
+    along them, so that each x_p - V_p V_f^-1 x_f is identifiable.
 
     Args:
         names: Names of the base parameters.
-        rows: Information A, with A^T A the inverse of the covariance of the base parameters by
-            the data alone at their noise level, shape (k, b), in inverse SI units.
-        spread: Plausible spread of each before the data, shape (b,), SI units; 0 if known.
+        rows: A, where A^T A is the inverse covariance of the base parameters by the data alone at
+            their noise level, shape (k, b), in inverse SI units.
+        spread: Prior standard deviation of each, shape (b,), SI units; 0 if known.
     """
     free = np.flatnonzero(spread > 0)
     weak, shrinkage = np.zeros((len(spread), 0)), np.zeros(len(spread))
@@ -202,15 +201,15 @@ def determine(names: Sequence[str], rows: Array, spread: Array) -> Determination
 
 
 def _groups(names: tuple[str, ...], weak: Array, spread: Array) -> tuple[Group, ...]:
-    """Return the base parameters that move together along the weak directions."""
+    """Return the groups of base parameters that are coupled along the weak directions."""
     count = weak.shape[1]
     if not count:
         return ()
     order = scipy.linalg.qr(weak.T, mode="r", pivoting=True)[1]
     chosen, others = order[:count], np.sort(order[count:])
     moved = np.linalg.solve(weak[chosen].T, weak[others].T).T  # V_p V_f^-1
-    kept = np.linalg.norm(weak[others], axis=1)
-    is_open = (kept > _LED_IN_PART) | (np.abs(moved) > _COUPLED).any(axis=1)
+    share = np.linalg.norm(weak[others], axis=1)
+    is_open = (share > _LED_IN_PART) | (np.abs(moved) > _COUPLED).any(axis=1)
     others, moved = others[is_open], moved[is_open]
     label = np.append(np.arange(count), np.zeros(len(others), dtype=int))
     for k, row in enumerate(moved):
@@ -235,7 +234,7 @@ def _groups(names: tuple[str, ...], weak: Array, spread: Array) -> tuple[Group, 
 def _combination(
     names: tuple[str, ...], spread: Array, places: Sequence[int], scaled: Sequence[float]
 ) -> Combination:
-    """Return a sum given in units of the spread as one in SI units."""
+    """Return a sum in SI units, from one in units of the spread."""
     terms = sorted((p, c) for p, c in zip(places, scaled, strict=True) if abs(c) > _TERM)
     shares = np.array([c for _, c in terms])
     leading = int(np.argmax(np.abs(shares) >= _TIE * np.abs(shares).max()))

@@ -1,4 +1,4 @@
-"""The interface of estimators and what they return."""
+"""The interface of estimators and their result."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
@@ -22,28 +22,29 @@ __all__ = ["BatchEstimator", "Estimate", "Estimator", "Weighing", "require_rows"
 
 DataT = TypeVar("DataT", contravariant=True)
 
-#: "alike"; "by joint", each by its noise level; "by age", as of a filter that forgets or gates; or
-#: "by step", as of a gradient method, which ends beside the minimum of least squares.
+#: Weights of rows: "alike", all equal; "by joint", by the noise level; "by age", of a filter with
+#: forgetting or a gate; "by step", of a gradient method, which ends near the least squares minimum.
 Weighing: TypeAlias = Literal["alike", "by joint", "by age", "by step"]
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Estimated parameters and how well they are known.
+    """Estimated parameters and their uncertainty.
 
     Attributes:
         theta: Parameters, shape (c,), SI units.
-        covariance: Their covariance, shape (c, c); infinite variance where the data say nothing.
+        covariance: Their covariance, shape (c, c); infinite variance if not identifiable.
         names: Their names.
         sigma: Standard deviation of the torque residual per joint, shape (n,) [N m or N].
-        rank: Number of directions that the data determine.
-        condition: Condition number of the columns scaled to unit norm, over those directions.
-        undetermined: Names of the parameters that the data leave open.
-        converged: Whether the iteration ended by its own criterion.
+        rank: Number of identifiable directions.
+        condition: Condition number over those directions, columns scaled to unit norm.
+        undetermined: Names of the parameters that are not identifiable.
+        converged: Whether the iteration met its convergence criterion.
         n_iter: Number of iterations.
-        message: What the estimator says of its run.
-        prior_std: Standard deviation of each parameter before the data, shape (c,), or None.
-        details: How it was fitted, plain values by name: prior, constraints, solver.
+        message: Summary of the run of the estimator.
+        prior_std: Prior standard deviation of each parameter, shape (c,), or None.
+        details: Settings and results of the fit as plain values by name: prior, constraints,
+            solver.
     """
 
     theta: Array
@@ -71,7 +72,7 @@ class Estimate:
         return f"<p>{head}</p>\n" + table("Parameters", ["name", "value", "standard error"], rows)
 
     def summary(self) -> str:
-        """Return the parameters with their standard errors as text, one a line."""
+        """Return the parameters with their standard errors as text, one per line."""
         width = max(len(name) for name in self.names)
         rows = [f"  {name:{width}} {x:12.4g} +- {error:.2g}" for name, x, error in self._rows]
         return "\n".join([self._line, self.message, *rows])
@@ -80,16 +81,16 @@ class Estimate:
 
     @property
     def std_error(self) -> Array:
-        """Standard error of each parameter, shape (c,); inf where the data say nothing."""
-        # exact data leave a variance of rounding size, of either sign
+        """Standard error of each parameter, shape (c,); inf if not identifiable."""
+        # noise-free data give a variance of rounding size, of either sign
         errors: Array = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         return errors
 
     @property
     def quantile(self) -> Array:
-        """How many standard errors a 95 % interval reaches, by Student's quantile, shape (c,).
+        """Half-width of the 95 % intervals in standard errors, Student's quantile, shape (c,).
 
-        ``details`` has the degrees of freedom, ``freedom``, of errors from a scatter.
+        ``details["freedom"]`` has the degrees of freedom if standard errors are from a scatter.
         """
         freedom = self.details.get("freedom", np.inf)
         return quantile(np.broadcast_to(np.asarray(freedom, dtype=float), len(self.theta)))
@@ -108,28 +109,28 @@ class Estimate:
 
 
 class Estimator(ABC, Generic[DataT]):
-    """Settings go into the constructor, data only into ``fit``.
+    """Interface of estimators: settings are constructor arguments, data arguments of ``fit``.
 
     Attributes:
-        reads: What it needs of the data: the "factors" that all rows come down to, the "samples"
-            one by one, or a "simulator" that is compared with them.
+        reads: Form of the data that it needs: triangular "factors" of all rows, the "samples" one
+            by one, or a "simulator" that is compared with the data.
     """
 
     reads: ClassVar[Literal["factors", "samples", "simulator"]]
 
     @property
     def needs_mass(self) -> bool:
-        """Whether each sample must carry the regressor of the mass matrix."""
+        """Whether each sample must have the regressor of the mass matrix."""
         return False
 
     @property
     def weighing(self) -> Weighing:
-        """How the rows weigh, which decides what their scatter says of the standard errors."""
+        """Weights of the rows, which determine how standard errors follow from their scatter."""
         return "by joint"
 
     @property
     def in_cone(self) -> "Consistent | None":
-        """The physically consistent fit whose bounds it keeps to, if it is one."""
+        """The physically consistent fit whose constraints the estimate meets; None without."""
         return None
 
     @abstractmethod
@@ -137,18 +138,18 @@ class Estimator(ABC, Generic[DataT]):
         """Estimate the parameters.
 
         Args:
-            data: A problem in base parameters; of a batch estimator also its factors. Of one that
-                reads a simulator, the simulator.
+            data: A problem in base parameters; for a batch estimator also its factors; for an
+                estimator that reads a simulator, the simulator.
 
         Raises:
             DataError: If there are fewer rows than parameters, or a row cannot be used.
-            RankDeficientError: If the data leave parameters open and there is no prior.
-            NotConvergedError: If an iteration or a solver does not end.
+            RankDeficientError: If parameters are not identifiable and there is no prior.
+            NotConvergedError: If an iteration or a solver does not converge.
         """
 
 
 class BatchEstimator(Estimator[Problem | Factors]):
-    """An estimator to which the factors of the rows are enough."""
+    """An estimator that needs only the triangular factors of the rows."""
 
     reads: ClassVar[Literal["factors"]] = "factors"
 
@@ -163,7 +164,7 @@ class BatchEstimator(Estimator[Problem | Factors]):
 
 
 def require_rows(rows: int, columns: int, n_joints: int) -> None:
-    """Refuse fewer rows than parameters: a perfect fit would mean nothing.
+    """Raise an error if there are fewer rows than parameters.
 
     Args:
         rows: Number of rows used.
@@ -176,10 +177,10 @@ def require_rows(rows: int, columns: int, n_joints: int) -> None:
     if rows == 0:
         raise DataError(
             f"0 torque rows for {columns} parameters: no joint moves faster than min_velocity, or "
-            "trim leaves nothing of the logs ([signals]); record a motion of every joint"
+            "trim removes all rows ([signals]); record a motion of every joint"
         )
     if rows < columns:
         raise DataError(
             f"{rows} torque rows for {columns} parameters: too few rows to fit; record at least "
-            f"{-(-10 * columns // n_joints)} samples, or loosen min_velocity and trim"
+            f"{-(-10 * columns // n_joints)} samples, or reduce min_velocity and trim"
         )

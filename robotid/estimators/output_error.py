@@ -1,9 +1,9 @@
-"""Output error: parameters by which a simulator comes out as what was measured.
+"""Output error method: parameters for which simulated outputs agree with measured ones.
 
-The closed loop is simulated over windows and its outputs are compared, so nothing is
-differentiated, and neither torque nor acceleration need be measured. The residual of a simulation
-is correlated; it is whitened, e_t - rho e_(t-1), by joint, else what acts fast, a delay, is lost
-beside what drifts.
+The closed loop is simulated over windows and its outputs are compared. Nothing is differentiated,
+and neither torque nor acceleration needs to be measured. The residual of a simulation is
+correlated. It is whitened by joint, e_t - rho e_(t-1); without whitening, slow drift would mask
+fast effects such as a delay.
 """
 
 import math
@@ -22,34 +22,35 @@ from robotid.regressor.factors import Factors, triangle_of
 
 __all__ = ["OutputError", "Residual", "Simulator", "linearised"]
 
-_CAUTIOUS = 1e-3  # damping of a step, with which what nothing tells stays where it is
-_NEARLY_FREE = 1e-6  # the same of the last step, from near the minimum
-_STEPS = 25  # of the damped Gauss-Newton method in a round
-_ROUNDS = 5  # of whitening and noise levels ...
-_SETTLED = 2e-2  # ... until they change by less than that
-_ROUGH, _CLOSE = 1e-3, 1e-5  # relative decrease that ends a round, and the last one
-_TOO_STIFF = 1e10  # damping at which no step lowers the cost any more
-_UPHILL = 1e-2  # relative increase that a step with inexact derivatives may cost
-_NEAR = 1e-2  # of a standard error, squared, that such a step ends at
-_MOST_RHO = 0.95  # beyond it, whitening takes away what stays: offsets and gains
-_NO_TRACE = 1e-3  # noise levels that a start moves a window by, below which it is no matter
-#: Rows are cut into so many segments, to see how their scores scatter: few enough that each is
-#: longer than an encoder shows the same step while a joint turns back.
+_CAUTIOUS = 1e-3  # damping of a step: parameters that are not identifiable do not move
+_NEARLY_FREE = 1e-6  # damping of the last step, near the minimum
+_STEPS = 25  # largest number of damped Gauss-Newton steps in a round
+_ROUNDS = 5  # largest number of updates of whitening and noise levels ...
+_SETTLED = 2e-2  # ... until their relative change is smaller
+_ROUGH, _CLOSE = 1e-3, 1e-5  # relative decrease that ends the first round, and the others
+_TOO_STIFF = 1e10  # damping at which no step reduces the cost any more
+_UPHILL = 1e-2  # largest relative increase of the cost by a step with inexact derivatives
+_NEAR = 1e-2  # step in standard errors, squared, at which such steps end
+_MOST_RHO = 0.95  # largest correlation: beyond it, whitening removes offsets and gains
+_NO_TRACE = 1e-3  # effect of an initial state in noise levels below which it is neglected
+#: Number of segments for the scatter of scores: few enough that each is longer than the time for
+#: which an encoder stays at one step while a joint reverses.
 _SEGMENTS = 48
-_LOST = 1e-6  # share of its prior's variance, below which a direction's gain in knowledge is none
+_LOST = 1e-6  # relative reduction of the prior variance below which a parameter is undetermined
 
 
 @dataclass(frozen=True, eq=False)
 class Residual:
-    """Measured less simulated, over one window, of joints that move together.
+    """Measured minus simulated output over one window, for joints that are simulated together.
 
     Attributes:
-        e: Shape (N, k) [rad or m].
-        slopes: Derivatives of the simulated output, shape (N, k, c'); None if not asked for.
-        joints: Which joints, shape (k,).
-        columns: Which parameters, shape (c',).
-        by_start: Derivatives by where the window's own simulation starts, shape (N, k, s); None or
-            of s = 0 if that is known, or they were not asked for.
+        e: Residual, shape (N, k) [rad or m].
+        slopes: Derivatives of the simulated output by the parameters, shape (N, k, c'); None if
+            not requested.
+        joints: Indices of the joints, shape (k,).
+        columns: Indices of the parameters, shape (c',).
+        by_start: Derivatives by the initial state of the window's simulation, shape (N, k, s); None
+            or s = 0 if it is known, or if they are not requested.
     """
 
     e: Array
@@ -60,14 +61,13 @@ class Residual:
 
 
 class Simulator(Protocol):
-    """What simulates, and which parameters it has.
+    """Interface of a simulator and its parameters.
 
     Attributes:
-        names: Of the c parameters.
-        prior: What they are before any data, shape (c,).
-        prior_std: How far from it they may plausibly be, shape (c,); infinite where nothing is
-            known.
-        lowest: Smallest value that each may have, shape (c,); -inf without.
+        names: Names of the c parameters.
+        prior: Prior values, shape (c,).
+        prior_std: Prior standard deviations, shape (c,); infinite without prior knowledge.
+        lowest: Lower bounds, shape (c,); -inf without a bound.
     """
 
     @property
@@ -82,31 +82,31 @@ class Simulator(Protocol):
     def residuals(
         self, theta: Array, *, with_slopes: bool, with_starts: bool = False
     ) -> Sequence[Residual]:
-        """Return what is measured less what is simulated, window by window.
+        """Return measured minus simulated outputs, window by window.
 
         Args:
             theta: Parameters, shape (c,).
-            with_slopes: Whether derivatives are wanted.
-            with_starts: Whether those by the starts of windows are.
+            with_slopes: Whether derivatives by the parameters are computed.
+            with_starts: Whether derivatives by the initial states of windows are computed.
 
         Raises:
-            NotConvergedError: If it cannot be simulated with these parameters.
+            NotConvergedError: If the simulation with these parameters fails.
         """
 
     def rows(self, theta: Array) -> tuple[Array, Array]:
-        """Return further residuals of unit weight, as of torques, and what lowers them.
+        """Return additional linearised residuals of unit weight, as those of torques.
 
         Args:
             theta: Parameters, shape (c,).
 
         Returns:
-            A, shape (m, c), and b, shape (m,): parameters theta + x leave b - A x.
+            A, shape (m, c), and b, shape (m,): the residuals of theta + x are b - A x.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class _Weights:
-    """How residuals weigh, by joint."""
+    """Whitening and noise level of the residuals, by joint."""
 
     rho: Array  # correlation of one sample with the next [-]
     sigma: Array  # noise level of the whitened residual
@@ -123,21 +123,21 @@ class _Weights:
 class OutputError(Estimator[Simulator]):
     """Least squares of a simulator's whitened residuals, with priors and bounds.
 
-    A damped Gauss-Newton method (Levenberg, Marquardt) in rounds: weights of the residuals so far,
-    then parameters by these weights, until both have settled.
+    A damped Gauss-Newton method (Levenberg, Marquardt) in rounds. Each round computes the weights
+    from the residuals, then the parameters with these weights, until both have converged.
 
     Attributes:
-        name: What it is called, by what is compared.
-        whitens: Whether the residual's correlation is estimated and taken out.
-        most: Largest correlation of one sample with the next that is taken out, shape (n,): beyond
-            the loop's own, whitening takes away what the loop shows. 0.95 if None.
-        steps: Most steps in a round.
-        rounds: Most rounds.
-        inflation: By how much larger the variance of residuals counts, which whitening does not
-            make independent: beside further rows it says how both weigh.
-        frees: Whether the starts of windows move with the parameters, to first order, in each step:
-            wanted where nothing in a window makes up for a wrong start.
-        progress: Told of the steps.
+        name: Name of the method, by the compared signal.
+        whitens: Whether the residual is whitened by its estimated correlation.
+        most: Largest correlation of successive samples that is used, shape (n,): whitening with
+            more than the correlation of the loop removes the information. None: 0.95.
+        steps: Largest number of steps in a round.
+        rounds: Largest number of rounds.
+        inflation: Factor of the residuals' variance for the correlation that remains after
+            whitening. It determines the weight relative to additional rows.
+        frees: Whether the initial states of windows are fitted together with the parameters, to
+            first order, in each step; needed if the loop does not correct a wrong initial state.
+        progress: Callback for the progress of the steps.
 
     References:
         Ljung (1999), System identification, 4.3 and 10.2.
@@ -163,21 +163,21 @@ class OutputError(Estimator[Simulator]):
     ) -> Estimate:
         """Estimate the parameters.
 
-        Where the simulator's derivatives A are not those S of its residuals e, steps end where
-        A'e = 0, and errors are those of that equation, (A'S)^-1 A'e. A step leaves the share
-        1 - (A'A)^-1 A'S of what it should correct; ``details`` has the largest, ``left``.
+        If the simulator's derivatives A are approximate, with the exact ones S of its residuals e,
+        the steps converge to A'e = 0, and standard errors are those of (A'S)^-1 A'e. A step leaves
+        the share 1 - (A'A)^-1 A'S of the error; ``details["left"]`` has the largest one.
 
         Args:
-            data: What simulates.
+            data: The simulator.
             start: Initial values, shape (c,); the prior if None.
-            exact: The same with exact derivatives, if its own are not.
+            exact: The same simulator with exact derivatives, if its own are approximate.
 
         Raises:
             DataError: If there are fewer samples than parameters.
-            NotConvergedError: If it cannot be simulated where it begins.
+            NotConvergedError: If the simulation with the initial values fails.
         """
-        simulator, begin = data, data.prior if start is None else start
-        theta = np.maximum(np.array(begin, dtype=float), simulator.lowest)
+        simulator, initial = data, data.prior if start is None else start
+        theta = np.maximum(np.array(initial, dtype=float), simulator.lowest)
         found = self._left(simulator, theta)
         weights, rounds, count, converged = self._weigh(found), 0, 0, False
         for rounds in range(1, self.rounds + 1):
@@ -187,32 +187,32 @@ class OutputError(Estimator[Simulator]):
             )
             count += steps
             if exact is not None and not converged:
-                break  # what its steps leave, other weights would leave, too
+                break  # other weights would not help
             before, weights = weights, self._weigh(found)
             change = np.abs(weights.sigma / before.sigma - 1.0).max()
             if rounds > 1 and converged and max(change, _rho_change(before, weights)) < _SETTLED:
                 break
             converged = False
-        state = "settled" if converged else "not settled"
+        state = "converged" if converged else "not converged"
         message = f"{self.name}, {count} steps in {rounds} rounds, {state}"
         how = {"converged": converged, "n_iter": count, "message": message}
         return self._estimate(simulator, weights, theta, how, exact=exact)
 
     def weights(self, simulator: Simulator, theta: Array) -> "_Weights":
-        """Return correlation and level of the residuals, which they are weighed by.
+        """Return correlation and noise level of the residuals, their weights.
 
         Args:
-            simulator: What simulates.
+            simulator: The simulator.
             theta: Parameters, shape (c,).
         """
         return self._weigh(self._left(simulator, theta))
 
     def _left(self, simulator: Simulator, theta: Array) -> Sequence[Residual]:
-        """Return residuals without derivatives, but for those that free starts need."""
+        """Return residuals; with derivatives by the initial states only if these are free."""
         return simulator.residuals(theta, with_slopes=False, with_starts=self.frees)
 
     def _weigh(self, found: Sequence[Residual], *, frees: bool | None = None) -> "_Weights":
-        """Return correlation and level of residuals; of what better starts would leave."""
+        """Return correlation and noise level of residuals, with fitted initial states if free."""
         if self.frees if frees is None else frees:
             found = [replace(r, e=_freed(r)) for r in found]
         n = 1 + max(int(r.joints.max()) for r in found)
@@ -231,7 +231,7 @@ class OutputError(Estimator[Simulator]):
     def _cost(
         self, simulator: Simulator, weights: _Weights, theta: Array, found: Sequence[Residual]
     ) -> float:
-        """Return the cost of parameters that leave the residuals found."""
+        """Return the cost of parameters with the residuals ``found``."""
         cost = 0.0
         for r in found:
             b = weights.whiten(r.e, r.joints).reshape(-1)
@@ -242,24 +242,24 @@ class OutputError(Estimator[Simulator]):
         return cost if np.isfinite(cost) else np.inf
 
     def joint_step(self, simulator: Simulator, theta: Array) -> Array:
-        """Return the parameters after a step that moves them and the starts of windows together.
+        """Return the parameters after a step of them together with the windows' initial states.
 
         Args:
-            simulator: What simulates.
-            theta: Parameters that fit best with the starts as they are, shape (c,).
+            simulator: The simulator.
+            theta: Parameters of the best fit with fixed initial states, shape (c,).
         """
         H, g = self.normal(simulator, self.weights(simulator, theta), theta, frees=True)
         return _bounded_step(H, g, theta, simulator.lowest, _CAUTIOUS)
 
     def settle(self, simulator: Simulator, estimate: Estimate) -> Estimate:
-        """Return the estimate after a step that moves it and the starts of windows together.
+        """Return the estimate after a step of it together with the windows' initial states.
 
-        A fit with starts that stay ends where these bind it: they suit the noise as it was with
-        earlier parameters. The errors of an estimate are those of one whose starts are free.
+        With fixed initial states the fit is biased, because these were fitted with earlier
+        parameters. The standard errors of an estimate assume free initial states.
 
         Args:
-            simulator: What simulates, from starts that suit the estimate.
-            estimate: As of ``fit``, with exact derivatives.
+            simulator: The simulator, with initial states fitted for the estimate.
+            estimate: Result of ``fit``, with exact derivatives.
         """
         found = simulator.residuals(estimate.theta, with_slopes=True, with_starts=True)
         weights = self._weigh(found, frees=True)
@@ -267,16 +267,16 @@ class OutputError(Estimator[Simulator]):
         return self._estimate(simulator, weights, estimate.theta, how, found=found)
 
     def moved(self, simulator: Simulator, other: Simulator, theta: Array) -> tuple[Array, Array]:
-        """Return how far other residuals move the estimate, to first order, and its errors.
+        """Return the first-order change of the estimate for other residuals, and standard errors.
 
         Args:
-            simulator: What simulates.
-            other: The same with other residuals, as of smaller steps.
+            simulator: The simulator.
+            other: The same simulator with other residuals, as of a smaller integration step.
             theta: Parameters near the estimate, shape (c,).
 
         Returns:
-            Change of the parameters, and standard errors as if whitened residuals of ``other`` were
-            independent, both of shape (c,).
+            Change of the parameters, and standard errors for independent whitened residuals of
+            ``other``, both of shape (c,).
         """
         weights = self.weights(other, theta)
         (H, g), (_, changed) = (
@@ -296,10 +296,10 @@ class OutputError(Estimator[Simulator]):
         """Return H = A'A and A'b of the linearised problem, prior included.
 
         Args:
-            simulator: What simulates.
-            weights: As of ``weights``.
+            simulator: The simulator.
+            weights: As from ``weights``.
             theta: Parameters, shape (c,).
-            frees: Whether what starts of windows could do is taken out.
+            frees: Whether the effect of the windows' initial states is projected out.
         """
         return _summed(simulator, theta, linearised(simulator, weights, theta, frees=frees))
 
@@ -313,15 +313,15 @@ class OutputError(Estimator[Simulator]):
         *,
         is_exact: bool,
     ) -> tuple[Array, Sequence[Residual], int, bool]:
-        """Minimise with given weights from parameters that leave the residuals found.
+        """Minimise with fixed weights from parameters with the residuals ``found``.
 
-        Return where it ends, what is left there, its steps, and whether it settled.
+        Return the parameters, their residuals, the number of steps, and whether it converged.
         """
         damping, cost = _CAUTIOUS, self._cost(simulator, weights, theta, found)
         if not np.isfinite(cost):
             raise NotConvergedError(
-                "the loop cannot be simulated with the parameters that the fit begins with; state "
-                "gains nearer to the drive's in [controller]",
+                "the simulation of the closed loop with the initial values diverges; state gains "
+                "in [controller] that are closer to those of the drives",
                 "no start",
             )
         highest = 1.0 if is_exact else 1.0 + _UPHILL
@@ -335,14 +335,14 @@ class OutputError(Estimator[Simulator]):
                     left = self._left(simulator, trial)
                     new = self._cost(simulator, weights, trial, left)
                 except NotConvergedError:
-                    pass  # a step that leads there is too long
+                    pass  # the step is too long
                 if new < highest * cost or damping > _TOO_STIFF:
                     break
                 if is_exact and float(g @ (trial - theta)) < close * cost:
-                    break  # not even the linearised problem promises more
+                    break  # the predicted decrease is negligible
                 damping *= 6.0
             if not new < highest * cost:
-                return theta, found, step, True  # no step lowers it that would matter
+                return theta, found, step, True  # no step reduces the cost noticeably
             is_near = float(g @ (trial - theta)) < _NEAR
             decrease, theta, found, cost = (cost - new) / cost, trial, left, new
             damping = max(damping / 6.0, 1e-9)
@@ -360,9 +360,9 @@ class OutputError(Estimator[Simulator]):
         exact: Simulator | None = None,
         found: Sequence[Residual] | None = None,
     ) -> Estimate:
-        """Return the estimate, its errors from how much the scores of segments scatter.
+        """Return the estimate with standard errors from the scatter of the scores of segments.
 
-        With residuals found, it is that after a step of parameters and starts together.
+        With residuals ``found``, it is the estimate after a step with free initial states.
         """
         moves = found is not None
         if found is None:
@@ -371,7 +371,8 @@ class OutputError(Estimator[Simulator]):
         rows = sum(r.e.size for r in found)
         if rows < len(theta):
             raise DataError(
-                f"{rows} samples of position for {len(theta)} parameters; record a longer motion"
+                f"{rows} samples of position for {len(theta)} parameters, wanted at least as many "
+                "samples as parameters; record a longer motion"
             )
         H, g = _summed(simulator, theta, parts)
         change = np.zeros_like(theta)
@@ -393,9 +394,9 @@ class OutputError(Estimator[Simulator]):
             C = _cross(simulator, exact, weights, theta) + np.diag(known)
             left = float(np.abs(np.linalg.eigvals(np.eye(len(theta)) - bread @ C)).max())
             bread = np.linalg.inv(C)
-        # never better known than independent rows would make it
+        # standard errors are at least those for independent rows
         independent = np.diag(bread @ H @ bread.T)
-        gained = 1.0 - independent * known  # of each parameter's prior variance
+        gained = 1.0 - independent * known  # relative reduction of each prior variance
         undetermined = tuple(
             name for name, share in zip(simulator.names, gained, strict=True) if share < _LOST
         )
@@ -424,7 +425,7 @@ class OutputError(Estimator[Simulator]):
 def _summed(
     simulator: Simulator, theta: Array, parts: Iterable[tuple[Array, Array, Array]]
 ) -> tuple[Array, Array]:
-    """Return H = A'A and A'b of linearised rows, further ones and the prior included."""
+    """Return H = A'A and A'b of linearised rows, additional rows and the prior included."""
     tau = 1.0 / simulator.prior_std**2
     H, g = np.diag(tau), tau * (simulator.prior - theta)
     for A, b, columns in parts:
@@ -445,13 +446,13 @@ def _rho_change(before: _Weights, after: _Weights) -> float:
 def linearised(
     simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
 ) -> Iterable[tuple[Array, Array, Array]]:
-    """Yield rows A, b and their columns, whitened, window by window and part by part.
+    """Yield whitened rows A, b and the indices of their columns, window by window.
 
     Args:
-        simulator: What simulates.
-        weights: As of ``OutputError.weights``.
+        simulator: The simulator.
+        weights: As from ``OutputError.weights``.
         theta: Parameters, shape (c,).
-        frees: Whether what the start of a window could do is taken out of its rows.
+        frees: Whether the effect of a window's initial state is projected out of its rows.
     """
     found = simulator.residuals(theta, with_slopes=True, with_starts=frees)
     yield from _whitened(found, weights, frees=frees)
@@ -481,7 +482,7 @@ def _cross(simulator: Simulator, exact: Simulator, weights: _Weights, theta: Arr
 
 
 def _by_start(r: Residual, weights: _Weights) -> Array:
-    """Return an orthonormal basis of what the start of a window could do to its whitened rows."""
+    """Return an orthonormal basis of the effect of a window's initial state on whitened rows."""
     if r.by_start is None:
         return np.zeros((r.e[1:].size, 0))
     G = weights.whiten(r.by_start, r.joints).reshape(r.e[1:].size, -1)
@@ -491,7 +492,7 @@ def _by_start(r: Residual, weights: _Weights) -> Array:
 
 
 def _freed(r: Residual) -> Array:
-    """Return what a better start would leave of a residual, joints weighing by their size."""
+    """Return a residual after a fit of the initial state, joints weighted by their RMS residual."""
     if r.by_start is None:
         return r.e
     size = np.maximum(np.sqrt(np.mean(r.e**2, axis=0)), 1e-12)
@@ -503,12 +504,12 @@ def _freed(r: Residual) -> Array:
 
 def _given(r: Residual) -> Array:
     if r.slopes is None:
-        raise DataError("the simulator gave no derivatives")
+        raise DataError("the simulator returned no derivatives, wanted with_slopes=True")
     return r.slopes
 
 
 def _bounded_step(H: Array, g: Array, theta: Array, lowest: Array, damping: float) -> Array:
-    """Return where a damped step leads; parameters that it would push below a bound stay there."""
+    """Return the parameters after a damped step, limited to their lower bounds."""
     scale = 1.0 / np.sqrt(np.diag(H))
     H = H * np.outer(scale, scale) + damping * np.eye(len(H))  # its condition, not that of units
     free = (theta > lowest) | (g > 0)
@@ -530,8 +531,8 @@ def _segments(
 ) -> list[Factors]:
     """Return the factors of the whitened rows of c parameters, segment by segment.
 
-    Windows in which nothing takes back what drifts are segments as they are: what is wrong early
-    stays until their end.
+    With ``are_windows`` each window is about one segment: without feedback an early error persists
+    until the end of the window.
     """
     total = sum(len(b) for _, b, _ in found)
     segments: list[Factors] = []

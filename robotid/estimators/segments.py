@@ -1,7 +1,7 @@
-"""How much the scores of segments scatter: errors of least squares on coloured noise.
+"""Scatter of the scores of segments: standard errors of least squares with coloured noise.
 
-The score of a segment, W_s^T (tau_s - W_s theta), scatters as the noise makes it, whatever its
-colour, if the segment is longer than the correlation.
+The covariance of the score of a segment, W_s^T (tau_s - W_s theta), is that of the noise, whatever
+its colour, if the segment is longer than the correlation time.
 """
 
 from collections.abc import Sequence
@@ -16,22 +16,20 @@ from robotid.regressor.factors import Factors
 
 __all__ = ["FEWEST_SEGMENTS", "Scatter", "at_least", "quantile", "sandwich", "scatter"]
 
-#: Fewer segments do not show how much their scores scatter.
+#: Smallest number of segments for an estimate of the scatter.
 FEWEST_SEGMENTS = 12
-_OWN = 0.95  # leverage above which a segment fits a direction alone, and shows no scatter in it
+_OWN = 0.95  # leverage above which a segment determines a direction alone, without scatter
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """How much the scores of s segments scatter about zero, over c parameters."""
+    """Scatter of the scores of s segments about 0, for c parameters."""
 
     meat: Array  # (c, c), covariance of the score W^T S^-1 (tau - W theta) of all segments
     bread: Array  # (c, c), covariance of the parameters if rows were independent
     inflation: float  # mean ratio of the scatter to that of independent rows [-]
-    factors: (
-        Array  # (s, c, c), factors of the weighted rows of each segment, along its eigenvectors
-    )
-    adjusted: Array  # (s, c, c), the same behind the correction for their leverage
+    factors: Array  # (s, c, c), of the weighted rows of each segment, along its eigenvectors
+    adjusted: Array  # (s, c, c), the same after the correction for their leverage
 
     @property
     def covariance(self) -> Array:
@@ -50,18 +48,18 @@ class Scatter:
         back = np.einsum("sij,sil->lsj", R, loads, optimize=True)  # R_s^T a_s
         freedom = np.empty(len(bread))
         for k, Z in enumerate(back):
-            # of independent noise: covariances of the segments' contributions to the parameter
+            # covariances of the segments' contributions to the parameter for independent noise
             gram = np.diag((loads[:, :, k] ** 2).sum(axis=1)) - Z @ bread @ Z.T
             freedom[k] = np.trace(gram) ** 2 / max(float((gram**2).sum()), 1e-300)
         return np.maximum(freedom, 1.0)
 
 
 def scatter(segments: Sequence[Factors], theta: Array, sigma: Array, bread: Array) -> Scatter:
-    """Return how much the scores of segments scatter.
+    """Return the scatter of the scores of segments.
 
-    The residual of a segment that had a say in the fit is smaller than its noise; it is enlarged
-    by (I - leverage)^-1/2, which is exact for independent rows (known as CR2). Directions that one
-    segment alone determines show nothing; they get the mean scatter of all others.
+    The residual of a fitted segment is smaller than its noise. It is multiplied by
+    (I - leverage)^-1/2, which is exact for independent rows (CR2). Directions that one segment
+    alone determines have no scatter; the mean scatter of all others is used for them.
 
     Args:
         segments: Factors of contiguous segments, at least 12, each longer than the correlation of
@@ -79,37 +77,37 @@ def scatter(segments: Sequence[Factors], theta: Array, sigma: Array, bread: Arra
     """
     if len(segments) < FEWEST_SEGMENTS:
         raise DataError(
-            f"{len(segments)} segments do not show how much their scores scatter; wanted at "
-            f"least {FEWEST_SEGMENTS}: fit longer logs"
+            f"{len(segments)} segments are too few to estimate the scatter of their scores, wanted "
+            f"at least {FEWEST_SEGMENTS}; fit longer logs"
         )
     c = len(theta)
     meat, alone, along_squares, expected = np.zeros((c, c)), np.zeros((c, c)), 0.0, 0.0
-    turned, adjusted = np.empty((2, len(segments), c, c))
-    for k, segment in enumerate(segments):  # those of all together are far larger than a cache
+    rotated, adjusted = np.empty((2, len(segments), c, c))
+    for k, segment in enumerate(segments):  # one by one: all together are larger than a cache
         weighted = segment.weighted(sigma)
         R, u = weighted[:c, :c], weighted[:c, c] - weighted[:c, :c] @ theta
         leverage, V = np.linalg.eigh(R @ bread @ R.T)
-        kept = np.clip(1.0 - leverage, 0.0, 1.0)  # share of its own noise that a residual shows
-        gain = 1.0 / np.sqrt(np.maximum(kept, 1.0 - _OWN))
+        share = np.clip(1.0 - leverage, 0.0, 1.0)  # of the noise that is left in the residual
+        gain = 1.0 / np.sqrt(np.maximum(share, 1.0 - _OWN))
         along = gain * (V.T @ u)
-        # each eigenvector counts by the weight it has in the fit
+        # the weight of each eigenvector is its leverage
         along_squares += float(leverage @ along**2)
-        expected += float(leverage @ (gain**2 * kept))
-        np.matmul(V.T, R, out=turned[k])
-        np.multiply(gain[:, None], turned[k], out=adjusted[k])
-        score = along @ turned[k]
+        expected += float(leverage @ (gain**2 * share))
+        np.matmul(V.T, R, out=rotated[k])
+        np.multiply(gain[:, None], rotated[k], out=adjusted[k])
+        score = along @ rotated[k]
         meat += np.outer(score, score)
-        missing = np.sqrt(np.maximum(1.0 - gain**2 * kept, 0.0))[:, None] * turned[k]
+        missing = np.sqrt(np.maximum(1.0 - gain**2 * share, 0.0))[:, None] * rotated[k]
         alone += missing.T @ missing
     inflation = along_squares / expected
-    return Scatter(meat + inflation * alone, bread, inflation, turned, adjusted)
+    return Scatter(meat + inflation * alone, bread, inflation, rotated, adjusted)
 
 
 def sandwich(bread: Array, meat: Array) -> Array:
-    """Return the covariance bread meat bread^T of parameters whose score has a covariance.
+    """Return the covariance bread meat bread^T of parameters (sandwich estimate).
 
     Args:
-        bread: Derivative of the parameters by the score, shape (c, c).
+        bread: Derivative of the parameters with respect to the score, shape (c, c).
         meat: Covariance of the score, shape (c, c).
     """
     covariance: Array = bread @ meat @ bread.T
@@ -117,11 +115,11 @@ def sandwich(bread: Array, meat: Array) -> Array:
 
 
 def at_least(covariance: Array, variance: Array) -> Array:
-    """Return a covariance with variances of at least some size, correlations as they are.
+    """Return a covariance with lower bounds on its variances; correlations are unchanged.
 
     Args:
         covariance: Covariance, shape (c, c).
-        variance: The least variances, shape (c,).
+        variance: Lower bounds of the variances, shape (c,).
     """
     own = np.sqrt(np.diag(covariance))
     wider = np.maximum(own, np.sqrt(variance)) / own
@@ -130,10 +128,10 @@ def at_least(covariance: Array, variance: Array) -> Array:
 
 
 def quantile(freedom: Array) -> Array:
-    """Return how many standard errors a two-sided 95 % interval reaches, shape (c,).
+    """Return the half-width of two-sided 95 % intervals in standard errors, shape (c,).
 
     Args:
-        freedom: Degrees of freedom of each standard error, in Student's distribution, shape (c,).
+        freedom: Degrees of freedom of each standard error (Student's distribution), shape (c,).
     """
     quantiles: Array = scipy.special.stdtrit(freedom, 0.975)
     return quantiles

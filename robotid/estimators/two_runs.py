@@ -1,13 +1,13 @@
-"""Two runs of one robot that differ by what loads only one of them, or by gains nobody knows.
+"""Two runs of one robot, without and with a load, for payloads and unknown drive gains.
 
 Reference run   k_j i_j = W_j beta
 Loaded run      k_j i_j = W_j (beta + c + D x)
 
-with what is known of the difference in c, and what is not in x. W D needs no rows of its own: a
-body that is added has the columns of the link that it hangs on. A current i_j of unknown gain k_j
-is the only thing with noise, so it stands alone, i_j = W_j (...) / k_j: bilinear, solved by
-Gauss-Newton, whose step is one more column -W_j beta per gain. All of it runs on triangular
-factors, and all errors come from one covariance, that of the gains included.
+The difference of the runs has a known part c and an unknown part x. W D is computed from W: an
+added body has the regressor columns of the link to which it is attached. A current i_j of unknown
+gain k_j is the only noisy signal, so the equation is i_j = W_j (...) / k_j. It is bilinear and
+solved by Gauss-Newton steps, with one additional column -W_j beta per gain. Everything is computed
+from triangular factors, and all standard errors are from one covariance, which includes the gains.
 """
 
 from collections.abc import Sequence
@@ -25,26 +25,26 @@ from robotid.robot.parameters import ParameterLayout
 
 __all__ = ["Compared", "TwoRuns", "payload_runs"]
 
-_WIDE = 10.0  # plausible spreads about the URDF's values within which all is sought
-_FLOOR = 1e-7  # smallest noise level, as a share of the torque: noise-free data have none
-_LEAST_FREEDOM = 0.1  # share of the rows that are left to tell the noise
-_SINGULAR = 1e-12  # pivots of unit columns below this tell nothing
+_WIDE = 10.0  # factor of the prior standard deviations about the URDF's values
+_FLOOR = 1e-7  # smallest noise level over the torque, for noise-free data
+_LEAST_FREEDOM = 0.1  # smallest degrees of freedom of a noise level, as a share of the rows
+_SINGULAR = 1e-12  # pivot below which a column of unit norm is singular
 _STEPS = 50
-_SETTLED = 1e-9  # relative change of the gains
-_LONGEST = 1.0  # step of the logarithm of a gain
+_SETTLED = 1e-9  # relative change of the gains at convergence
+_LONGEST = 1.0  # largest step of the logarithm of a gain
 
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """What two runs tell.
+    """Result of the comparison of two runs.
 
     Attributes:
         theta: beta and x, shape (b + d,), SI units.
-        gain: Gain k of each joint's signal, shape (n,) [N m/A]; 1 of a torque.
+        gain: Gain k of each joint's signal, shape (n,) [N m/A]; 1 for a torque.
         covariance: Covariance of beta, x and the logarithms of the u unknown gains,
             shape (b + d + u, b + d + u).
         freedom: Degrees of freedom of their standard errors, shape (b + d + u,).
-        unexplained: Share of each joint's torque that is left, shape (n,) [-].
+        unexplained: Residual of each joint over its torque, shape (n,) [-].
     """
 
     theta: Array
@@ -56,16 +56,16 @@ class Compared:
 
 @dataclass(frozen=True, eq=False)
 class TwoRuns:
-    """Factors of two runs and what is known of their difference.
+    """Factors of two runs, and the prior of their difference.
 
     Attributes:
         reference: Factors of the segments of the reference run, of b base parameters.
-        loaded: Those of the loaded run.
+        loaded: Factors of the segments of the loaded run.
         D: Columns of the difference in base parameters, shape (b, d).
         known: Known part c of the difference, shape (b,).
-        mean: Plausible value of beta and x before the data, shape (b + d,).
-        precision: Its inverse covariance, shape (b + d, b + d), positive definite.
-        share: Share of the rows that count as independent [-].
+        mean: Prior mean of beta and x, shape (b + d,).
+        precision: Prior precision (inverse covariance), shape (b + d, b + d), positive definite.
+        share: Share of independent rows [-].
         unknown: Joints whose gain is unknown, shape (u,), int.
     """
 
@@ -79,22 +79,22 @@ class TwoRuns:
     unknown: Array
 
     def compare(self, *, by_joint: bool = True) -> Compared:
-        """Fit both runs at once, and the unknown gains with them.
+        """Fit both runs and the unknown gains together.
 
-        Standard errors come from the scatter of the scores of segments and of joints, and are at
-        least those of rows that are independent by ``share``; of fewer than 12 segments, they are
-        these.
+        Standard errors are from the scatter of the scores of segments and of joints, and are at
+        least those for a ``share`` of independent rows. With fewer than 12 segments the latter are
+        used.
 
         Args:
-            by_joint: Whether errors count what the joints of each run disagree about, too.
+            by_joint: Whether standard errors include the scatter between joints of each run.
 
         Raises:
-            NotConvergedError: If the gains do not settle.
+            NotConvergedError: If the gains do not converge.
 
         References:
             Gautier, Briot (2014), Global identification of joint drive gains and dynamic parameters
-            of robots, Journal of Dynamic Systems, Measurement, and Control 136, section 3, whose
-            total least squares this replaces.
+            of robots, Journal of Dynamic Systems, Measurement, and Control 136, section 3, which
+            uses total least squares instead.
         """
         size, u = len(self.mean), len(self.unknown)
         gain = self._first_gains()
@@ -108,8 +108,9 @@ class TwoRuns:
             gain[self.unknown] *= np.exp(step)
         else:
             raise NotConvergedError(
-                f"the gains still change by {np.abs(step).max():.1e} after {_STEPS} steps; record "
-                "richer motions of both runs, or state some of the gains",
+                f"the gains have not converged: relative change {np.abs(step).max():.1e} after "
+                f"{_STEPS} steps, wanted less than {_SETTLED:g}; record motions with more "
+                "excitation in both runs, or state some of the gains",
                 "max_iterations",
             )
         covariance, freedom = self._errors(gain, at, solution, bread, by_joint)
@@ -118,26 +119,27 @@ class TwoRuns:
         return Compared(theta, gain, covariance, freedom, np.sqrt(squares) / torque)
 
     def alike(self, gain: Array | None = None) -> tuple[Array, Array]:
-        """Return beta and x as all rows that are independent by ``share`` have them.
+        """Return beta and x for a ``share`` of independent rows.
 
         Args:
             gain: Gains, shape (n,); None: 1.
 
         Returns:
-            beta and x, shape (b + d,), and their covariance, whose variances are at most those of
+            beta and x, shape (b + d,), and their covariance; its variances are at most those of
             ``compare``.
         """
         gain = np.ones(len(self._logged.rows)) if gain is None else gain
         return self._minimum(self._both(gain), self._level(gain))
 
-    def held_together(self, theta: Array) -> Array:
-        """Return what the runs leave together over what each joint leaves by itself, shape (n,).
+    def residual_ratios(self, theta: Array) -> Array:
+        """Return the joint residual of both runs over that of separate fits, shape (n,) [-].
 
         Args:
             theta: beta and x, shape (b + d,), of runs without unknown gains.
 
         Returns:
-            Ratios of sums of squares, at least 1: far more where the runs differ by something else.
+            Ratios of sums of squares, at least 1. They are large if the runs differ by something
+            other than x.
         """
         b = len(self.known)
         without, loaded = self._whole
@@ -146,47 +148,49 @@ class TwoRuns:
         ratio: Array = together / np.maximum(self._own_squares, 1e-300)
         return ratio
 
-    def held_by_scales(self, kept: int) -> Array:
-        """Return the same if not x, but another scale of torques makes the loaded run another one.
+    def residual_ratios_by_scales(self, free: int) -> Array:
+        """Return these ratios if the runs differ by the scale of torques instead of x.
 
         Args:
-            kept: Number of the first unknowns of x that may differ nevertheless.
+            free: Number of the first elements of x that may differ in addition.
 
         Returns:
-            The ratios with one scale of all torques, or with one of each, whichever are less.
+            The ratios with one scale for all torques or with one per joint, whichever have the
+            smaller mean.
         """
         (without, loaded), size = self._whole, len(self.known)
         one = np.ones(len(without.rows))
         beta = self._minimum(self._extended(without, 0, one, None), self._level(one))[0][:size]
-        explained = np.column_stack([self.D[:, :kept], beta])
-        end = size + kept
-        unsure = scipy.linalg.block_diag(self.precision[:end, :end], 1.0)
-        scaled = replace(self, D=explained, mean=np.append(self.mean[:end], 0.0), precision=unsure)
+        explained = np.column_stack([self.D[:, :free], beta])
+        end = size + free
+        precision = scipy.linalg.block_diag(self.precision[:end, :end], 1.0)
+        mean = np.append(self.mean[:end], 0.0)
+        scaled = replace(self, D=explained, mean=mean, precision=precision)
         left = without.residual_squares(beta)
         for j, (R, own) in enumerate(zip(loaded.triangles, loaded.columns, strict=True)):
             A = R[:, :-1] @ explained[own]
             left[j] += np.sum((R[:, -1] - A @ np.linalg.lstsq(A, R[:, -1], rcond=None)[0]) ** 2)
         of_each: Array = left / np.maximum(self._own_squares, 1e-300)
-        return min(scaled.held_together(scaled.compare().theta), of_each, key=np.mean)
+        return min(scaled.residual_ratios(scaled.compare().theta), of_each, key=np.mean)
 
     def _level(self, gain: Array) -> Array:
-        """Return noise levels that make all rows count as independent, shape (n,) [N m or N]."""
+        """Return noise levels for rows treated as independent, shape (n,) [N m or N]."""
         level: Array = np.abs(gain) * self._noise / np.sqrt(self.share)
         return level
 
     @cached_property
     def _whole(self) -> tuple[Factors, Factors]:
-        """Factors of all of the reference, and of all of the loaded run."""
+        """Factors of the whole reference run, and of the whole loaded run."""
         return merge(self.reference), merge(self.loaded)
 
     @cached_property
     def _logged(self) -> Factors:
-        """Factors of all rows as if the runs were one."""
+        """Factors of all rows of both runs together."""
         return merge(self._whole)
 
     @cached_property
     def _own_squares(self) -> Array:
-        """Squares that the parameters of each joint's own, in each run, would leave, shape (n,)."""
+        """Residual sums of squares of separate fits for each joint and run, shape (n,)."""
         own: Array = np.sum(
             [[R[-1, -1] ** 2 for R in run.triangles] for run in self._whole], axis=0
         )
@@ -194,23 +198,23 @@ class TwoRuns:
 
     @cached_property
     def _noise(self) -> Array:
-        """Noise of each joint's signal, shape (n,), never quite zero.
+        """Noise level of each joint's signal, shape (n,), above 0.
 
-        A joint that rests but for a few rows leaves nothing, whatever its noise: all of its signal
-        counts as noise then.
+        If a joint moves in a few rows only, its residual is 0 whatever its noise; its RMS signal is
+        used then.
         """
         rows = np.maximum(self._logged.rows, 1)
-        spent = len(self._whole) * np.array([len(own) for own in self._logged.columns])
-        freedom = np.maximum(rows - spent / self.share, _LEAST_FREEDOM * rows)
+        used = len(self._whole) * np.array([len(own) for own in self._logged.columns])
+        freedom = np.maximum(rows - used / self.share, _LEAST_FREEDOM * rows)
         signal = np.sqrt(self._logged.torque_squares() / rows)
-        left = np.where(self.share * rows > spent, np.sqrt(self._own_squares / freedom), signal)
+        left = np.where(self.share * rows > used, np.sqrt(self._own_squares / freedom), signal)
         noise: Array = np.maximum(left, _FLOOR * signal)
         return np.where(noise > 0, noise, 1.0)
 
     def _first_gains(self) -> Array:
-        """Return gains to start from, shape (n,): least squares of k i - W (beta + D x) = W c.
+        """Return initial gains, shape (n,): least squares of k i - W (beta + D x) = W c.
 
-        Noise of the currents pulls them towards 0 a little.
+        Noise of the currents biases them slightly towards 0.
         """
         gain = np.ones(len(self._logged.rows))
         if len(self.unknown):
@@ -232,8 +236,8 @@ class TwoRuns:
             run: Factors of rows of one run, base parameters.
             loaded: 1 of the loaded run, 0 of the reference.
             gain: Gains, shape (n,).
-            at: Parameters beta and x that the gains' columns -W (beta + c + D x) are taken at,
-                shape (b + d,); None for no such columns.
+            at: Parameters beta and x of the gains' columns -W (beta + c + D x), shape (b + d,);
+                None: no such columns.
             is_start: Whether the gains' columns are -i instead.
         """
         S, c = np.hstack([np.eye(len(self.known)), loaded * self.D]), loaded * self.known
@@ -241,21 +245,21 @@ class TwoRuns:
         added = range(S.shape[1] - len(S) + len(unknown))
         triangles, columns = [], []
         for j, (R, own) in enumerate(zip(run.triangles, run.columns, strict=True)):
-            kept = np.flatnonzero(S[own].any(axis=0))
+            used = np.flatnonzero(S[own].any(axis=0))
             W, known, torque = R[:, :-1] @ S[own], R[:, :-1] @ c[own], gain[j] * R[:, -1]
-            rows = W[:, kept]
+            rows = W[:, used]
             if j in unknown:
-                kept = np.append(kept, S.shape[1] + unknown.index(j))
+                used = np.append(used, S.shape[1] + unknown.index(j))
                 column = -torque if at is None else -(W @ at + known)
                 rows = np.column_stack([rows, column])
                 torque = 0.0 * torque if at is None else torque
             triangles.append(triangle_of(np.column_stack([rows, torque - known])))
-            columns.append(kept)
+            columns.append(used)
         names = (*run.names, *map(str, added))
         return Factors(tuple(triangles), tuple(columns), run.rows, names)
 
     def _minimum(self, whole: Factors, sigma: Array) -> tuple[Array, Array]:
-        """Return the minimum with the prior beside the rows, and the inverse information."""
+        """Return the minimum of rows and prior, and the inverse information."""
         rows, size = whole.weighted(sigma), len(self.mean)
         root = np.zeros((size, rows.shape[1]))
         root[:, :size] = scipy.linalg.cholesky(self.precision)
@@ -266,8 +270,9 @@ class TwoRuns:
         R = triangle_of(np.column_stack([stacked[:, :-1] / scale, stacked[:, -1]]))
         if len(self.unknown) and np.abs(np.diag(R)[:-1]).min() < _SINGULAR:
             raise DataError(
-                "the runs do not tell every unknown gain: a joint's current is 0 or constant, or "
-                "nothing ties it to a joint of known gain or to the known mass; state its gain"
+                "an unknown gain is not identifiable: the current of a joint is 0 or constant, or "
+                "it is not coupled to a joint of known gain or to the known mass; state the gain "
+                "of this joint"
             )
         inverse = np.linalg.inv(R[:-1, :-1]) / scale[:, None]
         return inverse @ R[:-1, -1], inverse @ inverse.T
@@ -275,12 +280,12 @@ class TwoRuns:
     def _errors(
         self, gain: Array, at: Array | None, solution: Array, bread: Array, by_joint: bool
     ) -> tuple[Array, Array]:
-        """Return covariance and degrees of freedom; the prior adds its own uncertainty.
+        """Return covariance and degrees of freedom, including the uncertainty of the prior.
 
-        Scores are compared segment by segment, which shows what changes with time, and joint by
-        joint of each run, which shows what does not: a gain, friction of the day. Of a parameter
-        the larger error counts. Few parts scatter less than they should by chance: it is never
-        less than noise would make it.
+        The scatter between segments includes errors that vary with time. The scatter between the
+        joints of each run includes constant errors, as those of a gain or of friction. The larger
+        standard error of a parameter is used. The scatter of few parts may be too small, so a
+        standard error is at least that of independent noise.
         """
         if len(self.reference) + len(self.loaded) < FEWEST_SEGMENTS:
             return bread, np.full(len(solution), np.inf)
@@ -298,16 +303,16 @@ class TwoRuns:
     def _scattered(
         self, parts: Sequence[Factors], gain: Array, solution: Array, bread: Array
     ) -> tuple[Array, Array]:
-        """Return covariance and degrees of freedom by the scores of some parts of the rows."""
-        apart, size = self.share * bread, len(self.mean)
-        found = scatter(parts, solution, np.abs(gain) * self._noise, apart)
+        """Return covariance and degrees of freedom from the scores of parts of the rows."""
+        own, size = self.share * bread, len(self.mean)
+        found = scatter(parts, solution, np.abs(gain) * self._noise, own)
         meat = self.share**2 * found.meat
         meat[:size, :size] += self.precision
-        return sandwich(bread, meat), replace(found, bread=apart).freedom()
+        return sandwich(bread, meat), replace(found, bread=own).freedom()
 
 
 def _of_joint(factors: Factors, joint: int) -> Factors:
-    """Return the rows of one joint alone."""
+    """Return the factors with the rows of one joint only."""
     triangles = [R if j == joint else 0.0 * R for j, R in enumerate(factors.triangles)]
     rows = np.where(np.arange(len(factors.rows)) == joint, factors.rows, 0)
     return replace(factors, triangles=tuple(triangles), rows=rows)
@@ -325,22 +330,22 @@ def payload_runs(
     share: float,
     unknown: Sequence[int] = (),
 ) -> TwoRuns:
-    """Return two runs of which the loaded one carries payloads.
+    """Return the comparison of a run without and a run with payloads.
 
-    They share the robot's inertias, not friction and offsets of the drives, which change with load
-    and temperature.
+    The robot's inertias are the same in both runs. Friction and offsets of the drives differ,
+    because they change with load and temperature.
 
     Args:
         reference: The segments of the run without payloads.
-        loaded: Those of the run with them.
+        loaded: The segments of the run with payloads.
         layout: The robot's standard parameters.
         K: Map to the base parameters, shape (b, p).
         urdf: Standard parameters of the URDF, shape (p,).
-        spread: How far they may plausibly be wrong, shape (p,).
-        payloads: What the parameters of the payloads add to the base parameters, shape (b, c);
-            the parameters that are known, NaN where not, shape (c,); and how large each may be,
-            shape (c,).
-        share: Share of the rows that count as independent [-].
+        spread: Their prior standard deviations, shape (p,).
+        payloads: Map from the payloads' parameters to the base parameters, shape (b, c); known
+            values of the parameters, NaN if unknown, shape (c,); and their plausible sizes, shape
+            (c,).
+        share: Share of independent rows [-].
         unknown: Joints whose torque is a current of unknown gain.
     """
     columns, known, size = payloads

@@ -315,7 +315,9 @@ def _consistency(found: Identified) -> dict[str, Any]:
 def _band(identification: Identification, evaluation: Evaluation) -> dict[str, Any]:
     """Return the 95 % band of the predicted torque: its half width, and its coverage."""
     recording, band = evaluation.recording, identification.band(evaluation)
-    covered = band.held(recording.trajectory.tau, evaluation.torques["estimate"], recording.mask)
+    covered = band.coverage(
+        recording.trajectory.tau, evaluation.torques["estimate"], recording.mask
+    )
     return {
         row: {
             "half_width": float(QUANTILE * np.sqrt(np.mean(total**2))),

@@ -1,4 +1,4 @@
-"""How far predicted torques can be trusted: their bands from the covariance of the parameters."""
+"""Uncertainty bands of predicted torques and friction, from the covariance of the parameters."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -37,12 +37,12 @@ __all__ = [
     "typical_friction",
 ]
 
-#: Standard deviations that a 95 % band reaches.
+#: Half-width of a 95 % band in standard deviations.
 QUANTILE = 1.96
-_HELD = 0.95
-_ROUNDING = 1e-9  # of a band, by which a row on its edge may lie beyond it
-_SPEEDS = 20  # of a friction curve, either way
-_MOST = 500  # samples that a band is computed at, spread over the trajectory
+_COVERAGE = 0.95
+_ROUNDING = 1e-9  # relative tolerance for a row on the edge of the band
+_SPEEDS = 20  # points of a friction curve in each direction
+_MOST = 500  # largest number of samples at which a band is computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +50,9 @@ class TorqueBand:
     """Standard deviations of predicted torques at some samples of a trajectory.
 
     Attributes:
-        samples: Numbers of these samples, shape (k,), int.
-        parameters: From the uncertainty of the parameters, shape (k, n_rows) [N m, N].
-        noise: From what the model leaves of the torque beside it, shape (n_rows,) [N m, N].
+        samples: Indices of these samples, shape (k,), int.
+        parameters: Part due to the uncertainty of the parameters, shape (k, n_rows) [N m, N].
+        noise: Part due to the residual of the model, shape (n_rows,) [N m, N].
     """
 
     samples: Array
@@ -61,23 +61,26 @@ class TorqueBand:
 
     @property
     def total(self) -> Array:
-        """Standard deviation of a measured torque about its prediction, shape (k, n_rows)."""
+        """Standard deviation of measured torque minus prediction, shape (k, n_rows) [N m, N]."""
         return np.asarray(np.hypot(self.parameters, self.noise))
 
-    def held(self, tau: Array, prediction: Array, mask: Array) -> Array:
-        """Return which share of each joint's torques lies in the 95 % band; NaN without a row.
+    def coverage(self, tau: Array, prediction: Array, mask: Array) -> Array:
+        """Return the share of each joint's torques in the 95 % band, shape (n_rows,) [-].
 
         Args:
             tau: Measured torques of the whole trajectory, shape (N, n_rows) [N m, N].
-            prediction: Predicted ones, shape (N, n_rows) [N m, N].
+            prediction: Predicted torques, shape (N, n_rows) [N m, N].
             mask: Rows used, shape (N, n_rows), bool.
+
+        Returns:
+            The shares; NaN for a joint without rows.
         """
         used = mask[self.samples]
-        miss = np.abs(tau[self.samples] - prediction[self.samples])
-        # one of the rows that set the band may lie on its edge
-        is_held = (miss <= (1.0 + _ROUNDING) * QUANTILE * self.total) & used
+        error = np.abs(tau[self.samples] - prediction[self.samples])
+        # a row that determines the band may lie on its edge
+        is_inside = (error <= (1.0 + _ROUNDING) * QUANTILE * self.total) & used
         count = used.sum(axis=0)
-        return np.where(count > 0, is_held.sum(axis=0) / np.maximum(count, 1), np.nan)
+        return np.where(count > 0, is_inside.sum(axis=0) / np.maximum(count, 1), np.nan)
 
 
 def torque_band(
@@ -90,16 +93,17 @@ def torque_band(
 ) -> TorqueBand:
     """Return the band of predicted torques, at up to 500 samples.
 
-    Its variance is diag(W C W^T) + sum (W x + z)^2 for what errs at once in base parameters, by x,
-    and in torque, by z.
+    Its variance is diag(W C W^T) + sum (W x + z)^2. Each pair (x, z) is an error that changes the
+    base parameters by x and, together with them, the torque by z.
 
     Args:
         model: The robot.
         mapping: Standard to base parameters.
         trajectory: N samples.
-        covariance: Of the base parameters, shape (b, b), finite.
-        noise: Standard deviation of the torque's residual, shape (n_rows,) [N m, N].
-        errors: Pairs x, shape (b,), and z, shape (k, n_rows), at k samples of the trajectory.
+        covariance: Covariance of the base parameters, shape (b, b), finite.
+        noise: Standard deviation of the torque residual, shape (n_rows,) [N m, N].
+        errors: Function of k sample indices that returns the pairs x, shape (b,), and z, shape
+            (k, n_rows).
     """
     count = len(trajectory.t)
     samples = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int))
@@ -112,7 +116,7 @@ def torque_band(
 
 
 def expected_band(found: "Fit", evaluation: "Evaluation") -> TorqueBand:
-    """Return the band of a recording's torque by the noise of the fit, without its residual.
+    """Return the torque band of a recording by the fit's noise level, not by its own residual.
 
     Args:
         found: The fit.
@@ -130,12 +134,12 @@ def expected_band(found: "Fit", evaluation: "Evaluation") -> TorqueBand:
 
 
 def recording_bands(found: "Fit") -> tuple[TorqueBand, ...]:
-    """Return the band of each recording, fitted ones first, as their residuals show them.
+    """Return the torque band of each recording from its residuals, fitted recordings first.
 
-    Beside the parameters' part a band has the noise with which it holds 95 % of the torques of all
-    recordings of its kind, fitted or kept: of kept ones that is what the model misses of motion it
-    has not seen, and a new motion is held as these are (split conformal prediction, Lei et al.
-    2018, doi:10.1080/01621459.2017.1307116, with the parameters' part as the lower end).
+    The noise part is chosen so that the bands contain 95 % of the torques of all recordings of the
+    same kind, fitted or validation. For validation recordings it is the prediction error on new
+    motion, and the band covers further motions as it covers these (split conformal prediction, Lei
+    et al. 2018, doi:10.1080/01621459.2017.1307116, with the parameters' part as the lower bound).
 
     Args:
         found: The fit.
@@ -152,7 +156,7 @@ def recording_bands(found: "Fit") -> tuple[TorqueBand, ...]:
 
 
 def _residual_noise(own: Sequence[tuple[TorqueBand, "Evaluation"]]) -> Array:
-    """Return the noise with which bands hold 95 % of what they predict, shape (n_rows,)."""
+    """Return the noise with which bands contain 95 % of the torques, shape (n_rows,) [N m, N]."""
     noise = own[0][0].noise.copy()
     rows = []
     for band, e in own:
@@ -162,19 +166,19 @@ def _residual_noise(own: Sequence[tuple[TorqueBand, "Evaluation"]]) -> Array:
     needed = (residual / QUANTILE) ** 2 - std**2
     for j, used in enumerate(mask.T.astype(bool)):
         if used.any():
-            noise[j] = np.sqrt(max(np.quantile(needed[used, j], _HELD), 0.0))
+            noise[j] = np.sqrt(max(np.quantile(needed[used, j], _COVERAGE), 0.0))
     return noise
 
 
 @dataclass(frozen=True, eq=False)
 class FrictionCurve:
-    """Friction and offset of a drive while it moves steadily.
+    """Friction and offset of a drive at constant speed.
 
     Attributes:
         v: Speeds, shape (k,) [rad/s or m/s].
-        torque: Friction and offset there, shape (k,) [N m or N].
-        std: Its standard deviation from the uncertainty of the parameters, shape (k,).
-        load: Torque of the bodies that the gear carries meanwhile [N m or N].
+        torque: Friction plus offset, shape (k,) [N m or N].
+        std: Standard deviation due to the uncertainty of the parameters, shape (k,) [N m or N].
+        load: Joint load torque at which the friction is evaluated [N m or N].
     """
 
     v: Array
@@ -186,7 +190,7 @@ class FrictionCurve:
         rows = zip(self.v.tolist(), self.torque.tolist(), self.half_width.tolist(), strict=True)
         return "\n".join(
             [
-                f"friction and offset against speed, gear loaded by {self.load:.3g}",
+                f"friction and offset against speed, joint load torque {self.load:.3g}",
                 f"{'speed':>10} {'torque':>10} {'95 %':>9}",
                 *(f"{v:10.4g} {torque:10.4g} +-{half:7.2g}" for v, torque, half in rows),
             ]
@@ -199,7 +203,7 @@ class FrictionCurve:
 
     @property
     def half_width(self) -> Array:
-        """Half the width of the 95 % band about the torque, shape (k,) [N m or N]."""
+        """Half-width of the 95 % band, shape (k,) [N m or N]."""
         return QUANTILE * self.std
 
     def to_dict(self) -> dict[str, Any]:
@@ -220,18 +224,20 @@ def typical_friction(
     q: float | None = None,
     load: float | None = None,
 ) -> FrictionCurve:
-    """Return friction and offset of a drive as it was in the fitted logs; see ``friction_curve``.
+    """Return friction and offset of a drive under the conditions of the fitted logs.
+
+    See ``friction_curve``.
 
     Args:
         found: The fit.
-        joint: The joint that the drive turns, or the name of a coupling.
-        v: Speeds, shape (k,) [rad/s or m/s]; None: 20 either way, from the slowest to the fastest.
+        joint: The joint of the drive, or the name of a coupling.
+        v: Speeds, shape (k,) [rad/s or m/s]; None: 20 in each direction, from the slowest to the
+            fastest speed of the fitted rows.
         q: Position [rad or m]; None: the median.
-        load: Torque of the bodies that the gear carries [N m or N]; None: its root mean square if
-            the friction grows with it, else 0.
+        load: Joint load torque [N m or N]; None: its RMS if the friction depends on it, else 0.
 
     Raises:
-        DataError: If there is no such drive; or without speeds, if it was at rest.
+        DataError: If there is no such drive, or no speeds are given and the drive was at rest.
     """
     layout, d = found.model.layout, _drive_number(found, joint)
     ratios, first = layout.drive_ratios[d], found.model.n_rows - len(found.model.joints)
@@ -239,25 +245,25 @@ def typical_friction(
     motions = [e.recording.trajectory for e in found.fitted]
     for name, value in (("q", q), ("load", load)):
         if not (value is None or is_number(value)):
-            raise DataError(f"{name} is {str(value)[:60]!r}, wanted a finite number, or none")
+            raise DataError(f"{name} is {str(value)[:60]!r}, wanted a finite number or None")
     if v is None:
         used = zip(motions, rows, strict=True)
-        speeds = np.concatenate([np.abs(m.v[kept, first:] @ ratios) for m, kept in used])
+        speeds = np.concatenate([np.abs(m.v[is_used, first:] @ ratios) for m, is_used in used])
         if not speeds.any():
             raise DataError(
-                f"{joint} was at rest in the fitted logs, so no speeds are known to show its "
-                "friction at; state them, friction(joint, v)"
+                f"{joint} was at rest in the fitted logs, so the range of speeds is not known; "
+                "state the speeds: friction(joint, v)"
             )
         side = np.linspace(speeds.min(), speeds.max(), _SPEEDS)
         v = np.append(-side[::-1], side)
     if q is None:
-        places = [m.q[kept] @ ratios for m, kept in zip(motions, rows, strict=True)]
-        q = float(np.median(np.concatenate(places))) if np.any(np.concatenate(rows)) else 0.0
+        positions = [m.q[is_used] @ ratios for m, is_used in zip(motions, rows, strict=True)]
+        q = float(np.median(np.concatenate(positions))) if np.any(np.concatenate(rows)) else 0.0
     if load is None:
         load = 0.0
         if any(term.name == "load" for term in layout.own.get(joint, ())):
-            carried = [drive_motion_along(found.model, m).load[d] for m in motions]
-            load = float(np.sqrt(np.mean(np.concatenate(carried)[np.concatenate(rows)] ** 2)))
+            loads = [drive_motion_along(found.model, m).load[d] for m in motions]
+            load = float(np.sqrt(np.mean(np.concatenate(loads)[np.concatenate(rows)] ** 2)))
     speeds = real_numbers(v, "v")
     if speeds.ndim != 1 or not np.isfinite(speeds).all():
         raise DataError(f"v has shape {speeds.shape}, wanted finite speeds, shape (k,)")
@@ -265,7 +271,7 @@ def typical_friction(
 
 
 def fitted_moments(found: "Fit") -> dict[str, DriveMoments]:
-    """Return what projects the friction of drives on simpler terms, from the fitted rows.
+    """Return the moments that project drive friction on simpler terms, from the fitted rows.
 
     Args:
         found: The fit.
@@ -279,14 +285,14 @@ def friction_curve(
 ) -> FrictionCurve:
     """Return friction and offset of a drive against its speed, with the band of its parameters.
 
-    Friction that depends on the past is that of a drive which has moved one way for long.
+    Friction terms with an internal state have their value after long motion in one direction.
 
     Args:
         found: The fit.
-        joint: The joint that the drive turns, or the name of a coupling.
+        joint: The joint of the drive, or the name of a coupling.
         v: Speeds, shape (k,) [rad/s or m/s].
-        q: Position, of which some friction depends [rad or m].
-        load: Torque of the bodies that the gear carries [N m or N].
+        q: Position, for friction that depends on it [rad or m].
+        load: Joint load torque, for friction that depends on it [N m or N].
 
     Raises:
         DataError: If there is no such drive.
@@ -305,14 +311,14 @@ def friction_curve(
     C = found.standard_covariance[np.ix_(k, k)] - moves.T @ moves
     variance = np.einsum("ij,jk,ik->i", X, C, X)
     for term, moved in zip(found.open_terms, moves @ X.T, strict=True):
-        if term.joint == joint:  # its own torque adds to what it moves
+        if term.joint == joint:  # the term's own torque adds to the change of the parameters
             moved = moved + term.torque(motion, JointMotion.steady(motion))
         variance += moved**2
     return FrictionCurve(v, X @ found.standard[k], np.sqrt(np.maximum(variance, 0.0)), load)
 
 
 def _drive_number(found: "Fit", joint: str) -> int:
-    require_kind(joint, str, "joint", "the name of a joint, or of a coupling")
+    require_kind(joint, str, "joint", "the name of a joint or of a coupling")
     names = [drive.name for drive in found.model.layout.drives]
     if joint not in names:
         raise DataError(

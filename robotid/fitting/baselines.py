@@ -1,4 +1,4 @@
-"""What an identification must beat: the URDF's bodies with drives that are fitted to the logs."""
+"""The baseline of an identification: the URDF's bodies with drives fitted to the logs."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ __all__ = ["urdf_with_drives"]
 def urdf_with_drives(
     model: RobotModel, mapping: BaseMapping, factors: Factors, sigma: Array, spread: Array
 ) -> Array:
-    """Return the URDF's inertial parameters with the drive terms that fit best, shape (p,).
+    """Return the URDF's inertial parameters with fitted drive terms, shape (p,).
 
     Weighted least squares of the drive terms d >= 0 (offsets of either sign) with the bodies' pi_I
     as in the URDF: min sum_j |R_j K_I pi_I + R_j K_D d - tau_j|^2 / sigma_j^2.
@@ -21,9 +21,9 @@ def urdf_with_drives(
     Args:
         model: The robot, with the URDF's parameters.
         mapping: Standard to base parameters.
-        factors: What the fitted rows come down to, base parameters.
+        factors: Triangular factors of the fitted rows, base parameters.
         sigma: Noise level per joint, shape (n,) [N m or N].
-        spread: How far each standard parameter may plausibly be wrong, shape (p,): its scale.
+        spread: Prior standard deviation of each standard parameter, shape (p,); its scale.
     """
     from scipy.optimize import lsq_linear
 

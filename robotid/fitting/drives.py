@@ -1,4 +1,4 @@
-"""The terms that the drive of a joint was found to have, and their shapes."""
+"""The friction and other terms selected for the drive of a joint, and their shape parameters."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -11,18 +11,18 @@ from robotid.robot.drives import FAMILIES, DriveTerm, Family
 
 __all__ = ["DriveChoice", "FoundShape", "Tried", "with_shapes"]
 
-_FARTHEST = 1.33  # times that a shape grows or shrinks at once
+_FARTHEST = 1.33  # largest factor by which a shape parameter changes in one step
 
 
 @dataclass(frozen=True)
 class Tried:
-    """Terms of a joint that were tried.
+    """A set of drive terms that was tried for a joint.
 
     Attributes:
-        families: Names of what was tried beside viscous and Coulomb friction.
-        held_out_error_pct: Residual of held-out segments over the torque [%].
-        p_value: How likely held-out segments gain that much by chance [-]; 1 without a gain.
-        is_selected: Whether it was taken.
+        families: Names of the families in addition to viscous and Coulomb friction.
+        held_out_error_pct: Residual of the held-out segments, relative to the torque [%].
+        p_value: p-value of the reduction of the held-out residual [-]; 1 without a reduction.
+        is_selected: Whether it was selected.
     """
 
     families: tuple[str, ...]
@@ -33,14 +33,14 @@ class Tried:
 
 @dataclass(frozen=True)
 class FoundShape:
-    """A shape that was found.
+    """An identified shape parameter of a friction term.
 
     Attributes:
-        name: Which one, as ``stribeck.speed``.
-        value: Its value.
-        std_error: Its standard error.
+        name: Its name, as ``stribeck.speed``.
+        value: Its value [unit].
+        std_error: Its standard error [unit].
         unit: Its unit.
-        is_at_bound: Whether it is at the end of the range that it was sought in.
+        is_at_bound: Whether it is at a bound of the search range.
     """
 
     name: str
@@ -52,21 +52,21 @@ class FoundShape:
 
 @dataclass(frozen=True)
 class DriveChoice:
-    """The terms of one joint's drive.
+    """The terms selected for one joint's drive.
 
     Attributes:
         joint: The joint.
-        families: Names of what it has beside viscous and Coulomb friction.
-        terms: The terms themselves.
-        tried: What was tried, step by step.
-        shapes: The shapes that were found.
+        families: Names of the families in addition to viscous and Coulomb friction.
+        terms: The terms.
+        tried: The sets of terms that were tried, step by step.
+        shapes: The identified shape parameters.
         shape_covariance: Their covariance, row by row.
-        sizes: Shapes of each family.
-        data_range: Ranges of position "q" and of the size of speed "v" that the fit has seen.
-        grown: How many times larger the terms make the standard errors of the drive's armature,
+        sizes: Values of the shape parameters of each family.
+        data_range: Ranges of position "q" and of absolute speed "v" in the fitted rows.
+        grown: Factor by which the terms increase the standard errors of the drive's armature,
             viscous and Coulomb friction and offset, by name.
-        doubted: Terms that held-out segments favour, but not beyond chance: they were not taken,
-            and errors count what they would move.
+        undecided: Terms that reduce the held-out residual, but not significantly. They were not
+            selected; the standard errors include the change that they would cause.
     """
 
     joint: str
@@ -78,10 +78,10 @@ class DriveChoice:
     sizes: tuple[tuple[float, ...], ...] = ()
     data_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     grown: Mapping[str, float] = field(default_factory=dict)
-    doubted: tuple[DriveTerm, ...] = ()
+    undecided: tuple[DriveTerm, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what was tried, taken and found, as plain values."""
+        """Return the sets tried, the selected families and the shapes, as plain values."""
         return {
             "families": list(self.families),
             "shapes": [asdict(shape) for shape in self.shapes],
@@ -90,11 +90,13 @@ class DriveChoice:
         }
 
     def moved(self, step: Array, covariance: Array) -> "DriveChoice":
-        """Return the choice with shapes moved, within their bounds and by a third at most.
+        """Return the choice with shapes changed by a step, within their bounds.
+
+        No shape changes by more than a third.
 
         Args:
-            step: By how much, shape (k,).
-            covariance: Of the shapes there, shape (k, k).
+            step: Change of each shape, shape (k,).
+            covariance: Covariance of the changed shapes, shape (k, k).
         """
         flat = np.array([size for own in self.sizes for size in own])
         families = [FAMILIES[name] for name in self.families]
@@ -115,11 +117,11 @@ class DriveChoice:
         )
 
     def altered(self, which: int, share: float) -> tuple[DriveTerm, ...]:
-        """Return the terms with one of the shapes larger by a share.
+        """Return the terms with one of the shapes increased.
 
         Args:
-            which: Which of ``shapes``.
-            share: The share [-].
+            which: Index in ``shapes``.
+            share: Relative increase [-].
         """
         flat = [(at, k) for at, own in enumerate(self.sizes) for k in range(len(own))]
         sizes = [list(own) for own in self.sizes]
@@ -132,11 +134,11 @@ class DriveChoice:
 
 
 def with_shapes(families: Sequence[Family], flat: Array) -> list[tuple[Family, list[float]]]:
-    """Return families with their shapes, of all in a row.
+    """Return each family with its shapes, from one array of all shapes.
 
     Args:
         families: The families.
-        flat: Shapes of one after the other, shape (k,).
+        flat: Shapes of all families in order, shape (k,).
     """
     sizes = iter(flat.tolist())
     return [(family, [next(sizes) for _ in family.shapes]) for family in families]

@@ -1,4 +1,4 @@
-"""What estimators are made of: a robot, and what is known of it before the data."""
+"""Construction of the consistent estimator from a robot, its prior and the constraints."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,20 +18,20 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["Known", "consistent_fit", "make_constraints"]
 
-_FOLDS = 6  # held out in turn by prior_weight = "cv"
+_FOLDS = 6  # of the cross-validation, prior_weight = "cv"
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A robot, and what is known of it before the data."""
+    """A robot and the prior of its parameters."""
 
     model: RobotModel
     mapping: BaseMapping  # standard to base parameters
     pi: Array  # (p,), standard parameters of the URDF
-    spread: Array  # (p,), how far they may plausibly be wrong
+    spread: Array  # (p,), prior standard deviations
     share: float  # share of the rows that count as independent [-]
     sigma: Array  # (n,), noise level of each joint [N m or N]
-    held_out: tuple[Factors, ...] = ()  # segments to judge weight and extents by
+    held_out: tuple[Factors, ...] = ()  # segments for choosing the weight and testing extents
 
     @property
     def beta(self) -> Array:
@@ -40,21 +40,21 @@ class Known:
 
     @property
     def covariance(self) -> Array:
-        """How far these may plausibly be wrong, shape (b, b)."""
+        """Prior covariance of the base parameters, shape (b, b)."""
         KS = self.mapping.K * self.spread
         covariance: Array = KS @ KS.T
         return covariance
 
 
 def consistent_fit(settings: BoundedSettings, known: Known) -> Consistent:
-    """Return the physically consistent estimator, which also projects.
+    """Return the physically consistent estimator, which can also project an estimate.
 
     Args:
         settings: The settings.
-        known: The robot, and what is known of it before the data.
+        known: The robot and its prior.
 
     Raises:
-        SettingsError: If constraints contradict each other or do not fit the robot.
+        SettingsError: If constraints contradict each other or do not match the robot.
     """
     bounds, weight, model = settings.bounds, settings.prior_weight, known.model
     geometry = geometry_half_spaces(model, bounds.com_within)
@@ -97,18 +97,19 @@ def make_constraints(
     geometry: Mapping[str, tuple[Array, Array]],
     extent: Mapping[str, Array] = MappingProxyType({}),
 ) -> Constraints:
-    """Return the constraints as the estimator takes them.
+    """Return the constraints in the form that the estimator needs.
 
     Args:
-        bounds: The constraints as a job states them.
+        bounds: The constraints of the job.
         geometry: Half-spaces A c <= b of the centres of mass from the URDF's geometry, by name of
-            the body; boxes stated in ``com`` go before them.
-        extent: Box that holds all mass of each body, by its name.
+            the body; boxes in ``com`` replace them.
+        extent: Box that contains all mass of each body, by name of the body.
     """
     A = np.vstack([np.eye(3), -np.eye(3)])
-    com, kept = dict(geometry), dict(extent)
+    com, extents = dict(geometry), dict(extent)
     for name, (low, high) in bounds.boxes.items():
         com[name] = (A, np.concatenate([high, np.negative(low)]))
-        if name in kept:  # what is stated is known better
-            kept[name] = np.array([np.minimum(kept[name][0], low), np.maximum(kept[name][1], high)])
-    return Constraints(bounds.masses, bounds.total, com, tuple(bounds.pinned), kept)
+        if name in extents:  # a stated box enlarges the box of the geometry
+            lower, upper = extents[name]
+            extents[name] = np.array([np.minimum(lower, low), np.maximum(upper, high)])
+    return Constraints(bounds.masses, bounds.total, com, tuple(bounds.pinned), extents)

@@ -1,4 +1,4 @@
-"""Predicted torque of recordings, and its metrics: piece by piece, a log in memory at once."""
+"""Predicted torques of recordings and their metrics; logs in files are processed in pieces."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,23 +30,23 @@ __all__ = [
     "shares_rows",
 ]
 
-_SHOWN = 10_000  # samples at the beginning, in the middle and at the end that are kept for plots
-_SAMPLED = 200  # rows spread over a log that are looked for in others
-_SHARED = 0.02  # share of them that another recording may hold: windows that meet share a row
+_SHOWN = 10_000  # samples at the start, in the middle and at the end that are stored for plots
+_SAMPLED = 200  # rows spread over a log that are searched for in other logs
+_SHARED = 0.02  # share of them that another log may contain: adjacent windows share a row
 
 
 @dataclass(frozen=True)
 class Extent:
-    """How much of a log there is.
+    """Size of a log.
 
     Attributes:
-        samples: Rows of the log.
-        rate: Their median rate [Hz].
+        samples: Number of rows of the log.
+        rate: Median sampling rate [Hz].
         start: First time stamp [s].
         end: Last time stamp [s].
-        smooth: Samples of its trajectory.
-        rows_used: Torque rows of these that are used.
-        segments: Uninterrupted segments of the trajectory.
+        smooth: Number of samples of the smoothed trajectory.
+        rows_used: Number of torque rows used.
+        segments: Number of uninterrupted segments of the trajectory.
     """
 
     samples: int
@@ -60,14 +60,14 @@ class Extent:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A log made ready for a model. Of a long log, only some segments are at hand.
+    """A log processed for a model. Of a long log, only some segments are in memory.
 
     Attributes:
         log: The raw log, or its first rows.
-        signals: The settings it was processed with, everything automatic decided.
-        trajectory: The smooth motion, N samples, or segments of it.
+        signals: The settings of the processing, automatic settings resolved.
+        trajectory: The smoothed motion or segments of it, N samples.
         mask: Rows used, shape (N, n_rows), bool.
-        extent: How much of the whole log there is.
+        extent: Size of the whole log.
     """
 
     log: Log
@@ -78,28 +78,28 @@ class Recording:
 
     @property
     def name(self) -> str:
-        """Name of the log's file and the segment of it, as ``run3.parquet 5-7.4 s``."""
+        """Name of the log's file and its time range, as ``run3.parquet 5-7.4 s``."""
         file = Path(self.log.path).name or "log"
         return f"{file} {self.extent.start:.4g}-{self.extent.end:.4g} s"
 
     @property
     def is_partial(self) -> bool:
-        """Whether only segments of the motion are at hand."""
+        """Whether only segments of the motion are in memory."""
         return len(self.trajectory.t) < self.extent.smooth
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """A recording with the torques predicted for it.
+    """A recording with its predicted torques.
 
     Attributes:
         recording: The recording.
         torques: Predicted torques by name of the parameters, each of shape (N, n_rows) [N m, N];
-            among them the baselines "urdf", "gravity_only" and "urdf_with_drives".
-        sums: What the metrics over the whole log are made of, by name of the parameters, without
-            the baselines.
+            they include the baselines "urdf", "gravity_only" and "urdf_with_drives".
+        sums: Sums over the whole log from which the metrics are computed, by name of the
+            parameters, without the baselines.
         metrics: Metrics over the whole log, likewise.
-        is_refitted: Whether it was kept apart, but holds rows that were fitted.
+        is_refitted: Whether it is a validation recording that contains fitted rows.
     """
 
     recording: Recording
@@ -111,49 +111,50 @@ class Evaluation:
 
 def evaluate_logs(
     fitted: Sequence[SurveyedLog],
-    kept: Sequence[SurveyedLog],
+    validation: Sequence[SurveyedLog],
     parameters: Mapping[str, Array],
     prior: Array | None,
     driven: Array | None = None,
     *,
     plan: WorkPlan | None = None,
 ) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
-    """Return how well parameters predict logs.
+    """Return the torques that parameters predict for logs, and their metrics.
 
     Args:
         fitted: Logs that were fitted, surveyed with the model that predicts.
-        kept: Validation Logs.
+        validation: Validation logs.
         parameters: Standard parameters by name, each of shape (p,).
-        prior: Those of the URDF, shape (p,): the baselines are its torque, with and without motion;
-            None: no baselines.
-        driven: Those of the URDF with drives fitted to the logs, shape (p,): a baseline, if known.
-        plan: Who works on the pieces of logs in files; this process if None.
+        prior: Parameters of the URDF, shape (p,): the baselines are its torque with and without
+            motion; None: no baselines.
+        driven: Parameters of the URDF with drives fitted to the logs, shape (p,), a baseline;
+            None: no such baseline.
+        plan: Processes that work on the pieces of logs in files; None: this process.
 
     Returns:
-        Evaluations of the fitted logs, and of those kept apart; of logs in files, the torques are
-        those of the segments that are kept for plots.
+        Evaluations of the fitted logs and of the validation logs. For logs in files the torques
+        are those of the segments stored for plots.
 
     Raises:
         DataError: If no row of a log is used.
     """
     work = partial(_score, parameters=parameters, prior=prior, driven=driven)
-    apart = _score_logs(kept, work, plan)
-    sought = [score.sampled for score in apart]
+    other = _score_logs(validation, work, plan)
+    sought = [score.sampled for score in other]
     own = _score_logs(fitted, partial(work, sought=sought), plan)
-    again = [any(_is_shared(score.found[k]) for score in own) for k in range(len(apart))]
-    return tuple(map(_conclude, fitted, own)), tuple(map(_conclude, kept, apart, again))
+    again = [any(_is_shared(score.found[k]) for score in own) for k in range(len(other))]
+    return tuple(map(_conclude, fitted, own)), tuple(map(_conclude, validation, other, again))
 
 
 def shares_rows(one: Log, other: Log) -> bool:
-    """Return whether two logs hold the same recorded rows, whatever their files are called.
+    """Return whether two logs contain the same recorded rows, whatever the names of their files.
 
     Args:
         one: A log.
         other: Another log of the same joints.
 
     Returns:
-        Whether more than 2 % of 200 rows of positions and torques spread over the first are in
-        the second; windows that meet share their common row, which counts for nothing.
+        Whether the second log contains more than 2 % of 200 rows of positions and torques spread
+        over the first. The common row of two adjacent windows does not count.
     """
     rows, others = (np.hstack([log.q, log.tau]) for log in (one, other))
     return _is_shared(_rows_in(rows[:: _sampled_every(len(rows))], others))
@@ -175,9 +176,9 @@ def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Met
 
 
 def hidden_joints(model: RobotModel, evaluations: Sequence[Evaluation]) -> tuple[str, ...]:
-    """Return joints of a static model whose torque changes less than the estimate leaves of it.
+    """Return the joints of a static model whose gravity torque is smaller than their residual.
 
-    What friction holds where the robot stands hides the little that gravity does there.
+    Stiction at rest hides small changes of the gravity torque of these joints.
 
     Args:
         model: The robot.
@@ -185,15 +186,15 @@ def hidden_joints(model: RobotModel, evaluations: Sequence[Evaluation]) -> tuple
     """
     if not model.is_static or not evaluations:
         return ()
-    left = pool(model, evaluations, "estimate").per_joint
+    metrics = pool(model, evaluations, "estimate").per_joint
     torque = np.vstack([e.torques["estimate"] for e in evaluations])
     used = np.vstack([e.recording.mask for e in evaluations])
     hidden = tuple(
         row
         for j, row in enumerate(model.row_names)
-        if row in left and np.std(torque[used[:, j], j]) <= left[row].rmse
+        if row in metrics and np.std(torque[used[:, j], j]) <= metrics[row].rmse
     )
-    return hidden if len(hidden) < len(left) else ()
+    return hidden if len(hidden) < len(metrics) else ()
 
 
 _Shown = tuple[Trajectory, Array, Mapping[str, Array]]  # motion, rows used, torques
@@ -201,19 +202,19 @@ _Shown = tuple[Trajectory, Array, Mapping[str, Array]]  # motion, rows used, tor
 
 @dataclass(frozen=True, eq=False)
 class _Score:
-    """What is known of a log, or of its pieces so far."""
+    """Result of a log, or of its pieces so far."""
 
-    sums: Mapping[str, TorqueSums]  # what the metrics are made of, by name of the parameters
+    sums: Mapping[str, TorqueSums]  # from which the metrics are computed, by parameters
     smooth: int  # samples
     used: int  # torque rows used
     segments: frozenset[int]  # numbers of the segments that have samples
-    turned: Array  # (n,), bool: joints whose full turns were taken out
+    turned: Array  # (n,), bool: joints whose position was unwrapped
     shown: tuple[_Shown, ...]  # all samples, or a few segments
     sampled: Array  # (m, 2 n), recorded rows spread over the log
     found: tuple[Array, ...]  # which of the sampled rows of each other log are in this one
 
     def join(self, other: "_Score") -> "_Score":
-        """Return what is known with the pieces that follow."""
+        """Return the result together with that of the following pieces."""
         return _Score(
             sums={name: x.merge(other.sums[name]) for name, x in self.sums.items()},
             smooth=self.smooth + other.smooth,
@@ -228,7 +229,7 @@ class _Score:
 
 @dataclass(frozen=True, eq=False)
 class _Part(PieceTask):
-    """A piece, and what is kept of it: recorded rows spread over it, and a segment for plots."""
+    """A piece, with the rows of it that are stored: sampled rows, and a segment for plots."""
 
     sampled: slice
     shown: slice | None
@@ -237,7 +238,7 @@ class _Part(PieceTask):
 def _parts(log: SurveyedLog) -> list[_Part]:
     last = len(log.pieces) - 1
     shown = {0: slice(_SHOWN), (last + 1) // 2: slice(_SHOWN), last: slice(-_SHOWN, None)}
-    if log.is_held:
+    if log.is_in_memory:
         shown = {0: slice(None)}
     every = _sampled_every(log.stop - log.first)
     return [
@@ -249,7 +250,7 @@ def _parts(log: SurveyedLog) -> list[_Part]:
 def _score_logs(
     logs: Sequence[SurveyedLog], work: "partial[_Score]", plan: WorkPlan | None
 ) -> list[_Score]:
-    """Return what is known of each log; refuse one without samples."""
+    """Return the result of each log; raise an error for a log without samples."""
     parts = [_parts(log) for log in logs]
     every = list(chain.from_iterable(parts))
     found = (work(x, None) for x in every) if plan is None else plan.map(work, every, "evaluating")
@@ -259,7 +260,7 @@ def _score_logs(
         score = reduce(_Score.join, by_piece)
         if not score.smooth:
             raise log.too_short()
-        if not score.shown:  # of none of the chosen pieces is a sample left: draw another one
+        if not score.shown:  # the chosen pieces have no samples: choose another piece
             filled = next(k for k, piece in enumerate(by_piece) if piece.smooth)
             again = work(replace(own[filled], shown=slice(_SHOWN)), None)
             score = replace(score, shown=again.shown)
@@ -276,7 +277,7 @@ def _score(
     driven: Array | None,
     sought: Sequence[Array] = (),
 ) -> _Score:
-    """Return what is known of a piece, with the torques of a part of it."""
+    """Return the result of a piece, with the torques of a part of it."""
     header, rows = whole.piece.header, whole.piece.read()
     model, motion, mask = header.model, rows.trajectory, rows.mask
     of_urdf = {"urdf": prior, "urdf_with_drives": driven}
@@ -286,10 +287,10 @@ def _score(
     shown: tuple[_Shown, ...] = ()
     if whole.shown is not None and len(motion.t):
         start, stop, _ = whole.shown.indices(len(motion.t))
-        kept = {name: torque[start:stop] for name, torque in torques.items()}
-        # all of it as it is, with what was computed of it
-        seen = motion if stop - start == len(motion.t) else motion.part(start, stop)
-        shown = ((seen, mask[start:stop], kept),)
+        stored = {name: torque[start:stop] for name, torque in torques.items()}
+        # the whole motion is used as it is, with its cached properties
+        part = motion if stop - start == len(motion.t) else motion.part(start, stop)
+        shown = ((part, mask[start:stop], stored),)
     recorded = np.hstack([rows.positions, rows.torques])
     return _Score(
         sums={x: TorqueSums.of(motion.tau, torques[x], mask, baselines) for x in parameters},
@@ -310,7 +311,7 @@ def _predict_all(
     prior: Array | None,
     compiled: bool | None,
 ) -> dict[str, Array]:
-    """Return the torques that parameters and the URDF's gravity predict, each (N, n_rows)."""
+    """Return the torques by each set of parameters and by the URDF's gravity, (N, n_rows) each."""
     names = [*parameters] if prior is None else [*parameters, "gravity_only"]
     if not len(trajectory.t) or not names:
         return {name: np.empty((0, model.n_rows)) for name in names}
@@ -318,7 +319,7 @@ def _predict_all(
     if prior is not None:
         inertial = np.where(np.arange(len(prior)) < model.layout.n_inertial, prior, 0.0)
         still = np.zeros_like(trajectory.v)
-        at_rest = replace(trajectory, v=still, a=still, direction=None)  # no drive has a say in it
+        at_rest = replace(trajectory, v=still, a=still, direction=None)  # without drive torques
         torques += predict(model, [inertial], at_rest, compiled=compiled)
     return dict(zip(names, torques, strict=True))
 
@@ -346,7 +347,7 @@ def _conclude(log: SurveyedLog, score: _Score, is_refitted: bool = False) -> Eva
 
 
 def _joined(motions: Sequence[Trajectory]) -> Trajectory:
-    """Return motions one after the other; what is shown never joins what is not beside it."""
+    """Return the motions as one trajectory, each with segments of its own."""
     if len(motions) == 1:
         return motions[0]
     segments, number = [], 0
@@ -362,12 +363,12 @@ def _joined(motions: Sequence[Trajectory]) -> Trajectory:
 
 
 def _sampled_every(rows: int) -> int:
-    """Return how far apart the rows are that are looked for, of so many."""
+    """Return the step between sampled rows of a log."""
     return max(1, rows // _SAMPLED)
 
 
 def _rows_in(sampled: Array, rows: Array) -> Array:
-    """Return which of the rows (m, 2 n) of positions and torques are among others, shape (m,)."""
+    """Return which sampled rows (m, 2 n) of positions and torques are among rows, shape (m,)."""
     found = np.isin(sampled[:, 0], rows[:, 0])
     likely = rows[np.isin(rows[:, 0], sampled[found, 0])]
     for k in np.flatnonzero(found):
@@ -376,5 +377,5 @@ def _rows_in(sampled: Array, rows: Array) -> Array:
 
 
 def _is_shared(found: Array) -> bool:
-    """Return whether so many rows are in another log that it holds the same recording."""
+    """Return whether enough rows were found in another log to call it the same recording."""
     return int(found.sum()) > max(1, _SHARED * len(found))

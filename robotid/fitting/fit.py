@@ -1,4 +1,4 @@
-"""Recordings of a robot and the estimator asked for -> Fit: its errors, and what it predicts."""
+"""Fit of a robot's parameters to recordings: estimate, standard errors, predictions."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -35,16 +35,16 @@ from robotid.robot.prior import prior_spread
 
 __all__ = ["Solved", "fit_recordings", "rough_choice", "solve_recordings"]
 
-_MOST_LOADS = 20  # fits until the load of the gears is that of the bodies found
-_DAMPED = 3  # of them, after which they go half way only
-_SETTLED = 1e-3  # of the torque, by which they may still move it
+_MOST_LOADS = 20  # largest number of fits until the joint load torque has converged
+_DAMPED = 3  # number of fits after which only half of each change is applied
+_SETTLED = 1e-3  # change of the torque, relative to it, at which the fits have converged
 
 
 def rough_choice(choice: EstimatorSettings) -> EstimatorSettings:
-    """Return the estimator without what takes long and moves a fit's residual little.
+    """Return faster settings of the estimator, for fits whose residual only is used.
 
     Args:
-        choice: The estimator asked for.
+        choice: The settings of the estimator.
     """
     if not isinstance(choice, BoundedSettings):
         return choice
@@ -57,11 +57,11 @@ def fit_recordings(recordings: Recordings, choice: EstimatorSettings) -> Fit:
 
     Args:
         recordings: The recordings.
-        choice: Which estimator.
+        choice: Settings of the estimator.
 
     Raises:
         DataError: If a row of a log cannot be used.
-        RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
+        RankDeficientError: If the estimator is "ols" or "wls" and parameters are not identifiable.
         NotConvergedError: If a solver fails.
     """
     return solve_recordings(recordings, choice).with_errors()
@@ -70,16 +70,16 @@ def fit_recordings(recordings: Recordings, choice: EstimatorSettings) -> Fit:
 def solve_recordings(
     recordings: Recordings, choice: EstimatorSettings, *, is_last: bool = True
 ) -> "Solved":
-    """Return the parameters of a robot that fit recordings, their errors not yet measured.
+    """Return the parameters fitted to recordings, before their standard errors are computed.
 
     Args:
         recordings: The recordings.
-        choice: Which estimator.
-        is_last: Whether the bias by the steps of the positions is taken off, and bounds that the
-            data contradict are judged by held-out segments; not for fits in between.
+        choice: Settings of the estimator.
+        is_last: Whether the bias due to position quantisation is corrected and bounds that the
+            data contradict are tested on held-out segments; False for intermediate fits.
 
     Raises:
-        DataError, RankDeficientError, NotConvergedError: As of ``fit_recordings``.
+        DataError, RankDeficientError, NotConvergedError: As in ``fit_recordings``.
     """
     recordings = _under_own_load(recordings, choice)
     ground = _ground(recordings, choice, is_last=is_last)
@@ -90,45 +90,45 @@ def solve_recordings(
     except RankDeficientError as error:
         raise ground.determination.refusal(error) from error
     standard, _ = standard_of(estimate, recordings.mapping, ground.before.pi, ground.before.spread)
-    if recordings.model.layout.remembering:  # what is written predicts the torque by its own load
+    if recordings.model.layout.remembering:  # predictions use the load of the written parameters
         recordings = recordings.with_model(recordings.model.with_reference(standard))
     return Solved(choice, ground, recordings, estimate, in_cone, weighing, standard)
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """Parameters that fit recordings, and what their errors are measured by."""
+    """Parameters fitted to recordings, with the data for their standard errors."""
 
     choice: EstimatorSettings
     ground: "_Ground"
-    recordings: Recordings  # loaded by the bodies found
+    recordings: Recordings  # with the joint load torque of the identified bodies
     estimate: Estimate
-    in_cone: Consistent | None  # what made it physically consistent, if it is
+    in_cone: Consistent | None  # the estimator that made it physically consistent, if any
     weighing: Weighing
     standard: Array  # (p,), standard parameters
 
     @property
     def prior_std(self) -> Array:
-        """How far parameters may plausibly be wrong before the data, shape (p,)."""
+        """Prior standard deviations of the parameters, shape (p,)."""
         of_estimate = self.estimate.prior_std
         return self.ground.before.spread if of_estimate is None else of_estimate
 
     @cached_property
     def solution(self) -> Solution:
-        """The parameters, with the recordings that drives are judged by."""
+        """The parameters with the recordings on which drive terms are tested."""
         own = self.recordings
-        fitted, kept = evaluate_logs(own.fitted, own.kept, {}, None, plan=own.plan)
+        fitted, validation = evaluate_logs(own.fitted, own.validation, {}, None, plan=own.plan)
         return Solution(
             model=own.model,
             mapping=own.mapping,
             prior_std=self.prior_std,
             standard=self.standard,
             fitted=fitted,
-            validation=kept,
+            validation=validation,
         )
 
     def with_errors(self) -> Fit:
-        """Return the fit: the parameters with their measured errors, and what they predict."""
+        """Return the fit: the parameters with their standard errors and predictions."""
         ground, recordings = self.ground, self.recordings
         model, mapping, before = recordings.model, recordings.mapping, ground.before
         estimate, wls, errors = self._measured()
@@ -136,8 +136,9 @@ class Solved:
         base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
         wls_standard = mapping.to_standard(wls.theta, before.pi, before.spread)
         driven = urdf_with_drives(model, mapping, ground.factors, before.sigma, before.spread)
-        fitted, kept = evaluate_logs(
-            recordings.fitted, recordings.kept, {"estimate": self.standard, "wls": wls_standard},
+        fitted, validation = evaluate_logs(
+            recordings.fitted, recordings.validation,
+            {"estimate": self.standard, "wls": wls_standard},
             before.pi, driven, plan=recordings.plan,
         )  # fmt: skip
         is_base = estimate.names == mapping.base_names
@@ -156,22 +157,22 @@ class Solved:
             base=mapping.to_base(self.standard),
             base_error=base_error,
             fitted=fitted,
-            validation=kept,
+            validation=validation,
             errors=errors,
             factors=ground.factors,
             determination=ground.determination,
             regressor_noise=ground.noise,
         )
-        hidden = (mapping.K[:, ~found.at_bound] == 0).all(axis=1)  # nothing but terms at bounds
+        hidden = (mapping.K[:, ~found.at_bound] == 0).all(axis=1)  # sums of terms at bounds only
         return replace(found, base_error=np.where(hidden, np.inf, base_error))
 
     def _measured(self) -> tuple[Estimate, Estimate, StandardErrors]:
-        """Return the estimate and that of WLS with measured standard errors, and their ground."""
+        """Return the estimate and that of WLS with standard errors, and how these were found."""
         ground, choice, fit, estimate = self.ground, self.choice, self.in_cone, self.estimate
         factors, rough, mapping = ground.factors, ground.rough, ground.recordings.mapping
         segments, share, K = ground.segments, ground.before.share, mapping.K
         more = None if ground.noise is None else ground.noise.meat
-        of_wls = more if self.weighing != "alike" else None  # which is of other weights
+        of_wls = more if self.weighing != "alike" else None  # found with the weights of WLS
         wls, errors = measured_errors(rough, segments, factors, share, K, rough.sigma, more=of_wls)
         if self.weighing == "by step" and fit is None:
             estimate = with_wls_errors(estimate, wls)
@@ -179,13 +180,14 @@ class Solved:
             sigma = np.ones_like(rough.sigma) if self.weighing == "alike" else rough.sigma
             if estimate.names == mapping.names:
                 sigma = estimate.sigma
-            redraws, pull = None, 1.0  # of what no bound can bind
+            redraws, ratio = None, 1.0  # without bounds
             if fit is not None and isinstance(choice, BoundedSettings):
-                redraws, pull = Redraws(fit, choice.draws, np.random.default_rng(0)), fit.pull
+                redraws = Redraws(fit, choice.draws, np.random.default_rng(0))
+                ratio = fit.weight_ratio
             is_filter = self.weighing == "by age"
             estimate, errors = measured_errors(
                 estimate, segments, factors, share, K, sigma,
-                is_filter=is_filter, pull=pull, redraws=redraws, more=more,
+                is_filter=is_filter, weight_ratio=ratio, redraws=redraws, more=more,
             )  # fmt: skip
         if ground.grown != 1.0:
             estimate = replace(estimate, covariance=ground.grown * estimate.covariance)
@@ -194,21 +196,22 @@ class Solved:
 
 
 def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Recordings:
-    """Return recordings whose drives are loaded by the bodies that the fit to them gives.
+    """Return recordings with the joint load torque of the bodies fitted to them.
 
-    Least squares are iterated until their torque is the load; the estimator takes the last step.
+    Least squares fits are iterated until the load torque has converged; the last step uses the
+    estimator itself.
     """
     model, mapping = recordings.model, recordings.mapping
     if not is_loaded(model):
         return recordings
     choice = rough_choice(choice)
-    own = replace(recordings, kept=())  # nothing is predicted meanwhile
+    own = replace(recordings, validation=())  # no predictions are needed here
     for step in range(_MOST_LOADS):
         ground = _ground(own, choice, is_last=False)
         before = ground.before
         standard, _ = standard_of(ground.rough, mapping, before.pi, before.spread)
         moved = standard - own.model.carried_by
-        if step >= _DAMPED:  # friction that takes a large share of the load may overshoot
+        if step >= _DAMPED:  # friction that depends strongly on the load may overshoot
             standard = standard - 0.5 * moved
         loads = [_size_of(ground, x) for x in (moved, standard)]
         if (loads[0] <= _SETTLED * loads[1]).all():
@@ -219,14 +222,14 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
             return recordings.with_model(model.with_reference(standard))
         own = own.with_model(model.with_reference(standard))
     raise NotConvergedError(
-        f"the load of the gears still changes after {_MOST_LOADS} fits; use friction = "
-        "'viscous+coulomb', or record motion that determines more",
+        f"the joint load torque has not converged after {_MOST_LOADS} fits; set friction = "
+        "'viscous+coulomb', or record a motion that excites more parameters",
         "max_iterations",
     )
 
 
 def _size_of(ground: "_Ground", pi: Array) -> Array:
-    """Return the root mean square of the torque of parameters in each row, shape (n_rows,)."""
+    """Return the norm of the torque of parameters over all rows of each joint, shape (n_rows,)."""
     factors, mapping = ground.factors, ground.recordings.mapping
     beta = mapping.to_base(pi)
     rows = zip(factors.triangles, factors.columns, strict=True)
@@ -235,16 +238,16 @@ def _size_of(ground: "_Ground", pi: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Ground:
-    """What every estimator stands on."""
+    """The input of every estimator."""
 
-    recordings: Recordings  # their rows weighted if a robust loss was asked for
-    whole: Reduction  # what all fitted rows come down to, base parameters
-    before: Known  # without them
-    segments: tuple[Factors, ...]  # those of segments of the logs; none of a fit in between
-    rough: Estimate  # weighted least squares on them
-    pinned: Array  # (p,), bool: standard parameters that are known
-    grown: float  # by how much a robust loss widens the covariance [-]
-    noise: RegressorNoise | None = None  # what the steps of the positions do
+    recordings: Recordings  # rows weighted if the loss is robust
+    whole: Reduction  # reduction of all fitted rows, base parameters
+    before: Known  # the prior
+    segments: tuple[Factors, ...]  # factors of segments of the logs; none in intermediate fits
+    rough: Estimate  # weighted least squares
+    pinned: Array  # (p,), bool: fixed standard parameters
+    grown: float  # factor of the covariance for a robust loss [-]
+    noise: RegressorNoise | None = None  # effect of the position quantisation
 
     @property
     def factors(self) -> Factors:
@@ -260,7 +263,7 @@ class _Ground:
 
 
 def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool) -> _Ground:
-    """Reduce the rows, with a robust loss reweighted, to what every estimator stands on."""
+    """Reduce the rows, reweighted if the loss is robust, to the input of every estimator."""
     model, mapping = recordings.model, recordings.mapping
     prior, understated = model.standard_parameters(), 1.0
     if choice.is_robust:
@@ -279,16 +282,16 @@ def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool)
 
 
 def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Ground:
-    """Return the ground without the bias that the steps of the positions make.
+    """Return the input without the bias due to position quantisation.
 
-    The torque loses what least squares find of it by that bias, W shift, so that every fit to the
-    factors finds as much less. Estimators that read samples keep the bias as an error. Total least
-    squares have a correction of their own.
+    The term W shift is subtracted from the torque, so that every fit to the factors is corrected
+    by the shift. For estimators that read samples the bias is counted as an error. Total least
+    squares has a correction of its own.
     """
     if choice.allows_for_noise:
         return ground
     level, theta = ground.rough.sigma, ground.rough.theta
-    sigma = np.ones_like(level) if choice.weighs_alike else level
+    sigma = np.ones_like(level) if choice.has_equal_weights else level
     noise = find_regressor_noise(ground.recordings, ground.whole, theta, sigma, level)
     if noise is None:
         return ground
@@ -309,13 +312,13 @@ def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Gro
 def _run(
     choice: EstimatorSettings, ground: _Ground
 ) -> tuple[Estimate, Consistent | None, Weighing]:
-    """Return the estimate, what made it physically consistent if it is, and how rows weighed."""
+    """Return the estimate, the estimator that made it consistent, if any, and the weighting."""
     recordings, before = ground.recordings, ground.before
     estimator = choice.make(before)
     if recordings.model.is_static and estimator.needs_mass:
         raise SettingsError(
             f"the estimator {choice.name!r} needs the mass matrix, which dynamics = 'static' does "
-            "not identify; choose another one, or dynamics = 'full'"
+            "not identify; use another estimator, or set dynamics = 'full'"
         )
     if estimator.reads == "factors":
         return estimator.fit(ground.factors), estimator.in_cone, estimator.weighing

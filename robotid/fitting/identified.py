@@ -1,4 +1,4 @@
-"""A robot's parameters as they were identified: errors, intervals, and what determined them."""
+"""Identified parameters of a robot: standard errors, intervals, and the source of each value."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -16,19 +16,19 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["FROM_DATA", "FROM_PRIOR", "SOURCES", "Identified", "sources_of"]
 
-#: What may have determined a standard parameter.
+#: The possible sources of the value of a standard parameter.
 SOURCES = ("data", "mixed", "prior", "bound")
-FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
-FROM_PRIOR = 0.9  # ... and above this share, the prior's
+FROM_DATA = 0.3  # standard error over prior standard deviation below which the source is the data
+FROM_PRIOR = 0.9  # ... and above which it is the prior
 
 
 def sources_of(share: Array, is_prior: Array, is_bound: Array) -> tuple[str, ...]:
-    """Return what determined each parameter, of ``SOURCES``.
+    """Return the source of the value of each parameter, of ``SOURCES``.
 
     Args:
-        share: Standard error over the spread assumed before the fit, shape (p,) [-].
-        is_prior: Which keep the prior's value, shape (p,), bool.
-        is_bound: Which of the others a bound holds, shape (p,), bool.
+        share: Standard error over prior standard deviation, shape (p,) [-].
+        is_prior: Which parameters keep the prior's value, shape (p,), bool.
+        is_bound: Which of the others are at a bound, shape (p,), bool.
     """
     names = np.select([is_prior, is_bound, share < FROM_DATA], ["prior", "bound", "data"], "mixed")
     return tuple(names.tolist())
@@ -36,16 +36,16 @@ def sources_of(share: Array, is_prior: Array, is_bound: Array) -> tuple[str, ...
 
 @dataclass(frozen=True, eq=False)
 class Identified(ABC):
-    """Standard and base parameters of a robot, whatever they were identified from.
+    """Standard and base parameters of a robot, for every method of identification.
 
     Attributes:
-        model: The robot as the URDF describes it, with the drive terms that were identified.
+        model: The robot of the URDF, with the identified drive terms.
         mapping: Standard to base parameters.
         prior: Standard parameters of the URDF, shape (p,).
         standard: Standard parameters, shape (p,).
         standard_covariance: Their covariance given the prior, shape (p, p).
         base: Base parameters, shape (b,).
-        base_error: Their standard errors, shape (b,); inf where the data say nothing.
+        base_error: Their standard errors, shape (b,); inf if not identifiable.
     """
 
     model: RobotModel
@@ -59,57 +59,57 @@ class Identified(ABC):
     @property
     @abstractmethod
     def standard_error(self) -> Array:
-        """Standard errors of the standard parameters, shape (p,); inf where there is none."""
+        """Standard errors of the standard parameters, shape (p,); inf if there is none."""
 
     @property
     @abstractmethod
     def standard_quantile(self) -> Array:
-        """How many standard errors the 95 % interval of each standard parameter reaches, (p,)."""
+        """Half-width of each standard parameter's 95 % interval in standard errors, shape (p,)."""
 
     @property
     @abstractmethod
     def base_quantile(self) -> Array:
-        """How many standard errors the 95 % interval of each base parameter reaches, (b,)."""
+        """Half-width of each base parameter's 95 % interval in standard errors, shape (b,)."""
 
     @property
     @abstractmethod
     def at_bound(self) -> Array:
-        """Which standard parameters are where they are by a bound only, shape (p,), bool."""
+        """Which standard parameters are determined by a bound only, shape (p,), bool."""
 
     @property
     @abstractmethod
     def sources(self) -> tuple[str, ...]:
-        """What determined each standard parameter, of ``SOURCES``."""
+        """The source of the value of each standard parameter, of ``SOURCES``."""
 
     @property
     @abstractmethod
     def undetermined(self) -> tuple[str, ...]:
-        """Names of the parameters that the data leave open."""
+        """Names of the base parameters that are not identifiable."""
 
     @property
     @abstractmethod
     def moments(self) -> Mapping[str, DriveMoments]:
-        """What projects the friction of drives on simpler terms, by drive."""
+        """Moments that project the friction of each drive on simpler terms, by drive."""
 
     @property
     @abstractmethod
     def is_consistent(self) -> bool:
-        """Whether the parameters are physically possible."""
+        """Whether the parameters are physically consistent."""
 
     @property
     def standard_interval(self) -> Array:
-        """95 % interval of each standard parameter, shape (p, 2); infinite where there is none.
+        """95 % interval of each standard parameter, shape (p, 2); infinite if there is none.
 
-        It reaches as far as ``standard_quantile`` says.
+        Its half-width is ``standard_quantile`` standard errors.
         """
         half = self.standard_quantile * self.standard_error
         return np.column_stack([self.standard - half, self.standard + half])
 
     @property
     def base_interval(self) -> Array:
-        """95 % interval of each base parameter, shape (b, 2); infinite where it is open.
+        """95 % interval of each base parameter, shape (b, 2).
 
-        It is open where the data say nothing, and where the parameter is at its bound.
+        It is infinite if the parameter is not identifiable or is at its bound.
         """
         half = self.base_quantile * self.base_error
         return np.column_stack([self.base - half, self.base + half])
@@ -117,11 +117,11 @@ class Identified(ABC):
     def predict(
         self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None
     ) -> Array:
-        """Return the torques of motion, by the identified bodies, drives and chosen friction.
+        """Return the torques of a motion by the identified bodies, drives and friction.
 
-        Friction acts by the sign of the speed: at rest, where it holds any torque up to its size,
-        it counts as 0. Drives whose friction has a memory (presliding) have moved one way for
-        long, and a torque that comes late (lag) is told as of an instant at which it stays.
+        Coulomb friction acts by the sign of the speed; at rest, where stiction can have any value
+        up to its size, it is 0. Friction with an internal state (presliding) has its value after
+        long motion in one direction. A delayed torque (lag) has its steady-state value.
 
         Args:
             q: Positions in the order of ``model.joints``, shape (n,) or (N, n) [rad, m].
@@ -132,24 +132,24 @@ class Identified(ABC):
             Torques, likewise [N m, N].
 
         Raises:
-            DataError: If a shape does not fit, or a value is not finite.
+            DataError: If a shape is wrong, or a value is not finite.
         """
         return predict_instants(self.model, self.standard, q, v, a)
 
     def pinocchio_model(self) -> Any:  # noqa: ANN401
         """Return a ``pinocchio.Model`` with the identified inertias, armature and friction.
 
-        ``damping`` has the viscous friction; ``lowerDryFrictionLimit`` and
-        ``upperDryFrictionLimit``, -Fc - offset and Fc - offset, have Coulomb friction and offset.
-        ``rnea`` knows of inertias and armature only; the torque of joints that move is
+        ``damping`` is the viscous friction; ``lowerDryFrictionLimit`` = -Fc - offset and
+        ``upperDryFrictionLimit`` = Fc - offset contain Coulomb friction and offset. ``rnea``
+        computes inertias and armature only; the torque of moving joints is
 
         ``rnea(q, v, a) + damping v - where(v > 0, lowerDryFrictionLimit, upperDryFrictionLimit)``
 
-        which is that of ``predict``. Friction that depends on load, position, past or, other than
-        linearly, on speed is projected on these terms, nearest over the fitted rows: a warning
-        states the error. Drives that turn with several joints have no place. Locked joints are
-        part of the links that carry them; with mimic joints, or joints in another order than the
-        URDF's, ``model.configurations(q)`` and ``model.velocity_map`` lead to Pinocchio's
+        which equals ``predict``. Friction that depends on load, position, an internal state or,
+        nonlinearly, on speed is projected on these terms by least squares over the fitted rows; a
+        warning states the error. Drives coupled to several joints are not represented. Locked
+        joints are part of their parent links. With mimic joints, or joints in another order than
+        in the URDF, ``model.configurations(q)`` and ``model.velocity_map`` give Pinocchio's
         coordinates.
         """
         return projected_pinocchio_model(self.model, self.standard, self.moments)

@@ -1,4 +1,4 @@
-"""How much the fitted recordings say: singular values, correlations, shares of data and prior."""
+"""Information in the fitted recordings: singular values, correlations, shares of the data."""
 
 from dataclasses import dataclass
 
@@ -13,15 +13,17 @@ __all__ = ["Information", "information"]
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What the fitted recordings say about the base parameters.
+    """Information about the base parameters in the fitted recordings.
 
     Attributes:
-        singular_values: Of the weighted regressor with columns of unit norm, largest first,
-            shape (b,) [-]; the condition number is the first over the smallest determined one.
-        correlation: Of the errors of WLS if rows were independent, shape (b, b), NaN for what the
-            data leave open.
-        data_share: Share of the data in what is known of each base parameter, shape (b,), 0 to 1:
-            S^2 / (S^2 + s^2) with the prior's spread S and the standard error s of WLS.
+        singular_values: Singular values of the weighted regressor with columns of unit norm,
+            largest first, shape (b,) [-]; the condition number is the ratio of the first to the
+            smallest determined one.
+        correlation: Correlation of the errors of WLS if rows were independent, shape (b, b); NaN
+            for parameters that are not identifiable.
+        data_share: Share of the data in the information about each base parameter, shape (b,),
+            0 to 1: S^2 / (S^2 + s^2) with the prior standard deviation S and the standard error s
+            of WLS.
     """
 
     singular_values: Array
@@ -30,7 +32,7 @@ class Information:
 
 
 def information(found: Fit) -> Information:
-    """Return how much the fitted recordings say about each base parameter.
+    """Return the information about the base parameters in the fitted recordings.
 
     Args:
         found: The fit.

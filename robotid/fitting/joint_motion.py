@@ -1,4 +1,4 @@
-"""How a joint moves along recordings: what terms of its drive are functions of."""
+"""The motion of a joint along recordings: the arguments of its drive terms."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,19 +19,19 @@ __all__ = ["JointMotion", "joint_motions", "travelled"]
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
-    """How a joint moves in N rows of the fitted recordings, and what loads it.
+    """Motion and load of a joint in N rows of the fitted recordings.
 
     Attributes:
         q: Positions, shape (N,) [rad or m].
         v: Speeds, shape (N,) [rad/s or m/s].
         a: Accelerations, shape (N,) [rad/s^2 or m/s^2].
-        direction: Which way friction acts: the sign of v, as the torque is filtered, shape (N,).
+        direction: Direction of friction: the sign of v, filtered as the torque, shape (N,) [-].
         load: Torque of the rigid bodies by the estimate, shape (N,) [N m or N].
-        travelled: Way since v last changed its sign, shape (N,) [rad or m].
-        time: Time since the recording began, over the longest recording's, shape (N,).
-        passes: Cut-off of the filter of torques [Hz]; infinite without one.
-        others: The joints before and after it, by name.
-        scale: The motion whose typical speeds, ways and loads scale columns; None: this one.
+        travelled: Distance since the last change of sign of v, shape (N,) [rad or m].
+        time: Time since the start of the recording, over the longest duration, shape (N,) [-].
+        passes: Cut-off frequency of the torque filter [Hz]; infinite without a filter.
+        others: Motion of the joints before and after it, by name.
+        scale: Motion whose typical speeds, distances and loads scale columns; None: this one.
     """
 
     q: Array
@@ -47,10 +47,10 @@ class JointMotion:
 
     @classmethod
     def steady(cls, motion: DriveMotion) -> "JointMotion":
-        """Return the motion of a joint that has moved steadily for long, the others at rest.
+        """Return the motion of a joint after long motion at constant speed, the others at rest.
 
         Args:
-            motion: How its drive moves, arrays of shape (N,).
+            motion: Motion of its drive, arrays of shape (N,).
         """
         none, far = np.zeros_like(motion.v), np.full_like(motion.v, np.inf)
         m = motion
@@ -72,12 +72,12 @@ class JointMotion:
 def joint_motions(
     recordings: Sequence[Recording], rows: Sequence[Array], load: Array, model: RobotModel
 ) -> tuple[JointMotion, ...]:
-    """Return how each joint moves in some rows of recordings, with its neighbours.
+    """Return the motion of each joint and its neighbours in some rows of recordings.
 
     Args:
         recordings: The recordings.
-        rows: Which rows of each, N in all.
-        load: Torque of the bodies there, shape (N, n) [N m or N].
+        rows: Indices of the rows of each recording, N in total.
+        load: Torque of the bodies in these rows, shape (N, n) [N m or N].
         model: The robot.
     """
     motions = [recording.trajectory for recording in recordings]
@@ -89,33 +89,35 @@ def joint_motions(
 
     q, v, a = (joined(attrgetter(name)) for name in "qva")
     signs = joined(partial(_directions, model))
-    way = joined(travelled)
+    distance = joined(travelled)
     time = joined(lambda m: (m.t - m.t[0]) / (longest or 1.0))
     alone = [
-        JointMotion(q[:, j], v[:, j], a[:, j], signs[:, j], load[:, j], way[:, j], time, passes)
+        JointMotion(
+            q[:, j], v[:, j], a[:, j], signs[:, j], load[:, j], distance[:, j], time, passes
+        )
         for j in range(len(model.joints))
     ]
-    beside = [[k for k in (j - 1, j + 1) if 0 <= k < len(alone)] for j in range(len(alone))]
+    neighbours = [[k for k in (j - 1, j + 1) if 0 <= k < len(alone)] for j in range(len(alone))]
     return tuple(
         replace(motion, others={model.joints[k]: alone[k] for k in near})
-        for motion, near in zip(alone, beside, strict=True)
+        for motion, near in zip(alone, neighbours, strict=True)
     )
 
 
 def _directions(model: RobotModel, motion: Trajectory) -> Array:
-    """Return which way the friction of each joint's own drive acts, shape (N, n)."""
+    """Return the direction of the friction of each joint's own drive, shape (N, n)."""
     signs = friction_directions(model.layout, motion.v, motion.direction)[:, : len(model.joints)]
     return signs if signs.shape[1] else np.sign(motion.v)
 
 
 def travelled(motion: Trajectory) -> Array:
-    """Return how far each joint went since it last turned round, shape (N, n) [rad or m].
+    """Return the distance of each joint since its last reversal, shape (N, n) [rad or m].
 
     Args:
         motion: The motion, N rows.
     """
-    begins = np.diff(motion.segment, prepend=motion.segment[0] - 1) != 0
-    turns = (np.diff(np.sign(motion.v), axis=0, prepend=0.0) != 0) | begins[:, None]
-    last = np.maximum.accumulate(np.where(turns, np.arange(len(turns))[:, None], 0), axis=0)
-    way: Array = np.abs(motion.q - np.take_along_axis(motion.q, last, axis=0))
-    return way
+    is_first = np.diff(motion.segment, prepend=motion.segment[0] - 1) != 0
+    reverses = (np.diff(np.sign(motion.v), axis=0, prepend=0.0) != 0) | is_first[:, None]
+    last = np.maximum.accumulate(np.where(reverses, np.arange(len(reverses))[:, None], 0), axis=0)
+    distance: Array = np.abs(motion.q - np.take_along_axis(motion.q, last, axis=0))
+    return distance

@@ -1,4 +1,4 @@
-"""How good a predicted torque or position is, joint by joint, against baselines."""
+"""Prediction errors of torque or position, by joint, compared with baselines."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ __all__ = ["JointMetrics", "Metrics", "TorqueSums"]
 
 @dataclass(frozen=True)
 class JointMetrics:
-    """How well the torque of one joint is predicted, or its position, over the rows used.
+    """Prediction error of the torque or the position of one joint over the rows used.
 
     Attributes:
         rmse: Root mean square of the residual [unit].
-        unit: N m or rad, of a prismatic joint N or m.
-        relative_error_pct: 100 |tau - prediction| / |tau| [%]; predicting 0 scores 100. Of a
-            position, over its motion about the mean. None if what was measured is 0 throughout.
-        r2: Share of its variance that is explained [-].
+        unit: N m or rad; N or m for a prismatic joint.
+        relative_error_pct: 100 |tau - prediction| / |tau| [%]; 100 for a prediction of 0. For a
+            position, relative to its motion about the mean. None if the measured signal is 0.
+        r2: Share of the variance that the prediction explains [-].
         rows: Number of rows used.
         baselines: relative_error_pct of other predictions, by name [%].
         better_than_constant: Whether the residual is smaller than that of the mean.
@@ -41,7 +41,7 @@ class Metrics:
     """Metrics of every joint of one recording.
 
     Attributes:
-        per_joint: By name of the joint; a joint without rows is missing.
+        per_joint: Metrics by name of the joint; joints without rows are not in it.
         pooled_rmse: Root mean square of the residuals of all joints together [N m, N].
     """
 
@@ -49,7 +49,7 @@ class Metrics:
     pooled_rmse: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the metrics as result.json has them."""
+        """Return the metrics as they are written to result.json."""
         return {
             "per_joint": {
                 joint: {
@@ -69,15 +69,15 @@ class Metrics:
 
 @dataclass(frozen=True, eq=False)
 class TorqueSums:
-    """What the metrics of a prediction are made of; sums of two recordings merge into both's.
+    """Sums from which the metrics of a prediction are computed; sums of two recordings can merge.
 
     Attributes:
         rows: Number of rows used per joint, shape (n,), int.
         mean: Mean of the measured torque over them, shape (n,) [N m, N].
-        spread: Sum of its squared distances from the mean, shape (n,).
-        torque: Sum of its squares, shape (n,).
+        spread: Sum of squared deviations of the torque from the mean, shape (n,).
+        torque: Sum of squares of the torque, shape (n,).
         residual: Sum of squared residuals of the prediction, shape (n,).
-        baselines: The same of other predictions, by name, each of shape (n,).
+        baselines: Sums of squared residuals of other predictions, by name, each of shape (n,).
     """
 
     rows: Array
@@ -118,7 +118,7 @@ class TorqueSums:
         """Return the sums over the rows of both.
 
         Args:
-            other: Those of other rows of the same joints, with the same baselines.
+            other: Sums over other rows of the same joints, with the same baselines.
 
         References:
             Chan, Golub, LeVeque (1983), Algorithms for Computing the Sample Variance, (2.1).
@@ -136,7 +136,7 @@ class TorqueSums:
         )
 
     def metrics(self, names: Sequence[str], units: Sequence[str]) -> Metrics:
-        """Return the metrics that the sums make up.
+        """Return the metrics computed from the sums.
 
         Args:
             names: Names of the n joints.
@@ -147,8 +147,8 @@ class TorqueSums:
         """
         if not self.rows.any():
             raise DataError(
-                "no row is left to measure the prediction with: no joint moves faster than "
-                "min_velocity; lower it, or give a log with motion"
+                "the prediction error cannot be computed, 0 torque rows are used: no joint moves "
+                "faster than min_velocity; lower min_velocity, or use a log with motion"
             )
         per_joint = {name: self._joint(j, units[j]) for j, name in enumerate(names) if self.rows[j]}
         return Metrics(per_joint, float(np.sqrt(self.residual.sum() / self.rows.sum())))

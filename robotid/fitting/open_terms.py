@@ -1,4 +1,4 @@
-"""What is open of the drives: terms that they may have, shapes; what predictions err by them."""
+"""Uncertain terms and shapes of the drives, and the torque errors that they may cause."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,12 +20,12 @@ __all__ = ["OpenTerm", "open_torques"]
 
 @dataclass(frozen=True, eq=False)
 class OpenTerm:
-    """What is open of a joint's drive: a term that it may have, or a shape.
+    """An uncertainty of a joint's drive model: an undecided term, or the error of a shape.
 
     Attributes:
         joint: The joint.
-        moves: By how much it moves standard parameters, shape (p,).
-        torque: Its own torque along a motion of the drive, which the joint's is given beside,
+        moves: Change of the standard parameters that it causes, shape (p,).
+        torque: Function of the motion of the drive and of the joint that returns its own torque,
             shape (N,) [N m or N].
     """
 
@@ -38,12 +38,12 @@ def open_torques(found: "Fit", evaluation: "Evaluation", rows: Array) -> list[Ar
     """Return the torque of each open term of the drives along a recording.
 
     Args:
-        found: What was found.
+        found: The fit.
         evaluation: The recording.
-        rows: Which of its samples, shape (k,), int.
+        rows: Indices of its samples, shape (k,), int.
 
     Returns:
-        For each of ``open_terms`` its torque, shape (k, n_rows) [N m or N].
+        The torque of each of ``open_terms``, shape (k, n_rows) [N m or N].
     """
     if not found.open_terms:
         return []

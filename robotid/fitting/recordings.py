@@ -1,4 +1,4 @@
-"""What an identification asks of its logs: their factors, their samples, their predictions."""
+"""The logs of an identification: their triangular factors and their samples."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,43 +18,43 @@ from robotid.workers.plan import WorkPlan
 
 __all__ = ["Recordings"]
 
-_SEGMENTS = 48  # of all logs in memory: enough to see how much their scores scatter
-_CORRELATIONS = 10  # shortest segment in correlation times of noise behind the filter
-_SEGMENTS_IN_FILE = 64  # of each log in a file whose factors are kept apart
-_FACTORS = 2**26  # bytes of them all, if that leaves each log a few
+_SEGMENTS = 48  # of all logs in memory: enough to estimate the scatter of their scores
+_CORRELATIONS = 10  # shortest segment, in correlation times of filtered noise
+_SEGMENTS_IN_FILE = 64  # largest number of segments of a log in a file
+_FACTORS = 2**26  # largest size of all their factors [bytes], with at least _FEW segments per log
 _FEW = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """The logs of an fit, each read in pieces as often as needed; or held in memory.
+    """The logs of a fit, in memory or read in pieces from their files when needed.
 
     Attributes:
         model: The robot.
         mapping: Standard to base parameters.
         fitted: Logs to fit.
-        kept: Validation Logs.
-        plan: Who works on the pieces of logs in files; this process if None.
-        checkpoint: Where reductions are kept until the run is complete.
+        validation: Validation logs.
+        plan: Processes that work on the pieces of logs in files; None: this process.
+        checkpoint: Storage of the reductions until the run is complete.
         weights: Weights of the rows of each log to fit, shapes (N, n_rows); 1 if None.
     """
 
     model: RobotModel
     mapping: BaseMapping
     fitted: Sequence[SurveyedLog]
-    kept: Sequence[SurveyedLog] = ()
+    validation: Sequence[SurveyedLog] = ()
     plan: WorkPlan | None = None
     checkpoint: Checkpoint | None = None
     weights: tuple[Array, ...] | None = None
 
     @property
-    def is_held(self) -> bool:
+    def is_in_memory(self) -> bool:
         """Whether all logs are in memory."""
-        return all(log.is_held for log in (*self.fitted, *self.kept))
+        return all(log.is_in_memory for log in (*self.fitted, *self.validation))
 
     @property
     def share(self) -> float:
-        """Share of the fitted rows that count as independent [-]."""
+        """Share of independent rows among the fitted rows [-]."""
         return min(independent_share(log.signals) for log in self.fitted)
 
     @property
@@ -63,7 +63,7 @@ class Recordings:
         return [ReducedPiece(piece, self.mapping) for log in self.fitted for piece in log.pieces]
 
     def with_model(self, model: RobotModel) -> "Recordings":
-        """Return the same logs of a robot whose drives have other terms or another load.
+        """Return the same logs for a robot whose drives have other terms or another load.
 
         Args:
             model: The robot, with the same bodies, joints and couplings.
@@ -74,25 +74,26 @@ class Recordings:
             model=model,
             mapping=self.mapping if is_same else structural_mapping(model),
             fitted=[log.with_model(model) for log in self.fitted],
-            kept=[log.with_model(model) for log in self.kept],
-            checkpoint=None,  # it holds the pieces of the first fit
+            validation=[log.with_model(model) for log in self.validation],
+            checkpoint=None,  # it contains the pieces of the first fit
         )
 
     def reduce(self, *, is_cut: bool = True) -> tuple[Reduction, ...]:
         """Reduce the logs to fit.
 
         Args:
-            is_cut: Whether logs in memory are cut into segments, which a fit's errors stand on.
+            is_cut: Whether logs in memory are cut into segments, which standard errors need.
 
         Returns:
             One reduction per segment of a log, in order of time. A segment of a log in memory is
-            longer than the correlation of filtered noise; one in a file is of neighbouring pieces.
+            longer than the correlation time of filtered noise; a segment of a log in a file
+            consists of neighbouring pieces.
 
         Raises:
             DataError: If a row cannot be used, or no segment of a log is long enough.
         """
-        if self.is_held:
-            for log in (*self.fitted, *self.kept):  # refused before any fit
+        if self.is_in_memory:
+            for log in (*self.fitted, *self.validation):  # raises errors before any fit
                 keep_inertial_rows(self.model, log.whole.trajectory)
             reduced = self._segments if is_cut else self._whole
             return tuple(chain.from_iterable(map(reduced, range(len(self.fitted)))))
@@ -113,12 +114,12 @@ class Recordings:
         """Return the rows of the logs to fit, for estimators that read them in order of time.
 
         Args:
-            with_mass: Whether each sample also carries the regressor of its mass matrix.
+            with_mass: Whether each sample also has the regressor of its mass matrix.
 
         Returns:
-            The base problem; of logs in files in blocks only: each pass reads them anew.
+            The base problem. Logs in files are read again, in blocks, in each pass.
         """
-        if self.is_held:
+        if self.is_in_memory:
             motions = [log.whole.trajectory for log in self.fitted]
             return concatenate([self._problem(k, x, with_mass) for k, x in enumerate(motions)])
 
@@ -145,18 +146,18 @@ class Recordings:
         )
 
     def segments(self, k: int, motion: Trajectory, joined: int = 1) -> tuple[Factors, ...]:
-        """Return the factors of each segment of a log in memory, as ``reduce`` cuts it.
+        """Return the factors of each segment of a log in memory, with the segments of ``reduce``.
 
         Args:
-            k: Which of the logs to fit.
-            motion: Its smooth motion, or another one of as many samples; the rows used and their
-                weights are those of its own.
-            joined: How many of the segments are one.
+            k: Index of the log in ``fitted``.
+            motion: Its smoothed motion, or another motion with the same number of samples; the
+                rows used and their weights are those of the log.
+            joined: Number of segments that are joined into one.
         """
         return compress_segments(self._problem(k, motion), joined * self._length(k))
 
     def _problem(self, k: int, motion: Trajectory, with_mass: bool = False) -> Problem:
-        """Return the rows of a log in memory, weighted, on a motion of as many samples."""
+        """Return the weighted rows of a log in memory for a motion of the same length."""
         mask = self.fitted[k].whole.mask
         weight = mask if self.weights is None else mask * self.weights[k]
         return base_problem(self.model, self.mapping, motion, weight, with_mass=with_mass)
@@ -165,18 +166,18 @@ class Recordings:
         """Return the samples of each segment of a log in memory."""
         samples, count = len(self.fitted[k].whole.trajectory.t), -(-_SEGMENTS // len(self.fitted))
         shortest = round(_CORRELATIONS / independent_share(self.fitted[k].signals))
-        if self.model.is_static:  # means of segments, behind no filter
+        if self.model.is_static:  # means of segments, not filtered
             shortest = 1
         return max(-(-samples // count), shortest)
 
     def _segments(self, k: int) -> Iterator[Reduction]:
-        """Yield what each segment of a log in memory comes down to."""
+        """Yield the reduction of each segment of a log in memory."""
         motion, length = self.fitted[k].whole.trajectory, self._length(k)
         for i, factors in enumerate(self.segments(k, motion)):
             part = motion.part(i * length, (i + 1) * length)
             yield Reduction(factors, part.squares, len(part.t))
 
     def _whole(self, k: int) -> Iterator[Reduction]:
-        """Yield what a log in memory comes down to."""
+        """Yield the reduction of a log in memory."""
         motion = self.fitted[k].whole.trajectory
         yield Reduction.of(self._problem(k, motion), motion)

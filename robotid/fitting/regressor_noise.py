@@ -1,26 +1,26 @@
-"""How far the steps of an encoder bias least squares: errors in the variables of the regressor.
+"""Bias of least squares due to encoder quantisation: errors in the variables of the regressor.
 
-A position that an encoder rounds has noisy derivatives, so the regressor W has noise E of its own,
-which does not average out. Of H = W^T S^-1 W, D = E[E^T S^-1 E] is that noise, and least squares
-find theta_ls = H^-1 (H - D) theta. Corrected, theta = theta_ls + (H - D)^-1 D theta_ls.
+A quantised position has noisy derivatives. The regressor W therefore has noise E, whose effect does
+not average out: H = W^T S^-1 W contains D = E[E^T S^-1 E], and least squares gives
+theta_ls = H^-1 (H - D) theta. The corrected estimate is theta = theta_ls + (H - D)^-1 D theta_ls.
 
-D is found by rounding once more. Rounding errors e of the same encoder on the same motion, its zero
-elsewhere, are added to smoothed positions and go through the same filter, differences and
-regressor; of +e and -e together what is linear in e cancels. With the scores s(theta) =
-W^T S^-1 (tau - W theta):
+D is estimated by additional quantisation. Rounding errors e of the same encoder on the same motion,
+with a random zero of the encoder, are added to smoothed positions. They pass the same filter,
+differentiation and regressor. Terms linear in e cancel in the mean of +e and -e. With the scores
+s(theta) = W^T S^-1 (tau - W theta):
 
     D theta = s(theta) - mean over e of [s_{+e}(theta) + s_{-e}(theta)] / 2
 
-In the eigenvectors of D against H, whose eigenvalues x are the share of noise in what seems to be
-known of a direction, the correction is by 1 / (1 - x); D is not known so well that directions of
-nothing but noise could be corrected, so x counts up to a bound, and an error of D as an error. The
-correction amplifies errors by as much; the bias is uneven over a log, so segments scatter more than
-the errors do by about the same, and their scatter is taken as it is (coverages:
-docs/explanation/intervals.md).
+The eigenvalues x of D relative to H are the shares of noise in the information along the
+eigenvectors. Along each of them the correction is a factor of 1 / (1 - x). D is estimated with an
+error, so directions that contain only noise cannot be corrected: x is limited by a bound, and the
+error of D is counted as an error of the estimate. The correction amplifies errors by the same
+factor. The bias varies over a log, so the scatter of the segments is also larger by about this
+factor; it is used as it is (coverages: docs/explanation/intervals.md).
 
-What is linear in e, [s_{+e} - s_{-e}] / 2, is the noise of the score that the encoder makes. Where
-a motion is repeated so are its rounding errors, and segments of the log do not scatter as much as
-their sum: the covariance of the score then grows by what the sum scatters more.
+The part linear in e, [s_{+e} - s_{-e}] / 2, is the noise of the score due to the encoder. If a
+motion is repeated, its rounding errors are repeated, and the segments of the log scatter less than
+their sum. The difference is added to the covariance of the score.
 
 References:
     Carroll, Ruppert, Stefanski, Crainiceanu (2006), Measurement Error in Nonlinear Models, chapters
@@ -58,33 +58,34 @@ __all__ = [
 ]
 
 _FEWEST, _MOST = 4, 6  # pairs of rounding errors
-_SURE = 0.2  # standard errors by which the shift may be uncertain without more pairs
-_WORST = 0.8  # share of noise in a direction from which it is corrected no further
-_UNSURE = 0.1  # of a share of noise: its standard error
-_MATTERS = 0.1  # standard errors by which parameters move, below which nothing is done
-_NAMED, _WARNED = 0.5, 2.0  # standard errors of one parameter: a note, and a warning
-_ALIKE = 0.1  # of the largest share of noise, from which a joint is named
-_CUBIC = 5  # rows either way in which the motion is smoothed, at least
-_JOINED = 4  # segments that are one, which is faster
-_ROWS = 20_000  # of a log, in which the step of its positions is sought
-_FREQUENCIES = 2048  # at which the noise of an acceleration is summed
-_JOINTS = 4  # named in a finding
+_PRECISE = 0.2  # uncertainty of the shift in standard errors at which no more pairs are drawn
+_WORST = 0.8  # largest share of noise in a direction that is corrected
+_SHARE_ERROR = 0.1  # relative standard error of a share of noise
+_MATTERS = 0.1  # shift of the parameters in standard errors below which nothing is corrected
+_NAMED, _WARNED = 0.5, 2.0  # shift of a parameter in standard errors: note, warning
+_ALIKE = 0.1  # share of noise over the largest share, from which a joint is named
+_CUBIC = 5  # smallest number of rows on each side for smoothing
+_JOINED = 4  # segments that are joined into one, for speed
+_ROWS = 20_000  # rows of a log in which the step of its positions is searched
+_FREQUENCIES = 2048  # frequencies at which the noise of an acceleration is summed
+_JOINTS = 4  # largest number of joints named in a finding
 
 
 @dataclass(frozen=True, eq=False)
 class RegressorNoise:
-    """What the steps of the positions do to least squares.
+    """Effect of position quantisation on least squares.
 
     Attributes:
-        steps: Largest step of each joint's position in the logs, shape (n,) [rad or m]; 0: none, or
-            of no effect since velocities are measured.
-        share: Root mean square of what they add to each acceleration, over its own, shape (n,) [-].
-        shift: By how much they move base parameters, E[theta_ls] - theta, shape (b,).
-        std_error: Standard errors of base parameters by residual and filter alone, without what the
-            steps add to them, shape (b,); inf where the data leave them open.
-        meat: Covariance of the score that the scatter of segments does not show, shape (b, b): of
-            repeated rounding errors, and of the shift.
-        is_corrected: Whether the estimate is corrected; otherwise its covariance has the shift.
+        steps: Largest quantisation step of each joint's position in the logs, shape (n,)
+            [rad or m]; 0: none, or without effect because velocities are measured.
+        share: RMS of the quantisation noise of each acceleration, over the RMS of the
+            acceleration, shape (n,) [-].
+        shift: Bias of the base parameters, E[theta_ls] - theta, shape (b,).
+        std_error: Standard errors of the base parameters by residual and filter, without the
+            quantisation, shape (b,); inf if not identifiable.
+        meat: Covariance of the score that the scatter of segments does not include, shape (b, b):
+            of repeated rounding errors and of the shift.
+        is_corrected: Whether the estimate is corrected; if not, its covariance includes the shift.
     """
 
     steps: Array
@@ -95,7 +96,7 @@ class RegressorNoise:
     is_corrected: bool = True
 
     def uncorrected(self, information: Array) -> "RegressorNoise":
-        """Return the same where the shift is not corrected, but counts as an error.
+        """Return the same with the shift counted as an error instead of corrected.
 
         Args:
             information: H = W^T S^-1 W of all rows, shape (b, b).
@@ -107,14 +108,14 @@ class RegressorNoise:
 def find_regressor_noise(
     recordings: Recordings, whole: Reduction, theta: Array, sigma: Array, level: Array
 ) -> RegressorNoise | None:
-    """Return what the steps of the positions do to least squares; None if next to nothing.
+    """Return the effect of position quantisation on least squares; None if it is negligible.
 
     Args:
-        recordings: The recordings. Of logs in files, the windows that are in memory stand for all.
-        whole: What all of their rows come down to, base parameters.
-        theta: Base parameters that least squares find in them, shape (b,).
+        recordings: The recordings. Logs in files are represented by their windows in memory.
+        whole: Reduction of all of their rows, base parameters.
+        theta: Base parameters by least squares, shape (b,).
         sigma: Noise level per joint that weighted the rows, shape (n_rows,) [N m or N].
-        level: That of the residual, likewise.
+        level: Noise level per joint of the residual, shape (n_rows,) [N m or N].
     """
     model, factors, weights = recordings.model, whole.factors, 1.0 / sigma**2
     if model.is_static or model.free_flyer:
@@ -129,35 +130,35 @@ def find_regressor_noise(
         return None
     near = _without_steps(near, steps)
     plain = _sums(near, [log.whole.trajectory for log in near.fitted], theta, weights)
-    scale = float(factors.rows.sum() / plain.rows)  # all rows over those that are looked at
+    scale = float(factors.rows.sum() / plain.rows)  # all rows over those in memory
     bread = solve_factor(factors, sigma, theta).covariance
     variance = np.diag(bread @ factors.information((level * weights) ** 2) @ bread)
     error = np.sqrt(np.maximum(variance, 0.0) / recordings.share)
-    error = np.where(error > 0, error, np.inf)  # inf: left open
+    error = np.where(error > 0, error, np.inf)  # inf: not identifiable
     rng, pairs = np.random.default_rng(0), list[tuple[_Sums, _Sums]]()
     is_enough = False
     while not is_enough:
         pairs.append(_pair(near, steps, theta, weights, rng))
-        pulls = np.array([plain.score - 0.5 * (one.score + two.score) for one, two in pairs])
-        is_enough = _is_enough(scale * pulls @ bread / error)
+        draws = np.array([plain.score - 0.5 * (one.score + two.score) for one, two in pairs])
+        is_enough = _is_enough(scale * draws @ bread / error)
     if len(pairs) < _FEWEST:
         return None
     D = np.mean([0.5 * (one.information + two.information) for one, two in pairs], axis=0)
-    D, pull = scale * (D - plain.information), scale * pulls.mean(axis=0)
-    root, move, unsure = without_noise(bread, D, pull)
-    odd = np.array([0.5 * (one.segments - two.segments) @ root for one, two in pairs])  # (k, s, b)
-    along = factors.information(weights) @ root  # what a move along each direction adds to s
-    meat = (along * (scale * _repeated(odd) + unsure**2)) @ along.T
-    meat = meat + scale**2 * np.cov(pulls.T) / len(pulls)
+    D, D_theta = scale * (D - plain.information), scale * draws.mean(axis=0)
+    root, move, error_of_move = without_noise(bread, D, D_theta)
+    linear = np.array([0.5 * (one.segments - two.segments) @ root for one, two in pairs])
+    along = factors.information(weights) @ root  # change of the score per move along a direction
+    meat = (along * (scale * _repeated(linear) + error_of_move**2)) @ along.T
+    meat = meat + scale**2 * np.cov(draws.T) / len(draws)
     shift = -root @ move
     return RegressorNoise(np.max(steps, axis=0), share, shift, error, meat)
 
 
 def encoder_findings(fit: "Fit") -> list[Finding]:
-    """Return a finding where the steps of encoders move inertial parameters.
+    """Return a finding if encoder quantisation biases inertial parameters.
 
     Args:
-        fit: What was found.
+        fit: The fit.
     """
     noise, model = fit.regressor_noise, fit.model
     if noise is None:
@@ -171,20 +172,20 @@ def encoder_findings(fit: "Fit") -> list[Finding]:
     names = [model.joints[j] for j in coarse]
     largest = int(coarse[np.argmax(noise.steps[coarse])])
     step, unit = float(noise.steps[largest]), "rad"
-    resolution = f" ({np.log2(2 * np.pi / step):.1f} bits a turn)"
+    resolution = f" ({np.log2(2 * np.pi / step):.1f} bits per revolution)"
     if model.joints[largest] in model.layout.prismatic:
         unit, resolution = "m", ""
     effect = (
-        "the estimate is corrected for it"
+        "the estimate is corrected for this bias"
         if noise.is_corrected
-        else "this estimator is not corrected for it, its standard errors count it"
+        else "this estimator does not correct the bias, its standard errors include it"
     )
     message = (
-        f"{listed(names, _JOINTS)}: the position has steps of up to {step:.3g} {unit}{resolution}, "
-        f"which add noise of up to {100 * noise.share.max():.2g} % to the RMS acceleration. Noise "
-        f"of the regressor moves {fit.mapping.base_names[worst]} by "
-        f"{moved[worst]:.1f} standard errors; {effect}. A longer log does not reduce it: lower "
-        "cutoff, move faster, log the velocity of the drive, or use a finer encoder"
+        f"{listed(names, _JOINTS)}: the position is quantised in steps of up to {step:.3g} "
+        f"{unit}{resolution}. The resulting noise is up to {100 * noise.share.max():.2g} % of the "
+        f"RMS acceleration and shifts {fit.mapping.base_names[worst]} by {moved[worst]:.1f} "
+        f"standard errors; {effect}. A longer log does not reduce it: lower cutoff, move faster, "
+        "log the velocity of the drive, or use an encoder of higher resolution"
     )
     evidence = {
         f"step_{name}": float(noise.steps[j]) for name, j in zip(names, coarse, strict=True)
@@ -195,14 +196,14 @@ def encoder_findings(fit: "Fit") -> list[Finding]:
 
 
 def smoothed(q: Array, steps: Array, width: int) -> Array:
-    """Return what brings rounded positions near to what they were before, shape (N, n).
+    """Return the change that removes most of the quantisation of positions, shape (N, n).
 
-    A cubic through the rows around each, at most a step away.
+    A cubic polynomial is fitted to the rows around each sample; the change is at most one step.
 
     Args:
-        q: Positions, without full turns, shape (N, n) [rad or m].
-        steps: Steps of the encoders, shape (n,) [rad or m]; 0: none.
-        width: Rows in which the motion is taken to be a cubic, odd.
+        q: Unwrapped positions, shape (N, n) [rad or m].
+        steps: Quantisation steps of the encoders, shape (n,) [rad or m]; 0: none.
+        width: Number of rows over which the motion is approximated by a cubic, not even.
     """
     rows = (len(q) - 1) // 2 * 2 + 1
     smooth = local_polynomial(q, min(width, rows), min(3, rows - 1))
@@ -211,43 +212,44 @@ def smoothed(q: Array, steps: Array, width: int) -> Array:
 
 
 def rounding_errors(q: Array, steps: Array, rng: np.random.Generator) -> Array:
-    """Return errors of encoders whose zeros lie anywhere, shape (N, n).
+    """Return rounding errors of encoders with random zeros, shape (N, n) [rad or m].
 
     Args:
-        q: Positions before they are rounded, shape (N, n) [rad or m].
-        steps: Steps of the encoders, shape (n,) [rad or m]; 0: none.
-        rng: Source of the zeros.
+        q: Positions before quantisation, shape (N, n) [rad or m].
+        steps: Quantisation steps of the encoders, shape (n,) [rad or m]; 0: none.
+        rng: Random generator of the zeros.
     """
     count = q / np.where(steps > 0, steps, 1.0) + rng.random(q.shape[1])
     errors: Array = (np.round(count) - count) * steps
     return errors
 
 
-def without_noise(bread: Array, D: Array, pull: Array) -> tuple[Array, Array, Array]:
-    """Return (H - D)^-1 (D theta) in directions in which noise and information do not mix.
+def without_noise(bread: Array, D: Array, D_theta: Array) -> tuple[Array, Array, Array]:
+    """Return (H - D)^-1 D theta along directions in which H and D are diagonal.
 
     Args:
-        bread: Inverse of the information H, shape (b, b); 0 of what it leaves open.
+        bread: Inverse of the information H, shape (b, b); 0 for parameters not identifiable.
         D: Noise of H, shape (b, b).
-        pull: D theta, shape (b,).
+        D_theta: D theta, shape (b,).
 
     Returns:
-        The directions, columns X with X X^T = H^-1 and X^T D X diagonal, shape (b, b); how far to
-        go along each, as if at most 80 % of its information were noise; and how uncertain that is
-        by what is not known of D, shape (b,) each.
+        The directions, columns X with X X^T = H^-1 and X^T D X diagonal, shape (b, b); the step
+        along each, with a share of noise of at most 80 %, shape (b,); and the uncertainty of the
+        step due to that of D, shape (b,).
     """
     size, axes = np.linalg.eigh(bread)
     root = axes * np.sqrt(np.maximum(size, 0.0))
-    x, turn = np.linalg.eigh(root.T @ D @ root)
-    root, x = root @ turn, np.clip(x, 0.0, _WORST)
-    move = root.T @ pull / (1.0 - x)
-    return root, move, move * _UNSURE * x / (1.0 - x)
+    x, rotation = np.linalg.eigh(root.T @ D @ root)
+    root, x = root @ rotation, np.clip(x, 0.0, _WORST)
+    move = root.T @ D_theta / (1.0 - x)
+    return root, move, move * _SHARE_ERROR * x / (1.0 - x)
 
 
 def acceleration_noise(step: float, signals: SignalSettings) -> float:
-    """Return the acceleration's root mean square of white noise of 1 on the positions [1/s^2].
+    """Return the RMS acceleration due to white position noise of RMS 1 [1/s^2].
 
-    Behind the digital Butterworth filter, forward and backward, and two central differences:
+    The noise passes the digital Butterworth filter, forward and backward, and two central
+    differences:
 
     1 / (1 + (tan(pi f step) / tan(pi cutoff step))^(2 order)) and (sin(2 pi f step) / step)^2.
 
@@ -265,7 +267,7 @@ def acceleration_noise(step: float, signals: SignalSettings) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """What the rows of logs on some motion sum up to."""
+    """Score and information of the rows of logs for some motion."""
 
     segments: Array  # (s, b), score W^T S^-1 (tau - W theta) of each segment
     information: Array  # (b, b), W^T S^-1 W of all rows
@@ -273,25 +275,25 @@ class _Sums:
 
     @property
     def score(self) -> Array:
-        """That of all rows, shape (b,)."""
+        """Score of all rows, shape (b,)."""
         total: Array = self.segments.sum(axis=0)
         return total
 
 
 def _is_enough(moves: Array) -> bool:
-    """Return whether draws show by how much parameters move, or that it is next to nothing.
+    """Return whether the shift of the parameters is known precisely, or is negligible.
 
     Args:
-        moves: What each of k draws says, in standard errors, shape (k, b).
+        moves: Shift in standard errors by each of k draws, shape (k, b).
     """
     count = len(moves)
     if count < _FEWEST:
         return bool((np.abs(moves.mean(axis=0)) < _MATTERS).all())
-    return count >= _MOST or bool((moves.std(axis=0, ddof=1) <= _SURE * np.sqrt(count)).all())
+    return count >= _MOST or bool((moves.std(axis=0, ddof=1) <= _PRECISE * np.sqrt(count)).all())
 
 
 def _sums(near: Recordings, motions: Sequence[Trajectory], theta: Array, weights: Array) -> _Sums:
-    """Return what the rows sum up to if the logs in memory had moved so."""
+    """Return the sums over the rows of the logs in memory, for other motions."""
     segments, rows = list[Array](), 0
     information = np.zeros((len(theta), len(theta)))
     for k, motion in enumerate(motions):
@@ -310,7 +312,7 @@ def _pair(
     weights: Array,
     rng: np.random.Generator,
 ) -> tuple[_Sums, _Sums]:
-    """Return what the rows sum up to with rounding errors added, and subtracted."""
+    """Return the sums over the rows with rounding errors added, and subtracted."""
     logs = zip(near.fitted, steps, strict=True)
     errors = [rounding_errors(log.head.q, own, rng) for log, own in logs]
 
@@ -323,43 +325,43 @@ def _pair(
 
 
 def _shifted(log: SurveyedLog, change: Array) -> SurveyedLog:
-    """Return a log in memory with other positions, smoothed alike."""
+    """Return a log in memory with changed positions, smoothed in the same way."""
     source = replace(log.head, q=log.head.q + change)
     return replace(log, source=source, windows=(source,), asked=log.signals)
 
 
 def _without_steps(near: Recordings, steps: Sequence[Array]) -> Recordings:
-    """Return logs in memory with positions about as they were before they were rounded.
+    """Return logs in memory with most of the quantisation removed from the positions.
 
-    Errors that are added are then not multiplied by those that the positions had.
+    Added rounding errors then do not interact with those of the recorded positions.
     """
     logs = []
     for log, own in zip(near.fitted, steps, strict=True):
         period = 1.0 / ((log.signals.cutoff or np.inf) * log.step)  # [rows], of the filter
         width = 2 * max(_CUBIC, round(period)) + 1
-        slides = np.isin(log.model.joints, list(log.model.layout.prismatic))
-        q = np.where(slides, log.head.q, np.unwrap(log.head.q, axis=0))
+        is_prismatic = np.isin(log.model.joints, list(log.model.layout.prismatic))
+        q = np.where(is_prismatic, log.head.q, np.unwrap(log.head.q, axis=0))
         logs.append(_shifted(log, smoothed(q, own, width)))
-    return replace(near, fitted=logs, kept=())
+    return replace(near, fitted=logs, validation=())
 
 
-def _repeated(odd: Array) -> Array:
-    """Return the variance of the score along each direction that segments do not show, shape (b,).
+def _repeated(linear: Array) -> Array:
+    """Return the variance of the score along each direction due to repeated errors, shape (b,).
 
-    Segments that have the same rounding errors do not scatter, but add up.
+    Segments with the same rounding errors do not scatter, but their errors add up.
 
     Args:
-        odd: What is linear in k draws of the errors of the score of s segments along b directions,
-            shape (k, s, b).
+        linear: Part of the score linear in the rounding errors, of k draws, s segments and b
+            directions, shape (k, s, b).
     """
-    total, scattered = odd.sum(axis=1) ** 2, (odd**2).sum(axis=1)
+    total, scattered = linear.sum(axis=1) ** 2, (linear**2).sum(axis=1)
     more: Array = np.maximum(np.mean(total - scattered, axis=0), 0.0)
     return more
 
 
 def _in_memory(recordings: Recordings) -> Recordings:
-    """Return the fitted logs in memory; of those in files the windows that were looked at."""
-    if all(log.is_held for log in recordings.fitted):
+    """Return the fitted logs in memory; for logs in files, their windows in memory."""
+    if all(log.is_in_memory for log in recordings.fitted):
         return recordings
     windows = [
         hold_log(log.model, window, log.signals)
@@ -367,13 +369,13 @@ def _in_memory(recordings: Recordings) -> Recordings:
         for window in log.looks
     ]
     usable = [log for log in windows if len(log.pieces[0].read().trajectory.t)]
-    return replace(recordings, fitted=usable, kept=(), plan=None, checkpoint=None)
+    return replace(recordings, fitted=usable, validation=(), plan=None, checkpoint=None)
 
 
 def _steps(log: SurveyedLog) -> Array:
-    """Return the steps of the positions of a log in memory, shape (n,); 0 if they do not matter.
+    """Return the quantisation steps of the positions of a log in memory, shape (n,).
 
-    They do not where velocities are measured.
+    They are 0 if velocities are measured.
     """
     if log.signals.velocity == "measured":
         return np.zeros(len(log.model.joints))
@@ -381,7 +383,7 @@ def _steps(log: SurveyedLog) -> Array:
 
 
 def _share(logs: Sequence[SurveyedLog], steps: Sequence[Array], whole: Reduction) -> Array:
-    """Return what steps add to each acceleration over its own size, at most 1, shape (n,)."""
+    """Return the quantisation noise of each acceleration over its RMS, at most 1, shape (n,)."""
     noise = [
         own / np.sqrt(12.0) * acceleration_noise(log.step, log.signals)
         for log, own in zip(logs, steps, strict=True)

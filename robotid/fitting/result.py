@@ -1,4 +1,4 @@
-"""A fit: what an estimator found of a robot, its errors, and how well it predicts."""
+"""The result of a fit: identified parameters, standard errors, predictions."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -39,23 +39,24 @@ from robotid.robot.parameters import pseudo_inertia
 
 __all__ = ["Fit", "Solution"]
 
-_KNOWN = 1e-300  # the spread of what was known exactly
-_STAYED = 0.3  # spreads that a parameter of the prior may have moved
-_AT_BOUND = 1e-6  # of its spread: a drive term that small is at its bound of 0
+_KNOWN = 1e-300  # smallest prior standard deviation, of fixed parameters
+_STAYED = 0.3  # change in prior standard deviations up to which the source may be the prior
+_AT_BOUND = 1e-6  # size of a drive term at its bound of 0, in prior standard deviations
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
-    """A robot's parameters as fitted to recordings, before their errors are known.
+    """Parameters of a robot fitted to recordings, without standard errors.
 
     Attributes:
-        model: The robot as the URDF describes it.
+        model: The robot of the URDF.
         mapping: Standard to base parameters.
-        prior_std: How far parameters may plausibly be wrong before the data, shape (p,).
+        prior_std: Prior standard deviations of the standard parameters, shape (p,).
         standard: Standard parameters, shape (p,).
-        fitted: The recordings that were fitted.
-        validation: Those that were kept apart.
-        drives: What friction its joints have beside viscous and Coulomb's, and what was tried.
+        fitted: The fitted recordings.
+        validation: The validation recordings.
+        drives: Friction of the joints in addition to viscous and Coulomb friction, and the terms
+            that were tried.
     """
 
     model: RobotModel
@@ -69,20 +70,20 @@ class Solution:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fit(Identified, Solution):
-    """A robot's parameters as fitted to recordings, before anything is concluded of them.
+    """Parameters of a robot fitted to recordings, without findings and verdict.
 
-    Its recordings have predictions "estimate" and "wls".
+    Its recordings have the predictions "estimate" and "wls".
 
     Attributes:
         estimator: The estimator's settings.
-        estimate: What the estimator returned: base parameters, or standard ones ("consistent").
+        estimate: Result of the estimator: base parameters, or standard ones ("consistent").
         wls: Weighted least squares on the same factors, base parameters.
-        urdf_with_drives: The prior with the drive terms that then fit best, shape (p,).
-        errors: What the standard errors depend on.
-        factors: What the fitted rows come down to, base parameters.
+        urdf_with_drives: The prior with fitted drive terms, shape (p,).
+        errors: Method and degrees of freedom of the standard errors.
+        factors: Triangular factors of the fitted rows, base parameters.
         determination: Which base parameters the fitted rows determine.
-        open_terms: What is open of its drives, which ``standard_covariance`` counts.
-        regressor_noise: What the steps of the positions do to least squares; None: next to nothing.
+        open_terms: Uncertainties of the drive models; ``standard_covariance`` includes them.
+        regressor_noise: Effect of position quantisation on least squares; None: negligible.
     """
 
     estimator: EstimatorSettings
@@ -108,25 +109,25 @@ class Fit(Identified, Solution):
 
         Args:
             joint: The joint, or the name of a coupling.
-            v: Speeds, shape (k,) [rad/s or m/s]; None: 20 either way, from the slowest to the
-                fastest of the fitted rows.
-            q: Position, of which some friction depends [rad or m]; None: the median.
-            load: Torque of the bodies that the gear carries, of which some friction depends
-                [N m or N]; None: its root mean square in the fitted logs.
+            v: Speeds, shape (k,) [rad/s or m/s]; None: 20 in each direction, from the slowest to
+                the fastest speed of the fitted rows.
+            q: Position, for friction that depends on it [rad or m]; None: the median.
+            load: Joint load torque, for friction that depends on it [N m or N]; None: its RMS in
+                the fitted logs.
 
         Returns:
             The curve: ``v``, ``torque``, ``std``, ``half_width`` of the 95 % band, ``load``.
 
         Raises:
-            DataError: If there is no such drive; or without speeds, if it was at rest.
+            DataError: If there is no such drive, or no speeds are given and the drive was at rest.
         """
         return typical_friction(self, joint, v, q=q, load=load)
 
     @property
     def is_consistent(self) -> bool:
-        """Whether every body, every drive and the mass matrix are physically possible.
+        """Whether every body, every drive and the mass matrix are physically consistent.
 
-        A body must be so without its links on locked joints, which keep their own inertials; the
+        A body is checked without its links on locked joints, which keep their own inertials. The
         mass matrix must be positive definite at random poses.
         """
         size = self.model.layout.n_inertial
@@ -137,16 +138,16 @@ class Fit(Identified, Solution):
 
     @property
     def mass_matrix(self) -> MassMatrixCheck:
-        """The mass matrix of the standard parameters over random poses; ``replace`` keeps it."""
+        """Check of the mass matrix of the standard parameters at random poses."""
         if not self._checked or self._checked[-1][0] is not self.standard:
             self._checked.append((self.standard, check_mass_matrix(self.model, self.standard)))
         return self._checked[-1][1]
 
     @property
     def at_bound(self) -> Array:
-        """Which drive terms are 0 only since they cannot be negative, shape (p,).
+        """Which drive terms are at their bound of 0, shape (p,), bool.
 
-        What they would be without that bound is hidden, so they have no standard error.
+        Their value without the bound is not known, so they have no standard error.
         """
         is_bounded = bool(self.estimate.details.get("constraints"))
         is_zero = self.standard <= _AT_BOUND * self.prior_std
@@ -154,40 +155,40 @@ class Fit(Identified, Solution):
 
     @property
     def standard_error(self) -> Array:
-        """Standard errors of the standard parameters, shape (p,), by the prior; inf at bounds."""
-        # exact data leave a variance of rounding size, of either sign
+        """Standard errors of the standard parameters given the prior, shape (p,); inf at bounds."""
+        # noise-free data give a variance of rounding size, of either sign
         errors = np.sqrt(np.maximum(np.diag(self.standard_covariance), 0.0))
         return np.where(self.at_bound, np.inf, errors)
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """What determined each standard parameter.
+        """The source of the value of each standard parameter.
 
-        * "data": the motion, which shrinks its plausible spread below 30 %;
-        * "prior": nothing, so that the URDF's value stands, within 30 % of that spread;
-        * "bound": physics forbids the URDF's value or what the data ask for: a drive term at 0, a
-          body held by its extent;
-        * "mixed": data and URDF together, in sums with others; or a wish of the user.
+        * "data": the data; the standard error is below 30 % of the prior standard deviation;
+        * "prior": the URDF; the data do not determine the parameter, and it changed by less than
+          30 % of the prior standard deviation;
+        * "bound": a bound of physical consistency, as a drive term at 0 or a body at its extent;
+        * "mixed": data and URDF together, in sums with other parameters, or a setting of the user.
         """
         layout, unbounded = self.model.layout, self.errors.unbounded
-        after = self.standard_error if unbounded is None else unbounded  # a bound is no source
+        after = self.standard_error if unbounded is None else unbounded  # without bounds
         share = after / np.maximum(self.prior_std, _KNOWN)
         moved = np.abs(self.standard - self.prior) > _STAYED * self.prior_std
         active = self.estimate.details.get("active", ())
-        held = layout.owned_by([label.split(" ", 1)[1] for label in active if " " in label])
+        is_bound = layout.owned_by([label.split(" ", 1)[1] for label in active if " " in label])
         masses = self.estimator.bounds.masses.items()
-        known = [f"{link}.m" for link, mass in masses if np.ptp(mass) == 0]
-        kept = layout.owned_by(self.estimate.details.get("pinned", ()))
-        kept = kept | np.isin(layout.names, known) | ((share > FROM_PRIOR) & ~moved)
-        held = self.at_bound | (held & moved & (share >= FROM_DATA))
-        return sources_of(share, kept, held)
+        fixed = [f"{link}.m" for link, mass in masses if np.ptp(mass) == 0]
+        is_prior = layout.owned_by(self.estimate.details.get("pinned", ()))
+        is_prior = is_prior | np.isin(layout.names, fixed) | ((share > FROM_PRIOR) & ~moved)
+        is_bound = self.at_bound | (is_bound & moved & (share >= FROM_DATA))
+        return sources_of(share, is_prior, is_bound)
 
     @property
     def standard_quantile(self) -> Array:
-        """How many standard errors the 95 % interval of each standard parameter reaches, (p,).
+        """Half-width of each standard parameter's 95 % interval in standard errors, shape (p,).
 
-        The quantile is that of the base parameter, of those it is part of, whose standard error has
-        the fewest degrees of freedom.
+        The quantile is that of the base parameter with the fewest degrees of freedom, among those
+        that contain the parameter.
         """
         own = np.where(self.mapping.K != 0.0, self.errors.quantile[:, None], QUANTILE)  # (b, p)
         quantile: Array = own.max(axis=0)
@@ -204,14 +205,14 @@ class Fit(Identified, Solution):
 
     @property
     def moments(self) -> dict[str, DriveMoments]:
-        """What projects the friction of drives on simpler terms, from the fitted rows."""
+        """Moments that project drive friction on simpler terms, from the fitted rows, by drive."""
         return fitted_moments(self)
 
     def band(self, evaluation: Evaluation) -> TorqueBand:
-        """Return how far the torques predicted for a recording can be trusted.
+        """Return the uncertainty band of the torques predicted for a recording.
 
         Args:
-            evaluation: One of the recordings; of another one, the band has the fit's noise.
+            evaluation: A recording; if it is not one of this fit, the band has the fit's noise.
         """
         every = zip((*self.fitted, *self.validation), self._bands, strict=True)
         own = next((band for e, band in every if e is evaluation), None)
@@ -223,7 +224,7 @@ class Fit(Identified, Solution):
 
     @cached_property
     def outliers(self) -> tuple[Outlier, ...]:
-        """Rows of the fitted recordings that the estimate does not explain, the worst first."""
+        """Rows of the fitted recordings with very large residuals, the largest first."""
         return find_outliers(self.model, self.fitted, self.standard)
 
     def metrics(self, name: str = "estimate") -> Metrics:
@@ -233,7 +234,7 @@ class Fit(Identified, Solution):
             name: "estimate" or "wls".
 
         Raises:
-            SettingsError: If it is neither.
+            SettingsError: If it is another name.
         """
         if not isinstance(name, str) or name not in ("estimate", "wls"):
             raise SettingsError(f"name is {name!r}, wanted 'estimate' or 'wls'")
@@ -241,16 +242,16 @@ class Fit(Identified, Solution):
 
     @property
     def refitted(self) -> tuple[Evaluation, ...]:
-        """Validation recordings that hold rows which were fitted: they show no prediction."""
+        """Validation recordings that contain fitted rows: they do not test the prediction."""
         return tuple(e for e in self.validation if e.is_refitted)
 
     @property
     def is_poorly_excited(self) -> bool:
-        """Whether the motion, not the noise, leaves parameters open that a richer one would not."""
+        """Whether parameters are not identifiable because of too little excitation, not noise."""
         return is_poorly_excited(self.wls, len(self.base))
 
     @property
     def predictions(self) -> dict[str, Metrics]:
-        """Metrics of each validation recording that shows a prediction, by its name."""
-        kept = (e for e in self.validation if not e.is_refitted)
-        return {e.recording.name: e.metrics["estimate"] for e in kept}
+        """Metrics of each validation recording without fitted rows, by its name."""
+        new = (e for e in self.validation if not e.is_refitted)
+        return {e.recording.name: e.metrics["estimate"] for e in new}

@@ -1,4 +1,4 @@
-"""Which estimator is wanted, with its own settings: one table of settings per estimator."""
+"""The choice of the estimator and its settings: one table of settings per estimator."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -43,32 +43,34 @@ _FINITE = Range("a positive, finite number", lambda x: 0 < x < math.inf)
 
 @dataclass(frozen=True)
 class ConstraintSettings(Settings):
-    """Bounds beside physical consistency, by name of the link that a joint moves."""
+    """Bounds in addition to physical consistency, by name of the link that a joint moves."""
 
     mass: Mapping[str, Any] = setting(
-        {}, "mass, or smallest and largest mass, of a link with all that is fixed to it [kg]"
+        {}, "mass, or smallest and largest mass, of a link with all links fixed to it [kg]"
     )
     total_mass: float | Sequence[float] | None = setting(
-        None, "mass, or bounds of it, of all links that move [kg]", reads=(int, float, list)
+        None,
+        "mass, or smallest and largest mass, of all moving links [kg]",
+        reads=(int, float, list),
     )
     com: Mapping[str, Any] = setting(
         {},
-        "corners [[x, y, z], [x, y, z]] of a box in the link's frame that holds the centre of mass "
-        "[m]",
+        "lower and upper corner [[x, y, z], [x, y, z]] of a box in the link's frame that contains "
+        "the centre of mass [m]",
     )
     com_within: str = setting(
         "none",
-        "where the other centres of mass are kept: box or hull of the link's own geometry in the "
-        "URDF, where it has one and its meshes are found; or none",
+        "constraint on all other centres of mass: inside the box or the convex hull of the link's "
+        "geometry in the URDF (links without geometry or meshes are not constrained); or none",
         among=("none", "box", "hull"),
     )
     extent: str = setting(
         "box",
-        "where all mass of a link is kept: box of its geometry in the URDF, or of its frames if it "
-        "has none, as far as the data do not clearly contradict it; or none",
+        "constraint on the mass distribution of a link: all mass inside the box of its geometry in "
+        "the URDF, or of its frames if it has no geometry, unless the data contradict it; or none",
         among=("box", "none"),
     )
-    pinned: Sequence[str] = setting((), "links that keep the URDF's values")
+    pinned: Sequence[str] = setting((), "links that keep the URDF's inertial values")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -81,17 +83,17 @@ class ConstraintSettings(Settings):
 
     @property
     def total(self) -> tuple[float, float] | None:
-        """Smallest and largest mass of all links that move [kg]."""
+        """Smallest and largest mass of all moving links together [kg]."""
         return None if self.total_mass is None else _interval(self.total_mass, "total_mass")
 
     @property
     def boxes(self) -> dict[str, tuple[list[float], list[float]]]:
-        """Lower and upper corner of the box of the centre of mass by link [m]."""
+        """Lower and upper corner of the box of the centre of mass, by link [m]."""
         return {name: _corners(value, name) for name, value in self.com.items()}
 
 
 def _interval(value: object, what: str) -> tuple[float, float]:
-    """Return the bounds that a number, or a pair of them, states."""
+    """Return the bounds given by a number or by a pair of numbers."""
     pair = [value, value] if _is_number(value) else value
     if not (isinstance(pair, Sequence) and len(pair) == 2 and all(map(_is_number, pair))):
         raise SettingsError(f"{what} is {value!r}, wanted a number or [smallest, largest] [kg]")
@@ -103,7 +105,9 @@ def _interval(value: object, what: str) -> tuple[float, float]:
             f"{_LARGEST:g} for no upper bound"
         )
     if not low <= high:
-        raise SettingsError(f"{found}: the first is above the second; write the smaller one first")
+        raise SettingsError(
+            f"{found}: the first value is larger than the second; write the smaller one first"
+        )
     return low, high
 
 
@@ -116,14 +120,14 @@ def _corners(value: Any, name: str) -> tuple[list[float], list[float]]:  # noqa:
     is_box = [len(corner) for corner in corners] == [3, 3]
     if not is_box or not all(abs(x) <= _LARGEST for corner in corners for x in corner):
         raise SettingsError(
-            f"com of {name} is {value!r}, wanted [[x, y, z], [x, y, z]] [m], at most "
-            f"{_LARGEST:g} each"
+            f"com of {name} is {value!r}, wanted [[x, y, z], [x, y, z]] [m], each value at most "
+            f"{_LARGEST:g}"
         )
     low, high = corners
     if any(a > b for a, b in zip(low, high, strict=True)):
         raise SettingsError(
-            f"com of {name} is {value!r}: the first corner is above the second; write the smaller "
-            "coordinates first"
+            f"com of {name} is {value!r}: a coordinate of the first corner is larger than that of "
+            "the second; write the corner with the smaller coordinates first"
         )
     return low, high
 
@@ -134,19 +138,20 @@ def _is_number(value: object) -> bool:
 
 @dataclass(frozen=True, init=False)
 class EstimatorSettings(Settings):
-    """Which estimator, and its own settings, as ``EstimatorSettings("wls", robust="huber")``.
+    """The estimator and its settings, as ``EstimatorSettings("wls", robust="huber")``.
 
-    It makes the settings of that estimator; a setting of another one is refused.
+    The call returns the settings class of that estimator. A setting of another estimator is an
+    error.
 
     Attributes:
-        weighs_alike: Whether rows weigh alike, whatever the noise of their joints is.
-        allows_for_noise: Whether it allows for the noise of the regressor by itself.
+        has_equal_weights: Whether all rows have equal weights, whatever the noise of their joints.
+        allows_for_noise: Whether the estimator itself accounts for noise of the regressor.
     """
 
-    weighs_alike: ClassVar[bool] = False
+    has_equal_weights: ClassVar[bool] = False
     allows_for_noise: ClassVar[bool] = False
 
-    name: str = setting("consistent", "which estimator")
+    name: str = setting("consistent", "name of the estimator")
 
     def __new__(cls, name: str = "consistent", **options: object) -> "EstimatorSettings":
         require_kind(name, str, "estimator", f"one of {listed(ESTIMATORS)}")
@@ -177,32 +182,32 @@ class EstimatorSettings(Settings):
         """Return the estimator that reads rows or samples.
 
         Args:
-            known: The robot, and what is known of it before the data.
+            known: The robot and its prior.
 
         Raises:
-            SettingsError: If constraints contradict each other or do not fit the robot, or the
+            SettingsError: If constraints contradict each other or do not match the robot, or the
                 estimator reads a simulator.
         """
-        raise SettingsError(f"{self!r} describes no estimator; take EstimatorSettings(name)")
+        raise SettingsError(f"{self!r} describes no estimator; use EstimatorSettings(name)")
 
     @property
     def words(self) -> str:
-        """What the estimator is."""
+        """Description of the estimator."""
         return self.paths()["name"].text
 
     @property
     def loss(self) -> str:
-        """The loss of rows that fit badly, "none" if they count as the others."""
+        """The robust loss; "none" for squared residuals."""
         return str(getattr(self, "robust", "none"))
 
     @property
     def is_robust(self) -> bool:
-        """Whether rows that fit badly count less."""
+        """Whether rows with large residuals are downweighted."""
         return self.loss != "none"
 
     @property
     def bounds(self) -> ConstraintSettings:
-        """The bounds beside physical consistency."""
+        """The bounds in addition to physical consistency."""
         return ConstraintSettings(**getattr(self, "constraints", {}))
 
 
@@ -212,14 +217,16 @@ def _called(name: str, words: str) -> Any:  # noqa: ANN401
 
 @dataclass(frozen=True, init=False)
 class RobustSettings(EstimatorSettings):
-    """Settings of estimators that can count rows less that fit badly."""
+    """Settings of estimators that can downweight rows with large residuals."""
 
-    robust: str = setting("none", "loss of rows that fit badly", among=("none", "huber", "tukey"))
+    robust: str = setting(
+        "none", "loss that downweights rows with large residuals", among=("none", "huber", "tukey")
+    )
 
 
 @dataclass(frozen=True, init=False)
 class BoundedSettings(EstimatorSettings):
-    """Settings of fits that are kept, or made, physically possible."""
+    """Settings of fits whose result is physically consistent."""
 
     margin: float = setting(
         1e-4,
@@ -228,28 +235,31 @@ class BoundedSettings(EstimatorSettings):
     )
     prior: str = setting(
         "entropic",
-        "metric of the distance from the URDF's values",
+        "metric of the distance from the URDF's values (the prior)",
         among=("entropic", "euclidean", "riemannian"),
     )
     prior_weight: float | str = setting(
         "auto",
-        "weight of the URDF's values [-], or how it is chosen from the fitted logs: cv "
-        "(segments held out in turn), evidence, or auto (cv, or 1 for a log too short to be cut)",
+        "weight of the URDF's values [-], or the method that chooses it from the fitted logs: cv "
+        "(cross-validation), evidence (marginal likelihood), or auto (cv; 1 if the logs are too "
+        "short for cv)",
         among=("auto", "cv", "evidence"),
         within=_FINITE,
     )
     solver: str = setting(
-        "clarabel", "cone solver, of priors that are not entropic", among=("clarabel", "scs")
+        "clarabel",
+        "cone solver, for the priors euclidean and riemannian",
+        among=("clarabel", "scs"),
     )
-    check: bool = setting(False, "whether the other solver solves it, too")
+    check: bool = setting(False, "whether the second cone solver checks the solution")
     draws: int = setting(
         64,
-        "fits to redrawn data and prior that tell the standard errors where bounds bind; 0 leaves "
-        "the bounds out of them",
+        "number of fits to resampled data and prior, which give the standard errors if bounds are "
+        "active; 0: standard errors without the bounds",
         within=Range("0, or 10 to 10000", lambda x: x == 0 or 10 <= x <= 10_000),
     )
     constraints: Mapping[str, Any] = setting(
-        {}, "bounds beside physical consistency", reads=ConstraintSettings
+        {}, "bounds in addition to physical consistency", reads=ConstraintSettings
     )
 
     def __post_init__(self) -> None:
@@ -257,37 +267,41 @@ class BoundedSettings(EstimatorSettings):
         require_kind(self.constraints, Mapping, "constraints", "a table of bounds")
         known = [each.name for each in fields(ConstraintSettings)]
         if strange := [key for key in self.constraints if key not in known]:
-            raise SettingsError(f"constraints has {strange[0]!r}, wanted some of {listed(known)}")
+            raise SettingsError(
+                f"constraints has the key {strange[0]!r}, wanted keys of {listed(known)}"
+            )
         _ = self.bounds
 
 
 @dataclass(frozen=True, init=False)
 class RecursiveSettings(BoundedSettings):
-    """Settings of estimators that take the samples one by one."""
+    """Settings of estimators that read the samples one by one."""
 
-    physical: bool = setting(False, "whether the last estimate is made physically possible")
+    physical: bool = setting(
+        False, "whether the last estimate is projected onto physically consistent parameters"
+    )
 
 
 @dataclass(frozen=True, init=False)
 class DescentSettings(RecursiveSettings):
-    """Settings of estimators that step along a gradient, and end beside least squares."""
+    """Settings of gradient methods, which end near the least squares solution."""
 
     average: bool = setting(True, "whether the iterates are averaged")
     passes: int = setting(4, "largest number of passes over the logs", within=_COUNT)
-    seed: int = setting(0, "seed of the order of the samples; negative: that of time")
+    seed: int = setting(0, "seed of the random order of the samples; negative: order of time")
 
     @property
     def _common(self) -> dict[str, Any]:
-        """Return the arguments that these estimators share."""
+        """Return the arguments common to these estimators."""
         rng = np.random.default_rng(self.seed) if self.seed >= 0 else None
         return {"average": self.average, "passes": self.passes, "rng": rng}
 
 
 @dataclass(frozen=True)
 class OLSSettings(EstimatorSettings):
-    """Nothing but least squares."""
+    """Settings of ordinary least squares: none."""
 
-    weighs_alike: ClassVar[bool] = True
+    has_equal_weights: ClassVar[bool] = True
 
     name: str = _called("ols", "ordinary least squares")
 
@@ -315,10 +329,10 @@ class TLSSettings(EstimatorSettings):
 
     allows_for_noise: ClassVar[bool] = True
 
-    name: str = _called("tls", "total least squares, which allows for noise of the regressor, too")
+    name: str = _called("tls", "total least squares, which also models noise of the regressor")
     regressor_noise: float = setting(
         0.01,
-        "noise of the regressor's columns over their root mean square [-]",
+        "RMS noise of each regressor column, relative to the RMS of the column [-]",
         within=Range("x > 0", lambda x: x > 0),
     )
 
@@ -334,8 +348,7 @@ class ConsistentSettings(RobustSettings, BoundedSettings):
 
     name: str = _called(
         "consistent",
-        "weighted least squares that keeps every body physically possible and leaves the URDF's "
-        "value where the data say nothing",
+        "weighted least squares with physically consistent bodies and the URDF's values as prior",
     )
 
     def make(self, known: "Known") -> "BatchEstimator":
@@ -346,17 +359,17 @@ class ConsistentSettings(RobustSettings, BoundedSettings):
 
 @dataclass(frozen=True)
 class LogCholeskySettings(ConsistentSettings):
-    """Settings of the same fit in smooth coordinates."""
+    """Settings of the physically consistent fit in log-Cholesky parameters."""
 
     name: str = _called(
-        "log_cholesky", "the consistent fit without a cone, in log-Cholesky parameters"
+        "log_cholesky", "physically consistent fit in log-Cholesky parameters, without a cone"
     )
     starts: int = setting(
         0,
-        "random starts beside the one from the cone programme",
+        "number of random initial values in addition to the solution of the cone programme",
         within=Range("0 to 1000", lambda x: 0 <= x <= 1000),
     )
-    seed: int = setting(0, "seed of the random starts", within=_NOT_NEGATIVE)
+    seed: int = setting(0, "seed of the random initial values", within=_NOT_NEGATIVE)
 
     def make(self, known: "Known") -> "BatchEstimator":
         from robotid.estimators import LogCholesky
@@ -373,14 +386,14 @@ class RLSSettings(RecursiveSettings):
     name: str = _called("rls", "recursive least squares, sample by sample")
     forgetting: float = setting(
         1.0,
-        "weight of a sample relative to the next one [-]",
+        "forgetting factor: weight of a sample relative to the next one [-]",
         within=Range("0 < x <= 1", lambda x: 0 < x <= 1),
     )
 
     def make(self, known: "Known") -> "RecursiveEstimator[Any]":
         from robotid.estimators import RLS
 
-        # without forgetting nothing of the prior enters: batch least squares
+        # without forgetting the prior is not used: the result is that of batch least squares
         std = np.sqrt(np.diag(known.covariance)) if self.forgetting < 1 else None
         return RLS(known.sigma, self.forgetting, known.beta, std, known.share)
 
@@ -391,11 +404,13 @@ class KalmanSettings(RecursiveSettings):
 
     name: str = _called("kalman", "a Kalman filter over the samples")
     walk: float = setting(
-        0.0, "random walk per sample, as a share of the prior's spread [-]", within=_NOT_NEGATIVE
+        0.0,
+        "standard deviation of the parameters' random walk per sample, over that of the prior [-]",
+        within=_NOT_NEGATIVE,
     )
     gate: float | bool = setting(
         1 - 1e-7,
-        "probability with which a good row passes; false for no gate",
+        "innovation gate: probability that a row without a fault passes; false: no gate",
         within=Range(
             "0.5 <= x < 1, or false", lambda x: x is False or (x is not True and 0.5 <= x < 1)
         ),
@@ -410,12 +425,18 @@ class KalmanSettings(RecursiveSettings):
 
 @dataclass(frozen=True)
 class PRXSettings(DescentSettings):
-    """Settings of the paper's update."""
+    """Settings of the paper's update law."""
 
-    name: str = _called("prx", "steps along the gradient PRX, sample by sample")
-    step: str = setting("exact", "length of the step", among=("exact", "printed"))
+    name: str = _called("prx", "gradient steps along PRX (the paper's update), sample by sample")
+    step: str = setting(
+        "exact",
+        "step length: exact (line search) or printed (as in the paper)",
+        among=("exact", "printed"),
+    )
     metric: str = setting(
-        "noise", "what measures the residual of the exact step", among=("noise", "mass", "rows")
+        "noise",
+        "metric of the residual for the exact step: noise (levels), mass (matrix), or rows",
+        among=("noise", "mass", "rows"),
     )
 
     def make(self, known: "Known") -> "RecursiveEstimator[Any]":
@@ -431,7 +452,7 @@ class GradientSettings(DescentSettings):
 
     name: str = _called("gradient", "normalised gradient steps, sample by sample")
     step_size: float = setting(
-        1.0, "relaxation [-]", within=Range("0 < x < 2", lambda x: 0 < x < 2)
+        1.0, "relaxation factor [-]", within=Range("0 < x < 2", lambda x: 0 < x < 2)
     )
 
     def make(self, known: "Known") -> "RecursiveEstimator[Any]":
@@ -443,49 +464,49 @@ class GradientSettings(DescentSettings):
 
 @dataclass(frozen=True)
 class SimulationSettings(EstimatorSettings):
-    """Output error: closed loops are simulated on the commands, and fitted to the positions."""
+    """Settings of closed-loop output error: simulated from commands, fitted to positions."""
 
     name: str = _called(
         "simulation",
-        "closed loops simulated on the commands of logs and fitted to their positions; "
-        "[controller] says what is known of the loops",
+        "closed-loop output error: simulates the controlled robot from the logged commands and "
+        "fits it to the logged positions; [controller] has the known parameters of the controllers",
     )
     window: float | None = setting(
-        None, "length of the windows that are simulated [s]; if not stated 2.5, or 0.5 where the "
-        "logged torque drives the robot", within=_WINDOW,
+        None, "length of the simulated windows [s]; default 2.5, or 0.5 if the logged torque "
+        "drives the robot", within=_WINDOW,
     )  # fmt: skip
     lead: float | None = setting(
-        None, "how long before each window its roll-out begins [s]; if not stated 0.6, or 0 where "
+        None, "time by which the simulation starts before each window [s]; default 0.6, or 0 if "
         "the logged torque drives the robot", within=_NOT_NEGATIVE,
     )  # fmt: skip
     step: float = setting(
         2e-3,
-        "longest step of the integration [s]",
+        "largest step of the integration [s]",
         within=Range("2e-5 to 0.1", lambda x: 2e-5 <= x <= 0.1),
     )
     bodies: float = setting(
         0.1,
-        "plausible relative error of the URDF's bodies, by which they may change; 0: they stay",
+        "plausible relative error of the URDF's inertial parameters; 0: they are fixed",
         within=_NOT_NEGATIVE,
     )
     error: str = setting(
         "output",
-        "what is compared: output, the positions (closed-loop output error, CLOE); input, the "
-        "torques of the loops, simulated, with those logged (closed-loop input error, CLIE); "
-        "direct, the same with derivatives that neglect that the motion changes, which are those "
-        "of inverse dynamics (DIDIM; gains and delay must be stated)",
+        "compared signal: output, positions (closed-loop output error, CLOE); input, simulated "
+        "and logged torques (closed-loop input error, CLIE); direct, as input, but with the "
+        "derivatives of inverse dynamics, which neglect the change of the motion (DIDIM; gains "
+        "and delay must be stated)",
         among=("output", "input", "direct"),
     )
     velocities: bool = setting(
         False,
-        "whether logged velocities weigh beside the positions; those that a drive differentiates "
-        "from its encoder tell nothing more",
+        "whether logged velocities are fitted in addition to the positions; velocities that a "
+        "drive computes from its encoder add no information",
     )
     torques: bool = setting(
-        True, "whether torques weigh beside the positions, where all logs have them"
+        True, "whether torques are fitted in addition to the positions, if all logs have them"
     )
     whiten: bool = setting(
-        True, "whether the correlation of the residuals is estimated and taken out"
+        True, "whether the residuals are whitened by their estimated correlation"
     )
 
     def __post_init__(self) -> None:
@@ -495,11 +516,12 @@ class SimulationSettings(EstimatorSettings):
         compared = f"estimator: error = {self.error!r} compares torques"
         if not self.torques:
             raise SettingsError(
-                f"{compared}, but torques is false; leave it out, or set error = 'output'"
+                f"{compared}, but torques is false; remove torques = false, or set error = 'output'"
             )
         if self.velocities:
             raise SettingsError(
-                f"{compared}, but velocities is true; leave it out, or set error = 'output'"
+                f"{compared}, but velocities is true; remove velocities = true, or set "
+                "error = 'output'"
             )
 
 

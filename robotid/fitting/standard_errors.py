@@ -1,9 +1,9 @@
-"""Standard errors that hold for coloured noise, from how much the scores of segments scatter.
+"""Standard errors for coloured noise, from the scatter of the scores of segments.
 
-Residuals behind a low-pass filter are correlated, and what a model misses is correlated still
-longer, so rows do not count as independent measurements. Segments that are longer than the
-correlation do: the score of segment s, W_s^T (tau_s - W_s theta), scatters as the noise makes it,
-whatever its colour. The factors of the segments tell it without a second pass over the rows.
+Low-pass filtered residuals are correlated, and model errors are correlated over longer times, so
+rows are not independent measurements. Segments longer than the correlation time are independent:
+the covariance of the score of segment s, W_s^T (tau_s - W_s theta), is that of the noise, whatever
+its colour. It is computed from the factors of the segments, without a second pass over the rows.
 """
 
 from collections.abc import Sequence
@@ -28,20 +28,20 @@ __all__ = [
     "with_wls_errors",
 ]
 
-_LEAST_SOLVED = 0.8  # share of the redrawn fits below which they tell nothing
+_LEAST_SOLVED = 0.8  # smallest share of the resampled fits that must be solved
 
 
 @dataclass(frozen=True, eq=False)
 class StandardErrors:
-    """What the standard errors of an estimate depend on.
+    """How the standard errors of an estimate were computed.
 
     Attributes:
-        method: In words.
-        segments: Number of segments whose scores were compared.
-        inflation: How much more the scores scatter than those of independent rows would [-].
+        method: Description of the method.
+        segments: Number of segments whose scores were used.
+        inflation: Variance of the scores over that of independent rows [-].
         freedom: Degrees of freedom of each base parameter's standard error, shape (b,).
-        unbounded: Standard errors of the standard parameters with the bounds left out, shape (p,);
-            None if no bound binds.
+        unbounded: Standard errors of the standard parameters without the bounds, shape (p,); None
+            if no bound is active.
     """
 
     method: str
@@ -52,17 +52,17 @@ class StandardErrors:
 
     @property
     def quantile(self) -> Array:
-        """Standard errors that a 95 % interval of each base parameter reaches, shape (b,)."""
+        """Half-width of each base parameter's 95 % interval in standard errors, shape (b,)."""
         return quantile(self.freedom)
 
 
 @dataclass(frozen=True, eq=False)
 class Redraws:
-    """How the spread of a physically consistent fit is told where its bounds bind."""
+    """Resampling of a physically consistent fit, for standard errors with active bounds."""
 
     fit: Consistent
-    draws: int  # fits to data and prior drawn anew; 0 leaves the bounds out
-    rng: np.random.Generator  # source of the noise
+    draws: int  # number of fits to resampled data and prior; 0: without the bounds
+    rng: np.random.Generator  # of the noise
 
 
 def measured_errors(
@@ -74,55 +74,58 @@ def measured_errors(
     sigma: Array,
     *,
     is_filter: bool = False,
-    pull: float = 1.0,
+    weight_ratio: float = 1.0,
     redraws: Redraws | None = None,
     more: Array | None = None,
 ) -> tuple[Estimate, StandardErrors]:
-    """Return an estimate with the covariance that the scatter of the segments shows.
+    """Return an estimate with its covariance from the scatter of the segments.
 
-    With bread B, the covariance if rows were independent, and meat M, the covariance of the score:
+    With the bread B, the covariance if rows were independent, and the meat M, the covariance of the
+    score:
 
-    * of base parameters: B M B, as of any least squares on correlated rows;
-    * of standard parameters, with the prior's information L in B = (K^T H K + L)^-1 and that of
-      the truth's plausible spread, L over the pull g: B (K^T M K + g L) B, the mean square error
-      about a truth so spread. Where inequalities bind, fits to redrawn data and prior tell it;
-      without ``redraws`` they are left out;
-    * of a filter that forgets: its own covariance, grown by the mean inflation.
+    * base parameters: B M B, as for any least squares with correlated rows;
+    * standard parameters: B (K^T M K + g L) B with B = (K^T H K + L)^-1. L is the precision of the
+      prior as it was weighted, g is its ratio to the precision L / g of the plausible prior; this
+      is the mean square error if the true parameters have the plausible prior. If bounds are
+      active, it is computed from fits to resampled data and prior; without ``redraws`` the bounds
+      are neglected;
+    * a filter with forgetting: its own covariance times the mean inflation.
 
     Args:
         estimate: Base parameters, shape (b,), or standard ones, shape (p,), with the covariance
-            that rows would leave of which ``share`` are independent.
+            for a ``share`` of independent rows.
         segments: Factors of the segments, base parameters.
-        factors: Those of all segments together.
-        share: Share of the rows that the covariance takes to be independent [-].
+        factors: Factors of all segments together.
+        share: Share of the rows that the covariance assumes to be independent [-].
         K: Map to the base parameters, shape (b, p).
         sigma: Noise level per joint that weighted the rows, shape (n,) [N m or N].
-        is_filter: Whether it weighs rows otherwise, too, as a filter that forgets or gates.
-        pull: How much heavier the prior weighs than the truth's plausible spread says [-].
-        redraws: How the spread is told of an estimate whose details name active bounds.
-        more: Covariance of the score that segments do not show, shape (b, b); None: nothing.
+        is_filter: Whether the estimator weights rows in another way, by forgetting or a gate.
+        weight_ratio: Weight of the prior over its plausible weight [-].
+        redraws: Resampling, for an estimate whose details name active bounds.
+        more: Covariance of the score in addition to the scatter, shape (b, b); None: 0.
 
     Returns:
-        The estimate, and what its standard errors depend on. With fewer than 12 segments rows count
-        as independent by that share.
+        The estimate, and how its standard errors were computed. With fewer than 12 segments, the
+        given share of the rows is assumed to be independent.
 
     Raises:
-        NotConvergedError: If more than a fifth of the redrawn fits are not solved.
+        NotConvergedError: If more than a fifth of the resampled fits are not solved.
     """
     b = len(factors.names)
     if not (estimate.details.get("active") and redraws is not None and redraws.draws > 0):
-        redraws = None  # no bound binds, or it is left out
+        redraws = None  # no bound is active, or bounds are neglected
     if len(segments) < FEWEST_SEGMENTS:
         method = (
-            f"the filter's band: {share:.3g} of the rows count as independent, since the logs have "
-            f"only {len(segments)} segments longer than the filter's memory"
+            f"the bandwidth of the filter: a share of {share:.3g} of the rows is assumed to be "
+            f"independent, because the logs have only {len(segments)} segments longer than the "
+            "correlation time of the filter"
         )
         errors = StandardErrors(method, len(segments), 1 / share, np.full(b, np.inf))
         R = factors.weighted(sigma)[:b, :b]
         if redraws is not None:
             return _bounded(estimate, errors, redraws, factors, sigma, share * R.T @ R)
-        if pull > 1.0:
-            C = about_prior(estimate.covariance, K, share * R.T @ R, R, share, pull)
+        if weight_ratio > 1.0:
+            C = about_prior(estimate.covariance, K, share * R.T @ R, R, share, weight_ratio)
             estimate = replace(estimate, covariance=C)
         return estimate, errors
     is_open = ~np.isfinite(np.diag(estimate.covariance))
@@ -131,7 +134,7 @@ def measured_errors(
         found = scatter(segments, K @ estimate.theta, sigma, share * K @ C @ K.T)
         found = found if more is None else replace(found, meat=found.meat + more)
         R = factors.weighted(sigma)[:b, :b]
-        covariance = about_prior(C, K, share**2 * found.meat, R, share, pull)
+        covariance = about_prior(C, K, share**2 * found.meat, R, share, weight_ratio)
     elif not is_filter:
         bread = solve_factor(factors, sigma, estimate.theta).covariance
         found = scatter(segments, estimate.theta, sigma, bread)
@@ -152,10 +155,10 @@ def measured_errors(
 
 
 def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
-    """Return a gradient method's estimate with the covariance that the factors know.
+    """Return a gradient method's estimate with a covariance derived from weighted least squares.
 
-    It ends beside the minimum of least squares: its mean square error is the covariance of that
-    minimum plus the square of the distance to it, which is measured.
+    A gradient method ends near the minimum of least squares. Its mean square error is the
+    covariance of that minimum plus the square of the distance to it.
 
     Args:
         estimate: Base parameters, shape (b,).
@@ -182,33 +185,35 @@ def standard_of(
     Args:
         estimate: Base parameters, shape (b,), or standard ones, shape (p,).
         mapping: Standard to base parameters.
-        prior: What those of the URDF are, shape (p,).
-        spread: How far they may plausibly be wrong, shape (p,).
+        prior: Standard parameters of the URDF, shape (p,).
+        spread: Their prior standard deviations, shape (p,).
     """
     if estimate.names == mapping.names:
         return estimate.theta, estimate.covariance
     G, K = mapping.gain(spread), mapping.K
     before = np.diag(spread**2)
-    # what the data leave open (infinite variance) stays as wide as the prior has it
+    # parameters that are not identifiable (infinite variance) keep the variance of the prior
     base = np.where(np.isfinite(estimate.covariance), estimate.covariance, K @ before @ K.T)
     covariance = before - G @ K @ before + G @ base @ G.T
     return mapping.to_standard(estimate.theta, prior, spread), covariance
 
 
-def about_prior(C: Array, K: Array, meat: Array, R: Array, share: float, pull: float) -> Array:
-    """Return C (K^T meat K + pull L) C with L = C^-1 - share K^T R^T R K, shape (p, p).
+def about_prior(
+    C: Array, K: Array, meat: Array, R: Array, share: float, weight_ratio: float
+) -> Array:
+    """Return C (K^T meat K + weight_ratio L) C with L = C^-1 - share K^T R^T R K, shape (p, p).
 
     Args:
         C: Covariance of the standard parameters if a share of the rows is independent, (p, p).
         K: Map to the base parameters, shape (b, p).
         meat: Covariance of the score of these rows, shape (b, b).
         R: Weighted factor of all rows, base parameters, shape (b, b).
-        share: Share of the rows that the covariance takes to be independent [-].
-        pull: How much heavier the prior weighs than the truth's plausible spread says [-].
+        share: Share of the rows that the covariance assumes to be independent [-].
+        weight_ratio: Weight of the prior over its plausible weight [-].
     """
     KC = K @ C
     RKC = R @ KC
-    covariance: Array = pull * (C - share * RKC.T @ RKC) + KC.T @ meat @ KC
+    covariance: Array = weight_ratio * (C - share * RKC.T @ RKC) + KC.T @ meat @ KC
     return 0.5 * (covariance + covariance.T)
 
 
@@ -220,24 +225,27 @@ def _bounded(
     sigma: Array,
     meat: Array,
 ) -> tuple[Estimate, StandardErrors]:
-    """Return the estimate with the mean square distance of redrawn fits as its covariance.
+    """Return the estimate with the mean square distance of resampled fits as its covariance.
 
-    The meat is that of the rows as ``Consistent.rows`` has them, of which a share counts.
+    The meat is the covariance of the score of the rows of ``Consistent.rows``.
     """
     fit = redraws.fit
     rows = fit.rows(factors, sigma)
     found, failures = fit.programme.redrawn(
-        rows, fit.prior_weight, estimate.theta, meat, fit.pull, redraws.draws, redraws.rng
+        rows, fit.prior_weight, estimate.theta, meat, fit.weight_ratio, redraws.draws, redraws.rng
     )
     if len(found) < _LEAST_SOLVED * redraws.draws:
         raise NotConvergedError(
-            f"the spread of the fit where its bounds bind is not known: Clarabel solved "
-            f"{len(found)} of {redraws.draws} fits to redrawn data; set draws = 0 for standard "
-            "errors without the bounds",
+            f"standard errors with active bounds cannot be computed: Clarabel solved {len(found)} "
+            f"of {redraws.draws} fits to resampled data; set draws = 0 for standard errors without "
+            "the bounds",
             failures[0],
         )
-    missing = f" ({len(failures)} more not solved: {failures[0]})" if failures else ""
-    method = f"{errors.method}; bounds bind: {len(found)} fits to redrawn data and prior{missing}"
+    unsolved = f" ({len(failures)} more not solved: {failures[0]})" if failures else ""
+    method = (
+        f"{errors.method}; bounds are active: {len(found)} fits to resampled data and "
+        f"prior{unsolved}"
+    )
     freedom = 1.0 / (1.0 / errors.freedom + 1.0 / len(found))
     covariance = found.T @ found / len(found)
     return (

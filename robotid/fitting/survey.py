@@ -1,8 +1,8 @@
 """Logs of any length: surveyed once, then read in pieces. A log in memory is one piece.
 
-The survey of a file reads the time stamps of all rows and a few windows of the rest, and decides
-everything automatic for the whole log. A piece is a fixed segment of rows, read with rows around
-it.
+The survey of a file reads the time stamps of all rows and a few windows of all columns, and
+resolves automatic settings for the whole log. A piece is a fixed range of rows, read with some rows
+before and after it.
 """
 
 from bisect import bisect_right
@@ -46,14 +46,14 @@ __all__ = [
     "survey_log",
 ]
 
-#: Rows of a piece, if nothing else is said.
+#: Default number of rows of a piece.
 PIECE = 16384
-_WINDOW = 20_000  # rows of each window that is looked at closely
+_WINDOW = 20_000  # rows of each window that is checked
 
 
 @dataclass(frozen=True, eq=False)
 class _Header:
-    """What the pieces of a log have in common; the source is the log itself if it is in memory."""
+    """Data common to the pieces of a log; the source is the log itself if it is in memory."""
 
     model: RobotModel
     source: LogLayout | Log
@@ -61,7 +61,7 @@ class _Header:
     samples: int
 
     def read(self, first: int, stop: int, near: Place) -> Log:
-        """Return rows as a log in SI units, full turns left in; all of them in memory."""
+        """Return rows as a log in SI units, angles not unwrapped; for a log in memory, all rows."""
         if isinstance(self.source, Log):
             return self.source
         layout = self.source
@@ -70,68 +70,68 @@ class _Header:
 
     @property
     def is_compiled(self) -> bool | None:
-        """Whether the compiled path computes rows of a file: chosen for the log, not by piece."""
+        """Whether compiled code computes the rows of a file: chosen for the log, not by piece."""
         if isinstance(self.source, Log):
-            return None  # by the samples of its one piece
+            return None  # chosen by the number of samples of its one piece
         return choose_engine(self.model, self.samples, None) == COMPILED
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """What was read of a piece."""
+    """The rows of a piece and their smoothed motion."""
 
-    positions: Array  # (samples, n), as recorded, full turns left in [rad or m]
+    positions: Array  # (samples, n), as recorded, not unwrapped [rad or m]
     torques: Array  # (samples, n), as recorded [N m or N]
-    trajectory: Trajectory  # its smooth motion, of no samples if none is left
+    trajectory: Trajectory  # smoothed motion; it may have no samples
     mask: Array  # (N, n_rows), bool: rows of the motion that are used
-    turned: Array  # (n,), bool: joints whose full turns were taken out
+    turned: Array  # (n,), bool: joints whose position was unwrapped
 
 
 @dataclass(frozen=True, eq=False)
 class LogPiece:
-    """A segment of rows of a log, with what is needed to read it and to smooth it as the whole."""
+    """A range of rows of a log, with the data for reading it and smoothing it as the whole log."""
 
-    header: _Header  # what the pieces of the log have in common
+    header: _Header  # data common to the pieces of the log
     first: int  # its first row
     stop: int  # the row after its last one
-    span: tuple[int, int]  # first row that is read with it, and the row after the last one
-    near: Place  # where in the file the span starts, or a little before
-    segments: tuple[Segment, ...]  # the uninterrupted ones that it has rows of
+    span: tuple[int, int]  # first row that is read for it, and the row after the last one
+    near: Place  # position in the file at the start of the span, or shortly before
+    segments: tuple[Segment, ...]  # the uninterrupted segments that contain its rows
 
     @property
     def name(self) -> str:
-        """What messages call it, as ``run3.parquet rows 0-16384``."""
+        """Name for messages, as ``run3.parquet rows 0-16384``."""
         return f"{Path(self.header.source.path).name} rows {self.first}-{self.stop}"
 
     @property
     def samples(self) -> int:
-        """Number of its rows."""
+        """Number of rows."""
         return self.stop - self.first
 
     def read(self) -> Rows:
-        """Return its rows and its smooth motion; those of a log in memory are kept.
+        """Return its rows and its smoothed motion; for a log in memory they are cached.
 
         Raises:
             DataError: If a row cannot be used.
         """
-        return self._kept if isinstance(self.header.source, Log) else self._read()
+        return self._cached if isinstance(self.header.source, Log) else self._read()
 
     def take(self, rows: Rows, before: RobotModel) -> None:
-        """Keep rows that were smoothed before.
+        """Store rows that were smoothed before.
 
         Args:
             rows: The rows.
-            before: The robot that they are of, with the same friction speeds.
+            before: The robot for which they were smoothed, with the same friction speeds.
         """
         model, motion, mask = self.header.model, rows.trajectory, rows.mask
         if model.layout != before.layout or is_loaded(model):
             motion = remember(model, motion.with_states(None))
-        if not model.is_static:  # whose stands were chosen with their speeds
+        if not model.is_static:  # static rows were chosen by their speeds already
             mask = row_mask(model, motion, self.header.signals.min_velocity)
-        vars(self)["_kept"] = replace(rows, trajectory=motion, mask=mask)
+        vars(self)["_cached"] = replace(rows, trajectory=motion, mask=mask)
 
     @cached_property
-    def _kept(self) -> Rows:
+    def _cached(self) -> Rows:
         return self._read()
 
     def _read(self) -> Rows:
@@ -157,7 +157,7 @@ class LogPiece:
 
 @dataclass(frozen=True, eq=False)
 class PieceTask(Workload):
-    """Something to do with a piece of a log."""
+    """A task on one piece of a log."""
 
     piece: LogPiece
 
@@ -172,7 +172,7 @@ class PieceTask(Workload):
 
 @dataclass(frozen=True, eq=False)
 class ReducedPiece(PieceTask, Piece):
-    """A piece to be reduced to factors of base parameters."""
+    """The reduction of a piece to factors of base parameters."""
 
     mapping: BaseMapping
 
@@ -185,19 +185,19 @@ class ReducedPiece(PieceTask, Piece):
 
 @dataclass(frozen=True, eq=False)
 class SurveyedLog:
-    """A log ready to be read in pieces.
+    """A surveyed log, which can be read in pieces.
 
     Attributes:
         model: The robot.
-        source: The log if it is in memory, else which columns of its file make it up.
-        asked: How it becomes a trajectory, as the user gave it.
+        source: The log if it is in memory, else the assignment of columns of its file.
+        asked: Settings of the processing to a trajectory, as given by the user.
         stamps: Time stamps of all rows of the file, shape (N,) [s].
-        first: Its first row in the file, of the window.
-        stop: The row after its last one.
-        windows: Segments of rows that were looked at closely: all, or first, middle and last ones.
-        held: Positions in them of locked joints that the file has, by name [rad or m].
+        first: First row of the log in the file.
+        stop: The row after the last one.
+        windows: Ranges of rows that were checked: all rows, or the first, middle and last ones.
+        locked: Positions of locked joints in the windows, if the file has them, by name [rad or m].
         length: Rows per piece.
-        places: Where rows of the file start.
+        places: Positions in the file at which blocks of rows start.
     """
 
     model: RobotModel
@@ -207,33 +207,33 @@ class SurveyedLog:
     first: int
     stop: int
     windows: tuple[Log, ...]
-    held: Mapping[str, Array] = field(default_factory=dict)
+    locked: Mapping[str, Array] = field(default_factory=dict)
     length: int = PIECE
     places: Sequence[Place] = (Place(),)
 
     @property
     def path(self) -> str:
-        """The file; "" if it was made in memory."""
+        """Path of the file; "" for a log made in memory."""
         return self.source.path
 
     @property
-    def is_held(self) -> bool:
+    def is_in_memory(self) -> bool:
         """Whether it is in memory."""
         return isinstance(self.source, Log)
 
     @property
     def head(self) -> Log:
-        """The first rows, with the notes on the log."""
+        """The first rows of the log, with its notes."""
         log = self.windows[0]
         if len(self.windows) == 1:
             return log
         looks = ", ".join(f"{first}-{stop}" for first, stop in _close_looks(self.first, self.stop))
-        note = f"too long to be in memory at once; the doctor looked at rows {looks} only"
+        note = f"the log is too long for the memory; the doctor checked rows {looks} only"
         return replace(log, notes=(*log.notes, note))
 
     @property
     def looks(self) -> tuple[Log, ...]:
-        """The windows as logs of their own, named by their rows if they are not all rows."""
+        """The windows as separate logs, named by their rows if the log has more rows."""
         if len(self.windows) == 1:
             return self.windows
         ranges = _close_looks(self.first, self.stop)
@@ -249,11 +249,11 @@ class SurveyedLog:
 
     @cached_property
     def signals(self) -> SignalSettings:
-        """How it becomes a trajectory, everything automatic decided for the whole log.
+        """Settings of the processing to a trajectory, automatic ones resolved for the whole log.
 
         Raises:
-            DataError: If measured velocity or acceleration is asked for and the log has none.
-            SettingsError: If a setting does not fit the log.
+            DataError: If measured velocity or acceleration is required and the log has none.
+            SettingsError: If a setting cannot be applied to the log.
         """
 
         def is_trusted() -> bool:
@@ -284,13 +284,13 @@ class SurveyedLog:
         )
 
     def with_model(self, model: RobotModel) -> "SurveyedLog":
-        """Return the log of a robot whose drives have other terms or another load.
+        """Return the log for a robot whose drives have other terms or another load.
 
         Args:
             model: The robot, with the same bodies, joints and couplings.
         """
         other = replace(self, model=model, asked=self.signals)
-        if self.is_held and np.array_equal(
+        if self.is_in_memory and np.array_equal(
             friction_speeds(model.layout), friction_speeds(self.model.layout)
         ):
             for piece, own in zip(other.pieces, self.pieces, strict=True):
@@ -299,7 +299,7 @@ class SurveyedLog:
 
     @property
     def whole(self) -> Rows:
-        """All rows of a log in memory, and their smooth motion.
+        """All rows of a log in memory, and their smoothed motion.
 
         Raises:
             DataError: If no segment is long enough, or an angle jumps.
@@ -311,30 +311,30 @@ class SurveyedLog:
         return rows
 
     def too_short(self) -> DataError:
-        """Return the error of a log without a segment that is long enough."""
+        """Return the error for a log without a segment of sufficient length."""
         if self.model.is_static:
             return DataError(
-                f"{self.path or 'log'}: no segment of a quarter of a second is slow enough for "
-                "dynamics = 'static'; record poses that are held for a second or longer, or slow "
-                "motion at one speed, or set dynamics = 'full'",
+                f"{self.path or 'log'}: no segment of 0.25 s is slow enough for "
+                "dynamics = 'static'; record poses at rest for at least 1 s each, or slow motion "
+                "at constant speed, or set dynamics = 'full'",
                 code="too_short",
             )
         return too_short(self.path or "log", len(self.segments), self.signals)
 
     @cached_property
     def pieces(self) -> tuple[LogPiece, ...]:
-        """Its pieces, in order, each with the rows that are read around it."""
+        """Its pieces, in order, each with the rows that are read before and after it."""
         stamps, segments, window = self.stamps, self.segments, (self.first, self.stop)
         header = _Header(self.model, self.source, self.signals, self.stop - self.first)
-        reach = filter_reach(self.signals)
-        begins, found = [segment.first for segment in segments], list[LogPiece]()
+        settling = filter_reach(self.signals)
+        firsts, found = [segment.first for segment in segments], list[LogPiece]()
         for first in range(*window, self.length):
             stop = min(first + self.length, window[1])
-            mine = segments[bisect_right(begins, first) - 1 : bisect_right(begins, stop - 1)]
-            before = int(np.searchsorted(stamps, stamps[first] - reach)) - SPLINE
-            after = int(np.searchsorted(stamps, stamps[stop - 1] + reach)) + SPLINE
+            mine = segments[bisect_right(firsts, first) - 1 : bisect_right(firsts, stop - 1)]
+            before = int(np.searchsorted(stamps, stamps[first] - settling)) - SPLINE
+            after = int(np.searchsorted(stamps, stamps[stop - 1] + settling)) + SPLINE
             span = max(before, mine[0].first), min(after, mine[-1].stop)
-            if span[1] - span[0] < 2:  # a lonely row, with another one: a log has two
+            if span[1] - span[0] < 2:  # a single row: add one, a log needs two
                 low = max(span[0] - 1, window[0])
                 span = low, low + 2
             near = _near(self.places, span[0])
@@ -343,23 +343,23 @@ class SurveyedLog:
 
 
 def hold_log(
-    model: RobotModel, log: Log, signals: SignalSettings, held: Mapping[str, Array] | None = None
+    model: RobotModel, log: Log, signals: SignalSettings, locked: Mapping[str, Array] | None = None
 ) -> SurveyedLog:
-    """Return a log in memory, ready to be read as one piece; its faults are told as it is read.
+    """Return a log in memory as one piece; errors of its data are raised when it is read.
 
     Args:
         model: The robot.
-        log: The log, of the model's joints in its order.
-        signals: How it becomes a trajectory.
-        held: Positions of locked joints, if it has them, by name [rad or m].
+        log: The log, with the model's joints in its order.
+        signals: Settings of the processing to a trajectory.
+        locked: Positions of locked joints, if the log has them, by name [rad or m].
     """
     count = len(log.t)
-    if model.is_static:  # means of segments take the place of filters
+    if model.is_static:  # means of segments replace filters
         signals = replace(
             signals, cutoff=None, rate=None, velocity="differentiated",
             acceleration="differentiated",
         )  # fmt: skip
-    return SurveyedLog(model, log, signals, log.t, 0, count, (log,), held or {}, count)
+    return SurveyedLog(model, log, signals, log.t, 0, count, (log,), locked or {}, count)
 
 
 def survey_log(
@@ -371,34 +371,34 @@ def survey_log(
     *,
     length: int | None = PIECE,
 ) -> SurveyedLog:
-    """Return a log in a file, ready to be read.
+    """Return a surveyed log of a file.
 
-    Every time stamp is checked. Units, and how late the measured velocity is, are judged in the
-    windows; what each piece reads is checked as it is read.
+    Every time stamp is checked. Units and the delay of the measured velocity are checked in the
+    windows; the values of each piece are checked when it is read.
 
     Args:
-        layout: Which columns of the file make up the log.
-        table: The file, opened.
+        layout: Assignment of the file's columns.
+        table: The opened file.
         model: The robot.
-        signals: How the log becomes a trajectory.
-        window: First and last time stamp kept, on the log's own clock [s]; None for the ends.
-        length: Rows per piece; None: the log is read at once and kept in memory. A file that is
-            only read whole is one piece.
+        signals: Settings of the processing to a trajectory.
+        window: First and last time stamp used, on the log's own clock [s]; None: the ends.
+        length: Rows per piece; None: the log is read completely into memory. A file of a format
+            that cannot be read in parts is one piece.
 
     Raises:
-        DataError: If time does not increase, the window holds fewer than two rows, or units are
-            suspect.
+        DataError: If time does not increase, the window contains fewer than two rows, or units are
+            implausible.
     """
-    held = _held_columns(layout, table, model)
-    wanted = list(dict.fromkeys([*layout.wanted, *held.values()]))
+    locked = _locked_columns(layout, table, model)
+    wanted = list(dict.fromkeys([*layout.wanted, *locked.values()]))
     if length is None:
         columns = table.read(wanted)
         log = layout.to_log(columns)
         check_units(log, layout.units, layout.prismatic)
-        kept = log if window == (None, None) else log.window(*window)
-        inside = slice(*np.searchsorted(log.t, [kept.t[0], np.nextafter(kept.t[-1], np.inf)]))
-        positions = _positions(held, [columns], layout, model, inside)
-        return hold_log(model, kept, signals, positions)
+        used = log if window == (None, None) else log.window(*window)
+        inside = slice(*np.searchsorted(log.t, [used.t[0], np.nextafter(used.t[-1], np.inf)]))
+        positions = _positions(locked, [columns], layout, model, inside)
+        return hold_log(model, used, signals, positions)
     reader, places, where = _reader(table, wanted), list[Place](), Path(layout.path).name
     stamps = map_stamps(_stamps(reader, layout, places), where)
     first, stop = _window(stamps, where, *window)
@@ -407,7 +407,7 @@ def survey_log(
     windows = tuple(_log_of(layout, x, i) for x, (i, _) in zip(found, ranges, strict=True))
     for log in windows:
         check_units(log, layout.units, layout.prismatic)
-    positions = _positions(held, found, layout, model)
+    positions = _positions(locked, found, layout, model)
     if table.rows is None:
         length = max(stop - first, 1)
     return SurveyedLog(
@@ -417,7 +417,7 @@ def survey_log(
 
 @dataclass(frozen=True, eq=False)
 class _WholeTable(RowReader):
-    """Rows of a file that is only read whole."""
+    """Rows of a file of a format that cannot be read in parts."""
 
     table: Table
     wanted: Sequence[str]
@@ -441,19 +441,19 @@ def _reader(table: Table, wanted: Sequence[str]) -> RowReader:
 
 
 def _log_of(layout: LogLayout, columns: Mapping[str, Array], first: int) -> Log:
-    """Return rows of a file as a log in SI units, full turns left in."""
+    """Return rows of a file as a log in SI units, angles not unwrapped."""
     log = layout.to_log(columns, first)
     check_reach(log, layout.units, layout.prismatic)
     return log
 
 
 def _unwrap(model: RobotModel, log: Log) -> Log:
-    """Return the log without full turns."""
+    """Return the log with unwrapped angles."""
     return unwrap(log, np.array([joint.turns_freely for joint in model.limits]))
 
 
 def _stamps(rows: RowReader, layout: LogLayout, places: list[Place]) -> Iterator[Array]:
-    """Yield the time stamps in seconds, and note where the rows of each block are."""
+    """Yield the time stamps in seconds, and store the place of each block of rows."""
     for values, place in rows.scan(layout.columns["time"][0]):
         places.append(place)
         yield layout.stamps(values)
@@ -481,15 +481,15 @@ def _window(stamps: Array, where: str, start: float | None, end: float | None) -
 
 
 def _close_looks(first: int, stop: int) -> list[tuple[int, int]]:
-    """Return the first, middle and last rows; all, if they are few."""
+    """Return the ranges of the first, middle and last rows; one range if the log is short."""
     if stop - first <= 3 * _WINDOW:
         return [(first, stop)]
     middle = (first + stop - _WINDOW) // 2
     return [(row, row + _WINDOW) for row in (first, middle, stop - _WINDOW)]
 
 
-def _held_columns(layout: LogLayout, table: Table, model: RobotModel) -> dict[str, str]:
-    """Return the columns of locked joints' positions that a file has and no one reads otherwise."""
+def _locked_columns(layout: LogLayout, table: Table, model: RobotModel) -> dict[str, str]:
+    """Return the columns of a file with the positions of locked joints, by joint."""
     found = {}
     for joint in model.locked:
         named = layout.source.joints.get(joint, joint)
@@ -500,19 +500,19 @@ def _held_columns(layout: LogLayout, table: Table, model: RobotModel) -> dict[st
 
 
 def _positions(
-    held: Mapping[str, str],
+    names: Mapping[str, str],
     windows: Sequence[Mapping[str, Array]],
     layout: LogLayout,
     model: RobotModel,
     inside: slice = slice(None),
 ) -> dict[str, Array]:
-    """Return the positions of locked joints that were read, in rad or m."""
-    turning = {joint.name for joint in model.tree.movable if joint.type != "prismatic"}
+    """Return the positions of locked joints in the rows read, by joint [rad or m]."""
+    revolute = {joint.name for joint in model.tree.movable if joint.type != "prismatic"}
     positions = {}
-    for joint, column in held.items():
+    for joint, column in names.items():
         q = np.concatenate([columns[column] for columns in windows])[inside]
         q = q[np.isfinite(q)]
-        if joint in turning and layout.units.angle == "deg":
+        if joint in revolute and layout.units.angle == "deg":
             q = np.deg2rad(q)
         if len(q):
             positions[joint] = q

@@ -1,7 +1,7 @@
-"""Measured or differentiated velocities: which of them predict torque better where none was fitted.
+"""Choice between measured and differentiated velocities, by their torque prediction errors.
 
-Each joint's torque is fitted by itself, on every other part of the log, with either; the parts in
-between are predicted.
+The torque of each joint is fitted separately with either velocity on every other part of the log,
+and predicted on the other parts.
 """
 
 import logging
@@ -24,45 +24,45 @@ from robotid.robot.model import RobotModel
 __all__ = ["prefers_measured"]
 
 _log = logging.getLogger(__name__)
-_ROWS = 1000  # instants of a log that are compared, at most
+_ROWS = 1000  # largest number of samples of a log that are used
 _PARTS = 8  # of the log, every other one fitted
-_BETTER = 0.85  # a ratio of the errors below this is no chance
-_EXACT = 1e-6  # share of a torque that is missed at least: of a simulated log nothing is
-_FEW = 3.0  # rows per column from which a joint says something
+_BETTER = 0.85  # ratio of the errors below which the difference is significant
+_EXACT = 1e-6  # smallest relative error of a torque, for noise-free simulated logs
+_FEW = 3.0  # smallest number of rows per column for a joint
 
 
 def prefers_measured(model: RobotModel, logs: Sequence[Log], settings: SignalSettings) -> bool:
-    """Return whether velocity = "auto" takes the measured velocities of a log.
+    """Return whether velocity = "auto" uses the measured velocities of a log.
 
-    It never takes those that are coarse or not of their positions. Of others it takes those that
-    predict torque about as well as differentiated ones, or, where too little moves to tell, those
-    that are timely.
+    Measured velocities that are coarsely quantised or inconsistent with the positions are not used.
+    Others are used if they predict the torque about as well as differentiated velocities. If the
+    log has too little motion for this comparison, they are used if they are not delayed.
 
     Args:
         model: The robot.
-        logs: Parts of the log, full turns taken out.
-        settings: How it becomes a trajectory.
+        logs: Parts of the log, unwrapped.
+        settings: Settings of the processing to a trajectory.
     """
     if any(coarse_velocities(log) or unlike_velocities(log) for log in logs):
         return False
     errors = np.concatenate([_errors(model, log, settings) for log in logs])
-    told = np.isfinite(errors).all(axis=1)
-    if not told.any():
+    is_known = np.isfinite(errors).all(axis=1)
+    if not is_known.any():
         return all(is_timely(log, settings.velocity_delay) for log in logs)
-    ratio = float(np.median(errors[told, 1] / errors[told, 0]))
+    ratio = float(np.median(errors[is_known, 1] / errors[is_known, 0]))
     chosen = "measured" if ratio > _BETTER else "differentiated"
     _log.info(
-        "%s: velocity = 'auto' is %s: in segments that were not fitted, differentiated ones miss "
-        "%.2f times as much of the torque as measured ones",
+        "%s: velocity = 'auto' uses %s velocities: the torque prediction error on held-out "
+        "segments with differentiated velocities is %.2f times that with measured velocities",
         logs[0].name, chosen, ratio,
     )  # fmt: skip
     return ratio > _BETTER
 
 
 def _errors(model: RobotModel, log: Log, settings: SignalSettings) -> Array:
-    """Return what measured and differentiated velocities miss of each torque, shape (n, 2).
+    """Return the torque prediction errors with measured and differentiated velocities, (n, 2).
 
-    NaN where a joint moves too little to tell, or there is no torque.
+    NaN for a joint with too little motion or without torque.
     """
     found = np.full((2, len(model.joints)), np.nan)
     if not log.has_torque:
@@ -72,35 +72,35 @@ def _errors(model: RobotModel, log: Log, settings: SignalSettings) -> Array:
         chosen = replace(settings, velocity=velocity)
         try:
             motions.append(process(log, chosen, friction_speeds(model.layout)))
-        except DataError:  # too short, which is told where the log is read
+        except DataError:  # too short: the error is raised again when the log is read
             return found.T
     masks = [row_mask(model, motion, settings.min_velocity) for motion in motions]
-    sure = masks[0] & masks[1]
-    every = -(-len(sure) // _ROWS)
+    mask = masks[0] & masks[1]
+    every = -(-len(mask) // _ROWS)
     for errors, motion in zip(found, motions, strict=True):
-        errors[:] = _missed(model, motion, sure, every)
+        errors[:] = _held_out_error(model, motion, mask, every)
     return found.T
 
 
-def _missed(model: RobotModel, motion: Trajectory, sure: Array, every: int) -> Array:
-    """Return the root mean square that is missed of each torque in the parts not fitted, (n,)."""
+def _held_out_error(model: RobotModel, motion: Trajectory, mask: Array, every: int) -> Array:
+    """Return the norm of each torque's prediction error in the parts not fitted, shape (n,)."""
     rows = slice(None, None, every)
     state = motion.q[rows], motion.v[rows], motion.a[rows]
     direction = None if motion.direction is None else motion.direction[rows]
     Y = joint_torque_regressor(model, *state, direction)
     Y = Y.reshape(len(state[0]), len(model.joints), -1)
     part = np.arange(len(Y)) * _PARTS // len(Y) % 2
-    missed = np.full(len(model.joints), np.nan)
+    error = np.full(len(model.joints), np.nan)
     for j, support in enumerate(model.support()):
-        W, tau, used = Y[:, j, support], motion.tau[rows, j], sure[rows, j]
-        fitted, kept = used & (part == 0), used & (part == 1)
-        if min(fitted.sum(), kept.sum()) < _FEW * W.shape[1] or not tau.any():
-            continue  # a motion without torques tells nothing
+        W, tau, used = Y[:, j, support], motion.tau[rows, j], mask[rows, j]
+        even, odd = used & (part == 0), used & (part == 1)
+        if min(even.sum(), odd.sum()) < _FEW * W.shape[1] or not tau.any():
+            continue  # too few rows, or no torques
         squares = 0.0
-        for first, second in ((fitted, kept), (kept, fitted)):
+        for first, second in ((even, odd), (odd, even)):
             size = np.linalg.norm(W[first], axis=0)
             X = W / np.where(size > 0, size, 1.0)
             theta = np.linalg.lstsq(X[first], tau[first], rcond=1e-3)[0]
             squares += float(np.sum((tau[second] - X[second] @ theta) ** 2))
-        missed[j] = np.sqrt(squares) + _EXACT * np.linalg.norm(tau)
-    return missed
+        error[j] = np.sqrt(squares) + _EXACT * np.linalg.norm(tau)
+    return error

@@ -181,7 +181,7 @@ def conclude(
     merged = settled(with_known_springs(before, fit), of_fit)
     merged = rejected(merged, result.predictions, result.scale_check)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
-    heads = [log.head for log in (*recordings.fitted, *recordings.kept)]
+    heads = [log.head for log in (*recordings.fitted, *recordings.validation)]
     findings = [*log_findings(heads), *impossible_inertials(model), *merged]
     findings += unwritten(fit, log_errors)
     ignored = {current_code(code) for code in ignore}

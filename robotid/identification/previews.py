@@ -434,7 +434,7 @@ def _errors(
         for sigma in (information.sigma, np.ones_like(information.sigma))
     )
     if not isinstance(choice, ConsistentSettings):
-        return (alike if choice.weighs_alike else plain), plain
+        return (alike if choice.has_equal_weights else plain), plain
     stated = choice.prior_weight
     weight, plausible = typical if isinstance(stated, str) else (stated, 1.0)
     bounds = {**choice.constraints, "extent": "none"}
@@ -442,7 +442,9 @@ def _errors(
     fit = replace(consistent_fit(settings, known), plausible_weight=plausible)
     C = fit.programme.covariance(weight, fit.rows(factors, information.sigma))
     R, meat = factors.weighted(information.sigma)[:-1, :-1], information.meat(K, information.sigma)
-    covariance = about_prior(C, K, information.share**2 * meat, R, information.share, fit.pull)
+    covariance = about_prior(
+        C, K, information.share**2 * meat, R, information.share, fit.weight_ratio
+    )
     estimate = replace(
         plain, theta=known.pi, covariance=covariance, names=known.mapping.names,
         prior_std=fit.spread_before,

@@ -220,7 +220,7 @@ def _charts(
     said = "no rows used"
     if measured is not None:
         error = percent(measured.relative_error_pct).html
-        held = band.held(recording.trajectory.tau, e.torques["estimate"], recording.mask)[row]
+        held = band.coverage(recording.trajectory.tau, e.torques["estimate"], recording.mask)[row]
         said = (
             f"error {error} %, RMSE {measured.rmse:.3g} {unit}; 95 % band holds {100 * held:.0f} %"
         )

@@ -127,7 +127,7 @@ def test_a_log_that_cannot_be_used_is_refused_alone_where_that_is_wanted(hand, m
 class Held:
     """A surveyed log, as far as its locked joints go."""
 
-    held: dict
+    locked: dict
     model: object = None
 
 
@@ -158,7 +158,7 @@ def test_notes_of_a_long_log_are_told_once_and_its_looks_are_all_examined(hand, 
 
     def log(name, *looks):
         return SimpleNamespace(
-            path=f"runs/{name}", held=f"held of {name}", windows=looks, looks=list(looks),
+            path=f"runs/{name}", locked=f"held of {name}", windows=looks, looks=list(looks),
             head=SimpleNamespace(notes=[f"a note of {name}"]),
         )  # fmt: skip
 

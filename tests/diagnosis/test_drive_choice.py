@@ -429,7 +429,7 @@ def test_the_load_of_the_gears_is_that_of_the_bodies_found(plain, estimator, tmp
 def test_a_load_that_does_not_settle_is_refused(plain, cases, monkeypatch):
     monkeypatch.setattr("robotid.fitting.fit._SETTLED", -1.0)
     monkeypatch.setattr("robotid.fitting.fit._MOST_LOADS", 3)
-    with pytest.raises(NotConvergedError, match="load of the gears still changes after 3 fits"):
+    with pytest.raises(NotConvergedError, match="joint load torque has not converged after 3 fits"):
         fitted_in(plain, [cases("load")[2]], friction={ELBOW: "load"}, estimator="wls")
 
 
@@ -448,7 +448,7 @@ def test_logs_in_files_choose_as_in_memory(plain, cases, tmp_path, workers):
     job = job_from_settings(table, "job", tmp_path)
     fitted, kept = survey_logs(job, plain, job.identification, job.validation)
     recordings = Recordings(plain, structural_mapping(plain), fitted, kept)
-    assert not recordings.is_held
+    assert not recordings.is_in_memory
     found = with_drives(recordings, EstimatorSettings("wls"), wanted_families(AUTO, JOINTS))
     assert chosen(found) == chosen(held) == {ELBOW: ("presliding",)}
     ((shape,), (alike,)) = ([s for c in x.drives for s in c.shapes] for x in (found, held))
@@ -486,7 +486,7 @@ def test_what_is_nearly_chosen_widens_the_intervals_it_would_move(plain):
         found = found_in(plain, [log], estimator="wls")
         (choice,) = (c for c in found.drives if c.joint == ELBOW)
         assert all(x.p_value < 0.015 for x in choice.tried if x.is_selected and x.families)
-        if choice.families or [t.name for t in choice.doubted] != ["load"]:
+        if choice.families or [t.name for t in choice.undecided] != ["load"]:
             continue
         seen += 1
         alone = found_in(plain, [log], friction="none", estimator="wls")

@@ -408,7 +408,7 @@ def test_logs_in_files_are_judged_by_the_stretches_at_hand(ur5, tmp_path):
     job = job_from_settings(table, "job", tmp_path)
     surveyed = survey_logs(job, ur5, job.identification, job.validation)
     recordings = Recordings(ur5, structural_mapping(ur5), *surveyed)
-    assert not recordings.is_held
+    assert not recordings.is_in_memory
     (found,) = misfits(conclude(recordings, EstimatorSettings("wls"), friction="none"))
     assert (found.joint, found.term.code) == (LIFT, "load_friction")
     assert found.size == pytest.approx(0.1, abs=0.01)

@@ -111,7 +111,7 @@ def test_held_joints_are_checked_in_logs_read_in_pieces_too(job, tmp_path, monke
     long = replace(short, rows_in_memory=512)
     (one,), (other,) = found(short), found(long)
     assert (other.message, other.evidence["median"]) == (one.message, one.evidence["median"])
-    assert any(f.code == "log_note" and "looked at rows 0-300" in f.message for f in examine(long))
+    assert any(f.code == "log_note" and "checked rows 0-300" in f.message for f in examine(long))
     identification, _ = run_job(replace(long, estimator=EstimatorSettings("wls")), tmp_path / "out")
     assert identification.verdict.reasons[0] == one.message
     assert identification.log_errors[0] == one.message

@@ -163,7 +163,7 @@ def test_its_noise_is_what_rows_leave_and_its_part_of_the_regressor_is_stated(rn
 def test_more_noise_than_the_residual_holds_is_refused(rng):
     W = rng.standard_normal((300, 2))
     tau = W @ [10.0, 3.0] + 0.01 * rng.standard_normal(300)
-    with pytest.raises(DataError, match=r"regressor_noise 0\.01 alone would make"):
+    with pytest.raises(DataError, match=r"regressor_noise = 0\.01 corresponds to"):
         TLS().fit(compress(problem(W, tau, ("a", "b"))))
 
 
@@ -184,7 +184,7 @@ def test_data_that_leave_parameters_open_are_refused(rng):
 
 
 def test_noise_beyond_the_signal_has_no_single_solution():
-    with pytest.raises(DataError, match="no single smallest"):
+    with pytest.raises(DataError, match="is not unique"):
         mixed_tls(np.eye(3), np.ones(2))
 
 

@@ -64,7 +64,7 @@ def test_a_sum_that_alone_is_measured_is_named_as_such():
     assert known.rank == 2
     assert known.undetermined == ("x.coulomb", "x.offset")
     assert known.described() == (
-        "of x.coulomb and x.offset only x.coulomb + x.offset is determined"
+        "x.coulomb and x.offset are identifiable only as x.coulomb + x.offset"
     )
     ((group,),) = [known.to_list()]
     assert group["determined"][0]["terms"] == pytest.approx({"x.coulomb": 1.0, "x.offset": 1.0})
@@ -105,11 +105,11 @@ def grouped(size, count):
 def test_words_of_groups_say_how_many_sums_are_determined():
     said = [str(grouped(*sizes)) for sizes in ((2, 0), (2, 1), (5, 2), (4, 3), (6, 1), (1, 0))]
     assert said == [
-        "of p0 and p1 nothing is determined", "of p0 and p1 only p0 is determined",
-        "of p0, p1, p2, p3 and p4 only p0 and p1 are determined",
-        "of the 4 parameters p0 ... p3 only 3 sums are determined, as p0",
-        "of the 6 parameters p0 ... p5 only 1 sum is determined, as p0",
-        "of p0 nothing is determined",
+        "p0 and p1 are not identifiable", "p0 and p1 are identifiable only as p0",
+        "p0, p1, p2, p3 and p4 are identifiable only as p0 and p1",
+        "the 4 parameters p0 ... p3 are identifiable only in 3 sums, as p0",
+        "the 6 parameters p0 ... p5 are identifiable only in 1 sum, as p0",
+        "p0 is not identifiable",
     ]  # fmt: skip
     a, b = Group(("x",), ()), Group(("y", "z"), ())
     one, two, three, four = (grouped(size, 1) for size in (2, 3, 4, 5))
@@ -120,10 +120,10 @@ def test_words_of_groups_say_how_many_sums_are_determined():
 
     found = known(a, one, two, b, three, four)
     assert found.merged == (one, two, three, four, Group(("x", "y", "z"), ()))
-    nothing = "of x, y and z nothing is determined"
-    assert found.described() == f"{one}; {two}; 2 more such groups; {nothing}"
-    assert known(one, two, three).described() == f"{one}; {two}; 1 more such group"
-    assert known(two, a).described() == f"{two}; of x nothing is determined"
+    nothing = "x, y and z are not identifiable"
+    assert found.described() == f"{one}; {two}; 2 more groups of this kind; {nothing}"
+    assert known(one, two, three).described() == f"{one}; {two}; 1 more group of this kind"
+    assert known(two, a).described() == f"{two}; x is not identifiable"
     assert found.rank == 5
     assert found.undetermined == names[:-1]
     assert known().merged == ()
@@ -132,7 +132,7 @@ def test_words_of_groups_say_how_many_sums_are_determined():
     assert known().refusal(error) is error
     said = found.refusal(error)
     assert (said.rank, said.undetermined) == (5, names[:-1])
-    assert f"{one}; {two}; 2 more such groups" in str(said)
+    assert f"{one}; {two}; 2 more groups of this kind" in str(said)
 
 
 @pytest.mark.parametrize(("noise", "is_determined"), [(1.0, True), (2.0, True), (2.2, False)])
@@ -205,8 +205,8 @@ def test_a_joint_that_turns_one_way_leaves_friction_and_offset_a_sum(pan):
     assert known.undetermined == ("shoulder_pan_joint.coulomb", "shoulder_pan_joint.offset")
     assert known.rank == 57
     assert known.described() == (
-        "of shoulder_pan_joint.coulomb and shoulder_pan_joint.offset only "
-        "shoulder_pan_joint.coulomb + shoulder_pan_joint.offset is determined"
+        "shoulder_pan_joint.coulomb and shoulder_pan_joint.offset are identifiable only as "
+        "shoulder_pan_joint.coulomb + shoulder_pan_joint.offset"
     )
     # the sum is found, the terms are not
     pi = truth(pan.model)

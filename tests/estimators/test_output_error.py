@@ -227,8 +227,8 @@ def test_rows_of_torque_weigh_in_one_estimate(rng):
 def test_it_says_that_it_has_not_settled(rng):
     found = OutputError(steps=1, rounds=1).fit(lagging(rng), START)
     assert not found.converged
-    assert found.message.endswith("not settled")
-    assert OutputError().fit(lagging(rng), START).message.endswith(", settled")
+    assert found.message.endswith("not converged")
+    assert OutputError().fit(lagging(rng), START).message.endswith(", converged")
 
 
 def test_a_step_that_cannot_be_simulated_is_shortened(rng):

@@ -90,7 +90,7 @@ def test_both_runs_are_one_fit_with_the_prior_by_the_noise_of_each_joint(rng, sh
     torque = np.sum(tau**2, axis=(0, 2))
     np.testing.assert_allclose(found.unexplained, np.sqrt(left / torque), rtol=1e-9)
     # one set of both runs' own parameters leaves more than each by itself
-    np.testing.assert_allclose(runs.held_together(theta), left / own, rtol=1e-9)
+    np.testing.assert_allclose(runs.residual_ratios(theta), left / own, rtol=1e-9)
 
 
 @pytest.mark.parametrize("hold", [1, 20])

@@ -73,10 +73,8 @@ def test_the_fewest_joints_before_the_link_move_and_the_others_rest(designer, fo
     # an axis shows nothing of mass on it; two that meet turn about one point
     fewer = dict.fromkeys(found.fewer)
     assert list(fewer) == [WRIST[-1:], WRIST[-2:]]
-    assert found.fewer[WRIST[-2:]].described() == "of tool0.m nothing is determined"
-    assert "With wrist_2_joint, wrist_3_joint alone, of tool0.m nothing is" in " ".join(
-        found.described()
-    )
+    assert found.fewer[WRIST[-2:]].described() == "tool0.m is not identifiable"
+    assert "With wrist_2_joint, wrist_3_joint alone, tool0.m is not" in " ".join(found.described())
 
 
 def test_the_limits_are_kept_with_the_payload_and_without_it(designer, found):
@@ -122,7 +120,7 @@ def test_a_motion_of_stated_joints_says_what_it_leaves_open(designer):
     assert few.determination.rank == 3
     assert not few.fewer
     words = " ".join(few.described())
-    assert "It leaves open: of tool0.m, tool0.mcz, " in words
+    assert "It leaves open: tool0.m, tool0.mcz, " in words
     assert "Standard errors" not in words
 
 

@@ -59,7 +59,7 @@ def test_bands_hold_95_percent_of_the_torques_of_a_new_motion(found):
     identification, _ = found
     (evaluation,) = identification.validation
     recording, band = evaluation.recording, identification.band(evaluation)
-    share = band.held(recording.trajectory.tau, evaluation.torques["estimate"], recording.mask)
+    share = band.coverage(recording.trajectory.tau, evaluation.torques["estimate"], recording.mask)
     assert ((share > 0.91) & (share < 0.99)).all(), share
     np.testing.assert_allclose(band.noise, NOISE, rtol=0.1)
 
@@ -81,7 +81,9 @@ def test_the_noise_of_a_band_is_what_recordings_of_its_kind_leave(ur5):
     assert kept[0].noise[2] == pytest.approx(NOISE[2], rel=0.15)
     for e in found.validation:
         recording = e.recording
-        share = found.band(e).held(recording.trajectory.tau, e.torques["estimate"], recording.mask)
+        share = found.band(e).coverage(
+            recording.trajectory.tau, e.torques["estimate"], recording.mask
+        )
         assert ((share > 0.93) & (share < 0.97)).all(), share
     np.testing.assert_array_equal(expected_band(found, found.fitted[0]).noise, found.estimate.sigma)
 
@@ -129,14 +131,14 @@ def test_result_json_states_bands_intervals_and_method(found):
 def test_a_row_on_the_edge_of_the_band_lies_in_it():
     band = TorqueBand(np.arange(3), np.zeros((3, 1)), np.ones(1))
     edge = 1.96 * np.array([[1.0 + 1e-12], [1.0 + 1e-6], [0.5]])
-    assert band.held(edge, np.zeros((3, 1)), np.ones((3, 1), bool)) == pytest.approx(2 / 3)
+    assert band.coverage(edge, np.zeros((3, 1)), np.ones((3, 1), bool)) == pytest.approx(2 / 3)
 
 
 def test_rows_that_are_not_used_do_not_count():
     band = TorqueBand(np.array([0, 2]), np.zeros((2, 2)), np.ones(2))
     tau = np.array([[0.0, 9.0], [50.0, 50.0], [9.0, 9.0]])
     mask = np.array([[True, False], [True, True], [True, False]])
-    share = band.held(tau, np.zeros((3, 2)), mask)
+    share = band.coverage(tau, np.zeros((3, 2)), mask)
     assert share[0] == 0.5
     assert np.isnan(share[1])
 

@@ -148,7 +148,7 @@ def test_two_hundred_rows_of_a_window_are_looked_for_whatever_its_pieces():
     first, stop = 5003, 7003  # of a long file
     ends = [first, 5600, 6205, stop]
     pieces = [SimpleNamespace(first=row) for row in ends[:-1]]
-    log = SimpleNamespace(pieces=pieces, first=first, stop=stop, is_held=False)
+    log = SimpleNamespace(pieces=pieces, first=first, stop=stop, is_in_memory=False)
     rows = [
         np.arange(piece.first, end)[part.sampled]
         for piece, part, end in zip(pieces, _parts(log), ends[1:], strict=True)

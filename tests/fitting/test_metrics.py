@@ -40,7 +40,7 @@ def test_a_silent_torque_channel_has_no_relative_error():
 
 
 def test_nothing_to_measure_is_an_error():
-    with pytest.raises(DataError, match="no row is left to measure the prediction with"):
+    with pytest.raises(DataError, match="0 torque rows are used"):
         measure(TAU, TAU, np.zeros((4, 2), dtype=bool), ["a", "b"], ["N m", "N m"])
 
 

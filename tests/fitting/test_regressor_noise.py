@@ -182,8 +182,8 @@ def test_a_finding_names_joints_step_and_parameter(planar, motion):
     found = identify(planar, [log], signals=SIGNALS)
     (finding,) = [f for f in found.findings if f.code == "encoder_noise"]
     assert finding.severity == "warning"
-    assert "steps of up to 0.00307 rad (11.0 bits a turn)" in finding.message
-    assert "the estimate is corrected for it" in finding.message
+    assert "steps of up to 0.00307 rad (11.0 bits per revolution)" in finding.message
+    assert "the estimate is corrected for this bias" in finding.message
     assert finding.evidence["std_errors"] >= 2.0
     noise = found.regressor_noise
     moved = np.abs(noise.shift) / noise.std_error
@@ -222,7 +222,7 @@ def test_an_estimator_that_reads_samples_counts_the_shift_as_an_error(planar, mo
     np.testing.assert_allclose(rls.base - noise.shift, wls.base, rtol=1e-3, atol=1e-4)
     assert (rls.base_error >= 0.95 * np.abs(noise.shift)).all()
     (finding,) = [f for f in rls.findings if f.code == "encoder_noise"]
-    assert "its standard errors count it" in finding.message
+    assert "its standard errors include it" in finding.message
 
 
 def test_corrected_factors_are_those_of_the_fit(planar, motion, runs):
@@ -284,7 +284,7 @@ def test_rows_that_are_not_looked_at_scale_the_covariance_of_the_score(planar, m
 
     thrice = join(parts * 3)
     both = found(whole), found(thrice)
-    monkeypatch.setattr(regressor_noise, "_repeated", lambda odd: np.zeros(odd.shape[-1]))
+    monkeypatch.setattr(regressor_noise, "_repeated", lambda linear: np.zeros(linear.shape[-1]))
     alone = found(whole), found(thrice)
     size = np.sqrt(np.outer(np.diag(both[1].meat), np.diag(both[1].meat)))
     for one, more in (both, alone):

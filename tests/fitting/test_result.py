@@ -32,7 +32,7 @@ def test_a_bound_is_the_source_of_what_it_moved_and_the_data_do_not_show(identif
     assert {held.sources[i] for i in own} == {"prior"}
 
 
-def test_the_reach_of_a_standard_parameter_is_the_largest_of_its_base_parameters():
+def test_the_quantile_of_a_standard_parameter_is_the_largest_of_its_base_parameters():
     K = np.array([[1.0, 0.0, 2.0, 0.0], [0.0, 0.0, -0.5, 0.0], [0.0, 0.0, 0.0, 3.0]])
     errors = SimpleNamespace(quantile=np.array([2.125, 2.5, 1.97]))
     found = SimpleNamespace(mapping=SimpleNamespace(K=K), errors=errors)

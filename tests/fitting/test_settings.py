@@ -74,7 +74,7 @@ def test_a_recursive_estimate_is_made_physical_on_request(ur5, rng, name):
     settings = EstimatorSettings(name, physical=True, draws=0)
     found = fit(ur5, [log], signals=EXACT, estimator=settings)
     assert found.is_consistent
-    assert "made physically possible" in found.estimate.message
+    assert "projected onto physically consistent" in found.estimate.message
 
 
 def test_the_printed_step_asks_for_the_mass_regressor_itself(ur5, rng):

@@ -72,7 +72,9 @@ def test_standard_errors_are_the_scatter_of_many_recordings(W, colour):
     assert 0.92 < np.mean(held) < 0.98
 
 
-@pytest.mark.parametrize(("samples", "basis"), [(1600, "16 segments"), (800, "filter's band")])
+@pytest.mark.parametrize(
+    ("samples", "basis"), [(1600, "16 segments"), (800, "bandwidth of the filter")]
+)
 def test_behind_the_filter_errors_are_the_scatter_and_those_of_independent_rows_are_not(
     samples, basis
 ):

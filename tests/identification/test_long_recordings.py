@@ -184,7 +184,7 @@ def test_only_stretches_of_a_long_log_are_drawn_and_examined(noisy_job, tmp_path
     page = (tmp_path / "report.html").read_text()
     assert "a long log, 300 of its 1478 samples are drawn, from its beginning" in page
     notes = [w["message"] for w in result["warnings"] if w["code"] == "log_note"]
-    assert any("looked at rows 0-400, 550-950, 1100-1500 only" in note for note in notes)
+    assert any("checked rows 0-400, 550-950, 1100-1500 only" in note for note in notes)
     found = [f for f in examine(job) if f.code == "rate"]
     assert [f.where for f in found] == [
         "fit.csv rows 0-400",
@@ -213,14 +213,14 @@ def test_a_log_with_samples_in_no_usual_piece_is_drawn_all_the_same(rng, tmp_pat
 def test_a_job_is_long_by_the_rows_of_all_its_files(noisy_job):
     model, refused = noisy_job.model(), []
     groups = noisy_job.identification, noisy_job.validation
-    for rows, is_held in ((2199, False), (2200, True)):
+    for rows, is_in_memory in ((2199, False), (2200, True)):
         fitted, kept = survey_logs(replace(noisy_job, rows_in_memory=rows), model, *groups)
-        assert [log.is_held for log in (*fitted, *kept)] == [is_held] * 3
+        assert [log.is_in_memory for log in (*fitted, *kept)] == [is_in_memory] * 3
     missing = (LogEntry(Path("missing.csv")), noisy_job.identification[0])
     (found,) = survey_logs(
         replace(noisy_job, rows_in_memory=1500), model, missing, refuse=lambda *x: refused.append(x)
     )
-    assert [log.is_held for log in found] == [True]
+    assert [log.is_in_memory for log in found] == [True]
     ((entry, error),) = refused
     assert (entry, str(error)) == (missing[0], "there is no log file 'missing.csv'")
     with pytest.raises(SettingsError, match="rows_in_memory is 0, wanted a positive number"):

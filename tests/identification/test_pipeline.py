@@ -186,10 +186,10 @@ def test_noise_levels_that_settle_slowly_on_few_rows_do_not_stop_it(ur5, monkeyp
     log = exact_log(ur5, truth(ur5), np.random.default_rng(0), samples=60, noise=0.5)
     monkeypatch.setattr(batch, "_MAX_ITERATIONS", 40)
     found = fit(ur5, [log], estimator="wls")
-    assert "after 40 iterations, where they still change by" in found.estimate.message
+    assert "after 40 iterations, remaining relative change" in found.estimate.message
     assert found.errors.segments < 12
     monkeypatch.setattr(batch, "_MAX_ITERATIONS", 20)
-    with pytest.raises(NotConvergedError, match=r"still change by 3\.\de-04 after 20 iterations"):
+    with pytest.raises(NotConvergedError, match=r"relative change 3\.\de-04 after 20 iterations"):
         fit(ur5, [log], estimator="wls")
 
 

@@ -96,7 +96,7 @@ def test_positions_of_other_joints_are_refused_with_their_own_shape(found):
 def test_a_curve_shows_its_speeds_torques_and_band(found):
     curve = found.friction(ELBOW, [0.5, 1.0], load=2.0)
     head, _, *rows = str(curve).splitlines()
-    assert "loaded by 2" in head
+    assert "joint load torque 2" in head
     for k, row in enumerate(rows):
         v, torque, half = row.replace("+-", " ").split()
         assert float(v) == pytest.approx(curve.v[k])

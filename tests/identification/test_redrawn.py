@@ -128,8 +128,8 @@ def test_bounds_make_intervals_narrower_and_are_named(rng):
     free = fit(model, [log], signals=EXACT, estimator=EstimatorSettings(draws=0, **BOUND))
     assert found.estimate.details["active"]
     np.testing.assert_array_equal(found.standard, free.standard)
-    assert "64 fits to redrawn data and prior" in found.errors.method
-    assert "redrawn" not in free.errors.method
+    assert "64 fits to resampled data and prior" in found.errors.method
+    assert "resampled" not in free.errors.method
     np.testing.assert_allclose(found.errors.unbounded**2, np.diag(free.estimate.covariance))
     ratio = np.sqrt(np.diag(found.estimate.covariance) / np.diag(free.estimate.covariance))
     assert 0.4 < np.median(ratio) < 1.0
@@ -152,7 +152,9 @@ def test_fits_that_are_not_solved_are_counted_and_many_are_refused(rng, monkeypa
     assert "61 fits" in found.errors.method
     assert "(3 more not solved: InsufficientProgress)" in found.errors.method
     lost = 20
-    with pytest.raises(NotConvergedError, match="solved 44 of 64 fits to redrawn data; set draws"):
+    with pytest.raises(
+        NotConvergedError, match="solved 44 of 64 fits to resampled data; set draws"
+    ):
         fit(model, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
 
 
@@ -161,7 +163,7 @@ def test_a_log_of_few_stretches_is_redrawn_by_the_filters_share(rng):
     log = exact_log(model, truth(model), rng, samples=300, noise=NOISE[1:4])
     found, again = (fit(model, [log], estimator=EstimatorSettings(**BOUND)) for _ in range(2))
     assert "only" in found.errors.method
-    assert "fits to redrawn data" in found.errors.method
+    assert "fits to resampled data" in found.errors.method
     np.testing.assert_array_equal(again.standard_error, found.standard_error)
 
 

@@ -199,5 +199,5 @@ def test_what_static_models_cannot_do_is_refused(rng):
         identify(static, [log], estimator=EstimatorSettings("prx", metric="mass"))
     fast = Log(t=log.t[:20], q=log.q[:20] + 2.0 * log.t[:20, None], tau=log.tau[:20],
                joints=log.joints)  # fmt: skip
-    with pytest.raises(DataError, match="no segment of a quarter of a second is slow enough for"):
+    with pytest.raises(DataError, match=r"no segment of 0\.25 s is slow enough for"):
         identify(static, [fast])

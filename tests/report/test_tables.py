@@ -85,7 +85,7 @@ def test_the_head_counts_parameters_samples_and_rows(report, identified):
     assert f"({samples} samples after filtering, {rows} torque rows used)" in said
     assert "fitted to first.csv 0-3.58 s, second.csv 0-3.475 s (" in said
     assert "Validation: kept.csv 0-5.98 s." in said
-    assert "possible and leaves the URDF's value where the data say nothing (consistent)" in said
+    assert "consistent bodies and the URDF's values as prior (consistent)" in said
 
 
 def relative(value, error):

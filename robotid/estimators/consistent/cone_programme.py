@@ -1,4 +1,4 @@
-"""The convex programme of a consistent fit: data and prior over the cone, at any weight."""
+"""The convex programme of a consistent fit: data and prior over a cone, at any weight."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,12 +16,12 @@ from robotid.regressor.factors import Factors
 
 __all__ = ["Programme"]
 
-_EXACT = 1e-12  # decrease of the objective by another step at which a fit is exact, relative
-_ROUGH = 1e-6  # ... and at which it will do for a prediction
-_TOGETHER = 2**17  # numbers of data sets that are fitted in one pass: more leave a cache
-_NOISE_STEPS, _NOISE_SETTLED = 50, 1e-4  # a noise level need not be known better
-_FLOOR = 1e-6  # smallest noise level, as a share of the torque: noise-free data have none
-_LEAST_FREEDOM = 0.1  # share of the rows that are left to tell the noise
+_EXACT = 1e-12  # relative decrease of the objective per step at which a fit is exact
+_ROUGH = 1e-6  # ... and at which it is sufficient for a prediction
+_TOGETHER = 2**17  # entries of the data sets that are fitted in one pass: they fit into a cache
+_NOISE_STEPS, _NOISE_SETTLED = 50, 1e-4  # steps and relative change of the noise levels
+_FLOOR = 1e-6  # smallest noise level over the torque, for noise-free data
+_LEAST_FREEDOM = 0.1  # smallest degrees of freedom of a noise level, as a share of the rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +30,12 @@ class Programme:
 
     Attributes:
         K: Map to the base parameters, shape (b, p).
-        scale: Unit of each parameter, shape (p,): cone and subspace are those of x = pi / scale.
+        scale: Unit of each parameter, shape (p,): cone and subspace are in x = pi / scale.
         penalty: Distance from the prior.
         cone: The inequalities.
-        space: What the equalities leave.
-        solver: "clarabel" or "scs", of priors that are not entropic and of the check.
-        max_iterations: Bound on the iterations of each solve.
+        space: Subspace of the points that meet the equalities.
+        solver: Cone solver for quadratic priors and for the check: "clarabel" or "scs".
+        max_iterations: Largest number of iterations of each solve.
     """
 
     K: Array
@@ -48,7 +48,7 @@ class Programme:
 
     @property
     def binding(self) -> Cone:
-        """The inequalities that can bind: the log det of a penalty keeps matrices inside."""
+        """The inequalities that can be active: the log det of a penalty is a barrier."""
         return self.cone.linear if self.penalty.keeps_positive else self.cone
 
     def minimise(
@@ -59,19 +59,19 @@ class Programme:
         is_exact: bool = True,
         start: ConeSolution | None = None,
     ) -> ConeSolution:
-        """Return the minimum, its x being pi, shape (p,).
+        """Return the minimum; its x is pi, shape (p,).
 
-        A quadratic penalty is a problem of the cone solver; the entropic one has a method of its
-        own, ``EntropicProblem``.
+        With a quadratic penalty the cone solver is used; with the entropic penalty the
+        interior-point method of ``EntropicProblem``.
 
         Args:
-            rows: Information on the base parameters, shape (k, b + 1).
+            rows: Rows of the data in base parameters, shape (k, b + 1).
             weight: Weight of the penalty [-].
-            is_exact: Whether to solve beyond 1e-3 standard deviations.
-            start: Minimum of nearly the same rows, or at another weight.
+            is_exact: Whether to solve more precisely than 1e-3 standard deviations.
+            start: Initial value: minimum of nearly the same rows, or at another weight.
 
         Raises:
-            NotConvergedError: If it is not solved.
+            NotConvergedError: If the solver fails.
         """
         starts = None if start is None else [start]
         return self.minimise_each(rows[None], weight, is_exact=is_exact, starts=starts)[0]
@@ -84,16 +84,16 @@ class Programme:
         is_exact: bool = True,
         starts: Sequence[ConeSolution] | None = None,
     ) -> list[ConeSolution]:
-        """Return the minimum of each data set, as of ``minimise``, in one pass.
+        """Return the minimum of each of f data sets, as ``minimise``, in one pass.
 
         Args:
-            rows: Information on the base parameters, shape (f, k, b + 1).
+            rows: Rows of the data in base parameters, shape (f, k, b + 1).
             weight: Weight of the penalty [-].
-            is_exact: Whether to solve beyond 1e-3 standard deviations.
-            starts: Minima of nearly the same rows, or at another weight.
+            is_exact: Whether to solve more precisely than 1e-3 standard deviations.
+            starts: Initial values: minima of nearly the same rows, or at another weight.
 
         Raises:
-            NotConvergedError: If one is not solved.
+            NotConvergedError: If the solver fails for a data set.
         """
         if not isinstance(self.penalty, Entropic):
             centre = self.penalty.centre
@@ -109,14 +109,14 @@ class Programme:
                 near = None if starts is None else starts[k]
                 solutions += self._entropic.minimise(A[k], d[k], weight, tolerance, near)
         except NotConvergedError:
-            # the cone solver knows whether the bounds leave room for possible bodies
+            # the cone solver detects bounds that no physically consistent body can meet
             self.expanded(rows[0], weight, self.penalty.centre, within=self.cone)
             raise
         return [replace(solution, x=solution.x * self.scale) for solution in solutions]
 
     @cached_property
     def _entropic(self) -> EntropicProblem:
-        """The problem of the entropic penalty, in units of the scale."""
+        """The problem with the entropic penalty, in units of the scale."""
         penalty, space, cone = self.penalty, self.space, self.cone.linear
         assert isinstance(penalty, Entropic)
         size = len(penalty.held)
@@ -138,45 +138,45 @@ class Programme:
         weight: float,
         pi: Array,
         meat: Array,
-        pull: float,
+        weight_ratio: float,
         draws: int,
         rng: np.random.Generator,
     ) -> tuple[Array, list[str]]:
-        """Return how fits lie about this one whose data and prior are drawn anew.
+        """Return the distances of fits to resampled data and prior from this fit.
 
-        Noise of the data with the covariance that their score has, and of the prior with that of
-        the penalty over its pull, moves the minimum without the inequalities; its nearest point in
+        Noise of the data has the covariance of their score. Noise of the prior has the covariance
+        of the plausible prior. Both move the minimum without the inequalities; the nearest point in
         the cone, in the metric of the fit, is the minimum with them. A penalty that is not
         quadratic is expanded at the fit.
 
         Args:
-            rows: Information on the base parameters, shape (k, b + 1).
+            rows: Rows of the data in base parameters, shape (k, b + 1).
             weight: Weight of the penalty [-].
             pi: The fit, shape (p,).
             meat: Covariance of the score of the rows, shape (b, b).
-            pull: How much heavier the penalty weighs than the truth's plausible spread says [-].
-            draws: How many.
-            rng: Source of the noise.
+            weight_ratio: Weight of the penalty over its plausible weight [-].
+            draws: Number of fits.
+            rng: Random generator of the noise.
 
         Returns:
-            Distances of the fits from pi, shape (m, p), and the solver's status of those that it
-            did not find, draws - m of them.
+            Distances of the m solved fits from pi, shape (m, p), and the solver's status of each of
+            the draws - m others.
 
         References:
             Bardsley, Fox (2012), An MCMC method for uncertainty quantification in nonnegativity
             constrained inverse problems, section 3.
         """
         triangle, cone = self._system(rows, weight, pi, self.binding)
-        # rounding decides on the signs of rows, and of eigenvectors, but not of these
+        # signs of rows depend on rounding: make the diagonal positive
         triangle = np.sign(np.diag(triangle))[:, None] * triangle
         R, space = triangle[:, :-1], self.space
         at = space.basis.T @ (pi / self.scale - space.origin)
         inverse = scipy.linalg.solve_triangular(R, np.eye(len(R)))
-        # y = R (x - at): of independent rows, whose meat is their information, the noise is white
+        # y = R (x - at): with independent rows, whose meat is their information, noise is white
         data = self.K * self.scale @ space.basis @ inverse
         prior = space.basis @ inverse
-        # the score of the prior: weight H (pi - truth), the truth of covariance pull / (weight H)
-        S = np.sqrt(pull * weight) * self._scaled_root(pi) @ prior
+        # score of the prior: weight H (pi - true pi), covariance of pi: weight_ratio / (weight H)
+        S = np.sqrt(weight_ratio * weight) * self._scaled_root(pi) @ prior
         size, axes = np.linalg.eigh(data.T @ meat @ data + S.T @ S)
         root = axes * np.sqrt(np.maximum(size, 0.0)) @ axes.T
         noise = rng.standard_normal((draws, len(R))) @ root
@@ -187,10 +187,10 @@ class Programme:
         return self.scale * (y @ prior.T), failures
 
     def objective(self, rows: Array, pi: Array, weight: float) -> float:
-        """Return what is minimised: the squares of the residual plus the weighted penalty [-].
+        """Return the objective: the squared residual plus the weighted penalty [-].
 
         Args:
-            rows: Information on the base parameters, shape (k, b + 1).
+            rows: Rows of the data in base parameters, shape (k, b + 1).
             pi: Standard parameters, shape (p,).
             weight: Weight of the penalty [-].
         """
@@ -198,24 +198,24 @@ class Programme:
         return float(residual @ residual + weight * self.penalty.value(pi))
 
     def whitened(self, rows: Array) -> tuple[Array, Array]:
-        """Return A, r with r = A x + noise, x being what the prior gives mean 0 and variance 1.
+        """Return A, r with r = A x + noise, for coordinates x whose prior is N(0, 1).
 
         Args:
-            rows: Information on the base parameters, shape (k, b + 1).
+            rows: Rows of the data in base parameters, shape (k, b + 1).
 
         Returns:
-            A, shape (k, r), and r, shape (k,), at a weight of 1, with the penalty expanded at its
-            centre and r the number of directions that the equalities leave.
+            A, shape (k, m), and r, shape (k,), at a weight of 1, with the penalty expanded at its
+            centre and m directions that are free under the equalities.
         """
         beta, M = self._plausible
         return rows[:, :-1] @ M, rows[:, -1] - rows[:, :-1] @ beta
 
     @cached_property
     def _plausible(self) -> tuple[Array, Array]:
-        """Base parameters by the prior, beta + M x, shapes (b,) and (b, r), as of ``whitened``."""
+        """Prior of the base parameters, beta + M x, shapes (b,) and (b, m); see ``whitened``."""
         centre, basis = self.penalty.centre / self.scale, self.space.basis
         S = self._scaled_root(self.penalty.centre)
-        # the point of the subspace that is nearest to the centre
+        # the point of the subspace nearest to the centre
         away = np.linalg.lstsq(S @ basis, S @ (centre - self.space.origin), rcond=None)[0]
         nearest = self.space.origin + basis @ away
         L = scipy.linalg.qr(S @ basis, mode="r")[0][: basis.shape[1]]
@@ -223,16 +223,16 @@ class Programme:
         return K @ nearest, scipy.linalg.solve_triangular(L, (K @ basis).T, trans="T").T
 
     def noise(self, factors: Factors, sigma: Array, share: float, weight: float) -> Array:
-        """Return the noise levels, shape (n,) [N m or N], by the fit without inequalities, never 0.
+        """Return the noise levels of the fit without inequalities, shape (n,) [N m or N], not 0.
 
-        sigma_j^2 = |tau_j - W_j pi|^2 / (rows_j - spent_j / share): rows behind a filter repeat
-        each other, so that few of them are spent soon; spent_j counts the parameters that the
-        rows of joint j determine beside the prior, the trace of their leverage.
+        sigma_j^2 = |tau_j - W_j pi|^2 / (rows_j - used_j / share), where used_j is the number of
+        effective degrees of freedom of the rows of joint j, the trace of their leverage. Filtered
+        rows are correlated: only a share of them is independent.
 
         Args:
             factors: The factors, of base parameters.
-            sigma: Noise levels to start from, shape (n,) [N m or N].
-            share: Share of the rows that count as independent [-].
+            sigma: Initial noise levels, shape (n,) [N m or N].
+            share: Share of independent rows [-].
             weight: Weight of the penalty [-].
         """
         beta, M = self._plausible
@@ -240,7 +240,7 @@ class Programme:
         torque = np.sqrt(factors.torque_squares() / rows)
         least = _FLOOR * np.where(torque > 0, torque, 1.0)
         sigma = np.maximum(sigma, least)
-        # M x = U x' with as few parameters as there are base parameters
+        # M x = U x' with at most as many coordinates x' as base parameters
         U = scipy.linalg.qr(M.T, mode="r")[0][: len(M)].T
         left = factors.without(beta)
         for _ in range(_NOISE_STEPS):
@@ -248,8 +248,8 @@ class Programme:
             information = U.T @ left.information(weights) @ U + weight * np.eye(U.shape[1])
             factor = scipy.linalg.cho_factor(information)
             x = scipy.linalg.cho_solve(factor, U.T @ left.score(np.zeros(len(U)), weights))
-            spent = weights * left.leverages(U @ scipy.linalg.cho_solve(factor, U.T))
-            freedom = np.maximum(rows - spent / share, _LEAST_FREEDOM * rows)
+            used = weights * left.leverages(U @ scipy.linalg.cho_solve(factor, U.T))
+            freedom = np.maximum(rows - used / share, _LEAST_FREEDOM * rows)
             updated = np.maximum(np.sqrt(left.residual_squares(U @ x) / freedom), least)
             change = float(np.max(np.abs(updated / sigma - 1.0)))
             sigma = updated
@@ -264,9 +264,8 @@ class Programme:
 
         Args:
             weight: Weight of the penalty [-].
-            rows: Information on the base parameters, shape (k, b + 1); that of the prior alone if
-                None.
-            pi: Where the penalty is expanded, shape (p,); None: at its centre.
+            rows: Rows of the data in base parameters, shape (k, b + 1); None: the prior only.
+            pi: Point at which the penalty is expanded, shape (p,); None: its centre.
         """
         S = np.sqrt(weight) * self._scaled_root(self.penalty.centre if pi is None else pi)
         data = [] if rows is None else [rows[:, :-1] @ self.K * self.scale]
@@ -289,14 +288,14 @@ class Programme:
         """Return the minimum with the penalty expanded at a point, by the cone solver.
 
         Args:
-            rows: Information on the base parameters, shape (k, b + 1).
+            rows: Rows of the data in base parameters, shape (k, b + 1).
             weight: Weight of the penalty [-].
             pi: The point, shape (p,).
-            is_exact: As of ``minimise``.
-            within: The inequalities; None: those that can bind.
+            is_exact: As in ``minimise``.
+            within: The inequalities; None: those that can be active.
 
         Raises:
-            NotConvergedError: If the cone solver does not solve it.
+            NotConvergedError: If the cone solver fails.
         """
         triangle, cone = self._system(rows, weight, pi, self.binding if within is None else within)
         solution = least_squares(
@@ -312,11 +311,11 @@ class Programme:
         return replace(solution, x=x * self.scale)
 
     def _system(self, rows: Array, weight: float, pi: Array, cone: Cone) -> tuple[Array, Cone]:
-        """Return the triangle [R d] and a cone of what the equalities leave, expanded at pi."""
+        """Return the triangle [R d] and the cone in free coordinates, expanded at pi."""
         L = np.sqrt(weight) * self._scaled_root(pi)  # half the Hessian is L^T L
         slope = 0.5 * weight * self.penalty.gradient(pi) * self.scale
         lowest = pi / self.scale - scipy.linalg.cho_solve((L, False), slope)
-        # the data rows stand over prior rows, both in units of the scale
+        # rows of the data above rows of the prior, both in units of the scale
         A = np.vstack([rows[:, :-1] @ self.K * self.scale, L])
         d = np.concatenate([rows[:, -1], L @ lowest])
         space = self.space
@@ -327,6 +326,6 @@ class Programme:
         return triangle, cone
 
     def _scaled_root(self, pi: Array) -> Array:
-        """Return the root of half the Hessian of the penalty in units of the scale."""
+        """Return the root of half the penalty's Hessian, in units of the scale."""
         scaled: Array = self.penalty.root(pi) * self.scale
         return scaled

@@ -1,6 +1,6 @@
-"""The set that a consistent fit keeps to, and convex solvers of |A x - d|^2 over it.
+"""The feasible set of a consistent fit, and convex solvers of |A x - d|^2 over it.
 
-Linear inequalities, pseudo-inertias and equalities; Clarabel, and SCS as a second opinion.
+The set has linear inequalities, pseudo-inertias and equalities. The solvers are Clarabel and SCS.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +30,7 @@ __all__ = [
 
 _SIZE = 4  # of a pseudo-inertia
 _ENTRIES = _SIZE * (_SIZE + 1) // 2
-_REACHES = (1.0, 1e-3, 1e-5)  # units of the first solution and of its corrections
+_UNITS = (1.0, 1e-3, 1e-5)  # units of the first solution and of its corrections
 _SOLVED, _ALMOST, _INFEASIBLE = "Solved", "AlmostSolved", "PrimalInfeasible"
 _NAMES = {"clarabel": "Clarabel", "scs": "SCS"}
 _SCS_STATUS = {
@@ -41,19 +41,19 @@ _SCS_STATUS = {
     -6: "DualInfeasible",
     -7: _INFEASIBLE,
 }
-_FAR = 1e3  # distance from the cone beyond which a longer unit is used
-_NEAREST = 1e-6  # gap at which a point in units of its spread is right to 1e-3
-_CONTRADICTED = 1e-7  # ratio of a first step inside to all of it, below which there is no inside
-_SCS_ITERATIONS = 100  # of SCS for one of an interior-point method: each is a back-substitution
+_FAR = 1e3  # distance from the cone above which a larger unit is used
+_NEAREST = 1e-6  # duality gap for an error of 1e-3 standard deviations
+_CONTRADICTED = 1e-7  # distance of the NNLS problem below which the inequalities contradict
+_SCS_ITERATIONS = 100  # iterations of SCS per iteration of an interior-point method
 
 
 @dataclass(frozen=True, eq=False)
 class Subspace:
-    """The points x = origin + basis y that equalities leave.
+    """The subspace x = origin + basis y of the points that meet equalities.
 
     Attributes:
         origin: A point that meets them, shape (p,).
-        basis: Directions that are left, shape (p, r), orthonormal.
+        basis: Free directions, shape (p, r), orthonormal.
     """
 
     origin: Array
@@ -61,7 +61,7 @@ class Subspace:
 
     @classmethod
     def of(cls, E: Array, e: Array) -> "Subspace":
-        """Return the points with E x = e, or the nearest to it if they contradict each other.
+        """Return the points with E x = e, in the least squares sense if they contradict.
 
         Args:
             E: Coefficients, shape (k, p).
@@ -81,7 +81,7 @@ class Subspace:
 
     @cached_property
     def fixed(self) -> Array:
-        """Directions that are held, shape (p, p - r), orthonormal."""
+        """Fixed directions, shape (p, p - r), orthonormal."""
         p, r = self.basis.shape
         fixed: Array = np.zeros((p, 0)) if r == p else scipy.linalg.null_space(self.basis.T)
         return fixed
@@ -94,7 +94,7 @@ class Cone:
     Attributes:
         G: Coefficients of the linear rows, shape (k, p).
         h: Constants of the linear rows, shape (k,).
-        S: Coefficients of the matrices, svec by svec, shape (10 m, p).
+        S: Coefficients of the matrices in svec form, shape (10 m, p).
         s: Their constants, shape (10 m,).
         labels: Family and owner of each linear row, then of each matrix, as "mass forearm".
     """
@@ -112,7 +112,7 @@ class Cone:
 
     @property
     def families(self) -> tuple[str, ...]:
-        """The kinds of constraints in it, each once."""
+        """The families of constraints in it, each once."""
         return tuple(dict.fromkeys(label.split(" ", 1)[0] for label in self.labels))
 
     @cached_property
@@ -122,7 +122,7 @@ class Cone:
 
     @property
     def linear(self) -> "Cone":
-        """Its linear rows alone."""
+        """The cone of its linear rows only."""
         return Cone(self.G, self.h, self.S[:0], self.s[:0], self.labels[: len(self.h)])
 
     def matrices(self, x: Array) -> Array:
@@ -134,7 +134,7 @@ class Cone:
         return unsvec(self.S @ x + self.s)
 
     def slack(self, x: Array) -> Array:
-        """Return values of rows, then smallest eigenvalues, shape (k + m,); negative beyond bounds.
+        """Return values of rows, then smallest eigenvalues, shape (k + m,); negative if violated.
 
         Args:
             x: A point, shape (p,).
@@ -143,7 +143,7 @@ class Cone:
         return np.concatenate([self.G @ x + self.h, eigenvalues])
 
     def holds(self, x: Array) -> bool:
-        """Return whether a point lies in it.
+        """Return whether the cone contains a point.
 
         Args:
             x: A point, shape (p,).
@@ -151,7 +151,7 @@ class Cone:
         return bool((self.slack(x) >= 0).all())
 
     def restrict(self, space: Subspace) -> "Cone":
-        """Return the cone in coordinates y of a subspace: the points y whose x lies in this one.
+        """Return the cone in coordinates y of a subspace: the y whose x is in this cone.
 
         Args:
             space: The subspace.
@@ -165,17 +165,17 @@ class Cone:
         )
 
     def active(self, x: Array, tolerance: float) -> tuple[Array, tuple[str, ...]]:
-        """Return the constraints that bind at a point, linearised there.
+        """Return the constraints that are active at a point, linearised there.
 
-        A matrix with r eigenvalues at 0, of eigenvectors V, holds the r (r + 1) / 2 directions
-        V^T dS V = 0, as its rank does not change on the boundary.
+        A matrix with r eigenvalues at 0, with eigenvectors V, gives r (r + 1) / 2 constraints
+        V^T dS V = 0, because its rank does not change on the boundary.
 
         Args:
             x: A point, shape (p,).
-            tolerance: Slack below which a constraint counts as active.
+            tolerance: Slack below which a constraint is active.
 
         Returns:
-            Gradients of what is held at 0, shape (a, p), and the label of each.
+            Gradients of the functions that are 0, shape (a, p), and the label of each.
         """
         gradients, labels = [np.zeros((0, len(x)))], []
         for row, constant, label in zip(self.G, self.h, self.labels, strict=False):
@@ -208,7 +208,7 @@ def svec(S: Array) -> Array:
 
 @cache
 def _upper(k: int) -> tuple[Array, Array, Array]:
-    """Return rows and columns of an upper triangle by columns, and the weights of its entries."""
+    """Return rows and columns of an upper triangle by columns, and the factors of its entries."""
     columns, rows = np.tril_indices(k)  # (j, i) with i <= j
     return rows, columns, np.where(rows == columns, 1.0, np.sqrt(2.0))
 
@@ -228,13 +228,13 @@ def unsvec(vector: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ConeSolution:
-    """A point of the cone and what the solver said of it.
+    """A point of the cone and the status of the solver.
 
     Attributes:
         x: The point, shape (p,).
-        n_iter: Iterations of the solver.
+        n_iter: Number of iterations of the solver.
         message: Name of the solver and its status.
-        multipliers: Those of the linear rows, shape (k,), if the solver states them.
+        multipliers: Multipliers of the linear rows, shape (k,); None: the solver returns none.
     """
 
     x: Array
@@ -252,78 +252,77 @@ def least_squares(
     max_iterations: int = 200,
     is_exact: bool = True,
 ) -> ConeSolution:
-    """Minimise |A x - d|^2 over a cone; without it, and exactly, if it does not bind.
+    """Minimise |A x - d|^2 over a cone; directly if no constraint is active.
 
-    A solver's tolerance is relative to the problem: solved again for a correction in units of
-    1e-3 and 1e-5, its error shrinks likewise (measured on exact data: 2e-7, 5e-14, 2e-15).
+    The tolerance of a solver is relative to the problem. The problem is therefore solved again for
+    corrections in units of 1e-3 and 1e-5, which reduces the error accordingly (measured on exact
+    data: 2e-7, 5e-14, 2e-15).
 
     Args:
         A: Upper triangular factor, shape (p, p), not singular.
         d: Right-hand side, shape (p,).
-        cone: Where x must lie.
+        cone: Feasible set of x.
         solver: One of ``SOLVERS``.
-        max_iterations: Bound on its iterations.
-        is_exact: Whether to solve for the corrections, too. If not, Clarabel solves it to 1e-3 of
-            the unit of A x, in half the time; of weighted rows that is a standard deviation. A
-            cone of linear rows alone takes a fiftieth of the time.
+        max_iterations: Largest number of its iterations.
+        is_exact: Whether to solve for the corrections, too. If not, the error is about 1e-3 in
+            units of A x, which are standard deviations for weighted rows. This takes half the time,
+            and for a cone of linear rows a fiftieth.
 
     Raises:
         MissingDependencyError: If the solver is not installed.
-        NotConvergedError: If it does not solve the problem, or finds that no point meets the
-            constraints.
+        NotConvergedError: If the solver fails, or no point meets the constraints.
     """
     x = scipy.linalg.solve_triangular(A, d)
     if cone.holds(x):
-        return ConeSolution(x, 0, "no constraint binds")
+        return ConeSolution(x, 0, "no constraint is active")
     if not is_exact:
         inverse = scipy.linalg.solve_triangular(A, np.eye(len(A)))
         whitened = cone.restrict(Subspace(x, inverse))
         y, failures = nearest(np.zeros((1, len(d))), whitened, max_iterations=max_iterations)
-        if not failures:  # where data contradict the cone, the exact way goes on
-            return ConeSolution(x + inverse @ y[0], 0, f"{_NAMES['clarabel']}: {_SOLVED} roughly")
+        if not failures:  # otherwise continue with the exact solution
+            status = f"{_SOLVED} at reduced precision"
+            return ConeSolution(x + inverse @ y[0], 0, f"{_NAMES['clarabel']}: {status}")
     call, name = SOLVERS[solver], _NAMES[solver]
     G, h = cone.rows
     x, iterations, statuses = np.zeros(len(d)), 0, []
-    for reach in _REACHES:
-        y, status, count = call(
-            A, (d - A @ x) / reach, G, (h + G @ x) / reach, cone, max_iterations
-        )
+    for unit in _UNITS:
+        y, status, count = call(A, (d - A @ x) / unit, G, (h + G @ x) / unit, cone, max_iterations)
         statuses.append(status)
         iterations += count
         if status not in (_SOLVED, _ALMOST):
             break
-        x = x + reach * y
+        x = x + unit * y
     if _SOLVED not in statuses:
         raise _failure(name, statuses[0], cone)
     return ConeSolution(x, iterations, f"{name}: {_described(statuses)}")
 
 
 def _described(statuses: Sequence[str]) -> str:
-    """Return how a solution and its refinements ended, the last of which may be less exact."""
+    """Return the status of a solution and its refinements; the last one may be less exact."""
     first = _SOLVED if statuses[0] == _SOLVED else f"first {statuses[0]}"
     count = len(statuses) - 1
     refined = f", refined {'once' if count == 1 else f'{count} times'}" if count else ""
     last = statuses[-1]
-    return first + refined + ("" if last == _SOLVED else f", the last time to {last} only")
+    return first + refined + ("" if last == _SOLVED else f", the last one {last}")
 
 
 def nearest(points: Array, cone: Cone, *, max_iterations: int = 200) -> tuple[Array, list[str]]:
     """Return the point of a cone that is nearest to each of several points.
 
-    Among linear rows alone to rounding, by their active set; beside matrices to 1e-3 or so, by
-    Clarabel: coordinates are wanted whose unit is a standard deviation.
+    For linear rows an active-set method is used, with an error of rounding size. With matrices,
+    Clarabel is used, with an error of about 1e-3: the unit of the coordinates should be a standard
+    deviation.
 
     Args:
         points: The points, shape (k, p).
         cone: The cone.
-        max_iterations: Bound on Clarabel's iterations for one point.
+        max_iterations: Largest number of Clarabel's iterations for one point.
 
     Returns:
-        The nearest points, shape (m, p), and the solver's status of each of the k - m that it did
-        not find.
+        The nearest points found, shape (m, p), and the solver's status of each of the k - m others.
     """
     G, h = cone.rows
-    # rows, and matrices, of unit size: they come in units of a standard deviation, great or small
+    # normalise rows and matrices: in units of a standard deviation their sizes differ widely
     size = np.linalg.norm(G, axis=1)
     k = len(cone.h)
     size[k:] = np.repeat(np.linalg.norm(size[k:].reshape(-1, _ENTRIES), axis=1), _ENTRIES)
@@ -339,7 +338,7 @@ def nearest(points: Array, cone: Cone, *, max_iterations: int = 200) -> tuple[Ar
 
 
 def _step_inside(G: Array, slack: Array, point: Array) -> Array | str:
-    """Return point + z with the shortest z whose G z + slack >= 0, or why there is none.
+    """Return point + z with the shortest z for which G z + slack >= 0, or the solver's status.
 
     References:
         Lawson, Hanson (1974), Solving least squares problems, chapter 23: the shortest vector
@@ -347,49 +346,49 @@ def _step_inside(G: Array, slack: Array, point: Array) -> Array | str:
     """
     from scipy.optimize import nnls
 
-    reach = -slack.min()
-    if reach <= 0:
+    violation = -slack.min()
+    if violation <= 0:
         return point
-    E = np.vstack([G.T, -slack / reach])
+    E = np.vstack([G.T, -slack / violation])
     goal = np.zeros(len(E))
     goal[-1] = 1.0
     try:
         multipliers, distance = nnls(E, goal)
-    except RuntimeError:  # it says so of its iterations
+    except RuntimeError:  # too many iterations
         return "MaxIterations"
     if distance < _CONTRADICTED:
         return _INFEASIBLE
     residual = E @ multipliers - goal
-    nearest_one: Array = point - reach / residual[-1] * residual[:-1]
+    nearest_one: Array = point - violation / residual[-1] * residual[:-1]
     return nearest_one
 
 
 def _nearest_by_clarabel(points: Array, cone: Cone, max_iterations: int) -> list[Array | str]:
-    """Return what is nearest to each point in a cone of rows of unit size, or Clarabel's status."""
+    """Return the nearest point to each point in a cone of unit rows, or Clarabel's status."""
     import clarabel
     from scipy import sparse
 
     p = points.shape[1]
     G, h = cone.rows
-    lacking = [-cone.slack(point).min() for point in points]
-    # far from the cone, a longer unit: a solver holds bounds of 1e10 for contradictory
-    reach = max(1.0, max(lacking) / _FAR)
+    violations = [-cone.slack(point).min() for point in points]
+    # far from the cone, a larger unit: a solver reports bounds of 1e10 as infeasible
+    length = max(1.0, max(violations) / _FAR)
     settings = _clarabel_settings(max_iterations, _NEAREST)
     settings.tol_feas = _NEAREST
-    # without these the data of a solver cannot change
+    # with these settings the data of a solver could not be updated
     settings.presolve_enable = settings.chordal_decomposition_enable = False
     settings.input_sparse_dropzeros = False
     rows = sparse.csc_matrix(-G)
     unit = sparse.eye(p, format="csc")
-    solver = clarabel.DefaultSolver(unit, np.zeros(p), rows, h / reach, _cones(cone), settings)
+    solver = clarabel.DefaultSolver(unit, np.zeros(p), rows, h / length, _cones(cone), settings)
     solved: list[Array | str] = []
-    for point, beyond in zip(points, lacking, strict=True):
-        if beyond <= 0:
+    for point, violation in zip(points, violations, strict=True):
+        if violation <= 0:
             solved.append(point)
             continue
-        solver.update(q=-point / reach)
+        solver.update(q=-point / length)
         x, status, _ = _solution(solver)
-        solved.append(reach * x if status in (_SOLVED, _ALMOST) else status)
+        solved.append(length * x if status in (_SOLVED, _ALMOST) else status)
     return solved
 
 
@@ -397,14 +396,13 @@ def _failure(name: str, status: str, cone: Cone) -> NotConvergedError:
     families = ", ".join(cone.families)
     if _INFEASIBLE in status:
         return NotConvergedError(
-            f"no parameters meet all constraints ({families}, beside known masses and pinned "
-            f"links), says {name}; loosen the bounds in [estimator.constraints], or the margin",
+            f"{name} found that no parameters meet all constraints ({families}, known masses and "
+            "pinned links); widen the bounds in [estimator.constraints], or reduce the margin",
             status,
         )
     return NotConvergedError(
-        f"the physically consistent fit was not solved by {name}, with the constraints "
-        f"{families}; check the URDF's inertials with 'robotid inspect', or use the 'wls' "
-        "estimator",
+        f"{name} failed to solve the physically consistent fit with the constraints {families}; "
+        "check the URDF's inertials with 'robotid inspect', or use the estimator 'wls'",
         status,
     )
 
@@ -412,7 +410,7 @@ def _failure(name: str, status: str, cone: Cone) -> NotConvergedError:
 def _clarabel(
     A: Array, d: Array, G: Array, h: Array, cone: Cone, max_iterations: int
 ) -> tuple[Array, str, int]:
-    """Minimise |z|^2 with z = (A x - d) / size and h + G x in the cone (residual form)."""
+    """Minimise |z|^2 with z = (A x - d) / size and h + G x in the cone, by Clarabel."""
     import clarabel
     from scipy import sparse
 
@@ -422,7 +420,7 @@ def _clarabel(
     rows = sparse.bmat([[A / size, -sparse.eye(p)], [-G, None]], format="csc")
     right = np.concatenate([d / size, h])
     cones = [clarabel.ZeroConeT(p), *_cones(cone)]
-    # at the default 1e-8 it stalls on easy problems, at an optimum right to 1e-9
+    # at the default of 1e-8 it stalls on easy problems, although the optimum is exact to 1e-9
     settings = _clarabel_settings(max_iterations, 1e-7)
     solver = clarabel.DefaultSolver(P, np.zeros(2 * p), rows, right, cones, settings)
     x, status, iterations = _solution(solver)
@@ -430,10 +428,10 @@ def _clarabel(
 
 
 def _solution(solver: Any) -> tuple[Array, str, int]:  # noqa: ANN401
-    """Return the point, the status and the iterations of Clarabel, "Panic" where it gave up so."""
+    """Return the point, the status and the iterations of Clarabel; "Panic" if its code panics."""
     try:
         solution = solver.solve()
-    except BaseException as error:  # of Rust: it is no Exception
+    except BaseException as error:  # a panic of Rust is not an Exception
         if type(error).__name__ != "PanicException":
             raise
         return np.empty(0), "Panic", 0
@@ -463,7 +461,7 @@ def _clarabel_settings(max_iterations: int, gap: float) -> "clarabel.DefaultSett
 def _scs(
     A: Array, d: Array, G: Array, h: Array, cone: Cone, max_iterations: int
 ) -> tuple[Array, str, int]:
-    """Solve the same problem by SCS, whose matrices are stored as lower triangles."""
+    """Solve the same problem by SCS, which stores matrices as lower triangles."""
     try:
         import scs
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""What else is known of the bodies: bounds of mass, centre of mass, and bodies that are known."""
+"""Constraints on bodies beyond physical consistency: mass, centre of mass, extent, pinned links."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -13,25 +13,25 @@ from robotid.robot.parameters import ParameterLayout, pseudo_inertia, pseudo_ine
 
 __all__ = ["SIGN_MARGIN", "Constraints", "slabs"]
 
-#: Drive terms stay above this share of their scale, so that rounding cannot make them negative.
+#: Lower bound of drive terms relative to their scale: rounding cannot make them negative.
 SIGN_MARGIN = 1e-9
 _OPEN = (0.0, np.inf)  # [kg]
-_ROUNDING = 1e-9  # [kg], [m]: a pinned body may lie that far outside its bounds
+_ROUNDING = 1e-9  # [kg], [m]: tolerance for a pinned body outside its bounds
 
 
 @dataclass(frozen=True, eq=False)
 class Constraints:
-    """Bounds beside physical consistency, by name of the body that a joint moves.
+    """Bounds in addition to physical consistency, by name of the body that a joint moves.
 
     Attributes:
         mass: Smallest and largest mass of a body [kg].
         total_mass: Smallest and largest mass of all bodies together [kg], or None.
-        com: Half-spaces A c <= b that hold the centre of mass c of a body in its own frame, by
+        com: Half-spaces A c <= b that contain the centre of mass c of a body in its own frame, by
             name: A of shape (k, 3), unit rows, and b of shape (k,) [m].
         pinned: Bodies that keep the prior's values.
-        extent: Box that holds all mass of a body, by name: lower and upper corner in its own
+        extent: Box that contains all mass of a body, by name: lower and upper corner in its own
             frame, shape (2, 3) [m]; see ``slabs``.
-        relaxed: Bodies whose extent was left out, for the data contradict it.
+        relaxed: Bodies whose extent was removed because the data contradict it.
     """
 
     mass: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -42,33 +42,34 @@ class Constraints:
     relaxed: tuple[str, ...] = ()
 
     def without_extent(self, bodies: Iterable[str]) -> "Constraints":
-        """Return the same constraints with the extents of some bodies left out.
+        """Return the same constraints without the extents of some bodies.
 
         Args:
             bodies: Names of the bodies.
         """
         relaxed = tuple(body for body in self.extent if body in set(bodies))
-        kept = {body: box for body, box in self.extent.items() if body not in relaxed}
-        return replace(self, extent=kept, relaxed=(*self.relaxed, *relaxed))
+        others = {body: box for body, box in self.extent.items() if body not in relaxed}
+        return replace(self, extent=others, relaxed=(*self.relaxed, *relaxed))
 
     def check(self, layout: ParameterLayout, prior: Array, held: Array) -> None:
-        """Refuse bounds that no parameters meet, before a solver looks for them.
+        """Check that the bounds do not contradict each other, before a solver is called.
 
         Args:
             layout: The standard parameters.
             prior: Their prior values, shape (p,).
-            held: Known share of each body, shape (10 bodies,).
+            held: Known part of each body, shape (10 bodies,).
 
         Raises:
-            SettingsError: If a body is unknown, bounds contradict each other, or a pinned body lies
-                outside its bounds or is not physically possible.
+            SettingsError: If a body is unknown, bounds contradict each other, or a pinned body is
+                outside its bounds or not physically consistent.
         """
         known = {*self.mass, *self.com, *self.extent, *self.pinned}
         unknown = sorted(known - set(layout.bodies))
         if unknown:
             raise SettingsError(
-                f"constraints name {unknown}, which are no bodies of the model; links joined by "
-                f"fixed joints count to the one that a joint moves: {listed(layout.bodies)}"
+                f"constraints name {unknown}, which are not bodies of the model, wanted names of "
+                f"{listed(layout.bodies)}; links connected by fixed joints are part of the body "
+                "that a joint moves"
             )
         values = prior[: layout.n_inertial].reshape(-1, 10)
         parts = held.reshape(-1, 10)
@@ -77,8 +78,8 @@ class Constraints:
             _check_range(f"mass of {body}", low, high)
             if high < parts[i, 0]:
                 raise SettingsError(
-                    f"mass of {body} is bounded by {high:g} kg, but its links on locked joints "
-                    f"alone weigh {parts[i, 0]:g} kg; raise the bound"
+                    f"mass of {body} is at most {high:g} kg by its bound, but its links on locked "
+                    f"joints alone have {parts[i, 0]:g} kg; increase the bound"
                 )
         for body in self.pinned:
             i = layout.bodies.index(body)
@@ -89,14 +90,14 @@ class Constraints:
     def cone(
         self, layout: ParameterLayout, scale: Array, held: Array, shrink: Array, margin: float
     ) -> Cone:
-        """Return the cone of possible parameters x = pi / scale; pinned bodies have no part in it.
+        """Return the cone of consistent parameters x = pi / scale, without pinned bodies.
 
         Args:
             layout: The standard parameters.
             scale: Unit of each parameter, shape (p,).
-            held: Known share of each body, shape (10 bodies,).
-            shrink: Matrices T^-1/2 that make pseudo-inertias free of units, shape (bodies, 4, 4).
-            margin: Smallest eigenvalue of T^-1/2 J T^-1/2 of a body beside its held share [-].
+            held: Known part of each body, shape (10 bodies,).
+            shrink: Matrices T^-1/2 that make pseudo-inertias dimensionless, shape (bodies, 4, 4).
+            margin: Smallest eigenvalue of T^-1/2 J T^-1/2 of a body without its known part [-].
         """
         p = len(layout.names)
         signs = np.flatnonzero(layout.is_nonnegative())
@@ -122,7 +123,7 @@ class Constraints:
         return Cone(np.vstack(G), np.concatenate(h), np.vstack(S), np.concatenate(s), tuple(labels))
 
     def equalities(self, layout: ParameterLayout, prior: Array) -> tuple[Array, Array]:
-        """Return what is known exactly, as E pi = e: pinned bodies, and masses without a range.
+        """Return the equalities E pi = e: pinned bodies, and masses given as one value.
 
         Args:
             layout: The standard parameters.
@@ -133,8 +134,8 @@ class Constraints:
         """
         p = len(layout.names)
         pinned = [i for i, body in enumerate(layout.bodies) if body in self.pinned]
-        kept = [10 * i + k for i in pinned for k in range(10)]
-        E, e = [np.eye(p)[kept]], [prior[kept]]
+        fixed = [10 * i + k for i in pinned for k in range(10)]
+        E, e = [np.eye(p)[fixed]], [prior[fixed]]
         for body, (low, high) in self.mass.items():
             i = layout.bodies.index(body)
             if low == high and i not in pinned:
@@ -146,7 +147,7 @@ class Constraints:
         return np.vstack(E), np.concatenate(e)
 
     def _bounds(self, layout: ParameterLayout) -> tuple[Array, Array, list[str]]:
-        """Return C, c and labels of the rows C pi + c >= 0 of bounds that leave a range."""
+        """Return C, c and labels of the rows C pi + c >= 0 of bounds that are ranges."""
         p = len(layout.names)
         rows: list[Array] = []
         constants: list[float] = []
@@ -193,14 +194,14 @@ class Constraints:
         (J,) = pseudo_inertia(values - held)
         if np.linalg.eigvalsh(J)[0] <= 0:
             raise SettingsError(
-                f"{body} is pinned, but its inertial in the URDF is not physically possible; fix "
-                "it, or leave it out of 'pinned'"
+                f"{body} is pinned, but its inertial in the URDF is not physically consistent; "
+                "correct it, or remove the link from 'pinned'"
             )
         low, high = self.mass.get(body, _OPEN)
         if not low - _ROUNDING <= values[0] <= high + _ROUNDING:
             raise SettingsError(
                 f"{body} is pinned at the URDF's {values[0]:g} kg, outside its bounds "
-                f"[{low:g}, {high:g}] kg; leave it out of 'pinned' or of 'mass'"
+                f"[{low:g}, {high:g}] kg; remove the link from 'pinned' or from 'mass'"
             )
         if body in self.com:
             A, b = self.com[body]
@@ -209,8 +210,8 @@ class Constraints:
             if beyond > _ROUNDING:
                 raise SettingsError(
                     f"{body} is pinned, but the URDF's centre of mass "
-                    f"{np.round(centre, 4).tolist()} m lies {1e3 * beyond:.1f} mm outside its "
-                    "bounds; leave it out of 'pinned' or widen them"
+                    f"{np.round(centre, 4).tolist()} m is {1e3 * beyond:.1f} mm outside its "
+                    "bounds; remove the link from 'pinned' or widen the bounds"
                 )
 
     def _check_total(self, layout: ParameterLayout, values: Array) -> None:
@@ -225,17 +226,17 @@ class Constraints:
         least, most = bounds.sum(axis=0)
         if high < least - _ROUNDING or low > most + _ROUNDING:
             raise SettingsError(
-                f"total_mass is bounded by [{low:g}, {high:g}] kg, but the bodies' own bounds and "
-                f"pinned masses allow [{least:g}, {most:g}] kg; make them agree"
+                f"total_mass is bounded by [{low:g}, {high:g}] kg, but the bounds of the bodies "
+                f"and pinned masses allow [{least:g}, {most:g}] kg; correct the bounds"
             )
 
 
 def slabs(box: Array) -> Array:
-    """Return the matrices Q_k, shape (3, 4, 4), with tr(J Q_k) >= 0 of mass inside a box.
+    """Return the matrices Q_k, shape (3, 4, 4), with tr(J Q_k) >= 0 for all mass inside a box.
 
-    With x_k between the corners l and u, (x_k - l_k) (u_k - x_k) >= 0 of every grain of mass; its
-    integral over the body is tr(J Q_k). Together with J >= 0 it keeps the centre of mass and the
-    radii of gyration inside the box.
+    Every mass element with x_k between the corners l and u has (x_k - l_k) (u_k - x_k) >= 0; the
+    integral over the body is tr(J Q_k). Together with J >= 0 it bounds the centre of mass and the
+    radii of gyration by the box.
 
     Args:
         box: Lower and upper corner, shape (2, 3) [m].
@@ -261,8 +262,8 @@ def _all_masses(layout: ParameterLayout) -> Array:
 def _check_range(what: str, low: float, high: float) -> None:
     if not low <= high:
         raise SettingsError(
-            f"{what} is bounded by [{low:g}, {high:g}] kg: the first is above the second; "
-            "write the smaller one first"
+            f"{what} is bounded by [{low:g}, {high:g}] kg: the first value is larger than the "
+            "second; write the smaller one first"
         )
     if high <= 0:
         raise SettingsError(f"{what} is bounded by {high:g} kg, wanted a positive bound")

@@ -1,4 +1,4 @@
-"""Physically consistent fit: a convex cone programme on the factors."""
+"""Physically consistent fit: a convex cone programme on the triangular factors."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -29,45 +29,46 @@ from robotid.robot.parameters import ParameterLayout
 
 __all__ = ["Consistent"]
 
-_ACTIVE = 1e-5  # slack below which a constraint counts as active, free of units
+_ACTIVE = 1e-5  # slack below which a constraint is active, dimensionless
 
 
 @dataclass(frozen=True, eq=False)
 class Consistent(BatchEstimator):
-    """Physically consistent standard parameters, near their prior where the data say nothing.
+    """Fit of physically consistent standard parameters, regularised by a prior.
 
     Minimises, over the standard parameters pi,
 
         sum_j |tau_j - W_b,j K pi|^2 / sigma_j^2 + prior_weight penalty(pi)
 
     subject to J(pi_i) - J(held_i) >= margin T_i for each body i, armature, viscous and Coulomb
-    coefficients >= 0, and the further constraints. The noise levels sigma_j are those of the fit
-    without the inequalities, from weighted least squares onwards.
+    coefficients >= 0, and the other constraints. The noise levels sigma_j are those of the fit
+    without the inequalities, iterated from those of weighted least squares.
 
-    An estimate is over the p standard parameters, its covariance that of the fit without the
-    inequalities; ``Programme.redrawn`` tells that with them. Its rank, condition number and the
-    names of undetermined parameters are those of the base parameters.
+    The estimate contains the p standard parameters. Its covariance is that of the fit without the
+    inequalities; see ``Programme.redrawn`` for the covariance with them. Its rank, condition number
+    and the names of undetermined parameters refer to the base parameters.
 
     Attributes:
         layout: The standard parameters.
         K: Map to the base parameters, shape (b, p).
         prior: Prior value of each parameter, shape (p,), as the URDF's.
-        prior_std: How far a parameter may plausibly lie from its prior, shape (p,), positive.
-        held: Share of each body that is known and may not be negative beside it, as the links on
-            locked joints, shape (10 bodies,); None for nothing.
+        prior_std: Prior standard deviation of each parameter, shape (p,), positive.
+        held: Known part of each body, as the links on locked joints, shape (10 bodies,); the rest
+            of the body must be physically consistent. None: no known parts.
         margin: Smallest eigenvalue of a body's pseudo-inertia relative to its prior size [-].
         prior_weight: Weight of the prior [-].
-        plausible_weight: Weight whose spread about the prior the truth plausibly has [-].
-        independent_share: Share of the rows that count as independent, 2 cutoff / rate.
-        max_iterations: Bound on the iterations of the cone solver.
-        metric: How the distance from the prior is measured: "euclidean",
-            "riemannian" or "entropic"; see ``make_penalty``.
-        constraints: Bounds beside physical consistency.
-        solver: "clarabel" or "scs", of priors that are not entropic and of the check.
-        choice: How ``prior_weight`` was chosen, if it was.
-        check: Whether the other solver solves it, too; its difference is stated in the details.
-        wls_noise: Noise levels of weighted least squares of the rows that are fitted, shape (n,)
-            [N m or N]; None: to be found.
+        plausible_weight: Weight at which the prior has the plausible spread of the true parameters
+            [-].
+        independent_share: Share of independent rows, 2 cutoff / rate [-].
+        max_iterations: Largest number of iterations of the cone solver.
+        metric: Metric of the distance from the prior: "euclidean", "riemannian" or "entropic"; see
+            ``make_penalty``.
+        constraints: Bounds in addition to physical consistency.
+        solver: Cone solver for quadratic priors and for the check: "clarabel" or "scs".
+        choice: How ``prior_weight`` was chosen; None: it was given.
+        check: Whether the second cone solver checks the solution; the details have the difference.
+        wls_noise: Noise levels of weighted least squares of the fitted rows, shape (n,) [N m or N];
+            None: they are computed.
 
     References:
         Sousa, Cortesao (2014), Physical feasibility of robot base inertial parameter
@@ -142,24 +143,24 @@ class Consistent(BatchEstimator):
         )
 
     def project(self, estimate: Estimate) -> Estimate:
-        """Return the possible standard parameters nearest to an estimate of the base parameters.
+        """Return the physically consistent standard parameters nearest to an estimate.
 
-        Nearest in the metric of its covariance C, the prior beside it, with the constraints of
-        ``fit``: minimises (K pi - beta)^T C^-1 (K pi - beta) + prior_weight penalty(pi).
+        Minimises (K pi - beta)^T C^-1 (K pi - beta) + prior_weight penalty(pi) under the
+        constraints of ``fit``, with the covariance C of the estimate.
 
         Args:
-            estimate: Base parameters, as a recursive estimator has them at any moment. Those of
-                infinite variance count as unknown.
+            estimate: Base parameters, as those of a recursive estimator at any time. Parameters
+                with infinite variance are not used.
 
         Raises:
             DataError: If no base parameter has a finite variance, or C is not positive definite.
-            NotConvergedError: If the cone solver does not solve it.
+            NotConvergedError: If the solver fails.
         """
         known = np.flatnonzero(np.isfinite(np.diag(estimate.covariance)))
         if not len(known):
             raise DataError(
-                "an estimate without a covariance cannot be projected: it has no metric; use 'rls' "
-                "or 'kalman', which have one"
+                "the estimate has no covariance, so it cannot be projected onto physically "
+                "consistent parameters; use the estimator 'rls' or 'kalman', which have one"
             )
         rows = _information_rows(estimate, known)  # (k, b + 1)
         solution = self.programme.minimise(rows, self.prior_weight)
@@ -170,13 +171,14 @@ class Consistent(BatchEstimator):
             names=self.layout.names,
             undetermined=self.undetermined(rows, estimate.names),
             n_iter=estimate.n_iter + solution.n_iter,
-            message=f"{estimate.message}; made physically possible, {solution.message}",
+            message=f"{estimate.message}; projected onto physically consistent parameters, "
+            f"{solution.message}",
             prior_std=self.spread_before,
             details=self._details(solution.x),
         )
 
     def noise(self, factors: Factors) -> Array:
-        """Return the noise levels, shape (n,) [N m or N], by the fit without the inequalities.
+        """Return the noise levels of the fit without the inequalities, shape (n,) [N m or N].
 
         Args:
             factors: The factors, of base parameters.
@@ -185,7 +187,7 @@ class Consistent(BatchEstimator):
         return self.programme.noise(factors, start, self.independent_share, self.prior_weight)
 
     def rows(self, factors: Factors, sigma: Array) -> Array:
-        """Return rows [R d], shape (b + 1, b + 1), |R K pi - d|^2 the weighted squared residual.
+        """Return rows [R d], shape (b + 1, b + 1): |R K pi - d|^2 is the weighted cost of the data.
 
         Args:
             factors: The factors, of base parameters.
@@ -194,24 +196,24 @@ class Consistent(BatchEstimator):
         return factors.weighted(sigma / np.sqrt(self.independent_share))
 
     def objective(self, rows: Array, pi: Array) -> float:
-        """Return what the fit minimises; see ``Programme.objective``.
+        """Return the objective of the fit; see ``Programme.objective``.
 
         Args:
-            rows: Information, shape (k, b + 1).
+            rows: Rows of the data, shape (k, b + 1), from ``rows``.
             pi: Standard parameters, shape (p,).
         """
         return self.programme.objective(rows, pi, self.prior_weight)
 
     def active(self, pi: Array, tolerance: float = _ACTIVE) -> tuple[Array, tuple[str, ...]]:
-        """Return the constraints that bind at parameters, linearised there.
+        """Return the inequalities that are active at given parameters, linearised there.
 
         Args:
             pi: Standard parameters, shape (p,).
-            tolerance: Slack below which a constraint counts as active, free of units.
+            tolerance: Slack below which a constraint is active, dimensionless.
 
         Returns:
-            Gradients with respect to pi, shape (a, p), of what the constraints hold at 0, and the
-            family and owner of each, as "pseudo_inertia forearm"; equalities are not among them.
+            Gradients with respect to pi of the constraint functions at 0, shape (a, p), and the
+            family and owner of each constraint, as "pseudo_inertia forearm".
         """
         gradients, labels = self.programme.binding.active(pi / self.prior_std, tolerance)
         return gradients / self.prior_std, labels
@@ -233,33 +235,34 @@ class Consistent(BatchEstimator):
         return self.programme.penalty
 
     @property
-    def pull(self) -> float:
-        """How much heavier the prior weighs than its plausible spread says, at least 1 [-].
+    def weight_ratio(self) -> float:
+        """Weight of the prior over its plausible weight, at least 1 [-].
 
-        A heavy weight says that the data are explained near the prior, not that all parameters
-        are: what they leave open stays as uncertain as at ``plausible_weight``.
+        A large weight means that parameters near the prior explain the data, not that all
+        parameters are near the prior: parameters that the data do not determine are as uncertain
+        as at ``plausible_weight``.
         """
         return max(self.prior_weight / self.plausible_weight, 1.0)
 
     @property
     def spread_before(self) -> Array:
-        """Plausible standard deviation of each parameter by the prior alone, shape (p,)."""
-        covariance = self.programme.covariance(self.prior_weight / self.pull)
+        """Plausible standard deviation of each parameter before the data, shape (p,)."""
+        covariance = self.programme.covariance(self.prior_weight / self.weight_ratio)
         spread: Array = np.sqrt(np.diag(covariance))
         return spread
 
     @property
     def known_share(self) -> Array:
-        """The share of each body that is held, shape (10 bodies,); 0 for nothing."""
+        """The known part of each body, shape (10 bodies,); 0 without one."""
         return np.zeros(self.layout.n_inertial) if self.held is None else self.held
 
     def undetermined(self, rows: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the names of the base parameters that the data do not determine by themselves.
+        """Return the names of the base parameters that the data do not determine individually.
 
-        See ``determine``; whatever metric and weight the prior has.
+        See ``determine``. The metric and the weight of the prior have no effect.
 
         Args:
-            rows: Information, shape (k, b + 1), as of ``rows``.
+            rows: Rows of the data, shape (k, b + 1), from ``rows``.
             base_names: Names of the base parameters.
         """
         known = self.layout.owned_by(self.constraints.pinned)
@@ -273,12 +276,12 @@ class Consistent(BatchEstimator):
         return WLS(self.K @ self.prior, self.independent_share).fit(factors).sigma
 
     def _details(self, pi: Array) -> dict[str, Any]:
-        """Return how it was fitted, as plain values."""
+        """Return the settings of the fit and its active constraints, as plain values."""
         is_bound = self.programme.space.basis.shape[1] < len(pi)
         prior: dict[str, Any] = {
             "metric": self.metric,
             "weight": self.prior_weight,
-            "plausible_weight": self.prior_weight / self.pull,
+            "plausible_weight": self.prior_weight / self.weight_ratio,
         }
         if self.choice is not None:
             prior["chosen_by"] = self.choice.how
@@ -293,7 +296,7 @@ class Consistent(BatchEstimator):
         }
 
     def _second_opinion(self, rows: Array, pi: Array, factors: Factors) -> dict[str, Any]:
-        """Return what the other solver makes of it, as plain values."""
+        """Return the result of the other solver, as plain values."""
         (other,) = (name for name in SOLVERS if name != self.solver)
         try:
             programme = replace(self.programme, solver=other)
@@ -312,15 +315,15 @@ class Consistent(BatchEstimator):
 
 
 def _information_rows(estimate: Estimate, known: Array) -> Array:
-    """Return rows [L^-1 (beta -> known), L^-1 beta] with L L^T the covariance of what is known."""
+    """Return rows [L^-1 (beta -> known), L^-1 beta], L L^T the covariance of known parameters."""
     C = estimate.covariance[np.ix_(known, known)]
     scale = np.sqrt(np.diag(C))
     try:
         L = scale[:, None] * np.linalg.cholesky(C / np.outer(scale, scale))
     except np.linalg.LinAlgError as error:
         raise DataError(
-            "the covariance of the estimate is not positive definite, so it has no metric to "
-            "project in; give the estimator more samples or a prior"
+            "the covariance of the estimate is not positive definite, so it cannot be projected "
+            "onto physically consistent parameters; use more samples or a prior"
         ) from error
     chosen = np.zeros((len(known), len(estimate.theta) + 1))
     chosen[np.arange(len(known)), known] = 1.0

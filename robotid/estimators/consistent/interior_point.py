@@ -9,8 +9,8 @@ s = G x + h. Both are followed along one central path, Z_i J_i = t 1 and lambda_
 coordinates z of Nesterov and Todd, J_i = R_i (diag(l_i) + z_i) R_i^T, the Hessian of the barrier
 is the identity, however thin a body is.
 
-Several data sets, as the folds of a cross-validation, are fitted in one pass: their minima are the
-first axis, f, of every array.
+Several data sets, as the folds of a cross-validation, are fitted in one pass. They are the first
+axis, f, of every array.
 
 References:
     Nesterov, Todd (1998), Primal-dual interior-point methods for self-scaled cones; Mehrotra
@@ -38,28 +38,28 @@ _BASIS = pseudo_inertia_basis().reshape(_ENTRIES, _SIZE * _SIZE)  # J = sum_k pi
 _TO_PARAMETERS = np.linalg.inv(svec(pseudo_inertia_basis()))  # pi = svec(J) @ .
 _UNITS = unsvec(np.eye(_ENTRIES).reshape(-1))  # (10, 4, 4), whose svec are unit vectors
 _MOST = 100  # steps; 8 to 20 are typical
-_BACK = 0.995  # share of the way to the boundary that a step goes at most
-_FIRST = 1e-2  # t at the start, over what the prior's torque misses by, per eigenvalue
-_WARM = 0.1  # mu at a start near the minimum, over the weight
-_SHORT = 0.3  # share of a step below which its correction is left out, and mu reduced to ...
+_BACK = 0.995  # largest step as a share of the step length to the boundary
+_FIRST = 1e-2  # initial t over the squared torque error of the prior, per eigenvalue
+_WARM = 0.1  # initial mu near the minimum, over the weight
+_SHORT = 0.3  # step length below which the correction is omitted, and mu is reduced to ...
 _CENTRED = 0.3
-_LEAST = 1e-10  # slack of an inequality that binds, in units of the prior's spread
+_LEAST = 1e-10  # smallest slack of an active inequality, in prior standard deviations
 
 
 @dataclass(frozen=True, eq=False)
 class EntropicProblem:
-    """The problem but for its data and weight; x is in units of a scale.
+    """The problem without its data and weight; x is in units of a scale.
 
     Attributes:
         scale: Unit of each parameter, shape (p,).
-        held: Known share of each body's parameters, shape (10 n,), in these units.
-        P: Pseudo-inertias of the prior beside what is held, shape (n, 4, 4), positive definite.
+        held: Known part of each body's parameters, shape (10 n,), in these units.
+        P: Pseudo-inertias of the prior without the known parts, shape (n, 4, 4), positive definite.
         centre: c, where the penalty is 0, shape (p,).
         stiffness: D of the drives, shape (p - 10 n,).
         G: Coefficients of the inequalities, shape (k, p).
         h: Their constants, shape (k,).
-        N: Directions that equalities hold, shape (p, e), orthonormal.
-        origin: o, a point that meets them, shape (p,).
+        N: Directions fixed by equalities, shape (p, e), orthonormal.
+        origin: o, a point that meets the equalities, shape (p,).
     """
 
     scale: Array
@@ -85,27 +85,27 @@ class EntropicProblem:
         Args:
             A: Coefficients of the data, shape (f, m, p).
             d: Their right-hand sides, shape (f, m).
-            weight: Weight w of the prior.
-            tolerance: Share of the objective by which another step would lower it at most.
-            starts: Minima of nearly the same data, or at another weight.
+            weight: Weight w of the prior [-].
+            tolerance: Largest relative decrease of the objective by a further step [-].
+            starts: Initial values: minima of nearly the same data, or at another weight.
 
         Raises:
-            NotConvergedError: If one is not found in 100 steps, as where inequalities contradict
-                each other.
+            NotConvergedError: If a minimum is not found in 100 steps, for example because
+                inequalities contradict each other.
         """
         point = self._first(A, d, weight) if starts is None else self._near(starts, weight)
         found: dict[int, ConeSolution] = {}
-        left = np.arange(len(A))  # data sets that are not settled
+        left = np.arange(len(A))  # data sets that have not converged
         for step in range(1, _MOST + 1):
             try:
                 system = _System.of(self, point, A, d, weight)
-            except np.linalg.LinAlgError:  # where inequalities contradict each other
+            except np.linalg.LinAlgError:  # inequalities contradict each other
                 break
             ahead = system.direction(weight, 0.0)
-            share = np.minimum(1.0, system.reach(ahead))
+            share = np.minimum(1.0, system.to_boundary(ahead))
             settled = system.is_settled(ahead, share, tolerance)
             if settled.any():
-                length = np.minimum(share, _BACK * system.reach_of_bodies(ahead))
+                length = np.minimum(share, _BACK * system.bodies_to_boundary(ahead))
                 x, name = point.x + length[:, None] * ahead.x, f"interior point, {step} steps"
                 for k in np.flatnonzero(settled):
                     found[left[k]] = ConeSolution(x[k], step, name, point.multipliers[k])
@@ -115,23 +115,23 @@ class EntropicProblem:
             if settled.any():
                 A, d, left, point = A[~settled], d[~settled], left[~settled], point.of(~settled)
         raise NotConvergedError(
-            f"the fit still changes after {step} steps at a prior weight of {weight:g}; use the "
-            "'euclidean' prior or a larger weight",
+            f"the fit has not converged after {step} steps at prior_weight = {weight:g}; set "
+            "prior = 'euclidean', or a larger prior_weight",
             "max_iterations",
         )
 
     @property
     def inertial(self) -> int:
-        """Number of inertial parameters, which come first."""
+        """Number of inertial parameters; they are the first ones."""
         return len(self.held)
 
     @cached_property
     def P_inverse(self) -> Array:
-        """The inverses of the prior's pseudo-inertias, shape (n, 4, 4)."""
+        """Inverse pseudo-inertias of the prior, shape (n, 4, 4)."""
         return np.asarray(np.linalg.inv(self.P))
 
     def bodies(self, x: Array) -> Array:
-        """Return the pseudo-inertias beside what is held, shape (f, n, 4, 4).
+        """Return the pseudo-inertias without the known parts, shape (f, n, 4, 4).
 
         Args:
             x: Points, shape (f, p).
@@ -141,14 +141,14 @@ class EntropicProblem:
         return J.reshape(*J.shape[:2], _SIZE, _SIZE)
 
     def _first(self, A: Array, d: Array, weight: float) -> "_Point":
-        """Return the prior, at a t by which it is about as far from the data as from itself."""
-        missed = np.sum((A @ self.centre - d) ** 2, axis=1)
-        t = np.maximum(weight, _FIRST * missed / max(_SIZE * len(self.P), 1))[:, None]
+        """Return the prior as a point, with a t that balances penalty and data."""
+        squares = np.sum((A @ self.centre - d) ** 2, axis=1)
+        t = np.maximum(weight, _FIRST * squares / max(_SIZE * len(self.P), 1))[:, None]
         x = np.broadcast_to(self.centre, (len(A), len(self.centre)))
         return self._centred(x, np.zeros((len(A), len(self.h))), t, t, weight)
 
     def _near(self, starts: Sequence[ConeSolution], weight: float) -> "_Point":
-        """Return points beside minima."""
+        """Return points near minima."""
         none, x = np.zeros(len(self.h)), np.array([start.x for start in starts])
         multipliers = [none if s.multipliers is None else s.multipliers for s in starts]
         t = np.full((len(x), 1), weight)
@@ -157,7 +157,7 @@ class EntropicProblem:
     def _centred(
         self, x: Array, multipliers: Array, t: Array, mu: Array, weight: float
     ) -> "_Point":
-        """Return the centred points that are nearest: Z J = t 1, and s lambda = mu of each row."""
+        """Return the nearest centred points: Z J = t 1, and s lambda = mu for each row."""
         inverse = np.linalg.inv(np.linalg.cholesky(self.bodies(x)))
         flat = _Coordinates.of(np.linalg.inv(inverse), self, weight)
         unit = 1.0 / np.maximum((flat.into(self.G) ** 2).sum(axis=2), 1e-300)
@@ -177,13 +177,13 @@ class _Point:
     multipliers: Array  # (f, k), lambda
 
     def of(self, which: Array) -> "_Point":
-        """Return some of them."""
+        """Return the points of some data sets."""
         return _Point(self.x[which], self.Z[which], self.s[which], self.multipliers[which])
 
 
 @dataclass(frozen=True, eq=False)
 class _Direction:
-    """Steps, of the bodies in coordinates in which J and Z are diag(l)."""
+    """Steps; those of the bodies are in coordinates in which J and Z are diag(l)."""
 
     z: Array  # (f, p)
     x: Array  # (f, p)
@@ -195,7 +195,7 @@ class _Direction:
 
 @dataclass(frozen=True, eq=False)
 class _Coordinates:
-    """x = M z: of bodies J = R unsvec(z) R^T, of drives in units of their penalty."""
+    """Coordinates z, x = M z: J = R unsvec(z) R^T of bodies, units of the penalty for drives."""
 
     M: Array  # (f, n, 10, 10)
     drives: Array  # (p - 10 n,)
@@ -207,7 +207,7 @@ class _Coordinates:
         return cls(_transposed(moved) / own, 1.0 / (np.sqrt(weight) * problem.stiffness))
 
     def into(self, rows: Array) -> Array:
-        """Return rows of coefficients of x as those of z, shape (f, k, p)."""
+        """Return rows of coefficients of x as coefficients of z, shape (f, k, p)."""
         f, n = self.M.shape[:2]
         k, size = rows.shape[-2], _ENTRIES * n
         by_body = rows[..., :size].reshape(*rows.shape[:-1], n, _ENTRIES).swapaxes(-3, -2)
@@ -225,7 +225,7 @@ class _Coordinates:
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """The equations of a step from each point, factorised."""
+    """The factorised equations of a step from each point."""
 
     problem: EntropicProblem
     point: _Point
@@ -236,8 +236,8 @@ class _System:
     A: Array  # coefficients in z
     G: Array
     N: Array
-    gradient: Array  # (f, p), of all but log det and inequalities, in z
-    value: Array  # (f,), of the objective, its square of the residual not halved
+    gradient: Array  # (f, p), without log det and inequalities, in z
+    value: Array  # (f,), twice the objective
     ratio: Array  # (f, k), lambda / s
     roots: list[Array]  # lower triangles of the Hessians
 
@@ -275,16 +275,16 @@ class _System:
         cross: Array | None = None,
         pairs: Array | float = 0.0,
     ) -> _Direction:
-        """Return the steps to where Z J = t 1 and lambda s = mu.
+        """Return the steps to the point with Z J = t 1 and lambda s = mu.
 
         Args:
-            t: Product of the bodies that is aimed at, shape (f, 1).
-            mu: That of the inequalities, shape (f, 1).
-            cross: Products of the changes of J and Z that are expected, shape (f, n, 4, 4).
-            pairs: Those of s and lambda, shape (f, k).
+            t: Target of the product of the bodies, shape (f, 1).
+            mu: Target of the product of the inequalities, shape (f, 1).
+            cross: Expected products of the changes of J and Z, shape (f, n, 4, 4); None: 0.
+            pairs: Expected products of the changes of s and lambda, shape (f, k).
         """
         point, length, size = self.point, self.length, self.problem.inertial
-        bodies = np.zeros_like(self.R_inverse)  # what J and Z change by together, but for -diag(l)
+        bodies = np.zeros_like(self.R_inverse)  # sum of the changes of J and Z, plus diag(l)
         if cross is not None:
             bodies -= 2.0 * cross / (length[..., :, None] + length[..., None, :])
         bodies[..., _EYE, _EYE] += np.reshape(t, (-1, 1, 1)) / length
@@ -306,7 +306,7 @@ class _System:
 
     @cached_property
     def _held(self) -> tuple[Array, Array]:
-        """What the equalities' multipliers do to a step, shape (f, p, e), and to the equalities."""
+        """Effect of the equalities' multipliers on a step, shape (f, p, e), and on equalities."""
         columns = self._solve(_transposed(self.N))
         return columns, self.N @ columns
 
@@ -316,11 +316,11 @@ class _System:
         return np.array([scipy.linalg.lapack.dpotrs(L, b, lower=True)[0] for L, b in pairs])
 
     def corrected(self, ahead: _Direction, share: Array) -> _Point:
-        """Return the points after a step that counts what the step ahead shows.
+        """Return the points after a corrected step (Mehrotra's predictor and corrector).
 
         Args:
-            ahead: The steps to the minima.
-            share: How much of them keeps inside, shape (f,).
+            ahead: The steps to the minima (predictor).
+            share: Feasible share of these steps, shape (f,).
         """
         point, share = self.point, share[:, None]
         mean = (self.length**2).mean(axis=(1, 2))[:, None]
@@ -331,7 +331,7 @@ class _System:
             pairs = trust * ahead.s * ahead.multipliers
             t = self.weight + left * np.maximum(mean - self.weight, 0.0)
             step = self.direction(t, left * mu, trust[:, :, None, None] * crossed, pairs)
-            return step, np.minimum(1.0, _BACK * self.reach(step))[:, None]
+            return step, np.minimum(1.0, _BACK * self.to_boundary(step))[:, None]
 
         step, length = aimed(left, share)
         short = length < np.minimum(_SHORT, 0.5 * share)
@@ -346,26 +346,26 @@ class _System:
             point.multipliers + length * step.multipliers,
         )
 
-    def reach(self, step: _Direction) -> Array:
-        """Return the largest multiple of each step that keeps all positive, shape (f,)."""
+    def to_boundary(self, step: _Direction) -> Array:
+        """Return the step length to the boundary for each step, shape (f,)."""
         x = np.hstack([self.point.s, self.point.multipliers])
         rows = _to_zero(x, np.hstack([step.s, step.multipliers]))
-        return np.minimum(self.reach_of_bodies(step), rows)
+        return np.minimum(self.bodies_to_boundary(step), rows)
 
-    def reach_of_bodies(self, step: _Direction) -> Array:
-        """Return the largest multiple of each step that keeps J and Z positive definite."""
+    def bodies_to_boundary(self, step: _Direction) -> Array:
+        """Return the step length to the boundary of positive definite J and Z, shape (f,)."""
         root = np.sqrt(self.length)
         unit = root[..., :, None] * root[..., None, :]
         lowest = np.linalg.eigvalsh(np.hstack([step.J / unit, step.Z / unit]))[..., 0]
         return _to_zero(np.ones_like(lowest), lowest)
 
     def is_settled(self, ahead: _Direction, share: Array, tolerance: float) -> Array:
-        """Return whether the step to each minimum changes nothing any more, shape (f,), bool.
+        """Return whether the step to each minimum is negligible, shape (f,), bool.
 
         Args:
             ahead: The steps.
-            share: How much of them keeps inside, shape (f,).
-            tolerance: Share of the objective that counts as nothing.
+            share: Feasible share of these steps, shape (f,).
+            tolerance: Largest relative decrease of the objective [-].
         """
         nothing = tolerance * (1.0 + self.value)
         decrease = (_times(self.A, ahead.z) ** 2).sum(axis=1) + (ahead.z**2).sum(axis=1)
@@ -374,7 +374,7 @@ class _System:
 
 
 def _root(A: Array) -> Array:
-    """Return L of L L^T = A + 1, shape (p, p), in its lower triangle."""
+    """Return L with L L^T = A + 1, shape (p, p), in the lower triangle."""
     A.flat[:: len(A) + 1] += 1.0
     L, info = scipy.linalg.lapack.dpotrf(A.T, lower=True, clean=False, overwrite_a=True)
     if info:
@@ -383,12 +383,12 @@ def _root(A: Array) -> Array:
 
 
 def _mean(x: Array) -> Array:
-    """Return the means along the last axis, which is kept; 0 of nothing."""
+    """Return the means along the last axis, which stays; 0 for an empty axis."""
     return np.asarray(x.sum(axis=-1, keepdims=True) / max(x.shape[-1], 1))
 
 
 def _to_zero(x: Array, step: Array) -> Array:
-    """Return the largest multiple of each step that keeps positive x positive, shape (f,)."""
+    """Return the step length at which positive x reaches 0, shape (f,)."""
     multiples = np.divide(-x, step, out=np.full_like(x, np.inf), where=step < 0)
     return np.asarray(multiples.min(axis=-1, initial=np.inf))
 

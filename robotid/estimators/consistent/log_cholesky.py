@@ -18,33 +18,33 @@ from robotid.robot.parameters import pseudo_inertia, pseudo_inertia_basis
 
 __all__ = ["LogCholesky", "from_log_cholesky"]
 
-_INSIDE = 1e-6  # a start on the boundary is moved inside by that, free of units
+_INSIDE = 1e-6  # distance by which an initial value is moved off the boundary, dimensionless
 _STEPS = 500
 _SETTLED = 1e-14  # predicted decrease at which it has converged, relative to the objective
-_FLAT = 1e-9  # smallest curvature that damping counts with, relative
-_TOO_STIFF = 1e16  # damping at which no step lowers the objective any more
-_LONGEST = 4.0  # change of a coordinate in one step: most stand in an exponential
-_SPREAD = 1.0  # of random starts, in log-Cholesky parameters
-_STIFF = 10.0  # of the augmented Lagrangian, over the objective where it starts
-_ROUNDS = 12  # of it at most ...
-_PAID = 1e-7  # ... until the extents, free of units, are met to that
+_FLAT = 1e-9  # smallest relative curvature used by the damping
+_TOO_STIFF = 1e16  # damping at which no step reduces the objective any more
+_LONGEST = 4.0  # largest change of a coordinate in one step: most are exponents
+_SPREAD = 1.0  # standard deviation of random initial values, in log-Cholesky parameters
+_STIFF = 10.0  # stiffness of the augmented Lagrangian, over the initial objective
+_ROUNDS = 12  # largest number of updates of the multipliers ...
+_PAID = 1e-7  # ... until the extents are met to this tolerance, dimensionless
 
 
 @dataclass(frozen=True, eq=False)
 class LogCholesky(BatchEstimator):
-    """The fit of ``Consistent``, over coordinates in which every point is possible.
+    """The fit of ``Consistent`` in coordinates in which every point is physically consistent.
 
-    Beside its held share and its margin, a body's pseudo-inertia is U U^T with U an upper
-    triangle whose diagonal is exponential, and a drive's coefficient an exponential. The extents
-    of bodies are kept by an augmented Lagrangian. The problem is not convex in these coordinates:
-    it starts from the cone programme's solution, moved inside, and from random points; the best
-    end is taken. How far each ends above the cone programme is in the details as ``gaps``,
-    relative to the objective.
+    Without its known part and its margin, a body's pseudo-inertia is U U^T. U is an upper triangle
+    with an exponential diagonal. A drive's coefficient is an exponential. The extents of bodies
+    are enforced by an augmented Lagrangian. The problem is not convex in these coordinates. It is
+    solved from the solution of the cone programme, moved inside, and from random initial values;
+    the best solution is used. The details contain, as ``gaps``, the objective of each solution
+    above that of the cone programme, relative to it.
 
     Attributes:
         fit_in_cone: The cone programme of the same problem.
-        starts: Number of random starts.
-        rng: Source of the random starts.
+        starts: Number of random initial values.
+        rng: Random generator of the initial values.
 
     References:
         Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14); Nocedal,
@@ -59,8 +59,8 @@ class LogCholesky(BatchEstimator):
         bounds: Constraints = self.fit_in_cone.constraints
         if bounds.mass or bounds.total_mass or bounds.com or bounds.pinned:
             raise SettingsError(
-                "estimator 'log_cholesky' knows no constraints beside physical consistency and "
-                "extents; use 'consistent' for bounds and pinned links"
+                "estimator 'log_cholesky' supports only the constraints extent and physical "
+                "consistency; use 'consistent' for bounds and pinned links"
             )
 
     @property
@@ -91,7 +91,7 @@ class LogCholesky(BatchEstimator):
         )
 
     def _descend(self, rows: Array, z: Array) -> tuple[Array, float, int, bool]:
-        """Minimise from a point; return the end, its value, the steps and whether it converged."""
+        """Minimise from a point; return solution, value, number of steps, whether it converged."""
         fit, steps = self.fit_in_cone, 0
         value = fit.objective(rows, self._parameters(z)[0])
         price = np.zeros(len(self._extents))  # multipliers of the extents
@@ -100,8 +100,8 @@ class LogCholesky(BatchEstimator):
             z, count, converged = self._settle(rows, z, price, stiffness)
             pi, steps = self._parameters(z)[0], steps + count
             slack = self._extents @ pi
-            owed = np.maximum(price - stiffness * slack, 0.0)
-            change, price = np.abs(owed - price), owed
+            updated = np.maximum(price - stiffness * slack, 0.0)
+            change, price = np.abs(updated - price), updated
             if (change <= _PAID * stiffness).all():
                 break
         return z, fit.objective(rows, pi), steps, converged
@@ -109,7 +109,7 @@ class LogCholesky(BatchEstimator):
     def _settle(
         self, rows: Array, z: Array, price: Array, stiffness: float
     ) -> tuple[Array, int, bool]:
-        """Minimise by damped Newton steps at given multipliers; return also the steps."""
+        """Minimise by damped Newton steps at fixed multipliers; return as ``_descend``."""
         damping = 1e-3
         value = self.objective(rows, z, price, stiffness)
         for step in range(1, _STEPS + 1):
@@ -134,14 +134,14 @@ class LogCholesky(BatchEstimator):
         f + 1/(2 s) sum_i max(0, l_i - s g_i)^2, g_i = tr(J Q_i) of ``slabs``.
 
         Args:
-            rows: Information, shape (k, b + 1), as of ``Consistent.rows``.
+            rows: Rows of the data, shape (k, b + 1), from ``Consistent.rows``.
             z: Ten log-Cholesky parameters per body, then those of the drives, shape (p,).
             price: Multipliers l of the extents, at least 0.
             stiffness: The s.
         """
         pi = self._parameters(z)[0]
-        owed = np.maximum(price - stiffness * (self._extents @ pi), 0.0)
-        return self.fit_in_cone.objective(rows, pi) + float(owed @ owed) / (2.0 * stiffness)
+        excess = np.maximum(price - stiffness * (self._extents @ pi), 0.0)
+        return self.fit_in_cone.objective(rows, pi) + float(excess @ excess) / (2.0 * stiffness)
 
     def derivatives(
         self, rows: Array, z: Array, price: Array, stiffness: float
@@ -149,10 +149,10 @@ class LogCholesky(BatchEstimator):
         """Return gradient, shape (p,), and Hessian, shape (p, p), of ``objective`` by coordinates.
 
         Args:
-            rows: Information, shape (k, b + 1), as of ``Consistent.rows``.
+            rows: Rows of the data, shape (k, b + 1), from ``Consistent.rows``.
             z: Ten log-Cholesky parameters per body, then those of the drives, shape (p,).
             price: Multipliers of the extents.
-            stiffness: Of the augmented Lagrangian.
+            stiffness: Stiffness of the augmented Lagrangian.
         """
         fit, size = self.fit_in_cone, self.fit_in_cone.layout.n_inertial
         pi, J = self._parameters(z)
@@ -160,11 +160,11 @@ class LogCholesky(BatchEstimator):
         in_pi = 2.0 * D.T @ (D @ pi - rows[:, -1]) + fit.prior_weight * fit.penalty.gradient(pi)
         curvature = 2.0 * D.T @ D + fit.prior_weight * fit.penalty.hessian(pi)
         G_e = self._extents
-        owed = np.maximum(price - stiffness * (G_e @ pi), 0.0)
-        in_pi -= G_e.T @ owed
-        curvature += stiffness * G_e[owed > 0].T @ G_e[owed > 0]
+        excess = np.maximum(price - stiffness * (G_e @ pi), 0.0)
+        in_pi -= G_e.T @ excess
+        curvature += stiffness * G_e[excess > 0].T @ G_e[excess > 0]
         H = J.T @ curvature @ J
-        # what the coordinates themselves bend: tr(G d2M) with G the gradient in the matrices
+        # curvature of the coordinates: tr(G d2M), G the gradient by the matrices
         grow = np.linalg.inv(self._shrink)
         G = grow @ unsvec((in_pi[:size].reshape(-1, 10) @ _TO_PI.T).reshape(-1)) @ grow
         bent = log_cholesky_curvature(z[:size].reshape(-1, 10), G)
@@ -206,7 +206,7 @@ class LogCholesky(BatchEstimator):
 
     @cached_property
     def _extents(self) -> Array:
-        """Rows E, shape (k, p), with E pi >= 0 of the extents."""
+        """Rows E of the extents, E pi >= 0, shape (k, p)."""
         cone = self.fit_in_cone.programme.cone.linear
         chosen = [i for i, label in enumerate(cone.labels) if label.startswith("extent ")]
         E: Array = cone.G[chosen] / self.fit_in_cone.prior_std
@@ -290,7 +290,7 @@ def _slopes(z: Array) -> Array:
 
 
 def _damped_step(H: Array, slope: Array, damping: float) -> Array:
-    """Return the Newton step with eigenvalues made positive, which never goes uphill."""
+    """Return the damped Newton step with positive eigenvalues: a direction of descent."""
     values, vectors = np.linalg.eigh(H)
     bent = np.maximum(np.abs(values), 1e-15) + damping
     step: Array = -vectors @ ((vectors.T @ slope) / bent)

@@ -1,6 +1,6 @@
-"""How far parameters are from their prior values: three metrics, all free of units.
+"""The distance of parameters from their prior values: three dimensionless metrics.
 
-Each penalty is about |delta / sigma|^2 near the prior, so that one weight means the same for all.
+Near the prior each penalty is about |delta / sigma|^2, so a weight has the same meaning for all.
 """
 
 from abc import ABC, abstractmethod
@@ -33,7 +33,7 @@ __all__ = [
 
 METRICS = ("euclidean", "entropic", "riemannian")
 _SINGULAR = 1e-12  # ratio of the axes of a body, squared, below which it is singular
-_THINNEST = 0.01  # a prior's pseudo-inertia is not thinner than that, relative to its body's size
+_THINNEST = 0.01  # smallest relative thickness of a prior's pseudo-inertia
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class WeightChoice:
     Attributes:
         weight: The weight [-].
         how: "cv" or "evidence".
-        curve: Pairs of weight and score, ascending: prediction error of held-out segments over
-            the noise level ("cv"), or minus the log evidence; smaller is better.
+        curve: Pairs of weight and score, by ascending weight. The score is the prediction error of
+            held-out segments over the noise level ("cv"), or minus the log evidence.
         plausible: The weight with the largest log evidence [-].
     """
 
@@ -58,9 +58,9 @@ class Penalty(ABC):
     """A convex penalty on the distance from the prior.
 
     Attributes:
-        is_quadratic: Whether its Hessian is the same everywhere.
+        is_quadratic: Whether its Hessian is constant.
         keeps_positive: Whether it is finite for positive definite pseudo-inertias only.
-        centre: Where it is 0, shape (p,).
+        centre: Parameters at which it is 0, shape (p,).
     """
 
     is_quadratic: ClassVar[bool]
@@ -69,7 +69,7 @@ class Penalty(ABC):
 
     @abstractmethod
     def value(self, pi: Array) -> float:
-        """Return the penalty, at least 0; infinite where the metric is not defined.
+        """Return the penalty, at least 0; infinite if the metric is not defined.
 
         Args:
             pi: Standard parameters, shape (p,).
@@ -87,7 +87,8 @@ class Penalty(ABC):
     def root(self, pi: Array) -> Array:
         """Return S with S^T S half its second derivative, shape (p, p), upper triangular.
 
-        The second derivative of a thin body is too ill-conditioned to be factorised, its root not.
+        For a thin body the root is computed directly: its second derivative has a condition number
+        too large to be factorised.
 
         Args:
             pi: Standard parameters, shape (p,).
@@ -131,15 +132,14 @@ class Quadratic(Penalty):
 
 @dataclass(frozen=True, eq=False)
 class Entropic(Penalty):
-    """2 sum_i d(J_i || P_i) of the bodies, and |(pi - centre) / std|^2 of the drives.
+    """2 sum_i d(J_i || P_i) of the bodies plus |(pi - centre) / std|^2 of the drives.
 
-    d(J || P) = tr(P^-1 J) - log det(P^-1 J) - 4 is the Bregman divergence of -log det, half the
-    Kullback-Leibler distance of two mass distributions seen as Gaussians, times 4.
+    d(J || P) = tr(P^-1 J) - log det(P^-1 J) - 4 is the Bregman divergence of -log det.
 
     Attributes:
         centre: Prior values, shape (p,).
         precision: 1 / std^2 of the drives, shape (drives,).
-        held: Known share of each body, shape (10 bodies,).
+        held: Known part of each body, shape (10 bodies,).
     """
 
     is_quadratic = False
@@ -167,7 +167,7 @@ class Entropic(Penalty):
 
     @cached_property
     def prior(self) -> Array:
-        """The pseudo-inertias P of the prior beside what is held, shape (n, 4, 4)."""
+        """The pseudo-inertias P of the prior without the known parts, shape (n, 4, 4)."""
         return self._rest(self.centre)
 
     @cached_property
@@ -176,7 +176,7 @@ class Entropic(Penalty):
         return np.linalg.cholesky(self.prior)
 
     def _ratio(self, pi: Array) -> Array:
-        """Return L^-1 J L^-T of each body: free of units, 1 at the prior P = L L^T."""
+        """Return L^-1 J L^-T of each body, dimensionless, 1 at the prior P = L L^T."""
         return _whitened(self._rest(pi), self._prior_factor)
 
     def _rest(self, pi: Array) -> Array:
@@ -197,15 +197,16 @@ def make_penalty(
     * "riemannian": delta^T g delta with g of ``pull_back_metric`` at the prior, half the
       Hessian of the entropic one there.
 
-    The latter two do not depend on the frame a body is stated in; the drives stay Euclidean. A
-    prior that is not possible, or thinner than 1 % of its body's size, is widened to that first.
+    The latter two do not depend on the frame of a body; for the drives they are Euclidean. If the
+    pseudo-inertia of a prior is not physically consistent or its relative thickness is below 1 %,
+    its eigenvalues are increased to 1 % first.
 
     Args:
         metric: One of ``METRICS``.
         layout: The standard parameters.
         prior: Prior values, shape (p,).
-        prior_std: How far they may plausibly be wrong, shape (p,).
-        held: Known share of each body, shape (10 bodies,).
+        prior_std: Prior standard deviations, shape (p,).
+        held: Known part of each body, shape (10 bodies,).
 
     References:
         Lee, Wensing, Park (2019), Geometric robot dynamic identification: a convex programming
@@ -230,7 +231,7 @@ def pull_back_metric(J: Array) -> Array:
         J: Pseudo-inertias, shape (n, 4, 4), positive definite.
 
     References:
-        Lee, Wensing, Park (2019), as of ``make_penalty``, (22).
+        Lee, Wensing, Park (2019), cited in ``make_penalty``, (22).
     """
     S = metric_root(np.linalg.cholesky(J))
     metric: Array = S.transpose(0, 2, 1) @ S
@@ -251,11 +252,11 @@ def metric_root(L: Array) -> Array:
 
 
 def body_units(spread: Array) -> Array:
-    """Return T^-1/2, which makes pseudo-inertias free of units: diagonal, shape (bodies, 4, 4).
+    """Return diagonal T^-1/2, which make pseudo-inertias dimensionless, shape (bodies, 4, 4).
 
     Args:
-        spread: How far the inertial parameters may lie from their prior, shape (10 bodies,): mass
-            m and radius r of a body's size are those of m and m r.
+        spread: Prior standard deviations of the inertial parameters, shape (10 bodies,). Mass m and
+            radius r of a body's size are taken from those of m and m r.
     """
     by_body = spread.reshape(-1, 10)
     mass, radius = by_body[:, 0], by_body[:, 1] / by_body[:, 0]
@@ -271,7 +272,7 @@ def _whitened(S: Array, L: Array) -> Array:
 
 
 def _widened(J: Array, shrink: Array) -> Array:
-    """Return pseudo-inertias whose smallest eigenvalue, free of units, is at least 1 %."""
+    """Return pseudo-inertias whose smallest dimensionless eigenvalue is at least 1 %."""
     values, vectors = np.linalg.eigh(shrink @ J @ shrink)
     floored = (vectors * np.maximum(values, _THINNEST)[:, None]) @ vectors.transpose(0, 2, 1)
     grow = np.linalg.inv(shrink)

@@ -1,4 +1,4 @@
-"""Decisions by held-out segments of the fitted data: the prior's weight, and bodies' extents."""
+"""Cross-validation on segments of the fitted data: weight of the prior, extents of bodies."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -16,29 +16,29 @@ from robotid.regressor.lapack import Triangle
 
 __all__ = ["Segments", "choose_weight", "contradicted_extents", "held_out_errors", "log_evidence"]
 
-_LIGHTEST, _HEAVIEST = -4.0, 2.0  # decades of the weights tried
-_LIGHTEST_ENTROPIC = -1.0  # below, bodies become thin, and fits take long
-_PATIENCE = 2  # decades without a better score that end the search
+_SMALLEST, _LARGEST = -4.0, 2.0  # decades of the weights tried
+_SMALLEST_ENTROPIC = -1.0  # at smaller weights bodies become thin, and fits converge slowly
+_PATIENCE = 2  # decades without a better score after which the search ends
 _ALIKE = 2.0  # standard errors by which the mean log error of a larger weight may be above the best
-_MOST_LOSS = 1.02  # ratio of held-out errors that a larger weight may cost, mean over joints
-_MOST_JOINT_LOSS = 1.05  # ... and at any one joint
-_BEYOND = 4.0  # standard errors by which a body must leave its box
-_CLEAR = 0.02  # share of the mean square by which an extent must be worse, to be left out
-_STEP = 0.5  # decades by which the best one is refined
+_MOST_LOSS = 1.02  # largest ratio of the held-out errors of a larger weight, mean over joints
+_MOST_JOINT_LOSS = 1.05  # ... and of any one joint
+_BEYOND = 4.0  # standard errors by which a body must be outside its box
+_CLEAR = 0.02  # relative increase of the mean square error at which an extent is contradicted
+_STEP = 0.5  # decades between the best weight and the refined ones
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Contiguous segments of the fitted data, each held out of fits in turn.
+    """Contiguous segments of the fitted data: the folds of a cross-validation.
 
     Attributes:
-        kept: Their factors, K of them.
+        folds: Factors of the K segments.
         sigma: Noise level per joint, shape (n,) [N m or N].
-        rows: Information of all of them, shape (b + 1, b + 1), as of ``Consistent.rows``.
-        share: Share of the rows that count as independent [-].
+        rows: Rows of all segments, shape (b + 1, b + 1), from ``Consistent.rows``.
+        share: Share of independent rows [-].
     """
 
-    kept: tuple[Factors, ...]
+    folds: tuple[Factors, ...]
     sigma: Array
     rows: Array
     share: float
@@ -47,12 +47,12 @@ class Segments:
     def of(
         cls, fit: Consistent, segments: Sequence[Factors], sigma: Array | None = None
     ) -> "Segments":
-        """Return segments with the noise level that a fit to all of them shows.
+        """Return segments with the noise level of a fit to all of them.
 
         Args:
-            fit: The fit, whose constraints do not matter.
+            fit: The fit; its constraints are not used.
             segments: Factors of contiguous segments of the fitted data.
-            sigma: The noise level, if it is known.
+            sigma: The noise level, shape (n,) [N m or N]; None: it is computed.
         """
         whole = merge(segments)
         level = fit.noise(whole) if sigma is None else sigma
@@ -60,8 +60,8 @@ class Segments:
 
     @cached_property
     def others(self) -> Array:
-        """Information of all segments but one, shape (K, b + 1, b + 1)."""
-        own = [factors.weighted(self.sigma / np.sqrt(self.share)) for factors in self.kept]
+        """Rows of all segments except one, for each segment, shape (K, b + 1, b + 1)."""
+        own = [factors.weighted(self.sigma / np.sqrt(self.share)) for factors in self.folds]
         rest = [Triangle(len(self.rows)) for _ in own]
         for k, total in enumerate(rest):
             for R in (*own[:k], *own[k + 1 :]):
@@ -70,36 +70,38 @@ class Segments:
 
 
 def choose_weight(fit: Consistent, segments: Segments, how: str) -> WeightChoice:
-    """Return the weight of the prior that the fitted data speak for.
+    """Return the weight of the prior, chosen from the fitted data.
 
-    * "cv": the largest weight that predicts held-out segments as well as the best one. The error of
-      a joint is the RMS over all segments, that of a weight the geometric mean over joints. A
-      larger weight is accepted if its error is at most 2 % above the smallest one, at most 5 % at
-      any joint, and the mean log ratio of the errors by segment at most two standard errors
-      above 0. The test alone would not do: of six segments, one or two bad ones do not reject.
+    * "cv": the largest weight with the same prediction error on held-out segments as the best one.
+      The error of a joint is the RMS over all segments, the error of a weight is the geometric mean
+      over joints. A larger weight is accepted if its error is at most 2 % above the smallest one,
+      at most 5 % for any joint, and the mean log ratio of the errors by segment is at most two
+      standard errors above 0. This test alone is not sufficient: with six segments it has little
+      power against one or two bad segments.
     * "evidence": the weight with the largest ``log_evidence``.
 
-    Weights are tried from 100 down to 1e-4 (entropic: 0.1) at most, by decades until two in a
-    row are worse than those before, then around the best one. A weight beyond 1 keeps parameters
-    near the prior, but not their standard errors narrow; see ``Consistent.pull``. One at which the
-    fit does not converge, as bodies shrink to points, counts as infinitely bad.
+    Weights are tried from 100 down to 1e-4 (entropic: 0.1) in decades, until two weights in a row
+    are worse than those before, and then around the best one. A weight above 1 shifts the estimate
+    towards the prior, but does not reduce the standard errors; see ``Consistent.weight_ratio``. A
+    weight at which the fit does not converge, because bodies shrink to points, has an infinite
+    error.
 
     Args:
-        fit: The fit, whose own weight does not matter.
+        fit: The fit; its own weight is not used.
         segments: The fitted data.
         how: "cv" or "evidence".
 
     Raises:
         DataError: If "cv" has fewer than two segments.
-        NotConvergedError: If the fit does not converge at the heaviest weight.
+        NotConvergedError: If the fit does not converge at the largest weight.
     """
-    lightest = _LIGHTEST if fit.penalty.is_quadratic else _LIGHTEST_ENTROPIC
+    smallest = _SMALLEST if fit.penalty.is_quadratic else _SMALLEST_ENTROPIC
     evidence = log_evidence(fit, segments.rows)
-    by_evidence = _search(lambda w: (-evidence(w), np.zeros(0)), "evidence", lightest)
+    by_evidence = _search(lambda w: (-evidence(w), np.zeros(0)), "evidence", smallest)
     if how == "evidence":
         return by_evidence
 
-    starts = None  # the fits at the weight before
+    starts = None  # the fits at the previous weight
 
     def score(weight: float) -> tuple[float, Array]:
         nonlocal starts
@@ -108,28 +110,28 @@ def choose_weight(fit: Consistent, segments: Segments, how: str) -> WeightChoice
         except NotConvergedError:
             if starts is None:
                 raise
-            return float("inf"), np.full((len(segments.kept), len(segments.sigma)), np.inf)
+            return float("inf"), np.full((len(segments.folds), len(segments.sigma)), np.inf)
         return float(np.exp(0.5 * np.log(_by_joint(errors)).mean())), errors
 
-    return replace(_search(score, how, lightest), plausible=by_evidence.plausible)
+    return replace(_search(score, how, smallest), plausible=by_evidence.plausible)
 
 
 def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]:
-    """Return the bodies whose mass the data put outside the box that should hold it.
+    """Return the bodies whose extent is contradicted by the data.
 
-    They are those that a fit without extents, at a weight of 1, puts outside by more than four
-    standard errors; if it also predicts held-out segments better than the fit with extents, by
-    more than two standard errors and 2 % of the mean square.
+    These are the bodies that are outside their box by more than four standard errors in a fit
+    without extents, at a weight of 1. That fit must also predict held-out segments better than the
+    fit with extents, by more than two standard errors and 2 % of the mean square error.
 
     Args:
-        fit: The fit, whose own weight does not matter.
-        segments: The fitted data; one segment cannot be held out.
+        fit: The fit; its own weight is not used.
+        segments: The fitted data; with one segment the prediction is not tested.
     """
-    cone, rows, count = fit.programme.cone.linear, segments.rows, len(segments.kept)
+    cone, rows, count = fit.programme.cone.linear, segments.rows, len(segments.folds)
     free = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
     try:
         solution = free.programme.minimise(rows, 1.0, is_exact=False)
-    except NotConvergedError:  # bodies run away: that contradicts no extent
+    except NotConvergedError:  # bodies diverge: this contradicts no extent
         return ()
     G, covariance = cone.G / fit.prior_std, free.programme.covariance(1.0, rows, solution.x)
     error = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", G, covariance, G), 0.0))
@@ -144,7 +146,7 @@ def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]
         return ()
     try:
         bound = held_out_errors(fit, segments, 1.0)[0].sum(axis=1)
-    except NotConvergedError:  # data without noise cannot be fitted at all
+    except NotConvergedError:  # noise-free data that contradict the extents
         return bodies
     is_clear = bound.sum() > (1.0 + _CLEAR) * unbound.sum() and not _is_as_good(bound, unbound)
     return bodies if is_clear else ()
@@ -156,45 +158,45 @@ def held_out_errors(
     weight: float,
     starts: Sequence[ConeSolution] | None = None,
 ) -> tuple[Array, list[ConeSolution]]:
-    """Return how well each segment is predicted by the fit to all others, constraints included.
+    """Return the prediction errors of each segment by the fit to all others, with constraints.
 
     Args:
-        fit: The fit, whose own weight does not matter.
+        fit: The fit; its own weight is not used.
         segments: The fitted data, at least two segments.
-        weight: Weight of the prior.
-        starts: Fits to start from, one without each segment.
+        weight: Weight of the prior [-].
+        starts: Initial values, one fit without each segment.
 
     Returns:
-        Sum of squares of the prediction errors by segment and joint, over the joint's noise level
-        and its number of rows in all segments, shape (segments, n) [-]: the sum over segments is
-        the mean square of each joint; and the fits, to start others.
+        Sums of squared prediction errors by segment and joint, over the square of the joint's noise
+        level and its number of rows in all segments, shape (segments, n) [-]: the sum over segments
+        is the mean square of each joint. And the fits, as initial values of other fits.
 
     Raises:
         DataError: If there are fewer than two segments.
         NotConvergedError: If a fit does not converge.
     """
-    if len(segments.kept) < 2:
+    if len(segments.folds) < 2:
         raise DataError(
-            f"the prior's weight cannot be chosen from {len(segments.kept)} segment; fit longer "
-            "logs, or use prior_weight = 'evidence'"
+            f"prior_weight = 'cv' needs at least 2 segments, found {len(segments.folds)}; fit "
+            "longer logs, or set prior_weight = 'evidence'"
         )
     fits = fit.programme.minimise_each(segments.others, weight, is_exact=False, starts=starts)
-    pairs = zip(segments.kept, fits, strict=True)
-    squares = [kept.residual_squares(fit.K @ x.x) / segments.sigma**2 for kept, x in pairs]
-    rows = np.sum([kept.rows for kept in segments.kept], axis=0)  # (n,)
+    pairs = zip(segments.folds, fits, strict=True)
+    squares = [fold.residual_squares(fit.K @ x.x) / segments.sigma**2 for fold, x in pairs]
+    rows = np.sum([fold.rows for fold in segments.folds], axis=0)  # (n,)
     return np.array(squares) / np.maximum(rows, 1), fits
 
 
 def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
-    """Return the log marginal likelihood of the data by the prior's weight, but for a constant.
+    """Return the log marginal likelihood of the data as a function of the prior's weight.
 
-    With x = L (pi - centre) ~ N(0, 1 / weight) before the data and r = A x + noise of unit
-    variance, r ~ N(0, I + A A^T / weight). A penalty that is not quadratic is expanded at its
-    centre; the inequalities are left out.
+    With the prior x = L (pi - centre) ~ N(0, 1 / weight) and r = A x + noise of unit variance,
+    r ~ N(0, I + A A^T / weight). A penalty that is not quadratic is expanded at its centre. The
+    inequalities are neglected, and a constant is omitted.
 
     Args:
-        fit: The fit, whose own weight does not matter.
-        rows: Information, shape (k, b + 1), as of ``Consistent.rows``.
+        fit: The fit; its own weight is not used.
+        rows: Rows of the data, shape (k, b + 1), from ``Consistent.rows``.
 
     Returns:
         The function of the weight [-].
@@ -215,12 +217,12 @@ def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
 
 
 def _search(
-    score: Callable[[float], tuple[float, Array]], how: str, lightest: float
+    score: Callable[[float], tuple[float, Array]], how: str, smallest: float
 ) -> WeightChoice:
-    """Return the weight with the smallest score, from 100 down by decades until it only grows.
+    """Return the largest weight that ``_is_accepted`` in comparison with that of smallest score.
 
-    Beside the score come its parts by segment and joint, or none; the largest weight is chosen
-    that ``_is_accepted`` beside the best one.
+    Weights are tried from 100 down in decades, until the score increases. ``score`` returns the
+    score and its parts by segment and joint, or no parts.
     """
     tried: dict[float, float] = {}
     parts: dict[float, Array] = {}
@@ -228,13 +230,13 @@ def _search(
     def attempt(decade: float) -> None:
         tried[decade], parts[decade] = score(10.0**decade)
 
-    decade = _HEAVIEST
-    while decade >= lightest and _is_promising(tried):
+    decade = _LARGEST
+    while decade >= smallest and _is_promising(tried):
         attempt(decade)
         decade -= 1.0
     best = min(tried, key=lambda k: tried[k])
     for k in (best - _STEP, best + _STEP):
-        if lightest <= k <= _HEAVIEST and np.isfinite(tried.get(k - _STEP, 0.0)):
+        if smallest <= k <= _LARGEST and np.isfinite(tried.get(k - _STEP, 0.0)):
             attempt(k)
     best = min(tried, key=lambda k: tried[k])
     alike = [k for k in tried if np.isfinite(tried[k]) and _is_accepted(parts[k], parts[best])]
@@ -243,7 +245,7 @@ def _search(
 
 
 def _is_accepted(parts: Array, best: Array) -> bool:
-    """Return whether errors are as good as the best ones, each of shape (segments, n)."""
+    """Return whether errors are about as small as the best ones, both of shape (segments, n)."""
     if not parts.size:
         return False
     ratio = np.sqrt(_by_joint(parts) / _by_joint(best))  # (n,)
@@ -256,13 +258,13 @@ def _is_accepted(parts: Array, best: Array) -> bool:
 
 
 def _by_joint(parts: Array) -> Array:
-    """Return the mean squares of the joints that have rows, shape (n,), of errors by segment."""
+    """Return the mean squares of the joints with rows, shape (n,), from errors by segment."""
     squares: Array = parts.sum(axis=0)
     return squares[squares > 0]
 
 
 def _is_as_good(parts: Array, best: Array) -> bool:
-    """Return whether a sum of parts is within two standard errors of the best one, pair by pair."""
+    """Return whether the sum of parts is within two standard errors of the best, paired."""
     excess = parts - best
     if not len(excess):
         return False
@@ -271,7 +273,7 @@ def _is_as_good(parts: Array, best: Array) -> bool:
 
 
 def _is_promising(tried: dict[float, float]) -> bool:
-    """Return whether one of the last two weights had the smallest score."""
+    """Return whether one of the last two weights has the smallest score."""
     scores = list(tried.values())
     if scores and not np.isfinite(scores[-1]):
         return False

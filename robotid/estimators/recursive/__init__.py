@@ -1,3 +1,3 @@
-"""Estimators that read one sample after the other."""
+"""Recursive estimators: the samples are read one by one."""
 
 __all__: list[str] = []

@@ -29,10 +29,10 @@ StateT = TypeVar("StateT")
 
 
 class RecursiveEstimator(Estimator[Problem], Generic[StateT]):
-    """Settings go into the constructor, everything learnt into a state that is never changed.
+    """Interface of recursive estimators: settings in the constructor, results in a state.
 
-    A state is a frozen dataclass of arrays and numbers: ``save_state`` and
-    ``load_state`` keep every bit of it.
+    A state is an immutable dataclass of arrays and numbers. ``save_state`` and ``load_state``
+    preserve it exactly.
     """
 
     reads: ClassVar[Literal["samples"]] = "samples"
@@ -47,19 +47,19 @@ class RecursiveEstimator(Estimator[Problem], Generic[StateT]):
 
     @abstractmethod
     def update(self, state: StateT, sample: Sample) -> StateT:
-        """Return the state after one more sample; the state given is not changed.
+        """Return the state after one more sample; the given state is not changed.
 
         Args:
-            state: The state before.
-            sample: One instant; rows of weight 0 are skipped.
+            state: The previous state.
+            sample: One sample; rows of weight 0 are skipped.
 
         Raises:
-            DataError: If the sample is not finite or of another shape; the state stays valid.
+            DataError: If the sample is not finite or has a wrong shape; the state remains valid.
         """
 
     @abstractmethod
     def estimate(self, state: StateT, names: tuple[str, ...]) -> Estimate:
-        """Return the estimate that a state holds.
+        """Return the estimate of a state.
 
         Args:
             state: The state.
@@ -73,10 +73,10 @@ def fold(estimator: RecursiveEstimator[StateT], samples: Iterable[Sample], state
     Args:
         estimator: The estimator.
         samples: The samples, in the order of the updates.
-        state: The state before.
+        state: The initial state.
 
     Raises:
-        DataError: If a sample is not finite or of another shape.
+        DataError: If a sample is not finite or has a wrong shape.
     """
     for sample in samples:
         state = estimator.update(state, sample)
@@ -84,15 +84,15 @@ def fold(estimator: RecursiveEstimator[StateT], samples: Iterable[Sample], state
 
 
 def scaled_rows(sample: Sample, sigma: Array, c: int) -> Array:
-    """Return rows sqrt(weight_j) / sigma_j [Y_j tau_j], shape (k, c + 1), but those of weight 0.
+    """Return rows sqrt(weight_j) / sigma_j [Y_j tau_j] of nonzero weight, shape (k, c + 1).
 
     Args:
-        sample: One instant.
+        sample: One sample.
         sigma: Noise level of each joint, shape (n,) [N m or N].
         c: Number of parameters.
 
     Raises:
-        DataError: If the sample is not finite or of another shape.
+        DataError: If the sample is not finite or has a wrong shape.
     """
     n = len(sigma)
     if sample.Y.shape != (n, c) or sample.tau.shape != (n,) or sample.weight.shape != (n,):
@@ -106,20 +106,21 @@ def scaled_rows(sample: Sample, sigma: Array, c: int) -> Array:
     rows *= (np.sqrt(sample.weight) / sigma)[:, None]
     if not sample.weight.all():
         rows = rows[sample.weight != 0]
-    # one sum is the cheapest test: it is finite unless an entry is not
+    # the sum is the fastest test: it is finite only if every entry is
     if not math.isfinite(rows.sum()):
         raise DataError(
-            "the sample is not finite, so it was refused; the state before it is still valid"
+            "the sample has values that are not finite and was not used; the previous state "
+            "remains valid"
         )
     return rows
 
 
 def save_state(state: Any, path: str | Path) -> None:  # noqa: ANN401
-    """Write a state to an NPZ file, every bit of it, without pickle.
+    """Write a state to an NPZ file, exactly and without pickle.
 
     Args:
-        state: A frozen dataclass of arrays and numbers.
-        path: The file; written beside its place first.
+        state: An immutable dataclass of arrays and numbers.
+        path: The file. A temporary file is written first and then renamed.
     """
     content = {f.name: np.asarray(getattr(state, f.name)) for f in fields(state)}
     kind = np.frombuffer(json.dumps(type(state).__name__).encode(), dtype=np.uint8)
@@ -128,41 +129,41 @@ def save_state(state: Any, path: str | Path) -> None:  # noqa: ANN401
 
 
 def load_state(path: str | Path, kind: type[StateT]) -> StateT:
-    """Read a state back; updates from it give the same bits as an unbroken run.
+    """Return a state from a file; updates from it give exactly the results of an unbroken run.
 
     Args:
         path: The file.
         kind: Class of the state, as ``RLSState``.
 
     Raises:
-        DataError: If the file is missing, no NPZ, or holds another kind of state.
+        DataError: If the file does not exist, is not NPZ, or contains another class of state.
     """
     source = Path(path)
     if not source.is_file():
-        raise DataError(f"there is no state {str(source)!r}")
+        raise DataError(f"the file {str(source)!r} of the state does not exist")
     try:
         with np.load(source, allow_pickle=False) as archive:
             content = dict(archive)
     except (ValueError, OSError) as error:
-        raise DataError(f"{source.name} is not a state: {error}") from error
+        raise DataError(f"{source.name} is not a file of a state: {error}") from error
     found = json.loads(bytes(content.pop("__kind__", np.frombuffer(b"null", np.uint8))))
     if found != kind.__name__:
-        raise DataError(f"{source.name} holds a state {found!r}, wanted {kind.__name__!r}")
-    # LAPACK wants its own order: arrays come back in the order they were saved in
+        raise DataError(f"{source.name} contains a state {found!r}, wanted {kind.__name__!r}")
+    # LAPACK needs column order: NPZ preserves the memory order of arrays
     plain = {key: x if x.ndim else x.item() for key, x in content.items()}
     return kind(**plain)
 
 
 def require_samples(data: object) -> None:
-    """Refuse what holds no samples.
+    """Raise an error if data for ``fit`` have no samples.
 
     Args:
-        data: What was given to ``fit``.
+        data: The data for ``fit``.
 
     Raises:
-        DataError: If it is no problem: factors hold no samples.
+        DataError: If the data are not a problem; factors have no samples.
     """
     if not isinstance(data, Problem):
         raise DataError(
-            "a recursive estimator reads samples, and factors hold none; give it the problem itself"
+            "a recursive estimator needs samples, but factors have none; call fit with the problem"
         )

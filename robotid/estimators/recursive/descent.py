@@ -1,7 +1,7 @@
-"""The gradient methods: a step per sample along the gradient, passes in random order.
+"""Gradient methods: one step per sample along the gradient, passes in random order.
 
-They work in scaled parameters x = scale theta, where every column has unit norm; their residual is
-e = Psi P^ - tau, the paper's sign.
+They use scaled parameters x = scale theta, for which every column has unit norm. The residual is
+e = Psi P^ - tau, with the sign of the paper.
 """
 
 from abc import abstractmethod
@@ -18,31 +18,31 @@ from robotid.regressor.problem import Problem, Sample, shuffled
 
 __all__ = ["PRX", "DescentState", "NormalisedGradient", "column_scale"]
 
-#: Rows of a sample: all, or the indices of those of positive weight.
+#: Rows of a sample: all, or the indices of the rows of positive weight.
 Rows: TypeAlias = slice | Array
 
-_AVERAGE = 3.0  # weight of the newest iterate: 3 / (k + 2), so that the start fades as k^-3
+_AVERAGE = 3.0  # weight of the newest iterate: 3 / (k + 2), the initial value decays as k^-3
 _MEMORY = 1000.0  # [samples] over which PRX and the residuals are averaged
-_SILENT = 1e-9  # columns smaller than this share of the largest are not scaled up
-_SMALLEST = 1e-6  # eigenvalues of D(q, P^) below this share of the largest are raised to it
-_RIDGE = 1e-9  # of metric "rows": rows that depend on each other stay soluble
-_GAIN = 0.01  # a pass that makes the squared residual smaller by less brings nothing more
-_ZERO = 2.0  # a mean PRX below this many of its standard errors is 0
+_SILENT = 1e-9  # relative norm below which columns are not scaled
+_SMALLEST = 1e-6  # lower bound of the eigenvalues of D(q, P^), relative to the largest
+_RIDGE = 1e-9  # relative regularisation for metric "rows", for dependent rows
+_GAIN = 0.01  # relative decrease of the squared residual per pass at convergence
+_ZERO = 2.0  # a mean PRX of fewer standard errors is 0
 
 
 @dataclass(frozen=True, eq=False)
 class DescentState:
-    """What a gradient method knows.
+    """State of a gradient method.
 
     Attributes:
         x: Scaled parameters, shape (c,).
         mean: Average of the iterates, shape (c,).
-        prx: Recent mean of PRX (23) at the estimate, shape (c,), in scaled parameters.
-        prx_square: Recent mean of its squared norm.
-        squares: Recent mean of the squared residual per joint, shape (n,) [(N m)^2 or N^2].
-        steps: Number of samples seen.
+        prx: Moving average of PRX (23) at the estimate, shape (c,), in scaled parameters.
+        prx_square: Moving average of its squared norm.
+        squares: Moving average of the squared residual per joint, shape (n,) [(N m)^2 or N^2].
+        steps: Number of samples read.
         skipped: Number of samples without information, |Psi|^2 <= eps2.
-        rows: Number of rows taken.
+        rows: Number of rows used.
     """
 
     x: Array
@@ -57,21 +57,20 @@ class DescentState:
 
 @dataclass(frozen=True, eq=False)
 class Descent(RecursiveEstimator[DescentState]):
-    """A gradient method; its leaves say how a sample moves the parameters.
+    """Base class of gradient methods; subclasses define the step of the parameters by a sample.
 
-    ``fit`` visits the samples in several passes, until PRX = 0. A gradient method does not learn
-    how uncertain it is: the covariance is infinite, rank and condition number are unknown.
+    ``fit`` reads the samples in several passes, until PRX = 0. A gradient method has no estimate of
+    its uncertainty: the covariance is infinite, rank and condition number are unknown.
 
     Attributes:
         sigma: Noise level of each joint, shape (n,) [N m or N].
-        prior: Parameters to start from, shape (c,); 0 if None.
-        scale: Column scaling, shape (c,); None: ``fit`` takes the column norms, a state made by
-            ``init`` has none.
-        average: Whether the estimate is the average of the iterates; wanted with noise.
+        prior: Initial values, shape (c,); 0 if None.
+        scale: Column scaling, shape (c,); None: ``fit`` uses the column norms, and a state of
+            ``init`` is not scaled.
+        average: Whether the estimate is the average of the iterates; recommended with noise.
         passes: Largest number of passes of ``fit``.
-        rng: Source of the random order in which ``fit`` visits the samples; in the order of time
-            if None.
-        eps1: PRX = 0 if its recent mean is within this norm, in scaled parameters.
+        rng: Random generator of the order in which ``fit`` reads the samples; None: order of time.
+        eps1: Norm of the moving average of PRX below which it is 0, in scaled parameters.
         eps2: Samples with |Psi|^2 <= eps2 are skipped.
 
     Raises:
@@ -98,15 +97,15 @@ class Descent(RecursiveEstimator[DescentState]):
     @property
     @abstractmethod
     def _takes_scale(self) -> bool:
-        """Whether ``fit`` scales the columns where no scale is given."""
+        """Whether ``fit`` scales the columns if no scale is given."""
 
     @abstractmethod
     def _check(self) -> None:
-        """Refuse settings of the leaf that are out of their range."""
+        """Raise an error if settings of the subclass are out of their range."""
 
     @abstractmethod
     def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
-        """Return x, shape (c,), after rows Psi (k, c) with residuals e (k,), in units of noise."""
+        """Return x, shape (c,), after rows Psi (k, c), residuals e (k,), both in units of noise."""
 
     def init(self, c: int) -> DescentState:
         x = np.zeros(c) if self.prior is None else self.prior * self._unit
@@ -121,12 +120,12 @@ class Descent(RecursiveEstimator[DescentState]):
         steps = state.steps + 1
         if np.vdot(Psi, Psi) <= self.eps2:
             return replace(state, steps=steps, skipped=state.skipped + 1)
-        # all rows at once is the typical case, and a slice is cheap
+        # usually all rows are used, and a slice is fast
         used = slice(None) if len(rows) == len(sigma) else np.flatnonzero(sample.weight)
         x = self._moved(state.x, Psi, Psi @ state.x - tau, used, sample)
         newest = _AVERAGE / (steps + _AVERAGE - 1)
         mean = state.mean + (x - state.mean) * newest if self.average else x
-        # how good the estimate was for this sample, before the sample changed it
+        # residual of this sample for the averaged estimate before it
         e = Psi @ state.mean - tau
         prx = e @ Psi  # (23), (4): Psi^T (Psi P^ - u)
         share = 1.0 / min(steps, _MEMORY)
@@ -157,7 +156,7 @@ class Descent(RecursiveEstimator[DescentState]):
             converged=self._is_zero(state),
             n_iter=state.steps,
             message=f"{state.steps} steps, {state.skipped} without information, |PRX| = {prx:.3g}; "
-            "a gradient method does not know its covariance, so it is stated as infinite",
+            "a gradient method has no covariance, it is stated as infinite",
         )
 
     def fit(self, data: Problem) -> Estimate:
@@ -186,7 +185,7 @@ class Descent(RecursiveEstimator[DescentState]):
         return 1.0 if self.scale is None else self.scale
 
     def _is_zero(self, state: DescentState) -> bool:
-        """Return whether PRX = 0 (25): within eps1, or within what its own scatter leaves open."""
+        """Return whether PRX = 0 (25): within eps1, or within its own scatter."""
         if state.steps < _MEMORY:
             return False
         norm = float(np.linalg.norm(state.prx))
@@ -196,7 +195,7 @@ class Descent(RecursiveEstimator[DescentState]):
     def _has_settled(self, before: DescentState, after: DescentState) -> bool:
         """Return whether PRX = 0 after a pass.
 
-        What scatters about 0 only counts as 0 if the pass has not made the residual any smaller.
+        A PRX that scatters about 0 is 0 only if the pass has not reduced the residual.
         """
         first, last = (float(np.sum(s.squares / self.sigma**2)) for s in (before, after))
         gain = 1.0 - last / first if first > 0 else 1.0
@@ -206,10 +205,10 @@ class Descent(RecursiveEstimator[DescentState]):
 
 @dataclass(frozen=True, eq=False)
 class NormalisedGradient(Descent):
-    """Normalised gradient (NLMS), the cheapest recursive estimator.
+    """Normalised gradient (NLMS), the fastest recursive estimator.
 
     theta <- theta - mu / (eps + |Psi|_F^2) Psi^T e, e = Psi theta - tau, rows in units of their
-    noise. Without noise |theta~| never grows while 0 < mu < 2.
+    noise. Without noise |theta~| does not increase for 0 < mu < 2.
 
     Attributes:
         step_size: The relaxation mu, above 0 and below 2 [-].
@@ -241,26 +240,27 @@ class PRX(Descent):
     """The paper's update P^ <- P^ - gamma Psi^T eta (24), with e = Psi P^ - tau and eta = M e.
 
     * step "printed": eta = D^-1 e, gamma = sigma_D / |Psi|_F^2, sigma_D the smallest eigenvalue of
-      D(q, P^). On an arm of six joints it hardly moves.
+      D(q, P^). For an arm with six joints the steps are very small.
     * step "exact": gamma = e^T eta / |Psi^T eta|^2, the minimiser of |P~| along the direction.
 
-    Without noise |P~| never grows: with "exact" for any positive definite M, with "printed" while
-    sigma_min(D(q, P^)) <= 2 sigma_min(D(q, P)). With column scaling that is the norm of
+    Without noise |P~| does not increase: with "exact" for any positive definite M, with "printed"
+    if sigma_min(D(q, P^)) <= 2 sigma_min(D(q, P)). With column scaling this is the norm of
     scale * P~.
 
-    With noise each iterate jumps about as far as the noise of its own sample. On the recordings of
-    a UR10e and a Panda the last iterate predicts 1.3 to 1.9 times worse than weighted least
-    squares; the average of the iterates, the k-th weighted by k^2, 1.03 to 1.05 times after one
-    pass. Steps that shrink as 1/k came to 1.03 to 1.2, depending on their rate, and a dead zone of
-    the size of the noise to 1.1 to 1.7; so ``average`` takes the average.
+    With noise each iterate changes by about the noise of its sample. On recordings of a UR10e and a
+    Panda the prediction error of the last iterate is 1.3 to 1.9 times that of weighted least
+    squares. With the average of the iterates, the k-th weighted by k^2, it is 1.03 to 1.05 times
+    after one pass. With step sizes proportional to 1/k it is 1.03 to 1.2 times, depending on their
+    rate, and with a dead zone of the size of the noise 1.1 to 1.7 times. The default is therefore
+    ``average``.
 
-    ``fit`` scales the columns of step "exact" only.
+    ``fit`` scales the columns for step "exact" only.
 
     Attributes:
         step: "exact" or "printed".
-        metric: Of step "exact": "noise" for M = diag(sigma^-2); "mass" for M = D(q, P^)^-1, as
-            printed; "rows" for M = (Psi Psi^T)^-1, which fits a sample's rows all at once.
-        bounds: Radius of the set Omega (8) about the prior in scaled parameters; None for none.
+        metric: For step "exact": "noise" for M = diag(sigma^-2); "mass" for M = D(q, P^)^-1, as
+            printed; "rows" for M = (Psi Psi^T)^-1, which fits all rows of a sample together.
+        bounds: Radius of the set Omega (8) about the prior in scaled parameters; None: no bound.
 
     References:
         Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (20)-(25).
@@ -299,7 +299,7 @@ class PRX(Descent):
         return moved if self.bounds is None else self._bounded(moved, self.bounds)
 
     def _massive_step(self, x: Array, sample: Sample, used: Rows) -> Array:
-        """Return the step with eta = D^-1 e (20), rows as the paper has them."""
+        """Return the step with eta = D^-1 e (20), rows as in the paper."""
         Psi = sample.Y[used] / self._unit
         values, vectors = self._inertia(x, sample)
         e = np.zeros(len(values))
@@ -314,17 +314,20 @@ class PRX(Descent):
     def _inertia(self, x: Array, sample: Sample) -> tuple[Array, Array]:
         """Return eigenvalues and eigenvectors of D(q, P^), which is linear in P^ (11).
 
-        Any positive definite D keeps the proof, so an estimate that makes it indefinite on its way
-        costs nothing: small and negative eigenvalues are raised.
+        The proof holds for any positive definite D. For an intermediate estimate with an indefinite
+        D, small and negative eigenvalues are replaced by a positive bound.
         """
         if sample.mass_regressor is None:
             raise DataError(
-                "PRX needs the mass regressor of each sample; build the problem with "
+                "PRX needs the mass regressor of each sample, found none; build the problem with "
                 "build_problem(..., with_mass=True)"
             )
         D = sample.mass_regressor @ (x / self._unit)  # (n, n)
         if not np.isfinite(D).all():
-            raise DataError("the mass regressor of the sample is not finite, so it was refused")
+            raise DataError(
+                "the mass regressor of the sample has values that are not finite; the sample was "
+                "not used"
+            )
         values, vectors = np.linalg.eigh((D + D.T) / 2)
         largest = float(np.abs(values).max())
         return np.maximum(values, _SMALLEST * largest if largest > 0 else 1.0), vectors
@@ -338,9 +341,9 @@ class PRX(Descent):
 
 
 def column_scale(problem: Problem, sigma: Array) -> Array:
-    """Return the root mean square of columns, shape (c,), positive, rows in units of their noise.
+    """Return the RMS of columns, shape (c,), positive, with rows in units of their noise.
 
-    Scaled by it, all columns have the same norm. A column without data keeps 1.
+    Scaled by it, all columns have the same norm. The value of a column without data is 1.
 
     Args:
         problem: The rows.
@@ -356,7 +359,7 @@ def column_scale(problem: Problem, sigma: Array) -> Array:
         squares += row_weight @ np.where(row_weight[:, None] > 0, W, 0.0) ** 2
         count += len(W) // n
     if not np.isfinite(squares).all():
-        raise DataError("the problem holds a row that is not finite; check the trajectory")
+        raise DataError("the problem has a row that is not finite; check the trajectory")
     rms = np.sqrt(squares / max(count, 1))
     return np.where(rms > _SILENT * rms.max(initial=0.0), rms, 1.0)
 

@@ -23,14 +23,14 @@ from robotid.regressor.problem import Problem, Sample
 
 __all__ = ["RLS", "Kalman", "KalmanState", "RLSState"]
 
-_BLOCK = 8  # columns that LAPACK reduces at a time
-_TINY = 1e-12  # smallest noise, as a share of sigma: noise-free data have none
-_PATIENCE = 50  # samples in a row that the gate may turn away from a joint
-_PRIOR_LED = 0.9  # a parameter whose spread shrinks by less than this is undetermined
+_BLOCK = 8  # block size of LAPACK
+_TINY = 1e-12  # smallest noise over sigma, for noise-free data
+_PATIENCE = 50  # largest number of successive rows of a joint that the gate rejects
+_PRIOR_LED = 0.9  # ratio to the prior standard deviation above which a parameter is undetermined
 
 
 class Filter(RecursiveEstimator[StateT]):
-    """A recursive estimator that visits the samples once, in the order of time."""
+    """A recursive estimator that reads the samples once, in the order of time."""
 
     prior: Array | None
 
@@ -51,12 +51,12 @@ class Filter(RecursiveEstimator[StateT]):
 
 @dataclass(frozen=True, eq=False)
 class RLSState:
-    """What recursive least squares knows.
+    """State of recursive least squares.
 
     Attributes:
         R: Upper triangular factor of the weighted rows [Y tau], shape (c + 1, c + 1).
-        rows: Number of rows in it, forgotten ones taken off.
-        steps: Number of samples taken.
+        rows: Effective number of rows in it, with forgetting.
+        steps: Number of samples used.
     """
 
     R: Array
@@ -68,24 +68,25 @@ class RLSState:
 class RLS(Filter[RLSState]):
     """Recursive least squares with exponential forgetting.
 
-    The state is the triangular factor R of all rows; a sample is folded in by QR:
+    The state is the triangular factor R of all rows. It is updated with a sample by QR:
 
         R <- triangle of [sqrt(forgetting) R; [Y tau] / sigma].
 
-    Nothing is inverted before an estimate is asked for, so it cannot blow up, and it starts from
-    no information at all: without forgetting the result is that of batch least squares. With
-    forgetting, information that no motion renews would vanish (wind-up). So each step adds one
-    row of the prior, parameter after parameter, which keeps the information of each between
-    forgetting^c and 1 times that of the prior. What the data leave open has infinite variance.
+    Nothing is inverted until an estimate is computed, so the update is numerically stable, and the
+    initial state has no information: without forgetting the result is that of batch least squares.
+    With forgetting, information that is not updated by motion would vanish (wind-up). Each step
+    therefore adds one row of the prior, one parameter after the other, so that the prior
+    information of each stays between forgetting^c and 1 times that of the prior. Parameters that
+    are not identifiable have infinite variance.
 
     Attributes:
         sigma: Noise level of each joint, shape (n,) [N m or N]. Only the ratios matter: the
             common factor is estimated.
         forgetting: Weight of a sample relative to the next one, 0 < forgetting <= 1 [-].
-        prior: Parameters kept where the data say nothing, shape (c,); None: 0, and ``fit`` refuses
-            data that leave something open.
-        prior_std: How far each may lie from its prior, shape (c,); None for no information.
-        independent_share: Share of the rows that count as independent, 2 cutoff / rate.
+        prior: Parameter values for directions that are not identifiable, shape (c,); None: 0, and
+            ``fit`` raises an error if there are any.
+        prior_std: Prior standard deviations, shape (c,); None: no prior information.
+        independent_share: Share of independent rows, 2 cutoff / rate [-].
 
     Raises:
         DataError: If a setting is out of its range, or forgetting < 1 comes without a prior.
@@ -106,11 +107,11 @@ class RLS(Filter[RLSState]):
         if not (np.isfinite(self.sigma).all() and (self.sigma > 0).all()):
             raise DataError(f"sigma is {self.sigma}, wanted positive finite numbers")
         if self.prior_std is not None and self.prior is None:
-            raise DataError("prior_std was given without the prior it is about")
+            raise DataError("prior_std was given without prior; state both, or neither")
         if self.forgetting < 1 and self.prior_std is None:
             raise DataError(
-                "with forgetting, information that no motion renews vanishes; give prior and "
-                "prior_std to hold it above theirs"
+                f"forgetting is {self.forgetting}, which needs prior and prior_std: information "
+                "that is not updated by motion vanishes otherwise; state both"
             )
 
     @property
@@ -146,17 +147,17 @@ class RLS(Filter[RLSState]):
         scale = max(abs(float(state.R[c, c])) / np.sqrt(freedom), _TINY)
         covariance = scale**2 / self.independent_share * solution.covariance
         message = (
-            f"{state.steps} samples folded in, forgetting {self.forgetting:g}; noise "
-            f"levels {scale:.3g} times those given"
+            f"{state.steps} samples used, forgetting {self.forgetting:g}; noise levels "
+            f"{scale:.3g} times the given ones"
         )
         return solution.estimate(names, covariance, scale * self.sigma, state.steps, message)
 
     def _rows_of(self, state: RLSState) -> int:
-        # those that are forgotten have been seen all the same
+        # forgotten rows count, too
         return int(state.rows) if self.forgetting == 1 else state.steps * len(self.sigma)
 
     def _prior_row(self, state: RLSState) -> Array:
-        """Return a row of the prior that makes up for what c steps forget of one parameter."""
+        """Return a row of the prior that replaces the information forgotten in c steps."""
         c = len(state.R) - 1
         row = np.zeros(c + 1)
         if self.prior is not None and self.prior_std is not None:
@@ -168,16 +169,16 @@ class RLS(Filter[RLSState]):
 
 @dataclass(frozen=True, eq=False)
 class KalmanState:
-    """What the filter knows.
+    """State of the Kalman filter.
 
     Attributes:
         theta: Parameters, shape (c,).
         P: Their covariance, shape (c, c).
         products: Sum of innovation times residual per joint, shape (n,): rows times variance.
-        rows: Rows taken per joint, shape (n,).
-        gated: Rows turned away per joint, shape (n,).
-        in_a_row: Rows turned away since the last one taken, shape (n,).
-        steps: Number of samples seen.
+        rows: Number of rows used per joint, shape (n,).
+        gated: Number of rows rejected by the gate per joint, shape (n,).
+        in_a_row: Number of rows rejected since the last one used, shape (n,).
+        steps: Number of samples read.
     """
 
     theta: Array
@@ -194,20 +195,21 @@ class Kalman(Filter[KalmanState]):
     """Kalman filter: theta_k+1 = theta_k + w, tau = Y theta + noise.
 
     The covariance is updated in Joseph's form, P <- (1 - K Y) P (1 - K Y)^T + K R K^T, multiplied
-    out: P - A - A^T with A = K (P Y^T - K T / 2)^T and T = Y P Y^T + R. It is as forgiving of an
-    inexact K, symmetric to the last bit, and its products have only n columns. A row whose
-    innovation is improbable is turned away and counted; a joint that is turned away 50 times in a
-    row is believed again. A parameter about which the data say next to nothing is undetermined,
-    and as uncertain as its prior.
+    out: P - A - A^T with A = K (P Y^T - K T / 2)^T and T = Y P Y^T + R. This form is as robust to
+    an inexact K, exactly symmetric, and its products have only n columns. A row with an improbable
+    innovation is rejected and counted. After 50 rejected rows in a row the next row of the joint is
+    used. A parameter with almost no information from the data is undetermined, and its standard
+    deviation is that of its prior.
 
     Attributes:
         sigma: Noise level of each joint, shape (n,) [N m or N].
-        prior: Parameters before any data, shape (c,).
-        prior_std: How far each may lie from it, shape (c,), positive; or its covariance, (c, c).
-        walk: Standard deviation of the random walk per sample, as a share of prior_std [-].
-        gate: Probability with which a good row passes the chi-square gate (one degree of freedom
-            per row), below 1; None to let all pass.
-        independent_share: Share of the rows that count as independent, 2 cutoff / rate.
+        prior: Prior values, shape (c,).
+        prior_std: Prior standard deviations, shape (c,), positive; or the prior covariance, shape
+            (c, c).
+        walk: Standard deviation of the random walk per sample, over prior_std [-].
+        gate: Probability that a row without a fault passes the chi-square gate (one degree of
+            freedom per row), below 1; None: no gate.
+        independent_share: Share of independent rows, 2 cutoff / rate [-].
 
     Raises:
         DataError: If a setting is out of its range.
@@ -229,9 +231,9 @@ class Kalman(Filter[KalmanState]):
             values = getattr(self, name)
             diagonal = np.diag(values) if values.ndim == 2 else values
             if not (np.isfinite(values).all() and (diagonal > 0).all()):
-                raise DataError(f"{name} must be positive and finite, found {diagonal}")
+                raise DataError(f"{name} is {diagonal}, wanted positive finite numbers")
         if not np.isfinite(self.prior).all():
-            raise DataError("prior must be finite for every parameter")
+            raise DataError(f"prior is {self.prior}, wanted finite numbers")
         if not self.walk >= 0:
             raise DataError(f"walk is {self.walk}, wanted 0 or a positive number")
         if self.gate is not None and not 0.5 <= self.gate < 1:
@@ -244,8 +246,8 @@ class Kalman(Filter[KalmanState]):
     def init(self, c: int) -> KalmanState:
         if self.prior.shape != (c,) or len(self.prior_std) != c:
             raise DataError(
-                f"prior {self.prior.shape} and prior_std {self.prior_std.shape}: wanted {c} "
-                "parameters"
+                f"prior has shape {self.prior.shape} and prior_std {self.prior_std.shape}, wanted "
+                f"{c} parameters"
             )
         n = len(self.sigma)
         P = self.prior_std if self.prior_std.ndim == 2 else np.diag(self.prior_std**2)
@@ -255,27 +257,27 @@ class Kalman(Filter[KalmanState]):
     def update(self, state: KalmanState, sample: Sample) -> KalmanState:
         c = len(state.theta)
         used = np.flatnonzero(sample.weight)
-        # in units of each row's noise, that of rows which are not independent enlarged
+        # in units of each row's noise, increased for rows that are not independent
         scale = self.sigma / np.sqrt(self.independent_share)
         rows = scaled_rows(sample, scale, c)
         Y, e = rows[:, :c], rows[:, c] - rows[:, :c] @ state.theta  # (k, c), (k,)
         P = self._walked(state.P)
         PY = P @ Y.T  # (c, k)
         T = Y @ PY  # (k, k), covariance of the prediction, then of the innovation
-        kept = self._passes(e, np.diag(T), state.in_a_row[used])
-        if not kept.all():
-            Y, e, PY, T = Y[kept], e[kept], PY[:, kept], T[np.ix_(kept, kept)]
+        passed = self._passes(e, np.diag(T), state.in_a_row[used])
+        if not passed.all():
+            Y, e, PY, T = Y[passed], e[passed], PY[:, passed], T[np.ix_(passed, passed)]
         T.flat[:: len(T) + 1] += 1.0
         solved = np.linalg.solve(T, np.column_stack([PY.T, e])) if len(T) else np.zeros((0, c + 1))
         K, residual = solved[:, :c].T, solved[:, c]  # (c, k), (k,): tau - Y theta afterwards
         A = K @ (PY - K @ T / 2).T
-        rows, gated, in_a_row = _count(state, used, kept)
+        rows, gated, in_a_row = _count(state, used, passed)
         products = state.products.copy()
-        taken = used[kept]
-        products[taken] += scale[taken] ** 2 / sample.weight[taken] * e * residual
+        k = used[passed]
+        products[k] += scale[k] ** 2 / sample.weight[k] * e * residual
         return KalmanState(
             state.theta + K @ e,
-            P - (A + A.T),  # symmetric to the last bit
+            P - (A + A.T),  # exactly symmetric
             products,
             rows,
             gated,
@@ -286,7 +288,7 @@ class Kalman(Filter[KalmanState]):
     def estimate(self, state: KalmanState, names: tuple[str, ...]) -> Estimate:
         std = self._prior_spread()
         after = np.sqrt(np.maximum(np.diag(state.P), 0.0))
-        # the mean of innovation times residual is the noise variance, whatever P is
+        # the mean of innovation times residual is the noise variance, independent of P
         variance = np.maximum(state.products, 0.0) / np.maximum(state.rows, 1)
         is_open = after > _PRIOR_LED * std
         eigenvalues = np.linalg.eigvalsh(state.P / np.outer(std, std))
@@ -300,8 +302,8 @@ class Kalman(Filter[KalmanState]):
             undetermined=tuple(np.array(names)[is_open].tolist()),
             converged=True,
             n_iter=state.steps,
-            message=f"{state.steps} samples, {int(state.gated.sum())} rows turned away by the "
-            f"gate, {int(state.rows.sum())} taken",
+            message=f"{state.steps} samples, {int(state.gated.sum())} rows rejected by the gate, "
+            f"{int(state.rows.sum())} used",
         )
 
     def _rows_of(self, state: KalmanState) -> int:
@@ -322,20 +324,20 @@ class Kalman(Filter[KalmanState]):
         return P
 
     def _passes(self, e: Array, variance: Array, in_a_row: Array) -> Array:
-        """Return which rows the gate lets pass: e^2 / (variance + 1) within chi-square's bound."""
+        """Return which rows pass the gate: e^2 / (variance + 1) below the chi-square quantile."""
         if self.gate is None:
             return np.ones(len(e), dtype=bool)
         bound = NormalDist().inv_cdf((1 + self.gate) / 2) ** 2
         return (e**2 <= bound * (variance + 1)) | (in_a_row >= _PATIENCE)
 
 
-def _count(state: KalmanState, used: Array, kept: Array) -> tuple[Array, Array, Array]:
-    """Return the rows taken, turned away, and turned away since the last one taken."""
+def _count(state: KalmanState, used: Array, passed: Array) -> tuple[Array, Array, Array]:
+    """Return the numbers of rows used, rejected, and rejected since the last one used."""
     rows = state.rows.copy()
-    rows[used] += kept
-    if kept.all() and not state.in_a_row.any():
+    rows[used] += passed
+    if passed.all() and not state.in_a_row.any():
         return rows, state.gated, state.in_a_row
     gated, in_a_row = state.gated.copy(), state.in_a_row.copy()
-    gated[used] += ~kept
-    in_a_row[used] = np.where(kept, 0, in_a_row[used] + 1)
+    gated[used] += ~passed
+    in_a_row[used] = np.where(passed, 0, in_a_row[used] + 1)
     return rows, gated, in_a_row

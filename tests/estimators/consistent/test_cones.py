@@ -68,7 +68,7 @@ def test_where_nothing_binds_the_answer_is_exact(rng):
     A = np.triu(rng.standard_normal((3, 3))) + 3 * np.eye(3)
     solution = least_squares(A, A @ np.ones(3), cone_of(np.eye(3), np.zeros(3)))
     np.testing.assert_allclose(solution.x, np.ones(3), rtol=1e-14)
-    assert solution.message == "no constraint binds"
+    assert solution.message == "no constraint is active"
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -82,7 +82,7 @@ def test_bounds_without_a_point_are_named(solver):
 def test_a_solver_that_stops_early_says_so(solver, name, monkeypatch):
     monkeypatch.setattr("robotid.estimators.consistent.cones._SCS_ITERATIONS", 1)
     A, d = np.diag(10.0 ** np.arange(-5, 5)), -np.arange(1.0, 11.0)
-    text = f"was not solved by {name}, with the constraints psd; "
+    text = f"{name} failed to solve the physically consistent fit with the constraints psd; "
     with pytest.raises(NotConvergedError, match=text) as caught:
         least_squares(A, d, psd_cone(), solver=solver, max_iterations=1)
     assert caught.value.status in ("MaxIterations", "AlmostSolved")
@@ -123,7 +123,7 @@ def test_a_solver_that_breaks_down_is_a_fit_that_was_not_solved(monkeypatch):
 
     monkeypatch.setattr("clarabel.DefaultSolver", Solver)
     error = PanicException("eigenvalues of NaN")
-    with pytest.raises(NotConvergedError, match="not solved by Clarabel") as caught:
+    with pytest.raises(NotConvergedError, match="Clarabel failed to solve") as caught:
         least_squares(np.eye(10), np.ones(10), psd_cone(), solver="clarabel")
     assert caught.value.status == "Panic"
     error = KeyboardInterrupt()

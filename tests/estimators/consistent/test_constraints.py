@@ -81,7 +81,7 @@ def test_pinned_bodies_keep_the_urdf_and_the_rest_is_the_constrained_least_squar
     fit = replace(fit, prior=truth(ur5), prior_weight=10.0, metric="riemannian")
     pinned = constrained(fit, pinned=("forearm_link", "wrist_1_link"))
     estimate = pinned.fit(factors)
-    assert estimate.message == "no constraint binds"
+    assert estimate.message == "no constraint is active"
     rows = pinned.rows(factors, estimate.sigma)
     D = rows[:, :-1] @ fit.K
     H = D.T @ D + 0.5 * fit.prior_weight * fit.penalty.hessian(fit.prior)
@@ -130,8 +130,8 @@ def test_gradients_of_active_constraints_are_those_of_their_slack(case):
 @pytest.mark.parametrize(
     ("bounds", "text"),
     [
-        ({"mass": {"tool0": (1.0, 2.0)}}, r"\['tool0'\], which are no bodies of the model"),
-        ({"mass": {"forearm_link": (3.0, 2.0)}}, r"\[3, 2\] kg: the first is above the second"),
+        ({"mass": {"tool0": (1.0, 2.0)}}, r"\['tool0'\], which are not bodies of the model"),
+        ({"mass": {"forearm_link": (3.0, 2.0)}}, r"\[3, 2\] kg: the first value is larger"),
         ({"mass": {"forearm_link": (-2.0, -1.0)}}, "is bounded by -1 kg, wanted a positive"),
         ({"total_mass": (0.0, 2.0), "mass": {"forearm_link": (3.0, 9.0)}}, "allow .3, inf. kg"),
         (
@@ -155,7 +155,7 @@ def test_bounds_that_contradict_each_other_are_refused_before_the_solver_runs(ca
 def test_links_on_locked_joints_count_in_the_bounds(case):
     held = np.zeros(60)
     held[20:30] = [2.0, 0, 0, 0, 0.01, 0, 0.01, 0, 0, 0.01]
-    with pytest.raises(SettingsError, match="its links on locked joints alone weigh 2 kg"):
+    with pytest.raises(SettingsError, match="its links on locked joints alone have 2 kg"):
         constrained(replace(case[0], held=held), mass={"forearm_link": (0.5, 1.0)})
 
 
@@ -177,9 +177,9 @@ def test_bounds_that_no_body_meets_are_named(case):
         ({"total_mass": [1.0, np.nan]}, r"total_mass is \[1.0, nan\], wanted finite numbers"),
         ({"total_mass": [1.0, 1e300]}, r"1e\+300\], .* at most 1e\+09 kg; write 1e\+09 for no"),
         ({"total_mass": [3.0]}, r"total_mass is \[3.0\], wanted a number or"),
-        ({"total_mass": [4.0, 3.0]}, "the first is above the second"),
+        ({"total_mass": [4.0, 3.0]}, "the first value is larger than the second"),
         ({"com": {"a": [[0, 0], [1, 1]]}}, "com of a is .* wanted"),
-        ({"com": {"a": [[0, 0, 1], [1, 1, 0]]}}, "the first corner is above the second"),
+        ({"com": {"a": [[0, 0, 1], [1, 1, 0]]}}, "a coordinate of the first corner is larger"),
         ({"com_within": "sphere"}, "com_within is 'sphere', wanted one of"),
     ],
 )

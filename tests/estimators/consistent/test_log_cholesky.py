@@ -118,7 +118,7 @@ def test_every_end_is_possible(case):
 
 def test_it_knows_no_further_constraints(case):
     bounds = Constraints(total_mass=(1.0, 2.0))
-    with pytest.raises(SettingsError, match="'log_cholesky' knows no constraints beside"):
+    with pytest.raises(SettingsError, match="'log_cholesky' supports only the constraints"):
         LogCholesky(replace(case[0], constraints=bounds))
 
 

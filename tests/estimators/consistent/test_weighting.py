@@ -213,7 +213,7 @@ def test_the_noise_level_is_that_of_the_whole_regressor(case):
 
 def test_one_stretch_is_too_few(case):
     fit, problem = case
-    with pytest.raises(DataError, match="cannot be chosen from 1 segment"):
+    with pytest.raises(DataError, match="needs at least 2 segments, found 1"):
         choose_weight(fit, Segments.of(fit, [compress(problem)]), "cv")
 
 
@@ -322,7 +322,7 @@ def test_an_extent_is_contradicted_by_four_errors_two_percent_and_two_errors_of_
         return left, []
 
     monkeypatch.setattr("robotid.estimators.consistent.weighting.held_out_errors", held_out)
-    segments = SimpleNamespace(rows=None, kept=[None] * 8)
+    segments = SimpleNamespace(rows=None, folds=[None] * 8)
     assert contradicted_extents(fit, segments) == named
 
 

@@ -16,13 +16,13 @@ from robotid.regressor.factors import Factors
 
 
 def test_a_file_that_is_no_state_is_refused(tmp_path):
-    with pytest.raises(DataError, match="there is no state"):
+    with pytest.raises(DataError, match="of the state does not exist"):
         load_state(tmp_path / "none.npz", RLSState)
     (tmp_path / "text.npz").write_text("not a state")
-    with pytest.raises(DataError, match=r"text.npz is not a state"):
+    with pytest.raises(DataError, match=r"text.npz is not a file of a state"):
         load_state(tmp_path / "text.npz", RLSState)
     save_state(RLS(np.ones(2)).init(3), tmp_path / "rls.npz")
-    with pytest.raises(DataError, match="holds a state 'RLSState', wanted 'KalmanState'"):
+    with pytest.raises(DataError, match="contains a state 'RLSState', wanted 'KalmanState'"):
         load_state(tmp_path / "rls.npz", KalmanState)
 
 
@@ -31,5 +31,5 @@ def test_factors_hold_no_samples_and_are_refused(estimator):
     factors = Factors(np.zeros((2, 4, 4)), np.array([9, 9]), np.zeros(2), ("a", "b", "c"))
     sigma, zero = np.ones(2), np.zeros(3)
     fitted = estimator(sigma, zero, np.eye(3)) if estimator is Kalman else estimator(sigma)
-    with pytest.raises(DataError, match="factors hold none; give it the problem itself"):
+    with pytest.raises(DataError, match="factors have none; call fit with the problem"):
         fitted.fit(factors)

@@ -63,7 +63,7 @@ def test_what_rls_was_not_shown_is_refused_by_name_or_keeps_its_prior():
     np.testing.assert_allclose(kept.theta, [1.0, 2.0, 7.0])
     assert kept.undetermined == ("c",)
     assert np.isinf(kept.std_error[2])
-    with pytest.raises(DataError, match="give prior and prior_std"):
+    with pytest.raises(DataError, match="which needs prior and prior_std"):
         RLS(np.ones(2), 0.99)
     with pytest.raises(DataError, match="forgetting is 0"):
         RLS(np.ones(2), 0.0)
