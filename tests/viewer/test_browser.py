@@ -303,7 +303,7 @@ def test_a_joint_picked_anywhere_shows_everywhere(still, ur5, how):
         row = box["height"] / 6
         seen.page.mouse.click(box["x"] + box["width"] * 0.75, box["y"] + 3.5 * row)
         assert seen.page.evaluate("replay.clock.time") == pytest.approx(10.0, abs=0.05)
-        assert "× the noise" in seen.page.locator("#told").inner_text()
+        assert "× RMS noise" in seen.page.locator("#reading").inner_text()
         seen.page.locator("#sheet").press("ArrowUp")
         assert seen.page.evaluate("replay.picked") == ur5.joints[2]
         seen.page.locator("#sheet").press("ArrowDown")
@@ -613,7 +613,7 @@ def test_ghosts_of_positions_may_stand_farther_away(browser, arm_page):
         seen.page.evaluate("replay.seek(0)")
         turned = [relative_turn(seen, which) for which in ("ghosts[0]", "ghosts[1]")]
         np.testing.assert_allclose(turned, [0.01, 0.05], atol=1e-4)
-        seen.page.get_by_label("ghosts 10 × as far away").click()
+        seen.page.get_by_label("ghost distance × 10").click()
         seen.page.evaluate("replay.seek(0)")
         np.testing.assert_allclose(relative_turn(seen, "ghosts[0]"), 0.1, atol=1e-4)
 
