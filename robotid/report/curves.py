@@ -34,8 +34,9 @@ def curves_section(
     verdicts: Mapping[str, Mapping[str, Any]],
     worst: Sequence[str],
     charts: Callable[[RunT, int, str, int], str],
+    note: Callable[[int], str],
 ) -> str:
-    """Return a part for each joint; the worst joints that are not good are open.
+    """Return a part for each joint; the worst joint and the worst ones that are not good are open.
 
     Args:
         intro: Description of the charts, HTML.
@@ -45,13 +46,14 @@ def curves_section(
         worst: Joints that have errors, the worst first.
         charts: Returns the charts of a recording, given the number of a joint, the name that
             links the charts, and the number of points.
+        note: Returns the HTML above the charts of the joint with a number.
     """
     points = min(_LONGEST, max(200, _ROWS // (2 * len(rows) * max(1, len(runs)))))
     parts, first = [intro], [*worst][:_OPEN]
     for row, name in enumerate(rows):
         status = verdict_cell(name, verdicts[name]) if name in verdicts else ""
-        html = "".join(charts(run, row, link, points) for link, run in runs.items())
+        html = note(row) + "".join(charts(run, row, link, points) for link, run in runs.items())
         summary = f"<strong>{code(name).html}</strong> {escape(status)}"
-        is_open = status.startswith(("poor", "usable")) and name in first
+        is_open = name in first[:1] or (status.startswith(("poor", "usable")) and name in first)
         parts.append(folded(f"joint-{row}", summary, html, is_open=is_open))
     return "".join(parts)

@@ -49,13 +49,13 @@ def write_report(
     require_kind(origin, (Origin, type(None)), "origin", "an Origin")
     at = origin or Origin()
     if isinstance(identification, Identification):
-        shown = shown_torques(identification, at)
+        shown = shown_torques(identification, at, (files or {}).get("replay", ""))
     else:
-        shown = _of_loops(identification, at)
+        shown = _of_loops(identification, at, (files or {}).get("replay", ""))
     return write_text(page_of(shown, files or {}), target)
 
 
-def _of_loops(found: "LoopIdentification", at: Origin) -> Shown:
+def _of_loops(found: "LoopIdentification", at: Origin, replay: str) -> Shown:
     """Return the content of a report on a closed-loop identification; imported when needed."""
     from robotid.closed_loop.result import LoopIdentification
     from robotid.report.positions import shown_positions
@@ -63,5 +63,5 @@ def _of_loops(found: "LoopIdentification", at: Origin) -> Shown:
     require_kind(found, LoopIdentification, "identification", "a robotid.Identification")
     result = build_result(found, {"estimator": found.estimator.to_dict()})
     return shown_positions(
-        result, found.fitted, found.validation, at, (found.model, found.standard)
+        result, found.fitted, found.validation, at, (found.model, found.standard), replay
     )

@@ -1,7 +1,7 @@
 """The content of a report on a closed-loop identification, from its result.json and logs."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from robotid.report.curves import curves_section, drawn
 from robotid.report.errors import POSITION, Errors, worst_errors
 from robotid.report.shown import Shown
 from robotid.report.tables import input_table, parameter_section, version_table
+from robotid.report.worst_second import Residual, worst_html, worst_second
 from robotid.robot.model import RobotModel
 
 __all__ = ["shown_positions"]
@@ -53,6 +54,7 @@ def shown_positions(
     validation: Sequence[OpenLoop],
     origin: Origin,
     changed: tuple[RobotModel, Array] | None = None,
+    replay: str = "",
 ) -> Shown:
     """Return the content of a report on a result.
 
@@ -63,6 +65,7 @@ def shown_positions(
         origin: The folder of the result, for commands.
         changed: The robot of the URDF and its identified standard parameters, shape (p,), SI
             units; None if the URDF is not available.
+        replay: File of the replay in the report's folder; "" if there is none.
 
     Raises:
         DataError: If the joints of a log and of the result differ.
@@ -108,7 +111,7 @@ def shown_positions(
         steps=loop_steps(content, origin),
         made=f"<p>{escape(_method(content, names))}</p>\n",
         errors=(_DRIVEN_ERRORS if is_driven else _ERRORS, _horizons(content)),
-        curves=("Positions", _positions(content, fitted, validation, worst)),
+        curves=("Positions", _positions(content, fitted, validation, worst, replay)),
         why="",
         parameters=parameter_section(
             model, standard, entries, _DRIVEN if is_driven else _PARAMETERS
@@ -245,6 +248,7 @@ def _positions(
     fitted: Sequence[OpenLoop],
     validation: Sequence[OpenLoop],
     worst: Sequence[str],
+    replay: str,
 ) -> str:
     """Return charts of each joint in every log."""
     joints, count = content["joints"], len(validation)
@@ -271,8 +275,19 @@ def _positions(
         unit = units.get(joints[row], "rad")
         return _charts(*of, row, joints[row], unit, link=link, points=points)
 
+    def note(row: int) -> str:
+        unit = f"{POSITION.prefix}{units.get(joints[row], 'rad')}"
+        seconds = worst_second(_residuals(validation or fitted, row))
+        return worst_html(seconds, joints[row], unit, replay, POSITION.scale)
+
     verdicts = content["verdict"].get("per_joint", {})
-    return curves_section(intro, runs, joints, verdicts, worst, charts)
+    return curves_section(intro, runs, joints, verdicts, worst, charts, note)
+
+
+def _residuals(runs: Sequence[OpenLoop], j: int) -> Iterator[Residual]:
+    """Yield the position errors of a joint."""
+    for run in runs:
+        yield Residual(run.name, run.log.name, run.log.t, run.log.q[:, j] - run.q[:, j])
 
 
 def _charts(

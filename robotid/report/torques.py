@@ -1,8 +1,11 @@
 """The content of a report on an identification from torques."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from robotid.export.entries import input_entries
 from robotid.findings import listed
@@ -35,6 +38,7 @@ from robotid.report.tables import (
     version_table,
 )
 from robotid.report.why import why_section
+from robotid.report.worst_second import Residual, worst_html, worst_second
 from robotid.versions import versions
 
 __all__ = ["shown_torques", "torques_section"]
@@ -51,12 +55,13 @@ _PARAMETERS = (
 )
 
 
-def shown_torques(found: Identification, origin: Origin) -> Shown:
+def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Shown:
     """Return the content of a report on an identification.
 
     Args:
         found: The identification.
         origin: Its source and folder, for commands.
+        replay: File of the replay in the report's folder; "" if there is none.
     """
     count = len(found.fitted)
     fitted = Errors(
@@ -85,7 +90,8 @@ def shown_torques(found: Identification, origin: Origin) -> Shown:
         steps=next_steps(found, origin),
         made="".join(f"<p>{escape(text)}</p>\n" for text in (_method(found), _totals(found))),
         errors=(_ERRORS, ""),
-        curves=("Torques", torques_section(found, verdict["per_joint"], [*worst_errors(counted)])),
+        curves=("Torques", torques_section(found, verdict["per_joint"], [*worst_errors(counted)],
+                                           replay)),
         why=why_section(found),
         parameters=parameter_section(found.model, found.standard if found.has_urdf else None,
                                      entries, _PARAMETERS, found.on_misfit),
@@ -168,7 +174,10 @@ def _chain(signals: SignalSettings) -> str:
 
 
 def torques_section(
-    found: Identification, verdicts: Mapping[str, Mapping[str, Any]], worst: Sequence[str]
+    found: Identification,
+    verdicts: Mapping[str, Mapping[str, Any]],
+    worst: Sequence[str],
+    replay: str = "",
 ) -> str:
     """Return charts of torques and residuals over time.
 
@@ -176,6 +185,7 @@ def torques_section(
         found: The identification.
         verdicts: The verdict on each joint, as in result.json.
         worst: Joints that have errors, the worst first.
+        replay: File of the replay in the page's folder; "" if there is none.
     """
     evaluations, rows = found.validation or found.fitted, found.model.row_names
     shown = drawn(evaluations, rows)
@@ -184,8 +194,21 @@ def torques_section(
     def charts(run: tuple[Evaluation, TorqueBand], row: int, link: str, points: int) -> str:
         return _charts(found, *run, row, link=link, points=points)
 
+    def note(row: int) -> str:
+        name, unit = rows[row], found.model.row_units[row]
+        seconds = None if found.model.is_static else worst_second(_residuals(evaluations, row))
+        return worst_html(seconds, name, unit, replay)
+
     intro = _intro(found, shown, evaluations[len(shown) :])
-    return curves_section(intro, runs, rows, verdicts, worst, charts)
+    return curves_section(intro, runs, rows, verdicts, worst, charts, note)
+
+
+def _residuals(evaluations: Sequence[Evaluation], row: int) -> Iterator[Residual]:
+    """Yield the residuals of a joint, of the samples used."""
+    for e in evaluations:
+        motion, used = e.recording.trajectory, e.recording.mask[:, row].astype(bool)
+        left = np.where(used, motion.tau[:, row] - e.torques["estimate"][:, row], np.nan)
+        yield Residual(e.recording.name, Path(e.recording.log.path).name, motion.t, left)
 
 
 def _intro(found: Identification, shown: Sequence[Evaluation], left: Sequence[Evaluation]) -> str:

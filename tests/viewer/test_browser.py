@@ -415,6 +415,14 @@ def test_the_address_keeps_time_joint_and_camera(browser, still, ur5):
         assert seen.page.evaluate("replay.clock.time") == pytest.approx(9.25)
         assert seen.page.evaluate("replay.picked") == ur5.joints[2]
         assert seen.page.evaluate(camera) == pytest.approx(place, rel=1e-4)
+        # a link of a report to the open replay, and one to another recording
+        seen.page.evaluate(f"location.hash = 't=8.125&joint={ur5.joints[4]}'")
+        until(seen, "replay.clock.time === 8.125")
+        assert seen.page.evaluate("replay.picked") == ur5.joints[4]
+        assert seen.page.locator("#state").inner_text() == ""
+        seen.page.evaluate("location.hash = 't=8.5&log=other.csv'")
+        until(seen, "replay.clock.time === 8.5")
+        assert "to other.csv; this replay shows another" in seen.page.inner_text("#state")
         assert seen.errors == []
 
 

@@ -109,7 +109,6 @@ function tick(now) {
 
 // ---- the address stores time, joint and camera -------------------------------------------------
 
-const stored = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
 const hasAddress = location.protocol !== "about:"; // the frame of a notebook has none
 let isRestored = false;
 
@@ -124,7 +123,10 @@ function keep() {
   history.replaceState(null, "", `#${new URLSearchParams(state)}`);
 }
 
-function restore() {
+function restore() { // at the start, and when a link of another page changes the address
+  const stored = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
+  const isOther = stored.log && !data.notes.some((note) => note.includes(stored.log));
+  byId("state").textContent = isOther ? `The link is to ${stored.log}; this replay shows another recording.` : "";
   if (stored.t !== undefined && Number.isFinite(Number(stored.t))) { pause(); seek(Number(stored.t)); }
   const place = (stored.camera || "").split(" ").map(Number);
   if (viewer && place.length === 6 && place.every(Number.isFinite)) {
@@ -137,3 +139,4 @@ function restore() {
   if (stored.joint) pick(nodeOf(stored.joint));
   isRestored = true;
 }
+window.addEventListener("hashchange", restore);
