@@ -7,6 +7,7 @@ const CLOSER = 0.5; // zoom factor of a key
 const HINT = "Arrow keys move the cursor, plus and minus zoom, Escape shows all, digits hide lines.";
 const STEPS = Array.from({ length: 24 }, (_, k) => [1, 2, 5].map((x) => x * 10 ** (k - 12))).flat();
 const all = [];
+const idle = window.requestIdleCallback || ((act) => setTimeout(act, 30));
 
 function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);
@@ -28,7 +29,10 @@ function tone(name) {
 
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   tones.clear();
-  for (const chart of all) if (chart.plot) chart.plot.redraw(false);
+  for (const chart of all) {
+    const redraw = () => chart.plot && chart.plot.redraw(false);
+    if (chart.link.seen.has(chart)) redraw(); else idle(redraw);
+  }
 });
 
 function words(x, digits = 4) {
@@ -300,6 +304,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.cursor = element("div", { class: "line", hidden: "" });
     this.plot.over.append(this.cursor);
     this.listen(this.plot.over);
+    this.live.classList.remove("waiting");
   }
 
   paint(u) { // what is under the lines
@@ -494,9 +499,20 @@ for (const figure of document.querySelectorAll("figure.chart")) {
     series.y = unpack(series.y);
     series.half = series.half && unpack(series.half);
   }
-  figure.classList.add("drawn");
-  new Chart(figure, what);
+  const { live } = new Chart(figure, what), picture = figure.querySelector("svg");
+  live.classList.add("waiting");
+  if (picture) live.append(picture); // on screen until the chart is drawn, and in print
 }
+
+// charts out of sight are drawn when the browser is idle, one at a time; folded ones wait
+function drawNext() {
+  const next = all.find((chart) => !chart.plot && !chart.live.closest("details:not([open])"));
+  if (!next) return;
+  next.draw();
+  idle(drawNext);
+}
+idle(drawNext);
+document.addEventListener("toggle", () => idle(drawNext), true);
 
 return { link, Chart, all };
 })();
