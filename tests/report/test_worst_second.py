@@ -23,7 +23,8 @@ def burst(start, size, length=1.0, noise=0.1):
 
 
 def test_the_window_is_where_the_burst_is():
-    worst = worst_second([residual(burst(103.5, 2.0)), residual(burst(107.0, 1.0), name="b.csv")])
+    others = [residual(burst(107.0, 1.0, noise=x), name="b.csv") for x in (0.1, 1e-3)]
+    worst = worst_second([others[0], residual(burst(103.5, 2.0)), others[1]])
     assert (worst.of.file, worst.start, worst.end) == ("a.csv", pytest.approx(103.5), 104.5)
     assert worst.rms == pytest.approx(2.0)
     whole = np.sqrt(0.1 * 2.0**2 + 0.9 * 0.1**2)

@@ -525,6 +525,7 @@ def test_a_phone_shows_everything_without_scrolling_sideways(still):
 
 def test_every_control_has_a_name(still):
     seen = still
+    seen.page.evaluate("document.querySelector('details').open = true")
     named = seen.page.evaluate(
         "[...document.querySelectorAll('button:not([hidden]), input, select')].map(e => "
         "(e.labels && e.labels.length && e.labels[0].innerText.trim()) || "
