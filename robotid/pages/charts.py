@@ -260,8 +260,8 @@ class _Axis:
     @property
     def step(self) -> float:
         """Distance of the ticks: 1, 2 or 5 times a power of ten."""
-        apart = 22.0 if self.stop < self.start else 80.0  # [px] at least
-        least = (self.high - self.low) * apart / abs(self.stop - self.start)
+        distance = 22.0 if self.stop < self.start else 80.0  # [px] at least
+        least = (self.high - self.low) * distance / abs(self.stop - self.start)
         power = 10.0 ** np.floor(np.log10(least))
         return float(power * next(s for s in (1, 2, 5, 10) if s * power >= least))
 
@@ -349,9 +349,9 @@ def _frame(chart: Chart, across: _Axis, up: _Axis) -> str:
     slant = _slant(chart.x_names)
     for v, word in zip(columns, chart.x_names or across.words, strict=True):
         place = f"{across(v):.1f} {bottom + 14:.0f}"
-        turned = f'transform="translate({place}) rotate(-30)" text-anchor="end"'
+        slanted = f'transform="translate({place}) rotate(-30)" text-anchor="end"'
         upright = f'transform="translate({place})" text-anchor="middle"'
-        parts.append(f"<text {turned if slant else upright}>{escape(word)}</text>")
+        parts.append(f"<text {slanted if slant else upright}>{escape(word)}</text>")
     dotted = "".join(f"M{across(v):.1f} {_TOP}V{bottom}" for v in chart.marks)
     if dotted:
         parts.append(f'<path d="{dotted}" stroke="currentColor" stroke-dasharray="1 3"/>')

@@ -288,8 +288,8 @@ def _terms(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     """Return the step that adds missing drive terms to the model."""
     codes = {cause.code for cause in causes}
     entries: dict[str, list[str | DriveTerm]] = {}
-    for joint, turned in _balanced(causes):
-        entries[joint] = [spring_family(turned, COUNTERBALANCE)]
+    for joint, rotation in _balanced(causes):
+        entries[joint] = [spring_family(rotation, COUNTERBALANCE)]
     couplings: dict[frozenset[str], str] = {}
     for misfit in found.misfits:
         term = misfit.term

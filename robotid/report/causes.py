@@ -17,13 +17,13 @@ def findings_line(findings: Sequence[Finding], joints: Sequence[str], worst: str
         joints: Names of the robot's joints.
         worst: The joint with the largest error; "" if there is none.
     """
-    grave = [finding for finding in findings if finding.severity != "note"]
-    notes = len(findings) - len(grave)
+    serious = [finding for finding in findings if finding.severity != "note"]
+    notes = len(findings) - len(serious)
     of_notes = [_count(notes, "note")] if notes else []
-    if not grave:
+    if not serious:
         return ", ".join(of_notes) or "none"
-    causes = grouped(grave, joints)
-    counts = f"{_count(len(grave), 'finding')}, {_count(len(causes), 'cause')}"
+    causes = grouped(serious, joints)
+    counts = f"{_count(len(serious), 'finding')}, {_count(len(causes), 'cause')}"
     return "; ".join([counts, *([f"worst: {escape(worst)}"] if worst else []), *of_notes])
 
 
@@ -62,7 +62,7 @@ def _by_joint(shown: Sequence[str], causes: Sequence[Cause]) -> str:
     for joint in shown:
         mine = [cause for cause in causes if joint in cause.joints]
         if mine:
-            grave, notes = (
+            serious, notes = (
                 ", ".join(
                     f'<a href="#cause-{escape(cause.code)}">{escape(cause.code)}</a>'
                     for cause in mine
@@ -70,7 +70,7 @@ def _by_joint(shown: Sequence[str], causes: Sequence[Cause]) -> str:
                 )
                 for is_note in (False, True)
             )
-            rows.append([code(joint), Cell(grave or "–"), Cell(notes or "–")])
+            rows.append([code(joint), Cell(serious or "–"), Cell(notes or "–")])
     if not rows:
         return ""
     return table(

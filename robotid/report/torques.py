@@ -221,12 +221,12 @@ def _intro(found: Identification, shown: Sequence[Evaluation], left: Sequence[Ev
     ]
     if not found.validation:
         parts.append("<p>There is no validation log. The charts show the fitted logs.</p>\n")
-    for evaluation in shown:
-        if evaluation.recording.is_partial:
-            seen, whole = len(evaluation.recording.trajectory.t), evaluation.recording.extent.smooth
+    for recording in (evaluation.recording for evaluation in shown):
+        if recording.is_partial:
+            count, whole = len(recording.trajectory.t), recording.extent.smooth
             parts.append(
-                f"<p>{escape(evaluation.recording.name)} is long: {seen} of its {whole} samples "
-                "are drawn, from its start, middle and end. Errors are computed from all.</p>\n"
+                f"<p>{escape(recording.name)} is long: {count} of its {whole} samples are drawn, "
+                "from its start, middle and end. Errors are computed from all.</p>\n"
             )
     if left:
         names = ", ".join(evaluation.recording.name for evaluation in left)

@@ -288,9 +288,9 @@ def _check(t: Array, q: Array, rate: float) -> None:
         raise DataError(f"the motion has {len(t)} samples, wanted at least 2 to play")
     if not (np.isfinite(t).all() and np.isfinite(q).all()):
         raise DataError("t or q has values that are not finite; exclude those samples")
-    late = np.flatnonzero(np.diff(t) <= 0)
-    if len(late):
-        k = int(late[0])
+    reversed_rows = np.flatnonzero(np.diff(t) <= 0)
+    if len(reversed_rows):
+        k = int(reversed_rows[0])
         raise DataError(
             f"t must increase, but t[{k + 1}] = {t[k + 1]:.6g} s follows t[{k}] = {t[k]:.6g} s"
         )

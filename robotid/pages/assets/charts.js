@@ -192,8 +192,8 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       const y = this.ys[i], half = this.halves[i];
       const low = new Float64Array(size), high = new Float64Array(size);
       for (let k = 0; k < size; k += 1) {
-        const reach = half && Number.isFinite(half[k]) ? half[k] : 0;
-        [low[k], high[k]] = [y[k] - reach, y[k] + reach];
+        const margin = half && Number.isFinite(half[k]) ? half[k] : 0;
+        [low[k], high[k]] = [y[k] - margin, y[k] + margin];
         if (kind === "bars") [low[k], high[k]] = [Math.min(0, low[k]), Math.max(0, high[k])];
         if (kind === "area") {
           [low[k], high[k]] = [down[k] + Math.min(0, y[k] || 0), up[k] + Math.max(0, y[k] || 0)];
