@@ -78,7 +78,9 @@ def rewrite_report(
         model = job.model()
         pi, bodies = model.standard_parameters(), slice(model.layout.n_inertial)
         pi[bodies] = loaded.parameters[bodies]
-        shown = shown_positions(content, fitted, validation, origin, (model, pi))
+        shown = shown_positions(
+            content, fitted, validation, origin, (model, pi), files.get("replay", "")
+        )
         write_text(page_of(shown, files), goal)
     else:
         write_report(found, goal, files=files, origin=origin)

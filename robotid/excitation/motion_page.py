@@ -77,7 +77,8 @@ def write_motion_page(
     best = [entry[1] for entry in content["history"]]
     if best and max(best) - min(best) > _VISIBLE:
         sections["design"] = Section("How it was found", _history(content))
-    return write_text(page(f"{model.name}: motion", _head(model, content), sections), target)
+    title = f"{model.name}: excitation trajectory"
+    return write_text(page(title, _head(model, content), sections), target)
 
 
 def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
@@ -99,7 +100,7 @@ def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
     }
     said = facts_html({name: escape(value) for name, value in facts.items()})
     return (
-        f"<h1>{escape(model.name)}: a motion to record</h1>\n{said}"
+        f"<h1>{escape(model.name)}: excitation trajectory</h1>\n{said}"
         "<p>Torques depend on the URDF's masses and on assumed friction. Play the motion slowly "
         f'first.</p>\n<p class="note">Written by robotid {__version__}.</p>\n'
     )

@@ -1,4 +1,4 @@
-"""Charts of the pages: data and a still picture in HTML, which charts.js makes explorable."""
+"""Charts of the pages: data and a static picture in HTML, which charts.js makes interactive."""
 
 import base64
 import json
@@ -17,12 +17,12 @@ __all__ = ["Chart", "Series", "broken", "chart_html", "thin"]
 
 _KINDS = ("line", "dots", "bars", "area")
 _POINTS = 2000  # rows of a chart's data
-_STILL = 200  # points of a line in the still picture
-_WIDTH = 640  # [px] of the still picture
+_STILL = 200  # points of a line in the static picture
+_WIDTH = 640  # [px] of the static picture
 _LEFT, _RIGHT, _TOP, _BOTTOM = 54, 10, 20, 34  # [px] around its axes
-_THIN = 0.05  # [px] what covers no more is not drawn
+_THIN = 0.05  # [px] narrower areas are not drawn
 _LINE = 14  # [px] of a row of labels
-_LETTER = 6.2  # [px] about the width of one
+_LETTER = 6.2  # [px] about the width of a letter
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +33,11 @@ class Series:
         label: Its name in the legend.
         y: Values, shape (N,), NaN where the line breaks.
         tone: Its colour: a variable of tones.css without its dashes, as "predicted" or "tone-1".
-        kind: "line", "dots", "bars", which stand side by side, or "area"; the areas of a chart
-            are stacked, what is positive upwards and what is negative downwards.
+        kind: "line", "dots", "bars", which are side by side, or "area"; the areas of a chart
+            are stacked, positive values upwards and negative values downwards.
         half: Half width of a band about a line, of error bars about dots and bars, shape (N,).
-        is_weak: Whether it stands back behind the others.
-        is_hidden: Whether it is seen only when its key in the legend is pressed.
+        is_weak: Whether it is drawn faintly.
+        is_hidden: Whether it is hidden until its key in the legend is pressed.
     """
 
     label: str
@@ -54,20 +54,20 @@ class Chart:
     """A chart: series over a common x.
 
     Attributes:
-        title: What it shows in words, for those who cannot see it.
-        x: Shape (N,); the log's own time where it is time. Rows are drawn in its order.
-        series: What is drawn, the last on top.
+        title: Its description, for screen readers.
+        x: Shape (N,); the log's own time where it is time. Points are drawn in its order.
+        series: The series, the last one on top.
         x_label: Its name and unit, as "time [s]".
         y_label: Name and unit of the values, as "torque [N m]".
         link: Charts of one link share the cursor and the zoom along x.
-        spans: Segments of x with a shaded ground, as rows that are not used.
-        marks: Where dotted lines stand on x.
-        logarithmic: Which axes are: "", "x", "y" or "xy".
-        height: Of the plot [px].
+        spans: Segments of x with a shaded background, as samples that are not used.
+        marks: Positions of dotted lines on x.
+        logarithmic: The logarithmic axes: "", "x", "y" or "xy".
+        height: Height of the plot [px].
         x_names: Names at x = 0, 1, ... in place of numbers, if any.
 
     Raises:
-        DataError: If a series has not as many values as x, or is of no known kind.
+        DataError: If the lengths of a series and of x differ, or the kind of a series is unknown.
     """
 
     title: str
@@ -98,16 +98,16 @@ class Chart:
 
 
 def chart_html(chart: Chart, caption: str, *, points: int = _POINTS, still: int = _STILL) -> str:
-    """Return a chart as a figure of a page that ``pages.html`` makes.
+    """Return a chart as a figure of a page of ``pages.html``.
 
-    It holds a still picture, for print and where no script runs, and the data that charts.js
-    draws: numbers of 16 bits, so they are exact to 1/65,000 of their range.
+    It contains a static picture, for print and without scripts, and the data that charts.js
+    draws: numbers of 16 bits, exact to 1/65,000 of their range.
 
     Args:
         chart: The chart.
         caption: HTML of the caption; none if empty.
-        points: About how many rows of data go into the page; extremes and breaks are kept.
-        still: About how many of them the still picture shows.
+        points: Approximate number of points in the page; extremes and breaks are retained.
+        still: Approximate number of points in the static picture.
     """
     order = np.argsort(chart.x, kind="stable")
     x = np.asarray(chart.x, dtype=float)[order]
@@ -148,14 +148,14 @@ def chart_html(chart: Chart, caption: str, *, points: int = _POINTS, still: int 
 
 
 def thin(y: Array, points: int) -> NDArray[np.int_]:
-    """Return the rows of a line that are enough to draw it: its extremes and its breaks.
+    """Return the points of a line that are sufficient to draw it: its extremes and its breaks.
 
     Args:
         y: Values, shape (N,), NaN where the line breaks.
-        points: About how many rows to keep.
+        points: Approximate number of points to retain.
 
     Returns:
-        The rows, in order: all where there are no more than asked for.
+        Indices of the points, in order: all if there are no more than ``points``.
     """
     count = len(y)
     if count <= points:
@@ -178,7 +178,7 @@ def broken(segment: Array, x: Array, *lines: Array) -> tuple[Array, ...]:
     """Return x and lines with a row of NaN between the segments of a recording.
 
     Args:
-        segment: Number of the uninterrupted segment of each row, shape (N,).
+        segment: Number of the uninterrupted segment of each sample, shape (N,).
         x: Times, shape (N,).
         *lines: Values over it, shape (N,) each.
     """
@@ -192,7 +192,7 @@ def _sorted(values: Array | None, order: NDArray[np.int_]) -> Any:  # noqa: ANN4
 
 
 def _union(lines: Sequence[Array], points: int, count: int) -> NDArray[np.int_]:
-    """Return rows that are enough for every line."""
+    """Return points that are sufficient for every line."""
     if count <= points:
         return np.arange(count)
     share = max(points // len(lines), 8)
@@ -200,7 +200,7 @@ def _union(lines: Sequence[Array], points: int, count: int) -> NDArray[np.int_]:
 
 
 def _packed(values: Array, *, is_log: bool = False, bits: int = 16) -> dict[str, Any]:
-    """Return numbers as base64: steps from low to high, the last code for what is none."""
+    """Return numbers as base64: steps from low to high, the last code for NaN."""
     code, last = np.dtype(f"<u{bits // 8}"), 2**bits - 1
     if is_log:
         values = np.log10(np.where(values > 0, values, np.nan))
@@ -224,7 +224,7 @@ def _extent(arrays: Sequence[Array], margin: float) -> tuple[float, float]:
     return low - beyond, high + beyond
 
 
-# ---- the still picture -----------------------------------------------------------------------
+# ---- the static picture ---------------------------------------------------------------------
 
 _Drawn = tuple[Series, Array, Array | None]  # a series, its sorted values and half widths
 
@@ -260,14 +260,14 @@ class _Axis:
     @property
     def step(self) -> float:
         """Distance of the ticks: 1, 2 or 5 times a power of ten."""
-        apart = 22.0 if self.stop < self.start else 80.0  # [px] at least
-        least = (self.high - self.low) * apart / abs(self.stop - self.start)
+        distance = 22.0 if self.stop < self.start else 80.0  # [px] at least
+        least = (self.high - self.low) * distance / abs(self.stop - self.start)
         power = 10.0 ** np.floor(np.log10(least))
         return float(power * next(s for s in (1, 2, 5, 10) if s * power >= least))
 
     @property
     def words(self) -> list[str]:
-        """The numbers at the ticks, with as many digits as tell them apart."""
+        """The numbers at the ticks, with as many digits as their step needs."""
         digits = 0 if self.is_log else max(0, -int(np.floor(np.log10(self.step) + 1e-9)))
         written = [f"{v:.6g}" if self.is_log else f"{v + 0.0:.{digits}f}" for v in self.ticks]
         return [word.replace("-", "−") for word in written]
@@ -277,16 +277,16 @@ _Cover = list[tuple[Array, Array]]  # lower and upper edges of what a series cov
 
 
 def _slant(names: Sequence[str]) -> int:
-    """Return how much room [px] names at ticks need below that stand too close to be upright."""
+    """Return the height [px] of slanted names below the axis; 0 if they fit horizontally."""
     room = (_WIDTH - _LEFT - _RIGHT) / max(len(names), 1)
     longest = _LETTER * max(map(len, names), default=0)
     return round(0.5 * longest) if longest > room else 0
 
 
 def _covers(series: Sequence[_Drawn]) -> list[_Cover]:
-    """Return what each series covers; an area covers what is positive and what is negative."""
+    """Return the covered ranges of each series; an area has a positive and a negative one."""
     covers: list[_Cover] = []
-    up = down = np.zeros(0)  # where the areas that come next begin
+    up = down = np.zeros(0)  # edges of the areas so far
     for s, y, half in series:
         if s.kind == "area":
             up, down = (up, down) if len(up) else (np.zeros(len(y)), np.zeros(len(y)))
@@ -294,9 +294,9 @@ def _covers(series: Sequence[_Drawn]) -> list[_Cover]:
             covers.append([(up, higher), (lower, down)])
             up, down = higher, lower
         else:
-            reach = 0.0 if half is None else np.where(np.isfinite(half), half, 0.0)
+            margin = 0.0 if half is None else np.where(np.isfinite(half), half, 0.0)
             zero = 0.0 if s.kind == "bars" else np.nan
-            covers.append([(np.fmin(y - reach, zero), np.fmax(y + reach, zero))])
+            covers.append([(np.fmin(y - margin, zero), np.fmax(y + margin, zero))])
     return covers
 
 
@@ -349,9 +349,9 @@ def _frame(chart: Chart, across: _Axis, up: _Axis) -> str:
     slant = _slant(chart.x_names)
     for v, word in zip(columns, chart.x_names or across.words, strict=True):
         place = f"{across(v):.1f} {bottom + 14:.0f}"
-        turned = f'transform="translate({place}) rotate(-30)" text-anchor="end"'
+        slanted = f'transform="translate({place}) rotate(-30)" text-anchor="end"'
         upright = f'transform="translate({place})" text-anchor="middle"'
-        parts.append(f"<text {turned if slant else upright}>{escape(word)}</text>")
+        parts.append(f"<text {slanted if slant else upright}>{escape(word)}</text>")
     dotted = "".join(f"M{across(v):.1f} {_TOP}V{bottom}" for v in chart.marks)
     if dotted:
         parts.append(f'<path d="{dotted}" stroke="currentColor" stroke-dasharray="1 3"/>')
@@ -364,9 +364,9 @@ def _frame(chart: Chart, across: _Axis, up: _Axis) -> str:
 
 
 def _legend(chart: Chart, height: float) -> tuple[str, float]:
-    """Return the name of the values with the label of each series, and the height with them.
+    """Return the name of the values with the label of each series, and the total height.
 
-    Labels that find no place above the axes stand below the picture.
+    Labels that do not fit above the axes are below the picture.
     """
     parts = [f'<text x="4" y="12">{escape(chart.y_label)}</text>']
     place, down = 4 + _LETTER * (len(chart.y_label) + 3), 12.0
@@ -434,7 +434,7 @@ def _drawn(
 def _band(
     x: Array, y: Array, cover: _Cover, across: _Axis, up: _Axis, style: str, points: int
 ) -> str:
-    """Return what lies between edges, as a path."""
+    """Return the area between edges, as a path."""
     breaks = np.flatnonzero(np.diff(np.isfinite(y)))
     step = max(1, len(x) // points)
     every = np.arange(0, len(x), step)
@@ -444,7 +444,7 @@ def _band(
     for low, high in cover:
         lower, upper = up(low[rows]), up(high[rows])
         is_wide = np.abs(upper - lower) > _THIN
-        is_seen = is_wide.copy()  # ... and what is beside what is wide
+        is_seen = is_wide.copy()  # ... and the points beside wide ones
         is_seen[:-1] |= is_wide[1:]
         is_seen[1:] |= is_wide[:-1]
         path += "".join(

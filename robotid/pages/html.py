@@ -1,4 +1,4 @@
-"""HTML of the pages: scaffold, style, sections, tables. Everything inline, nothing fetched."""
+"""HTML of the pages: scaffold, style, sections, tables. All parts are inline."""
 
 import base64
 import hashlib
@@ -31,14 +31,14 @@ __all__ = [
 ]
 
 _ASSETS = Path(__file__).parent / "assets"
-_FIRST = 3  # reasons of a verdict that are seen at once
-#: What in a page asks for which script.
+_FIRST = 3  # reasons of a verdict that are visible without unfolding
+#: Scripts, and the pattern of pages that need them.
 _SCRIPTS = {"page.js": '<details|<table class="data"', "tables.js": '<table class="data"'}
 
 
 @cache
 def asset(name: str) -> str:
-    """Return the text of a file that pages are made of.
+    """Return the text of an asset file.
 
     Args:
         name: Its name in the folder of assets.
@@ -50,9 +50,9 @@ def asset(name: str) -> str:
 class Cell:
     """One cell of a table."""
 
-    html: str  # already escaped
-    kind: str = ""  # of its style: "" for prose, "text" for short words, "number", "code", "flag"
-    value: float | None = None  # the number that it shows, in full
+    html: str  # escaped
+    kind: str = ""  # style: "" for prose, "text" for short texts, "number", "code", "flag"
+    value: float | None = None  # the number in full precision
 
 
 class Section(NamedTuple):
@@ -60,14 +60,14 @@ class Section(NamedTuple):
 
     Attributes:
         title: Its heading, HTML.
-        html: What it holds.
-        said: What it holds in a few words, HTML, if it is folded.
-        is_open: Whether it is open at first; None if it cannot be folded.
+        html: Its content.
+        summary: Summary of its content, HTML, if it is folded.
+        is_open: Whether it is open initially; None if it cannot be folded.
     """
 
     title: str
     html: str
-    said: str = ""
+    summary: str = ""
     is_open: bool | None = None
 
 
@@ -75,8 +75,8 @@ def text(value: str, *, flag: bool = False) -> Cell:
     """Return a cell of text.
 
     Args:
-        value: The text, not escaped yet; one of a few words is kept on one line.
-        flag: Whether it is shown as a fault.
+        value: The text, not escaped; a short one stays on one line.
+        flag: Whether it is marked as a fault.
     """
     return Cell(escape(value), "flag" if flag else "text" if len(value) < 24 else "")
 
@@ -85,9 +85,9 @@ def code(value: str) -> Cell:
     """Return a cell for names, hashes and formulas.
 
     Args:
-        value: The text, not escaped yet.
+        value: The text, not escaped.
     """
-    # long names and formulas may break behind a dot, an underscore or a slash, not elsewhere
+    # long names and formulas may break after a dot, an underscore or a slash only
     html = escape(value)
     for mark in (".", "_", "/"):
         html = html.replace(mark, f"{mark}<wbr>")
@@ -98,8 +98,8 @@ def number(value: float | None, spec: str = ".4g") -> Cell:
     """Return a cell for a number.
 
     Args:
-        value: The number; None and non-finite ones are shown as a dash.
-        spec: How it is written.
+        value: The number; None and non-finite values are shown as a dash.
+        spec: Its format.
     """
     if value is None or not math.isfinite(value):
         return Cell("–", "number")
@@ -110,7 +110,7 @@ def percent(value: float | None) -> Cell:
     """Return a cell for a percentage.
 
     Args:
-        value: The percentage; None and non-finite ones are shown as a dash.
+        value: The percentage; None and non-finite values are shown as a dash.
     """
     if value is not None and value >= 1000:
         return number(value, ".0f")
@@ -118,16 +118,18 @@ def percent(value: float | None) -> Cell:
 
 
 def with_error(value: float, error: float, *, sign: str = "") -> tuple[Cell, Cell]:
-    """Return cells for a number and its error: two digits of it, and the number to its last one.
+    """Return cells for a number and its error, the error with two digits, both to the same place.
 
     Args:
         value: The number.
-        error: Its error; one that is not finite is a dash.
-        sign: "+" to write the number with its sign in any case.
+        error: Its error; a non-finite one is shown as a dash.
+        sign: "+" to write positive numbers with their sign.
     """
     if not (math.isfinite(error) and error > 0 and math.isfinite(value)):
         return number(value, f"{sign}.4g"), number(None)
-    exponent = math.floor(math.log10(float(f"{error:.1e}")))  # of its first digit, rounded
+    exponent = math.floor(
+        math.log10(float(f"{error:.1e}"))
+    )  # of the first digit of the rounded error
     size = math.floor(math.log10(abs(value))) if value else exponent
     if max(size, exponent) < -3 or exponent > 4:
         digits = max(size - exponent + 1, 0)
@@ -144,14 +146,14 @@ def table(
     *,
     is_data: bool = False,
 ) -> str:
-    """Return the HTML of a table in a box of its own, which scrolls where the page is narrow.
+    """Return the HTML of a table in a box that scrolls on narrow pages.
 
     Args:
-        caption: What it shows.
+        caption: Its caption.
         headers: Heads of the columns.
         rows: Cells; the first of each row is its head.
-        foot: Cells of a last row that sums up, if any.
-        is_data: Whether its rows can be sorted, filtered and taken away, by tables.js.
+        foot: Cells of a last row with totals, if any.
+        is_data: Whether tables.js can sort, filter and export its rows.
     """
     first = rows[0] if rows else [Cell("")] * len(headers)
     kinds = ["number" if cell.kind == "number" else "text" for cell in first]
@@ -170,37 +172,37 @@ def table(
 
 
 def figure(caption: str, svg: str, *, single: bool = False) -> str:
-    """Return the HTML of a figure, which scrolls where the page is narrow, by keys too.
+    """Return the HTML of a figure, which scrolls on narrow pages, also by keyboard.
 
     Args:
-        caption: What it shows, HTML.
+        caption: Its caption, HTML.
         svg: The ``<svg>`` element.
-        single: Whether it stands alone and is kept from filling the page.
+        single: Whether its width is limited, as of a figure alone in its row.
     """
     kind = ' class="single"' if single else ""
     return f'<figure{kind} tabindex="0"><figcaption>{caption}</figcaption>{svg}</figure>\n'
 
 
 def folded(key: str, summary: str, html: str, *, is_open: bool = False) -> str:
-    """Return the HTML of what opens at a click or a key, and is open in print.
+    """Return the HTML of foldable content, which is open in print.
 
     Args:
-        key: Its id, which links open it by.
-        summary: What is seen when it is closed, HTML.
-        html: What it holds.
-        is_open: Whether it is open at first.
+        key: Its id; links to it open it.
+        summary: Its visible summary, HTML.
+        html: Its content.
+        is_open: Whether it is open initially.
     """
     opened = " open" if is_open else ""
     return f'<details id="{key}"{opened}><summary>{summary}</summary>\n{html}</details>\n'
 
 
 def verdict_html(robot: str, status: str, reasons: Sequence[str]) -> str:
-    """Return the heading of a result: its robot and its verdict, with the first reasons in sight.
+    """Return the heading of a result: robot, verdict and the first reasons.
 
     Args:
-        robot: Name of the robot, not escaped yet.
-        status: The verdict in a word or two.
-        reasons: Its reasons, not escaped yet, the gravest first.
+        robot: Name of the robot, not escaped.
+        status: The verdict.
+        reasons: Its reasons, not escaped, the most severe first.
     """
     items = [f"<li>{escape(reason)}</li>" for reason in reasons]
     more = "".join(items[_FIRST:])
@@ -216,44 +218,44 @@ def verdict_html(robot: str, status: str, reasons: Sequence[str]) -> str:
 
 
 def facts_html(facts: Mapping[str, str], files: Mapping[str, str] | None = None) -> str:
-    """Return the HTML of figures beside their names.
+    """Return the HTML of figures with their names.
 
     Args:
-        facts: What is said by its name, both HTML.
-        files: Files to link to, by what they are; they come last.
+        facts: Figures by their names, both HTML.
+        files: Files to link to, by their kind; they come last.
     """
     links = ", ".join(
         f'<a href="{escape(path)}">{escape("URDF" if kind == "urdf" else kind)}</a>'
         for kind, path in (files or {}).items()
     )
-    said = {**facts, "Files": links} if links else facts
-    cells = "".join(f"<div><dt>{name}</dt><dd>{html}</dd></div>" for name, html in said.items())
+    shown = {**facts, "Files": links} if links else facts
+    cells = "".join(f"<div><dt>{name}</dt><dd>{html}</dd></div>" for name, html in shown.items())
     return f'<dl class="facts">{cells}</dl>\n'
 
 
 def steps_html(steps: Iterable[tuple[str, Sequence[str]]]) -> str:
-    """Return the HTML of what to do next; nothing if there is nothing.
+    """Return the HTML of the next steps; nothing if there are none.
 
     Args:
-        steps: What is done, in words, and the commands or lines to copy, none of it escaped yet.
+        steps: Each action, and its commands or lines to copy, not escaped.
     """
     items = "".join(
-        f"<li><p>{escape(words)}</p>"
+        f"<li><p>{escape(action)}</p>"
         + "".join(
             f'<div class="copy"><pre class="command">{escape(block)}</pre></div>'
             for block in blocks
         )
         + "</li>\n"
-        for words, blocks in steps
+        for action, blocks in steps
     )
     return f'<h2 id="next">Do next</h2>\n<ol class="next">{items}</ol>\n' if items else ""
 
 
 def page(title: str, header: str, sections: Mapping[str, Section | tuple[str, str]]) -> str:
-    """Return the HTML of a page to read: links to its sections, its header, the sections.
+    """Return the HTML of a page: links to its sections, its header, the sections.
 
     Args:
-        title: Title of the window, not escaped yet.
+        title: Title of the window, not escaped.
         header: HTML of the header.
         sections: The sections by their ids, or title and HTML of each.
     """
@@ -277,25 +279,24 @@ def _section(key: str, section: Section) -> str:
     head = f'<h2 id="{key}">{section.title}</h2>'
     html = f"{head}\n{section.html}"
     if section.is_open is not None:
-        said = f"<span>{section.said}</span>" if section.said else ""
-        html = folded(f"{key}-fold", f"{head}{said}", section.html, is_open=section.is_open)
+        summary = f"<span>{section.summary}</span>" if section.summary else ""
+        html = folded(f"{key}-fold", f"{head}{summary}", section.html, is_open=section.is_open)
     return f'<section aria-labelledby="{key}">\n{html}</section>\n'
 
 
 def scaffold(
     title: str, head: str, body: str, *, policy: str = "", scripts: Sequence[str] = ()
 ) -> str:
-    """Return the HTML of a document, which fetches nothing that its policy does not allow.
+    """Return the HTML of a document, which loads only what its policy allows.
 
-    Where its body holds charts, it has the scripts that draw them; no script but these and those
-    that are named may run.
+    A body with charts gets the scripts that draw them. Only these and the named scripts may run.
 
     Args:
-        title: Title of the window, not escaped yet.
+        title: Title of the window, not escaped.
         head: HTML of the head: style, icon; ``/*tones*/`` in it becomes the pages' colours.
         body: HTML of the body.
-        policy: What the page may do beside having styles and charts, as a content security policy.
-        scripts: Names of assets that it runs.
+        policy: Additional permissions of the page, as a content security policy.
+        scripts: Names of the assets that it runs.
     """
     style, run = "", [asset(name) for name in scripts]
     if '<figure class="chart"' in body:
@@ -304,7 +305,7 @@ def scaffold(
     if run:
         policy += "; script-src " + " ".join(map(_allowed, run))
     inline = "".join(f"<script>{script}</script>\n" for script in run)
-    # the policy keeps the page offline whatever a name in it might hold
+    # with this policy the page stays offline, whatever names it contains
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta http-equiv="Content-Security-Policy" '
@@ -318,7 +319,7 @@ def scaffold(
 
 @cache
 def _allowed(script: str) -> str:
-    """Return what allows this one script in a content security policy."""
+    """Return the entry of a content security policy that allows this script."""
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     return f"'sha256-{digest}'"
 

@@ -1,4 +1,4 @@
-"""Charts that Python is given: a notebook shows them, and a page holds them."""
+"""Charts for Python and notebooks, which a page can contain."""
 
 from dataclasses import dataclass
 from html import escape
@@ -10,17 +10,17 @@ from robotid.pages.html import asset, scaffold
 
 __all__ = ["Plot"]
 
-_AROUND = 112  # [px] of caption, axis and legend around each chart
+_AROUND = 112  # [px] of caption, axis and legend of each chart
 _STYLE = "main { padding: .5rem 1rem; } h1 { font-size: 1.125rem; margin: 0 0 .5rem; }"
-_HIGHEST = 900  # [px] that a cell of a notebook gives
+_HIGHEST = 900  # [px] of a notebook cell
 
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """Charts below each other: drag to zoom, double click for all, values under the cursor.
+    """Charts one below the other: drag to zoom, double click for all, values under the cursor.
 
     Attributes:
-        title: What they show.
+        title: Their subject.
         charts: The charts, each with its caption.
     """
 
@@ -28,7 +28,7 @@ class Plot:
     charts: tuple[tuple[Chart, str], ...]
 
     def __repr__(self) -> str:
-        return f"<Plot of {self.title}; .write('plot.html') keeps it>"
+        return f"<Plot of {self.title}; .write('plot.html') saves it>"
 
     def _repr_html_(self) -> str:
         height = min(_HIGHEST, sum(chart.height + _AROUND for chart, _ in self.charts) + 60)
@@ -38,7 +38,7 @@ class Plot:
         )
 
     def html(self) -> str:
-        """Return a page of them that fetches nothing."""
+        """Return a self-contained page of the charts."""
         figures = "".join(chart_html(chart, escape(caption)) for chart, caption in self.charts)
         return scaffold(
             self.title,
@@ -47,7 +47,7 @@ class Plot:
         )
 
     def write(self, path: str | Path) -> Path:
-        """Write the page, whole or not at all.
+        """Write the page, atomically.
 
         Args:
             path: The file, as "plot.html".

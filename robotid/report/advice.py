@@ -1,4 +1,4 @@
-"""What to do next about a result: a few steps, each with what to type."""
+"""Advice on a result: a few next steps, each with the command or the setting to type."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _APPENDED = ("--validate",)  # flags that add to what was stated before
 
 @dataclass(frozen=True)
 class Step:
-    """One thing to do.
+    """One next step.
 
     Attributes:
-        words: What, and why.
-        blocks: What to type, or to write into the job file; each is copied by itself.
+        words: The action, imperative, and its reason.
+        blocks: Commands, or lines of the job file; each is copied separately.
     """
 
     words: str
@@ -43,12 +43,12 @@ class Step:
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a result came from and where it is, for commands.
+    """The source of a result and its folder, for commands.
 
     Attributes:
-        source: What follows ``robotid identify``: a job file, or URDF, logs and flags; nothing if
-            no command made it.
-        folder: Folder of the results; "" if they are in none.
+        source: The arguments of ``robotid identify``: a job file, or URDF, logs and flags; empty
+            if no command made the result.
+        folder: Folder of the results; "" if they were not written.
     """
 
     source: tuple[str, ...] = ()
@@ -60,65 +60,65 @@ class Origin:
         return self.source[0] if self.source and self.source[0].endswith(".toml") else ""
 
     def again(self, *flags: str) -> str:
-        """Return the command that identifies again.
+        """Return the command that repeats the identification.
 
         Args:
-            flags: Flags to put behind it.
+            flags: Flags to append.
         """
         out = ["--out", self.folder] if self.folder else []
         return shlex.join(["robotid", "identify", *_without(self.source, flags), *flags, *out])
 
     def stating(self, table: str, line: str, *flags: str) -> tuple[str, ...]:
-        """Return what to do to identify again with another setting.
+        """Return the blocks that repeat the identification with another setting.
 
         Args:
-            table: Table of the job file that it stands in.
-            line: Its line there.
-            flags: The same as flags of the command line, if there are any.
+            table: Table of the job file that has the setting.
+            line: Line of the setting in that table.
+            flags: The equivalent flags of the command line, if there are any.
         """
         if flags and self.source and not self.job:
             return (self.again(*flags),)
         return (f"{table}\n{line}", *([self.again()] if self.job else []))
 
     def using(self, command: str, *words: str) -> tuple[str, ...]:
-        """Return a command that reads the results, none if they are in no folder.
+        """Return a command that reads the results; nothing if they were not written.
 
         Args:
             command: Name of the command.
-            words: What follows it.
+            words: Its arguments.
         """
         return (shlex.join(["robotid", command, *words]),) if self.folder else ()
 
 
 def _without(source: Sequence[str], flags: Sequence[str]) -> list[str]:
-    """Return the words of a command without what other flags state anew."""
-    anew = {_key(*pair) for pair in pairwise(flags) if pair[0] not in _APPENDED}
-    words, kept = [*source, ""], []
+    """Return the words of a command without the flags that new flags replace."""
+    replaced = {_key(*pair) for pair in pairwise(flags) if pair[0] not in _APPENDED}
+    words, remaining = [*source, ""], []
     skip = False
     for word, following in pairwise(words):
         flag, sign, value = word.partition("=")
-        is_apart = word.startswith("--") and not sign
-        if not skip and _key(flag, value if sign else following) not in anew:
-            kept.append(word)
+        has_separate_value = word.startswith("--") and not sign
+        if not skip and _key(flag, value if sign else following) not in replaced:
+            remaining.append(word)
             continue
-        skip = is_apart and not skip
-    return kept
+        skip = has_separate_value and not skip
+    return remaining
 
 
 def _key(flag: str, value: str) -> tuple[str, str]:
-    """Return what two flags have in common that state the same: of J=VALUE the joint, too."""
+    """Return the key of a flag: its name, and the joint if its value is JOINT=VALUE."""
     name, sign, _ = value.partition("=")
     return flag, name if sign else ""
 
 
 def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
-    """Return what to do next, the most urgent first: three steps at most.
+    """Return the next steps, the most urgent first: three at most.
 
-    What makes the result wrong comes first, then what leaves it in doubt, then how to use it.
+    Steps for errors come first, then steps for warnings, then uses of the result.
 
     Args:
         found: The result.
-        origin: Where it came from.
+        origin: The source of the result.
     """
     asked: dict[int, list[Cause]] = {}
     causes = (*grouped(found.findings, found.model.joints), *_of_verdict(found))
@@ -127,7 +127,7 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
     }
     for cause in causes:
         if cause.code in _UNNAMED and named.intersection(cause.joints):
-            # what is wrong with these has a step of its own
+            # the named cause of these joints has a step of its own
             cause = replace(cause, joints=tuple(j for j in cause.joints if j not in named))
             if not cause.joints:
                 continue
@@ -140,27 +140,27 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
 
 
 def loop_steps(content: Mapping[str, Any], origin: Origin) -> tuple[Step, ...]:
-    """Return what may be done with what was identified by simulation; nothing if it is nowhere.
+    """Return the uses of a result of closed-loop identification; nothing if it was not written.
 
     Args:
         content: Content of its result.json.
-        origin: Where it is.
+        origin: Its folder.
     """
     urdf, log = (
         next((x["path"] for x in content["inputs"] if x["role"] == role), "")
         for role in ("urdf", "identification")
     )
     has_gains = content["simulation"]["controller"]["kind"] != "torque"
-    seen = "See measured and predicted torque."
+    words = "Compare measured and predicted torque in the replay."
     if has_gains:
-        seen = "See commanded, measured and simulated robot."
-    watched = Step(seen, origin.using("replay", urdf, log, f"{origin.folder}/result.json"))
+        words = "Compare the commanded, measured and simulated robot in the replay."
+    watched = Step(words, origin.using("replay", urdf, log, f"{origin.folder}/result.json"))
     exports = _exports(content["robot"], origin, has_gains=has_gains)
     return (watched, *exports) if origin.folder else ()
 
 
 def _exports(robot: str, origin: Origin, *, has_gains: bool = False) -> list[Step]:
-    """Return what writes a result in the formats that are of use to it."""
+    """Return the exports of a result to the formats that can use it."""
     steps = []
     for name, form in FORMATS.items():
         if words := form.use_of_gains if has_gains else form.use:
@@ -171,57 +171,57 @@ def _exports(robot: str, origin: Origin, *, has_gains: bool = False) -> list[Ste
 
 
 def _once(steps: Sequence[Step]) -> tuple[Step, ...]:
-    """Return the steps, what several ask to be typed in the last of them only."""
-    kept: list[Step] = []
+    """Return the steps; a block that several steps have is in the last of them only."""
+    unique: list[Step] = []
     for k, step in enumerate(steps):
         later = {block for other in steps[k + 1 :] for block in other.blocks}
         blocks = tuple(block for block in step.blocks if block not in later)
-        kept.append(replace(step, blocks=blocks))
-    return tuple(kept)
+        unique.append(replace(step, blocks=blocks))
+    return tuple(unique)
 
 
 _Maker: TypeAlias = "Callable[[Identification, Origin, Sequence[Cause]], Step]"
 
 
 def _of_verdict(found: Identification) -> list[Cause]:
-    """Return what a verdict blames beside findings."""
-    causes, kept = [], found.predictions
-    measured = [(j, m) for metrics in kept.values() for j, m in metrics.per_joint.items()]
+    """Return the causes of a verdict that no finding names."""
+    causes, predictions = [], found.predictions
+    measured = [(j, m) for metrics in predictions.values() for j, m in metrics.per_joint.items()]
     beaten = {joint for joint, m in measured if is_beaten(m)}
-    missed = {j for j, m in measured if m.relative_error_pct and m.relative_error_pct > GOOD}
-    for code, joints in (("beaten", beaten), ("missed", missed)):
+    poor = {j for j, m in measured if m.relative_error_pct and m.relative_error_pct > GOOD}
+    for code, joints in (("beaten", beaten), ("poor_prediction", poor)):
         if joints:
             named = tuple(joint for joint in found.model.joints if joint in joints)
             causes.append(Cause(code, "warning", named, (), ()))
-    if not kept:
-        causes.append(Cause("unseen", "warning", (), (), ()))
+    if not predictions:
+        causes.append(Cause("not_validated", "warning", (), (), ()))
     if not found.is_consistent:
         causes.append(Cause("impossible", "warning", (), (), ()))
     if not found.scale_check.agrees:
         severity = "warning" if found.scale_check.contradicts else "note"
-        causes.append(Cause("unweighed", severity, (), (), ()))
+        causes.append(Cause("scale_unchecked", severity, (), (), ()))
     return causes
 
 
 def _step_for(cause: Cause) -> int | None:
-    """Return the number of the step that a cause asks for; None if it asks for none."""
-    last = 0 if cause.severity == "error" else None  # the doctor explains any other error
+    """Return the number of the step that removes a cause; None if there is none."""
+    last = 0 if cause.severity == "error" else None  # doctor explains all other errors
     return next((k for k, (_, codes) in enumerate(_STEPS) if cause.code in codes), last)
 
 
 def _named(causes: Sequence[Cause], wanted: Sequence[str] = ()) -> str:
-    """Return the joints that causes are about, as a sentence holds them."""
+    """Return the joints of causes, as part of a sentence."""
     return listed(dict.fromkeys(j for cause in causes for j in cause.joints) or wanted, _NAMED)
 
 
-def _weigh(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     before, after, _ = found.scale_check.masses
     check = ""
     if any(cause.code in ("total_mass", "urdf_mismatch") for cause in causes):
         check = "Check the sign, the order and the unit of the torques and the URDF's masses. "
     words = (
-        f"{check}Weigh the links that move and state their mass, which tells the scale: "
-        f"{after:.4g} kg as identified, {before:.4g} kg in the URDF."
+        f"{check}State the measured mass of the moving links to verify the torque scale: "
+        f"{after:.4g} kg identified, {before:.4g} kg in the URDF."
     )
     return Step(words, origin.stating("[estimator.constraints]", "total_mass = KG"))
 
@@ -229,8 +229,9 @@ def _weigh(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
 def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     joints = list(dict.fromkeys(j for cause in causes for j in cause.joints))
     words = (
-        f"State the gain of {listed(joints or ['the joints'], _NAMED)} in N m per A (N per A if it "
-        "slides), if the column is a current: the torque fits the URDF in another scale only."
+        f"If the column is a current, state the gain of {listed(joints or ['the joints'], _NAMED)} "
+        "in N m per A (N per A for a prismatic joint): the torque is consistent with the URDF only "
+        "at another scale."
     )
     line = "\n".join(f"{toml_key(joint)} = GAIN" for joint in joints or ["JOINT"])
     flags = [x for joint in joints or ["JOINT"] for x in ("--gain", f"{joint}=GAIN")]
@@ -241,8 +242,8 @@ def _delay(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     delays = [finding.evidence["delay"] for cause in causes for finding in cause.findings]
     delay = f"{sum(delays) / len(delays):.4f}"
     words = (
-        f"If the drives filter their torque, state that it is {delay} s late; friction that the "
-        "model lacks can look like this, too."
+        f"If the drives filter their torque, state its delay of {delay} s. Unmodelled friction can "
+        "cause the same finding."
     )
     line = f"torque_delay = {delay}"
     return Step(words, origin.stating("[signals]", line, "--torque-delay", delay))
@@ -257,16 +258,16 @@ def _locks(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
         if "median" in finding.evidence
     }
     asked = places or dict.fromkeys(joints if len(joints) <= _NAMED else ["*"], "POSITION")
-    words = f"State where the locked joints {listed(places or joints, _NAMED)} truly stood."
+    words = f"State the true positions of the locked joints {listed(places or joints, _NAMED)}."
     flags = [x for joint, place in asked.items() for x in ("--lock", f"{joint}={place}")]
     line = "\n".join(f"{toml_key(joint)} = {place}" for joint, place in asked.items())
     return Step(words, origin.stating("[locked]", line, *flags))
 
 
-def _keep(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _validate(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = (
-        "Record another motion and keep it apart: how well an unseen motion is predicted is not "
-        "known."
+        "Record another motion and use it as validation log: the prediction of other motions is "
+        "not verified."
     )
     line = f'log = "{_NEW}"'
     return Step(words, origin.stating("[[validation]]", line, "--validate", _NEW))
@@ -276,19 +277,19 @@ def _pin(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step
     joints = {joint for cause in causes for joint in cause.joints}
     links = [joint.child for joint in found.model.tree.movable if joint.name in joints]
     words = (
-        f"Leave the links of {_named(causes)} at the URDF: with fitted drives it predicts these "
-        "joints better than the identified bodies."
+        f"Keep the URDF's values for the links of {_named(causes)}: with fitted drives, the URDF "
+        "predicts the torque of these joints better than the identified links."
     )
     line = f"pinned = {json.dumps(links, ensure_ascii=False)}"
     return Step(words, origin.stating("[estimator.constraints]", line))
 
 
 def _terms(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    """Return what adds the terms to the model that drives lack."""
+    """Return the step that adds missing drive terms to the model."""
     codes = {cause.code for cause in causes}
     entries: dict[str, list[str | DriveTerm]] = {}
-    for joint, turned in _balanced(causes):
-        entries[joint] = [spring_family(turned, COUNTERBALANCE)]
+    for joint, rotation in _balanced(causes):
+        entries[joint] = [spring_family(rotation, COUNTERBALANCE)]
     couplings: dict[frozenset[str], str] = {}
     for misfit in found.misfits:
         term = misfit.term
@@ -300,21 +301,21 @@ def _terms(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     lines = [with_entries(found, joint, own) for joint, own in entries.items()]
     blocks = [*couplings.values(), *(["\n".join(["[drives]", *lines])] if lines else [])]
     what = listed(dict.fromkeys(_CAUSES[cause.code] for cause in causes))
-    words = f"Add to the model of {_named(causes)} what its drive lacks: {what}."
+    words = f"Add the missing drive terms to the model of {_named(causes)}: {what}."
     if not blocks and any(m.term.name == "coulomb" and m.term.code in codes for m in found.misfits):
         return Step(
             words, origin.stating("[model]", f'friction = "{_PLAIN}"', "--friction", _PLAIN)
         )
     if not blocks:
         words = (
-            f"Leave out the rows in which {_named(causes)} shows what no term of the model is "
-            f"like, or record other motion: {what}."
+            f"Exclude the samples with an effect that the model has no term for, or record another "
+            f"motion: {what} of {_named(causes)}."
         )
     return Step(words, (*blocks, *((origin.again(),) if origin.job and blocks else ())))
 
 
 def _balanced(causes: Sequence[Cause]) -> list[tuple[str, float]]:
-    """Return the joints with a counterbalance, and how far they turned [rad]."""
+    """Return the joints with a counterbalance, and the rotation of each [rad]."""
     found = [finding for cause in causes for finding in cause.findings]
     return [
         (finding.where.rpartition(": ")[2], finding.evidence["turned"])
@@ -327,8 +328,8 @@ def _payload(found: Identification, origin: Origin, causes: Sequence[Cause]) -> 
     logs = [x for x in found.validation if not x.is_refitted] or list(found.fitted)
     log = str(logs[0].recording.log.path)
     words = (
-        "Validate with the load of the fitted logs: this log has another one. The load itself is "
-        "what robotid payload finds."
+        "Validate with the payload of the fitted logs: this log has another one. Identify the "
+        "payload with robotid payload."
     )
     words_of = (str(found.model.tree.path), log, "--reference", f"{origin.folder}/result.json")
     return Step(words, origin.using("payload", *words_of))
@@ -336,8 +337,8 @@ def _payload(found: Identification, origin: Origin, causes: Sequence[Cause]) -> 
 
 def _unclipped(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = (
-        f"Record a slower motion, or one with less load: the torque of {_named(causes)} reaches "
-        "its limit, and what lies beyond is not in the log."
+        f"Record a slower motion, or one with less load: the torque of {_named(causes)} is clipped "
+        "at its limit."
     )
     return Step(words, _another_log(origin))
 
@@ -346,21 +347,21 @@ def _zeros(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     sizes = [f for cause in causes for f in cause.findings if "size" in f.evidence]
     by = "".join(f"; of {f.where} by {-f.evidence['size']:.3g}" for f in sizes)
     words = (
-        f"Correct the zero of the position of {_named(causes)}, in the log or by the joint's "
+        f"Correct the position offset of {_named(causes)}, in the log or by the joint's "
         f"origin in the URDF{by}."
     )
     return Step(words, (shlex.join(["robotid", "inspect", str(found.model.tree.path)]),))
 
 
 def _as_found(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    """Return what the findings say themselves, which name a cause and its remedy."""
+    """Return the messages of the findings, which name a cause and its remedy."""
     return Step(" ".join(f"{m[0].upper()}{m[1:]}." for cause in causes for m in cause.messages[:1]))
 
 
 def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = (
-        f"Identify with the consistent estimator: what {found.estimator.name} found is physically "
-        "not possible, so no URDF could be written."
+        f"Identify with the consistent estimator: the result of {found.estimator.name} is not "
+        "physically consistent, and no URDF was written."
     )
     flags = ("--estimator", "consistent")
     return Step(words, origin.stating("[estimator]", 'name = "consistent"', *flags))
@@ -368,9 +369,9 @@ def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) ->
 
 def _watch(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = (
-        f"Look at what the torque of {_named(causes, found.model.joints)} does that the model does "
-        "not explain, under Why and in motion: a channel that holds something else, a spring, a "
-        "gear that is not round."
+        f"Examine the residual of {_named(causes, found.model.joints)} in the section Residual "
+        "analysis and in the replay. Possible causes: a wrong torque channel, a spring, gear "
+        "ripple."
     )
     return Step(words, _replay(found, origin))
 
@@ -378,14 +379,14 @@ def _watch(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
 def _richer(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     count = len(found.determination.undetermined)
     words = (
-        f"Record a richer motion, with more speed and wider poses, and fit it as well: the data "
-        f"leave {count} base parameters open."
+        f"Record another motion with higher speeds and wider poses, and add it to the fitted logs: "
+        f"the data do not determine {count} base parameters."
     )
     return Step(words, _another_log(origin))
 
 
 def _another_log(origin: Origin) -> tuple[str, ...]:
-    """Return what identifies again with one more log."""
+    """Return the blocks that repeat the identification with one more log."""
     if not origin.job and origin.source:
         urdf, *others = origin.source
         return (Origin((urdf, _NEW, *others), origin.folder).again(),)
@@ -394,32 +395,34 @@ def _another_log(origin: Origin) -> tuple[str, ...]:
 
 
 def _inspect(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    words = "Correct the URDF: what its inspection names stands in the way of the prior."
+    words = "Correct the URDF: the prior uses the values that its inspection rejects."
     return Step(words, (shlex.join(["robotid", "inspect", str(found.model.tree.path)]),))
 
 
 def _doctor(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    said = causes[0].messages[0]
-    words = f"{said[0].upper()}{said[1:]}."
+    message = causes[0].messages[0]
+    words = f"{message[0].upper()}{message[1:]}."
     return Step(
         words, (shlex.join(["robotid", "doctor", *origin.source]),) if origin.source else ()
     )
 
 
 def _uses(found: Identification, origin: Origin, asked: Sequence[Step]) -> list[Step]:
-    """Return what may be done with a result, but for what is asked for already."""
+    """Return the uses of a result, without commands that other steps have."""
     result = f"{origin.folder}/result.json"
     steps = [
-        Step("Play a recording and see where the prediction misses.", _replay(found, origin)),
         Step(
-            "Measure the prediction on another motion, one with the speeds of your use.",
+            "Play a recording and examine the prediction error over time.", _replay(found, origin)
+        ),
+        Step(
+            "Validate the result on another motion, at the speeds of your application.",
             origin.using("validate", result, _NEW),
         ),
     ]
     if found.has_urdf:
         steps = [*_exports(found.model.name, origin), *steps]
     if not found.scale_check.agrees:
-        steps.insert(0, _weigh(found, origin, ()))
+        steps.insert(0, _scale(found, origin, ()))
     typed = {block for step in asked for block in step.blocks}
     return [step for step in steps if step.blocks and typed.isdisjoint(step.blocks)]
 
@@ -429,17 +432,17 @@ def _replay(found: Identification, origin: Origin) -> tuple[str, ...]:
     return origin.using("replay", str(found.model.tree.path), log, origin.folder)
 
 
-#: Terms that drives may have and the model lacks, by the code of the finding, in words.
+#: Drive terms that the model may lack, by the code of the finding.
 _CAUSES = {
     "backlash": "backlash or windup",
     "counterbalance": "a counterbalance",
-    "coupling": "a coupling with another joint",
-    "friction_shape": "friction of another shape",
-    "load_friction": "friction that grows with the load",
-    "position_periodic": "a torque that repeats with the position",
+    "coupling": "a coupling to another joint",
+    "friction_shape": "another friction curve",
+    "load_friction": "load-dependent friction",
+    "position_periodic": "a torque that is periodic in the position",
     "spring": "a spring",
 }
-#: What names a cause but has nothing to type: its message says what to do.
+#: Findings that name a cause but have no command: their messages state the remedy.
 _AS_FOUND = (
     "angle_scale",
     "active_bound",
@@ -467,13 +470,13 @@ _AS_FOUND = (
     "unmounted_part",
     "unsigned_torque",
 )
-#: Codes that name what is wrong with a joint, and those that only say that something is.
+#: Codes that name the cause of an error of a joint, and codes that state the error only.
 _NAMED_CAUSES = (*_CAUSES, *_AS_FOUND, "clipped", "payload_change", "position_offset")
-_UNNAMED = ("missed", "unexplained_torque", "constraint_costs")
-#: The steps, the most telling first, each with the codes of what asks for it.
+_UNNAMED = ("poor_prediction", "unexplained_torque", "constraint_costs")
+#: The steps, the most informative first, each with the codes that it removes.
 _STEPS: Sequence[tuple[_Maker, tuple[str, ...]]] = (
     (_doctor, ()),
-    (_weigh, ("total_mass", "urdf_mismatch", "unweighed")),
+    (_scale, ("total_mass", "urdf_mismatch", "scale_unchecked")),
     (_gains, ("current_for_torque", "torque_scale")),
     (_delay, ("torque_delay",)),
     (_locks, ("locked_at_zero", "locked_position")),
@@ -482,7 +485,7 @@ _STEPS: Sequence[tuple[_Maker, tuple[str, ...]]] = (
     (_unclipped, ("clipped",)),
     (_terms, tuple(_CAUSES)),
     (_as_found, _AS_FOUND),
-    (_keep, ("unseen", "repeated_motion", "validation_was_fitted")),
+    (_validate, ("not_validated", "repeated_motion", "validation_was_fitted")),
     (_possible, ("impossible",)),
     (_watch, (*_UNNAMED, "outliers", "spikes")),
     (_pin, ("beaten",)),

@@ -1,4 +1,4 @@
-"""Bars of the errors of joints, the worst first, beside those of other predictions."""
+"""Error bars of the joints, the worst first, with the errors of other predictions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,16 +11,16 @@ from robotid.pages.html import code, percent
 
 __all__ = ["Bar", "Mark", "bars_html"]
 
-_ROWS = 10  # joints whose errors are seen at once
-_WIDEST = 150.0  # [%] at the end of the scale; what is beyond stands there
+_ROWS = 10  # joints that are visible without unfolding
+_WIDEST = 150.0  # [%] end of the scale; larger errors end there, too
 
 
 class Mark(NamedTuple):
-    """How another prediction is marked.
+    """Marker of another prediction.
 
     Attributes:
-        words: What it is called.
-        path: Its path about (0, 9).
+        words: Its name.
+        path: Its SVG path about (0, 9).
         style: "fill" or "line".
     """
 
@@ -34,13 +34,13 @@ class Bar:
     """The error of one joint.
 
     Attributes:
-        row: Number of the joint, which ids of the page are made of.
+        row: Number of the joint, part of the ids of the page.
         joint: Its name.
-        error: Its error [%]; None if it is not known.
+        error: Its error [%]; None if unknown.
         others: Errors of other predictions, by name [%].
         verdict: The verdict on it.
-        link: Id of what its name leads to.
-        why: Id of what says more; "" if nothing does.
+        link: Id of the target of its name.
+        why: Id of its residual analysis; "" if there is none.
     """
 
     row: int
@@ -59,19 +59,19 @@ def bars_html(
     marks: Mapping[str, Mark],
     limits: tuple[float, float],
 ) -> str:
-    """Return a bar for each joint on one scale of percent, whose root is linear.
+    """Return a bar for each joint on a common square-root scale in percent.
 
     Args:
-        title: What is missed.
-        note: What it is a share of, HTML.
+        title: Name of the error.
+        note: Its definition, HTML.
         bars: The joints, the worst first.
-        marks: How other predictions are marked, by name.
+        marks: Markers of other predictions, by name.
         limits: Largest error that is good, and largest that is usable [%].
     """
     rows = [_row(bar, marks, limits) for bar in bars]
     more = "".join(rows[_ROWS:])
     if more:
-        words = f"{len(rows) - _ROWS} more joints, which are predicted better"
+        words = f"{len(rows) - _ROWS} more joints with smaller errors"
         more = f"<details><summary>{words}</summary><ol>{more}</ol></details>\n"
     return (
         f'<h2 id="worst">{title}, worst joint first <span class="note">{note}</span></h2>\n'
@@ -80,7 +80,7 @@ def bars_html(
 
 
 def _at(value: float) -> str:
-    """Return where an error stands on the scale, whose root is linear."""
+    """Return the position of an error on the square-root scale."""
     return f"{100 * (min(value, _WIDEST) / _WIDEST) ** 0.5:.2f}%"
 
 
@@ -90,7 +90,8 @@ def _row(bar: Bar, marks: Mapping[str, Mark], limits: tuple[float, float]) -> st
     if bar.error is not None:
         picture = _picture(bar, bar.error, marks, limits)
     if bar.why:
-        link = f' <a href="#{bar.why}" aria-label="why, of {escape(bar.joint)}">why</a>'
+        label = f"residual analysis of {escape(bar.joint)}"
+        link = f' <a href="#{bar.why}" aria-label="{label}">analysis</a>'
     return (
         f'<li class="{kind}"><a class="code" href="#{bar.link}">{code(bar.joint).html}</a>'
         f'{picture}<span class="number">{percent(bar.error).html} %</span><strong>{status}</strong>'
@@ -99,10 +100,10 @@ def _row(bar: Bar, marks: Mapping[str, Mark], limits: tuple[float, float]) -> st
 
 
 def _picture(bar: Bar, error: float, marks: Mapping[str, Mark], limits: tuple[float, float]) -> str:
-    """Return the bar of a joint with the marks of the other predictions."""
+    """Return the bar of a joint with the markers of other predictions."""
     shown = {key: x for key in marks if (x := bar.others.get(key)) is not None}
     figures = [f"{marks[key].words} {percent(value).html} %" for key, value in shown.items()]
-    title = f"{bar.joint}: {percent(error).html} % missed; by comparison {', '.join(figures)}"
+    title = f"{bar.joint}: error {percent(error).html} %; for comparison {', '.join(figures)}"
     lines = "".join(f'<line x1="{_at(x)}" x2="{_at(x)}" y1="-2" y2="18"/>' for x in limits)
     others = "".join(
         f'<svg x="{_at(value)}" overflow="visible" aria-hidden="true">{_drawn(marks[key])}</svg>'

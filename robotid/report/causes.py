@@ -1,4 +1,4 @@
-"""The report's findings, by their cause and by the joint that they are about."""
+"""The section of findings: by cause and by joint."""
 
 from collections.abc import Sequence
 from html import escape
@@ -10,50 +10,50 @@ __all__ = ["findings_line", "findings_section"]
 
 
 def findings_line(findings: Sequence[Finding], joints: Sequence[str], worst: str = "") -> str:
-    """Return how many findings there are of how many causes, and on which joint it is worst.
+    """Return the number of findings and causes, and the worst joint.
 
     Args:
         findings: The findings.
         joints: Names of the robot's joints.
-        worst: The joint that is predicted worst; "" if none is.
+        worst: The joint with the largest error; "" if there is none.
     """
-    grave = [finding for finding in findings if finding.severity != "note"]
-    notes = len(findings) - len(grave)
-    noted = [_count(notes, "note")] if notes else []
-    if not grave:
-        return ", ".join(noted) or "none"
-    causes = grouped(grave, joints)
-    said = f"{_count(len(grave), 'finding')}, {_count(len(causes), 'cause')}"
-    return "; ".join([said, *([f"worst: {escape(worst)}"] if worst else []), *noted])
+    serious = [finding for finding in findings if finding.severity != "note"]
+    notes = len(findings) - len(serious)
+    of_notes = [_count(notes, "note")] if notes else []
+    if not serious:
+        return ", ".join(of_notes) or "none"
+    causes = grouped(serious, joints)
+    counts = f"{_count(len(serious), 'finding')}, {_count(len(causes), 'cause')}"
+    return "; ".join([counts, *([f"worst: {escape(worst)}"] if worst else []), *of_notes])
 
 
 def findings_section(
     findings: Sequence[Finding], joints: Sequence[str], shown: Sequence[str]
 ) -> str:
-    """Return the causes with what was found, the gravest first, and the causes of each joint.
+    """Return the causes with their messages, by severity, and the causes of each joint.
 
     Args:
         findings: The findings.
         joints: Names of the robot's joints.
-        shown: Those that have errors, the worst first.
+        shown: The joints that have errors, the worst first.
     """
     causes = grouped(findings, joints)
     return _by_joint(shown, causes) + ("".join(map(_cause, causes)) or "<p>None.</p>\n")
 
 
 def _cause(cause: Cause) -> str:
-    """Return one cause: what was found, once, and each finding where there are several."""
-    said = "".join(f"<p>{escape(message)}</p>\n" for message in cause.messages)
+    """Return one cause: its messages, and each finding where there are several."""
+    messages = "".join(f"<p>{escape(message)}</p>\n" for message in cause.messages)
     about = f": {escape(', '.join(cause.joints))}" if cause.joints else ""
     each = ""
     if len(cause.findings) > len(cause.messages):
         items = "".join(f"<li>{escape(finding.message)}</li>" for finding in cause.findings)
-        title = f"each of {len(cause.findings)} findings"
+        title = f"all {len(cause.findings)} findings"
         each = f"<details><summary>{title}</summary><ul>{items}</ul></details>\n"
     return (
         f'<div class="cause {cause.severity}" id="cause-{escape(cause.code)}"><h3>'
         f"<strong>{cause.severity}</strong> {code(cause.code).html}{about}</h3>\n"
-        f"{said}{each}</div>\n"
+        f"{messages}{each}</div>\n"
     )
 
 
@@ -62,7 +62,7 @@ def _by_joint(shown: Sequence[str], causes: Sequence[Cause]) -> str:
     for joint in shown:
         mine = [cause for cause in causes if joint in cause.joints]
         if mine:
-            grave, notes = (
+            serious, notes = (
                 ", ".join(
                     f'<a href="#cause-{escape(cause.code)}">{escape(cause.code)}</a>'
                     for cause in mine
@@ -70,11 +70,13 @@ def _by_joint(shown: Sequence[str], causes: Sequence[Cause]) -> str:
                 )
                 for is_note in (False, True)
             )
-            rows.append([code(joint), Cell(grave or "–"), Cell(notes or "–")])
+            rows.append([code(joint), Cell(serious or "–"), Cell(notes or "–")])
     if not rows:
         return ""
-    return table("By joint, the worst first", ["joint", "errors and warnings", "notes"], rows)
+    return table(
+        "Findings by joint, the worst first", ["joint", "errors and warnings", "notes"], rows
+    )
 
 
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -1,4 +1,4 @@
-"""Several results side by side, from their result.json files only."""
+"""Comparison of results, from their result.json files only."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from robotid.robot.drives import TERMS, DriveMotion
 __all__ = ["compare_results", "write_comparison"]
 
 _SPEEDS = 40  # of a friction curve, in each direction
-_FILES = ("urdf", "identification", "validation")  # settings that stand among the inputs
+_FILES = ("urdf", "identification", "validation")  # settings that are shown as inputs
 
 
 def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
@@ -30,24 +30,24 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
 
     Returns:
         Plain values: "results" (label, name, path, robot, estimator, verdict; the name is the
-        part of the path that tells it from the others), "validation" and "fitted" (errors by joint,
-        one column per result), "fitted_alike" and "remarks" (what may not be compared, and why),
+        unique part of the path), "validation" and "fitted" (errors by joint, one column per
+        result), "fitted_alike" and "notes" (what is not comparable, and the reason),
         "friction" (curves by joint), "base_parameters" (values, standard errors, and the difference
         to the first result over the combined standard error), "settings", "inputs" and "versions"
-        that differ. What differs most comes first.
+        that differ. The largest difference comes first.
 
     Raises:
-        DataError: If there are fewer than two results, one cannot be read, or their base
-            parameters are not the same; the message names what differs.
+        DataError: If there are fewer than two results, one is not readable, or their base
+            parameters differ; the message names the differences.
     """
     if len(paths) < 2:
         raise DataError(f"compare takes at least two results, found {len(paths)}")
     results = [load_result(path).content for path in paths]
     for path, result in zip(paths[1:], results[1:], strict=True):
         _require_same_mapping(str(paths[0]), results[0], str(path), result)
-    logs = _told_apart([entry["log"] for result in results for entry in result["validation"]])
+    logs = _short_names([entry["log"] for result in results for entry in result["validation"]])
     common, notes = _common_recordings(results, logs)
-    names = _told_apart(paths)
+    names = _short_names(paths)
     return {
         "results": [
             {
@@ -82,11 +82,11 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
 
 
 def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[str, Any]:
-    """Compare results, write the page, and return what ``compare_results`` does.
+    """Compare results, write the page, and return the content of ``compare_results``.
 
     Args:
         paths: At least two result.json files.
-        target: The HTML file to write; made beside it and then put in place.
+        target: The HTML file to write, atomically.
 
     Raises:
         DataError: If the results cannot be compared, or the folder of the target is missing.
@@ -103,10 +103,10 @@ def _label(k: int) -> str:
     return chr(ord("A") + k % 26) + (str(k // 26 + 1) if k >= 26 else "")
 
 
-def _told_apart(paths: Sequence[str | Path]) -> dict[str, str]:
-    """Return of each path the fewest of its last parts that no other path ends with.
+def _short_names(paths: Sequence[str | Path]) -> dict[str, str]:
+    """Return the shortest unique end of each path.
 
-    Parts that all of them end with are left out, as "result.json" of folders a and b.
+    A common end of all paths is left out, as "result.json" of folders a and b.
     """
     parts = {str(path): Path(path).resolve().parts for path in paths}
     every = set(parts.values())
@@ -118,7 +118,7 @@ def _told_apart(paths: Sequence[str | Path]) -> dict[str, str]:
 
 
 def _shortest(own: tuple[str, ...], every: set[tuple[str, ...]]) -> str:
-    """Return the shortest end of a path that only it has."""
+    """Return the shortest end that only one path has."""
     for size in range(1, len(own)):
         if sum(other[-size:] == own[-size:] for other in every) == 1:
             return str(Path(*own[-size:]))
@@ -128,7 +128,7 @@ def _shortest(own: tuple[str, ...], every: set[tuple[str, ...]]) -> str:
 def _require_same_mapping(
     first: str, one: Mapping[str, Any], second: str, other: Mapping[str, Any]
 ) -> None:
-    """Refuse results whose base parameters stand for other things."""
+    """Refuse results whose base parameters have other expressions."""
     ours, theirs = (
         {
             entry["name"]: entry["expression"]
@@ -144,26 +144,26 @@ def _require_same_mapping(
     ):
         if names:
             raise DataError(
-                f"{has} has {len(names)} base parameters that {lacks} has not: "
+                f"{has} has {len(names)} base parameters that {lacks} does not have: "
                 f"{listed(names, 5)}; {what}"
             )
     changed = [name for name in ours if ours[name] != theirs[name]]
     if changed:
         name = changed[0]
         raise DataError(
-            f"{len(changed)} base parameters stand for other sums in {first} and {second}: "
+            f"{len(changed)} base parameters have other expressions in {first} and {second}: "
             f"{listed(changed, 5)}; {name} is {ours[name]} and {theirs[name]}; {what}"
         )
 
 
 def _is_chosen(name: str, result: Mapping[str, Any]) -> bool:
-    """Return whether a parameter is one of friction that only some results may have found."""
+    """Return whether a parameter is a friction term that some results may not have."""
     drives = {entry["name"] for entry in result["drive_parameters"]}
     return name in drives and name.rpartition(".")[2] not in TERMS
 
 
 def _recordings(result: Mapping[str, Any], role: str) -> tuple[tuple[Any, ...], ...]:
-    """Return what was read in a role: the file's hash, or its path without one, and the window."""
+    """Return the inputs of a role: the file's hash, or its path without hash, and the window."""
     return tuple(
         (entry["sha256"] or entry["path"], round(entry["start"], 6), round(entry["end"], 6))
         for entry in result["inputs"]
@@ -176,7 +176,7 @@ def _by_recording(result: Mapping[str, Any]) -> dict[tuple[Any, ...], dict[str, 
 
 
 def _signals(result: Mapping[str, Any], key: tuple[Any, ...]) -> dict[str, Any]:
-    """Return how a validation recording was prepared, and how many rows of it are used."""
+    """Return the signal settings of a validation recording, and its number of samples used."""
     entries = [entry for entry in result["inputs"] if entry.get("role") == "validation"]
     entry = entries[_recordings(result, "validation").index(key)]
     return {**entry["signals"], "rows": entry["rows_used"]}
@@ -185,7 +185,7 @@ def _signals(result: Mapping[str, Any], key: tuple[Any, ...]) -> dict[str, Any]:
 def _common_recordings(
     results: Sequence[Mapping[str, Any]], names: Mapping[str, str]
 ) -> tuple[dict[tuple[Any, ...], dict[str, Any]], list[str]]:
-    """Return the validation recordings that every result has, and what is not comparable."""
+    """Return the validation recordings of all results, and notes on what is not comparable."""
     each = [_by_recording(result) for result in results]
     common = {k: v for k, v in each[0].items() if all(k in other for other in each[1:])}
     notes = []
@@ -193,26 +193,26 @@ def _common_recordings(
         left = [names[v["log"]] for key, v in by_recording.items() if key not in common]
         if left:
             notes.append(
-                f"{_label(k)} was validated on {', '.join(left)}, which not every result was: "
-                "these errors are not compared"
+                f"{_label(k)} was validated on {', '.join(left)}, other results were not: these "
+                "errors are not compared"
             )
     if not common:
         notes.append(
-            "no validation recording is common to all results: their errors of prediction cannot "
-            "be compared; run 'robotid validate' on one log with each"
+            "the results have no common validation recording, so their prediction errors are not "
+            "comparable; run 'robotid validate' with each result on the same log"
         )
     for key, entry in common.items():
         prepared = [_flat(_signals(result, key)) for result in results]
         if other := [f"{d['name']} {' | '.join(d['values'])}" for d in _differences(prepared)]:
             notes.append(
-                f"{names[entry['log']]} was prepared in other ways ({'; '.join(other)}): a "
-                "smoother torque, and fewer rows, are easier to predict"
+                f"the signal settings of {names[entry['log']]} differ ({'; '.join(other)}): "
+                "smoother torque and fewer samples reduce the error"
             )
     return common, notes
 
 
 def _errors(metrics: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return error and RMSE of each joint, one entry per result; None where a joint has no rows."""
+    """Return error and RMSE of each joint, one entry per result; None without samples."""
     joints = dict.fromkeys(joint for m in metrics for joint in m["per_joint"])
     rows = []
     for joint in joints:
@@ -224,17 +224,16 @@ def _errors(metrics: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _spread(values: Sequence[float | None]) -> float:
-    """Return how far values are apart; of fewer than two, -1."""
+    """Return the range of the values; -1 for fewer than two."""
     known = [value for value in values if value is not None]
     return max(known) - min(known) if len(known) > 1 else -1.0
 
 
 def _friction_curves(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the friction of each joint's drive over its speed, of a gear without load at q = 0.
+    """Return the friction of each joint's drive over its speed, without load, at q = 0.
 
-    The speeds are those that the recordings of any result have; a joint of which none is stated,
-    or that has no friction, is left out. What grows with the load is said beside: "load" is
-    the torque lost per torque of load, None without such a term.
+    The speeds span the range of all recordings. A joint without stated range or without friction
+    is left out. "load" is the friction torque per load torque, None without such a term.
     """
     found = []
     for joint in dict.fromkeys(joint for result in results for joint in result["joints"]):
@@ -262,7 +261,7 @@ def _friction_curves(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any
 def _friction_curve(
     result: Mapping[str, Any], joint: str, v: Array
 ) -> tuple[Array | None, float | None]:
-    """Return the friction of a joint's own drive at some speeds, and what it loses of its load."""
+    """Return the friction of a joint's own drive at some speeds, and its load coefficient."""
     value = {entry["name"]: entry["value"] for entry in result["drive_parameters"]}
     own = terms_from_facts(result.get("own_terms", {})).get(joint, ())
     terms = (*TERMS.values(), *own)
@@ -283,7 +282,7 @@ def _unit_of_force(results: Sequence[Mapping[str, Any]], joint: str) -> str:
 
 
 def _base_parameters(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return values beside each other, with (b_k - b_1) / sqrt(s_k^2 + s_1^2); None for none."""
+    """Return the values of all results, with (b_k - b_1) / sqrt(s_k^2 + s_1^2) or None."""
     each = [{e["name"]: e for e in result["base_parameters"]} for result in results]
     stated = {name: entry for by_name in reversed(each) for name, entry in by_name.items()}
     rows = []
@@ -315,7 +314,7 @@ def _difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float | Non
 
 
 def _chosen(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a job; recordings stand among the inputs."""
+    """Return the settings of a job without its files, which are inputs."""
     return {k: v for k, v in result["settings"].items() if k not in _FILES}
 
 
@@ -338,14 +337,14 @@ def _plain(value: object) -> str:
 
 
 def _differences(each: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
-    """Return the keys whose values are not the same everywhere; "" where a key is missing."""
+    """Return the keys whose values differ; "" where a key is missing."""
     keys = dict.fromkeys(key for values in each for key in values)
     rows = [{"name": key, "values": [values.get(key, "") for values in each]} for key in keys]
     return [row for row in rows if len(set(row["values"])) > 1]
 
 
 def _inputs(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return every file and window with who read it, those that all have last."""
+    """Return every file and window with the results that use it, the common ones last."""
     found: dict[tuple[Any, ...], dict[str, Any]] = {}
     for k, result in enumerate(results):
         for entry in result["inputs"]:

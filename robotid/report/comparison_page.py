@@ -1,4 +1,4 @@
-"""The page of results side by side: errors as bars, friction curves, differences, tables."""
+"""The page of a comparison: errors as bars, friction curves, differences, tables."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,8 +14,8 @@ from robotid.pages.html import Cell, code, number, page, percent, table, text, w
 
 __all__ = ["comparison_page"]
 
-_FAR = 3.0  # combined standard errors beyond which a difference is shown as a fault
-_WIDEST = 6.0  # of them at the end of a bar
+_FAR = 3.0  # combined standard errors beyond which a difference is in bold
+_WIDEST = 6.0  # combined standard errors at the end of a bar
 _BAR, _HIGH = 160, 9  # [px] of an error's bar: the longest, and its height
 _HALF = 45  # [px] of a difference's bar, to each side
 _TONES = 8
@@ -25,15 +25,15 @@ def comparison_page(content: Mapping[str, Any]) -> str:
     """Return the HTML of the page.
 
     Args:
-        content: What ``compare_results`` returns.
+        content: The value of ``compare_results``.
     """
     sections = {
         "errors": ("Prediction errors", _errors_section(content)),
         "friction": ("Friction", _friction_section(content)),
-        "settings": ("Settings that differ", _differing(content, "settings", "setting")),
+        "settings": ("Different settings", _differing(content, "settings", "setting")),
         "base": ("Base parameters", _base_section(content)),
         "inputs": ("Inputs", _inputs_section(content)),
-        "versions": ("Versions that differ", _differing(content, "versions", "what")),
+        "versions": ("Different versions", _differing(content, "versions", "package")),
     }
     robots = ", ".join(dict.fromkeys(result["robot"] for result in content["results"]))
     title = f"{robots}: {len(content['results'])} results compared"
@@ -55,7 +55,7 @@ def _tone(k: int) -> str:
 
 
 def _key(k: int) -> str:
-    """Return a patch of a result's colour."""
+    """Return a patch in a result's colour."""
     return (
         '<svg width="14" height="10" style="vertical-align: baseline" aria-hidden="true">'
         f'<path d="M0 0h14v10h-14z" fill="var(--{_tone(k)})"/></svg>'
@@ -63,7 +63,7 @@ def _key(k: int) -> str:
 
 
 def _legend(content: Mapping[str, Any]) -> str:
-    """Return which colour and letter each result has."""
+    """Return the legend of colours and letters of the results."""
     keys = "".join(
         f"<span>{_key(k)} {result['label']} {escape(result['name'])}</span> "
         for k, result in enumerate(content["results"])
@@ -78,8 +78,8 @@ def _labels(content: Mapping[str, Any], unit: str = "") -> list[str]:
 def _errors_section(content: Mapping[str, Any]) -> str:
     notes = "".join(f"<li>{escape(note)}</li>" for note in content["notes"])
     parts = [
-        "<p>error = 100 |τ − prediction| / |τ| over the rows used. What differs most comes first; "
-        "the least in bold, if it is one result's alone.</p>\n",
+        "<p>error = 100 |τ − prediction| / |τ| over the samples used. The largest difference comes "
+        "first. Bold: the smallest error, if only one result has it.</p>\n",
         _legend(content),
     ]
     if notes:
@@ -95,9 +95,9 @@ def _errors_section(content: Mapping[str, Any]) -> str:
     ]
     fitted, alike = content["fitted"], content["fitted_alike"]
     if not alike:
-        parts.append("<p>The results were fitted to other recordings: of the errors below each is "
-                     "that of its own, and they are not comparable.</p>\n")  # fmt: skip
-    parts.append(_error_table("Fitted rows of each result", content, fitted, alike))
+        parts.append("<p>The results were fitted to different recordings. The errors below are of "
+                     "each result's own recordings and are not comparable.</p>\n")  # fmt: skip
+    parts.append(_error_table("Fitted samples of each result", content, fitted, alike))
     return "".join(parts)
 
 
@@ -120,7 +120,7 @@ def _error_table(
 
 
 def _bars(values: Sequence[float | None], most: float) -> Cell:
-    """Return one bar for each value under each other, as long as it is of the largest."""
+    """Return one bar for each value, relative to the largest."""
     height = _HIGH * len(values)
     paths = "".join(
         f'<path d="M0 {k * _HIGH + 1}h{_BAR * value / (most or 1.0):.1f}v{_HIGH - 2}H0z" '
@@ -133,7 +133,7 @@ def _bars(values: Sequence[float | None], most: float) -> Cell:
 
 
 def _percents(errors: Sequence[float | None], alike: bool) -> list[Cell]:
-    """Return the errors, the least in bold where they are comparable and it is the only one."""
+    """Return the errors, the smallest in bold if they are comparable and it is unique."""
     cells = [percent(error) for error in errors]
     known = [(error, cell.html) for error, cell in zip(errors, cells, strict=True) if error]
     least = min(known)[1] if known and alike else None
@@ -148,18 +148,18 @@ def _percents(errors: Sequence[float | None], alike: bool) -> list[Cell]:
 def _friction_section(content: Mapping[str, Any]) -> str:
     curves = content["friction"]
     if not curves:
-        return "<p>No result states friction and the speeds that it was found at.</p>\n"
+        return "<p>No result has friction curves with a range of speeds.</p>\n"
     charts = "".join(_friction_figure(content, entry) for entry in curves)
     return (
-        "<p>Friction of each joint's drive that moves steadily, without load and offset, at the "
-        "speeds of the recordings. What differs most comes first.</p>\n"
+        "<p>Friction of each drive at constant speed, without load and offset, over the speeds of "
+        "the recordings. The largest difference comes first.</p>\n"
         f'{_legend(content)}<div class="plots">\n{charts}</div>\n'
     )
 
 
 def _friction_figure(content: Mapping[str, Any], entry: Mapping[str, Any]) -> str:
     v = np.array(entry["speeds"])
-    turns = entry["unit"] == "N m"
+    is_revolute = entry["unit"] == "N m"
     series = tuple(
         Series(result["label"], _open_at_0(v, np.array(torque)), _tone(k))
         for k, (result, torque) in enumerate(zip(content["results"], entry["torques"], strict=True))
@@ -169,7 +169,7 @@ def _friction_figure(content: Mapping[str, Any], entry: Mapping[str, Any]) -> st
         title=f"Friction of {entry['joint']} over its speed, by result",
         x=v,
         series=series,
-        x_label=f"speed [{'rad/s' if turns else 'm/s'}]",
+        x_label=f"speed [{'rad/s' if is_revolute else 'm/s'}]",
         y_label=f"friction [{entry['unit']}]",
         height=150,
     )
@@ -178,12 +178,12 @@ def _friction_figure(content: Mapping[str, Any], entry: Mapping[str, Any]) -> st
         for result, load in zip(content["results"], entry["load"], strict=True)
         if load is not None
     )
-    beside = f"; beside it, of each {entry['unit']} of load: {loads}" if loads else ""
-    return chart_html(chart, f"<strong>{escape(entry['joint'])}</strong>{beside}")
+    of_load = f"; additional friction per {entry['unit']} of load: {loads}" if loads else ""
+    return chart_html(chart, f"<strong>{escape(entry['joint'])}</strong>{of_load}")
 
 
 def _open_at_0(v: Array, torque: Array) -> Array:
-    """Return a friction curve that jumps at 0 where it changes its sign."""
+    """Return a friction curve with a gap at speed 0, where its sign changes."""
     return np.where(v == 0, np.nan, torque)
 
 
@@ -191,11 +191,11 @@ def _base_section(content: Mapping[str, Any]) -> str:
     labels = _labels(content)
     headers = ["parameter", *[f"({label} − A) / s" for label in labels[1:]]]
     headers += [head for label in labels for head in (label, f"± {label}")] + ["unit"]
-    rows, apart = [], 0
+    rows, different = [], 0
     for entry in content["base_parameters"]:
         differences = entry["differences"]
         far = any(d is not None and abs(d) > _FAR for d in differences)
-        apart += far
+        different += far
         rows.append(
             [
                 code(entry["name"]),
@@ -208,10 +208,10 @@ def _base_section(content: Mapping[str, Any]) -> str:
             ]
         )
     return (
-        f"<p>{apart} of {len(rows)} differ from A by more than {_FAR:g} combined standard errors "
-        "s = √(s² + s_A²), the dotted lines of the bars, and are in bold. Results of the same "
-        "recordings share their noise: there the figure only sets a scale. Standard errors do not "
-        f"know of faults of the model.</p>\n{_legend(content)}"
+        f"<p>{different} of {len(rows)} parameters differ from A by more than {_FAR:g} combined "
+        "standard errors s = √(s² + s_A²): dotted lines, bold figures. Results of the same "
+        "recordings share their noise; their differences are not significance tests. Standard "
+        f"errors do not include errors of the model.</p>\n{_legend(content)}"
         + table("Base parameters with standard errors", headers, rows, is_data=True)
     )
 
@@ -224,10 +224,10 @@ def _stated(value: float | None, error: float | None) -> tuple[Cell, Cell]:
 
 
 def _difference(difference: float | None, k: int) -> Cell:
-    """Return a difference behind its bar, which ends in a point beyond six standard errors."""
-    said = number(difference, "z.1f")
+    """Return a difference after its bar, which ends in a point beyond six standard errors."""
+    cell = number(difference, "z.1f")
     if difference is None:
-        return said
+        return cell
     middle, unit = _HALF, _HALF / _WIDEST
     lines = "".join(f"M{middle + s * _FAR * unit:.0f} 0v14" for s in (-1, 1))
     end = max(-_WIDEST, min(_WIDEST, difference)) * unit
@@ -238,9 +238,9 @@ def _difference(difference: float | None, k: int) -> Cell:
         f'<path d="M{middle} 3h{end - tip:.1f}l{tip:g} 4l{-tip:g} 4H{middle}z" '
         f'fill="var(--{_tone(k)})"/></svg>'
     )
-    html = f"<strong>{said.html}</strong>" if abs(difference) > _FAR else said.html
+    html = f"<strong>{cell.html}</strong>" if abs(difference) > _FAR else cell.html
     digits = f'<span style="display: inline-block; min-width: 3em">{html}</span>'
-    return Cell(bar + digits, "number", said.value)
+    return Cell(bar + digits, "number", cell.value)
 
 
 def _differing(content: Mapping[str, Any], key: str, head: str) -> str:
@@ -250,7 +250,7 @@ def _differing(content: Mapping[str, Any], key: str, head: str) -> str:
     ]
     if not rows:
         return "<p>None.</p>\n"
-    return table(f"{key.capitalize()} that differ", [head, *_labels(content)], rows)
+    return table(f"Different {key}", [head, *_labels(content)], rows)
 
 
 def _inputs_section(content: Mapping[str, Any]) -> str:
@@ -266,4 +266,4 @@ def _inputs_section(content: Mapping[str, Any]) -> str:
         for row in content["inputs"]
     ]
     headers = ["role", *_labels(content), "file", "from s", "to s", "SHA-256"]
-    return table("Files read, those that differ first", headers, rows)
+    return table("Files read, different ones first", headers, rows)

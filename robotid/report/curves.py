@@ -1,4 +1,4 @@
-"""The report's section of charts over time: each joint's, in every recording that is shown."""
+"""The section of charts over time: of each joint, in each recording that is drawn."""
 
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
@@ -9,7 +9,7 @@ from robotid.pages.html import code, folded
 
 __all__ = ["curves_section", "drawn"]
 
-_ROWS = 24_000  # of all charts together: about half a MB
+_ROWS = 24_000  # of all charts: about half a MB
 _LONGEST = 2000  # rows of one chart
 _OPEN = 6  # joints that are open at most
 _MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
@@ -18,7 +18,7 @@ RunT = TypeVar("RunT")
 
 
 def drawn(runs: Sequence[RunT], rows: Sequence[str]) -> Sequence[RunT]:
-    """Return the recordings that are drawn, the first ones, to keep the page small.
+    """Return the recordings that are drawn: the first ones, to limit the page's size.
 
     Args:
         runs: All recordings.
@@ -28,30 +28,32 @@ def drawn(runs: Sequence[RunT], rows: Sequence[str]) -> Sequence[RunT]:
 
 
 def curves_section(
-    said: str,
+    intro: str,
     runs: Mapping[str, RunT],
     rows: Sequence[str],
     verdicts: Mapping[str, Mapping[str, Any]],
     worst: Sequence[str],
     charts: Callable[[RunT, int, str, int], str],
+    note: Callable[[int], str],
 ) -> str:
-    """Return a part for each joint; those that are not good are open, the worst few.
+    """Return a part for each joint; the worst joint and the worst ones that are not good are open.
 
     Args:
-        said: What the charts show, HTML.
-        runs: The recordings, by a name that links their charts.
+        intro: Description of the charts, HTML.
+        runs: The recordings, by the name that links their charts.
         rows: Names of the joints.
-        verdicts: The verdict on each, as in result.json.
+        verdicts: The verdict on each joint, as in result.json.
         worst: Joints that have errors, the worst first.
-        charts: Returns the charts of a recording and of the number of a joint, of a name that
-            links them, of so many points.
+        charts: Returns the charts of a recording, given the number of a joint, the name that
+            links the charts, and the number of points.
+        note: Returns the HTML above the charts of the joint with a number.
     """
     points = min(_LONGEST, max(200, _ROWS // (2 * len(rows) * max(1, len(runs)))))
-    parts, first = [said], [*worst][:_OPEN]
+    parts, first = [intro], [*worst][:_OPEN]
     for row, name in enumerate(rows):
         status = verdict_cell(name, verdicts[name]) if name in verdicts else ""
-        html = "".join(charts(run, row, link, points) for link, run in runs.items())
+        html = note(row) + "".join(charts(run, row, link, points) for link, run in runs.items())
         summary = f"<strong>{code(name).html}</strong> {escape(status)}"
-        is_open = status.startswith(("poor", "usable")) and name in first
+        is_open = name in first[:1] or (status.startswith(("poor", "usable")) and name in first)
         parts.append(folded(f"joint-{row}", summary, html, is_open=is_open))
     return "".join(parts)

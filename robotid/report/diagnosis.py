@@ -26,7 +26,7 @@ from robotid.robot.parameters import INERTIAL_TERMS
 __all__ = ["body_figures", "drive_figures", "information_section", "residual_section"]
 
 _PAIRS = 15  # strongest correlations that are listed
-_STRONG = 0.8  # a correlation worth naming
+_STRONG = 0.8  # smallest correlation that is listed
 _CELL = 11  # [px] of the correlation matrix
 _STEPS = 8  # shades of each sign in it
 _STILL = 100  # points of a friction chart in print
@@ -39,15 +39,15 @@ def residual_section(found: Identification) -> str:
         found: The identification.
     """
     if found.model.is_static:
-        return "<p>Stands and slow segments are no signal that has a spectrum.</p>\n"
+        return "<p>Static poses and slow segments have no spectrum.</p>\n"
     figures = "".join(_residual_figures(found, row) for row in range(found.model.n_rows))
     name = escape(shown_evaluation(found).recording.name)
     return (
-        f"<p>Of {name}, rows used. Left: the residual's spectrum "
-        "under that of the torque; a peak is a vibration or a ripple that the model lacks. Right: "
-        "its autocorrelation; noise behind the filter falls to zero within the dotted time, "
-        "1/(2 cut-off). What stays longer is motion that the model does not explain. The dotted "
-        "frequency is the cut-off.</p>\n"
+        f"<p>Samples of {name} that are used. Left: spectra of residual and torque. A peak is a "
+        "vibration or a ripple that the model does not contain. The dotted line is the filter's "
+        "cut-off. Right: autocorrelation of the residual. Filtered noise falls to zero within the "
+        "dotted time, 1/(2 cut-off). A slower decay indicates an effect of the motion that the "
+        "model does not contain.</p>\n"
         f'<div class="plots">\n{figures}</div>\n'
     )
 
@@ -69,27 +69,27 @@ def drive_figures(found: Identification) -> str:
     choice = "".join(_choice(found, drive) for drive in found.drives)
     if choice:
         choice = (
-            "<h3>Which friction the logs show</h3>\n<p>Beside viscous and Coulomb friction, for "
-            "each joint: the error of segments that were held out of the fit, and how likely they "
-            f"gain that much by chance.</p>\n{choice}"
+            "<h3>Selection of friction terms</h3>\n<p>Terms in addition to viscous and Coulomb "
+            "friction, for each joint: the error on held-out segments, and the p-value of its "
+            f"decrease.</p>\n{choice}"
         )
     curves = ""
-    is_static = found.model.is_static  # it knows no speeds
-    seen = escape(shown_evaluation(found).recording.name)
+    is_static = found.model.is_static  # without speeds
+    log = escape(shown_evaluation(found).recording.name)
     if not is_static and not all(term.is_inertia for _, term in layout.drive_parameters):
         curves = (
-            f"<h3>Friction against speed</h3>\n<p>Measured: torque that inertia, gravity and "
-            f"armature leave, on {seen}; identified: friction and offset. "
-            "Dots that bend away from the blue ones ask for another friction model; what is beyond "
-            "chance is among the warnings and notes. The line is the friction of steady motion, "
-            "with the 95 % band of its parameters.</p>\n"
+            f"<h3>Friction against speed</h3>\n<p>Measured: torque minus inertia, gravity and "
+            f"armature, on {log}; identified: friction and offset. "
+            "Measured dots that deviate systematically from the identified ones indicate another "
+            "friction curve; significant deviations are findings. The line is the friction at "
+            "constant speed, with the 95 % band of its parameters.</p>\n"
             f'<div class="plots">\n{_friction_figures(found)}</div>\n'
         )
     return f'{curves}{choice}<h3>Values</h3>\n<div class="plots">\n{bars}</div>\n'
 
 
 def body_figures(found: Identification) -> str:
-    """Return each inertial parameter of all bodies with error bars, beside the URDF's.
+    """Return each inertial parameter of all bodies with error bars, and the URDF's values.
 
     Args:
         found: The identification.
@@ -99,35 +99,35 @@ def body_figures(found: Identification) -> str:
 
 
 def information_section(found: Identification) -> str:
-    """Return how much the data say: singular values, shares, correlations.
+    """Return the information in the data: singular values, shares, correlations.
 
     Args:
         found: The identification.
     """
-    said, names = information(found), found.mapping.base_names
-    shares = np.round(100 * said.data_share).astype(int)
+    info, names = information(found), found.mapping.base_names
+    shares = np.round(100 * info.data_share).astype(int)
     weak = [
-        [code(names[i]), number(float(said.data_share[i]) * 100, ".1f")]
-        for i in np.argsort(said.data_share, kind="stable")
-        if said.data_share[i] < 0.99
+        [code(names[i]), number(float(info.data_share[i]) * 100, ".1f")]
+        for i in np.argsort(info.data_share, kind="stable")
+        if info.data_share[i] < 0.99
     ]
     known = (
         table(
-            "Base parameters that the data settle by less than 99 %, the weakest first",
-            ["parameter", "share of the data %"],
+            "Base parameters that the data determine by less than 99 %, the weakest first",
+            ["parameter", "share of data %"],
             weak,
         )
         if weak
-        else "<p>The data settle every base parameter by 99 % or more.</p>\n"
+        else "<p>The data determine every base parameter by 99 % or more.</p>\n"
     )
-    singular = singular_chart(said.singular_values, found.wls.rank)
+    singular = singular_chart(info.singular_values, found.wls.rank)
     return (
         f"<p>Condition number {found.wls.condition:.3g}; singular values from "
-        f"{said.singular_values[0]:.3g} to {said.singular_values[-1]:.2g}. Of what is known about "
-        f"the base parameters the data give {shares.mean():.0f} % in the mean and {shares.min()} "
-        "% of the weakest, the URDF the rest: S²/(S² + s²) with the spread S assumed before the "
-        "fit and the standard error s of WLS.</p>\n"
-        f"{chart_html(singular, singular.title)}{known}" + _correlations(said, names)
+        f"{info.singular_values[0]:.3g} to {info.singular_values[-1]:.2g}. The data determine the "
+        f"base parameters by {shares.mean():.0f} % on average and the weakest by {shares.min()} "
+        "%, the URDF determines the rest: S²/(S² + s²) with the prior's spread S and the standard "
+        "error s of WLS.</p>\n"
+        f"{chart_html(singular, singular.title)}{known}" + _correlations(info, names)
     )
 
 
@@ -135,12 +135,14 @@ def _residual_figures(found: Identification, row: int) -> str:
     name = escape(found.model.row_names[row])
     charts = residual_charts(found, shown_evaluation(found), row)
     if charts is None:
-        return f"<p>{name}: no rows used.</p>\n"
+        return f"<p>{name}: no samples used.</p>\n"
     of_noise, r = charts[1].x, charts[1].series[0].y
     inside = np.flatnonzero(np.abs(r) < 0.2)
-    falls = f"falls below 0.2 after {of_noise[inside[0]]:.2g} s" if len(inside) else "stays high"
-    said = (f"<strong>{name}</strong>: spectrum", f"<strong>{name}</strong>: correlation {falls}")
-    return "".join(chart_html(chart, caption) for chart, caption in zip(charts, said, strict=True))
+    falls = (
+        f"falls below 0.2 after {of_noise[inside[0]]:.2g} s" if len(inside) else "does not decay"
+    )
+    captions = f"<strong>{name}</strong>: spectrum", f"<strong>{name}</strong>: correlation {falls}"
+    return "".join(chart_html(*each) for each in zip(charts, captions, strict=True))
 
 
 def _friction_figures(found: Identification) -> str:
@@ -149,7 +151,7 @@ def _friction_figures(found: Identification) -> str:
     for joint in found.model.row_names:
         chart = friction_chart(found, joint, split=split)
         if chart is None:
-            figures.append(f"<p>{escape(joint)}: no rows used.</p>\n")
+            figures.append(f"<p>{escape(joint)}: no samples used.</p>\n")
         else:
             caption = f"<strong>{escape(joint)}</strong>"
             figures.append(chart_html(chart, caption, still=_STILL))
@@ -161,29 +163,29 @@ def _parameter_figure(chart: Chart) -> str:
 
 
 def _choice(found: Identification, drive: DriveChoice) -> str:
-    """Return what friction of a joint was tried, what was taken, and its shapes."""
-    taken = " + ".join(drive.families) or "nothing more"
+    """Return the candidate friction terms of a joint, the selection, and its shape parameters."""
+    selected = " + ".join(drive.families) or "no additional term"
     shapes = [
         f"{shape.name} = {shape.value:.3g} ± {shape.std_error:.2g} {shape.unit}"
         + (" (at its bound)" if shape.is_at_bound else "")
         for shape in drive.shapes
     ]
-    said = f"{drive.joint}: {taken}" + (f"; {listed(shapes)}" if shapes else "")
+    title = f"{drive.joint}: {selected}" + (f"; {listed(shapes)}" if shapes else "")
     rows = [
         [
             text(" + ".join(tried.families) or "viscous and Coulomb"),
             number(tried.held_out_error_pct, ".2f"),
             number(tried.p_value, ".1e") if tried.families else text(""),
-            text("taken" if tried.is_selected else ""),
+            text("selected" if tried.is_selected else ""),
         ]
         for tried in drive.tried
     ]
-    headers = ["terms", "held-out error %", "p_value", ""]
-    return f"<details><summary>{escape(said)}</summary>{table(said, headers, rows)}</details>\n"
+    headers = ["terms", "held-out error %", "p-value", ""]
+    return f"<details><summary>{escape(title)}</summary>{table(title, headers, rows)}</details>\n"
 
 
-def _correlations(said: Information, names: Sequence[str]) -> str:
-    r = np.where(np.isfinite(said.correlation), said.correlation, 0.0)
+def _correlations(info: Information, names: Sequence[str]) -> str:
+    r = np.where(np.isfinite(info.correlation), info.correlation, 0.0)
     lower = np.abs(np.tril(r, -1))
     order = np.argsort(-lower, axis=None, kind="stable")[:_PAIRS]
     pairs = [(int(i), int(j)) for i, j in zip(*np.unravel_index(order, r.shape), strict=True)]
@@ -194,8 +196,8 @@ def _correlations(said: Information, names: Sequence[str]) -> str:
     ]
     strong = int((lower >= _STRONG).sum())
     title = f"Correlation of the errors of {len(names)} base parameters; {strong} pairs above 0.8"
-    image = _correlation_map(said.correlation, names, title=title, key="correlation")
-    caption = "Blue: errors rise together; orange: one rises as the other falls; full colour at 1."
+    image = _correlation_map(info.correlation, names, title=title, key="correlation")
+    caption = "Blue: positive; orange: negative; full colour at ±1."
     listed = (
         table(
             f"The strongest of {strong} correlations of {_STRONG:g} and more",
@@ -206,8 +208,8 @@ def _correlations(said: Information, names: Sequence[str]) -> str:
         else f"<p>No two errors are correlated by {_STRONG:g} or more.</p>\n"
     )
     return (
-        "<h3>Correlation of errors</h3>\n<p>Two parameters whose errors are correlated near ±1 are "
-        "known as a sum or a difference only: the motion does not tell them apart.</p>\n"
+        "<h3>Correlation of errors</h3>\n<p>The data determine only the sum or the difference of "
+        "two parameters whose errors have a correlation near ±1.</p>\n"
         f"{listed}{figure(caption, image)}"
     )
 

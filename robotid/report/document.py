@@ -1,4 +1,4 @@
-"""The report of an identification as one HTML file that fetches nothing."""
+"""The report of an identification as one self-contained HTML file."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,16 +25,16 @@ def write_report(
     files: Mapping[str, str] | None = None,
     origin: Origin | None = None,
 ) -> Path:
-    """Write what an identification found, and how far to trust it, as one HTML file.
+    """Write the report of an identification: result, verdict and evidence, as one HTML file.
 
-    The file fetches nothing. It is made beside its target and then put in place.
+    The file loads no other file. It is written atomically.
 
     Args:
-        identification: What was found.
+        identification: The identification.
         target: The file to write.
-        files: Files beside it to link to, by what they are, as "URDF".
-        origin: How it was identified and where its results are, for the commands that it shows;
-            none are shown that need what is not said.
+        files: Files of the same folder to link to, by their kind, as "URDF".
+        origin: Source and folder of the results, for the commands of the report; commands that
+            need more than is given are left out.
 
     Returns:
         Path of the file.
@@ -49,19 +49,19 @@ def write_report(
     require_kind(origin, (Origin, type(None)), "origin", "an Origin")
     at = origin or Origin()
     if isinstance(identification, Identification):
-        shown = shown_torques(identification, at)
+        shown = shown_torques(identification, at, (files or {}).get("replay", ""))
     else:
-        shown = _of_loops(identification, at)
+        shown = _of_loops(identification, at, (files or {}).get("replay", ""))
     return write_text(page_of(shown, files or {}), target)
 
 
-def _of_loops(found: "LoopIdentification", at: Origin) -> Shown:
-    """Return what is shown of an identification by simulation, which few need to import."""
+def _of_loops(found: "LoopIdentification", at: Origin, replay: str) -> Shown:
+    """Return the content of a report on a closed-loop identification; imported when needed."""
     from robotid.closed_loop.result import LoopIdentification
     from robotid.report.positions import shown_positions
 
     require_kind(found, LoopIdentification, "identification", "a robotid.Identification")
     result = build_result(found, {"estimator": found.estimator.to_dict()})
     return shown_positions(
-        result, found.fitted, found.validation, at, (found.model, found.standard)
+        result, found.fitted, found.validation, at, (found.model, found.standard), replay
     )

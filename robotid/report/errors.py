@@ -1,4 +1,4 @@
-"""Errors of joints, of torques or of positions: as bars, and as a table of each recording."""
+"""Torque or position errors of the joints: as bars, and as a table of each recording."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,19 +12,19 @@ from robotid.report.bars import Bar, Mark, bars_html
 
 __all__ = ["POSITION", "TORQUE", "Errors", "Quantity", "error_bars", "error_table", "worst_errors"]
 
-_SMALL = 1e-3  # of rad and m, which errors of positions are shown in
+_SMALL = 1e-3  # [rad or m] unit of position errors
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is predicted, and what its error is compared with.
+    """The predicted quantity, and the baselines of its error.
 
     Attributes:
-        title: What its error is called.
-        share: What the error is a share of, as a formula or a few words.
+        title: Name of its error.
+        share: Definition of the error, as a formula.
         limits: Largest error that is good, and largest that is usable [%].
-        marks: Other predictions of it, by name of the baseline.
-        scale: Its unit over that which errors are shown in.
+        marks: Markers of the baselines, by name.
+        scale: Unit of the errors shown, in units of the quantity.
         prefix: Prefix of that unit.
     """
 
@@ -52,8 +52,8 @@ POSITION = Quantity(
     "100 |q − simulated| / |motion|",
     (positions.GOOD, positions.POOR),
     {
-        "second_order": Mark("second order", "M-5 -1h10l-5 6z", "fill"),
-        "rows": Mark("torques alone", "M-5 19h10l-5 -6z", "fill"),
+        "second_order": Mark("2nd-order model", "M-5 -1h10l-5 6z", "fill"),
+        "rows": Mark("torque fit", "M-5 19h10l-5 -6z", "fill"),
         "urdf": Mark("URDF", "M0 0v18", "line"),
         "command": Mark("command", "M-3 6l6 6m0 -6l-6 6", "line"),
         "steady": Mark("constant speed", "M-3 9h6", "line"),
@@ -65,12 +65,12 @@ POSITION = Quantity(
 
 @dataclass(frozen=True)
 class Errors:
-    """The errors of joints on a recording, or on several together.
+    """The errors of the joints on one recording, or on several together.
 
     Attributes:
         name: The recording.
-        joints: Metrics of each joint that has rows, as in result.json; WLS is a baseline of them.
-        is_fitted: Whether it was fitted.
+        joints: Metrics of each joint that has samples, as in result.json; WLS is a baseline.
+        is_fitted: Whether the recording was fitted.
     """
 
     name: str
@@ -81,12 +81,12 @@ class Errors:
     def caption(self) -> str:
         """The recording, and whether it was fitted."""
         if self.is_fitted and not self.name:
-            return "All fitted rows together"
+            return "All fitted samples together"
         return f"{self.name}: {'fitted' if self.is_fitted else 'not fitted'}"
 
 
 def worst_errors(recordings: Sequence[Errors]) -> dict[str, Mapping[str, Any]]:
-    """Return the metrics of each joint on the recording where it is worst, the worst joint first.
+    """Return the metrics of each joint on its worst recording, the worst joint first.
 
     Args:
         recordings: The recordings.
@@ -100,7 +100,7 @@ def worst_errors(recordings: Sequence[Errors]) -> dict[str, Mapping[str, Any]]:
 
 
 def _share(measured: Mapping[str, Any]) -> float:
-    """Return a joint's error [%], inf where nothing was measured."""
+    """Return a joint's error [%]; inf without measurement."""
     error = measured.get("relative_error_pct")
     return float("inf") if error is None else float(error)
 
@@ -113,14 +113,14 @@ def error_bars(
     *,
     has_why: bool = False,
 ) -> str:
-    """Return the errors of joints as bars, the worst first, each where it is worst.
+    """Return the errors of the joints on their worst recordings as bars, the worst joint first.
 
     Args:
-        quantity: What is predicted.
-        recordings: The recordings that count.
-        rows: Names of the joints, of which ids of the page are numbered.
+        quantity: The predicted quantity.
+        recordings: The recordings that the verdict uses.
+        rows: Names of the joints, whose order numbers the ids of the page.
         verdicts: The verdict on each joint, as in result.json.
-        has_why: Whether the page says why each joint is as it is.
+        has_why: Whether the page has a residual analysis of each joint.
     """
     worst, bars = worst_errors(recordings), []
     # the only validation recording need not be named
@@ -137,7 +137,7 @@ def error_bars(
         bars.append(Bar(row, joint, error, others, of_joint, f"joint-{row}", why))
     known = {key for bar in bars for key, error in bar.others.items() if error is not None}
     marks = {key: mark for key, mark in quantity.marks.items() if key in known}
-    kind = "fitted rows, for there is no validation log"
+    kind = "fitted samples, without validation log"
     kind = kind if recordings[0].is_fitted else "not fitted"
     return bars_html(quantity.title, f"{quantity.share}, {kind}", bars, marks, quantity.limits)
 
@@ -151,14 +151,14 @@ def error_table(
     """Return the table of the errors on a recording.
 
     Args:
-        quantity: What is predicted.
+        quantity: The predicted quantity.
         errors: The errors.
         rows: Names of all joints.
         verdicts: The verdict on each joint, as in result.json.
     """
     keys = {f"{key}_relative_error_pct": mark.words for key, mark in quantity.marks.items()}
     shown = [key for key in keys if any(m.get(key) is not None for m in errors.joints.values())]
-    headers = ["joint", "error %", "verdict", "RMSE", "unit", "R²", "rows"]
+    headers = ["joint", "error %", "verdict", "RMSE", "unit", "R²", "samples"]
     headers += [f"{keys[key]} %" for key in shown]
     cells = []
     for name in rows:
@@ -167,15 +167,15 @@ def error_table(
             status = verdict_cell(name, verdicts[name])
         if m is None:
             dashes = [number(None)] * (3 + len(shown))
-            nothing = text(f"{status}; no rows used")
+            nothing = text(f"{status}; no samples used")
             cells.append([code(name), number(None), nothing, number(None), text(""), *dashes[1:]])
             continue
-        said = "; ".join([status, *(note for note in _notes(m) if note not in status)])
+        verdict = "; ".join([status, *(note for note in _notes(m) if note not in status)])
         cells.append(
             [
                 code(name),
                 percent(m["relative_error_pct"]),
-                text(said, flag=said != status or status.startswith("poor")),
+                text(verdict, flag=verdict != status or status.startswith("poor")),
                 number(m["rmse"] / quantity.scale, ".3g"),
                 text(f"{quantity.prefix}{m['unit']}"),
                 number(m.get("r2"), ".3f"),

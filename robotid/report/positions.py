@@ -1,7 +1,7 @@
-"""What the report shows of an identification by simulation, from its result.json and its logs."""
+"""The content of a report on a closed-loop identification, from its result.json and logs."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -20,54 +20,58 @@ from robotid.report.curves import curves_section, drawn
 from robotid.report.errors import POSITION, Errors, worst_errors
 from robotid.report.shown import Shown
 from robotid.report.tables import input_table, parameter_section, version_table
+from robotid.report.worst_second import Residual, worst_html, worst_second
 from robotid.robot.model import RobotModel
 
 __all__ = ["shown_positions"]
 
-_NAMED = 7  # joints whose errors over the horizon are drawn
+_NAMED = 7  # joints in the chart of errors over the horizon
 _ROLES = {"validation": "not fitted", "identification": "fitted"}
 _ERRORS = (
-    "<p>error = 100 |q − simulated| / |motion|, of the motion about its mean. The identified robot "
-    "starts where the log starts and then hears the commands alone; over horizons, it is put back "
-    "to what was measured after each. For comparison, the error of the command taken for the "
-    "position, of the URDF with the stated gains and neither friction nor delay, and of a model of "
-    "second order for each joint by itself.</p>\n"
+    "<p>error = 100 |q − simulated| / |motion|, with the motion about its mean. The simulation "
+    "starts at the log's first sample and has the commands as its only input; errors over "
+    "horizons are of simulations that restart from the measurement after each horizon. For "
+    "comparison: the error of the command as position, of the URDF with the stated gains, without "
+    "friction and delay, and of a second-order model of each joint alone.</p>\n"
 )
 _DRIVEN_ERRORS = (
-    "<p>error = 100 |q − simulated| / |motion|. The logged torque alone drives the identified "
-    f"robot, which is put back to what was measured every {DRIFTS:g} s, or after another horizon. "
-    "For comparison, the error of what the torques determine by themselves, of the URDF with "
-    "drives fitted to them, and of going on at the speed of the start.</p>\n"
+    "<p>error = 100 |q − simulated| / |motion|. The simulation has the logged torque as its only "
+    f"input and restarts from the measurement every {DRIFTS:g} s, or after another horizon. "
+    "For comparison: the error of the parameters fitted to torques only, of the URDF with "
+    "drives fitted to torques, and of a motion at constant speed.</p>\n"
 )
 _PARAMETERS = (
-    "τ = kp (q<sub>ref</sub>(t − delay) − q) + kd (v<sub>ref</sub> − v) moves the joint against "
-    "armature, friction and offset; where an encoder reads 0, the joint is at zero in the URDF."
+    "Motor torque: τ = kp (q<sub>ref</sub>(t − delay) − q) + kd (v<sub>ref</sub> − v). It moves "
+    "armature, links, friction and offset. zero: position of the joint in the URDF where its "
+    "encoder reads 0."
 )
-_DRIVEN = "The logged torque moves the joint against armature, friction and offset."
+_DRIVEN = "The logged torque moves armature, links, friction and offset."
 
 
 def shown_positions(
     content: Mapping[str, Any],
     fitted: Sequence[OpenLoop],
-    kept: Sequence[OpenLoop],
+    validation: Sequence[OpenLoop],
     origin: Origin,
     changed: tuple[RobotModel, Array] | None = None,
+    replay: str = "",
 ) -> Shown:
-    """Return what a report shows of a result.
+    """Return the content of a report on a result.
 
     Args:
         content: Content of the result.json.
-        fitted: The fitted logs, with the positions simulated for them.
-        kept: The same of validation logs.
-        origin: Where the result is, for commands.
+        fitted: The fitted logs with their simulated positions.
+        validation: The validation logs with their simulated positions.
+        origin: The folder of the result, for commands.
         changed: The robot of the URDF and its identified standard parameters, shape (p,), SI
-            units; None if the URDF is not at hand.
+            units; None if the URDF is not available.
+        replay: File of the replay in the report's folder; "" if there is none.
 
     Raises:
-        DataError: If a log has other joints than the result.
+        DataError: If the joints of a log and of the result differ.
     """
     joints, is_driven = content["joints"], _is_driven(content)
-    for run in (*kept, *fitted):
+    for run in (*validation, *fitted):
         if run.q.shape[1] != len(joints):
             raise DataError(f"{run.log.name} has {run.q.shape[1]} joints, the result {len(joints)}")
     names = {
@@ -79,7 +83,7 @@ def shown_positions(
         content["identification"]["per_joint"],
         is_fitted=True,
     )
-    apart = [
+    validated = [
         Errors(entry.get("name", Path(entry["log"]).name), entry["per_joint"])
         for entry in content["validation"]
     ]
@@ -88,8 +92,8 @@ def shown_positions(
         for key in ("standard_parameters", "drive_parameters")
         for entry in content[key]
     ]
-    worst = list(worst_errors(apart or [whole]))
-    source = "roll-outs of its torques" if is_driven else "commands"
+    worst = list(worst_errors(validated or [whole]))
+    source = "torque-driven simulation" if is_driven else "commands"
     model, standard = changed or (None, np.zeros(0))
     return Shown(
         title=f"{content['robot']}: drives from {source}",
@@ -101,20 +105,20 @@ def shown_positions(
             for entry in content.get("warnings", [])
         ],
         quantity=POSITION,
-        counted=apart or [whole],
-        recordings=[*apart, whole],
+        counted=validated or [whole],
+        recordings=[*validated, whole],
         facts=_facts(content),
         steps=loop_steps(content, origin),
-        made=f"<p>{escape(_made(content, names))}</p>\n",
+        made=f"<p>{escape(_method(content, names))}</p>\n",
         errors=(_DRIVEN_ERRORS if is_driven else _ERRORS, _horizons(content)),
-        curves=("Positions", _positions(content, fitted, kept, worst)),
+        curves=("Positions", _positions(content, fitted, validation, worst, replay)),
         why="",
         parameters=parameter_section(
             model, standard, entries, _DRIVEN if is_driven else _PARAMETERS
         ),
         entries=entries,
         appendix={
-            "open": ("What the data do not determine", _undetermined(content)),
+            "open": ("Parameters not identifiable", _undetermined(content)),
             "settings": ("Controller", _controller(content)),
             "inputs": ("Inputs", input_table(content["inputs"])),
             "versions": (
@@ -126,7 +130,7 @@ def shown_positions(
 
 
 def _is_driven(content: Mapping[str, Any]) -> bool:
-    """Return whether the logged torque drove the robot, which no loop was closed on."""
+    """Return whether the logged torque is the simulation's input, without a controller."""
     return bool(content["simulation"]["controller"]["kind"] == "torque")
 
 
@@ -142,7 +146,7 @@ def _name(entry: Mapping[str, Any]) -> str:
 
 
 def _unit(entry: Mapping[str, Any]) -> str:
-    """Return the unit that errors are shown in, "mrad or mm" if some joints are prismatic."""
+    """Return the unit of the errors, "mrad or mm" if some joints are prismatic."""
     units = dict.fromkeys(each["unit"] for each in entry["per_joint"].values())
     return " or ".join(f"{POSITION.prefix}{unit}" for unit in units)
 
@@ -164,7 +168,7 @@ def _facts(content: Mapping[str, Any]) -> dict[str, str]:
     ours = _mean([each["rmse"] for each in joints])
     over = f" over {DRIFTS:g} s" if _is_driven(content) else ""
     facts = {
-        f"Open-loop position error{over}, {_ROLES[role]}": (
+        f"Simulated position error{over}, {_ROLES[role]}": (
             f"<strong>{number(_scaled(ours), '.3g').html} {_unit(entry)}</strong>, geometric mean "
             f"of {len(joints)} joint{'s' if len(joints) > 1 else ''}"
         )
@@ -175,23 +179,23 @@ def _facts(content: Mapping[str, Any]) -> dict[str, str]:
         if ours and (theirs := _mean([each.get(f"{key}_rmse") for each in joints]))
     ]
     if times:
-        facts["By comparison, times that error"] = escape(", ".join(times))
+        facts["Other predictions, relative to this error"] = escape(", ".join(times))
     return facts
 
 
-def _made(content: Mapping[str, Any], names: Mapping[str, Sequence[str]]) -> str:
-    """Return what was fitted to what."""
-    fit, kept = content["simulation"].get("fit", {}), names["validation"]
+def _method(content: Mapping[str, Any], names: Mapping[str, Sequence[str]]) -> str:
+    """Return a description of the fit and its logs."""
+    fit, validation = content["simulation"].get("fit", {}), names["validation"]
     count = f"{fit['parameters']} parameters" if "parameters" in fit else "Parameters"
     return (
         f"{count} of {len(content['joints'])} joints were fitted to "
         f"{listed(names['identification'])} by {content['settings']['estimator']['name']}. "
-        + (f"Validation: {listed(kept)}." if kept else "There is no validation log.")
+        + (f"Validation: {listed(validation)}." if validation else "There is no validation log.")
     )
 
 
 def _horizons(content: Mapping[str, Any]) -> str:
-    """Return errors over how long the open loop has run, of the worst joints as a chart."""
+    """Return errors over the horizon of the simulation: a chart of the worst joints, and tables."""
     (role, entry), *_ = _entries(content)
     order = sorted(entry["per_joint"].items(), key=lambda item: -item[1]["rmse"])
     errors = _by_horizon({**entry, "per_joint": dict(order)})
@@ -203,22 +207,22 @@ def _horizons(content: Mapping[str, Any]) -> str:
         for k, (name, ys) in enumerate([*lines.items()][:_NAMED])
     ]
     chart = Chart(
-        "position error over the horizon of the open loop", x,
-        (*series, Series("geometric mean of all", _curve(means), "text")),
-        "time since the open loop began [s]", f"RMSE [{_unit(entry)}]", logarithmic="xy",
+        "position error over the horizon of the simulation", x,
+        (*series, Series("geometric mean", _curve(means), "text")),
+        "horizon [s]", f"RMSE [{_unit(entry)}]", logarithmic="xy",
         height=220,
     )  # fmt: skip
     words = [f"the worst {_NAMED} joints"] if len(lines) > _NAMED else []
-    words += ["the whole recording last"] if len(x) > len(entry.get("horizons", {})) else []
-    said = f"{', '.join(['Error over horizon', *words])}: {escape(_name(entry))}, {_ROLES[role]}"
-    return chart_html(chart, said) + "".join(_horizon_table(*each) for each in _entries(content))
+    words += ["whole recording at the end"] if len(x) > len(entry.get("horizons", {})) else []
+    caption = f"{', '.join(['Error over horizon', *words])}: {escape(_name(entry))}, {_ROLES[role]}"
+    return chart_html(chart, caption) + "".join(_horizon_table(*each) for each in _entries(content))
 
 
 def _by_horizon(entry: Mapping[str, Any]) -> dict[float, Mapping[str, float]]:
-    """Return the errors of joints by horizon [s], that of the whole recording among them."""
+    """Return the errors of the joints by horizon [s], including the whole recording."""
     errors = {float(key): own for key, own in entry.get("horizons", {}).items()}
     joints = entry["per_joint"]
-    if "steady_rmse" not in next(iter(joints.values())):  # which is put back again and again
+    if "steady_rmse" not in next(iter(joints.values())):  # no restarts
         errors[entry["end"] - entry["start"]] = {name: x["rmse"] for name, x in joints.items()}
     return errors
 
@@ -242,25 +246,27 @@ def _horizon_table(role: str, entry: Mapping[str, Any]) -> str:
 def _positions(
     content: Mapping[str, Any],
     fitted: Sequence[OpenLoop],
-    kept: Sequence[OpenLoop],
+    validation: Sequence[OpenLoop],
     worst: Sequence[str],
+    replay: str,
 ) -> str:
     """Return charts of each joint in every log."""
-    joints, count = content["joints"], len(kept)
-    shown = drawn([*kept, *fitted], joints)
+    joints, count = content["joints"], len(validation)
+    shown = drawn([*validation, *fitted], joints)
     if not shown:
-        return "<p>No log is at hand to be shown.</p>\n"
+        return "<p>The logs are not available.</p>\n"
     units = {name: each["unit"] for _, entry in _entries(content)
              for name, each in entry["per_joint"].items()}  # fmt: skip
     words = (
-        f"Measured and simulated position, the simulation put back every {DRIFTS:g} s"
+        f"Measured and simulated position; the simulation restarts every {DRIFTS:g} s"
         if _is_driven(content)
-        else "Commanded, measured and simulated position, the simulation in open loop from the "
-        "first sample"
+        else "Commanded, measured and simulated position; the simulation starts at the first "
+        "sample and has the commands as its only input"
     )
-    said = f"<p>{words}; below, what is left. Drag to zoom; double-click or Escape shows all.</p>\n"
-    if left := [run.name for run in [*kept, *fitted][len(shown) :]]:
-        said += f"<p>Not drawn, to keep the file small: {escape(', '.join(left))}.</p>\n"
+    zoom = "Drag to zoom; double-click or Escape shows all."
+    intro = f"<p>{words}. Below: the position error. {zoom}</p>\n"
+    if left := [run.name for run in [*validation, *fitted][len(shown) :]]:
+        intro += f"<p>Not drawn, to limit the file size: {escape(', '.join(left))}.</p>\n"
     runs = {
         f"log {k}": (run, "not fitted" if k < count else "fitted") for k, run in enumerate(shown)
     }
@@ -269,14 +275,25 @@ def _positions(
         unit = units.get(joints[row], "rad")
         return _charts(*of, row, joints[row], unit, link=link, points=points)
 
+    def note(row: int) -> str:
+        unit = f"{POSITION.prefix}{units.get(joints[row], 'rad')}"
+        seconds = worst_second(_residuals(validation or fitted, row))
+        return worst_html(seconds, joints[row], unit, replay, POSITION.scale)
+
     verdicts = content["verdict"].get("per_joint", {})
-    return curves_section(said, runs, joints, verdicts, worst, charts)
+    return curves_section(intro, runs, joints, verdicts, worst, charts, note)
+
+
+def _residuals(runs: Sequence[OpenLoop], j: int) -> Iterator[Residual]:
+    """Yield the position errors of a joint."""
+    for run in runs:
+        yield Residual(run.name, run.log.name, run.log.t, run.log.q[:, j] - run.q[:, j])
 
 
 def _charts(
     run: OpenLoop, kind: str, j: int, joint: str, unit: str, *, link: str, points: int
 ) -> str:
-    """Return positions of a joint in a log, and how far they are from what was measured."""
+    """Return charts of positions and position errors of a joint in a log."""
     log, q, q_sim = run.log, run.log.q[:, j], run.q[:, j]
     positions = [Series("measured", q, "text"), Series("simulated", q_sim, "predicted")]
     left = [Series("measured − simulated", (q - q_sim) / POSITION.scale, "residual")]
@@ -298,48 +315,47 @@ def _charts(
 
 
 def _undetermined(content: Mapping[str, Any]) -> str:
-    """Return what positions and commands alone do not determine."""
+    """Return the parameters that positions and commands do not determine."""
     structure = content["structure"]
     names = structure["undetermined"]
     parts = []
     if names:
         items = "".join(f"<li>{escape(name)}</li>" for name in names)
-        parts.append(f"<p>The logs leave these open:</p>\n<ul>{items}</ul>\n")
+        parts.append(f"<p>The logs do not determine:</p>\n<ul>{items}</ul>\n")
     elif alike := [f for f in content.get("warnings", ()) if f["code"] == "proportional_commands"]:
         names = escape(listed([f["where"] for f in alike]))
         parts.append(
-            "<p>Every parameter has a standard error by this model, but some commands are "
+            "<p>Every parameter has a standard error in this model, but some commands are "
             f"proportional (proportional_commands: {names}): effects of one joint on another "
             "are not distinguishable from its own.</p>\n"
         )
     else:
-        parts.append("<p>The logs determine all that was to be found.</p>\n")
+        parts.append("<p>The logs determine all free parameters.</p>\n")
     for entry in structure.get("indistinguishable", []):
-        parts.append(f"<p>Only together: {escape(listed(entry['names']))}.</p>\n")
+        parts.append(f"<p>Indistinguishable: {escape(listed(entry['names']))}.</p>\n")
     if _is_driven(content):
         return "".join(parts)
     parts.append(
-        "<p>Positions and commands determine torques up to one factor: with gains, inertias, "
-        "frictions and masses all larger by it, the motion is the same. What was stated or is held "
-        "sets it: "
-        f"{escape(_held(content))}.</p>\n"
+        "<p>Positions and commands determine torques up to a common factor: gains, inertias, "
+        "friction and masses multiplied by this factor cause the same motion. Stated and fixed "
+        f"parameters determine the factor: {escape(_fixed(content))}.</p>\n"
     )
     return "".join(parts)
 
 
-def _held(content: Mapping[str, Any]) -> str:
-    """Return which drive parameters were stated or are held, those of all joints by their term."""
-    held: dict[str, list[str]] = {}
+def _fixed(content: Mapping[str, Any]) -> str:
+    """Return the stated and fixed drive parameters, by term if all joints have them."""
+    fixed: dict[str, list[str]] = {}
     for entry in content["drive_parameters"]:
         if entry["value"] and entry.get("std_error") is None:
             joint, _, term = entry["name"].rpartition(".")
-            held.setdefault(term, []).append(joint)
+            fixed.setdefault(term, []).append(joint)
     every = len(content["joints"])
-    said = [
-        f"{term} of {'every joint' if len(joints) == every else listed(joints, 4)}"
-        for term, joints in held.items()
+    terms = [
+        f"{term} of {'all joints' if len(joints) == every else listed(joints, 4)}"
+        for term, joints in fixed.items()
     ]
-    return listed([*said, "masses of the URDF"])
+    return listed([*terms, "masses of the URDF"])
 
 
 def _controller(content: Mapping[str, Any]) -> str:

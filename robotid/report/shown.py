@@ -1,4 +1,4 @@
-"""What a report shows of a result, of torques or of positions, and the page that it makes."""
+"""The content of a report, on torques or on positions, and its page."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,26 +22,26 @@ _WRITTEN = (
 
 @dataclass(frozen=True)
 class Shown:
-    """What a report shows. Texts are HTML.
+    """The content of a report. Texts are HTML.
 
     Attributes:
         title: Title of the page, not escaped.
         robot: Name of the robot, not escaped.
         rows: Names of its joints.
         verdict: The verdict, as in result.json.
-        findings: What was found.
-        quantity: What is predicted.
-        counted: The recordings whose errors count.
-        recordings: All of them.
+        findings: The findings.
+        quantity: The predicted quantity.
+        counted: The recordings whose errors the verdict uses.
+        recordings: All recordings.
         facts: Figures by their names.
-        steps: What to do next.
-        made: How it was made.
-        errors: What errors are, and what is beside their tables.
+        steps: The next steps.
+        made: Description of the identification.
+        errors: Definition of the errors, and content after their tables.
         curves: Title and content of the section of charts over time.
-        why: Why each joint is predicted as it is; "" if that is not known.
+        why: Residual analysis of each joint; "" if there is none.
         parameters: Content of the section of parameters.
         entries: The parameters, as in result.json.
-        appendix: Title and content of what stands last, by its key.
+        appendix: Title and content of the parts of the appendix, by their keys.
     """
 
     title: str
@@ -70,11 +70,11 @@ class Shown:
 
 
 def first_screen(shown: Shown, files: Mapping[str, str]) -> str:
-    """Return the HTML of the first screen: verdict, figures, errors of joints, what to do next.
+    """Return the HTML of the first screen: verdict, figures, errors of joints, next steps.
 
     Args:
-        shown: What is shown.
-        files: Files beside the report, by what they are.
+        shown: The content.
+        files: Files of the report's folder, by their kind.
     """
     facts = {**shown.facts, **sources_fact(shown.entries)}
     bars = error_bars(
@@ -92,11 +92,11 @@ def page_of(shown: Shown, files: Mapping[str, str]) -> str:
     """Return the HTML of the report.
 
     Args:
-        shown: What is shown.
-        files: Files beside it to link to, by what they are.
+        shown: The content.
+        files: Files of its folder to link to, by their kind.
     """
     worst = list(worst_errors(shown.counted))
-    words, beside = shown.errors
+    definition, after = shown.errors
     tables = "".join(
         error_table(shown.quantity, errors, shown.rows, shown.verdicts)
         for errors in shown.recordings
@@ -108,22 +108,22 @@ def page_of(shown: Shown, files: Mapping[str, str]) -> str:
     line = findings_line(shown.findings, shown.rows, next(iter(worst), ""))
     sections = {
         "errors": Section(
-            "Errors", f"{words}{tables}{beside}", f"{len(shown.verdicts)} joints, by recording",
+            "Errors", f"{definition}{tables}{after}", f"{len(shown.verdicts)} joints, by recording",
             False,
         ),
         "findings": Section(
             "Findings", findings_section(shown.findings, shown.rows, worst), line, False
         ),
         "curves": Section(*shown.curves),
-        "why": Section("Why each joint", shown.why, "what its torque is made of", False),
+        "why": Section("Residual analysis", shown.why, "torque components of each joint", False),
         "parameters": Section(
             "Parameters",
             shown.parameters,
-            f"{found} of {len(shown.entries)} determined by motion, in part or whole",
+            f"{found} of {len(shown.entries)} determined by the data, fully or partly",
             False,
         ),
         "appendix": Section("Appendix", appendix),
     }  # fmt: skip
-    made = folded("made", "How it was made", f'{shown.made}<p class="note">{_WRITTEN}</p>\n')
+    made = folded("made", "Method and data", f'{shown.made}<p class="note">{_WRITTEN}</p>\n')
     there = {key: section for key, section in sections.items() if section.html}
     return page(shown.title, first_screen(shown, files) + made, there)

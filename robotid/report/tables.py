@@ -1,4 +1,4 @@
-"""The report's tables as HTML: parameters, changes, consistency, what is open, settings, inputs."""
+"""The report's tables as HTML: parameters, changes, consistency, settings, inputs."""
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -29,26 +29,26 @@ __all__ = [
     "version_table",
 ]
 
-#: In words, what determined a parameter.
+#: Names of the sources of parameters.
 _DETERMINED = {
-    "data": "motion",
-    "mixed": "motion and prior",
+    "data": "data",
+    "mixed": "data and prior",
     "prior": "prior",
     "bound": "at its bound",
     "stated": "stated",
 }
 
 _FIRST_TERMS = ("kp", "kd", "delay", "limit", "zero")  # of a drive, before all others
-_MILLI = {"s": "ms"}  # units that drives are shown in
+_MILLI = {"s": "ms"}  # units in the table of drives
 _METRICS = {
-    "euclidean": "each parameter over its own spread (euclidean)",
+    "euclidean": "the parameters' differences over their spreads (euclidean)",
     "riemannian": "the pull-back metric at the URDF's pseudo-inertias (riemannian)",
     "entropic": "the divergence of the pseudo-inertias (entropic)",
 }
 _ROLES = {"urdf": "URDF", "identification": "fitted", "validation": "validation"}
 _CHOSEN = {
-    "cv": "chosen by predicting segments of the fitted logs from the others",
-    "evidence": "chosen by the evidence of the fitted logs",
+    "cv": "selected by cross-validation on the fitted logs",
+    "evidence": "selected by the evidence of the fitted logs",
 }
 
 
@@ -59,21 +59,21 @@ def parameter_section(
     words: str,
     on_misfit: Collection[str] = (),
 ) -> str:
-    """Return every parameter of the links and drives, and how the URDF changes.
+    """Return all parameters of the links and drives, and the changes of the URDF.
 
     Args:
-        model: The robot; None if its URDF is not at hand.
+        model: The robot; None if its URDF is not available.
         standard: Its identified standard parameters, shape (p,), SI units; None without a URDF.
         entries: The parameters, as in result.json.
-        words: What they are, HTML.
-        on_misfit: Names of those that stand on a misfit.
+        words: Introduction, HTML.
+        on_misfit: Names of parameters that depend on a misfit of the model.
     """
     return (
-        f"<p>{words} ±: one standard error; low and high: the 95 % interval. Determined by motion, "
-        "where it is below 30 % of the spread assumed before the fit; by the prior, above 90 %, "
-        "which is the URDF; at its bound, where physics allows no more; with another (r), where "
-        "the errors of both cancel: the effect of the two together is known far better than "
-        "each.</p>\n"
+        f"<p>{words} ±: one standard error; low and high: the 95 % interval. Determined by data: "
+        "the standard error is below 30 % of the prior's spread. By prior: it is above 90 %, and "
+        "the value is the URDF's. At its bound: a physical constraint is active. "
+        "With another parameter (r): the errors are strongly correlated, and the joint effect of "
+        "both is determined far better than each parameter.</p>\n"
         + _drive_table(entries)
         + _parameter_table(entries, on_misfit)
         + folded("changes", "Changes of the URDF", _change_section(model, standard))
@@ -81,7 +81,7 @@ def parameter_section(
 
 
 def _parameter_table(entries: Sequence[Mapping[str, Any]], on_misfit: Collection[str]) -> str:
-    """Return every parameter: before, after, and what determined it."""
+    """Return the table of parameters: the URDF's value, the identified value and its source."""
     rows = []
     for entry in entries:
         owner, _, term = entry["name"].rpartition(".")
@@ -93,7 +93,7 @@ def _parameter_table(entries: Sequence[Mapping[str, Any]], on_misfit: Collection
             if not set("123456789") & set(change.html):
                 change = replace(change, html="0")
         words = _DETERMINED[entry["source"]]
-        words += ", on a misfit" if entry["name"] in on_misfit else ""
+        words += ", model misfit" if entry["name"] in on_misfit else ""
         if other := entry.get("correlated_with"):
             words += f", with {other.rpartition('.')[2]} (r = {entry['correlation']:.3f})"
         ends = entry.get("interval_95") or (None, None)
@@ -118,25 +118,25 @@ def _parameter_table(entries: Sequence[Mapping[str, Any]], on_misfit: Collection
 
 
 def _drive_table(entries: Sequence[Mapping[str, Any]]) -> str:
-    """Return the terms of drives side by side, joint by joint."""
+    """Return the drive terms, one row per joint."""
     drives: dict[str, dict[str, Mapping[str, Any]]] = {}
     for entry in entries:
         owner, _, term = entry["name"].rpartition(".")
         if term not in INERTIAL_TERMS:
             drives.setdefault(owner, {})[term] = entry
-    told = {
+    shown = {
         term: entry
         for own in drives.values()
         for term, entry in own.items()
         if entry["value"] or entry.get("std_error") is not None
-    }  # of the others all are 0 and fixed
-    terms = sorted(told, key=lambda term: (*_FIRST_TERMS, term).index(term))
-    units = [_MILLI.get(told[term]["unit"], told[term]["unit"]) for term in terms]
+    }  # all other terms are fixed at 0
+    terms = sorted(shown, key=lambda term: (*_FIRST_TERMS, term).index(term))
+    units = [_MILLI.get(shown[term]["unit"], shown[term]["unit"]) for term in terms]
     headers = ["joint", *(f"{term} [{unit}]" for term, unit in zip(terms, units, strict=True))]
     rows = [
         [code(joint), *(_short(own.get(term)) for term in terms)] for joint, own in drives.items()
     ]
-    return table("Drives, joint by joint", headers, rows, is_data=True) if terms else ""
+    return table("Drives, by joint", headers, rows, is_data=True) if terms else ""
 
 
 def _error(entry: Mapping[str, Any]) -> float:
@@ -156,7 +156,7 @@ def _short(entry: Mapping[str, Any] | None) -> Cell:
 
 
 def sources_fact(entries: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Return how many parameters were determined by what, in figures, HTML by its name.
+    """Return the number of parameters by source, HTML by its name.
 
     Args:
         entries: The parameters, as in result.json.
@@ -172,21 +172,21 @@ def sources_fact(entries: Sequence[Mapping[str, Any]]) -> dict[str, str]:
 
 
 def _change_section(model: RobotModel | None, standard: Array | None) -> str:
-    """Return the lines of the URDF that change, with the name of the link before each."""
+    """Return the changed lines of the URDF, each link's under its name."""
     if standard is None:
         return "<p>No URDF was written.</p>\n"
     lines = [] if model is None else urdf_changes(model, standard)
     if not lines:
-        return "<p>The URDF is no longer where it was read.</p>\n"
+        return "<p>The URDF is no longer at its path.</p>\n"
     kinds, html, link = {"-": "del", "+": "ins"}, "", ""
     for line in lines[2:]:
         if line[0] in kinds:
             html += f"<{kinds[line[0]]}>{escape(line)}</{kinds[line[0]]}>\n"
-        elif (name := line.rpartition("@@ ")[2]) != link:  # lines between that stay cut it in two
+        elif (name := line.rpartition("@@ ")[2]) != link:  # unchanged lines split a link's changes
             html, link = f"{html}<strong>{escape(name)}</strong>\n", name
     title = " and ".join(line.split(" ", 1)[1].strip() for line in lines[:2])
     return (
-        f"<p>Of {escape(title)}; every other byte is the same.</p>\n"
+        f"<p>{escape(title)}; all other bytes are unchanged.</p>\n"
         f'<pre class="diff" tabindex="0">{html}</pre>\n'
     )
 
@@ -207,17 +207,17 @@ def base_table(found: Identification) -> str:
         value, uncertain = with_error(found.base[k], error)
         share = _relative(found.base[k], error)
         rows.append([code(name), value, uncertain, share, text(units[i]), code(expression)])
-    headers = ["parameter", "value", "± error", "relative %", "unit", "stands for"]
+    headers = ["parameter", "value", "± error", "relative %", "unit", "expression"]
     return (
-        "<p>The combinations of parameters that torque depends on. Each is named after one of "
-        "its terms; a dash as error: not determined by the data by itself. Errors are standard "
-        f"errors, which depend on {escape(found.errors.method)}.</p>\n"
+        "<p>The combinations of standard parameters that the torque depends on. Each is named "
+        "after one of its terms. A dash as error: not identifiable alone from these data. Errors "
+        f"are standard errors from {escape(found.errors.method)}.</p>\n"
         + table("Base parameters", headers, rows, is_data=True)
     )
 
 
 def consistency_section(found: Identification) -> str:
-    """Return masses and pseudo-inertias, before and after; then prior, bounds and mass matrix.
+    """Return masses and pseudo-inertias, of the URDF and identified; prior, bounds, mass matrix.
 
     Args:
         found: The identification.
@@ -234,7 +234,7 @@ def consistency_section(found: Identification) -> str:
             number(after[i, 3, 3]),
             number(low_before[i], ".3g"),
             number(low_after[i], ".3g"),
-            text("" if low_after[i] > 0 else "not possible", flag=True),
+            text("" if low_after[i] > 0 else "inconsistent", flag=True),
         ]
         for i, body in enumerate(layout.bodies)
     ]
@@ -242,58 +242,58 @@ def consistency_section(found: Identification) -> str:
     foot = [text("total"), *totals, text(""), text(""), text("")]
     headers = ["body", "mass, URDF [kg]", "mass [kg]", "smallest eigenvalue, URDF"]
     headers += ["smallest eigenvalue", "remark"]
-    said = "Every body and drive is" if found.is_consistent else "Not every body and drive is"
+    every = "All bodies and drives are" if found.is_consistent else "Not all bodies and drives are"
     return (
-        f"<p>{said} physically possible. A body is possible when the smallest eigenvalue of its "
-        "pseudo-inertia is positive; a drive, when armature and friction are not negative.</p>\n"
+        f"<p>{every} physically consistent. A body is consistent if the smallest eigenvalue of its "
+        "pseudo-inertia is positive; a drive, if armature and friction are not negative.</p>\n"
         + table("Mass and pseudo-inertia of each body", headers, rows, foot)
         + _consistency_notes(found)
     )
 
 
 def open_section(found: Identification) -> str:
-    """Return what the data do not determine.
+    """Return the parameters that the data do not determine.
 
     Args:
         found: The identification.
     """
     wls, layout = found.wls, found.model.layout
-    kept = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
+    fixed = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
     return (
         f"<p>The data determine {found.determination.rank} of {len(found.base)} base parameters; "
         f"condition number {wls.condition:.3g} (columns scaled to unit norm).</p>\n"
         + _indistinguishable(found)
-        + _listed("Parameters that no motion can show", found.mapping.unidentifiable)
+        + _listed("Parameters without effect on the torque", found.mapping.unidentifiable)
         + _combinations(found)
-        + _listed("Standard parameters that remain as the URDF has them, or nearly", kept)
+        + _listed("Standard parameters that remain at the URDF's values", fixed)
     )
 
 
 def _indistinguishable(found: Identification) -> str:
-    """Return which base parameters the data do not tell apart, and what of them they determine."""
+    """Return indistinguishable base parameters, and their identifiable combinations."""
     groups = found.determination.merged
-    title = "Base parameters that the data do not determine by themselves"
+    title = "Base parameters that are not identifiable alone"
     if not groups:
         return _listed(title, ())
     parts = [
-        f"<h3>{title}</h3>\n<p>A direction counts as determined if the data shrink its plausible "
-        "spread by a tenth or more. Factors are in SI units; terms of less than 5 % of the largest "
-        "one, each times its spread, are left out. result.json has all.</p>\n"
+        f"<h3>{title}</h3>\n<p>A combination counts as identifiable if the data reduce its prior "
+        "spread by 10 % or more. Factors are in SI units. Terms below 5 % of the largest one, each "
+        "times its spread, are left out. result.json has all.</p>\n"
     ]
     for group in groups:
         names = ", ".join(code(name).html for name in group.names)
         sums = "<br>".join(code(str(combination)).html for combination in group.combinations)
         parts.append(
-            f'<p>Of</p>\n<p class="code">{names}</p>\n<p>only this is determined:</p>\n'
+            f'<p>Parameters:</p>\n<p class="code">{names}</p>\n<p>Identifiable:</p>\n'
             f'<p class="code">{sums}</p>\n'
             if sums
-            else f'<p>Nothing is determined of</p>\n<p class="code">{names}</p>\n'
+            else f'<p>Not identifiable:</p>\n<p class="code">{names}</p>\n'
         )
     return "".join(parts)
 
 
 def _combinations(found: Identification) -> str:
-    """Return per body which parameters motion shows one by one, in sums only, or never."""
+    """Return the identifiability of each body's parameters: alone, in sums only, or never."""
     layout = found.model.layout
     rows = []
     for i, body in enumerate(layout.bodies):
@@ -302,8 +302,8 @@ def _combinations(found: Identification) -> str:
         short = {key: ", ".join(n.rsplit(".", 1)[1] for n in kinds[key]) or "–" for key in kinds}
         rows.append([code(body), *[text(short[key]) for key in ("alone", "in sums", "never")]])
     return table(
-        "What any motion can show of each body",
-        ["body", "by itself", "only in sums with others (see base parameters)", "never"],
+        "Structural identifiability of each body",
+        ["body", "alone", "only in sums with others (see base parameters)", "never"],
         rows,
     )
 
@@ -330,15 +330,15 @@ def settings_tables(found: Identification) -> str:
         ratios = listed(f"{joint} × {ratio:g}" for joint, ratio in coupling.ratios)
         pairs[f"coupling {coupling.name}"] = ratios
     rows = [[text(key), text(value)] for key, value in pairs.items()]
-    headers = ["log", "filter", "rate Hz", "velocity", "trim s", "least speed", "gap s"]
+    headers = ["log", "filter", "rate Hz", "velocity", "trim s", "minimum speed", "gap s"]
     signals = [_signal_row(e.recording) for e in (*found.fitted, *found.validation)]
     return table("Model and estimator", ["setting", "value"], rows) + table(
-        "Signals, as used for each log; least speed in rad/s or m/s", headers, signals
+        "Signals, as used for each log; minimum speed in rad/s or m/s", headers, signals
     )
 
 
 def input_table(inputs: Iterable[Mapping[str, Any]]) -> str:
-    """Return the table of the files that were read.
+    """Return the table of the input files.
 
     Args:
         inputs: As in result.json.
@@ -364,7 +364,7 @@ def version_table(ran: Mapping[str, str]) -> str:
     """Return the table of the versions that ran.
 
     Args:
-        ran: They, by what they are of.
+        ran: The versions, by package.
     """
     rows = [[text(name), code(version)] for name, version in ran.items()]
     return table("Versions that ran", ["what", "version"], rows)
@@ -396,36 +396,36 @@ def _signal_row(recording: Recording) -> list[Cell]:
 
 
 def _consistency_notes(found: Identification) -> str:
-    """Return paragraphs on the fit's prior, bounds and mass matrix, and on what the data carry."""
-    said = [_reach(found), _mass_matrix(found)]
+    """Return paragraphs on data coverage, mass matrix, prior and bounds of the fit."""
+    notes = [_coverage(found), _mass_matrix(found)]
     details = found.estimate.details
     if "prior" in details:
         prior = details["prior"]
         chosen = _CHOSEN.get(prior.get("chosen_by", ""), "as set")
-        said.append(
-            f"The distance from the URDF's values is measured by {_METRICS[prior['metric']]}; its "
+        notes.append(
+            f"The prior is the distance from the URDF's values by {_METRICS[prior['metric']]}; its "
             f"weight is {prior['weight']:.3g}, {chosen}."
         )
         active = ", ".join(details["active"])
-        said.append(f"Constraints that bind: {active}." if active else "No constraint binds.")
+        notes.append(f"Active constraints: {active}." if active else "No constraint is active.")
         if details["relaxed"]:
-            said.append(f"Extents that the data contradict: {', '.join(details['relaxed'])}.")
+            notes.append(f"Extents that contradict the data: {', '.join(details['relaxed'])}.")
         if details["pinned"]:
-            said.append(f"Kept at the URDF's values: {', '.join(details['pinned'])}.")
+            notes.append(f"Fixed at the URDF's values: {', '.join(details['pinned'])}.")
     if "check" in details:
         check = details["check"]
         difference = check.get("torque_difference")
-        said.append(
-            f"Second opinion of {check['solver']}: {check['status']}"
+        notes.append(
+            f"Check by a second solver, {check['solver']}: {check['status']}"
             + ("." if difference is None else f"; torques differ by {100 * difference:.2g} %.")
         )
     if "gaps" in details:
         gaps = ", ".join(f"{gap:.1e}" for gap in details["gaps"])
-        said.append(f"Gap of log-Cholesky to the cone programme, per start: {gaps}.")
-    return "".join(f"<p>{escape(text)}</p>\n" for text in said)
+        notes.append(f"Gap of the log-Cholesky solution to the cone programme, per start: {gaps}.")
+    return "".join(f"<p>{escape(text)}</p>\n" for text in notes)
 
 
-def _reach(found: Identification) -> str:
+def _coverage(found: Identification) -> str:
     counts = {kind: found.sources.count(kind) for kind in SOURCES}
     carried = [
         body
@@ -437,17 +437,19 @@ def _reach(found: Identification) -> str:
         )
     ]
     text = (
-        f"How far the data carry: of {len(found.sources)} parameters {counts['data']} come from "
-        f"the data, {counts['mixed']} from data and URDF together, {counts['prior']} from the "
-        f"URDF; {counts['bound']} are at a bound of physics."
+        f"Sources of the {len(found.sources)} parameters: {counts['data']} the data, "
+        f"{counts['mixed']} data and URDF together, {counts['prior']} the URDF; {counts['bound']} "
+        "are at a physical bound."
     )
-    return text + (f" Nothing is known of {', '.join(carried)} but the URDF." if carried else "")
+    return text + (
+        f" The data do not determine {', '.join(carried)}: URDF only." if carried else ""
+    )
 
 
 def _mass_matrix(found: Identification) -> str:
     check = found.mass_matrix
-    where = "at every one" if check.is_positive else f"at {100 * check.positive_share:.3g} %"
+    where = "at all" if check.is_positive else f"at {100 * check.positive_share:.3g} % of"
     return (
-        f"The mass matrix, armatures included, is positive definite {where} of {check.poses} "
+        f"The mass matrix, armatures included, is positive definite {where} {check.poses} "
         f"random poses (smallest eigenvalue {check.smallest_eigenvalue:.3g})."
     )

@@ -1,8 +1,11 @@
-"""What the report shows of an identification from torques."""
+"""The content of a report on an identification from torques."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from robotid.export.entries import input_entries
 from robotid.findings import listed
@@ -35,28 +38,30 @@ from robotid.report.tables import (
     version_table,
 )
 from robotid.report.why import why_section
+from robotid.report.worst_second import Residual, worst_html, worst_second
 from robotid.versions import versions
 
 __all__ = ["shown_torques", "torques_section"]
 
 _ERRORS = (
-    "<p>error = 100 |τ − prediction| / |τ| over the rows used. For comparison, the error of "
-    "unconstrained weighted least squares (WLS) on the same rows, of the URDF as shipped "
-    "without drive parameters, of the URDF's bodies with drive terms fitted to the same rows, "
-    "and of the URDF's gravity torque alone; predicting zero scores 100.</p>\n"
+    "<p>error = 100 |τ − prediction| / |τ| over the samples used; a prediction of zero has 100 %. "
+    "For comparison: the error of unconstrained weighted least squares (WLS), of the "
+    "original URDF without drive parameters, of the URDF's links with drive terms fitted to the "
+    "same samples, and of the URDF's gravity torque alone.</p>\n"
 )
 _PARAMETERS = (
-    "One of many sets with the same torque: the data fix the base parameters only, the rest "
-    "follows the URDF."
+    "One of many sets of standard parameters with the same torque: the data determine the base "
+    "parameters only, the URDF determines the rest."
 )
 
 
-def shown_torques(found: Identification, origin: Origin) -> Shown:
-    """Return what a report shows of an identification.
+def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Shown:
+    """Return the content of a report on an identification.
 
     Args:
         found: The identification.
-        origin: Where it came from, for commands.
+        origin: Its source and folder, for commands.
+        replay: File of the replay in the report's folder; "" if there is none.
     """
     count = len(found.fitted)
     fitted = Errors(
@@ -64,11 +69,11 @@ def shown_torques(found: Identification, origin: Origin) -> Shown:
         _joints(found.metrics(), found.metrics("wls")),
         is_fitted=True,
     )
-    kept = [
+    validation = [
         Errors(e.recording.name, _joints(e.metrics["estimate"], e.metrics["wls"]))
         for e in found.validation
     ]
-    counted = [errors for errors, e in zip(kept, found.validation, strict=True)
+    counted = [errors for errors, e in zip(validation, found.validation, strict=True)
                if not e.is_refitted] or [fitted]  # fmt: skip
     entries = [entry for part in parameter_entries(found) for entry in part]
     verdict = found.verdict.to_dict()
@@ -80,24 +85,25 @@ def shown_torques(found: Identification, origin: Origin) -> Shown:
         findings=found.findings,
         quantity=TORQUE,
         counted=counted,
-        recordings=[*kept, fitted],
+        recordings=[*validation, fitted],
         facts=_facts(found),
         steps=next_steps(found, origin),
-        made="".join(f"<p>{escape(text)}</p>\n" for text in (_made(found), _beside(found))),
+        made="".join(f"<p>{escape(text)}</p>\n" for text in (_method(found), _totals(found))),
         errors=(_ERRORS, ""),
-        curves=("Torques", torques_section(found, verdict["per_joint"], [*worst_errors(counted)])),
+        curves=("Torques", torques_section(found, verdict["per_joint"], [*worst_errors(counted)],
+                                           replay)),
         why=why_section(found),
         parameters=parameter_section(found.model, found.standard if found.has_urdf else None,
                                      entries, _PARAMETERS, found.on_misfit),
         entries=entries,
         appendix={
-            "residuals": ("What the residuals hold", residual_section(found)),
+            "residuals": ("Residual spectra", residual_section(found)),
             "drives": ("Friction and drives", drive_figures(found)),
-            "bodies": ("Bodies beside the URDF's", body_figures(found)),
+            "bodies": ("Comparison with the URDF", body_figures(found)),
             "base": ("Base parameters", base_table(found)),
             "consistency": ("Physical consistency", consistency_section(found)),
             "information": ("Excitation and correlation", information_section(found)),
-            "open": ("What the data do not determine", open_section(found)),
+            "open": ("Parameters not identifiable", open_section(found)),
             "settings": ("Settings", settings_tables(found)),
             "inputs": ("Inputs", input_table(input_entries(found))),
             "versions": ("Versions", version_table(versions())),
@@ -106,7 +112,7 @@ def shown_torques(found: Identification, origin: Origin) -> Shown:
 
 
 def _joints(metrics: Metrics, wls: Metrics) -> dict[str, dict[str, Any]]:
-    """Return the metrics of joints as in result.json, the error of WLS as that of a baseline."""
+    """Return the metrics of the joints as in result.json, with WLS as a baseline."""
     joints: dict[str, dict[str, Any]] = metrics.to_dict()["per_joint"]
     for joint, measured in joints.items():
         measured["wls_relative_error_pct"] = wls.per_joint[joint].relative_error_pct
@@ -129,30 +135,30 @@ def _facts(found: Identification) -> dict[str, str]:
     }
 
 
-def _made(found: Identification) -> str:
-    """Return what was fitted to what."""
-    fitted, kept = found.fitted, found.validation
+def _method(found: Identification) -> str:
+    """Return a description of the fit and its logs."""
+    fitted, validation = found.fitted, found.validation
     samples = sum(e.recording.extent.smooth for e in fitted)
     rows = sum(e.recording.extent.rows_used for e in fitted)
-    chains = sorted({_chain(e.recording.signals) for e in (*fitted, *kept)})
+    chains = sorted({_chain(e.recording.signals) for e in (*fitted, *validation)})
     return (
         f"{len(found.base)} base parameters of {len(found.model.joints)} joints were fitted to "
-        f"{_names(fitted)} ({samples} samples after filtering, {rows} torque rows used) by "
+        f"{_names(fitted)} ({samples} samples after filtering, {rows} torque values used) by "
         f"{found.estimator.words} ({found.estimator.name}). "
-        + (f"Validation: {_names(kept)}. " if kept else "There is no validation log. ")
+        + (f"Validation: {_names(validation)}. " if validation else "There is no validation log. ")
         + f"Signals: {'; or '.join(chains)}."
     )
 
 
-def _beside(found: Identification) -> str:
-    """Return masses, gravity and friction in a sentence, beside which a verdict is read."""
+def _totals(found: Identification) -> str:
+    """Return total mass, gravity torque and friction, for comparison with the verdict."""
     scale_check = found.scale_check
     shares = [f"{joint} {100 * share:.0f} %" for joint, share in scale_check.friction.items()]
     before, after, _ = scale_check.masses
     gravity = [f"{joint} {ratio:.2f}" for joint, ratio in scale_check.gravity.items()]
     return (
-        f"Total mass {before:.2f} -> {after:.2f} kg. Gravity torque over the URDF's: "
-        f"{listed(gravity)}. Friction as a share of the torque: {listed(shares)}."
+        f"Total mass {before:.2f} -> {after:.2f} kg. Gravity torque relative to the URDF: "
+        f"{listed(gravity)}. Friction relative to the torque: {listed(shares)}."
     )
 
 
@@ -163,19 +169,23 @@ def _chain(signals: SignalSettings) -> str:
             f"zero-phase Butterworth low-pass, cut-off {signals.cutoff:g} Hz, order "
             f"{signals.order} run forward and backward"
         )
-    rate = f"grid of {signals.rate:.6g} Hz" if signals.rate else "rows as they were recorded"
+    rate = f"grid of {signals.rate:.6g} Hz" if signals.rate else "samples as recorded"
     return f"{cutoff}, {rate}, velocity {signals.velocity}"
 
 
 def torques_section(
-    found: Identification, verdicts: Mapping[str, Mapping[str, Any]], worst: Sequence[str]
+    found: Identification,
+    verdicts: Mapping[str, Mapping[str, Any]],
+    worst: Sequence[str],
+    replay: str = "",
 ) -> str:
-    """Return torques and residuals over time.
+    """Return charts of torques and residuals over time.
 
     Args:
         found: The identification.
         verdicts: The verdict on each joint, as in result.json.
         worst: Joints that have errors, the worst first.
+        replay: File of the replay in the page's folder; "" if there is none.
     """
     evaluations, rows = found.validation or found.fitted, found.model.row_names
     shown = drawn(evaluations, rows)
@@ -184,30 +194,43 @@ def torques_section(
     def charts(run: tuple[Evaluation, TorqueBand], row: int, link: str, points: int) -> str:
         return _charts(found, *run, row, link=link, points=points)
 
-    said = _said(found, shown, evaluations[len(shown) :])
-    return curves_section(said, runs, rows, verdicts, worst, charts)
+    def note(row: int) -> str:
+        name, unit = rows[row], found.model.row_units[row]
+        seconds = None if found.model.is_static else worst_second(_residuals(evaluations, row))
+        return worst_html(seconds, name, unit, replay)
+
+    intro = _intro(found, shown, evaluations[len(shown) :])
+    return curves_section(intro, runs, rows, verdicts, worst, charts, note)
 
 
-def _said(found: Identification, shown: Sequence[Evaluation], left: Sequence[Evaluation]) -> str:
-    """Return what the charts show, and of which recordings."""
+def _residuals(evaluations: Sequence[Evaluation], row: int) -> Iterator[Residual]:
+    """Yield the residuals of a joint, of the samples used."""
+    for e in evaluations:
+        motion, used = e.recording.trajectory, e.recording.mask[:, row].astype(bool)
+        left = np.where(used, motion.tau[:, row] - e.torques["estimate"][:, row], np.nan)
+        yield Residual(e.recording.name, Path(e.recording.log.path).name, motion.t, left)
+
+
+def _intro(found: Identification, shown: Sequence[Evaluation], left: Sequence[Evaluation]) -> str:
+    """Return the description of the charts and their recordings."""
     parts = [
-        "<p>Measured torque, the identified model's with its 95 % band, the URDF's; below, the "
-        "residual (measured − identified). Shaded: rows not used, for the joint is at rest and "
-        "the sign of its friction is unknown, and gaps. Drag to zoom; double-click or Escape shows "
-        "all.</p>\n"
+        "<p>Torque: measured, identified model with its 95 % band, and URDF; below, the residual "
+        "(measured − identified). Shaded: gaps, and samples that are not used because the joint is "
+        "at rest and the sign of its friction is unknown. Drag to zoom; double-click or Escape "
+        "shows all.</p>\n"
     ]
     if not found.validation:
-        parts.append("<p>There is no validation log: these are the fitted logs.</p>\n")
-    for evaluation in shown:
-        if evaluation.recording.is_partial:
-            seen, whole = len(evaluation.recording.trajectory.t), evaluation.recording.extent.smooth
+        parts.append("<p>There is no validation log. The charts show the fitted logs.</p>\n")
+    for recording in (evaluation.recording for evaluation in shown):
+        if recording.is_partial:
+            count, whole = len(recording.trajectory.t), recording.extent.smooth
             parts.append(
-                f"<p>Of {escape(evaluation.recording.name)}, a long log, {seen} of its {whole} "
-                "samples are drawn, from its beginning, middle and end; errors are of all.</p>\n"
+                f"<p>{escape(recording.name)} is long: {count} of its {whole} samples are drawn, "
+                "from its start, middle and end. Errors are computed from all.</p>\n"
             )
     if left:
         names = ", ".join(evaluation.recording.name for evaluation in left)
-        parts.append(f"<p>Not drawn, to keep the file small: {escape(names)}.</p>\n")
+        parts.append(f"<p>Not drawn, to limit the file size: {escape(names)}.</p>\n")
     return "".join(parts)
 
 
@@ -217,14 +240,15 @@ def _charts(
     """Return torque and residual of a joint in a recording."""
     name, unit = found.model.row_names[row], found.model.row_units[row]
     measured, recording = e.metrics["estimate"].per_joint.get(name), e.recording
-    said = "no rows used"
+    words = "no samples used"
     if measured is not None:
         error = percent(measured.relative_error_pct).html
-        held = band.coverage(recording.trajectory.tau, e.torques["estimate"], recording.mask)[row]
-        said = (
-            f"error {error} %, RMSE {measured.rmse:.3g} {unit}; 95 % band holds {100 * held:.0f} %"
+        inside = band.coverage(recording.trajectory.tau, e.torques["estimate"], recording.mask)[row]
+        words = (
+            f"error {error} %, RMSE {measured.rmse:.3g} {unit}; 95 % band contains "
+            f"{100 * inside:.0f} %"
         )
     kind = "not fitted" if found.validation else "fitted"
     torque, residual = torque_charts(found, e, row, band=band, link=link)
-    caption = f"{escape(recording.name)}, {kind}: {said}"
+    caption = f"{escape(recording.name)}, {kind}: {words}"
     return chart_html(torque, caption, points=points) + chart_html(residual, "", points=points)

@@ -1,4 +1,4 @@
-"""Why each joint is predicted as it is: its torque in parts, and what its residual follows."""
+"""Residual analysis: torque components of each joint, and quantities that its residual follows."""
 
 from html import escape
 
@@ -12,21 +12,21 @@ from robotid.pages.html import Cell, code, folded, number, percent, table, text
 __all__ = ["why_section"]
 
 _POINTS = 300  # of a chart
-_ALL_POINTS = 1800  # of one chart of every joint together
+_ALL_POINTS = 1800  # of one chart, summed over the joints
 _FEWEST_POINTS = 100
-_STILL, _STILL_SPLIT = 30, 80  # of them, in print
-_MOST = 12  # joints with all their charts; others have those that say something
+_STILL, _STILL_SPLIT = 30, 80  # points in print
+_MOST = 12  # joints with all charts; others have charts of significant dependences only
 
 
 def why_section(found: Identification) -> str:
-    """Return the HTML of the section: a part for each joint, the worst first and open.
+    """Return the HTML of the section: a part for each joint, the worst joint first and open.
 
     Args:
         found: The identification.
     """
-    torques = sorted(joint_torques(found), key=_missed, reverse=True)
+    torques = sorted(joint_torques(found), key=_error, reverse=True)
     shown = ", ".join(torques[0].rows.recordings)
-    kind = "kept apart" if torques[0].fitted is not None else "fitted, for none was kept apart"
+    kind = "Validation logs" if torques[0].fitted is not None else "Fitted logs, without validation"
     points = max(_FEWEST_POINTS, min(_POINTS, _ALL_POINTS // len(torques)))
     names = [e.recording.name for e in found.validation or found.fitted]
     first = torques[0].rows.recordings[0]
@@ -41,31 +41,31 @@ def why_section(found: Identification) -> str:
         for k, torque in enumerate(torques)
     )
     return (
-        "<p>The torque of each joint, split into what it consists of, and what its residual "
-        f"follows. Of the recordings {kind}: {escape(shown)}. A residual follows a quantity if its "
-        "mean over bins of it, without a segment of the recording, explains more of that segment "
-        f"than chance does.</p>\n{joints}"
+        "<p>The torque of each joint as sum of its components, and the quantities that its "
+        f"residual follows. {kind}: {escape(shown)}. A residual follows a quantity if the mean "
+        "residual in bins of this quantity, computed without a segment of the recording, explains "
+        f"a significant share of the residual in that segment.</p>\n{joints}"
     )
 
 
-def _missed(torque: JointTorque) -> float:
-    """Return the residual over the torque; of what does not move -1."""
+def _error(torque: JointTorque) -> float:
+    """Return the RMS residual over the RMS torque; -1 if there is no torque."""
     rms = torque.rms
     return rms["residual"] / rms["measured"] if rms["measured"] > 0 else -1.0
 
 
 def _joint(torque: JointTorque, link: str, points: int, *, is_full: bool) -> str:
-    """Return table and charts of a joint, all or those alone that say what its residual follows."""
+    """Return table and charts of a joint: all charts, or those of significant dependences."""
     if not torque.used.any():
         return ""
     charts = why_charts(torque, link=link, points=points)
-    said = "Torque in parts, stacked; shaded: rows not used"
-    split = _chart(charts.pop("split"), said, _STILL_SPLIT)
-    sure = {d.name for d in torque.follows if d.is_significant}
+    caption = "Torque components, stacked; shaded: samples not used"
+    split = _chart(charts.pop("split"), caption, _STILL_SPLIT)
+    significant = {d.name for d in torque.follows if d.is_significant}
     small = "".join(
         _chart(chart, _caption(torque, name))
         for name, chart in charts.items()
-        if is_full or name in sure
+        if is_full or name in significant
     )
     return f'{_parts(torque)}{split}<div class="plots">\n{small}</div>\n'
 
@@ -82,18 +82,18 @@ def _caption(torque: JointTorque, name: str) -> str:
         )
     (dependence,) = (d for d in torque.follows if d.name == name)
     share = percent(100 * (dependence.share or 0.0)).html
-    said = "explains nothing"
+    result = "no dependence"
     if dependence.share is None:
-        said = "too little was recorded to tell"
+        result = "too few samples"
     elif dependence.is_significant:
-        said = f"<strong>explains {share} % of its variance</strong>"
+        result = f"<strong>explains {share} % of the variance</strong>"
     elif dependence.share >= DEPENDENCE_SHARE:
-        said = f"explains {share} %, perhaps by chance"
-    return f"Residual against {name}: {said}"
+        result = f"explains {share} % of the variance, not significant"
+    return f"Residual against {name}: {result}"
 
 
 def _parts(torque: JointTorque) -> str:
-    """Return the table of what the torque consists of."""
+    """Return the table of torque components."""
     rms = torque.rms
     whole, parts = rms["measured"], torque.present
     cells = [
@@ -106,14 +106,12 @@ def _parts(torque: JointTorque) -> str:
         for name in (*sorted(parts, key=lambda name: -rms[name]), "residual")
     ]
     foot = [text("measured"), number(whole, ".3g"), percent(100.0), Cell("")]
-    headers = ["part", f"rms {torque.unit}", "% of torque", "its terms, rms"]
-    return table(
-        f"{torque.joint}: what its torque consists of; parts may cancel", headers, cells, foot
-    )
+    headers = ["component", f"RMS {torque.unit}", "% of torque", "terms, RMS"]
+    return table(f"{torque.joint}: torque components, which may cancel", headers, cells, foot)
 
 
 def _terms(torque: JointTorque, part: str) -> Cell:
-    """Return the terms of a part that has more than one."""
+    """Return the terms of a component that has more than one."""
     sizes = {name: torque.size(x) for name, x in torque.terms.get(part, {}).items()}
     if len(sizes) < 2:
         return Cell("")

@@ -1,3 +1,3 @@
-"""What people watch: the replay in a browser, recorded or live."""
+"""The replay in a browser, of a log or live."""
 
 __all__: list[str] = []

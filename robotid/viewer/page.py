@@ -1,4 +1,4 @@
-"""The page of a replay: Meshcat's viewer, uPlot, our script and the data, in one file."""
+"""The page of a replay: Meshcat's viewer, uPlot, the page's script and the data, in one file."""
 
 import json
 from collections.abc import Mapping
@@ -19,10 +19,11 @@ _SCRIPTS = (
 
 
 def page(data: Mapping[str, Any]) -> str:
-    """Return the page of a replay. It fetches nothing, except events if it is live.
+    """Return the page of a replay. It loads nothing, except events if it is live.
 
     Args:
-        data: ``title``, ``notes``, ``live`` and what replay.js draws, in plain finite values.
+        data: ``title``, ``notes``, ``live`` and the data that the script draws, in plain finite
+            values.
     """
     title = f"{data['title']}: {'live' if data['live'] else 'replay'}"
     notes = " ".join(f"<p>{escape(note)}</p>" for note in data["notes"])
@@ -51,7 +52,7 @@ def _asset(name: str) -> str:
 
 @cache
 def _script() -> str:
-    """Return the sections of the page's script as one, whose names are its own."""
+    """Return the sections of the page's script as one script in its own scope."""
     sections = "".join(_asset(f"{name}.js") for name in _SCRIPTS)
     return f'"use strict";\n(() => {{\n{sections}}})();\n'
 
@@ -82,24 +83,24 @@ _BODY = f"""\
 <div id="strip" hidden>
 <div id="joints"></div>
 <div id="sheets"><canvas id="sheet" tabindex="0" role="img"
- aria-label="residual of each joint over time; up and down pick a joint"></canvas></div>
+ aria-label="residual of each joint over time; up and down select a joint"></canvas></div>
 <p class="quiet">Residual, <span class="ramp"></span> from 0 to <span id="full"></span>;
-<span class="hatched"></span> at rest, not used, or no samples. <output id="told"></output></p>
+<span class="hatched"></span> at rest (not used) or no samples. <output id="reading"></output></p>
 </div>
 </footer>
 <main aria-label="3-D view">
-<div id="meshcat-pane" role="img" aria-label="the robot in motion"></div>
+<div id="meshcat-pane" role="img" aria-label="moving robot"></div>
 <div id="names" aria-hidden="true" hidden></div>
 <output id="picked" hidden></output>
 <div id="tools"><button type="button" id="view">Reset view</button>
 <button type="button" id="picture">Picture</button>
 <button type="button" id="film" aria-pressed="false">Film</button></div>
 </main>
-<aside id="side" aria-label="what is shown, and plots" hidden>
+<aside id="side" aria-label="options and plots" hidden>
 <section id="events" hidden><h2>Events</h2><ul id="marks"></ul></section>
 <div id="switches"></div>
-<p id="residuals" class="quiet"><span id="arcs">Arcs: measured torque from its tick at zero, 270°
-is a joint's largest; the inner one is predicted, unless the joint is at rest.
+<p id="residuals" class="quiet"><span id="arcs">Outer arcs: measured torque; the tick is zero,
+270° is the joint's maximum. Inner arcs: predicted torque, unless the joint is at rest.
 </span>Colour: residual, <span class="ramp"></span> from 0 to <span id="most"></span>.</p>
 <div id="plots"></div>
 </aside>"""

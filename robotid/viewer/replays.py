@@ -1,7 +1,7 @@
-"""Replay of a motion: the robot in Meshcat's viewer, torques and parameters beside it, one page.
+"""Replay of a motion: the robot in Meshcat's viewer, with torques and parameters, as one page.
 
-Meshcat's own export asks a server process for the page. Here its viewer is written into the page
-with what it shows, so that no process, no socket and no port is opened.
+Meshcat's own export needs a server process. Here the page contains the viewer and its data, so
+no process, socket or port is needed.
 """
 
 import itertools
@@ -31,24 +31,24 @@ _KEYS = 500_000  # numbers of a motion: about 3 MB
 _POINTS = 1_000_000  # numbers of all plots: about 6 MB
 _BINS = 480  # columns of the heat strip
 _PLOT_RATE = 50.0  # [Hz] points of a plot per second
-_DATA_RANGE = 100  # poses that the camera is aimed by
+_DATA_RANGE = 100  # poses that determine the camera's view
 _CELLS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # [m] of the grid, 40 by 40
 _GAP = 0.25  # [s] a longer time without samples is a gap ...
-_TIMES = 5.0  # ... if it is so many times the typical one
+_TIMES = 5.0  # ... if it is this multiple of the typical one
 
 
 @dataclass(frozen=True, eq=False)
 class Torques:
-    """Torques to plot beside a motion, or positions of drives that follow commands.
+    """Torques to plot with a motion, or positions of position-controlled drives.
 
     Attributes:
         t: Times on the clock of the motion, shape (N,) [s].
         measured: Measured torques, shape (N, n) [N m or N].
-        predicted: Predicted ones by the name of who predicts, shape (N, n) each, NaN where there
-            is no prediction; arcs, links and the heat strip take the residual of the first.
-        noise: Root mean square of each joint's residual where the first was identified, shape
-            (n,): what a residual is compared to; the torque's own root mean square if None. Of
-            positions: that of the command's error.
+        predicted: Predicted torques by the name of the model, shape (N, n) each, NaN where there
+            is no prediction; arcs, links and the heat strip show the residual of the first.
+        noise: Scale of the residuals, shape (n,): the RMS residual of each joint on the fitted
+            logs of the first model; the RMS torque if None. Of positions: the RMS error of the
+            command.
         quantity: "torque" or "position", whose units are the joints' [rad or m].
     """
 
@@ -61,7 +61,7 @@ class Torques:
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Parameters over time, as a recursive estimator saw them.
+    """Parameters over time, from a recursive estimator.
 
     Attributes:
         t: Times on the clock of the motion, shape (K,) [s].
@@ -80,13 +80,13 @@ class Bands:
 
 @dataclass(frozen=True)
 class Mark:
-    """A moment worth a mark on the time line.
+    """An event on the time line.
 
     Attributes:
-        t: When, on the clock of the motion [s].
-        label: What happened.
+        t: Its time, on the clock of the motion [s].
+        label: Its description.
         kind: "payload", "contact", "gap" or "note".
-        joint: The joint that it shows at, if any.
+        joint: The affected joint, if any.
     """
 
     t: float
@@ -100,7 +100,7 @@ class Replay:
     """A page that plays a motion; a notebook shows it as the value of a cell.
 
     Attributes:
-        data: What the page shows, in plain values.
+        data: Content of the page, in plain values.
     """
 
     data: Mapping[str, Any]
@@ -125,7 +125,7 @@ class Replay:
         return write_text(self.html, target)
 
     def _repr_html_(self) -> str:
-        # its scripts reach nothing outside
+        # its scripts have no access to the notebook
         return (
             f'<iframe title="{escape(self.data["title"])}: replay" sandbox="allow-scripts" '
             f'srcdoc="{escape(self.html)}" style="width: 100%; height: 620px; border: 0"></iframe>'
@@ -145,28 +145,28 @@ def replay(
     notes: Sequence[str] = (),
     rate: float = 30.0,
 ) -> Replay:
-    """Return a page that plays a motion at its true speed, in three dimensions.
+    """Return a page that plays a motion in real time, in three dimensions.
 
     Args:
-        model: The robot; its URDF's meshes are shown where they are found.
+        model: The robot; the meshes of its URDF are shown if they are found.
         t: Times, shape (N,), strictly increasing [s].
         q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
         torques: Torques to plot, and to draw as arcs around the joints.
         masses: Standard parameters by label, shape (p,) each: centres of mass and equimomental
             ellipsoids of the links, as ``{"URDF": prior, "identified": pi}``.
-        ghosts: Times and joint coordinates of other motions by their label, shown as ghosts that
-            start when the first does.
+        ghosts: Times and joint coordinates of other motions by their labels, shown as ghosts that
+            start with the first motion.
         bands: Parameters over time to plot.
-        marks: Moments to mark.
+        marks: Events to mark.
         notes: Sentences for the head of the page.
-        rate: Keyframes per second at most [Hz]; fewer for motions so long that the page would
-            grow too large.
+        rate: Largest number of keyframes per second [Hz]; fewer for long motions, to limit the
+            page's size.
 
     Returns:
         The page.
 
     Raises:
-        DataError: If times and values do not fit each other or the model.
+        DataError: If times and values are inconsistent with each other or with the model.
         SettingsError: If the rate is not positive.
     """
     for name, value, kinds, wanted in (
@@ -209,7 +209,7 @@ def replay(
             {"t": mark.t, "label": mark.label, "kind": mark.kind, "joint": mark.joint}
             for mark in sorted((*marks, *gaps), key=lambda mark: mark.t)
         ],
-        notes=[*notes, *_held(model), *(f"{note}." for note in scene.notes)],
+        notes=[*notes, *_fixed_base(model), *(f"{note}." for note in scene.notes)],
     )
     return Replay(data)
 
@@ -217,18 +217,18 @@ def replay(
 def live_page(
     model: RobotModel, names: Sequence[str], units: Sequence[str], q: Array, masses: Array
 ) -> str:
-    """Return a page that listens to the address ``events`` beside it, and draws what it hears.
+    """Return a page that receives events from the relative address ``events``, and draws them.
 
     Args:
         model: The robot, with a fixed base.
-        names: Names of the parameters that are estimated.
+        names: Names of the estimated parameters.
         units: Their units.
-        q: Joint coordinates that the camera is aimed by, shape (N, n) [rad or m].
+        q: Joint coordinates that determine the camera's view, shape (N, n) [rad or m].
         masses: Standard parameters of the URDF, shape (p,).
 
     Returns:
-        The HTML. An event is a JSON list of objects with ``t``, ``q`` as ``coordinates``
-        gives it, ``at``, ``tau``, ``predicted`` (null at rest), ``theta``, ``std_error``, or with
+        The HTML. An event is a JSON list of objects with ``t``, ``q`` as of ``coordinates``,
+        ``at``, ``tau``, ``predicted`` (null at rest), ``theta``, ``std_error``, or with
         ``mark``. Times are the log's own.
     """
     empty = np.zeros((0, 0))
@@ -263,7 +263,7 @@ def _data(
 
 
 def _check_masses(model: RobotModel, label: str, pi: Array) -> None:
-    """Refuse what are no standard parameters, all or the inertial ones, under a label."""
+    """Refuse labelled values that are not standard parameters, all or the inertial ones."""
     require_kind(label, str, "the label of masses", "text")
     require_kind(pi, np.ndarray, f"masses of {label!r}", "an array of standard parameters")
     sizes = model.layout.n_inertial, len(model.layout.names)
@@ -287,17 +287,17 @@ def _check(t: Array, q: Array, rate: float) -> None:
     if len(t) < 2:
         raise DataError(f"the motion has {len(t)} samples, wanted at least 2 to play")
     if not (np.isfinite(t).all() and np.isfinite(q).all()):
-        raise DataError("t or q holds values that are not finite; leave those samples out")
-    late = np.flatnonzero(np.diff(t) <= 0)
-    if len(late):
-        k = int(late[0])
+        raise DataError("t or q has values that are not finite; exclude those samples")
+    reversed_rows = np.flatnonzero(np.diff(t) <= 0)
+    if len(reversed_rows):
+        k = int(reversed_rows[0])
         raise DataError(
             f"t must increase, but t[{k + 1}] = {t[k + 1]:.6g} s follows t[{k}] = {t[k]:.6g} s"
         )
 
 
 def _keyframes(t: Array, rate: float, most: int) -> Array:
-    """Return the rows to show: the last sample before each tick of the rate, and the last row."""
+    """Return the samples to show: the last before each tick of the rate, and the last one."""
     count = min(int((t[-1] - t[0]) * rate) + 2, max(most, 2))
     ticks = np.linspace(t[0], t[-1], count)
     rows: Array = np.unique(np.searchsorted(t, ticks, side="right") - 1)
@@ -305,14 +305,14 @@ def _keyframes(t: Array, rate: float, most: int) -> Array:
 
 
 def _gaps(t: Array) -> list[int]:
-    """Return the rows after which nothing was recorded for a while."""
+    """Return the samples before gaps of the recording."""
     steps = np.diff(t)
     return np.flatnonzero((steps > _GAP) & (steps > _TIMES * np.median(steps))).tolist()
 
 
 def _moved(model: RobotModel, t: Array, q: Array, rate: float) -> tuple[Array, Array]:
-    """Return times from 0 and how far each joint has moved, at the keyframes."""
-    model.configurations(q)  # says what width q should have
+    """Return times from 0 and the displacement of each joint, at the keyframes."""
+    model.configurations(q)  # refuses a wrong width of q
     q = q.copy()
     base = 7 if model.free_flyer else 0
     free = [base + j for j, joint in enumerate(model.limits) if joint.turns_freely]
@@ -328,12 +328,12 @@ def _packed_motion(t: Array, q: Array) -> dict[str, Any]:
     return {"t": packed(t), "q": packed(q)}
 
 
-def _held(model: RobotModel) -> list[str]:
-    """Return what to say of a trunk with several limbs whose motion is not known."""
+def _fixed_base(model: RobotModel) -> list[str]:
+    """Return a note for a trunk with several limbs whose motion is unknown."""
     tree = model.pin_model
     limbs = sum(int(parent) == 0 for parent in list(tree.parents)[1:])
-    is_held = limbs > 1 and not model.free_flyer
-    return ["The base is held fixed; the log does not say where it was."] if is_held else []
+    is_fixed = limbs > 1 and not model.free_flyer
+    return ["The base is drawn as fixed: the log has no pose of the base."] if is_fixed else []
 
 
 def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any]:
@@ -346,9 +346,9 @@ def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any
     noise = rms if torques.noise is None else np.asarray(torques.noise, dtype=float)
     if noise.shape != wanted[1:]:
         raise DataError(f"noise has shape {noise.shape}, wanted {wanted[1:]}")
-    full, unit = (0.5, "the torque's rms") if torques.noise is None else (6.0, "the noise")
+    full, unit = (0.5, "RMS torque") if torques.noise is None else (6.0, "RMS noise")
     if torques.quantity == "position":
-        full, unit = 0.25, "the command's error"
+        full, unit = 0.25, "RMS command error"
     scale = {"of": np.where(noise > 0, noise, 1.0).tolist(), "full": full, "unit": unit}
     strip = None
     if len(series) > 1:
@@ -366,7 +366,7 @@ def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any
 
 
 def _stepped(values: Array) -> dict[str, Any]:
-    """Return columns in half the bytes: steps of a 65,534th of their range; 65,535 is no number."""
+    """Return columns in half the bytes: steps of a 65,534th of their range; 65,535 is NaN."""
     known = np.isfinite(values)
     low = np.where(known, values, np.inf).min(axis=0, initial=np.inf)
     high = np.where(known, values, -np.inf).max(axis=0, initial=-np.inf)
@@ -377,7 +377,7 @@ def _stepped(values: Array) -> dict[str, Any]:
 
 
 def _coded(levels: Array, of: Array) -> Array:
-    """Return hundredths of what residuals are compared to; 65,534: not used, 65,535: a gap."""
+    """Return residuals in hundredths of their scale; 65,534: not used, 65,535: a gap."""
     hundredths = np.minimum(np.round(100 * levels / of), 60_000)
     return np.where(np.isnan(levels), 65_535, np.where(levels < 0, 65_534, hundredths))
 
@@ -385,7 +385,7 @@ def _coded(levels: Array, of: Array) -> Array:
 def _torque_rows(
     model: RobotModel, labels: Sequence[str], quantity: str = "torque"
 ) -> dict[str, Any]:
-    """Return who is plotted, without times and values: joints, not the rows of a free base."""
+    """Return joints and labels of the plots, without times, values and the floating base."""
     tree, units = model.pin_model, model.row_units[-len(model.joints) :]
     if quantity == "position":
         units = tuple("m" if joint in model.layout.prismatic else "rad" for joint in model.joints)
@@ -410,7 +410,7 @@ def _band_data(bands: Bands, start: float) -> dict[str, Any]:
 
 
 def _plotted(t: Array, values: Array) -> tuple[Array, Array]:
-    """Return the rows of a plot, with one of NaN in each gap."""
+    """Return the samples of a plot, with a row of NaN in each gap."""
     rows = _keyframes(t, _PLOT_RATE, _POINTS // max(values.shape[1], 1))
     holes = np.array(_gaps(t), dtype=int)
     rows = np.unique(np.r_[rows, holes, holes + 1])
@@ -420,9 +420,9 @@ def _plotted(t: Array, values: Array) -> tuple[Array, Array]:
 
 
 def _view(model: RobotModel, corners: Sequence[Array], motions: Sequence[Array]) -> dict[str, Any]:
-    """Return the outermost points of a motion, about the base if that floats, and a grid below."""
+    """Return the outermost points of a motion, relative to a floating base, and a ground grid."""
     data = model.pin_model.createData()
-    points, lowest, first = [], np.inf, int(model.free_flyer)  # without the world's own corner
+    points, lowest, first = [], np.inf, int(model.free_flyer)  # without the world's corner
     for q in motions:
         rows = np.unique(np.linspace(0, len(q) - 1, _DATA_RANGE).astype(int))
         for configuration in model.configurations(q[rows]):
@@ -436,8 +436,8 @@ def _view(model: RobotModel, corners: Sequence[Array], motions: Sequence[Array])
     towards = np.array([d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)], dtype=float)
     outermost = places[np.unique((places @ towards.T).argmax(axis=0))]
     radius = float(np.linalg.norm(np.ptp(places, axis=0)) / 2) or 0.1
-    # the camera stands 2.8 radii off; a grid that ends before it has no line behind it
+    # the camera is 2.8 radii away; the grid ends before it
     cell = max((c for c in _CELLS if 20 * c <= 2.5 * radius), default=_CELLS[0])
-    # the ground is at 0, or under a robot that reaches below it
+    # the ground is at 0, or below a robot that extends below 0
     ground = lowest if lowest < -0.1 * radius else 0.0
     return {"points": outermost.tolist(), "radius": radius, "cell": cell, "ground": ground}

@@ -1,4 +1,4 @@
-"""The robot as a viewer draws it: joints as nodes, meshes or a skeleton as the parts they carry."""
+"""The robot as scene of the viewer: joints as nodes, meshes or a skeleton as their parts."""
 
 import base64
 import itertools
@@ -31,14 +31,14 @@ _File = tuple[Path | None, tuple[float, ...], tuple[int, int] | None]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is drawn, in plain values for JSON, lengths in m.
+    """The scene, in plain values for JSON, lengths in m.
 
     Attributes:
         content: ``nodes``: one per joint, the first fixed to the world, each with its parent, its
-            pose at 0 and how it moves; ``parts``: shapes on nodes; ``meshes``: triangles that
-            parts share; ``reach``: the size of the robot.
-        notes: What could not be drawn, in words.
-        corners: Points on each node whose hull holds its parts, shape (k, 3) each [m].
+            pose at 0 and its kind of motion; ``parts``: shapes on nodes; ``meshes``: triangles
+            that parts share; ``reach``: the size of the robot.
+        notes: Shapes that are not drawn, as sentences.
+        corners: Points on each node whose hull contains its parts, shape (k, 3) each [m].
     """
 
     content: dict[str, Any]
@@ -48,14 +48,14 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid:
-    """The mass of a body as a solid.
+    """The mass distribution of a body as a solid.
 
     Attributes:
         mass: Mass [kg].
         com: Centre of mass in the body's frame, shape (3,) [m]; None without mass.
         semi_axes: Lengths of the semi-axes, shape (3,) [m]; None if no solid has this inertia.
         rotation: Directions of the axes as columns, a rotation, shape (3, 3).
-        fault: Why there is no solid, in words; empty if there is one.
+        fault: Reason for no solid; empty if there is one.
     """
 
     mass: float
@@ -68,7 +68,7 @@ class Ellipsoid:
 def robot_scene(model: RobotModel) -> Scene:
     """Return the nodes and the parts of a robot.
 
-    A body is drawn with the visual shapes of its links if they are found, and otherwise as a
+    A body is drawn with the visual shapes of its links if they are found, otherwise as a
     skeleton: capsules from its joint to the next ones, and a drum along the joint's axis.
 
     Args:
@@ -80,7 +80,7 @@ def robot_scene(model: RobotModel) -> Scene:
     drawn = {part["node"] for part in parts}
     if library.missing:
         count, first = len(library.missing), library.missing[0]
-        notes.append(f"{count} meshes not found or not readable, among them {first}")
+        notes.append(f"{count} meshes were not found or are not readable, for example {first}")
     for i in range(tree.njoints):
         if i not in drawn:
             parts += _skeleton(model, i)
@@ -97,7 +97,7 @@ def robot_scene(model: RobotModel) -> Scene:
 
 
 def coordinates(model: RobotModel, q: Array) -> Array:
-    """Return how far each node of a scene has moved.
+    """Return the displacements of the nodes of a scene.
 
     Args:
         model: The robot.
@@ -105,7 +105,7 @@ def coordinates(model: RobotModel, q: Array) -> Array:
 
     Returns:
         Angles and lengths in Pinocchio's order, shape (N, nv), or (N, 7 + nv - 6) with a
-        floating base [rad, m]; ``column`` of a node says which are its own.
+        floating base [rad, m]; ``column`` of a node is the index of its own.
     """
     base, first = (7, 6) if model.free_flyer else (0, 0)
     G = model.velocity_map[first:, first:]
@@ -119,11 +119,11 @@ def mass_marks(model: RobotModel, pi: Array, label: str) -> dict[str, Any]:
     Args:
         model: The robot.
         pi: Its standard parameters, shape (p,), or the inertial ones alone.
-        label: Whose they are.
+        label: Their label.
 
     Returns:
         Plain values: the label, and per body its node, name, mass [kg], centre of mass [m],
-        semi-axes [m] and their direction, or why there is no ellipsoid.
+        semi-axes [m] and their direction, or the reason for no ellipsoid.
     """
     found = ellipsoids(pi[: model.layout.n_inertial])
     return {
@@ -147,7 +147,7 @@ def ellipsoids(pi: Array) -> tuple[Ellipsoid, ...]:
     """Return the equimomental ellipsoid of each body.
 
     The second moments about the centre of mass, Sigma_c = Sigma - m c c', are those of a solid
-    ellipsoid of even density whose semi-axes have the lengths sqrt(5 s_i / m), s_i the
+    ellipsoid of uniform density whose semi-axes have the lengths sqrt(5 s_i / m), s_i the
     eigenvalues of Sigma_c.
 
     Args:
@@ -190,7 +190,7 @@ def _ellipsoid(J: Array) -> Ellipsoid:
 
 
 class _Library:
-    """The meshes of a robot, each once, and the parts that show them."""
+    """The meshes of a robot, each once, and the parts that use them."""
 
     def __init__(self, model: RobotModel) -> None:
         self.missing: list[str] = []
@@ -198,7 +198,7 @@ class _Library:
         self.parts: list[dict[str, Any]] = []
         self.boxes: list[Array] = []  # the two corners of each mesh, shape (2, 3)
         visuals = [v for v in read_shapes(model.tree.robot) if v.kind]
-        # each mesh once at each scale, with the file as it is now
+        # each mesh once at each scale, with the current file
         files = {(v.file, v.size): _file(model, v) for v in visuals if v.kind == "mesh"}
         numbers: dict[tuple[str, tuple[float, ...]], list[tuple[int, Surface]]] = {}
         for key, surfaces in zip(files, _thinned(tuple(files.values())), strict=True):
@@ -220,9 +220,9 @@ def _file(model: RobotModel, visual: Shape) -> _File:
     return path, visual.size, stamp and (stamp.st_mtime_ns, stamp.st_size)
 
 
-@lru_cache(maxsize=4)  # thinning takes seconds, and a robot has many pages
+@lru_cache(maxsize=4)  # thinning needs seconds, and a robot has many pages
 def _thinned(files: tuple[_File, ...]) -> tuple[list[Surface] | None, ...]:
-    """Return the surfaces of each file in its scale, few enough for a page; None: not readable."""
+    """Return the scaled surfaces of each file, thinned for a page; None: not readable."""
     found: list[list[Surface] | None] = []
     for path, scale, _ in files:
         try:
@@ -320,7 +320,7 @@ def _node(model: RobotModel, i: int) -> dict[str, Any]:
 
 
 def _movement(model: RobotModel, i: int) -> tuple[str, list[float]]:
-    """Return how a joint moves: fixed, free, turn or slide; and the axis in its own frame."""
+    """Return the kind of joint: fixed, free, revolute or prismatic; and its own axis."""
     if i == 0:
         return "fixed", []
     kind = model.pin_model.joints[i]
@@ -329,12 +329,12 @@ def _movement(model: RobotModel, i: int) -> tuple[str, list[float]]:
     data = kind.createData()
     kind.calc(data, pin.neutral(model.pin_model), np.zeros(model.pin_model.nv))
     S = np.array(data.S).reshape(6)
-    turns = bool(S[3:].any())
-    return ("turn", S[3:].tolist()) if turns else ("slide", S[:3].tolist())
+    is_revolute = bool(S[3:].any())
+    return ("revolute", S[3:].tolist()) if is_revolute else ("prismatic", S[:3].tolist())
 
 
 def _skeleton(model: RobotModel, joint: int) -> Iterator[dict[str, Any]]:
-    """Return the drum of a joint and the links from it to whatever it carries."""
+    """Return the drum of a joint and the links to its children."""
     radius = _THICKNESS * _reach(model)
     skin = _LINK if joint else _BASE
     for end in _ends(model, joint):
@@ -344,7 +344,7 @@ def _skeleton(model: RobotModel, joint: int) -> Iterator[dict[str, Any]]:
             yield _part(joint, "cylinder", [0.7 * radius, length], skin, along)
         yield _part(joint, "sphere", [0.7 * radius], skin, _from_y_axis(_UP, end))
     kind, axis = _movement(model, joint)
-    if kind in ("turn", "slide"):
+    if kind in ("revolute", "prismatic"):
         drum = _from_y_axis(np.array(axis), np.zeros(3))
         yield _part(joint, "cylinder", [radius, 2.6 * radius], _JOINT, drum)
     elif joint == 0 and not model.free_flyer:
@@ -353,7 +353,7 @@ def _skeleton(model: RobotModel, joint: int) -> Iterator[dict[str, Any]]:
 
 
 def _ends(model: RobotModel, joint: int) -> list[Array]:
-    """Return the points that a joint carries: its children, or else its farthest fixed frame."""
+    """Return the end points of a joint's links: its children, or its farthest fixed frame."""
     tree = model.pin_model
     children = [
         np.array(tree.jointPlacements[i].translation)
@@ -371,16 +371,18 @@ def _ends(model: RobotModel, joint: int) -> list[Array]:
 
 
 def _reach(model: RobotModel) -> float:
-    """Return the longest way from the root along the joints [m]; 0.1 at least."""
+    """Return the longest path from the root along the joints [m]; 0.1 or more."""
     tree = model.pin_model
-    ways = [0.0] * tree.njoints
+    paths = [0.0] * tree.njoints
     for i in range(1, tree.njoints):
-        ways[i] = ways[tree.parents[i]] + float(np.linalg.norm(tree.jointPlacements[i].translation))
-    return max(0.1, *ways)
+        paths[i] = paths[tree.parents[i]] + float(
+            np.linalg.norm(tree.jointPlacements[i].translation)
+        )
+    return max(0.1, *paths)
 
 
 def _from_y_axis(axis: Array, position: Array) -> Array:
-    """Return the pose that turns the y axis, the viewer's axis of a cylinder, into an axis."""
+    """Return the pose that maps the y axis, the viewer's axis of a cylinder, to an axis."""
     M = np.eye(4)
     M[:3, :3] = pin.Quaternion.FromTwoVectors(_UP, axis).toRotationMatrix()
     M[:3, 3] = position

@@ -1,4 +1,4 @@
-"""A live page: a server on this machine alone, which tells it what is sent."""
+"""A live page: a server on the local host, which forwards messages to the page."""
 
 import json
 import sys
@@ -11,8 +11,8 @@ from typing import Any, Self
 
 __all__ = ["LivePage"]
 
-_KEPT = 20_000  # messages that a page opened late still gets
-_ALIVE = 10.0  # [s] between signs of life when there is nothing to tell
+_HISTORY = 20_000  # last messages, which pages opened later receive
+_ALIVE = 10.0  # [s] between keep-alive comments
 
 
 class LivePage:
@@ -20,26 +20,26 @@ class LivePage:
 
     Args:
         html: The page.
-        port: Port to listen at; any free one if 0.
+        port: Port to listen on; any free one if 0.
 
     Attributes:
         url: Address of the page.
-        page: The page, as it is sent.
+        page: The page, encoded.
 
     Raises:
-        OSError: If the port is taken.
+        OSError: If the port is in use.
     """
 
     def __init__(self, html: str, port: int = 0) -> None:
         self.page = html.encode()
-        self._messages: deque[str] = deque(maxlen=_KEPT)
+        self._messages: deque[str] = deque(maxlen=_HISTORY)
         self._sent, self._over = 0, False
         self._news = threading.Condition()
         handler = type("Handler", (_Handler,), {"live": self})
         try:
             self._server = _Server(("127.0.0.1", port), handler)
         except OSError as error:
-            message = f"port {port} of 127.0.0.1: {error.strerror}; name another one, or none"
+            message = f"port {port} of 127.0.0.1: {error.strerror}; choose another port, or none"
             raise OSError(message) from error
         self.url = f"http://127.0.0.1:{self._server.server_address[1]}/"
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
@@ -52,10 +52,10 @@ class LivePage:
         self.close()
 
     def send(self, message: Mapping[str, Any]) -> None:
-        """Tell every page, those opened later too.
+        """Send a message to all pages, including pages opened later.
 
         Args:
-            message: Plain finite values; replay.js says which.
+            message: Plain finite values, as ``live_page`` documents.
         """
         text = json.dumps(message, allow_nan=False)
         with self._news:
@@ -64,7 +64,7 @@ class LivePage:
             self._news.notify_all()
 
     def finish(self) -> None:
-        """Tell every page that no more will come; the server goes on."""
+        """Send the end of the stream to all pages; the server continues."""
         with self._news:
             self._over = True
             self._news.notify_all()
@@ -80,24 +80,24 @@ class LivePage:
         """Wait for messages.
 
         Args:
-            count: How many have been taken.
+            count: Number of messages already received.
 
         Returns:
-            Those after them, none if nothing came for a while; how many there have been; and
+            The messages after them, empty after a timeout; the number of messages so far; and
             whether these are the last.
         """
         with self._news:
             self._news.wait_for(lambda: self._sent > count or self._over, _ALIVE)
             new = min(self._sent - count, len(self._messages))
-            kept = list(self._messages)
-            return kept[len(kept) - new :], self._sent, self._over
+            messages = list(self._messages)
+            return messages[len(messages) - new :], self._sent, self._over
 
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Say nothing of a page that was closed in the middle of a request or of an answer."""
+        """Ignore pages that were closed during a request or a response."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
 
@@ -107,14 +107,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         host = self.headers.get("Host", "").rsplit(":", 1)[0]
-        if host not in ("127.0.0.1", "localhost"):  # a name of another site that points here
+        if host not in ("127.0.0.1", "localhost"):  # a foreign host name that resolves to this host
             self.send_error(HTTPStatus.FORBIDDEN)
         elif self.path == "/":
             self._start("text/html; charset=utf-8", len(self.live.page))
             self.wfile.write(self.live.page)
         elif self.path == "/events":
             self._start("text/event-stream", None)
-            self._tell()
+            self._stream()
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 
@@ -126,7 +126,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Length", str(length))
         self.end_headers()
 
-    def _tell(self) -> None:
+    def _stream(self) -> None:
         count, over = 0, False
         while not over:
             new, count, over = self.live.after(count)
@@ -135,4 +135,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(b"event: end\ndata:\n\n")
 
     def log_message(self, format: str, *_: object) -> None:
-        """Say nothing of each request."""
+        """Do not log requests."""

@@ -1,4 +1,4 @@
-"""Segments of a motion whose torque no model of the robot explains: contacts, loads, faults."""
+"""Segments of a motion with unexplained torque: contacts, loads, faults."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,11 +9,11 @@ from robotid._typing import Array
 
 __all__ = ["Unexplained", "find_unexplained", "residual_levels"]
 
-_WINDOW = 0.2  # [s] over which a residual is averaged
-_TIMES = 6.0  # a mean residual so many times its median ...
-_SHARE = 0.3  # ... and above this share of the joint's torque is unexplained
-_APART = 1.0  # [s] segments closer than this are one
-_SHORTEST = 0.05  # [s] what is shorter is a spike
+_WINDOW = 0.2  # [s] averaging window of a residual
+_TIMES = 6.0  # unexplained: a mean residual above this multiple of its median ...
+_SHARE = 0.3  # ... and above this share of the joint's torque
+_APART = 1.0  # [s] closer segments are merged
+_SHORTEST = 0.05  # [s] shorter segments are spikes
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,9 @@ class Unexplained:
     """A segment of unexplained torque.
 
     Attributes:
-        start: When it begins [s].
-        end: When it ends [s].
-        joint: The joint that it shows most at, in shares of the joint's torque.
+        start: Its start [s].
+        end: Its end [s].
+        joint: The joint with the largest residual relative to its torque.
         residual: Largest mean residual of that joint [N m or N].
     """
 
@@ -36,19 +36,19 @@ class Unexplained:
 def find_unexplained(
     t: Array, tau: Array, predicted: Array, joints: Sequence[str]
 ) -> tuple[Unexplained, ...]:
-    """Return where measured and predicted torque disagree as nowhere else in a motion.
+    """Return the segments with an exceptional difference of measured and predicted torque.
 
-    The root mean square of each joint's residual over 0.2 s is unexplained if it is six times its
-    median over the motion and 0.3 of the torque's root mean square, for 0.05 s at least.
+    The RMS residual of a joint over 0.2 s is unexplained if it is above six times its median over
+    the motion and above 0.3 of the RMS torque, for 0.05 s or longer.
 
     Args:
         t: Times, shape (N,) [s].
         tau: Measured torques, shape (N, n) [N m or N].
-        predicted: Predicted torques, shape (N, n), NaN where there is none.
+        predicted: Predicted torques, shape (N, n), NaN without prediction.
         joints: Names of the n joints.
 
     Returns:
-        The segments, in order of time.
+        The segments, ordered by time.
     """
     if len(t) < 2:
         return ()
@@ -75,16 +75,15 @@ def find_unexplained(
 
 
 def residual_levels(edges: Array, t: Array, residual: Array) -> Array:
-    """Return the root mean square of each joint's residual within each segment of time.
+    """Return the RMS residual of each joint in each segment of time.
 
     Args:
-        edges: Where the segments begin, and the last one's end, shape (B + 1,) [s].
+        edges: Starts of the segments, and the end of the last one, shape (B + 1,) [s].
         t: Times, shape (N,) [s].
-        residual: Measured less predicted torque, shape (N, n), NaN where none is predicted.
+        residual: Measured minus predicted torque, shape (N, n), NaN without prediction.
 
     Returns:
-        Shape (B, n); -1 where there are samples but nothing is predicted, NaN where there is no
-        sample.
+        RMS residuals, shape (B, n); -1 for samples without prediction, NaN without samples.
     """
     bins = len(edges) - 1
     which = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, bins - 1)
@@ -99,7 +98,7 @@ def residual_levels(edges: Array, t: Array, residual: Array) -> Array:
 
 
 def _running_mean(values: Array, width: int) -> Array:
-    """Return the mean of the numbers about each row; NaN where half of them are missing."""
+    """Return the running mean without NaN; NaN if half of a window is NaN."""
     known = np.isfinite(values)
     sums = np.cumsum(np.vstack([np.zeros(values.shape[1]), np.where(known, values, 0.0)]), axis=0)
     counts = np.cumsum(np.vstack([np.zeros(values.shape[1]), known]), axis=0)

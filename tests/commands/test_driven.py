@@ -81,8 +81,8 @@ def test_a_job_driven_by_its_torque_writes_errors_beside_those_of_its_rows(folde
 
 def test_its_report_tells_of_torques_and_not_of_commands(folder):
     page = (folder / "report.html").read_text()
-    assert "drives from roll-outs of its torques" in page
-    assert "torques alone" in page
+    assert "drives from torque-driven simulation" in page
+    assert "torque fit" in page
     assert "q<sub>ref</sub>" not in page
     assert "commanded" not in page.split("<h2")[1]
 

@@ -99,7 +99,7 @@ def test_residuals_are_compared_to_those_of_the_identification(folder):
     result = json.loads((folder / "out" / "result.json").read_text())
     fitted = result["identification"]["per_joint"]
     scale = data["torques"]["scale"]
-    assert scale["unit"] == "the noise"
+    assert scale["unit"] == "RMS noise"
     assert scale["of"] == [fitted[joint]["rmse"] for joint in result["joints"]]
     # the log is that of the identification: its residual is the noise
     strip = np.where(data["torques"]["strip"] < 65_000, data["torques"]["strip"] / 100, np.nan)
@@ -250,11 +250,11 @@ def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):
     columns = ["time", *(f"q_{j}" for j in model.joints), *(f"tau_{j}" for j in model.joints)]
     rows = np.column_stack([t, q, 0.1 * q])
     held = play(rows, columns)
-    assert "The base is held fixed; the log does not say where it was." in held["notes"]
+    assert "The base is drawn as fixed: the log has no pose of the base." in held["notes"]
     told = base.copy()
     told[149] = np.nan  # between two signs of one turn
     data = play(np.column_stack([rows, told]), [*columns, *names])
-    assert not any("held fixed" in note for note in data["notes"])
+    assert not any("drawn as fixed" in note for note in data["notes"])
     assert data["torques"]["labels"] == ["measured"]
     assert [joint["node"] for joint in data["torques"]["joints"]] == list(range(2, 14))
     times, moved = data["motion"]["t"], data["motion"]["q"]
@@ -362,7 +362,7 @@ def test_drives_that_follow_commands_are_played_with_their_ghosts(tmp_path):
     np.testing.assert_allclose(commanded[0], log.q_ref[0] + 0.1, atol=1e-6)
     error = np.sqrt(np.mean((log.q_ref - log.q) ** 2, axis=0))
     np.testing.assert_allclose(data["torques"]["scale"]["of"], error, rtol=1e-6)
-    assert data["torques"]["scale"]["unit"] == "the command's error"
+    assert data["torques"]["scale"]["unit"] == "RMS command error"
     assert data["notes"][0] == "Motion: log.csv, as measured; ghosts: command and simulation."
     left = 1e3 * np.sqrt(np.nanmean((load_result(out).follow_commands(log) - log.q) ** 2, axis=0))
     worst = ", ".join(f"{arm.model.joints[j]} {left[j]:.2g}" for j in np.argsort(left)[::-1])

@@ -182,7 +182,7 @@ def test_only_stretches_of_a_long_log_are_drawn_and_examined(noisy_job, tmp_path
     rows = evaluation.metrics["estimate"].per_joint["elbow_joint"].rows
     assert 1000 < rows <= recording.extent.smooth == 1478
     page = (tmp_path / "report.html").read_text()
-    assert "a long log, 300 of its 1478 samples are drawn, from its beginning" in page
+    assert "is long: 300 of its 1478 samples are drawn, from its start" in page
     notes = [w["message"] for w in result["warnings"] if w["code"] == "log_note"]
     assert any("checked rows 0-400, 550-950, 1100-1500 only" in note for note in notes)
     found = [f for f in examine(job) if f.code == "rate"]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.browsing import until, visit
 from helpers.pages import charts
+from PIL import Image
 
 from robotid.exceptions import DataError
 from robotid.pages.charts import (
@@ -350,17 +351,18 @@ def colours(seen):
 
 
 def test_an_open_page_follows_from_dark_to_light_and_prints_light(seen):
-    seen.page.emulate_media(color_scheme="dark")
-    seen.page.wait_for_timeout(200)
-    light, dark = colours(seen)
-    assert light > 10 * dark
-    seen.page.emulate_media(color_scheme="light")
-    seen.page.wait_for_timeout(200)
-    light, dark = colours(seen)
-    assert dark > 10 * light
+    for scheme, is_light in (("dark", True), ("light", False)):
+        seen.page.emulate_media(color_scheme=scheme)
+        for _ in range(60):  # until it is drawn again
+            light, dark = colours(seen)
+            if (light > dark) == is_light:
+                break
+            seen.page.wait_for_timeout(50)
+        assert max(light, dark) > 10 * min(light, dark)
+        assert (light > dark) == is_light
     seen.page.emulate_media(color_scheme="dark", media="print")
     assert seen.page.locator("figure.chart svg").first.is_visible()
-    assert not seen.page.locator(".explore").first.is_visible()
+    assert not seen.page.locator(".explore .place").first.is_visible()
     ink = "getComputedStyle(document.documentElement).getPropertyValue('--predicted').trim()"
     assert seen.page.evaluate(ink) == "#0b63c5"
 
@@ -387,3 +389,39 @@ def test_labels_of_many_series_stay_inside_the_still_picture():
     assert labels["measured"][1] > labels["gravity"][1]
     few = chart_html(Chart("few", x, series[:2], "time [s]", "torque [N m]"), "")
     assert float(re.search(r'viewBox="([^"]*)"', few)[1].split()[3]) < height
+
+
+@pytest.mark.parametrize("is_idle", [True, False])
+def test_charts_below_the_window_are_there_in_a_capture_of_the_page(
+    browser, tmp_path, lines, is_idle
+):
+    """Drawn as soon as the browser is idle, and as a picture before."""
+    chart = Chart("far down", T, (Series("measured", lines[0], "tone-1"),), "time [s]", "y")
+    spacer = '<div style="height: 4000px"></div>'
+    path = tmp_path / "far.html"
+    html = page("far", "<h1>far</h1>", {"a": ("a", f"{spacer}{chart_html(chart, 'below')}")})
+    if not is_idle:
+        html = html.replace("window.requestIdleCallback ||", "false && 0 || (() => 0) ||")
+        html = re.sub(r"script-src [^\"]*", "script-src 'unsafe-inline'", html)
+    path.write_text(html, encoding="utf-8")
+    with visit(browser, path) as seen:
+        if is_idle:
+            until(seen, "charts.all[0].plot !== null")
+        assert seen.page.evaluate("charts.all[0].plot === null") != is_idle
+        assert seen.page.evaluate("scrollY") == 0
+        box = seen.page.locator("figure.chart").bounding_box()
+        assert box["y"] > 3000
+        seen.page.screenshot(path=tmp_path / "far.png", full_page=True)
+        image = np.asarray(Image.open(tmp_path / "far.png").convert("RGB")).astype(int)
+        picture = image[int(box["y"]) + 60 : int(box["y"] + box["height"]) - 60, 200:-200]
+        blue = (picture[..., 2] - picture[..., 0] > 100).sum()  # the line, in tone-1
+        assert blue > 500
+        height = seen.page.evaluate("document.body.scrollHeight")
+        seen.page.evaluate("scrollTo(0, 4000)")
+        until(seen, "charts.all[0].plot !== null")
+        assert seen.page.evaluate("document.body.scrollHeight") == height
+        hidden = "getComputedStyle(document.querySelector('figure svg')).display"
+        assert seen.page.evaluate(hidden) == "none"
+        seen.page.emulate_media(media="print")
+        assert seen.page.evaluate(hidden) == "block"
+        assert seen.errors == []

@@ -56,17 +56,17 @@ def test_every_command_is_one_that_the_program_takes(identified):
 
 #: Codes that name what is wrong with a joint, and the first words of their steps.
 NAMED = {
-    "backlash": "Leave out the rows",
+    "backlash": "Exclude the samples",
     "clipped": "Record a slower motion",
-    "counterbalance": "Add to the model of elbow_joint",
-    "coupling": "Add to the model of elbow_joint",
+    "counterbalance": "Add the missing drive terms",
+    "coupling": "Add the missing drive terms",
     "drift": "Drift is so; do something",
-    "friction_shape": "Add to the model of elbow_joint",
-    "load_friction": "Add to the model of elbow_joint",
-    "payload_change": "Validate with the load",
-    "position_offset": "Correct the zero",
-    "position_periodic": "Add to the model of elbow_joint",
-    "spring": "Add to the model of elbow_joint",
+    "friction_shape": "Add the missing drive terms",
+    "load_friction": "Add the missing drive terms",
+    "payload_change": "Validate with the payload",
+    "position_offset": "Correct the position offset",
+    "position_periodic": "Add the missing drive terms",
+    "spring": "Add the missing drive terms",
 }
 
 
@@ -129,7 +129,7 @@ def test_every_setting_that_is_advised_for_a_term_is_read(identified, joint, rng
 
 @pytest.mark.parametrize("code", NAMED)
 def test_a_named_cause_has_its_step_and_no_guess_beside_it(identified, code, rng):
-    """A joint that is also badly predicted is not said to have a spring or a round gear."""
+    """A joint that is also badly predicted has no guessed spring or gear ripple as cause."""
     joint = "elbow_joint"
     own = [c for c in candidates(joint, "wrist_1_joint", rng) if c.code == code]
     entries = {c.name: c.families[:1] or c.terms for c in own}
@@ -158,7 +158,7 @@ def test_a_named_cause_has_its_step_and_no_guess_beside_it(identified, code, rng
 
 
 def _guesses(step, joint):
-    return "gear that is not round" in step.words and joint in step.words
+    return "gear ripple" in step.words and joint in step.words
 
 
 def test_a_flag_that_was_given_is_stated_anew_and_not_twice():
@@ -212,11 +212,12 @@ def test_an_error_comes_before_a_warning_and_three_steps_are_enough(identified):
     steps = next_steps(found, JOB)
     assert next(step.words for step in steps) == "Not_known is so; do something."
     assert steps[0].blocks == ("robotid doctor 'my job.toml'",)
-    assert words(steps)[1:] == ["State", "If"]
+    assert words(steps)[1:] == ["If", "If"]
+    assert ["gain" in step.words for step in steps[1:]] == [True, False]
     grave = told(
         identified, warning("torque_delay", delay=0.01), warning("spikes", severity="error")
     )
-    assert words(next_steps(grave, JOB))[:2] == ["Look", "If"]
+    assert words(next_steps(grave, JOB))[:2] == ["Examine", "If"]
 
 
 @pytest.mark.parametrize(
@@ -267,7 +268,7 @@ def test_what_two_steps_ask_to_be_typed_is_typed_last(identified):
 
 def test_without_a_recording_apart_one_is_asked_for(identified):
     step = next_steps(told(identified, validation=()), FLAGS)[0]
-    assert step.words.startswith("Record another motion and keep it apart")
+    assert step.words.startswith("Record another motion and use it as validation log")
     assert step.blocks[0].endswith("--validate NEW.csv --out out")
 
 
@@ -282,7 +283,9 @@ def test_links_that_the_urdf_describes_better_are_pinned(identified):
     }
     metrics = {**kept.metrics, "estimate": replace(kept.metrics["estimate"], per_joint=joint)}
     steps = next_steps(told(identified, validation=(replace(kept, metrics=metrics),)), JOB)
-    (step,) = [step for step in steps if step.words.startswith("Leave the links of")]
+    (step,) = [
+        step for step in steps if step.words.startswith("Keep the URDF's values for the links of")
+    ]
     assert step.blocks[0] == '[estimator.constraints]\npinned = ["forearm_link"]'
 
 
@@ -306,7 +309,7 @@ def test_the_source_of_a_command_line_is_what_is_identified():
 def test_figures_in_steps_are_those_of_all_findings_and_of_the_result(identified):
     late = (warning("torque_delay", "a.csv", delay=0.004), warning("torque_delay", delay=0.008))
     step = next_steps(told(identified, *late), FLAGS)[0]
-    assert "state that it is 0.0060 s late" in step.words
+    assert "state its delay of 0.0060 s" in step.words
     assert step.blocks[0].endswith("--torque-delay 0.0060 --out out")
     zeros = (
         warning("position_offset", "elbow_joint", size=0.0123),
@@ -316,7 +319,7 @@ def test_figures_in_steps_are_those_of_all_findings_and_of_the_result(identified
     assert step.words.endswith("; of elbow_joint by -0.0123; of wrist_1_joint by 0.5.")
     before, after = (pi[:60:10].sum() for pi in (identified.prior, identified.standard))
     step = next_steps(told(identified, warning("total_mass", "robot")), JOB)[0]
-    assert f"{after:.4g} kg as identified, {before:.4g} kg in the URDF." in step.words
+    assert f"{after:.4g} kg identified, {before:.4g} kg in the URDF." in step.words
     assert f"{after:.4g}" != f"{before:.4g}"
     assert step.blocks[0] == "[estimator.constraints]\ntotal_mass = KG"
 
@@ -338,7 +341,7 @@ def test_joints_that_any_recording_misses_are_looked_at_and_the_first_is_played(
 
     runs = (other("x.csv", [35.0, 1, 1, 1, 1, 1]), other("y.csv", [1, 1, 1, 1, 35.0, 1]))
     steps = next_steps(told(identified, validation=runs), JOB)
-    (look,) = [step for step in steps if step.words.startswith("Look at what the torque of")]
-    assert f"the torque of {names[0]}, {names[4]} does" in look.words
+    (look,) = [step for step in steps if step.words.startswith("Examine the residual of")]
+    assert f"the residual of {names[0]}, {names[4]} in" in look.words
     (played,) = [b for step in steps for b in step.blocks if b.startswith("robotid replay")]
     assert " x.csv out" in played

@@ -39,7 +39,7 @@ def test_the_line_counts_what_is_grave_its_causes_and_notes(findings, worst, lin
 
 def test_each_joint_has_its_causes_the_worst_first_and_notes_apart():
     html = findings_section(MANY, JOINTS, ["two", "three", "one"])
-    assert tables(html)["By joint, the worst first"].rows == [
+    assert tables(html)["Findings by joint, the worst first"].rows == [
         ["two", "spikes, late", "slow"], ["three", "–", "slow"], ["one", "late", "–"],
     ]  # fmt: skip
     assert re.findall(r'<div class="cause (\w+)" id="cause-(\w+)">', html) == [

@@ -94,8 +94,8 @@ def test_another_recording_is_not_compared(changed):
 
     found = changed(other_log)
     assert found["validation"] == []
-    assert "A was validated on second.csv, which not every result was" in found["notes"][0]
-    assert "no validation recording is common to all results" in found["notes"][-1]
+    assert "A was validated on second.csv, other results were not" in found["notes"][0]
+    assert "the results have no common validation recording" in found["notes"][-1]
     assert [row["in"] for row in found["inputs"]][:2] == [[True, False], [False, True]]
 
 
@@ -109,7 +109,7 @@ def test_another_filter_is_said(changed):
         result["inputs"][-1]["signals"]["cutoff"] = 3.0
 
     (note,) = changed(smoother)["notes"]
-    assert note.startswith("second.csv was prepared in other ways (cutoff 8 | 3)")
+    assert note.startswith("the signal settings of second.csv differ (cutoff 8 | 3)")
 
 
 def test_each_common_recording_is_compared_by_its_own_signals_and_rows(folder, tmp_path):
@@ -132,11 +132,11 @@ def test_each_common_recording_is_compared_by_its_own_signals_and_rows(folder, t
     last["rows_used"] = 77
     last["signals"] = last["signals"] | {"cutoff": 3.0}
     (note,) = notes()
-    said = f"second.csv was prepared in other ways (cutoff 8 | 3; rows {rows} | 77)"
+    said = f"the signal settings of second.csv differ (cutoff 8 | 3; rows {rows} | 77)"
     assert note.startswith(said)
     results[1]["inputs"][-2]["signals"] = {"cutoff": 4.5}
     first, second = notes()
-    assert first.startswith("more.csv was prepared in other ways (cutoff 5 | 4.5)")
+    assert first.startswith("the signal settings of more.csv differ (cutoff 5 | 4.5)")
     assert second == note
 
 
@@ -181,7 +181,7 @@ def test_a_third_result_is_compared_with_the_first_and_with_what_all_have(folder
     assert all(len(joint["rmse"]) == 3 for joint in entry["per_joint"])
     (note,) = found["notes"]
     rows = a["inputs"][-1]["rows_used"]
-    assert f"second.csv was prepared in other ways (rows {rows} | {rows} | 77)" in note
+    assert f"the signal settings of second.csv differ (rows {rows} | {rows} | 77)" in note
 
     found = compared(lambda result: result["inputs"][1].update(sha256="1" * 64))
     assert not found["fitted_alike"]
@@ -191,18 +191,22 @@ def test_a_third_result_is_compared_with_the_first_and_with_what_all_have(folder
     found = compared(lambda result: result["inputs"][-1].update(sha256="0" * 64))
     assert found["validation"] == []
     assert [note[:15] for note in found["notes"]] == [
-        *(f"{label} was validated"[:15] for label in "ABC"), "no validation r",
+        *(f"{label} was validated"[:15] for label in "ABC"), "the results hav",
     ]  # fmt: skip
 
 
 def test_other_base_parameters_are_refused_by_name(changed):
-    with pytest.raises(DataError, match=r"a\.json has 1 base parameters that .*b\.json has not: "):
+    with pytest.raises(
+        DataError, match=r"a\.json has 1 base parameters that .*b\.json does not have: "
+    ):
         changed(lambda result: result["base_parameters"].pop())
 
     def other_sum(result):
         result["base_parameters"][0]["expression"] = "2 x"
 
-    with pytest.raises(DataError, match=r"1 base parameters stand for other sums in .* and 2 x; "):
+    with pytest.raises(
+        DataError, match=r"1 base parameters have other expressions in .* and 2 x; "
+    ):
         changed(other_sum)
 
 
@@ -243,7 +247,7 @@ def test_the_page_shows_the_figures_of_the_two_results(folder, tmp_path):
     assert kept.startswith("second.csv 0-")
     for caption, parts in (
         (kept, [r["validation"][0] for r in (a, b)]),
-        ("Fitted rows of each result", [r["identification"] for r in (a, b)]),
+        ("Fitted samples of each result", [r["identification"] for r in (a, b)]),
     ):
         for row in shown[caption].rows:
             one, other = (part["per_joint"][row[0]] for part in parts)
@@ -273,11 +277,11 @@ def test_the_page_shows_the_figures_of_the_two_results(folder, tmp_path):
             assert error == pytest.approx(entry["std_error"], rel=0.051)
             assert value == pytest.approx(entry["value"], abs=0.051 * entry["std_error"])
     far = sum(abs(float(row[1].replace("−", "-"))) > 3.0 for row in table.rows)
-    assert f"{far} of {len(table.rows)} differ from A by more than 3 combined" in html
+    assert f"{far} of {len(table.rows)} parameters differ from A by more than 3 combined" in html
     assert html.count(f"<strong>{table.rows[0][1]}</strong>") == 1
-    settings = dict((row[0], row[1:]) for row in shown["Settings that differ"].rows)
+    settings = dict((row[0], row[1:]) for row in shown["Different settings"].rows)
     assert settings["estimator.name"] == ["consistent", "wls"]
-    files = shown["Files read, those that differ first"]
+    files = shown["Files read, different ones first"]
     assert files.headers == ["role", "A", "B", "file", "from s", "to s", "SHA-256"]
     for row, entry in zip(files.rows, a["inputs"], strict=True):
         window = [number(entry.get(end), ".6g") for end in ("start", "end")]
@@ -311,8 +315,8 @@ def test_versions_that_differ_stand_on_the_page(folder, tmp_path):
     write_json(b, tmp_path / "b.json")
     content = write_comparison([folder / "a.json", tmp_path / "b.json"], tmp_path / "c.html")
     html = (tmp_path / "c.html").read_text(encoding="utf-8")
-    assert tables(html)["Versions that differ"].rows == [["numpy", np.__version__, "1.26.0"]]
-    files = tables(html)["Files read, those that differ first"].rows
+    assert tables(html)["Different versions"].rows == [["numpy", np.__version__, "1.26.0"]]
+    files = tables(html)["Files read, different ones first"].rows
     assert [row[1:3] for row in files] == [["yes", "no"], ["no", "yes"], *[["yes", "yes"]] * 2]
     for note in content["notes"]:
         assert f"<li>{note.replace(chr(39), '&#x27;')}</li>" in html
@@ -349,8 +353,8 @@ def test_results_and_logs_of_one_name_are_told_apart_by_the_shortest_path(folder
         write_json(own, place)
     found = compare_results(places)
     assert [x["name"] for x in found["results"]] == ["monday/out", "tuesday/out", "wls"]
-    assert "A was validated on a, which not every result was" in found["notes"][0]
-    assert "B was validated on b, which" in found["notes"][1]
+    assert "A was validated on a, other results were not" in found["notes"][0]
+    assert "B was validated on b, other" in found["notes"][1]
     write_comparison(places, tmp_path / "c.html")
     html = (tmp_path / "c.html").read_text(encoding="utf-8")
     for label, name in zip("ABC", ("monday/out", "tuesday/out", "wls"), strict=True):
@@ -410,7 +414,7 @@ def test_results_that_state_no_speeds_have_no_curves(folder, tmp_path):
         write_json({**read_result(folder / f"{name}.json"), "friction": {}}, tmp_path / name)
     content = write_comparison([tmp_path / "a", tmp_path / "b"], tmp_path / "c.html")
     assert content["friction"] == []
-    assert "No result states friction and the speeds" in (tmp_path / "c.html").read_text()
+    assert "No result has friction curves" in (tmp_path / "c.html").read_text()
 
 
 def test_bars_are_as_long_as_what_they_show(folder, tmp_path):
@@ -466,7 +470,7 @@ def test_a_difference_is_far_if_that_to_any_result_is_and_ends_in_a_point_beyond
         ],
     }  # fmt: skip
     html = comparison_page._base_section(content)
-    assert "<p>2 of 5 differ from A by more than 3 combined standard errors" in html
+    assert "<p>2 of 5 parameters differ from A by more than 3 combined standard errors" in html
     rows = tables(html)["Base parameters with standard errors"].by_name()
     assert rows["b"]["(C − A) / s"] == "−7.2"
     assert rows["d"]["(C − A) / s"] == "0.0"

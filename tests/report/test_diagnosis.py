@@ -12,15 +12,15 @@ from robotid.identification.pictures import residual_charts
 from robotid.pages.charts import Chart, Series
 from robotid.report.diagnosis import _choice, _correlations, _residual_figures, information_section
 from robotid.report.errors import _notes
-from robotid.report.torques import _beside
+from robotid.report.torques import _totals
 
 
 def test_shares_of_the_data_are_those_of_all_and_of_the_weakest(identified):
     share = information(identified).data_share
     said = information_section(identified)
     assert (
-        f"the data give {np.mean(np.round(100 * share)):.0f} % in the mean and "
-        f"{round(100 * share.min())} % of the weakest"
+        f"base parameters by {np.mean(np.round(100 * share)):.0f} % on average and the weakest by "
+        f"{round(100 * share.min())} %,"
     ) in said
     assert share.min() < 0.9 * share.mean()
 
@@ -40,7 +40,7 @@ def test_a_correlation_falls_where_its_chart_first_does(identified, row):
     [
         ([1.0, 0.4, -0.6, -0.3, 0.19, 0.5], "falls below 0.2 after 1 s"),
         ([1.0, -0.19, 0.6], "falls below 0.2 after 0.25 s"),
-        ([1.0, -0.9, 0.8], "stays high"),
+        ([1.0, -0.9, 0.8], "does not decay"),
     ],
 )
 def test_a_correlation_that_turns_negative_has_not_fallen(identified, monkeypatch, values, said):
@@ -76,13 +76,13 @@ def test_what_was_tried_of_a_joint_stands_with_error_chance_and_shape():
     ((caption, table),) = tables(html).items()
     assert caption == said
     assert f"<summary>{said}</summary>" in html
-    assert table.headers == ["terms", "held-out error %", "p_value", ""]
+    assert table.headers == ["terms", "held-out error %", "p-value", ""]
     assert table.rows == [
         ["viscous and Coulomb", "4.57", "", ""], ["tanh", "3.40", "2.0e−04", ""],
-        ["tanh + load", "2.25", "3.1e−02", "taken"],
+        ["tanh + load", "2.25", "3.1e−02", "selected"],
     ]  # fmt: skip
     none = SimpleNamespace(joint="two", families=(), shapes=(), tried=tried[:1])
-    assert "<summary>two: nothing more</summary>" in _choice(None, none)
+    assert "<summary>two: no additional term</summary>" in _choice(None, none)
 
 
 def test_all_strong_correlations_are_counted_and_the_strongest_listed():
@@ -104,14 +104,14 @@ def test_all_strong_correlations_are_counted_and_the_strongest_listed():
     assert "No two errors are correlated by 0.8 or more." in weak
 
 
-def test_what_a_verdict_is_read_beside_is_in_percent_and_times():
+def test_totals_beside_a_verdict_are_in_percent_and_times():
     scale_check = SimpleNamespace(
         friction={"one": 0.256, "two": 0.044}, masses=(10.126, 12.374, 0.1),
         gravity={"one": 1.049, "two": 0.951},
     )  # fmt: skip
-    assert _beside(SimpleNamespace(scale_check=scale_check)) == (
-        "Total mass 10.13 -> 12.37 kg. Gravity torque over the URDF's: one 1.05, two 0.95. "
-        "Friction as a share of the torque: one 26 %, two 4 %."
+    assert _totals(SimpleNamespace(scale_check=scale_check)) == (
+        "Total mass 10.13 -> 12.37 kg. Gravity torque relative to the URDF: one 1.05, two 0.95. "
+        "Friction relative to the torque: one 26 %, two 4 %."
     )
 
 

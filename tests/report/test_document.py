@@ -184,18 +184,20 @@ def test_samples_and_rows_are_those_of_the_fitted_logs_together(report, identifi
     said = " ".join(Reader(report).text.split())
     assert (
         f"{len(identified.base)} base parameters of 6 joints were fitted to {first}, {second} "
-        f"({samples} samples after filtering, {rows} torque rows used) by " in said
+        f"({samples} samples after filtering, {rows} torque values used) by " in said
     )
     assert f"Validation: {kept.recording.name}. " in said
     counts = [identified.sources.count(source) for source in ("data", "mixed")]
     assert min(counts) > 0
     every = len(identified.sources)
-    assert f"{sum(counts)} of {every} determined by motion, in part or whole" in said
+    assert f"{sum(counts)} of {every} determined by the data, fully or partly" in said
     before, after = (pi[:60:10].sum() for pi in (identified.prior, identified.standard))
-    assert f"Total mass {before:.2f} -> {after:.2f} kg. Gravity torque over the URDF's: " in said
+    assert (
+        f"Total mass {before:.2f} -> {after:.2f} kg. Gravity torque relative to the URDF: " in said
+    )
     shares = [f"{x} {100 * share:.0f} %" for x, share in identified.scale_check.friction.items()]
     assert len(shares) > 1
-    assert f"Friction as a share of the torque: {', '.join(shares[:-1])}" in said
+    assert f"Friction relative to the torque: {', '.join(shares[:-1])}" in said
     assert f"{shares[-1]}. " in said
 
 
@@ -233,7 +235,7 @@ def test_findings_stand_under_their_cause_and_their_joint(html):
     assert re.findall(r'<div class="cause (\w+)" id="cause-(\w+)">', html) == [
         ("error", "b"), ("warning", "gap"), ("note", "log_note"), ("note", "a")
     ]  # fmt: skip
-    (row,) = tables(html)["By joint, the worst first"].rows
+    (row,) = tables(html)["Findings by joint, the worst first"].rows
     assert row == ["shoulder", "b", "–"]
 
 
@@ -289,9 +291,9 @@ def test_a_joint_worse_than_the_urdf_is_flagged(model, tmp_path):
 def test_without_a_validation_log_the_fitted_rows_are_drawn(model, tmp_path):
     found = identify(model, [make_log(model, 1, path="a.csv")])
     text = Reader(write_report(found, tmp_path / "r.html").read_text(encoding="utf-8")).text
-    assert "There is no validation log: these are the fitted logs." in text
+    assert "There is no validation log. The charts show the fitted logs." in text
     assert "a.csv 0-7.99 s, fitted" in text
-    assert "fitted rows, for there is no validation log" in text
+    assert "fitted samples, without validation log" in text
 
 
 def test_long_recordings_stay_small(model, html, tmp_path):

@@ -127,7 +127,7 @@ def test_the_steps_stand_in_order_with_what_to_copy(screen, identified):
 def test_the_best_of_many_joints_are_folded_away(identified, screen, monkeypatch):
     monkeypatch.setattr(errors, "_ROWS", 4)
     html = screen_of(identified)
-    shown, folded = html.split("2 more joints, which are predicted better")
+    shown, folded = html.split("2 more joints with smaller errors")
     assert [*bars(shown), *bars(folded)] == list(bars(screen))
     assert len(bars(shown)) == 4
 

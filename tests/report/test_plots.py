@@ -206,7 +206,7 @@ def test_correlations_are_drawn_in_their_cell_with_their_sign_and_strength(repor
 def test_the_shares_of_the_data_are_said_in_the_mean_and_of_the_weakest(identified, report):
     shares = [round(100 * share) for share in information(identified).data_share]
     assert min(shares) < np.mean(shares) < 99.5
-    said = f"the data give {np.mean(shares):.0f} % in the mean and {min(shares)} % of the weakest"
+    said = f"by {np.mean(shares):.0f} % on average and the weakest by {min(shares)} %"
     assert said in report
 
 
@@ -222,7 +222,7 @@ def test_captions_say_error_and_how_much_the_band_holds(identified, report):
         share = 100 * inside[used, j].mean()
         said.append(
             f"error {own.relative_error_pct:.1f} %, RMSE {own.rmse:.3g} N m; "
-            f"95 % band holds {share:.0f} %"
+            f"95 % band contains {share:.0f} %"
         )
     assert all(words in report for words in said), said
     assert len(set(said)) == len(said)
@@ -257,5 +257,5 @@ def test_each_recording_has_its_own_band_error_and_share_of_the_points(identifie
         assert upper.link == f"recording {k}"
         assert caption == (
             f"{evaluation.recording.name}, fitted: error {percent(100 * rmse / size)} %, RMSE "
-            f"{rmse:.3g} N m; 95 % band holds {100 * held:.0f} %"
+            f"{rmse:.3g} N m; 95 % band contains {100 * held:.0f} %"
         ), name

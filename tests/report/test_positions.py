@@ -15,7 +15,7 @@ from robotid.export.result import load_result
 from robotid.logs.data import Log
 from robotid.report.advice import Origin
 from robotid.report.errors import worst_errors
-from robotid.report.positions import _charts, _held, _horizons, _undetermined, shown_positions
+from robotid.report.positions import _charts, _fixed, _horizons, _undetermined, shown_positions
 from robotid.report.shown import page_of
 
 ERRORS = {"rmse": (2e-3, 4e-3, 8e-3), "command_rmse": (0.02, 0.05, 0.08), "urdf_rmse": (0.01,) * 3}
@@ -97,7 +97,7 @@ def page(content, followed):
 
 def test_errors_are_those_of_the_result(page):
     kept = tables(page)["kept.csv: not fitted"]
-    head = ["joint", "error %", "verdict", "RMSE", "unit", "R²", "rows", "URDF %", "command %"]
+    head = ["joint", "error %", "verdict", "RMSE", "unit", "R²", "samples", "URDF %", "command %"]
     assert kept.headers == head
     assert kept.rows[1] == [LEG[1], "4.0", "–", "4", "mrad", "0.990", "400", "10.0", "40.0"]
     assert kept.column("verdict") == ["–", "–", "usable: it is soft"]
@@ -128,7 +128,7 @@ def test_charts_show_commanded_measured_and_simulated(page, followed):
     horizon = chart(page, "position error over the horizon")
     np.testing.assert_allclose(horizon["x"], [0.1, 0.5, 4.0], rtol=1e-6)
     mean = horizon["series"][-1]
-    assert mean["label"] == "geometric mean of all"
+    assert mean["label"] == "geometric mean"
     np.testing.assert_allclose(mean["y"], [1.0, 2.0, 4.0], rtol=1e-4)
     shown = [c for c in charts(page) if c["title"].startswith("position of")]
     assert [c["title"] for c in shown] == [f"position of {joint}" for joint in LEG]
@@ -169,7 +169,7 @@ def test_of_two_logs_each_joint_shows_its_worse_error_and_each_log_its_own(conte
     assert f"kept.csv 1-5 s, fitted: RMSE {rmse:.3g} mrad" in html
 
 
-def test_what_is_held_of_every_joint_is_named_once():
+def test_what_is_fixed_of_every_joint_is_named_once():
     stated = [("a.kp", 1.0), ("b.kp", 2.0), ("c.kp", 3.0), ("a.kd", 0.1), ("c.kd", 0.2),
               ("b.zero", 0.0), ("c.delay", 0.01)]  # fmt: skip
     entries = [
@@ -177,7 +177,7 @@ def test_what_is_held_of_every_joint_is_named_once():
         for name, x in stated
     ]
     content = {"joints": ["a", "b", "c"], "drive_parameters": entries}
-    assert _held(content) == "kp of every joint, kd of a, c, masses of the URDF"
+    assert _fixed(content) == "kp of all joints, kd of a, c, masses of the URDF"
 
 
 def test_the_mean_over_the_horizon_is_of_all_joints_and_the_lines_of_the_worst(content):
@@ -200,12 +200,12 @@ def test_the_mean_over_the_horizon_is_of_all_joints_and_the_lines_of_the_worst(c
         np.testing.assert_allclose(line["y"], [x, 2 * x], rtol=1e-3)
     both = np.exp(np.mean(np.log([*size.values()])))
     np.testing.assert_allclose(mean["y"], [both, 2 * both], rtol=1e-3)
-    said = "the worst 7 joints, the whole recording last: kept.csv 3-10 s, not fitted"
+    said = "the worst 7 joints, whole recording at the end: kept.csv 3-10 s, not fitted"
     assert f"Error over horizon, {said}" in html
 
 
 def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content):
-    drives = tables(page)["Drives, joint by joint"]
+    drives = tables(page)["Drives, by joint"]
     assert drives.headers[1:4] == ["kp [N m/rad]", "kd [N m s/rad]", "delay [ms]"]
     assert drives.headers[-1] == "coulomb_q2 [N m]"
     rows = drives.by_name()
@@ -220,15 +220,15 @@ def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content
     assert 0 < has_error.count(True) != has_error.count(False) > 0
     count, every = has_error.count(True), len(has_error)
     assert f"{every} parameters, determined by" in page
-    assert f"{count} motion, {every - count} stated</dd>" in page
-    assert f"{count} of {every} determined by motion, in part or whole" in page
+    assert f"{count} data, {every - count} stated</dd>" in page
+    assert f"{count} of {every} determined by the data, fully or partly" in page
     rows = tables(page)["Parameters of links and drives"].rows
     own = {f"{row[0]}.{row[1]}": row for row in rows}
     assert own[f"{LEG[1]}.kp"][8] == "stated"
-    assert own[f"{LEG[1]}.coulomb"][8] == "motion"
-    said = page[page.index("The logs leave these open") :]
+    assert own[f"{LEG[1]}.coulomb"][8] == "data"
+    said = page[page.index("The logs do not determine:") :]
     assert "FL_calf.Ixx" in said
-    assert "kp of every joint, kd of every joint, masses of the URDF" in said
+    assert "kp of all joints, kd of all joints, masses of the URDF" in said
     files = tables(page)["Files read"]
     assert files.column("role") == ["URDF", "fitted"]
     assert files.column("SHA-256") == ["not read from a file"] * 2
@@ -244,7 +244,7 @@ def test_proportional_commands_leave_no_claim_that_all_is_determined():
     }
     content = {"structure": {"undetermined": []}, "warnings": []}
     content["simulation"] = {"controller": {"kind": "torque"}}
-    claim = "The logs determine all that was to be found"
+    claim = "The logs determine all free parameters"
     assert claim in _undetermined(content)
     text = _undetermined({**content, "warnings": [alike]})
     assert claim not in text
@@ -263,7 +263,7 @@ def test_logs_that_do_not_fit_are_refused(content, followed):
     other = replace(followed, q=followed.q[:, :2])
     with pytest.raises(DataError, match=r"kept.csv has 2 joints, the result 3"):
         page_with(content, [other], [])
-    assert "No log is at hand" in page_with(content, [], [])
+    assert "The logs are not available" in page_with(content, [], [])
     assert "kept.csv 1-5 s, fitted: RMSE 6 mrad" in page_with(content, [followed], [])
     driven = replace(followed, baselines={"steady": np.zeros(3)})
     shown = chart(page_with(content, [], [driven]), f"position of {LEG[0]}")
@@ -279,5 +279,5 @@ def test_the_lines_of_the_urdf_that_change_are_shown(content, followed):
     assert (
         f"<ins>+      &lt;mass value=&quot;{pi[0]}" in page or f"mass value=&quot;{pi[0]}" in page
     )
-    assert "every other byte is the same" in page
-    assert "no longer where it was read" in page_with(content, [], [followed])
+    assert "all other bytes are unchanged" in page
+    assert "no longer at its path" in page_with(content, [], [followed])

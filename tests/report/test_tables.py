@@ -18,7 +18,7 @@ from robotid.fitting.information import information
 from robotid.identification.summary import verdict_cell
 from robotid.pages import html
 from robotid.report.advice import Origin
-from robotid.report.tables import _consistency_notes, _drive_table, _reach, base_table
+from robotid.report.tables import _consistency_notes, _coverage, _drive_table, base_table
 from robotid.report.torques import shown_torques
 from robotid.robot.parameters import INERTIAL_TERMS
 from robotid.versions import versions
@@ -42,7 +42,7 @@ def section(html, key):
 
 @pytest.mark.parametrize(
     ("caption", "role"),
-    [("kept.csv 0-5.98 s: not fitted", "validation"), ("All fitted rows together", "fitted")],
+    [("kept.csv 0-5.98 s: not fitted", "validation"), ("All fitted samples together", "fitted")],
 )
 def test_errors_are_those_of_estimate_wls_and_baselines(shown, identified, caption, role):
     evaluations = getattr(identified, role)
@@ -58,7 +58,7 @@ def test_errors_are_those_of_estimate_wls_and_baselines(shown, identified, capti
             "RMSE": number(measured["rmse"], ".3g"),
             "unit": "N m",
             "R²": number(measured["r2"], ".3f"),
-            "rows": str(measured["rows"]),
+            "samples": str(measured["rows"]),
             "WLS %": percent(measured["wls"]),
             "URDF %": percent(measured["urdf"]),
             "URDF + drives %": percent(measured["urdf_with_drives"]),
@@ -82,7 +82,7 @@ def test_the_head_counts_parameters_samples_and_rows(report, identified):
     samples = sum(len(e.recording.trajectory.t) for e in identified.fitted)
     rows = sum(int(e.recording.mask.sum()) for e in identified.fitted)
     assert f"{len(identified.base)} base parameters of 6 joints" in said
-    assert f"({samples} samples after filtering, {rows} torque rows used)" in said
+    assert f"({samples} samples after filtering, {rows} torque values used)" in said
     assert "fitted to first.csv 0-3.58 s, second.csv 0-3.475 s (" in said
     assert "Validation: kept.csv 0-5.98 s." in said
     assert "consistent bodies and the URDF's values as prior (consistent)" in said
@@ -112,7 +112,7 @@ def test_every_parameter_stands_beside_that_of_the_urdf(shown, identified):
     assert [".".join(row[:2]) for row in rows] == list(layout.names)
     bodies = [body.toDynamicParameters() for body in list(identified.model.pin_model.inertias)[1:]]
     urdf = [*np.concatenate(bodies), *[0.0] * 24]
-    words = {"data": "motion", "mixed": "motion and prior", "prior": "prior"}
+    words = {"data": "data", "mixed": "data and prior", "prior": "prior"}
     words["bound"] = "at its bound"
     units = dict.fromkeys(("Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz", "armature"), "kg m^2")
     units |= {"m": "kg", "mcx": "kg m", "mcy": "kg m", "mcz": "kg m", "viscous": "N m s/rad"}
@@ -213,15 +213,15 @@ def test_the_notes_on_consistency_are_those_of_the_fit(report, identified):
     said = text_of(section(report, "consistency"))
     kinds = {kind: identified.sources.count(kind) for kind in ("data", "mixed", "prior", "bound")}
     assert (
-        f"of 84 parameters {kinds['data']} come from the data, {kinds['mixed']} from data and "
-        f"URDF together, {kinds['prior']} from the URDF; {kinds['bound']} are at a bound of "
-        "physics."
+        f"Sources of the 84 parameters: {kinds['data']} the data, {kinds['mixed']} data and "
+        f"URDF together, {kinds['prior']} the URDF; {kinds['bound']} are at a physical "
+        "bound."
     ) in said
     prior = identified.estimate.details["prior"]
     assert f"its weight is {prior['weight']:.3g}, " in said
     check = identified.mass_matrix
     assert f"(smallest eigenvalue {check.smallest_eigenvalue:.3g})" in said
-    assert "Every body and drive is physically possible." in said
+    assert "All bodies and drives are physically consistent." in said
 
 
 def test_the_notes_on_consistency_state_every_figure_with_its_unit(identified):
@@ -243,25 +243,26 @@ def test_the_notes_on_consistency_state_every_figure_with_its_unit(identified):
     said = text_of(_consistency_notes(found)).split(" The mass matrix")[1]
     assert said == (
         ", armatures included, is positive definite at 97.3 % of 321 random poses (smallest "
-        "eigenvalue -0.0123). The distance from the URDF's values is measured by the divergence of "
-        "the pseudo-inertias (entropic); its weight is 0.0234, chosen by predicting segments of "
-        "the fitted logs from the others. Constraints that bind: a, b. Extents that the data "
-        "contradict: c. Kept at the URDF's values: d, e. Second opinion of SCS: solved; torques "
-        "differ by 0.12 %. Gap of log-Cholesky to the cone programme, per start: 1.0e-09, 2.5e-08."
+        "eigenvalue -0.0123). The prior is the distance from the URDF's values by the divergence "
+        "of the pseudo-inertias (entropic); its weight is 0.0234, selected by cross-validation on "
+        "the fitted logs. Active constraints: a, b. Extents that contradict the data: c. Fixed at "
+        "the URDF's values: d, e. Check by a second solver, SCS: solved; torques differ by "
+        "0.12 %. Gap of the log-Cholesky solution to the cone programme, per start: "
+        "1.0e-09, 2.5e-08."
     )
     sources = ["prior"] * len(identified.sources)
     sources[:3], sources[60:] = ["data", "mixed", "bound"], ["data"] * (len(sources) - 60)
-    said = _reach(SimpleNamespace(model=identified.model, sources=tuple(sources)))
+    said = _coverage(SimpleNamespace(model=identified.model, sources=tuple(sources)))
     bodies = identified.model.layout.bodies
     assert said == (
-        f"How far the data carry: of {len(sources)} parameters {len(sources) - 59} come from the "
-        "data, 1 from data and URDF together, 57 from the URDF; 1 are at a bound of physics. "
-        f"Nothing is known of {', '.join(bodies[1:])} but the URDF."
+        f"Sources of the {len(sources)} parameters: {len(sources) - 59} the data, 1 data and URDF "
+        "together, 57 the URDF; 1 are at a physical bound. "
+        f"The data do not determine {', '.join(bodies[1:])}: URDF only."
     )
 
 
 def test_shares_of_the_data_are_listed_weakest_first(shown, identified):
-    caption = "Base parameters that the data settle by less than 99 %, the weakest first"
+    caption = "Base parameters that the data determine by less than 99 %, the weakest first"
     K, spread = identified.mapping.K, identified.prior_std
     before = np.einsum("bp,p,bp->b", K, spread**2, K)
     share = before / (before + identified.wls.std_error**2)
@@ -286,11 +287,11 @@ def test_what_is_open_is_named(report, shown, identified):
     assert f"The data determine {identified.determination.rank} of {len(identified.base)} " in said
     assert f"condition number {identified.wls.condition:.3g} (" in said
     never = ", ".join(identified.mapping.unidentifiable)
-    assert f"Parameters that no motion can show {never} What any motion" in said
+    assert f"Parameters without effect on the torque {never} Structural" in said
     kept = [n for n, s in zip(layout.names, identified.sources, strict=True) if s == "prior"]
-    title = "Standard parameters that remain as the URDF has them, or nearly"
+    title = "Standard parameters that remain at the URDF's values"
     assert said.endswith(f"{title} {', '.join(kept)}")
-    for row in shown["What any motion can show of each body"].rows:
+    for row in shown["Structural identifiability of each body"].rows:
         kinds = identified.mapping.described([f"{row[0]}.{term}" for term in INERTIAL_TERMS])
         names = [[n.rsplit(".", 1)[1] for n in kinds[k]] for k in ("alone", "in sums", "never")]
         assert row[1:] == [", ".join(part) or "–" for part in names]
@@ -342,7 +343,7 @@ def test_versions_are_listed(shown):
 def test_a_drive_parameter_that_stands_on_a_misfit_says_so(identified):
     found = replace(identified, on_misfit=("elbow_joint.coulomb",))
     rows = tables(shown_torques(found, Origin()).parameters)["Parameters of links and drives"].rows
-    marked = [row[:2] for row in rows if row[8].endswith(", on a misfit")]
+    marked = [row[:2] for row in rows if row[8].endswith(", model misfit")]
     assert marked == [["elbow_joint", "coulomb"]]
 
 

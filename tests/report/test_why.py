@@ -42,16 +42,16 @@ def test_the_tables_hold_the_root_mean_squares(section, identified):
     for j, joint in enumerate(identified.model.joints):
         (table,) = (t for caption, t in found.items() if caption.startswith(f"{joint}:"))
         rows, measured = table.by_name(), kept.metrics["estimate"].per_joint[joint]
-        assert rows["residual"]["rms N m"] == number(measured.rmse, ".3g")
+        assert rows["residual"]["RMS N m"] == number(measured.rmse, ".3g")
         assert rows["residual"]["% of torque"] == percent(measured.relative_error_pct)
         mask, motion = kept.recording.mask[:, j], kept.recording.trajectory
         assert table.foot[1] == number(np.sqrt(np.mean(motion.tau[mask, j] ** 2)), ".3g")
         theta = dict(zip(identified.model.layout.names, identified.standard, strict=True))
         inertia = theta[f"{joint}.armature"] * np.sqrt(np.mean(motion.a[mask, j] ** 2))
         if "motor inertia" in rows:
-            assert rows["motor inertia"]["rms N m"] == number(inertia, ".3g")
+            assert rows["motor inertia"]["RMS N m"] == number(inertia, ".3g")
         viscous = theta[f"{joint}.viscous"] * np.sqrt(np.mean(motion.v[mask, j] ** 2))
-        assert f"viscous {viscous:.3g}" in rows["friction"]["its terms, rms"]
+        assert f"viscous {viscous:.3g}" in rows["friction"]["terms, RMS"]
 
 
 def test_stacked_parts_in_the_page_sum_to_the_prediction(section, identified):
@@ -139,10 +139,10 @@ def test_captions_say_what_a_quantity_explains_and_power_what_is_done(torques):
     torque = replace(torques["elbow_joint"])
     dependence = replace(torque.follows[2], share=0.413, p_value=1e-5)
     for change, said in (
-        ({}, "<strong>explains 41.3 % of its variance</strong>"),
-        ({"p_value": 0.01}, "explains 41.3 %, perhaps by chance"),
-        ({"share": 0.05}, "explains nothing"),
-        ({"share": None}, "too little was recorded to tell"),
+        ({}, "<strong>explains 41.3 % of the variance</strong>"),
+        ({"p_value": 0.01}, "explains 41.3 % of the variance, not significant"),
+        ({"share": 0.05}, "no dependence"),
+        ({"share": None}, "too few samples"),
     ):
         torque.__dict__["follows"] = (replace(dependence, **change),)
         assert _caption(torque, "speed") == f"Residual against speed: {said}"

@@ -303,7 +303,7 @@ def test_a_joint_picked_anywhere_shows_everywhere(still, ur5, how):
         row = box["height"] / 6
         seen.page.mouse.click(box["x"] + box["width"] * 0.75, box["y"] + 3.5 * row)
         assert seen.page.evaluate("replay.clock.time") == pytest.approx(10.0, abs=0.05)
-        assert "× the noise" in seen.page.locator("#told").inner_text()
+        assert "× RMS noise" in seen.page.locator("#reading").inner_text()
         seen.page.locator("#sheet").press("ArrowUp")
         assert seen.page.evaluate("replay.picked") == ur5.joints[2]
         seen.page.locator("#sheet").press("ArrowDown")
@@ -415,6 +415,14 @@ def test_the_address_keeps_time_joint_and_camera(browser, still, ur5):
         assert seen.page.evaluate("replay.clock.time") == pytest.approx(9.25)
         assert seen.page.evaluate("replay.picked") == ur5.joints[2]
         assert seen.page.evaluate(camera) == pytest.approx(place, rel=1e-4)
+        # a link of a report to the open replay, and one to another recording
+        seen.page.evaluate(f"location.hash = 't=8.125&joint={ur5.joints[4]}'")
+        until(seen, "replay.clock.time === 8.125")
+        assert seen.page.evaluate("replay.picked") == ur5.joints[4]
+        assert seen.page.locator("#state").inner_text() == ""
+        seen.page.evaluate("location.hash = 't=8.5&log=other.csv'")
+        until(seen, "replay.clock.time === 8.5")
+        assert "to other.csv; this replay shows another" in seen.page.inner_text("#state")
         assert seen.errors == []
 
 
@@ -517,6 +525,7 @@ def test_a_phone_shows_everything_without_scrolling_sideways(still):
 
 def test_every_control_has_a_name(still):
     seen = still
+    seen.page.evaluate("document.querySelector('details').open = true")
     named = seen.page.evaluate(
         "[...document.querySelectorAll('button:not([hidden]), input, select')].map(e => "
         "(e.labels && e.labels.length && e.labels[0].innerText.trim()) || "
@@ -613,7 +622,7 @@ def test_ghosts_of_positions_may_stand_farther_away(browser, arm_page):
         seen.page.evaluate("replay.seek(0)")
         turned = [relative_turn(seen, which) for which in ("ghosts[0]", "ghosts[1]")]
         np.testing.assert_allclose(turned, [0.01, 0.05], atol=1e-4)
-        seen.page.get_by_label("ghosts 10 × as far away").click()
+        seen.page.get_by_label("ghost distance × 10").click()
         seen.page.evaluate("replay.seek(0)")
         np.testing.assert_allclose(relative_turn(seen, "ghosts[0]"), 0.1, atol=1e-4)
 

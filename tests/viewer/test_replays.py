@@ -51,9 +51,9 @@ def world_poses(nodes, moved):
     for node in nodes[1:]:
         rest = pin.SE3(pin.Quaternion(np.array(node["quaternion"])), np.array(node["position"]))
         axis, by = np.array(node["axis"]), float(moved[node["column"]])
-        if node["kind"] == "turn":
+        if node["kind"] == "revolute":
             rest = rest * pin.SE3(pin.exp3(axis * by), np.zeros(3))
-        elif node["kind"] == "slide":
+        elif node["kind"] == "prismatic":
             rest = rest * pin.SE3(np.eye(3), axis * by)
         else:
             turn = pin.Quaternion(np.array(moved[3:7], dtype=float)).normalized()
@@ -392,7 +392,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_beside_it(arm, motion, tmp_pa
         ),
         (lambda t, q: (t[:1], q[:1]), "the motion has 1 samples, wanted at least 2 to play"),
         (lambda t, q: (t, q[:, :1]), r"q has shape \(201, 1\), wanted \(N, 2\)"),
-        (lambda t, q: (t, q * np.nan), "t or q holds values that are not finite"),
+        (lambda t, q: (t, q * np.nan), "t or q has values that are not finite"),
         (lambda t, q: (np.r_[t[:9], t[8:-1]], q), r"t must increase, but t\[9\] = 5.08 s follows"),
     ],
 )

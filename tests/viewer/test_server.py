@@ -85,7 +85,7 @@ def test_a_client_that_breaks_off_leaves_no_trace(live, capfd, words):
 
 
 def test_only_the_newest_messages_are_kept(monkeypatch):
-    monkeypatch.setattr(live_module, "_KEPT", 5)
+    monkeypatch.setattr(live_module, "_HISTORY", 5)
     with LivePage("") as live:
         for k in range(12):
             live.send({"t": k})
@@ -95,7 +95,7 @@ def test_only_the_newest_messages_are_kept(monkeypatch):
 
 def test_closing_frees_the_port_and_a_taken_one_is_an_error(live):
     port = int(live.url.rstrip("/").rsplit(":", 1)[1])
-    with pytest.raises(OSError, match=rf"port {port} of .* already in use; name another one"):
+    with pytest.raises(OSError, match=rf"port {port} of .* already in use; choose another port"):
         LivePage("", port)
     live.close()
     LivePage("", port).close()

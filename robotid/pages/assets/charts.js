@@ -1,12 +1,13 @@
 "use strict";
-// Charts of the pages. uPlot draws axes and lines; this draws what is under them, and has the cursor,
+// Charts of the pages. uPlot draws axes and lines; this draws what is below them, and has the cursor,
 // the legend, and links: charts of one link share cursor and zoom.
 window.charts = (() => {
 const BAND = 0.2, AREA = 0.7, FAINT = 0.5, GROUND = 0.09; // opacities
-const CLOSER = 0.5; // what a key leaves of what is shown
+const CLOSER = 0.5; // zoom factor of a key
 const HINT = "Arrow keys move the cursor, plus and minus zoom, Escape shows all, digits hide lines.";
 const STEPS = Array.from({ length: 24 }, (_, k) => [1, 2, 5].map((x) => x * 10 ** (k - 12))).flat();
 const all = [];
+const idle = window.requestIdleCallback || ((act) => setTimeout(act, 30));
 
 function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);
@@ -28,7 +29,10 @@ function tone(name) {
 
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   tones.clear();
-  for (const chart of all) if (chart.plot) chart.plot.redraw(false);
+  for (const chart of all) {
+    const redraw = () => chart.plot && chart.plot.redraw(false);
+    if (chart.link.seen.has(chart)) redraw(); else idle(redraw);
+  }
 });
 
 function words(x, digits = 4) {
@@ -49,7 +53,7 @@ function steady(x, span) { // a number of an axis, with the digits that its span
   return x.toFixed(digits).replaceAll("-", "−");
 }
 
-function tickWords(_, ticks) { // with as many digits as tell them apart
+function tickWords(_, ticks) { // with as many digits as their step needs
   const step = ticks.length > 1 ? ticks[1] - ticks[0] : 1;
   const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
   return ticks.map((tick) => (tick + 0).toFixed(digits).replaceAll("-", "−"));
@@ -67,29 +71,29 @@ function unpack({ data, low, high, log, bits }) { // numbers from steps between 
 
 // ---- links -----------------------------------------------------------------------------------
 
-class Link { // a cursor and a stretch of x that charts share
+class Link { // a cursor and a range of x that charts share
   constructor() {
-    this.time = NaN; // where the cursor rests: set by a clock, a click or a key
-    this.shown = NaN; // where it is: under the pointer, or at rest
+    this.time = NaN; // the set position: a clock, a click or a key
+    this.shown = NaN; // its position: under the pointer, or the set one
     this.range = null; // zoomed to, or null
-    this.whole = null; // what is shown of no zoom; each chart's own x if null
+    this.whole = null; // range without zoom; each chart's own x if null
     this.seen = new Set(); // charts in sight
-    this.heard = new Set();
+    this.listeners = new Set();
   }
   set(x, how = "set") { // how: "set", "hover", "click", "key"
     if (how !== "hover") this.time = x;
     this.shown = x;
     for (const chart of this.seen) chart.move();
-    for (const tell of this.heard) tell(x, how);
+    for (const listener of this.listeners) listener(x, how);
   }
   leave() { this.set(this.time, "hover"); }
   zoom(range) {
     this.range = range;
     for (const chart of this.seen) chart.scale();
   }
-  on(tell) {
-    this.heard.add(tell);
-    return () => this.heard.delete(tell);
+  on(listener) {
+    this.listeners.add(listener);
+    return () => this.listeners.delete(listener);
   }
 }
 
@@ -132,7 +136,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.live = element("div", { class: "explore" }, this.keys, this.place);
     parent.append(this.live);
     this.setData(what.x, what.series.map((s) => s.y), what.series.map((s) => s.half));
-    this.move(); // says that there is no cursor yet
+    this.move(); // no cursor yet
     all.push(this);
     sight.observe(this.place);
     this.resized = new ResizeObserver(() => this.fit());
@@ -188,8 +192,8 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       const y = this.ys[i], half = this.halves[i];
       const low = new Float64Array(size), high = new Float64Array(size);
       for (let k = 0; k < size; k += 1) {
-        const reach = half && Number.isFinite(half[k]) ? half[k] : 0;
-        [low[k], high[k]] = [y[k] - reach, y[k] + reach];
+        const margin = half && Number.isFinite(half[k]) ? half[k] : 0;
+        [low[k], high[k]] = [y[k] - margin, y[k] + margin];
         if (kind === "bars") [low[k], high[k]] = [Math.min(0, low[k]), Math.max(0, high[k])];
         if (kind === "area") {
           [low[k], high[k]] = [down[k] + Math.min(0, y[k] || 0), up[k] + Math.max(0, y[k] || 0)];
@@ -204,7 +208,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
 
   // ---- what is in sight ----
 
-  window() { // the stretch of x that is shown
+  window() { // the visible range of x
     if (this.link.range) return this.link.range;
     if (this.link.whole) return this.link.whole;
     const first = this.x[0], last = this.x[this.x.length - 1];
@@ -300,6 +304,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.cursor = element("div", { class: "line", hidden: "" });
     this.plot.over.append(this.cursor);
     this.listen(this.plot.over);
+    this.live.classList.remove("waiting");
   }
 
   paint(u) { // what is under the lines
@@ -370,7 +375,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     ctx.fill();
   }
 
-  slot(series, X) { // width of a bar [px], and how far it stands from its x
+  slot(series, X) { // width of a bar [px], and its offset from its x
     const group = this.what.series.filter(({ kind }) => kind === "bars");
     const step = this.x.length > 1 ? this.x[1] - this.x[0] : 1;
     const width = 0.8 * (X(step) - X(0)) / (group.length || 1);
@@ -409,10 +414,10 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.values.forEach((value, i) => {
       value.textContent = shown ? this.value(i) : "";
     });
-    const said = this.what.series.map((s, i) => `${s.label} ${this.values[i].textContent}`);
+    const readings = this.what.series.map((s, i) => `${s.label} ${this.values[i].textContent}`);
     this.place.setAttribute("aria-valuenow", shown ? this.x[this.index] : 0);
     this.place.setAttribute("aria-valuetext",
-      shown ? `${this.at.textContent}: ${said.join(", ")}` : "no cursor");
+      shown ? `${this.at.textContent}: ${readings.join(", ")}` : "no cursor");
     if (!this.cursor) return;
     const [from, to] = this.window();
     this.cursor.hidden = !(shown && x >= from && x <= to);
@@ -426,7 +431,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     return `${words(y)}${Number.isFinite(y) && Number.isFinite(half) ? ` ± ${words(half, 2)}` : ""}`;
   }
 
-  where(x) { // an x in words
+  where(x) { // an x as text
     const { x_names: names, logarithmic } = this.what;
     if (names && names.length) return names[Math.round(x)];
     const [from, to] = this.window();
@@ -485,7 +490,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
   }
 }
 
-// ---- the charts that stand in the page -------------------------------------------------------
+// ---- the charts of the page -------------------------------------------------------
 
 for (const figure of document.querySelectorAll("figure.chart")) {
   const what = JSON.parse(figure.querySelector("script").textContent);
@@ -494,9 +499,20 @@ for (const figure of document.querySelectorAll("figure.chart")) {
     series.y = unpack(series.y);
     series.half = series.half && unpack(series.half);
   }
-  figure.classList.add("drawn");
-  new Chart(figure, what);
+  const { live } = new Chart(figure, what), picture = figure.querySelector("svg");
+  live.classList.add("waiting");
+  if (picture) live.append(picture); // on screen until the chart is drawn, and in print
 }
+
+// charts out of sight are drawn when the browser is idle, one at a time; folded ones wait
+function drawNext() {
+  const next = all.find((chart) => !chart.plot && !chart.live.closest("details:not([open])"));
+  if (!next) return;
+  next.draw();
+  idle(drawNext);
+}
+idle(drawNext);
+document.addEventListener("toggle", () => idle(drawNext), true);
 
 return { link, Chart, all };
 })();

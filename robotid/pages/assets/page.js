@@ -1,6 +1,6 @@
 "use strict";
 (() => {
-// ---- what is folded: opened by links to it, and all of it in print
+// ---- folded parts: opened by links and in print
 
 const folds = [...document.querySelectorAll("details")];
 
@@ -12,7 +12,7 @@ function reveal() {
 }
 
 window.addEventListener("hashchange", reveal);
-document.addEventListener("click", (event) => {  // a link to where the address already points
+document.addEventListener("click", (event) => {  // a link to the current address
   const link = event.target.closest && event.target.closest('a[href^="#"]');
   if (link && link.hash === location.hash) reveal();
 });
@@ -24,7 +24,7 @@ window.addEventListener("beforeprint", () => {
 });
 window.addEventListener("afterprint", () => { for (const fold of closed) fold.open = false; });
 
-// ---- what can be copied: commands and lines of a job file
+// ---- copying of commands and lines of a job file
 
 window.copyText = async (text, button) => {
   const label = button.dataset.label ??= button.textContent;

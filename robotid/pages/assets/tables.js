@@ -1,6 +1,6 @@
 "use strict";
 (() => {
-// ---- what a cell holds: the number in full where it shows one, else its words
+// ---- content of a cell: the full number, or its text
 
 const MINUS = /\u2212/g;
 
@@ -49,7 +49,7 @@ function saveCsv(table) {
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
-// ---- sorting: by number where cells have one, what has none last; then by words
+// ---- sorting: by number, cells without number last, then by text
 
 function compare(one, other, sign) {
   const [a, b] = [numberOf(one), numberOf(other)];

@@ -1,18 +1,18 @@
 
 // ---- torque arcs -----------------------------------------------------------------------------
 
-const FULL = 1.5 * Math.PI; // [rad] what the largest torque of a joint spans as an arc
+const FULL = 1.5 * Math.PI; // [rad] arc of the largest torque of a joint
 
 class Arc { // around a joint's axis, or a bar along it; grows with the torque from a tick at zero
   constructor(joint, radius, thickness, colour, hasHead) {
     const skin = (color) => new THREE.MeshBasicMaterial(
       { color, side: THREE.DoubleSide, depthTest: false, transparent: true });
     this.material = skin(colour);
-    this.slides = joint.kind === "slide";
+    this.isPrismatic = joint.kind === "prismatic";
     this.around = 6;
     this.along = 72;
     this.radius = radius;
-    const shape = this.slides
+    const shape = this.isPrismatic
       ? new THREE.CylinderGeometry(thickness, thickness, 1, 12).translate(0, 0.5, 0).rotateX(Math.PI / 2)
       : this.ring(radius, thickness);
     this.mesh = new THREE.Mesh(shape, this.material);
@@ -25,7 +25,7 @@ class Arc { // around a joint's axis, or a bar along it; grows with the torque f
       const wide = 5 * thickness, thin = 0.7 * thickness;
       const tick = new THREE.Mesh(
         new THREE.BoxGeometry(wide, thin, thin), skin("#1c2126")); // where the torque is zero
-      if (!this.slides) tick.position.x = radius;
+      if (!this.isPrismatic) tick.position.x = radius;
       this.holder.add(this.head, tick);
     }
     this.holder.children.forEach((mesh) => { mesh.renderOrder = 2; });
@@ -48,7 +48,7 @@ class Arc { // around a joint's axis, or a bar along it; grows with the torque f
     parts.forEach((part) => { part.visible = Number.isFinite(share); });
     if (!Number.isFinite(share)) return;
     const size = Math.min(Math.abs(share), 1), sense = share < 0 ? -1 : 1;
-    if (this.slides) {
+    if (this.isPrismatic) {
       this.mesh.scale.z = this.length * Math.max(size, 1e-3) * sense;
     } else {
       this.mesh.scale.y = sense;
@@ -56,10 +56,10 @@ class Arc { // around a joint's axis, or a bar along it; grows with the torque f
     }
     if (this.head) this.point(size, sense);
   }
-  point(size, sense) { // the head, at the end and along the way; none of next to nothing
+  point(size, sense) { // the head at the end, hidden for small torques
     const { head } = this;
     head.visible = size > 0.02;
-    if (this.slides) {
+    if (this.isPrismatic) {
       head.position.set(0, 0, sense * this.length * size);
       head.rotation.set(sense * Math.PI / 2, 0, 0);
     } else {
@@ -96,7 +96,7 @@ function showArcs(row) {
   });
 }
 
-function chooseArcs() { // all, or that of the picked joint; the others faint beside it
+function chooseArcs() { // all, or the selected joint's and faint others
   const isChosen = torques && torques.joints.some(({ node }) => node === picked);
   arcs.forEach(({ measured, predicted }, j) => {
     const isPicked = torques.joints[j].node === picked;

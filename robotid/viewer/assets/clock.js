@@ -7,15 +7,15 @@ const clock = { time: data.start, playing: !matchMedia("(prefers-reduced-motion:
   speed: 1, loop: true, follow: Boolean(data.live), start: data.start, end: 0, frames: 0, at: 0 };
 clock.end = Math.max(motion.end, ...ghostMotions.map(({ end }) => end));
 const slider = byId("time"), clockText = byId("clock"), playButton = byId("play");
-let shown = null, told = null, spoken = -Infinity;
+let shown = null, readings = null, announced = -Infinity;
 const digits = (time) => time.toFixed(2);
 
 function show() { // the robot in every frame, the page about it ten times a second
   if (shown !== clock.time) showRobot(clock.time);
   shown = clock.time;
   const now = performance.now();
-  if (told && (told.time === clock.time || (clock.playing && now - told.at < 100))) return;
-  told = { time: clock.time, at: now };
+  if (readings && (readings.time === clock.time || (clock.playing && now - readings.at < 100))) return;
+  readings = { time: clock.time, at: now };
   showReadings(clock.time);
 }
 
@@ -38,8 +38,8 @@ function showReadings(time) {
   byId("now").style.left = `${(100 * (time - clock.start)) / from}%`;
   slider.value = time;
   clockText.textContent = `${digits(time)} of ${digits(clock.end)} s`;
-  if (Math.abs(time - spoken) > 1 || !clock.playing) { // a screen reader hears it once a second
-    spoken = time;
+  if (Math.abs(time - announced) > 1 || !clock.playing) { // a screen reader announces it once a second
+    announced = time;
     slider.setAttribute("aria-valuetext", `${time.toFixed(1)} of ${clock.end.toFixed(1)} seconds`);
     keep();
   }
@@ -48,7 +48,7 @@ function showReadings(time) {
 function seek(time) {
   clock.follow = false;
   clock.time = Math.min(Math.max(time, clock.start), clock.end);
-  told = null;
+  readings = null;
   buttons();
   show();
 }
@@ -59,7 +59,7 @@ function play() {
 }
 function pause() {
   clock.playing = clock.follow = false;
-  told = null;
+  readings = null;
   sharpen();
   buttons();
 }
@@ -81,7 +81,7 @@ function draw(pixels) {
   viewer.renderer.setPixelRatio(pixels * fullRatio);
   resize();
 }
-function sharpen() { if (viewer && pace.pixels < 1) draw(1); } // all pixels of what stands still
+function sharpen() { if (viewer && pace.pixels < 1) draw(1); } // full resolution of a still picture
 
 let last = null;
 function tick(now) {
@@ -107,9 +107,8 @@ function tick(now) {
   requestAnimationFrame(tick);
 }
 
-// ---- the address keeps time, joint and camera -------------------------------------------------
+// ---- the address stores time, joint and camera -------------------------------------------------
 
-const kept = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
 const hasAddress = location.protocol !== "about:"; // the frame of a notebook has none
 let isRestored = false;
 
@@ -124,9 +123,12 @@ function keep() {
   history.replaceState(null, "", `#${new URLSearchParams(state)}`);
 }
 
-function restore() {
-  if (kept.t !== undefined && Number.isFinite(Number(kept.t))) { pause(); seek(Number(kept.t)); }
-  const place = (kept.camera || "").split(" ").map(Number);
+function restore() { // at the start, and when a link of another page changes the address
+  const stored = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
+  const isOther = stored.log && !data.notes.some((note) => note.includes(stored.log));
+  byId("state").textContent = isOther ? `The link is to ${stored.log}; this replay shows another recording.` : "";
+  if (stored.t !== undefined && Number.isFinite(Number(stored.t))) { pause(); seek(Number(stored.t)); }
+  const place = (stored.camera || "").split(" ").map(Number);
   if (viewer && place.length === 6 && place.every(Number.isFinite)) {
     aim(); // near and far of the camera
     viewer.camera.position.set(...place.slice(0, 3));
@@ -134,6 +136,7 @@ function restore() {
     viewer.controls.update();
     isTurned = true;
   }
-  if (kept.joint) pick(nodeOf(kept.joint));
+  if (stored.joint) pick(nodeOf(stored.joint));
   isRestored = true;
 }
+window.addEventListener("hashchange", restore);

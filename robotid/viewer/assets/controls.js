@@ -53,7 +53,7 @@ function drawSwitches() {
   const place = byId("switches");
   const add = (label, checked, act) => place.append(box(label, checked, act).label);
   if (viewer) {
-    add("see through the robot", false, (on) => { seeThrough = on; showMasses(); });
+    add("transparent robot", false, (on) => { seeThrough = on; showMasses(); });
     if (isTorque) add("torque arcs", true, (on) => { showsArcs = on; chooseArcs(); });
     if (predictions) add("links coloured by residual", false, tint);
     ghosts.forEach((ghost, k) => {
@@ -63,7 +63,7 @@ function drawSwitches() {
       place.append(made.label);
     });
     if (torques && !isTorque && !floats)
-      add(`ghosts ${BOOST} × as far away`, false, (on) => { boost = on ? BOOST : 1; shown = null; });
+      add(`ghost distance × ${BOOST}`, false, (on) => { boost = on ? BOOST : 1; shown = null; });
     if (floats) add("camera follows the robot", true, (on) => { follows = on; });
     add(`grid of ${cell} m`, true, (on) => { ground.visible = on; });
     add("frames", false, showFrames);
@@ -78,7 +78,7 @@ function drawSwitches() {
 function tint(on) {
   tints = on;
   if (!on) torques.joints.forEach(({ node }) => robot.tint(node, null));
-  shown = null; // the next frame paints them
+  shown = null; // the next frame colours them
 }
 
 function massTable() {
@@ -123,7 +123,7 @@ function save(blob, ending) {
 }
 
 let recorder = null;
-function record() { // from here on, until it is pressed again
+function record() { // until the button is pressed again
   if (recorder) { recorder.stop(); return; }
   const parts = [];
   recorder = new MediaRecorder(viewer.renderer.domElement.captureStream(30), { mimeType: "video/webm" });
@@ -145,7 +145,7 @@ function showRecording() {
 if (viewer) {
   byId("picture").onclick = () => {
     sharpen();
-    viewer.render(); // a canvas holds its picture only until the next frame
+    viewer.render(); // a canvas has its picture only until the next frame
     viewer.renderer.domElement.toBlob((blob) => save(blob, "png"));
   };
   byId("film").onclick = record;

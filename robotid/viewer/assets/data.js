@@ -1,8 +1,8 @@
-// What the page shows, and the tables of numbers that its parts read.
+// The data of the page, and tables of numbers.
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
 const COLOURS = ["#2f7ed8", "#e0671f", "#3a9d5d", "#a855c7", "#b58900", "#c2366b"];
-const LONGEST = 20000; // rows that a live page keeps of each table
+const LONGEST = 20000; // rows of each table in memory of a live page
 
 function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);
@@ -31,7 +31,7 @@ class Table { // times of the log and rows of numbers; in the page times are fro
     this.rows = this.t.map((_, k) => Array.from(flat.subarray(k * width, (k + 1) * width)));
   }
   get end() { return this.t.length ? this.t[this.t.length - 1] : data.start; }
-  before(time) { // the last row not after a time; 0 if all are
+  before(time) { // the last row not after a time; 0 if all are after it
     let low = 0, high = this.t.length - 1;
     while (low < high) {
       const middle = (low + high + 1) >> 1;
@@ -70,18 +70,18 @@ const bandTable = bands ? new Table(bands.t, bands.values) : null; // values, th
 
 const style = getComputedStyle(document.documentElement);
 const tone = (name) => style.getPropertyValue(`--${name}`).trim();
-const POOR = 0.5; // share of the torque's rms that is as red as it gets where no noise is known
-const UNSURE = "#8a97a5"; // of what is not predicted
+const POOR = 0.5; // share of the RMS torque at full red, if the noise is unknown
+const UNSURE = "#8a97a5"; // without prediction
 const RAMP = [[43, 131, 186], [255, 255, 191], [215, 25, 28]]; // at 0, a half and 1
-function residualColour(share) { // 0 to 1; of what is not a number, grey
+function residualColour(share) { // 0 to 1; grey for NaN
   if (!Number.isFinite(share)) return UNSURE;
   const x = 2 * Math.min(Math.max(share, 0), 1), k = x < 1 ? 0 : 1;
   return `rgb(${RAMP[k].map((c, i) => Math.round(c + (x - k) * (RAMP[k + 1][i] - c)))})`;
 }
 
-const scale = { of: new Array(count).fill(1), full: POOR, unit: "the torque's rms",
+const scale = { of: new Array(count).fill(1), full: POOR, unit: "RMS torque",
   ...(torques && torques.scale) };
-const largest = new Array(count).fill(0); // [N m or N] what an arc is drawn in proportion to
+const largest = new Array(count).fill(0); // [N m or N] torque of a full arc
 function measureTorques() {
   const squares = new Array(count).fill(0);
   let rows = 0;
@@ -94,8 +94,8 @@ function measureTorques() {
       squares[j] += row[j] ** 2;
     }
   }
-  if (torques.scale || !rows) return; // a live page learns it as it goes
+  if (torques.scale || !rows) return; // a live page updates it with the data
   squares.forEach((sum, j) => { scale.of[j] = Math.sqrt(sum / rows) || 1; });
 }
-const residualShare = (row, j) => // 1 is as red as it gets; NaN without a prediction
+const residualShare = (row, j) => // 1 is full red; NaN without a prediction
   predictions ? Math.abs(row[j] - row[count + j]) / scale.of[j] / scale.full : NaN;

@@ -7,7 +7,7 @@ function take(message) {
   if (message.t === undefined) return;
   if (!motion.t.length) slider.min = clock.start = clock.time = data.start = message.t;
   motion.push(message.t, message.q);
-  if (message.tau) { // these lie a filter's delay behind the motion
+  if (message.tau) { // delayed by the filter
     const predicted = message.predicted.map((x) => (x === null ? NaN : x)); // a joint at rest
     torqueTable.push(message.at, [...message.tau, ...predicted]);
     bandTable.push(message.at, [...message.theta, ...message.std_error]);

@@ -35,7 +35,7 @@ class Masses {
 const masses = data.masses.map((set, k) => new Masses(set, COLOURS[k % COLOURS.length]));
 let seeThrough = false;
 
-function showMasses() { // those asked for, and those of the link that is picked
+function showMasses() { // the requested ones, and those of the selected link
   if (!viewer) return;
   const inside = new Set();
   for (const set of masses) {

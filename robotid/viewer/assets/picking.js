@@ -1,5 +1,5 @@
 
-// ---- a joint that is picked shows everywhere -------------------------------------------------
+// ---- the selected joint is highlighted everywhere -------------------------------------------------
 
 let picked = null; // its node
 
@@ -18,12 +18,12 @@ function pick(node) { // null: none
   const words = picked ? data.scene.nodes[picked].name : "";
   byId("picked").textContent = words;
   byId("picked").hidden = !words;
-  told = null;
+  readings = null;
   keep();
 }
 const nodeOf = (name) => data.scene.nodes.findIndex((node, i) => i && node.name === name);
 
-function hit(event) { // the node of the link under the pointer, null beside the robot
+function hit(event) { // the node of the link under the pointer, null outside the robot
   const box = pane.getBoundingClientRect();
   const at = new THREE.Vector2(((event.clientX - box.left) / box.width) * 2 - 1,
     1 - ((event.clientY - box.top) / box.height) * 2);
@@ -37,7 +37,7 @@ function hit(event) { // the node of the link under the pointer, null beside the
 if (viewer) {
   let pressed = null;
   pane.addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; }, true);
-  pane.addEventListener("pointerup", (event) => { // a click, not the end of a turn of the camera
+  pane.addEventListener("pointerup", (event) => { // a click, not the end of a camera rotation
     const [x, y] = pressed || [Infinity, 0];
     if (Math.hypot(event.clientX - x, event.clientY - y) < 5) pick(hit(event));
   }, true);

@@ -1,7 +1,7 @@
 
 // ---- charts: torques of each joint, parameters over time --------------------------------------
 
-const LASTS = 60; // [s] that a live page shows
+const LASTS = 60; // [s] shown by a live page
 const timeLine = charts.link("time"); // the charts' cursor is the clock's
 const torqueCharts = [], bandCharts = [];
 timeLine.on((time, how) => {
@@ -10,17 +10,17 @@ timeLine.on((time, how) => {
   seek(time);
 });
 
-function moveCursor(time) { // of the charts; one that follows the pointer stays there
+function moveCursor(time) { // of the charts, except one under the pointer
   const isHovered = timeLine.shown !== timeLine.time && Number.isFinite(timeLine.shown);
   if (isHovered) timeLine.time = time; else timeLine.set(time);
 }
 
-function span() { // what the charts show if they are not zoomed
+function span() { // range of the charts without zoom
   return [data.live ? Math.max(clock.start, clock.end - LASTS) : clock.start,
     Math.max(clock.end, clock.start + 1e-3)];
 }
 
-function resting(j) { // stretches of time in which a joint is not used, by the columns of the strip
+function resting(j) { // segments in which a joint is not used, from the columns of the strip
   const found = [], wide = (motion.end - data.start) / bins;
   for (let bin = 0; bin < bins; bin++) {
     if (levels[bin * count + j] !== UNUSED) continue;
@@ -31,7 +31,7 @@ function resting(j) { // stretches of time in which a joint is not used, by the 
   return found;
 }
 
-function torqueRows(j) { // measured, predicted, and what the first prediction leaves
+function torqueRows(j) { // measured, predicted, and residual of the first prediction
   const { rows } = torqueTable;
   const ys = torques.labels.map((_, k) => rows.map((row) => row[k * count + j]));
   if (predictions) ys.push(ys[0].map((y, k) => y - ys[1][k]));

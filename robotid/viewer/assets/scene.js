@@ -2,7 +2,7 @@
 // ---- the scene -------------------------------------------------------------------------------
 
 const { THREE } = MeshCat;
-const onProcessor = (() => { // no graphics card draws: smooth edges would halve the frames
+const onProcessor = (() => { // without a graphics card antialiasing halves the frame rate
   const context = document.createElement("canvas").getContext("webgl");
   const info = context && context.getExtension("WEBGL_debug_renderer_info");
   const name = info ? context.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
@@ -14,10 +14,10 @@ let viewer = null, fullRatio = 1; // pixels of the view per pixel of the page
 try {
   const renderer = new THREE.WebGLRenderer({ antialias: !onProcessor, alpha: true });
   pane.append(renderer.domElement);
-  viewer = new MeshCat.Viewer(pane, false, renderer); // frames are drawn by this page's clock
+  viewer = new MeshCat.Viewer(pane, false, renderer); // this page's clock draws the frames
   fullRatio = onProcessor ? 1 : window.devicePixelRatio;
   renderer.setPixelRatio(fullRatio);
-} catch (error) { // the plots are of use without it
+} catch (error) { // the plots work without it
   pane.append(element("p", { class: "fault" }, `This browser shows no 3-D view: ${error.message}`));
 }
 
@@ -39,7 +39,7 @@ function geometry(part) {
   return meshes[a];
 }
 
-function visible(colour) { // what is almost black would be a hole in the picture
+function visible(colour) { // almost black shapes look like holes in the picture
   const made = new THREE.Color(colour), hsl = made.getHSL({});
   return hsl.l < 0.27 ? made.setHSL(hsl.h, hsl.s, 0.27) : made;
 }
@@ -80,9 +80,9 @@ class Robot { // the nodes of one robot in the viewer's tree, posed by a row of 
     if (!row) return;
     const turn = new THREE.Quaternion();
     for (const { kind, column, axis, object, rest } of this.joints) {
-      if (kind === "turn") {
+      if (kind === "revolute") {
         object.quaternion.copy(rest.quaternion).multiply(turn.setFromAxisAngle(axis, row[column]));
-      } else if (kind === "slide") {
+      } else if (kind === "prismatic") {
         object.position.copy(axis).multiplyScalar(row[column]);
         object.position.applyQuaternion(rest.quaternion).add(rest.position);
       } else if (kind === "free") {
@@ -112,7 +112,7 @@ class Robot { // the nodes of one robot in the viewer's tree, posed by a row of 
 const robot = viewer && new Robot("robot", (color, side) => new THREE.MeshLambertMaterial({ color, side }));
 const GHOSTS = ["#3b82f6", "#d9820f", "#3a9d5d"];
 const BOOST = 10;
-let boost = 1; // times that a ghost stands away from the robot
+let boost = 1; // factor on the distance of a ghost from the robot
 const ghosts = !viewer ? [] : ghostMotions.map((_, k) => new Robot(`ghost ${k}`,
   () => new THREE.MeshPhongMaterial({ color: GHOSTS[k % GHOSTS.length], transparent: true,
     opacity: 0.3, depthWrite: false })));
@@ -166,7 +166,7 @@ const middle = [0, 1, 2].map((k) => { // of the points that must be in sight
   const along = data.view.points.map((point) => point[k]);
   return (Math.min(...along) + Math.max(...along)) / 2;
 });
-let follows = floats, isTurned = false; // by hand: it then stays so when the window changes
+let follows = floats, isTurned = false; // by hand: the view then remains when the window changes
 // the viewer's camera has y upwards: (x, y, z) of the robot is (x, z, -y) there
 const upward = ([x, y, z]) => new THREE.Vector3(x, z, -y);
 
@@ -178,7 +178,7 @@ function aim() { // from the front and above, the whole motion in sight
   const tall = Math.tan((20 * Math.PI) / 180);
   const wide = tall * (pane.clientWidth / Math.max(pane.clientHeight, 1));
   let far = 1e-3;
-  for (const point of data.view.points) { // each asks for a distance
+  for (const point of data.view.points) { // each needs a distance
     const place = upward(point.map((x, k) => x - middle[k]));
     const needs = Math.max(Math.abs(place.dot(right)) / wide, Math.abs(place.dot(up)) / tall);
     far = Math.max(far, place.dot(away) + 1.15 * needs);
@@ -203,7 +203,7 @@ function follow(row) { // the camera goes where the base goes
   viewer.controls.target.add(moved);
 }
 
-function resize() { // and drawn at once: a canvas of another size is empty
+function resize() { // and draw immediately: a resized canvas is empty
   viewer.set_3d_pane_size();
   viewer.render();
 }

@@ -6,7 +6,7 @@ const levels = torques && torques.strip ? unpack(torques.strip) : null; // [bin 
 const bins = levels ? torques.strip.shape[0] : 0;
 const strip = byId("strip"), sheet = byId("sheet");
 
-function level(bin, j) { // residual over what it is compared to; NaN where there is none
+function level(bin, j) { // residual over its scale; NaN if there is none
   const code = levels[bin * count + j];
   return code >= UNUSED ? NaN : code / 100;
 }
@@ -35,14 +35,14 @@ function drawStrip() {
   const pen = sheet.getContext("2d"), span = motion.end - data.start || 1;
   const x = (bin) => ((data.start + (bin / bins) * span - clock.start) / (clock.end - clock.start)) * width;
   pen.scale(ratio, ratio);
-  const still = pen.createPattern(hatch(tone("quiet"), false), "repeat");
+  const resting = pen.createPattern(hatch(tone("quiet"), false), "repeat");
   const gap = pen.createPattern(hatch(tone("text"), true), "repeat");
   for (let bin = 0; bin < bins; bin++) {
     for (let j = 0; j < count; j++) {
       const code = levels[bin * count + j];
-      pen.fillStyle = code === GAP ? gap : code === UNUSED ? still
+      pen.fillStyle = code === GAP ? gap : code === UNUSED ? resting
         : residualColour(code / 100 / scale.full);
-      // the columns overlap a little, or light lines would show between them
+      // the columns overlap slightly; otherwise light lines are visible between them
       pen.fillRect(x(bin), j * high, x(bin + 1) - x(bin) + (code >= UNUSED ? 0 : 0.5), high - 1);
     }
   }
@@ -69,12 +69,12 @@ function under(event) { // time and joint under the pointer
   return { time: clock.start + share * (clock.end - clock.start), j: Math.min(Math.max(j, 0), count - 1) };
 }
 
-function tell({ time, j }) { // what the strip shows there, in words
+function describe({ time, j }) { // the residual of a joint at a time, as text
   const bin = Math.floor(((time - data.start) / (motion.end - data.start)) * bins);
   const code = bin < bins ? levels[bin * count + j] : GAP;
-  const words = code === GAP ? "no samples" : code === UNUSED ? "stands still, not used"
+  const words = code === GAP ? "no samples" : code === UNUSED ? "at rest, not used"
     : `${(code / 100).toFixed(2)} × ${scale.unit}`;
-  byId("told").textContent = `${torques.joints[j].name}, ${time.toFixed(2)} s: ${words}`;
+  byId("reading").textContent = `${torques.joints[j].name}, ${time.toFixed(2)} s: ${words}`;
 }
 
 if (levels) {
@@ -83,13 +83,13 @@ if (levels) {
   drawStripNames();
   sheet.addEventListener("pointermove", (event) => {
     const there = under(event);
-    tell(there);
+    describe(there);
     if (event.buttons) { pause(); seek(there.time); }
   });
   sheet.addEventListener("pointerdown", (event) => {
     sheet.setPointerCapture(event.pointerId);
     const there = under(event);
-    tell(there);
+    describe(there);
     pause();
     seek(there.time);
     pick(torques.joints[there.j].node);
@@ -101,7 +101,7 @@ if (levels) {
     const now = torques.joints.findIndex(({ node }) => node === picked);
     const j = now < 0 ? 0 : (now + by + count) % count;
     pick(torques.joints[j].node);
-    tell({ time: clock.time, j });
+    describe({ time: clock.time, j });
   });
   new ResizeObserver(drawStrip).observe(sheet.parentElement);
   darkness.addEventListener("change", drawStrip);
