@@ -141,10 +141,10 @@ class Tree(NamedTuple):
     gravity: Array
 
     @property
-    def slides(self) -> Array:
+    def prismatic(self) -> Array:
         """Which joints are prismatic, shape (B,), bool."""
-        slides: Array = np.any(self.joints[:, 33:36], axis=1)
-        return slides
+        prismatic: Array = np.any(self.joints[:, 33:36], axis=1)
+        return prismatic
 
     @property
     def axes(self) -> Array:
