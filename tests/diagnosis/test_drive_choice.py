@@ -247,7 +247,10 @@ def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
         assert (shape.name, shape.unit) == ("stribeck.speed", unit)
     anew = drive_choice._weighed_anew(alone, drive, [(family, [shape.value])])
     Z = np.hstack(
-        [drive.columns([Stribeck(speed=shape.value + x, seen=SEEN["v"])]) for x in (0.0, 1e-6)]
+        [
+            drive.columns([Stribeck(speed=shape.value + x, data_range=SEEN["v"])])
+            for x in (0.0, 1e-6)
+        ]
     )
     Z[:, 1] -= Z[:, 0]
     size = drive_choice.Trials(anew, Z[:, None, :1], 1e-10).whole.parameters([0])[0]
@@ -385,7 +388,7 @@ def test_a_joint_that_moves_in_one_of_several_logs_is_judged_by_that(plain, case
     [
         ("viscous+stribek", "friction of shoulder_lift_joint has stribek, wanted auto, or some of"),
         ({ELBOW: "load+x"}, "friction of elbow_joint has x, wanted auto, or some of load, "),
-        ({"elbow": "load"}, "friction is stated for elbow, not among the joints to identify: "),
+        ({"elbow": "load"}, "friction is stated for elbow, wanted joints that are identified: "),
     ],
 )
 def test_names_that_are_none_are_refused(stated, message):
