@@ -374,5 +374,5 @@ def test_a_setting_out_of_range_is_named(settings, message):
 
 
 def test_noise_without_a_source_is_refused():
-    with pytest.raises(SettingsError, match=r"^sensor noise needs rng, the source of its random"):
+    with pytest.raises(SettingsError, match=r"^sensor noise is stated, but rng is None"):
         Influences(q=1e-3)
