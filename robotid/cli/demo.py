@@ -1,4 +1,4 @@
-"""robotid demo: simulate a UR5, identify it, report: needs no input."""
+"""robotid demo: simulate a Unitree Z1 arm, identify it, report: needs no input."""
 
 import argparse
 
@@ -9,7 +9,7 @@ from robotid.cli.printing import print_files, say
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "simulate a UR5, identify it, report: needs no input"
+SUMMARY = "simulate a Unitree Z1 arm, identify it, report: needs no input"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,7 @@ def run(options: argparse.Namespace) -> None:
     """
     from robotid.commands.demo import run_demo
 
-    say("simulating a UR5 whose masses, armature and friction its URDF does not know ...")
+    say("simulating a Unitree Z1 arm: masses differ from the URDF, drives have friction ...")
     with terminal_progress() as progress:
         identification, result, truth = run_demo(options.out, progress=progress)
     show_result(result)
