@@ -111,9 +111,9 @@ class Postures:
 
     def _drawn(self, rng: np.random.Generator, count: int) -> Array:
         """Return random postures, shape (count, n) [rad or m]."""
-        reach = rng.uniform(-0.8, 0.8, (count, len(self.limits.middle)))
-        reach[:, self.limits.sizes[0] > 2.0] *= 0.6
-        q: Array = self.limits.middle + reach * self.limits.sizes[0]
+        share = rng.uniform(-0.8, 0.8, (count, len(self.limits.middle)))
+        share[:, self.limits.sizes[0] > 2.0] *= 0.6
+        q: Array = self.limits.middle + share * self.limits.sizes[0]
         return q
 
     def can_rest(self, q: Array) -> Array:

@@ -112,7 +112,7 @@ class History:
         tracking: Largest distance from the program in each iteration, shape (L, R) [rad or m].
         NA: The first iteration in which PRX was zero throughout (25), after which the estimate is
             constant; 0 if there was none, shape (R,).
-        lost: The iteration in which the robot diverged from its program, 0 if it did not, shape
+        diverged: The iteration in which the robot diverged from its program, 0 if it did not, shape
             (R,). Its estimate is constant afterwards.
         skipped: Number of updates omitted since D(q, P^) was not positive definite, shape (R,).
         torques: Control u (21), shape (L, updates, R, n) [N m or N], if requested.
@@ -122,7 +122,7 @@ class History:
     prx: Array
     tracking: Array
     NA: NDArray[np.int_]
-    lost: NDArray[np.int_]
+    diverged: NDArray[np.int_]
     skipped: NDArray[np.int_]
     torques: Array | None = field(default=None, repr=False)
 
@@ -234,7 +234,7 @@ class _Loop:
         self.start = motion.evaluate(np.zeros(R))[0] + np.broadcast_to(offset, (R, n))
         self.P = P0 if settings.bounds is None else settings.bounds.project(P0)
         self.active = np.ones(R, dtype=bool)
-        self.NA, self.lost, self.skipped = (np.zeros(R, dtype=int) for _ in range(3))
+        self.NA, self.diverged, self.skipped = (np.zeros(R, dtype=int) for _ in range(3))
         self.estimates: list[Array] = [self.P]
         self.prx: list[Array] = []
         self.tracking: list[Array] = []
@@ -319,9 +319,9 @@ class _Loop:
         """Reset robots that have diverged to their program."""
         deviation = np.maximum(np.abs(q - program[0]), np.abs(v - program[1])).max(axis=1)
         diverges = ~(deviation < _DIVERGED)  # also with NaN
-        self.lost = np.where(diverges & self.active, number, self.lost)
+        self.diverged = np.where(diverges & self.active, number, self.diverged)
         self.active = self.active & ~diverges
-        has_diverged = diverges | (self.lost > 0)
+        has_diverged = diverges | (self.diverged > 0)
         if not has_diverged.any():
             return q, v
         reset = has_diverged[:, None]
@@ -344,7 +344,7 @@ class _Loop:
             prx=np.stack(self.prx),
             tracking=np.stack(self.tracking),
             NA=self.NA,
-            lost=self.lost,
+            diverged=self.diverged,
             skipped=self.skipped,
             torques=np.stack(self.torques) if self.torques else None,
         )

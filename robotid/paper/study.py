@@ -283,8 +283,8 @@ class RandomRuns:
         }
 
     def _reason(self, r: int) -> str:
-        if self.history.lost[r]:
-            return f"the robot diverged from its program in iteration {self.history.lost[r]}"
+        if self.history.diverged[r]:
+            return f"the robot diverged from its program in iteration {self.history.diverged[r]}"
         reason = _course(self.errors[:, r])
         if skipped := self.history.skipped[r]:
             reason += f"; {skipped} updates were omitted, since D(q, P^) was not positive definite"

@@ -213,10 +213,10 @@ def finish_rows(values, places, widths, weights, root, out, span):
             out[places[e], k] = values[e, first + k]
     end = 0
     for j in range(len(widths) if len(weights) else 0):
-        begin, end = end, end + widths[j]
+        head, end = end, end + widths[j]
         for k in range(count):
             root[k] = np.sqrt(weights[first + k, j])
-        for column in range(begin, end):
+        for column in range(head, end):
             for k in range(count):
                 out[column, k] *= root[k]
 

@@ -381,7 +381,9 @@ def _acts_at_rest(term: DriveTerm) -> bool:
 
 def _check_gravity(gravity: Sequence[float]) -> None:
     if not np.any(_gravity(gravity)):
-        raise SettingsError("gravity is 0, but dynamics is 'static', wanted gravity that is not 0")
+        raise SettingsError(
+            "dynamics is 'static', but gravity is 0, wanted gravity that loads the joints"
+        )
 
 
 def _inertia(values: Array) -> pin.Inertia:

@@ -98,7 +98,7 @@ def test_a_random_run_is_critically_damped_at_its_bandwidth(rng):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"lost": 3}, "the robot diverged from its program in iteration 3"),
+        ({"diverged": 3}, "the robot diverged from its program in iteration 3"),
         (
             {"skipped": 7},
             "slow: the error is 0.4 after 1 iterations, with a decrease of 20 % in the last 1; 7 "
