@@ -77,7 +77,9 @@ def write_motion_page(
     best = [entry[1] for entry in content["history"]]
     if best and max(best) - min(best) > _VISIBLE:
         sections["design"] = Section("Course of the optimisation", _history(content))
-    return write_text(page(f"{model.name}: motion", _head(model, content), sections), target)
+    return write_text(
+        page(f"{model.name}: excitation trajectory", _head(model, content), sections), target
+    )
 
 
 def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
@@ -137,7 +139,7 @@ def _limit_table(model: RobotModel, content: Mapping[str, Any], course: Course) 
 
 
 def _collisions(content: Mapping[str, Any], course: Course) -> str:
-    """Return the smallest distance of the motion to a collision, as a paragraph."""
+    """Return the smallest margin of the motion to a collision, as a paragraph."""
     entry, contact = content["limits"].get("collision"), course.nearest
     if entry is None or course.clearance is None:
         return "<p>Collisions were not checked.</p>\n"
@@ -145,13 +147,13 @@ def _collisions(content: Mapping[str, Any], course: Course) -> str:
     if entry["margin"] is not None:
         required = entry["kept"]
         words = (
-            f"Smallest distance: {entry['where']}, "
+            f"Smallest margin to a collision: {entry['where']}, distance "
             f"{1e3 * (entry['margin'] + required):.0f} mm at {entry['time']:.2f} s. Required: "
             f"{1e3 * required:.0f} mm, also between the samples."
         )
     elif contact is not None:
         words = (
-            f"Smallest distance: {contact.first} and {contact.second}, "
+            f"Smallest margin to a collision: {contact.first} and {contact.second}, distance "
             f"{1e3 * contact.distance:.0f} mm at {contact.time:.2f} s. Required: "
             f"{1e3 * contact.required:.0f} mm."
         )
