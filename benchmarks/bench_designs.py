@@ -33,7 +33,7 @@ def design_row(name, task, best, seeds):
     seconds = [f.seconds for f in found]
     settled = sum(f.is_converged for f in found)
     fine = replace(task, finer=FINE)
-    used, margin, _ = fine._kept(found[0].motion.coefficients)
+    used, margin, _ = fine._constraints(found[0].motion.coefficients)
     most = np.abs(used).max(axis=(1, 2))
     shown = [f"{100 * (1 - most[LIMITS.index(k)]):.2f} %" for k in LIMITS[:2] + LIMITS[4:5]]
     return (

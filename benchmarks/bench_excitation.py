@@ -145,7 +145,7 @@ def slsqp(task, start, seconds):
                 raise TimeIsOver
             if len(known) > 2 * start.size:  # the differences of value and limits are the same
                 known.clear()
-            used, _, rows = free._kept(x.reshape(start.shape) * unit)
+            used, _, rows = free._constraints(x.reshape(start.shape) * unit)
             objective = free.judged(free.matrix(rows))[0]
             placed = task.clearance.placed(rows.motion[0])
             near = task.clearance.near(placed, least + 0.03).distance[:, ::EVERY]

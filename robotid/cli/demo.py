@@ -1,4 +1,4 @@
-"""robotid demo: simulate a UR5, identify it and write a report; no input is needed."""
+"""robotid demo: simulate a Unitree Z1 arm, identify it and write a report; no input is needed."""
 
 import argparse
 
@@ -9,7 +9,7 @@ from robotid.cli.printing import echo, print_files
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
-SUMMARY = "simulate a UR5, identify it and write a report; no input is needed"
+SUMMARY = "simulate a Unitree Z1 arm, identify it and write a report; no input is needed"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,7 @@ def run(options: argparse.Namespace) -> None:
     """
     from robotid.commands.demo import run_demo
 
-    echo("simulating a UR5 whose masses, armature and friction differ from its URDF ...")
+    echo("simulating a Unitree Z1 arm whose masses, armature and friction differ from its URDF ...")
     with terminal_progress() as progress:
         identification, result, truth = run_demo(options.out, progress=progress)
     show_result(result)

@@ -1,4 +1,4 @@
-"""The demonstration: simulate a UR5 that differs from its URDF, and identify it."""
+"""The demonstration: simulate a robot that deviates from its URDF, and identify it."""
 
 from pathlib import Path
 from typing import Any, cast
@@ -15,15 +15,18 @@ from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.closed_loop import Noise, another_robot, simulate
+from robotid.simulation.closed_loop import Noise, simulate
 from robotid.simulation.motions import random_fourier
+from robotid.simulation.settings import Truth
+from robotid.simulation.truth import draw_parameters
 from robotid.workers.plan import WorkPlan
 
 __all__ = ["run_demo"]
 
 _RATE = 200.0  # [Hz]
 _PERIOD = 10.0  # [s]
-_CENTRE = np.array([0.0, -1.2, 1.2, -1.0, 1.0, 0.0])  # [rad] upright, elbow bent
+_URDF = "z1.urdf"  # Unitree Z1
+_LOCKED = {"jointGripper": 0.0}  # [rad]
 _NOISE = Noise(q=2e-5, v=2e-4, tau=0.02)  # encoder [rad], its rate [rad/s], 2 % of torque
 
 
@@ -32,12 +35,11 @@ def run_demo(
 ) -> tuple[Identification, dict[str, Any], Array]:
     """Simulate, identify, validate, and write all files.
 
-    The simulated robot has other masses than its URDF, a tool that is not in the URDF, and
-    armature and friction in every joint.
+    The simulated robot has other bodies than its URDF, and armature and friction in every joint.
 
     Args:
-        folder: Folder of the results; created if it is missing.
-        progress: Called at the start of each stage of the identification, as by ``identify``.
+        folder: Folder of the files; created if it is missing.
+        progress: Called at the start of each stage of the identification, as of ``identify``.
 
     Returns:
         The identification, the content of result.json, and the true base parameters, shape (b,).
@@ -49,16 +51,17 @@ def run_demo(
     check_folder(target, ["identification.csv", "validation.csv", "result.json", "replay.html"])
     target.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
-    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
-    truth = another_robot(model, rng)
+    model = RobotModel.from_urdf(example_urdf(_URDF), locked=_LOCKED)
+    truth = draw_parameters(model, Truth(), rng)
     entries = []
     for name, duration in (("identification", 2 * _PERIOD), ("validation", _PERIOD)):
-        motion = random_fourier(model, rng, period=_PERIOD, centre=_CENTRE)
+        motion = random_fourier(model, rng, period=_PERIOD)
         log = simulate(model, truth, motion, rate=_RATE, duration=duration, rng=rng, noise=_NOISE)
         write_log(log, target / f"{name}.csv")
         entries.append(LogEntry(target / f"{name}.csv"))
     job = Job(
         urdf=Path(model.tree.path),
+        locked=_LOCKED,
         signals=SignalSettings(cutoff=10.0),
         identification=(entries[0],),
         validation=(entries[1],),

@@ -204,7 +204,7 @@ def _content(
         contact = design.contact
         margins["collision"] = {
             "margin": None if contact is None else contact.margin,
-            "kept": None if contact is None else contact.kept,
+            "kept": None if contact is None else contact.required,
             "where": None if contact is None else f"{contact.first} and {contact.second}",
             "time": None if contact is None else contact.time,
             "unread": clearance.unread,

@@ -1,3 +1,3 @@
-"""Which motion to record: the one that tells the most within a robot's limits."""
+"""Excitation trajectories: motions within a robot's limits that determine its parameters best."""
 
 __all__: list[str] = []

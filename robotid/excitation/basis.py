@@ -1,4 +1,4 @@
-"""Motions linear in their coefficients, that begin and end at rest: q(t) = Phi(t) C."""
+"""Motions linear in their coefficients, at rest at both ends: q(t) = Phi(t) C."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,17 +17,17 @@ _DEGREE = 5  # of B-splines: their jerk is continuous
 
 
 class Basis(Protocol):
-    """Functions of time whose sums are motions of one joint; the first is 1 at all times."""
+    """Basis functions of a joint's motion; the first one is constant 1."""
 
     duration: float  # [s]
 
     @property
     def size(self) -> int:
-        """How many functions there are."""
+        """Number of functions."""
 
     @property
     def shortest(self) -> float:
-        """Shortest period of what it can show [s]."""
+        """Shortest period [s]."""
 
     def derivatives(self, t: Array, order: int) -> Array:
         """Return the functions and their derivatives, shape (order + 1, N, size).
@@ -42,8 +42,8 @@ class Basis(Protocol):
 class FourierBasis(Basis):
     """Sines and cosines of the first harmonics of 1 / duration, at rest at both ends.
 
-    Of the 2 h coefficients of a joint two are spent: sum k s_k = 0 makes its velocity 0 at the
-    ends and sum k^2 c_k = 0 its acceleration.
+    Two of the 2 h coefficients of a joint are fixed by the ends: sum k s_k = 0 makes its velocity 0
+    there, and sum k^2 c_k = 0 its acceleration.
 
     References:
         Swevers et al. (1997), Optimal robot excitation and identification.
@@ -55,7 +55,7 @@ class FourierBasis(Basis):
     def __post_init__(self) -> None:
         if self.harmonics < 2:
             raise SettingsError(
-                f"harmonics is {self.harmonics}, wanted 2 or more: one alone cannot begin at rest"
+                f"harmonics is {self.harmonics}, wanted 2 or more: one cannot start at rest"
             )
 
     @property
@@ -86,7 +86,7 @@ class FourierBasis(Basis):
 
 @dataclass(frozen=True)
 class BSplineBasis(Basis):
-    """B-splines of degree 5 on even knots; three equal coefficients at each end keep it at rest."""
+    """B-splines of degree 5 on uniform knots; three equal coefficients at each end: at rest."""
 
     duration: float
     pieces: int = 12

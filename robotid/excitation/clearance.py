@@ -1,7 +1,7 @@
-"""How far the links of a moving robot keep from each other, from the floor and from boxes.
+"""Distances between the links of a moving robot, and to the floor and to boxes.
 
-Every shape is replaced by its convex hull, which holds it. Distances between hulls come from coal;
-a hull that a joint turns moves with the joint's screw, so that a distance has an exact gradient.
+Every shape is replaced by its convex hull, which contains it. Distances between hulls are computed
+by coal. A hull moves with the screws of the joints before it, so a distance has an exact gradient.
 """
 
 from collections.abc import Sequence
@@ -22,19 +22,19 @@ from robotid.simulation.motions import Motion
 
 __all__ = ["Box", "Clearance", "Contact", "Nearness"]
 
-_TRIED = 400  # random poses that say which links may meet at all
-_APART = 0.05  # [m] links that stay so far apart at all of them are looked at in the end alone
+_TRIED = 400  # random poses by which the pairs of links that may meet are found
+_DISTANT = 0.05  # [m] links whose distance is larger at all of them are checked in the end only
 _ALMOST_ALL = 0.95  # share of the poses
-_TOUCH = 1e-3  # [m] hulls nearer than this touch
-_ROOM = 5e-3  # [m] beyond the clearance: links that have no more are built near each other
-_THINNEST = 1e-3  # [m] a flat shape is as thick
-_FIRST = 0.05  # [s] the intervals that a motion is first looked at in ...
-_SHORTEST = 1e-3  # [s] ... and the shortest that they are halved to
-_SURE = 5e-4  # [m] by which a lower bound may be too low
+_TOUCH = 1e-3  # [m] hulls at a smaller distance touch
+_CLOSE = 5e-3  # [m] beyond the clearance: links within it are close by design
+_THINNEST = 1e-3  # [m] thickness given to a flat shape
+_FIRST = 0.05  # [s] the first intervals in which a motion is checked ...
+_SHORTEST = 1e-3  # [s] ... and the shortest
+_TOLERANCE = 5e-4  # [m] by which a lower bound may be too low
 _WIDE = 100.0  # [m] extent of the floor
-_SPARE = 0.002  # [m] of distances, that a design leaves for what lies between its instants ...
-_SPARE_ROOM = 0.25  # ... of the room that links have which are built near each other: at most that
-_DATA_RANGE = 0.01  # [m] short of which margins are reckoned
+_SPARE = 0.002  # [m] reserve of distances for the motion between samples, but at most ...
+_SPARE_SHARE = 0.25  # ... this share of the slack of links that are close by design
+_EXACT = 0.01  # [m] margin below which distances are exact
 _SIGNS = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T  # corners of a box, (8, 3)
 
 
@@ -43,7 +43,7 @@ class Box:
     """A box at rest beside the robot, in the frame of the root link.
 
     Attributes:
-        name: What it is called.
+        name: Its name.
         low: Its lower corner [m].
         high: Its upper corner [m].
     """
@@ -55,40 +55,41 @@ class Box:
 
 @dataclass(frozen=True)
 class Contact:
-    """Where two things come nearest.
+    """The smallest distance between two shapes.
 
     Attributes:
         first: Name of one.
         second: Name of the other.
         distance: Between their hulls, below 0 if they overlap [m].
-        time: When [s].
-        kept: Distance that is to be kept between them [m].
+        time: Time [s].
+        required: Required distance between them [m].
     """
 
     first: str
     second: str
     distance: float
     time: float
-    kept: float = 0.0
+    required: float = 0.0
 
     @property
     def margin(self) -> float:
-        """How much farther apart they stay than they have to [m]."""
-        return self.distance - self.kept
+        """Distance minus the required one [m]."""
+        return self.distance - self.required
 
     def __str__(self) -> str:
-        said = f"come to {1e3 * self.distance:.0f} mm" if self.distance > 0 else "overlap"
-        return f"{self.first} and {self.second} {said} at {self.time:.2f} s"
+        is_clear = self.distance > 0
+        words = f"approach to {1e3 * self.distance:.0f} mm" if is_clear else "overlap"
+        return f"{self.first} and {self.second} {words} at {self.time:.2f} s"
 
 
 @dataclass(frozen=True, eq=False)
 class Nearness:
-    """Distances of pairs that are near each other along a motion.
+    """Distances of near pairs along a motion.
 
     Attributes:
-        distance: Shape (pairs, N) [m]; of what is farther than asked for, a lower bound.
+        distance: Shape (pairs, N) [m]; a lower bound beyond the distance asked for.
         pairs: Pair of each of k distances that have a gradient, shape (k,).
-        samples: Instant of each, shape (k,).
+        samples: Sample of each, shape (k,).
         gradient: Of each by the n joints, shape (k, n) [m/rad or 1].
     """
 
@@ -100,7 +101,7 @@ class Nearness:
 
 @dataclass(frozen=True, eq=False)
 class _Hull:
-    """A convex piece of a link, or of what is at rest (body -1), in the frame of its body."""
+    """A convex piece of a link, or of a fixed shape (body -1), in the frame of its body."""
 
     name: str
     body: int
@@ -112,29 +113,29 @@ class _Hull:
 
 
 class Clearance:
-    """What keeps a robot from hitting itself and what stands around it.
+    """The distances of a robot's links to each other, to the floor and to obstacles.
 
-    Links that a joint joins are not looked at. Of other links the hulls of two may touch where the
-    robot stands at zero and in 95 % of random poses: they are made to, and left alone. Links that
-    are built near each other, without room for the clearance in 95 % of the poses, but that come
-    apart, are watched at half the distance that they usually have.
+    Links joined by a joint are not checked. Nor are two links whose hulls touch at zero position
+    and in 95 % of random poses: they are in contact by design. Two links whose distance is smaller
+    than the clearance in 95 % of the poses, but which do not always touch, are close by design:
+    half their median distance is required.
 
     Args:
         model: The robot, with a fixed base.
-        least: Distance that is to be kept [m].
-        floor: Height below which nothing that moves may go, in the frame of the root link [m].
-        boxes: What stands around the robot.
-        seed: Of the random poses that say which links may meet.
+        least: Required distance [m].
+        floor: Height of the floor, in the frame of the root link [m].
+        boxes: Obstacles around the robot.
+        seed: Seed of the random poses.
 
     Attributes:
         pairs: Numbers of the two hulls of each pair.
         likely: Which pairs may meet within the limits, shape (pairs,), bool.
-        kept: Distance that each pair is to keep, shape (pairs,) [m].
-        room: How much more than that pairs that are built near each other usually have, shape
-            (pairs,) [m]; inf of the others.
-        unread: Links of which a shape cannot be read: nothing keeps them from hitting anything.
-        made_to: Links that are made to touch and left alone, by two, with their least distance.
-        built_near: Links that are built near each other, by two, with the distance they keep.
+        required: Required distance of each pair, shape (pairs,) [m].
+        slack: Median distance beyond the required one of pairs that are close by design, shape
+            (pairs,) [m]; inf for the others.
+        unread: Links of which a shape cannot be read: they are not checked.
+        made_to: Links in contact by design, by two, with their smallest distance.
+        built_near: Links that are close by design, by two, with the required distance.
 
     Raises:
         DataError: If no link has a shape that can be read, or the base floats.
@@ -159,8 +160,8 @@ class Clearance:
         clouds, self.unread = link_clouds(model)
         if not clouds:
             raise DataError(
-                f"{model.tree.path} has no shape that can be read, so nothing is known of "
-                "collisions; give it collision geometry, or design without clearance"
+                f"{model.tree.path} has no shape that can be read, so collisions cannot be "
+                "checked; give it collision geometry, or design without clearance"
             )
         self._hulls = [_hull(name, body, points) for name, body, points in clouds]
         self._hulls += [_hull(box.name, -1, _corners(box)) for box in boxes]
@@ -169,7 +170,7 @@ class Clearance:
             self._hulls.append(_hull(below.name, -1, _corners(below)))
         self._request = coal.DistanceRequest(True, True)
         self.pairs = self._possible_pairs()
-        self._sort_out(np.random.default_rng(seed))
+        self._classify(np.random.default_rng(seed))
 
     def _possible_pairs(self) -> Array:
         """Return pairs that can move against each other: not links that a joint joins."""
@@ -183,31 +184,31 @@ class Clearance:
                 found.append((i, j))
         return np.array(found, dtype=int).reshape(-1, 2)
 
-    def _sort_out(self, rng: np.random.Generator) -> None:
-        """Find by random poses which pairs may meet, are made to, or are built near each other."""
+    def _classify(self, rng: np.random.Generator) -> None:
+        """Find by random poses which pairs may meet, are in contact, or are close by design."""
         low = [j.lower if j.has_limits else -np.pi for j in self._model.limits]
         high = [j.upper if j.has_limits else np.pi for j in self._model.limits]
         q = np.vstack([np.clip(0.0, low, high), rng.uniform(low, high, (_TRIED, len(low)))])
-        distance = self.near(self.placed(q), self.least + _APART, self.everything).distance
+        distance = self.near(self.placed(q), self.least + _DISTANT, self.everything).distance
         is_link = np.array([hull.name in self._model.tree.links for hull in self._hulls])
         are_links = np.all(is_link[self.pairs], axis=1)
         touch = np.less(distance, _TOUCH)
         always = are_links & touch[:, 0] & (touch.mean(axis=1) > _ALMOST_ALL)
         self.made_to = self._listed(always, distance.min(axis=1))
         self.pairs, distance, touch = self.pairs[~always], distance[~always], touch[~always]
-        near = (distance < self.least + _ROOM).mean(axis=1) > _ALMOST_ALL
+        near = (distance < self.least + _CLOSE).mean(axis=1) > _ALMOST_ALL
         near &= are_links[~always] & ~touch.all(axis=1)
-        self.kept, self.room = np.full(len(near), self.least), np.full(len(near), np.inf)
+        self.required, self.slack = np.full(len(near), self.least), np.full(len(near), np.inf)
         for k in np.flatnonzero(near):
-            usual = float(np.median(distance[k, ~touch[k]]))
-            self.kept[k] = min(self.least, usual / 2)
-            self.room[k] = usual - self.kept[k]
-        self.built_near = self._listed(near, self.kept)
-        apart = self.kept + np.minimum(_APART, self.room / 2)
-        self.likely = distance.min(axis=1, initial=np.inf) < apart
+            median = float(np.median(distance[k, ~touch[k]]))
+            self.required[k] = min(self.least, median / 2)
+            self.slack[k] = median - self.required[k]
+        self.built_near = self._listed(near, self.required)
+        distant = self.required + np.minimum(_DISTANT, self.slack / 2)
+        self.likely = distance.min(axis=1, initial=np.inf) < distant
 
     def _listed(self, chosen: Array, distance: Array) -> list[str]:
-        """Return the links of pairs and their least distances, in words, each two once."""
+        """Return the links of pairs and their smallest distances as text, each two once."""
         least: dict[tuple[str, str], float] = {}
         for k in np.flatnonzero(chosen).tolist():
             names = self.named[k]
@@ -241,24 +242,24 @@ class Clearance:
 
     @property
     def spare(self) -> Array:
-        """What is left of distances for what lies between instants, shape (pairs, 1) [m]."""
-        spare: Array = np.minimum(_SPARE, _SPARE_ROOM * self.room)[:, None]
+        """Reserve of the distances for the motion between samples, shape (pairs, 1) [m]."""
+        spare: Array = np.minimum(_SPARE, _SPARE_SHARE * self.slack)[:, None]
         return spare
 
     def margins(self, placed: Placements, spare: float, *, hints: Array | None = None) -> Array:
         """Return margins of distances, shape (pairs, N) [m]; a lower bound of those over 1 cm.
 
         Args:
-            placed: Where the bodies are at N instants.
-            spare: How many times what distances spare is taken off the margin.
+            placed: Poses of the bodies at N samples.
+            spare: Multiple of the reserve that is subtracted from the margin.
             hints: As of ``near``.
         """
-        kept = self.kept[:, None] + spare * self.spare
-        seen = np.minimum(_DATA_RANGE, self.room[:, None] / 4)
-        return self.near(placed, kept + seen, hints=hints).distance - kept
+        required = self.required[:, None] + spare * self.spare
+        exact = np.minimum(_EXACT, self.slack[:, None] / 4)
+        return self.near(placed, required + exact, hints=hints).distance - required
 
     def placed(self, q: Array) -> Placements:
-        """Return where the bodies are.
+        """Return the poses of the bodies.
 
         Args:
             q: Joint coordinates, shape (N, n) [rad or m].
@@ -275,12 +276,12 @@ class Clearance:
         """Return the distances of pairs along a motion, exact where they are near.
 
         Args:
-            placed: Where the bodies are at N instants.
-            within: Distance from which a lower bound will do, one, or one per pair and instant,
+            placed: Poses of the bodies at N samples.
+            within: Distance from which a lower bound suffices, one, or one per pair and sample,
                 shape (pairs, N) or one that broadcasts to it [m].
-            chosen: Which pairs to look at, shape (pairs,), bool; those that may meet if None.
-            hints: Directions that parted the hulls before, shape (pairs, N, 3), 0 at first; the
-                better they are, the faster it goes. Those found are written to it.
+            chosen: Pairs to check, shape (pairs,), bool; those that may meet if None.
+            hints: Earlier separating directions of the hulls, shape (pairs, N, 3), initially 0;
+                good ones save time. The directions found are written to it.
         """
         import coal
 
@@ -294,40 +295,40 @@ class Clearance:
         lower_bounds(numbers, self.pairs, enough, hints, bound, placed.R, placed.p, *self._corners)
         pairs, samples = np.nonzero(bound < limit)
         hulls = self.pairs[pairs].T  # (2, k)
-        centres, turns = self._stands(placed, hulls.ravel(), np.tile(samples, 2))
+        centres, rotations = self._poses(placed, hulls.ravel(), np.tile(samples, 2))
         shapes = [self._hulls[k].shape for k in hulls.ravel().tolist()]
-        poses = [coal.Transform3s(R, x) for R, x in zip(turns, centres, strict=True)]
+        poses = [coal.Transform3s(R, x) for R, x in zip(rotations, centres, strict=True)]
         count, result, exact = len(pairs), coal.DistanceResult(), np.empty(len(pairs))
-        scale_check, normals = np.empty((2, count, 3)), np.empty((count, 3))
+        points, normals = np.empty((2, count, 3)), np.empty((count, 3))
         for k in range(count):
             one, other = (shapes[k], poses[k]), (shapes[count + k], poses[count + k])
             result.clear()
             exact[k] = coal.distance(*one, *other, self._request, result)
-            scale_check[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
+            points[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
             normals[k] = result.normal
         bound[pairs, samples], hints[pairs, samples] = exact, normals
-        gradient = self._gradient(placed, pairs, samples, scale_check, normals)
+        gradient = self._gradient(placed, pairs, samples, points, normals)
         return Nearness(bound, pairs, samples, gradient)
 
     def nearest(self, motion: Motion, duration: float) -> Contact | None:
-        """Return where a motion has the least margin to a collision, between any samples, too.
+        """Return the smallest margin of a motion to a collision, at all times, not only at samples.
 
-        An interval of time is halved until no two hulls can come nearer within it, by what the
-        joints between them can still move them, than by 1 mm what has been seen elsewhere.
+        An interval of time is halved until, by the largest motion of the joints between two hulls
+        within it, their margin cannot be more than 0.5 mm below the smallest one found elsewhere.
 
         Args:
             motion: The motion.
             duration: Its length [s].
 
         Returns:
-            The pair with the least margin, by a lower bound of its distance; None if all of them
-            keep 5 cm more than they have to.
+            The pair with the smallest margin, by a lower bound of its distance; None if all margins
+            are at least 5 cm.
 
         References:
             Schwarzer, Saha, Latombe (2005), Adaptive dynamic collision checking for robots.
         """
-        seen, kept = _APART, self.kept[:, None]  # seen: the least margin so far
-        lowest, nearest = seen, None
+        smallest, required = _DISTANT, self.required[:, None]  # smallest: margin so far
+        lowest, nearest = smallest, None
         h = duration / max(2, round(duration / _FIRST)) / 2
         middles = np.arange(h, duration, 2 * h)
         a = motion.evaluate(np.linspace(0.0, duration, 40 * len(middles)))[2]
@@ -336,40 +337,40 @@ class Clearance:
             q, v, _ = motion.evaluate(middles)
             way = np.abs(v @ self._ratios.T) * h + fastest * h**2 / 2  # of each joint, (N, m)
             moved = self._levers @ way.T  # (pairs, N)
-            near = self.near(self.placed(q), kept + seen + moved, self.everything)
-            exact = near.distance[near.pairs, near.samples] - self.kept[near.pairs]
-            if exact.min(initial=np.inf) < seen:
+            near = self.near(self.placed(q), required + smallest + moved, self.everything)
+            exact = near.distance[near.pairs, near.samples] - self.required[near.pairs]
+            if exact.min(initial=np.inf) < smallest:
                 k = int(np.argmin(exact))
-                seen = float(exact[k])
+                smallest = float(exact[k])
                 nearest = int(near.pairs[k]), float(middles[near.samples[k]])
-            bound = near.distance - kept - moved
-            is_open = (bound < seen - _SURE).any(axis=0) & (2 * h > _SHORTEST)
+            bound = near.distance - required - moved
+            is_open = (bound < smallest - _TOLERANCE).any(axis=0) & (2 * h > _SHORTEST)
             lowest = min(lowest, float(bound[:, ~is_open].min(initial=np.inf)))
             h /= 2
             middles = np.sort(np.r_[middles[is_open] - h, middles[is_open] + h])
         if nearest is None:
             return None
         pair, time = nearest
-        own = float(self.kept[pair])
-        return Contact(*self.named[pair], min(lowest, seen) + own, time, own)
+        own = float(self.required[pair])
+        return Contact(*self.named[pair], min(lowest, smallest) + own, time, own)
 
     @cached_property
     def _levers(self) -> Array:
-        """How far each joint moves the hulls of a pair against each other at most, (pairs, m)."""
-        tree, slides = self._model.pin_model, self._tree.slides
+        """Largest relative motion of a pair's hulls per motion of each joint, (pairs, m)."""
+        tree, prismatic = self._model.pin_model, self._tree.prismatic
         lengths = np.linalg.norm([M.translation for M in tree.jointPlacements], axis=1)[1:]
         travel = {joint.name: max(-joint.lower, joint.upper) for joint in self._model.limits}
-        for i in np.flatnonzero(slides).tolist():
+        for i in np.flatnonzero(prismatic).tolist():
             lengths[i] += min(travel.get(tree.names[i + 1], _WIDE), _WIDE)
-        out = np.zeros((len(self.pairs), len(slides)))
+        out = np.zeros((len(self.pairs), len(prismatic)))
         for k, (one, other) in enumerate(self.pairs.tolist()):
             two = self._hulls[one], self._hulls[other]
-            apart = self._supports[two[0].body] ^ self._supports[two[1].body]
+            between = self._supports[two[0].body] ^ self._supports[two[1].body]
             for hull in two:
-                reach, body = float(np.linalg.norm(hull.centre)) + hull.radius, hull.body
-                while body >= 0 and apart[body]:
-                    out[k, body] += 1.0 if slides[body] else reach
-                    reach += lengths[body]
+                lever, body = float(np.linalg.norm(hull.centre)) + hull.radius, hull.body
+                while body >= 0 and between[body]:
+                    out[k, body] += 1.0 if prismatic[body] else lever
+                    lever += lengths[body]
                     body = int(tree.parents[body + 1]) - 1
         return out
 
@@ -382,28 +383,28 @@ class Clearance:
         points = np.vstack([hull.corners for hull in hulls])
         return *map(np.array, of_each), points, starts
 
-    def _stands(self, placed: Placements, hulls: Array, samples: Array) -> tuple[Array, Array]:
-        """Return where centres of k hulls are at k instants, (k, 3), and how they are turned."""
+    def _poses(self, placed: Placements, hulls: Array, samples: Array) -> tuple[Array, Array]:
+        """Return centres of k hulls at k samples, (k, 3), and their rotations, (k, 3, 3)."""
         bodies = np.array([hull.body for hull in self._hulls])[hulls]
         middles = np.array([hull.centre for hull in self._hulls])[hulls]
-        turns = np.moveaxis(placed.R[:, :, bodies, samples], -1, 0)  # (k, 3, 3)
-        centres = placed.p[:, bodies, samples].T + (turns @ middles[..., None])[..., 0]
-        stands = bodies < 0
-        turns = np.where(stands[:, None, None], np.eye(3), turns)
-        return np.where(stands[:, None], middles, centres), np.ascontiguousarray(turns)
+        rotations = np.moveaxis(placed.R[:, :, bodies, samples], -1, 0)  # (k, 3, 3)
+        centres = placed.p[:, bodies, samples].T + (rotations @ middles[..., None])[..., 0]
+        is_fixed = bodies < 0
+        rotations = np.where(is_fixed[:, None, None], np.eye(3), rotations)
+        return np.where(is_fixed[:, None], middles, centres), np.ascontiguousarray(rotations)
 
     def _gradient(
-        self, placed: Placements, pairs: Array, samples: Array, scale_check: Array, normals: Array
+        self, placed: Placements, pairs: Array, samples: Array, points: Array, normals: Array
     ) -> Array:
-        """Return what distances change by with each joint: normal . (velocity of the points)."""
-        slides = self._tree.slides[:, None]
+        """Return distances' derivatives by each joint: normal . (velocity of nearest points)."""
+        prismatic = self._tree.prismatic[:, None]
         axes = np.einsum("cdjk,jd->kjc", placed.R[..., samples], self._tree.axes)  # in the world
         origins = placed.p[..., samples].T  # (k, m, 3)
         bodies = np.array([hull.body for hull in self._hulls])[self.pairs[pairs]]  # (k, 2)
         out = np.zeros(axes.shape[:2])
         for side, sign in ((0, -1.0), (1, 1.0)):
-            levers = np.cross(axes, scale_check[side][:, None] - origins)
-            along = np.einsum("kjc,kc->kj", np.where(slides, axes, levers), normals)
+            levers = np.cross(axes, points[side][:, None] - origins)
+            along = np.einsum("kjc,kc->kj", np.where(prismatic, axes, levers), normals)
             out += sign * np.where(self._supports[bodies[:, side]], along, 0.0)
         by_joint: Array = out @ self._ratios
         return by_joint

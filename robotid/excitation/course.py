@@ -1,4 +1,4 @@
-"""How a motion uses a robot's limits over time, and how near it comes to a collision."""
+"""A motion's use of the robot's limits over time, and its distances to collisions."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,21 +12,21 @@ from robotid.excitation.limits import LIMITS, MotionLimits
 
 __all__ = ["Course"]
 
-_MOST = 1000  # at which distances are looked at
-_LOOKED_AT = 20  # instants that say which distances change ...
-_STILL = 1e-4  # [m] ... by more than this
-_WITHIN = 0.02  # [m] distances that are looked at first; then twice as far, and so on
+_MOST = 1000  # samples at which distances are computed
+_FEW = 20  # samples by which the changing distances are found ...
+_STILL = 1e-4  # [m] ... those that change by more than this
+_WITHIN = 0.02  # [m] distances that are computed first; then up to twice as far, and so on
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """A motion at N instants, and what it uses of each limit.
+    """A motion at N samples, and its use of each limit.
 
     Attributes:
         t: Times, shape (N,) [s].
         values: Position, velocity, acceleration, jerk, torque and power, shape (6, N, n), SI units.
-        limits: What the robot may do.
-        clearance: What keeps it from collisions; None: they are not looked at.
+        limits: The robot's limits.
+        clearance: The distances to collisions; None: they are not checked.
     """
 
     t: Array
@@ -36,12 +36,12 @@ class Course:
 
     @classmethod
     def of_design(cls, designer: Designer, design: Design) -> "Course":
-        """Return the course of a designed motion at the instants at which its limits were checked.
+        """Return the course of a designed motion at the samples at which its limits were checked.
 
         The torque is the one that its design assumes.
 
         Args:
-            designer: What it was designed for.
+            designer: The designer of the motion.
             design: The motion.
         """
         t = np.linspace(0.0, design.duration, design.intervals + 1)
@@ -57,13 +57,13 @@ class Course:
         limits: MotionLimits,
         clearance: Clearance | None = None,
     ) -> "Course":
-        """Return the course of a motion that is known at some instants; its jerk by differences.
+        """Return the course of a sampled motion; its jerk by finite differences.
 
         Args:
             t: Times, shape (N,) [s].
             motion: Positions, velocities, accelerations and torques, shape (N, n) each, SI units.
-            limits: What the robot may do.
-            clearance: What keeps it from collisions.
+            limits: The robot's limits.
+            clearance: The distances to collisions.
         """
         q, v, a, torque = motion
         jerk = np.gradient(a, t, axis=0)
@@ -71,39 +71,39 @@ class Course:
 
     @cached_property
     def used(self) -> Array:
-        """Share that is used of each limit, signed, shape (6, N, n); 0 where there is none."""
+        """Used share of each limit, signed, shape (6, N, n); 0 where there is no limit."""
         return self.limits.used(*self.values[:5])
 
     @property
     def largest(self) -> Array:
-        """Largest share that is used of each limit, by joint, shape (6, n)."""
+        """Largest used share of each limit, by joint, shape (6, n)."""
         largest: Array = np.abs(self.used).max(axis=1)
         return largest
 
     def peak(self, kind: str, joint: int) -> float:
-        """Return when a joint uses the most of a limit [s].
+        """Return the time of a joint's largest use of a limit [s].
 
         Args:
-            kind: Which, of ``LIMITS``.
+            kind: The limit, of ``LIMITS``.
             joint: Number of the joint.
         """
         return float(self.t[np.argmax(np.abs(self.used[LIMITS.index(kind), :, joint]))])
 
     @cached_property
     def thinned(self) -> "Course":
-        """The same at no more than 1,000 instants, to look at distances."""
+        """The same at no more than 1,000 samples, for the distances."""
         rows = slice(None, None, -(-len(self.t) // _MOST))
         return replace(self, t=self.t[rows], values=self.values[:, rows])
 
     def nearness(self, chosen: Array) -> tuple[Array, Array]:
-        """Return the least distance at each instant, and the pair that it is of, shape (N,) each.
+        """Return the smallest distance at each sample, and its pair, shape (N,) each.
 
         Args:
-            chosen: Which pairs of the clearance are looked at, shape (pairs,), bool.
+            chosen: Pairs of the clearance that are checked, shape (pairs,), bool.
 
         Returns:
-            Distances [m], inf without any pair, and numbers of pairs. Distances within which
-            something is are exact, so the least of them is the least of all.
+            Distances [m], inf without any pair, and numbers of pairs. The smallest distances are
+            exact; larger ones are lower bounds.
         """
         distance, pairs = np.full(len(self.t), np.inf), np.zeros(len(self.t), dtype=int)
         left = np.arange(len(self.t) if chosen.any() else 0)
@@ -119,12 +119,12 @@ class Course:
         return distance, pairs
 
     def changes(self, clearance: Clearance) -> Array:
-        """Return which pairs of a clearance the motion moves against each other, (pairs,), bool.
+        """Return which pairs of a clearance change their distance in the motion, (pairs,), bool.
 
         Args:
-            clearance: The pairs; one of bodies that turn about their own axis keeps its distance.
+            clearance: The pairs.
         """
-        few = np.unique(np.linspace(0, len(self.t) - 1, _LOOKED_AT).astype(int))
+        few = np.unique(np.linspace(0, len(self.t) - 1, _FEW).astype(int))
         placed = clearance.placed(self.values[0][few])
         change: Array = np.ptp(
             clearance.near(placed, np.inf, clearance.everything).distance, axis=1
@@ -133,13 +133,13 @@ class Course:
 
     @cached_property
     def nearest(self) -> Contact | None:
-        """Where what the motion moves has the least margin of distance; None if there is none."""
+        """The smallest margin of the changing distances; None if no distance changes."""
         if self.clearance is None:
             return None
-        few, kept = self.thinned, self.clearance.kept
+        few, required = self.thinned, self.clearance.required
         changes, found = few.changes(self.clearance), []
-        for own in np.unique(kept[changes]).tolist():
-            distance, pairs = few.nearness(changes & (kept == own))
+        for own in np.unique(required[changes]).tolist():
+            distance, pairs = few.nearness(changes & (required == own))
             k = int(np.argmin(distance))
             names = self.clearance.named[int(pairs[k])]
             found.append(Contact(*names, float(distance[k]), float(few.t[k]), own))

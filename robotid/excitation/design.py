@@ -1,9 +1,9 @@
-"""The motion that tells the most of a robot within its limits, found by its gradient.
+"""Optimal excitation trajectories within a robot's limits, by gradient-based optimisation.
 
 The information about the base parameters of a motion q = Phi C is the sum of W^T W / sigma^2 over
-its instants, in units of what the URDF leaves open, plus 1, or plus what earlier runs told. An
-augmented Lagrangian keeps the limits: at each instant, (used share)^2 - 1 <= 0 of each limit, and
-distances at least the clearance.
+its samples, in units of the prior deviations, plus 1, or plus the information of earlier runs. An
+augmented Lagrangian enforces the limits: at each sample, (used share)^2 - 1 <= 0 of each limit, and
+distances of at least the clearance.
 """
 
 import time
@@ -37,44 +37,41 @@ from robotid.simulation.motions import Motion
 
 __all__ = ["Design", "Designer"]
 
-_PER_PERIOD = 14  # instants within the shortest period of a basis that a design looks at
-_POLISHED = 3  # times as many that its last rounds look at ...
-_FINER = 15  # ... and at which its limits are checked in the end
+_PER_PERIOD = 14  # samples of the grid within the shortest period of a basis
+_POLISHED = 3  # times as many in the last rounds ...
+_FINER = 15  # ... and in the final check of the limits
 _ROUNDS = 14  # of the augmented Lagrangian ...
 _LAST_ROUNDS = 8  # ... and on the finer grid
 _STEPS = 20  # of L-BFGS in each
-_WEIGHT = 3.0  # of what is violated at all instants together, at first
-_LESS = 0.25  # of what a round broke: more weight is put on it if the next one breaks more
-_NEARLY = 1e-2  # change of the criterion from which on the finer grid is used ...
+_WEIGHT = 3.0  # initial weight of the violations of all samples together
+_LESS = 0.25  # share of a round's violation: the weight increases if the next violation exceeds it
+_NEARLY = 1e-2  # change of the criterion below which the finer grid is used ...
 _SETTLED = 2e-3  # ... and below which a design has converged
-_LOST = 0.02  # of the criterion that may be lost where a motion is made to keep its limits
-_OVER = 1.01  # share of a limit up to which a design that settled may use it before it is scaled
-_TRIALS = 10  # of shares of a motion, until the largest that keeps the limits is known ...
-_SHARE = 1e-3  # ... to within this, or as near to a limit
-_USUAL = 0.3  # of the largest torque, speed and acceleration: about the rms of a motion
-_WIDEST = 0.25  # share of the base parameters that the criterion "widest" is about
+_LOSS = 0.02  # largest increase of the criterion when a motion is scaled to satisfy its limits
+_OVER = 1.01  # largest use of a limit by a converged design before it is scaled
+_TRIALS = 10  # shares of a motion tried for the largest that satisfies the limits ...
+_SHARE = 1e-3  # ... to this accuracy, or as near to a limit
+_TYPICAL = 0.3  # of the largest torque, speed and acceleration: about the RMS of a motion
+_WIDEST = 0.25  # share of the base parameters in the criterion "widest"
 _STARTED = 10  # random motions of which the best is a start
 
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A motion and what it is good for.
+    """A motion, its criterion and its use of the limits.
 
     Attributes:
         motion: The motion.
         duration: Its length [s].
-        intervals: Into how many equal ones it is divided by the instants at which its limits were
-            checked.
+        intervals: Number of equal intervals between the samples at which its limits were checked.
         objective: Its criterion, the smaller the better.
-        condition: Condition number of the base problem, columns in units of what the URDF leaves
-            open.
-        used: Largest share that is used of each limit, by joint, shape (6, n); 0 where there is
-            none.
-        contact: Where it comes nearest to a collision; None if nowhere near.
-        seconds: How long it took [s].
-        starts: Starts that were followed to the end.
-        is_converged: Whether the best of them had settled.
-        history: Time since the beginning [s] and criterion of each better motion.
+        condition: Condition number of the base problem, columns in units of the prior deviations.
+        used: Largest used share of each limit, by joint, shape (6, n); 0 where there is no limit.
+        contact: Where the smallest distance is; None if no pair comes near.
+        seconds: Computing time [s].
+        starts: Number of completed starts.
+        is_converged: Whether the best of them has converged.
+        history: Computing time [s] and criterion of each better motion.
     """
 
     motion: Motion
@@ -92,23 +89,23 @@ class Design:
 
 @dataclass(frozen=True, eq=False)
 class Designer:
-    """Looks for the motion that tells the most.
+    """Optimises a motion for the information about the parameters.
 
     Attributes:
         information: The rows of the base problem, and their gradient.
-        limits: What the robot may do.
-        basis: Functions that motions are sums of.
+        limits: The robot's limits.
+        basis: Basis functions of the motion.
         noise: Density of each joint's noise, variance times the time over which it is correlated,
             shape (n,) [(N m)^2 s or N^2 s].
-        spread: How far base parameters may be from what is known, shape (b,).
-        standard_spread: The same of the standard parameters, shape (p,).
-        given: Information that is there already, shape (b, b), in units of the spread; 1 if None.
+        spread: Prior deviations of the base parameters, shape (b,).
+        standard_spread: Prior deviations of the standard parameters, shape (p,).
+        given: Prior information, shape (b, b), in units of the spread; 1 if None.
         name: The criterion, as of ``criterion``.
-        clearance: What keeps it from collisions; None: they are not looked at.
-        finer: How many times finer than typical the grid of instants is.
-        aim: What is asked for, if not the base parameters; nothing is known of them then.
+        clearance: The distances to collisions; None: they are not checked.
+        finer: Number of samples of the grid relative to a coarse one.
+        aim: The parameters of interest, if not the base parameters; there is no prior then.
         moving: Which joints move, shape (n,), bool; all if None. The others rest where the motion
-            begins, and tell nothing, for friction holds them.
+            starts and contribute no information, since static friction may carry any load.
     """
 
     information: MotionInformation
@@ -137,20 +134,20 @@ class Designer:
         correlation: float = CORRELATION,
         run: Run | None = None,
     ) -> "Designer":
-        """Return a designer that assumes of friction and noise what a preview does.
+        """Return a designer with the assumptions of a preview on friction and noise.
 
         Args:
-            model: The robot; with the friction of a run before, if there is one.
-            basis: Functions that motions are sums of.
-            limits: What the robot may do.
+            model: The robot; with the friction of an earlier run, if there is one.
+            basis: Basis functions of the motion.
+            limits: The robot's limits.
             name: The criterion.
-            clearance: What keeps it from collisions.
+            clearance: The distances to collisions.
             noise: Standard deviation of the torque's noise by joint [N m or N].
             correlation: Time over which it is correlated [s].
-            run: What was recorded before: the motion then tells what it did not.
+            run: Earlier logs: the motion complements their information.
 
         Raises:
-            SettingsError: If a setting is unusable.
+            SettingsError: If a setting is not usable.
         """
         criterion(name, np.eye(1))
         mapping = structural_mapping(model)
@@ -158,13 +155,13 @@ class Designer:
         pi = assumed_parameters(model, size, speed) if run is None else run.standard
         found = None if run is None else run.noise(mapping.K)
         density = assumed_noise(model, size, noise or {}, correlation, found).density(0.0)
-        usual = _USUAL * np.array([size, speed, speed * 2 * np.pi / basis.shortest])
-        standard_spread = prior_spread(model, usual**2, 1)
+        typical = _TYPICAL * np.array([size, speed, speed * 2 * np.pi / basis.shortest])
+        standard_spread = prior_spread(model, typical**2, 1)
         spread = base_spread(mapping.K, standard_spread)
         given = None
         if run is not None:
-            told = run.factors.information(run.step / density)
-            given = np.eye(len(spread)) + spread[:, None] * told * spread
+            earlier = run.factors.information(run.step / density)
+            given = np.eye(len(spread)) + spread[:, None] * earlier * spread
         information = MotionInformation(model, mapping, mapping.to_base(pi))
         return cls(
             information, limits, basis, density, spread, standard_spread, given, name, clearance
@@ -184,31 +181,31 @@ class Designer:
         seconds: float = np.inf,
         progress: Callable[[int, float], None] | None = None,
     ) -> Design:
-        """Return the best motion that was found, checked on a grid 15 times as fine as at first.
+        """Return the best motion, checked on a grid 15 times as fine as the first one.
 
         Args:
-            rng: Source of the starts.
-            starts: How many starts are followed to the end.
-            seconds: Time after which the best motion so far is returned [s].
+            rng: Random generator of the starts.
+            starts: Number of random starts.
+            seconds: Limit of the computing time [s]; the best motion found by then is returned.
             progress: Called with the number of the start and the best criterion.
 
         Raises:
-            SettingsError: If the robot cannot even rest within its limits.
+            SettingsError: If the robot can hold no posture within its limits.
         """
-        initialised, best = time.monotonic(), np.inf
+        began, best = time.monotonic(), np.inf
         history: list[tuple[float, float]] = []
         followed: list[_State] = []
 
         def is_over() -> bool:
-            return bool(history) and time.monotonic() - initialised > seconds
+            return bool(history) and time.monotonic() - began > seconds
 
         def follow(designer: Designer, state: _State, rounds: int, settled: float) -> _State:
-            """Return what a start leads to."""
+            """Return the end of the search from a start."""
             nonlocal best
             for state in designer._search(state, rounds, settled, is_over):  # noqa: B020
                 if state.objective < best:
                     best = state.objective
-                    history.append((time.monotonic() - initialised, best))
+                    history.append((time.monotonic() - began, best))
                 if progress is not None:
                     progress(len(followed), best)
             return state
@@ -216,56 +213,59 @@ class Designer:
         while len(followed) < starts and not is_over():
             random = [self.random(rng) for _ in range(_STARTED)]
             objective, k = min((self._objective(C), k) for k, C in enumerate(random))
-            held = Multipliers(_WEIGHT / self._functions.shape[1])
-            begin = _State(random[k], objective, random[k], held)
-            followed.append(follow(self, begin, _ROUNDS, _NEARLY))
+            multipliers = Multipliers(_WEIGHT / self._functions.shape[1])
+            initial = _State(random[k], objective, random[k], multipliers)
+            followed.append(follow(self, initial, _ROUNDS, _NEARLY))
         chosen = min(followed, key=lambda state: state.objective)
         fine, best = replace(self, finer=_POLISHED * self.finer), np.inf
-        kept, held = fine._feasible(chosen.kept, 1.0 - SPARE), chosen.multipliers.finer(_POLISHED)
-        begin = _State(kept, fine._objective(kept), chosen.away, held)
-        polished = follow(fine, begin, _LAST_ROUNDS, _SETTLED)
-        found = replace(self, finer=_FINER * self.finer).checked(polished.kept)
+        feasible = fine._feasible(chosen.feasible, 1.0 - SPARE)
+        multipliers = chosen.multipliers.finer(_POLISHED)
+        initial = _State(feasible, fine._objective(feasible), chosen.iterate, multipliers)
+        polished = follow(fine, initial, _LAST_ROUNDS, _SETTLED)
+        found = replace(self, finer=_FINER * self.finer).checked(polished.feasible)
         return replace(
             found,
-            seconds=time.monotonic() - initialised,
+            seconds=time.monotonic() - began,
             starts=len(followed),
             is_converged=polished.is_settled,
             history=tuple(history),
         )
 
     def checked(self, C: Array) -> Design:
-        """Return a motion, scaled down until it keeps all limits, and clear between instants, too.
+        """Return a motion, scaled down until it satisfies all limits, also between the samples.
 
         Args:
             C: Coefficients of a motion, shape (h, n).
         """
         C, contact = self._clear(self._feasible(C, 1.0))
-        used, _, rows = self._kept(C)
+        used, _, rows = self._constraints(C)
         motion = DesignedMotion(self.basis, C)
         information = self.matrix(rows)
-        return self._weighed(motion, self.basis.duration, information, used, contact)
+        return self._assessed(motion, self.basis.duration, information, used, contact)
 
     def examined(self, motion: Motion, duration: float, rate: float) -> Design:
-        """Return what any motion tells, and what it uses of limits other than jerk.
+        """Return the criterion of any motion, and its use of the limits other than jerk.
 
         Args:
             motion: The motion.
             duration: Its length [s].
-            rate: Instants per second at which it is looked at [Hz].
+            rate: Rate of the samples at which it is evaluated [Hz].
         """
-        used, information = self.used_and_told(motion, duration, rate)
+        used, information = self.used_and_informed(motion, duration, rate)
         contact = None
         if self.clearance is not None:
             contact = self.clearance.nearest(motion, duration)
-        return self._weighed(motion, duration, information, used, contact)
+        return self._assessed(motion, duration, information, used, contact)
 
-    def used_and_told(self, motion: Motion, duration: float, rate: float) -> tuple[Array, Array]:
-        """Return what a motion uses of limits but jerk, (6, N, n), and its information, (b, b).
+    def used_and_informed(
+        self, motion: Motion, duration: float, rate: float
+    ) -> tuple[Array, Array]:
+        """Return a motion's use of limits but jerk, (6, N, n), and its information, (b, b).
 
         Args:
             motion: The motion.
             duration: Its length [s].
-            rate: Instants per second at which it is looked at [Hz].
+            rate: Rate of the samples at which it is evaluated [Hz].
         """
         count = round(duration * rate)
         q, v, a = motion.evaluate(np.linspace(0.0, duration, count + 1))
@@ -273,7 +273,7 @@ class Designer:
         used = self.limits.used(q, v, a, 0.0 * a, self.information.torque(rows))
         return used, self._informed(rows, duration / count)
 
-    def _weighed(
+    def _assessed(
         self,
         motion: Motion,
         duration: float,
@@ -295,12 +295,12 @@ class Designer:
         )
 
     def _clear(self, C: Array) -> tuple[Array, Contact | None]:
-        """Return a motion scaled down until it is clear between its instants, too, and how far.
+        """Return a motion scaled down until it is clear between samples too, and its contact.
 
-        It is scaled by 0.99 first, then by more and more.
+        The first factor is 0.99; each further one is smaller.
 
         Raises:
-            NotConvergedError: If it is not clear at a thirtieth of its size.
+            NotConvergedError: If it is not collision-free at a thirtieth of its size.
         """
         if self.clearance is None:
             return C, None
@@ -310,7 +310,7 @@ class Designer:
                 return C, contact
             C = _scaled(C, max(1.0 - 0.01 * 2.0**k, 0.5))
         raise NotConvergedError(
-            f"between the instants that were looked at {contact}, margin "
+            f"between the samples of the design {contact}, margin "
             f"{1e3 * (contact.margin if contact else 0.0):.2g} mm, wanted 0 or more; raise the "
             "clearance or try another seed",
             "max_iterations",
@@ -318,7 +318,7 @@ class Designer:
 
     @property
     def known(self) -> Array:
-        """Information that is there already, in units of the spread, shape (b, b)."""
+        """Prior information, in units of the spread, shape (b, b)."""
         if self.aim is not None:
             return np.zeros((len(self.spread), len(self.spread)))
         known: Array = np.eye(len(self.spread)) if self.given is None else self.given
@@ -326,7 +326,7 @@ class Designer:
 
     @cached_property
     def widest(self) -> Array:
-        """The quarter of base parameters that are known the least already, shape (k,)."""
+        """The quarter of the base parameters with the largest prior variance, shape (k,)."""
         variance = np.diag(np.linalg.inv(self.known))
         return np.argsort(variance, kind="stable")[-max(1, round(_WIDEST * len(variance))) :]
 
@@ -348,19 +348,19 @@ class Designer:
         return value, L @ by_own @ L.T
 
     def _scale(self, step: float) -> Array:
-        """Return what rows are multiplied by, so that their squares are information, (n, b, 1)."""
+        """Return the factor of rows with which their squares are information, (n, b, 1)."""
         weight = self._moves * np.sqrt(step / self.noise)
         scale: Array = weight[:, None, None] * self.spread[:, None]
         return scale
 
     @cached_property
     def _step(self) -> float:
-        """Time between two instants of the grid [s]."""
+        """Time between two samples of the grid [s]."""
         step: float = self.basis.duration / (self._functions.shape[1] - 1)
         return step
 
     def matrix(self, rows: MotionRows) -> Array:
-        """Return the information of a motion and what was known, in units of the spread, (b, b).
+        """Return the information of a motion plus the prior's, in units of the spread, (b, b).
 
         Args:
             rows: Its rows.
@@ -376,17 +376,17 @@ class Designer:
 
     @cached_property
     def _hints(self) -> Array | None:
-        """Directions that parted hulls of the motion looked at last, shape (pairs, N, 3)."""
+        """Separating directions of the hulls in the last motion, shape (pairs, N, 3)."""
         if self.clearance is None:
             return None
         return np.zeros((len(self.clearance.pairs), self._functions.shape[1], 3))
 
-    def _kept(self, C: Array, spare: float = 0.0) -> tuple[Array, float, MotionRows]:
-        """Return shares of limits used (6, N, n), the least margin of distances and rows.
+    def _constraints(self, C: Array, spare: float = 0.0) -> tuple[Array, float, MotionRows]:
+        """Return used shares of limits (6, N, n), the smallest margin of distances and rows.
 
         Args:
             C: Coefficients of a motion, shape (h, n).
-            spare: How many times what distances spare is taken off the margin.
+            spare: Multiple of the distances' reserve that is subtracted from the margin.
         """
         q, v, a, jerk = self._functions @ C
         rows = self.information.rows(q, v, a)
@@ -425,7 +425,8 @@ class Designer:
         if self.clearance is not None:
             aim = self._wanted
             placed = self.clearance.placed(q)
-            near = self.clearance.near(placed, multipliers.reach(aim), hints=self._hints)
+            within = multipliers.distance_without_cost(aim)
+            near = self.clearance.near(placed, within, hints=self._hints)
             cost, pushed = multipliers.of_distances(near.distance, aim)
             value += cost
             along = -pushed[near.pairs, near.samples, None] / SOFT * near.gradient
@@ -441,24 +442,24 @@ class Designer:
 
     @property
     def _wanted(self) -> Array:
-        """Distances that the search aims at, shape (pairs, 1) [m]."""
+        """Distances that the search requires, shape (pairs, 1) [m]."""
         if self.clearance is None:
             return np.zeros((0, 1))
-        return self.clearance.kept[:, None] + 2.0 * self.clearance.spare
+        return self.clearance.required[:, None] + 2.0 * self.clearance.spare
 
     @cached_property
     def postures(self) -> Postures:
-        """The postures in which the robot can rest."""
+        """The postures that the robot can hold."""
         return Postures(self.information, self.limits, self.clearance)
 
     def random(self, rng: np.random.Generator) -> Array:
-        """Return the coefficients of a random motion that keeps the limits, shape (h, n).
+        """Return the coefficients of a random motion that satisfies the limits, shape (h, n).
 
         Args:
-            rng: Source of the motion.
+            rng: Random generator of the motion.
 
         Raises:
-            SettingsError: If no posture that the robot can rest in is found.
+            SettingsError: If no posture is found that the robot can hold.
         """
         n = len(self.limits.middle)
         C = rng.standard_normal((self.basis.size, n)) * self.limits.sizes[0]
@@ -467,48 +468,48 @@ class Designer:
         return self._feasible(C, 1.0 - SPARE)
 
     def _feasible(self, C: Array, most: float) -> Array:
-        """Return the largest share of a motion about its middle that keeps the limits, (h, n).
+        """Return the largest share of a motion about its middle that satisfies the limits, (h, n).
 
-        Each joint first keeps its own positions and speeds; then all are scaled as one.
+        Each joint is scaled to its own limits of position to jerk first; then all are scaled alike.
         """
-        room = most * self.limits.sizes[0] - np.abs(C[0] - self.limits.middle)
+        free = most * self.limits.sizes[0] - np.abs(C[0] - self.limits.middle)
         moving = np.abs(self._functions[:, :, 1:] @ C[1:]).max(axis=1)  # (4, n)
         over = np.vstack(
-            [moving[:1] / np.maximum(room, 1e-9), moving[1:] / self.limits.sizes[1:4] / most]
+            [moving[:1] / np.maximum(free, 1e-9), moving[1:] / self.limits.sizes[1:4] / most]
         )
         C = _scaled(C, 1.0 / np.maximum(1.0, over.max(axis=0)))
         return self._towards(_scaled(C, 0.0), C, most)
 
-    def _towards(self, kept: Array, C: Array, most: float) -> Array:
-        """Return the farthest motion that keeps the limits on the way to another, shape (h, n).
+    def _towards(self, feasible: Array, C: Array, most: float) -> Array:
+        """Return the farthest feasible motion on the line to another motion, shape (h, n).
 
         Args:
-            kept: Where the way begins; it is returned if nothing else keeps the limits.
-            C: Where it ends.
+            feasible: Start of the line; it is returned if no other point satisfies the limits.
+            C: End of the line.
             most: Share of the limits that may be used.
         """
-        way, low, high, share = C - kept, 0.0, 1.0, 1.0
-        under, over = -1.0, np.inf  # by how much limits are broken at both
+        way, low, high, share = C - feasible, 0.0, 1.0, 1.0
+        under, over = -1.0, np.inf  # violations of the limits at both
         for _ in range(_TRIALS):
-            used, margin, _ = self._kept(kept + share * way, 1.0)
-            broken = max(float(np.abs(used).max()) / most - 1.0, -margin / SOFT)
-            if broken <= 0.0:
-                low, under, over = share, broken, over / 2
+            used, margin, _ = self._constraints(feasible + share * way, 1.0)
+            violation = max(float(np.abs(used).max()) / most - 1.0, -margin / SOFT)
+            if violation <= 0.0:
+                low, under, over = share, violation, over / 2
             else:
-                high, over, under = share, broken, under / 2
+                high, over, under = share, violation, under / 2
             if low == 1.0 or high - low < _SHARE or (low > 0.0 and under > -_SHARE):
                 break
             share = low + (high - low) * np.clip(under / (under - over), 0.02, 0.98)
-        return kept + low * way
+        return feasible + low * way
 
     def _search(
         self, state: "_State", rounds: int, settled: float, is_over: Callable[[], bool]
     ) -> Iterator["_State"]:
-        """Yield where a search stands, at first and after each round, until it has settled."""
+        """Yield the state of a search, at first and after each round, until it has converged."""
         from scipy.optimize import minimize
 
         unit = self.limits.sizes[0]
-        before = np.inf  # by how much limits were broken
+        before = np.inf  # violation of the limits
 
         def scaled(x: Array) -> tuple[float, Array]:
             if is_over():
@@ -521,78 +522,79 @@ class Designer:
             try:
                 found = minimize(
                     scaled,
-                    (state.away / unit).reshape(-1),
+                    (state.iterate / unit).reshape(-1),
                     jac=True,
                     method="L-BFGS-B",
                     options={"maxiter": _STEPS, "maxcor": 20},
                 )
             except _OutOfTime:
                 return
-            state, broken = self._judged(state, found.x.reshape(-1, len(unit)) * unit, settled)
-            if broken > _LESS * before:
-                state = replace(state, multipliers=state.multipliers.heavier())
-            before = broken
+            state, violation = self._updated(state, found.x.reshape(-1, len(unit)) * unit, settled)
+            if violation > _LESS * before:
+                state = replace(state, multipliers=state.multipliers.increased())
+            before = violation
             yield state
             if state.is_settled:
                 return
 
-    def _judged(self, state: "_State", C: Array, settled: float) -> tuple["_State", float]:
-        """Return where a search stands after a round, and by how much a limit is broken.
+    def _updated(self, state: "_State", C: Array, settled: float) -> tuple["_State", float]:
+        """Return the state of a search after a round, and the violation of the limits.
 
         Args:
-            state: Where it stood before.
-            C: Where the round has led.
-            settled: Change of the criterion below which it has settled.
+            state: The state before.
+            C: The iterate at the end of the round.
+            settled: Change of the criterion below which the search has converged.
         """
-        used, margin, rows = self._kept(C)
+        used, margin, rows = self._constraints(C)
         own = self.judged(self.matrix(rows))[0]
-        held = state.multipliers
+        multipliers = state.multipliers
         distance = None
         if self.clearance is not None:
-            reach = held.reach(self._wanted)
+            within = multipliers.distance_without_cost(self._wanted)
             placed = self.clearance.placed(rows.motion[0])
-            distance = self.clearance.near(placed, reach, hints=self._hints).distance
-        kept = self._feasible(C, 1.0 - SPARE)
-        objective = self._objective(kept)
+            distance = self.clearance.near(placed, within, hints=self._hints).distance
+        feasible = self._feasible(C, 1.0 - SPARE)
+        objective = self._objective(feasible)
         if objective > state.objective - settled:
-            mixed = self._towards(state.kept, C, 1.0 - SPARE)
-            objective, kept = min(
-                [(objective, kept), (self._objective(mixed), mixed)], key=lambda pair: pair[0]
+            mixed = self._towards(state.feasible, C, 1.0 - SPARE)
+            objective, feasible = min(
+                [(objective, feasible), (self._objective(mixed), mixed)], key=lambda pair: pair[0]
             )
         gain = state.objective - objective
-        is_near = np.abs(used).max() < _OVER and margin >= 0.0 and objective - own < _LOST
-        is_lost = not is_near and gain < _LOST  # the way from what keeps the limits leads farther
+        is_near = np.abs(used).max() < _OVER and margin >= 0.0 and objective - own < _LOSS
+        is_stalled = not is_near and gain < _LOSS  # restart from the feasible motion
         if gain < 0.0:
-            kept, objective = state.kept, state.objective
-        broken = max(float(np.abs(used).max()) - 1.0 + SPARE, -margin / SOFT, 0.0)
-        held = held.raised(used, distance, self._wanted)
+            feasible, objective = state.feasible, state.objective
+        violation = max(float(np.abs(used).max()) - 1.0 + SPARE, -margin / SOFT, 0.0)
+        multipliers = multipliers.raised(used, distance, self._wanted)
+        iterate = feasible if is_stalled else C
         is_settled = bool(is_near and gain < settled)
-        return _State(kept, objective, kept if is_lost else C, held, is_settled), broken
+        return _State(feasible, objective, iterate, multipliers, is_settled), violation
 
 
 class _OutOfTime(Exception):
-    """The time of a design is over."""
+    """The limit of the computing time is reached."""
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Where a search stands.
+    """The state of a search.
 
     Attributes:
-        kept: Coefficients of the best motion that keeps the limits, shape (h, n).
+        feasible: Coefficients of the best motion that satisfies the limits, shape (h, n).
         objective: Its criterion.
-        away: Where the search goes on; it may break limits.
+        iterate: Coefficients at which the search continues; they may violate limits.
         multipliers: Those of the limits.
-        is_settled: Whether more rounds change nothing.
+        is_settled: Whether the search has converged.
     """
 
-    kept: Array
+    feasible: Array
     objective: float
-    away: Array
+    iterate: Array
     multipliers: Multipliers
     is_settled: bool = False
 
 
 def _scaled(C: Array, share: float | Array) -> Array:
-    """Return a motion with its way about the middle scaled, shape (h, n)."""
+    """Return a motion with its deviation from the middle scaled, shape (h, n)."""
     return np.vstack([C[:1], C[1:] * share])

@@ -1,4 +1,4 @@
-"""Designed motions as files: tables as logs are, and what robots' controllers execute."""
+"""Files of designed motions: tables like logs, ROS 2 trajectories and URScript programs."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,11 +16,11 @@ __all__ = ["check_motion_file", "write_motion"]
 
 _UR_JOINTS = 6
 _UR_STEP = 0.008  # [s] of servoj on every UR
-_SETTLES = 1.0  # [s] that a UR rests where the motion begins
+_SETTLES = 1.0  # [s] at rest at the first posture
 
 
 def check_motion_file(target: str | Path) -> None:
-    """Refuse a format that motions are not written in, as before the work of a design.
+    """Refuse an unknown format of motion files before a design is computed.
 
     Args:
         target: The file.
@@ -37,23 +37,23 @@ def write_motion(
 ) -> Path:
     """Write a motion: .csv or .parquet, .yaml for ROS 2, .script for Universal Robots.
 
-    A table has the columns time, q_, dq_ and ddq_ of each joint [s, rad or m], as a log has. A
-    .yaml file is a trajectory_msgs/JointTrajectory, a .script a URScript function that moves to the
-    beginning and then calls servoj every 8 ms.
+    A table has the columns time, q_, dq_ and ddq_ of each joint [s, rad or m], like a log. A .yaml
+    file is a trajectory_msgs/JointTrajectory. A .script is a URScript function that moves to the
+    first posture and then calls servoj every 8 ms.
 
     Args:
         motion: The motion.
         joints: Names of its n joints.
         duration: Its length [s].
-        rate: Rows or points per second [Hz]; a .script has those that the robot needs.
-        target: The file; made beside it and then put in place.
+        rate: Rows or points per second [Hz]; a .script has 125.
+        target: The file; written under a temporary name, then renamed.
 
     Returns:
         Path of the file.
 
     Raises:
         DataError: If the folder does not exist, or a table cannot be written in that format.
-        SettingsError: If the rate is not positive, or a UR script is asked for another robot.
+        SettingsError: If the rate is not positive, or the robot of a .script has not 6 joints.
     """
     path = Path(target)
     if not 0 < rate < np.inf:
@@ -88,8 +88,8 @@ def _ur(joints: Sequence[str], t: Array, q: Array, v: Array, a: Array) -> Iterat
     """Yield the lines of a URScript program."""
     if len(joints) != _UR_JOINTS:
         raise SettingsError(
-            f"a .script is for Universal Robots, which have {_UR_JOINTS} joints; this robot has "
-            f"{len(joints)}: write .csv, .parquet or .yaml"
+            f"a .script is for Universal Robots: this robot has {len(joints)} joints, wanted "
+            f"{_UR_JOINTS}; write .csv, .parquet or .yaml"
         )
     yield "def excitation():"
     yield f"  movej([{_numbers(q[0])}], a=0.5, v=0.5)"

@@ -1,10 +1,10 @@
 """Lower bounds of the distances between hulls along a motion, compiled by Numba.
 
-Imported only where a motion is designed. Along any direction two hulls are at least as far apart as
-the points of each that reach farthest towards the other. The sides of the boxes around them are
-tried first, then the direction that was best before, then those of Frank and Wolfe's way to the
-point of B - A that is nearest to 0. It ends where a bound suffices, or where that point shows that
-the hulls are nearer than asked for.
+Imported only where a motion is designed. For any direction, the gap of two hulls along it is a
+lower bound of their distance. The directions are, in this order: the sides of the boxes around the
+hulls, the best direction of the last call, and those of Frank and Wolfe's iteration to the point of
+B - A nearest to 0. The iteration ends where a bound suffices, or where that point shows that the
+distance is smaller than asked for.
 
 References:
     Gilbert, Johnson, Keerthi (1988), A fast procedure for computing the distance between complex
@@ -17,23 +17,23 @@ from robotid.regressor.lanes import compiled
 
 __all__ = ["lower_bounds"]
 
-_STEPS = 20  # directions that are tried
+_STEPS = 20  # largest number of iterations
 
 
 @compiled
 def _farthest(points, first, last, x, y, z):
-    """Return which of some points reaches farthest along a direction."""
+    """Return the farthest of some points along a direction."""
     best, most = first, -np.inf
     for k in range(first, last):
-        reach = x * points[k, 0] + y * points[k, 1] + z * points[k, 2]
-        if reach > most:
-            best, most = k, reach
+        extent = x * points[k, 0] + y * points[k, 1] + z * points[k, 2]
+        if extent > most:
+            best, most = k, extent
     return best
 
 
 @compiled
 def _support(hull, n, R, centres, bodies, points, starts, x, y, z):
-    """Return the point of a hull that reaches farthest along a direction of the world."""
+    """Return the farthest point of a hull along a direction of the world."""
     body, first, last = bodies[hull], starts[hull], starts[hull + 1]
     if body < 0:
         k = _farthest(points, first, last, x, y, z)
@@ -63,25 +63,25 @@ def _side(hull, c, n, R, bodies):
 
 @compiled
 def _boxes(i, j, n, bound, R, centres, bodies, half):
-    """Return a lower bound by the shadows of the boxes on their sides' directions."""
+    """Return a lower bound by the projections of the boxes on their sides' directions."""
     x = centres[0, j, n] - centres[0, i, n]
     y = centres[1, j, n] - centres[1, i, n]
     z = centres[2, j, n] - centres[2, i, n]
     for own in (i, j):
         for c in range(3):
             u, v, w = _side(own, c, n, R, bodies)
-            apart = abs(u * x + v * y + w * z)
+            gap = abs(u * x + v * y + w * z)
             for hull in (i, j):
                 for d in range(3):
                     a, b, e = _side(hull, d, n, R, bodies)
-                    apart -= half[hull, d] * abs(u * a + v * b + w * e)
-            bound = max(bound, apart)
+                    gap -= half[hull, d] * abs(u * a + v * b + w * e)
+            bound = max(bound, gap)
     return bound
 
 
 @compiled
 def _along(i, j, n, x, y, z, R, centres, bodies, points, starts):
-    """Return the point of B - A that is the lowest along a direction."""
+    """Return the lowest point of B - A along a direction."""
     a = _support(i, n, R, centres, bodies, points, starts, x, y, z)
     b = _support(j, n, R, centres, bodies, points, starts, -x, -y, -z)
     return b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -89,9 +89,9 @@ def _along(i, j, n, x, y, z, R, centres, bodies, points, starts):
 
 @compiled
 def _bound(i, j, n, enough, bound, hint, R, centres, bodies, points, starts):
-    """Return a lower bound of the distance of two hulls at one instant, ``bound`` at the least.
+    """Return a lower bound of the distance of two hulls at one sample, at least ``bound``.
 
-    ``hint`` is a direction that may be good; it is replaced by the best.
+    ``hint`` is the first direction tried; it is replaced by the best one.
     """
     hulls = R, centres, bodies, points, starts
     if hint[0] != 0.0 or hint[1] != 0.0 or hint[2] != 0.0:
@@ -108,9 +108,9 @@ def _bound(i, j, n, enough, bound, hint, R, centres, bodies, points, starts):
             return bound
         u, v, t = x / size, y / size, z / size
         w = _along(i, j, n, u, v, t, *hulls)
-        apart = w[0] * u + w[1] * v + w[2] * t
-        if apart > bound:
-            bound = apart
+        gap = w[0] * u + w[1] * v + w[2] * t
+        if gap > bound:
+            bound = gap
             hint[0], hint[1], hint[2] = u, v, t
         dx, dy, dz = w[0] - x, w[1] - y, w[2] - z
         step = dx * dx + dy * dy + dz * dz
@@ -146,19 +146,19 @@ def lower_bounds(
     """Write lower bounds of the distances of pairs of hulls [m].
 
     Args:
-        chosen: Which pairs are looked at, int.
+        chosen: Numbers of the pairs that are checked, int.
         pairs: Numbers of two hulls, shape (pairs, 2), int.
-        enough: What a bound need not exceed, shape (pairs, N) [m].
-        hints: Directions that may part the hulls, shape (pairs, N, 3); better ones are written.
+        enough: Distances from which a bound suffices, shape (pairs, N) [m].
+        hints: First directions to try, shape (pairs, N, 3); better ones are written.
         out: The bounds, shape (pairs, N); written.
-        R: Rotations of the m bodies at N instants, shape (3, 3, m, N).
+        R: Rotations of the m bodies at N samples, shape (3, 3, m, N).
         p: Origins of the bodies, shape (3, m, N) [m].
-        bodies: Body of each of h hulls, shape (h,), int; -1: it is at rest.
+        bodies: Body of each of h hulls, shape (h,), int; -1: it is fixed.
         middles: Middle of each in the frame of its body, shape (h, 3) [m].
-        radii: Of the spheres about them that hold the hulls, shape (h,) [m].
+        radii: Radii of the bounding spheres about them, shape (h,) [m].
         half: Half the box around each in the frame of its body, shape (h, 3) [m].
         points: Corners of all hulls about their middles, shape (k, 3) [m].
-        starts: Where those of each begin, and the last end, shape (h + 1,), int.
+        starts: First corner of each hull, and the number of all, shape (h + 1,), int.
     """
     centres = _centres(R, p, bodies, middles)
     for k in chosen:
@@ -167,11 +167,11 @@ def lower_bounds(
             x = centres[0, j, n] - centres[0, i, n]
             y = centres[1, j, n] - centres[1, i, n]
             z = centres[2, j, n] - centres[2, i, n]
-            apart = np.sqrt(x * x + y * y + z * z) - radii[i] - radii[j]
-            if apart < enough[k, n]:
-                apart = _boxes(i, j, n, apart, R, centres, bodies, half)
-            if apart < enough[k, n]:
-                apart = _bound(
-                    i, j, n, enough[k, n], apart, hints[k, n], R, centres, bodies, points, starts
+            gap = np.sqrt(x * x + y * y + z * z) - radii[i] - radii[j]
+            if gap < enough[k, n]:
+                gap = _boxes(i, j, n, gap, R, centres, bodies, half)
+            if gap < enough[k, n]:
+                gap = _bound(
+                    i, j, n, enough[k, n], gap, hints[k, n], R, centres, bodies, points, starts
                 )  # fmt: skip
-            out[k, n] = apart
+            out[k, n] = gap

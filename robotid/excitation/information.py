@@ -1,4 +1,4 @@
-"""What a motion will tell: the information of its torques about base parameters, by gradient."""
+"""The information of a motion's torques about the base parameters, and its gradient."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,18 +16,18 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["CRITERIA", "Aim", "MotionInformation", "MotionRows", "criterion"]
 
-#: Which property of the information is made large, or small.
+#: The optimality criteria.
 CRITERIA = ("D", "A", "E", "condition", "widest")
-_STEP = 1e-6  # of the differences by which drive columns are derived, in their argument's scale
-_TURN = 0.01  # [rad/s or m/s] speed over which the sign of friction changes
+_STEP = 1e-6  # of the finite differences of drive columns, in their argument's scale
+_REVERSAL = 0.01  # [rad/s or m/s] speed over which the sign of friction changes
 
 
 @dataclass(frozen=True, eq=False)
 class MotionRows:
-    """The regressor's kept columns along a motion, and what is needed for their gradient.
+    """The regressor's base columns along a motion, and the quantities that their gradient needs.
 
     Attributes:
-        W: Row r, base column c at each of N instants, shape (n, b, N).
+        W: Row r, base column c at each of N samples, shape (n, b, N).
     """
 
     W: Array
@@ -39,13 +39,13 @@ class MotionRows:
 class MotionInformation:
     """The rows W of the base problem along a motion, W beta = tau, and their gradient.
 
-    Drive terms are of an instant: what remembers has slid for long. The sign of friction is
-    tanh(w / 0.01 rad/s), so that it has a gradient.
+    Drive terms depend on the current motion only: internal states are at their steady value. The
+    sign of friction is tanh(w / 0.01 rad/s), so that it has a gradient.
 
     Attributes:
         model: The robot, with a fixed base.
         mapping: Its base parameters.
-        beta: Base parameters that torques are reckoned by, shape (b,).
+        beta: Base parameters by which torques are computed, shape (b,).
     """
 
     model: RobotModel
@@ -69,7 +69,7 @@ class MotionInformation:
 
     @cached_property
     def _terms(self) -> list[tuple[DriveTerm, list[int], list[int]]]:
-        """Each term of the kept drive parameters, which of those it has, and their drives."""
+        """Each term of the base drive parameters, which of those it has, and their drives."""
         found: dict[DriveTerm, tuple[list[int], list[int]]] = {}
         for k, parameter in enumerate(self._drives[1]):
             drive, term = self.model.layout.drive_parameters[parameter]
@@ -82,7 +82,7 @@ class MotionInformation:
     def chains(self) -> Array:
         """Share of each joint (column) in the torque at rest of each (row), shape (n, n).
 
-        The same of all joints before and behind it, 0 of others.
+        It is the same for all joints on the chain through it, 0 for others.
         """
         ratios = self.model.velocity_map != 0.0  # (m, n)
         chain = np.eye(len(ratios), dtype=bool)
@@ -93,7 +93,7 @@ class MotionInformation:
         return share
 
     def rows(self, q: Array, v: Array, a: Array) -> MotionRows:
-        """Return the rows along a motion of N instants.
+        """Return the rows along a motion of N samples.
 
         Args:
             q: Joint coordinates, shape (N, n) [rad or m].
@@ -111,15 +111,15 @@ class MotionInformation:
         """Return how the drives move, with smooth signs, arrays of shape (d, N)."""
         layout = self.model.layout
         motion = drive_motion(layout, q, v, a, v @ layout.drive_ratios.T, load)
-        return self._turning(motion)
+        return self._with_signs(motion)
 
-    def _turning(self, motion: DriveMotion) -> DriveMotion:
-        """Return the motion of drives with the signs that its speeds have."""
+    def _with_signs(self, motion: DriveMotion) -> DriveMotion:
+        """Return the motion of drives with the smooth signs of its speeds."""
         speeds = (motion.v.T / self.model.layout.drive_speeds).T
-        return replace(motion, direction=np.tanh(speeds / _TURN))
+        return replace(motion, direction=np.tanh(speeds / _REVERSAL))
 
     def _drive_values(self, motion: DriveMotion) -> Array:
-        """Return what the kept drive parameters multiply, shape (k, N); of (d, ..., N), alike."""
+        """Return the factors of the base drive parameters, shape (k, N); of (d, ..., N), alike."""
         values = np.empty((len(self._drives[1]), *motion.v.shape[1:]))
         for term, places, drives in self._terms:
             values[places] = term.column(motion.of(drives))
@@ -139,7 +139,7 @@ class MotionInformation:
 
         Args:
             rows: The rows.
-            weights: What each entry counts, shape (n, b, N).
+            weights: Weight of each entry, shape (n, b, N).
         """
         columns, parameters = self._drives
         loads = self.model.layout.drive_loads[:, parameters]
@@ -167,7 +167,7 @@ class MotionInformation:
             x[:, 2 * k + 1] -= step
             beside[name] = x
         still = np.zeros_like(x)
-        values = self._drive_values(self._turning(replace(motion, **beside, rate=still)))
+        values = self._drive_values(self._with_signs(replace(motion, **beside, rate=still)))
         gradients = []
         for k, (name, step) in enumerate(zip(names, steps, strict=True)):
             slope = by_drive @ (weights * (values[:, 2 * k] - values[:, 2 * k + 1])) / (2 * step)
@@ -177,26 +177,25 @@ class MotionInformation:
 
 @dataclass(frozen=True, eq=False)
 class Aim:
-    """What is asked for, where it is not the base parameters: some of u unknowns that make them.
+    """Parameters of interest other than the base parameters: some of u that determine these.
 
     Attributes:
-        columns: What each unknown adds to the base parameters, both in units of their spreads,
-            shape (b, u).
-        asked: How many of them, the last ones, are asked for; the others are unknown, too.
+        columns: Derivatives of the base parameters by each parameter, both in units of their
+            spreads, shape (b, u).
+        asked: Number of parameters of interest, the last ones; the others are nuisance parameters.
     """
 
     columns: Array
     asked: int
 
     def information(self, F: Array) -> tuple[Array, Array]:
-        """Return the information about what is asked for, and L with d information = L^T dF L.
+        """Return the information about those of interest, and L with d information = L^T dF L.
 
         Args:
             F: Information about the base parameters in units of their spread, shape (b, b).
 
         Returns:
-            Shapes (asked, asked), in units of the spreads and with 1 for what is known before; and
-            (b, asked).
+            Shapes (asked, asked), in units of the spreads and with 1 for the prior; and (b, asked).
         """
         T, rest = self.columns, self.columns.shape[1] - self.asked
         N = T.T @ F @ T + np.eye(T.shape[1])
@@ -206,13 +205,13 @@ class Aim:
 
 
 def criterion(name: str, F: Array, widest: Array | None = None) -> tuple[float, Array]:
-    """Return what is to be made small of an information matrix, and its gradient.
+    """Return a criterion of an information matrix, the smaller the better, and its gradient.
 
     Args:
         name: "D": -log det F / b; "A": log(trace F^-1 / b); "E": -log of the smallest eigenvalue;
             "condition": log of the condition number; "widest": the mean log variance of some.
         F: Information about b parameters in units of like size, shape (b, b), positive definite.
-        widest: Which parameters these are, of "widest"; all if None.
+        widest: The parameters of the criterion "widest"; all if None.
 
     Raises:
         SettingsError: If there is no such criterion.

@@ -1,4 +1,4 @@
-"""What a robot may do while it moves: positions, speeds, torques, and how much a motion uses."""
+"""The limits of a robot's motion: position, velocity, torque, ..., and a motion's use of them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from robotid.robot.tree import Joint
 
 __all__ = ["LIMITS", "MotionLimits"]
 
-#: What is limited, in the order of ``MotionLimits.sizes``.
+#: The limited quantities, in the order of ``MotionLimits.sizes``.
 LIMITS = ("position", "velocity", "acceleration", "jerk", "torque", "power")
-_FREE = np.pi  # [rad] either way of a revolute joint freely
+_FREE = np.pi  # [rad] half the range of a continuous joint
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,25 +42,25 @@ class MotionLimits:
         jerk: float | Mapping[str, float] = np.inf,
         power: float | Mapping[str, float] = np.inf,
     ) -> "MotionLimits":
-        """Return the limits that a URDF states, and those stated beside it.
+        """Return the limits stated in a URDF, and those stated in addition.
 
         Args:
             model: The robot.
-            share: How much of the URDF's range, speed and torque is used.
+            share: Usable share of the URDF's range, velocity and torque.
             acceleration: Largest acceleration of all joints, or of some [rad/s^2 or m/s^2].
             jerk: Largest jerk, likewise [rad/s^3 or m/s^3].
             power: Largest mechanical power, likewise [W].
 
         Raises:
-            SettingsError: If a limit that is needed is missing from the URDF, or one is unusable.
+            SettingsError: If the URDF lacks a limit that is needed, or one is not usable.
         """
         if not 0 < share <= 1:
             raise SettingsError(f"share is {share}, wanted more than 0 and at most 1")
         missing = [text for joint in model.limits if (text := _missing(joint))]
         if missing:
             raise SettingsError(
-                f"{Path(model.tree.path).name} states no limit of {listed(missing)}: a motion "
-                "cannot be kept safe without; add <limit lower upper velocity effort> to these "
+                f"{Path(model.tree.path).name} states no limit of {listed(missing)}: without it no "
+                "safe motion can be designed; add <limit lower upper velocity effort> to these "
                 "joints, or lock them"
             )
         middle = [(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits]
@@ -77,7 +77,7 @@ class MotionLimits:
         return cls(np.array(middle), np.array(sizes))
 
     def used(self, q: Array, v: Array, a: Array, jerk: Array, torque: Array) -> Array:
-        """Return how much of each limit a motion uses at each instant, shape (6, N, n), signed.
+        """Return a motion's quantities divided by their limits, signed, shape (6, N, n).
 
         Args:
             q: Joint coordinates, shape (N, n); the others likewise, SI units.
@@ -91,7 +91,7 @@ class MotionLimits:
 
 
 def _missing(joint: Joint) -> str:
-    """Return what the URDF does not state of a joint, in words; empty if nothing."""
+    """Return a joint and the limits that the URDF does not state; empty if none."""
     known = {
         "position": joint.has_limits or joint.type == "continuous",
         "velocity": 0 < joint.velocity < np.inf,
@@ -105,7 +105,7 @@ def _each(model: RobotModel, stated: float | Mapping[str, float], what: str) -> 
     for name, value in by_name.items():
         if name not in model.joints:
             raise SettingsError(
-                f"{what} is stated of {name!r}, which is no joint that moves; joints: "
+                f"{what} is stated for {name!r}, which is not a moving joint; moving joints: "
                 f"{listed(model.joints)}"
             )
         if not value > 0:

@@ -1,4 +1,4 @@
-"""The page of a designed motion: what it is, what it uses of each limit, what it will tell."""
+"""The page of a designed motion: criterion, smallest margin to each limit, expected errors."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -22,25 +22,25 @@ from robotid.versions import __version__
 __all__ = ["write_motion_page"]
 
 _UNITS = ("rad", "rad/s", "rad/s²", "rad/s³", "N m", "W")
-_SLIDING = ("m", "m/s", "m/s²", "m/s³", "N", "W")
-_TONES = 8  # of lines that can be told apart in one chart
-_NAMED = 5  # base parameters that stay open the most
-_SHARP = 0.1  # share of the plausible spread below which one is well known ...
-_OPEN = 0.5  # ... and above which it is open
+_PRISMATIC = ("m", "m/s", "m/s²", "m/s³", "N", "W")
+_TONES = 8  # distinguishable colours of lines in one chart
+_NAMED = 5  # base parameters with the largest expected standard errors that are named
+_SHARP = 0.1  # share of the plausible range below which one is well determined ...
+_OPEN = 0.5  # ... and above which it is undetermined
 _VISIBLE = 1e-3  # change of a criterion that is worth a chart
 _WIDE = 10.0  # ratio of distances from which their axis is logarithmic
 _SOURCES = {
     "data": "by the motion",
     "mixed": "by motion and URDF together",
     "prior": "by the URDF alone",
-    "bound": "by what is physically possible",
+    "bound": "by the bounds of physical consistency",
 }
 _CRITERIA = {
-    "D": "D: −log det of the information, by parameter",
+    "D": "D: −log det of the information matrix, per parameter",
     "A": "A: log of the mean variance",
-    "E": "E: −log of the weakest direction's information",
-    "condition": "log of the information's condition number",
-    "widest": "mean log variance of the quarter of the parameters that was known the least",
+    "E": "E: −log of the smallest eigenvalue of the information matrix",
+    "condition": "log of the condition number of the information matrix",
+    "widest": "mean log variance of the quarter of the parameters with the largest prior variance",
 }
 
 
@@ -51,16 +51,16 @@ def write_motion_page(
     course: Course,
     expected: Preview | Sequence[str],
 ) -> Path:
-    """Write what a designed motion uses and what it will tell, as one HTML file.
+    """Write a designed motion's use of the limits and its expected errors, as one HTML file.
 
-    The file fetches nothing. It is made beside its target and then put in place.
+    The file loads nothing from the network. It is written under a temporary name, then renamed.
 
     Args:
         target: The file to write.
         model: The robot.
         content: What ``robotid excite --json`` prints of the motion.
         course: The motion over time.
-        expected: What is to be expected of it; or sentences that say so.
+        expected: The standard errors expected of it; or sentences that state them.
 
     Returns:
         Path of the file.
@@ -68,25 +68,26 @@ def write_motion_page(
     Raises:
         DataError: If the folder of the target does not exist.
     """
-    told = _expected(expected) if isinstance(expected, Preview) else _paragraphs(expected)
+    errors = _expected(expected) if isinstance(expected, Preview) else _paragraphs(expected)
     sections = {
-        "limits": Section("Limits", _limit_table(model, content, course)),
-        "time": Section("Over time", _over_time(model, content, course)),
-        "expected": Section("What it will tell", told),
+        "limits": Section("Smallest margin to each limit", _limit_table(model, content, course)),
+        "time": Section("Course over time", _over_time(model, content, course)),
+        "expected": Section("Expected standard errors", errors),
     }
     best = [entry[1] for entry in content["history"]]
     if best and max(best) - min(best) > _VISIBLE:
-        sections["design"] = Section("How it was found", _history(content))
-    title = f"{model.name}: excitation trajectory"
-    return write_text(page(title, _head(model, content), sections), target)
+        sections["design"] = Section("Course of the optimisation", _history(content))
+    return write_text(
+        page(f"{model.name}: excitation trajectory", _head(model, content), sections), target
+    )
 
 
 def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
-    """Return what was designed, and how."""
+    """Return the heading, and the criterion and constraints of the design."""
     condition = content["condition_number"]
     how = f"{content['seconds']:.1f} s"
     if content["starts"]:
-        settled = "settled" if content["converged"] else "not settled: more seconds may improve it"
+        settled = "converged" if content["converged"] else "not converged: allow more seconds"
         plural = "start" if content["starts"] == 1 else "starts"
         how += f", {content['starts']} {plural}, {settled}"
     facts = {
@@ -94,26 +95,29 @@ def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
         "joints": f"{len(model.joints)}",
         "criterion": content["criterion"],
         "condition number": (
-            "infinite" if condition is None else f"{condition:,.0f}, in units of the URDF's spread"
+            "infinite"
+            if condition is None
+            else f"{condition:,.0f}, columns scaled by the uncertainty of the URDF's values"
         ),
-        "designed in": how,
+        "computing time": how,
     }
-    said = facts_html({name: escape(value) for name, value in facts.items()})
+    listing = facts_html({name: escape(value) for name, value in facts.items()})
     return (
-        f"<h1>{escape(model.name)}: excitation trajectory</h1>\n{said}"
-        "<p>Torques depend on the URDF's masses and on assumed friction. Play the motion slowly "
-        f'first.</p>\n<p class="note">Written by robotid {__version__}.</p>\n'
+        f"<h1>{escape(model.name)}: excitation trajectory</h1>\n"
+        f"<h2>Criterion and constraints</h2>\n{listing}"
+        "<p>The torques are computed from the URDF's masses and from assumed friction. Execute the "
+        f'motion slowly first.</p>\n<p class="note">Written by robotid {__version__}.</p>\n'
     )
 
 
 def _limit_table(model: RobotModel, content: Mapping[str, Any], course: Course) -> str:
-    """Return the most that is used of each limit, where and when, and what is left."""
+    """Return the largest used share of each limit, its joint and time, and the margin."""
     rows = []
     for kind, entry in content["limits"].items():
         if kind == "collision":
             continue
         joint, k = model.joints.index(entry["where"]), LIMITS.index(kind)
-        unit = (_SLIDING if entry["where"] in model.layout.prismatic else _UNITS)[k]
+        unit = (_PRISMATIC if entry["where"] in model.layout.prismatic else _UNITS)[k]
         rows.append(
             [
                 text(kind),
@@ -125,45 +129,45 @@ def _limit_table(model: RobotModel, content: Mapping[str, Any], course: Course) 
                 text(unit),
             ]
         )
-    headers = ["limit", "most used %", "left %", "joint", "at [s]", "its limit", "unit"]
-    said = (
-        f"<p>100 % is {100 * content['share']:.0f} % of what the URDF states of position, velocity "
-        "and torque, and what was stated of the others. Positions count from the middle of their "
-        "range.</p>\n"
+    headers = ["limit", "largest use %", "margin %", "joint", "at [s]", "value of limit", "unit"]
+    note = (
+        f"<p>100 % of position, velocity and torque is {100 * content['share']:.0f} % of the "
+        "URDF's limit. 100 % of the others is the stated limit. Positions are measured from the "
+        "middle of their range.</p>\n"
     )
-    return said + table("Largest share of each limit", headers, rows) + _collisions(content, course)
+    return note + table("Largest use of each limit", headers, rows) + _collisions(content, course)
 
 
 def _collisions(content: Mapping[str, Any], course: Course) -> str:
-    """Return in words how near the motion comes to a collision."""
+    """Return the smallest margin of the motion to a collision, as a paragraph."""
     entry, contact = content["limits"].get("collision"), course.nearest
     if entry is None or course.clearance is None:
-        return "<p>Collisions were not looked at.</p>\n"
-    said = "No two links can collide."
+        return "<p>Collisions were not checked.</p>\n"
+    words = "No two links can collide."
     if entry["margin"] is not None:
-        kept = entry["kept"]
-        said = (
-            f"Nearest to a collision: {entry['where']} come to "
-            f"{1e3 * (entry['margin'] + kept):.0f} mm at {entry['time']:.2f} s; "
-            f"{1e3 * kept:.0f} mm are kept, between the instants, too."
+        required = entry["kept"]
+        words = (
+            f"Smallest margin to a collision: {entry['where']}, distance "
+            f"{1e3 * (entry['margin'] + required):.0f} mm at {entry['time']:.2f} s. Required: "
+            f"{1e3 * required:.0f} mm, also between the samples."
         )
     elif contact is not None:
-        said = (
-            f"Nearest to a collision: {contact.first} and {contact.second}, "
-            f"{1e3 * contact.distance:.0f} mm apart at {contact.time:.2f} s; "
-            f"{1e3 * contact.kept:.0f} mm are kept."
+        words = (
+            f"Smallest margin to a collision: {contact.first} and {contact.second}, distance "
+            f"{1e3 * contact.distance:.0f} mm at {contact.time:.2f} s. Required: "
+            f"{1e3 * contact.required:.0f} mm."
         )
     if entry["unread"]:
-        said += f" Not looked at, since no shape can be read: {listed(entry['unread'])}."
+        words += f" Not checked, since no shape can be read: {listed(entry['unread'])}."
     if entry["left_alone"]:
-        said += f" Made to touch, and not looked at: {listed(entry['left_alone'])}."
+        words += f" Not checked, since in contact by design: {listed(entry['left_alone'])}."
     if entry["built_near"]:
-        said += f" Built near each other, and kept apart by less: {listed(entry['built_near'])}."
-    return f"<p>{escape(said)}</p>\n"
+        words += f" Close by design, with a smaller clearance: {listed(entry['built_near'])}."
+    return f"<p>{escape(words)}</p>\n"
 
 
 def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) -> str:
-    """Return charts of what is used of each limit, of what has none, and of distances."""
+    """Return charts of the use of each limit, of unlimited quantities, and of distances."""
     charts = []
     for k, kind in enumerate(LIMITS):
         is_limited = np.isfinite(course.limits.sizes[k])
@@ -178,28 +182,28 @@ def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) ->
 
 
 def _share_chart(model: RobotModel, course: Course, kind: str, joints: Array) -> str:
-    """Return the chart of what joints use of a limit."""
+    """Return the chart of the joints' use of a limit."""
     bound = np.full(len(course.t), 100.0)
     lines = _lines(model, 100.0 * course.used[LIMITS.index(kind)], joints)
     edges = [Series(label, sign * bound, "text") for label, sign in (("limit", 1), ("−limit", -1))]
     chart = Chart(
-        f"{kind} of each joint as a share of its limit", course.t, (*edges, *lines),
+        f"{kind} of each joint relative to its limit", course.t, (*edges, *lines),
         "time [s]", "% of the limit", link="time",
     )  # fmt: skip
     return chart_html(chart, f"{kind.capitalize()}, % of the limit")
 
 
 def _free_chart(model: RobotModel, course: Course, kind: str, joints: Array) -> str:
-    """Return the chart of what has no limit, in its unit."""
+    """Return the chart of a quantity without limit, in its unit."""
     k = LIMITS.index(kind)
-    slides = [model.joints[j] in model.layout.prismatic for j in joints]
-    units = [_UNITS[k]] * (not all(slides)) + [_SLIDING[k]] * any(slides)
+    prismatic = [model.joints[j] in model.layout.prismatic for j in joints]
+    units = [_UNITS[k]] * (not all(prismatic)) + [_PRISMATIC[k]] * any(prismatic)
     unit, lines = " or ".join(units), _lines(model, course.values[k], joints)
     chart = Chart(
         f"{kind} of each joint", course.t, tuple(lines), "time [s]", f"{kind} [{unit}]",
         link="time",
     )  # fmt: skip
-    return chart_html(chart, f"{kind.capitalize()}, of which no limit was stated")
+    return chart_html(chart, f"{kind.capitalize()} without a stated limit")
 
 
 def _lines(model: RobotModel, values: Array, joints: Array) -> list[Series]:
@@ -209,16 +213,16 @@ def _lines(model: RobotModel, values: Array, joints: Array) -> list[Series]:
 
 
 def _distance_chart(model: RobotModel, course: Course, clearance: Clearance) -> str:
-    """Return the chart of distances between links, and to what stands around them."""
+    """Return the chart of distances between links, and to the floor and boxes."""
     course = course.thinned
     own = np.array([b in model.tree.links and a in model.tree.links for a, b in clearance.named])
     series = [Series("clearance", np.full(len(course.t), 1e3 * clearance.least), "text")]
     changes = course.changes(clearance)
-    near = np.isfinite(clearance.room)
+    near = np.isfinite(clearance.slack)
     groups = (
         ("links", own & ~near, "tone-1"),
         ("floor and boxes", ~own, "tone-2"),
-        ("links built near each other", near, "tone-3"),
+        ("links close by design", near, "tone-3"),
     )
     for label, chosen, tone in groups:
         if (chosen & changes).any():
@@ -226,48 +230,48 @@ def _distance_chart(model: RobotModel, course: Course, clearance: Clearance) -> 
     low, high = (float(f([f(x.y) for x in series])) for f in (np.min, np.max))
     is_wide = low > 0 and high > _WIDE * low
     chart = Chart(
-        "distance of the two hulls that are nearest", course.t, tuple(series), "time [s]",
+        "distance of the two nearest hulls", course.t, tuple(series), "time [s]",
         "distance [mm]", link="time", logarithmic="y" if is_wide else "",
     )  # fmt: skip
     return chart_html(
-        chart, "Least distance between two links, and to floor and boxes, where it changes"
+        chart, "Smallest distance between two links, and to floor and boxes, where it changes"
     )
 
 
 def _expected(preview: Preview) -> str:
-    """Return in words what is to be expected of a log of the motion."""
+    """Return the standard errors expected of a log of the motion, as paragraphs."""
     found, noise = preview.expected, preview.noise
-    left = np.minimum(preview.base_error / preview.plausible, 1.0)
-    order = np.argsort(-left, kind="stable")[:_NAMED]
-    open_ones = [
-        f"{found.mapping.base_names[k]} {100 * left[k]:.0f} %" for k in order if left[k] > _OPEN
+    ratio = np.minimum(preview.base_error / preview.plausible, 1.0)
+    order = np.argsort(-ratio, kind="stable")[:_NAMED]
+    least = [
+        f"{found.mapping.base_names[k]} {100 * ratio[k]:.0f} %" for k in order if ratio[k] > _OPEN
     ]
     counts = {source: found.sources.count(source) for source in dict.fromkeys(found.sources)}
     sources = [f"{count} {_SOURCES[source]}" for source, count in counts.items()]
     stds = [f"{joint} {s:.2g}" for joint, s in zip(found.model.joints, noise.std, strict=True)]
-    said = [
+    sentences = [
         f"{preview.words}.",
-        f"Of {len(left)} base parameters, {int((left < _SHARP).sum())} are expected with a "
-        "standard error below a tenth of what is plausible of them, "
-        f"{int((left > _OPEN).sum())} above half of it.",
-        f"The least certain, as shares of that: {', '.join(open_ones)}." if open_ones else "",
-        f"The standard parameters will be told: {listed(sources)}.",
-        f"Noise of the torque, standard deviation {listed(dict.fromkeys(noise.origins))}: "
+        f"Of {len(ratio)} base parameters, {int((ratio < _SHARP).sum())} have an expected standard "
+        f"error below 10 % of their plausible range, {int((ratio > _OPEN).sum())} above 50 %.",
+        f"Largest, in % of the plausible range: {', '.join(least)}." if least else "",
+        f"The standard parameters will be determined: {listed(sources)}.",
+        f"Standard deviation of the torque noise, {listed(dict.fromkeys(noise.origins))}: "
         f"{', '.join(stds)} (N m or N).",
     ]
-    return _paragraphs(said)
+    return _paragraphs(sentences)
 
 
-def _paragraphs(said: Sequence[str]) -> str:
-    return "".join(f"<p>{escape(words)}</p>\n" for words in said if words)
+def _paragraphs(sentences: Sequence[str]) -> str:
+    return "".join(f"<p>{escape(words)}</p>\n" for words in sentences if words)
 
 
 def _history(content: Mapping[str, Any]) -> str:
-    """Return the chart of the best criterion against the time that the design took."""
+    """Return the chart of the best criterion against the computing time."""
     seconds, best = np.array(content["history"]).T
     chart = Chart(
-        "the best motion's criterion against the time of design", seconds,
+        "criterion of the best motion against the computing time", seconds,
         (Series("best so far", best, "tone-1"),),
-        "design time [s]", "criterion",
+        "computing time [s]", "criterion",
     )  # fmt: skip
-    return chart_html(chart, f"Criterion {escape(_CRITERIA[content['criterion']])}; less is better")
+    criterion = escape(_CRITERIA[content["criterion"]])
+    return chart_html(chart, f"Criterion {criterion}; smaller is better")

@@ -1,4 +1,4 @@
-"""Multipliers of the augmented Lagrangian that keeps a designed motion within its limits.
+"""Multipliers of the augmented Lagrangian that enforces the limits of a designed motion.
 
 References:
     Nocedal, Wright (2006), Numerical Optimization, section 17.4.
@@ -12,19 +12,19 @@ from robotid._typing import Array
 
 __all__ = ["SOFT", "SPARE", "Multipliers"]
 
-#: Share of limits that a design leaves for what lies between its instants.
+#: Share of limits reserved for the motion between the samples of a design.
 SPARE = 0.003
-#: Distance that weighs as much as a whole limit [m].
+#: Distance whose violation has the cost of a whole limit [m].
 SOFT = 0.05
 _GROWTH = 3.0  # of the weight from one round to the next
 
 
 @dataclass(frozen=True, eq=False)
 class Multipliers:
-    """Multipliers of the limits at each instant, and of distances.
+    """Multipliers of the limits at each sample, and of distances.
 
     Attributes:
-        weight: Of what is violated.
+        weight: Weight of the violations.
         limits: Shape (6, N, n); 0 at first.
         distances: Shape (pairs, N).
     """
@@ -34,16 +34,16 @@ class Multipliers:
     distances: Array | float = 0.0
 
     def finer(self, times: int) -> "Multipliers":
-        """Return the same on a grid of as many times the instants.
+        """Return the same on a finer grid.
 
         Args:
-            times: How many times.
+            times: Ratio of the numbers of intervals.
         """
         limits, distances = _between(self.limits, times), _between(self.distances, times)
         return Multipliers(self.weight / times, limits, distances)
 
-    def heavier(self) -> "Multipliers":
-        """Return the same with more weight."""
+    def increased(self) -> "Multipliers":
+        """Return the same with a larger weight."""
         return replace(self, weight=_GROWTH * self.weight)
 
     def raised(self, used: Array, distance: Array | None, aim: Array) -> "Multipliers":
@@ -51,14 +51,14 @@ class Multipliers:
 
         Args:
             used: Shares of limits used, shape (6, N, n).
-            distance: Distances of pairs, shape (pairs, N) [m]; None: they are not looked at.
-            aim: Distances aimed at, shape (pairs, 1) [m].
+            distance: Distances of pairs, shape (pairs, N) [m]; None: they are not checked.
+            aim: Required distances, shape (pairs, 1) [m].
         """
         distances = 0.0 if distance is None else self.of_distances(distance, aim)[1]
         return replace(self, limits=self.of_limits(used)[1], distances=distances)
 
     def of_limits(self, used: Array) -> tuple[float, Array]:
-        """Return the cost of limits and its slope by what they are over, shape (6, N, n).
+        """Return the cost of limits and its derivative by their violations, shape (6, N, n).
 
         Args:
             used: Shares of limits used, shape (6, N, n).
@@ -66,19 +66,19 @@ class Multipliers:
         return self._cost(used**2 / (1.0 - SPARE) ** 2 - 1.0, self.limits)
 
     def of_distances(self, distance: Array, aim: Array) -> tuple[float, Array]:
-        """Return the cost of distances and its slope by what they are short, shape (pairs, N).
+        """Return the cost of distances and its derivative by their deficits, shape (pairs, N).
 
         Args:
             distance: Distances of pairs, shape (pairs, N) [m].
-            aim: Distances aimed at, shape (pairs, 1) [m].
+            aim: Required distances, shape (pairs, 1) [m].
         """
         return self._cost((aim - distance) / SOFT, self.distances)
 
-    def reach(self, aim: Array) -> Array:
+    def distance_without_cost(self, aim: Array) -> Array:
         """Return the distances from which there is no cost, shape (pairs, N) or (pairs, 1) [m].
 
         Args:
-            aim: Distances aimed at, shape (pairs, 1) [m].
+            aim: Required distances, shape (pairs, 1) [m].
         """
         return aim + SOFT / self.weight * self.distances
 
@@ -89,7 +89,7 @@ class Multipliers:
 
 
 def _between(values: Array | float, times: int) -> Array | float:
-    """Return multipliers of instants, axis 1, spread over as many times the intervals."""
+    """Return multipliers of samples, axis 1, interpolated on as many times the intervals."""
     if isinstance(values, float):
         return values
     share = np.arange(times).reshape(-1, *[1] * (values.ndim - 2)) / times

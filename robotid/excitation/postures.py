@@ -1,4 +1,4 @@
-"""Postures in which a robot can rest: within its limits, and clear of what it may hit."""
+"""Postures that a robot can hold: within its limits, and without collisions."""
 
 from dataclasses import dataclass
 
@@ -14,19 +14,19 @@ from robotid.findings import listed
 
 __all__ = ["Postures"]
 
-_TRIED = 200  # random postures until one is found that the robot can rest in ...
+_TRIED = 200  # random postures tried for one that the robot can hold ...
 _AT_ONCE = 10  # ... so many at a time
-_REPAIRS = 300  # joints that are redrawn of a posture that breaks a limit, one after another
+_REPAIRS = 300  # joints that are redrawn of a posture that violates a limit, one after another
 
 
 @dataclass(frozen=True, eq=False)
 class Postures:
-    """Random postures, and those of them that keep limits and distances at rest.
+    """Random postures, and those of them that satisfy limits and distances at rest.
 
     Attributes:
         information: The rows of the robot's base problem, which give its torque.
-        limits: What the robot may do.
-        clearance: What keeps it from collisions; None: they are not looked at.
+        limits: The robot's limits.
+        clearance: The distances to collisions; None: they are not checked.
     """
 
     information: MotionInformation
@@ -34,32 +34,32 @@ class Postures:
     clearance: Clearance | None = None
 
     def resting(self, rng: np.random.Generator, tried: int = _TRIED) -> Array:
-        """Return those of random postures that keep limits and distances at rest, shape (k, n).
+        """Return the random postures that satisfy limits and distances at rest, shape (k, n).
 
         Args:
-            rng: Source of the postures.
-            tried: How many are tried.
+            rng: Random generator of the postures.
+            tried: Number of random postures.
 
         Raises:
             SettingsError: If none of them does.
         """
         q = self._drawn(rng, tried)
-        kept: Array = q[self.can_rest(q)]
-        if not len(kept):
-            kept = self._repaired(q[:_AT_ONCE], rng)
-        if not len(kept):
+        found: Array = q[self.can_rest(q)]
+        if not len(found):
+            found = self._repaired(q[:_AT_ONCE], rng)
+        if not len(found):
             raise SettingsError(self._why_not(*self._at_rest(q)))
-        return kept
+        return found
 
     def _repaired(self, q: Array, rng: np.random.Generator) -> Array:
-        """Return the postures that keep all limits once joints of what they broke are redrawn.
+        """Return the postures that satisfy all limits after joints with violations are redrawn.
 
-        Of each posture one such joint is redrawn at a time; what breaks more is not kept. Robots of
-        many joints have postures at rest, but one in a million random ones is one.
+        One such joint of each posture is redrawn at a time; a change that increases the violation
+        is discarded. Of a robot with many joints, one random posture in a million is feasible.
 
         Args:
             q: Postures, shape (N, n) [rad or m].
-            rng: Source of the joints and of their positions.
+            rng: Random generator of the joints and of their positions.
 
         References:
             Selman, Kautz, Cohen (1994), Noise strategies for improving local search.
@@ -74,13 +74,13 @@ class Postures:
             other, rows = q.copy(), np.arange(len(q))
             other[rows, joint] = self._drawn(rng, len(q))[rows, joint]
             now = self._broken_by_joint(other)
-            is_kept = now.sum(axis=1) <= total
-            q[is_kept], broken[is_kept] = other[is_kept], now[is_kept]
-        kept: Array = q[self.can_rest(q)]
-        return kept
+            is_better = now.sum(axis=1) <= total
+            q[is_better], broken[is_better] = other[is_better], now[is_better]
+        found: Array = q[self.can_rest(q)]
+        return found
 
     def _broken_by_joint(self, q: Array) -> Array:
-        """Return how much of what postures break each joint has part in, shape (N, n)."""
+        """Return each joint's share in the violations of postures, shape (N, n)."""
         used, margins = self._at_rest(q)
         found = np.maximum(used - 1.0, 0.0).sum(axis=0) @ self.information.chains
         if self.clearance is not None:
@@ -94,30 +94,30 @@ class Postures:
         """Return the first of ``resting``, which are tried a few at a time, shape (n,).
 
         Args:
-            rng: Source of the postures.
+            rng: Random generator of the postures.
 
         Raises:
-            SettingsError: If none of them is one.
+            SettingsError: If no posture is feasible.
         """
         for _ in range(_TRIED // _AT_ONCE):
             q = self._drawn(rng, _AT_ONCE)
-            kept: Array = q[self.can_rest(q)]
-            if len(kept):
+            found: Array = q[self.can_rest(q)]
+            if len(found):
                 break
         else:
-            kept = self.resting(rng)
-        first: Array = kept[0]
+            found = self.resting(rng)
+        first: Array = found[0]
         return first
 
     def _drawn(self, rng: np.random.Generator, count: int) -> Array:
         """Return random postures, shape (count, n) [rad or m]."""
-        reach = rng.uniform(-0.8, 0.8, (count, len(self.limits.middle)))
-        reach[:, self.limits.sizes[0] > 2.0] *= 0.6
-        q: Array = self.limits.middle + reach * self.limits.sizes[0]
+        share = rng.uniform(-0.8, 0.8, (count, len(self.limits.middle)))
+        share[:, self.limits.sizes[0] > 2.0] *= 0.6
+        q: Array = self.limits.middle + share * self.limits.sizes[0]
         return q
 
     def can_rest(self, q: Array) -> Array:
-        """Return whether postures keep limits and distances at rest, shape (N,), bool.
+        """Return whether postures satisfy limits and distances at rest, shape (N,), bool.
 
         Args:
             q: Postures, shape (N, n) [rad or m].
@@ -128,40 +128,41 @@ class Postures:
         return can
 
     def _at_rest(self, q: Array) -> tuple[Array, Array]:
-        """Return shares of limits that postures use, (6, N, n), and margins, (pairs, N) [m]."""
+        """Return used shares of limits of postures, (6, N, n), and margins, (pairs, N) [m]."""
         still = np.zeros_like(q)
         rows = self.information.rows(q, still, still)
         used = np.abs(self.limits.used(q, still, still, still, self.information.torque(rows)))
         return used, self._margins(q)
 
     def _margins(self, q: Array) -> Array:
-        """Return margins of distances with what a design spares, shape (pairs, N) [m]."""
+        """Return margins of distances with the reserve of a design, shape (pairs, N) [m]."""
         if self.clearance is None:
             return np.zeros((0, len(q)))
         return self.clearance.margins(self.clearance.placed(q), 1.0)
 
     def _why_not(self, used: Array, margins: Array) -> str:
-        """Return what leaves no posture: a limit or a distance alone, or several together."""
+        """Return what rules out all postures: one limit or distance, or several together."""
         broken = sorted(self._broken(used, margins), key=lambda entry: -entry[0])
-        tried = f"of {used.shape[1]} random postures none can be held at rest"
+        tried = f"none of {used.shape[1]} random postures is feasible at rest"
         share, alone, _ = broken[0]
         if share == 1.0:
             return f"{tried}: {alone}"
         most = [f"{words} in {100 * share:.0f} %" for share, _, words in broken]
         return (
-            f"{tried}: each breaks a limit or a distance, though none of them breaks all. Most "
-            f"often {listed(most, 3)}; narrow the limits of these joints, lock joints that need "
-            "not move, lower the clearance, or --clearance none to leave collisions unlooked at"
+            f"{tried}: each violates a limit or a distance, wanted one without violations. Most "
+            f"frequent: {listed(most, 3)}. Narrow the position limits of these joints, lock joints "
+            "that need not move, lower the clearance, or omit the collision check (--clearance "
+            "none)"
         )
 
     def _broken(self, used: Array, margins: Array) -> list[tuple[float, str, str]]:
-        """Return each limit and distance that postures break: their share, and two wordings."""
+        """Return each violated limit and distance: its share of the postures, and two wordings."""
         found, names = [], self.information.model.joints
         for kind, joint in np.argwhere((used > 1.0).any(axis=1)).tolist():
             own = used[kind, :, joint]
             least = (
-                f"{names[joint]} needs {_percent(own.min())} % of its {LIMITS[kind]} limit at the "
-                "least; state the limits that the robot has, or the load that it carries"
+                f"{names[joint]} needs at least {_percent(own.min())} % of its {LIMITS[kind]} "
+                "limit; state the robot's actual limits, or its actual payload"
             )
             some = f"{names[joint]} needs more than its {LIMITS[kind]} limit"
             found.append((float(np.mean(own > 1.0)), least, some))
@@ -169,11 +170,11 @@ class Postures:
             return found
         for pair in np.flatnonzero((margins < 0.0).any(axis=1)).tolist():
             two = " and ".join(self.clearance.named[pair])
-            wanted = float(self.clearance.kept[pair] + self.clearance.spare[pair, 0])
+            wanted = float(self.clearance.required[pair] + self.clearance.spare[pair, 0])
             most = (
-                f"in the best of them {two} are {1e3 * (margins[pair].max() + wanted):.1f} mm "
-                f"apart, wanted {1e3 * wanted:.1f} mm; lower the clearance, or move the floor and "
-                "the boxes"
+                f"the distance of {two} is {1e3 * (margins[pair].max() + wanted):.1f} mm at most, "
+                f"wanted {1e3 * wanted:.1f} mm; lower the clearance, or move the floor and the "
+                "boxes"
             )
             some = f"{two} are nearer than {1e3 * wanted:.1f} mm"
             found.append((float(np.mean(margins[pair] < 0.0)), most, some))

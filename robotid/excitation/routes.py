@@ -1,4 +1,4 @@
-"""Motions from place to place: slow sweeps that show friction, stands that show gravity."""
+"""Motions from posture to posture: slow sweeps for friction, static postures for gravity."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,31 +14,32 @@ from robotid.simulation.motions import Motion
 
 __all__ = ["Route", "design_stands", "design_sweeps"]
 
-_RAMP = 0.25  # [s] in which a sweep reaches its speed
+_RAMP = 0.25  # [s] until a sweep has its speed
 _SPEEDS = (0.03, 0.1, 0.3, 0.8)  # of sweeps, as shares of the joint's largest speed
-_STROKE = 3.0  # [s] that a sweep lasts at most ...
-_REACH = 0.8  # ... and share of the joint's range that it covers at most
-_HOLD = 2.0  # [s] that a stand lasts
-_BRISK = 0.5  # share of the largest speed at which the robot goes from stand to stand
-_CANDIDATES = 400  # random postures among which stands are chosen ...
-_LOOKED_AT = 20  # ... and those about which sweeps are thought of
-_PLACES = 41  # of a joint's range at which it is asked whether it can go there
+_STROKE = 3.0  # [s] largest duration of a sweep ...
+_RANGE = 0.8  # ... and largest share of the joint's free range
+_HOLD = 2.0  # [s] at each static posture
+_BRISK = 0.5  # share of the largest speed between static postures
+_CANDIDATES = 400  # random postures among which static ones are chosen ...
+_SWEPT = 20  # ... and those at which sweeps are tried
+_PLACES = 41  # positions of a joint's range at which its free range is checked
 _TRIES = 8  # sweeps, each shorter by a fifth than the one before
-_RATE = 100.0  # [Hz] of the instants at which limits are looked at
+_RATE = 100.0  # [Hz] of the samples at which limits are checked
 
 
 @dataclass(frozen=True, eq=False)
 class Route(Motion):
-    """A motion from place to place, straight in the joints, at rest at each for a while.
+    """A motion through postures, on straight lines in joint space, at rest at each posture.
 
-    On its way the speed rises smoothly, stays and falls: the way s of duration 1 has the speed
-    V (10 x^3 - 15 x^4 + 6 x^5) with x = u / r while u < r, V = 1 / (1 - r) then, and the same back.
+    On a line the speed rises smoothly, is constant and falls: the path parameter s of duration 1
+    has the speed V (10 x^3 - 15 x^4 + 6 x^5) with x = u / r while u < r, then V = 1 / (1 - r), and
+    falls symmetrically.
 
     Attributes:
-        places: Shape (K, n) [rad or m].
-        times: How long each of the ways takes, shape (K - 1,) [s].
+        places: The postures, shape (K, n) [rad or m].
+        times: Duration of each line, shape (K - 1,) [s].
         ramps: Share r of it in which the speed rises, shape (K - 1,), at most 0.5.
-        holds: How long it rests at each place, shape (K,) [s].
+        holds: Time at rest at each posture, shape (K,) [s].
     """
 
     places: Array
@@ -48,7 +49,7 @@ class Route(Motion):
 
     @cached_property
     def _starts(self) -> Array:
-        """When each way begins, and the last ends, shape (K,) [s]."""
+        """Start of each line, and end of the last one, shape (K,) [s]."""
         return np.cumsum(np.r_[self.holds[0], self.times[:-1] + self.holds[1:-1], self.times[-1]])
 
     @property
@@ -79,57 +80,58 @@ class Route(Motion):
 def design_sweeps(
     designer: Designer, rng: np.random.Generator, speeds: Sequence[float] = _SPEEDS
 ) -> Design:
-    """Return a motion in which joint after joint goes to and fro at steady speeds.
+    """Return a motion in which one joint after another moves to and fro at constant speeds.
 
-    Each joint sweeps about one posture, through it both ways, at each speed; the others rest.
+    Each joint sweeps about one posture, through it in both directions, at each speed; the others
+    rest.
 
     Args:
-        designer: What is to be told, within which limits.
-        rng: Source of the posture.
+        designer: The parameters and the limits.
+        rng: Random generator of the posture.
         speeds: Shares of each joint's largest speed.
 
     Raises:
         SettingsError: If no posture is found about which every joint can sweep.
     """
-    postures = designer.postures.resting(rng, _CANDIDATES)[:_LOOKED_AT]
-    rooms = [_room(designer, posture) for posture in postures]  # (n, 2) each
-    best = int(np.argmax([(room.sum(axis=1) / designer.limits.sizes[0]).min() for room in rooms]))
-    share = _REACH
+    postures = designer.postures.resting(rng, _CANDIDATES)[:_SWEPT]
+    ranges = [_free_range(designer, posture) for posture in postures]  # (n, 2) each
+    best = int(np.argmax([(own.sum(axis=1) / designer.limits.sizes[0]).min() for own in ranges]))
+    share = _RANGE
     for _ in range(_TRIES):
-        route = _sweeps(designer, postures[best], share * rooms[best], speeds)
+        route = _sweeps(designer, postures[best], share * ranges[best], speeds)
         design = designer.examined(route, route.duration, _RATE)
-        if _is_kept(design):
+        if _is_feasible(design):
             return design
         share *= 0.8
     raise SettingsError(
-        f"of {len(postures)} random postures there is none about which every joint can sweep: "
+        f"about none of {len(postures)} random postures every joint can sweep: "
         f"{_why(design, designer)}; lower the share or the clearance"
     )
 
 
-def _room(designer: Designer, posture: Array) -> Array:
-    """Return how far each joint can go down and up from a posture, shape (n, 2) [rad or m]."""
+def _free_range(designer: Designer, posture: Array) -> Array:
+    """Return each joint's free range below and above a posture, shape (n, 2) [rad or m]."""
     limits, n = designer.limits, len(posture)
     low, high = limits.middle - limits.sizes[0], limits.middle + limits.sizes[0]
     ways = np.linspace(low, high, _PLACES).T  # (n, places)
     q = np.repeat(posture[None], n * _PLACES, axis=0).reshape(n, _PLACES, n)
     q[np.arange(n), :, np.arange(n)] = ways
-    is_kept = designer.postures.can_rest(q.reshape(-1, n)).reshape(n, _PLACES)
-    room = np.zeros((n, 2))
-    for j, (way, kept) in enumerate(zip(ways, is_kept, strict=True)):
-        blocked = way[~kept]
+    are_free = designer.postures.can_rest(q.reshape(-1, n)).reshape(n, _PLACES)
+    free = np.zeros((n, 2))
+    for j, (way, is_free) in enumerate(zip(ways, are_free, strict=True)):
+        blocked = way[~is_free]
         below, above = blocked[blocked < posture[j]], blocked[blocked > posture[j]]
-        room[j, 0] = posture[j] - below.max(initial=low[j])
-        room[j, 1] = above.min(initial=high[j]) - posture[j]
-    return room
+        free[j, 0] = posture[j] - below.max(initial=low[j])
+        free[j, 1] = above.min(initial=high[j]) - posture[j]
+    return free
 
 
-def _sweeps(designer: Designer, posture: Array, room: Array, speeds: Sequence[float]) -> Route:
+def _sweeps(designer: Designer, posture: Array, free: Array, speeds: Sequence[float]) -> Route:
     places, times, ramps = [posture], [], []
     for j, fastest in enumerate(designer.limits.sizes[1]):
         for share in speeds:
             speed = share * fastest
-            down, up = np.minimum(room[j], speed * _STROKE / 2)
+            down, up = np.minimum(free[j], speed * _STROKE / 2)
             for to in (up, -down, 0.0):
                 place = posture.copy()
                 place[j] += to
@@ -142,18 +144,18 @@ def _sweeps(designer: Designer, posture: Array, room: Array, speeds: Sequence[fl
 
 
 def design_stands(designer: Designer, rng: np.random.Generator, count: int = 20) -> Design:
-    """Return a motion that rests at postures whose gravity tells the most, one after the other.
+    """Return a motion that rests at the postures whose gravity torques give the most information.
 
-    Postures are taken one by one from random ones, each that which adds the most to log det of the
-    information of all so far; the next is the nearest of them.
+    The postures are chosen one by one from random ones: each adds the most to log det of the
+    information of those before. The motion goes from each to the nearest that is not visited yet.
 
     Args:
-        designer: What is to be told, within which limits.
-        rng: Source of the postures.
-        count: How many stands.
+        designer: The parameters and the limits.
+        rng: Random generator of the postures.
+        count: Number of static postures.
 
     Raises:
-        SettingsError: If there are too few postures, or no way between them is clear.
+        SettingsError: If there are too few postures, or no line between them is collision-free.
 
     References:
         Fedorov (1972), Theory of Optimal Experiments.
@@ -181,30 +183,30 @@ def design_stands(designer: Designer, rng: np.random.Generator, count: int = 20)
 
 
 def _visited(designer: Designer, places: Array) -> Design:
-    """Return the motion from place to place; a place that cannot be reached clearly is left out."""
-    kept = [places[0]]
+    """Return the motion through postures, except those on whose line a limit is violated."""
+    visited = [places[0]]
     for place in places[1:]:
-        leg = _legs(designer, np.array([kept[-1], place]))
-        if _is_kept(designer.examined(leg, leg.duration, _RATE)):
-            kept.append(place)
-    if len(kept) < 2:
+        leg = _legs(designer, np.array([visited[-1], place]))
+        if _is_feasible(designer.examined(leg, leg.duration, _RATE)):
+            visited.append(place)
+    if len(visited) < 2:
         raise SettingsError(
-            "no posture can be reached from another one without a collision or beyond a limit; "
-            "lower the share or the clearance"
+            "every line between two postures has a collision or exceeds a limit; lower the share "
+            "or the clearance"
         )
-    route = _legs(designer, np.array(kept))
+    route = _legs(designer, np.array(visited))
     return designer.examined(route, route.duration, _RATE)
 
 
 def _legs(designer: Designer, places: Array) -> Route:
-    """Return the motion from place to place, at rest for 2 s at each."""
+    """Return the motion through postures, at rest for 2 s at each."""
     speed = _BRISK * designer.limits.sizes[1]
     times = 2.0 * np.abs(np.diff(places, axis=0) / speed).max(axis=1)
     times = np.maximum(times, 1.0)
     return Route(places, times, np.full(len(times), 0.5), np.full(len(places), _HOLD))
 
 
-def _is_kept(design: Design) -> bool:
+def _is_feasible(design: Design) -> bool:
     is_clear = design.contact is None or design.contact.margin >= 0.0
     return bool(design.used.max() <= 1.0 and is_clear)
 

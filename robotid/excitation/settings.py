@@ -1,4 +1,4 @@
-"""What motion is wanted: the settings of ``robotid excite``."""
+"""The settings of ``robotid excite``."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ from robotid.simulation.settings import Payload
 
 __all__ = ["FARTHEST", "ROUTES", "MotionSettings"]
 
-#: Kinds of motion that go from place to place.
+#: Kinds of motion from posture to posture.
 ROUTES = ("sweeps", "stands")
-#: [m] Distance within which things stand around a robot.
+#: [m] Largest coordinate of an obstacle.
 FARTHEST = 1e3
 _SIZES = 1e-9, 1e12  # of limits and noise, in any unit
 
@@ -26,59 +26,64 @@ _PLACE = Range(f"at most {FARTHEST:g} m", lambda x: abs(x) <= FARTHEST)
 
 @dataclass(frozen=True)
 class MotionSettings(Settings):
-    """What motion is wanted."""
+    """Kind, criterion and constraints of the motion."""
 
     kind: str = setting(
         "fourier",
-        "of motion: sweeps show friction, stands gravity, payload what hangs on a link; default: "
-        "fourier",
+        "kind of motion: sweeps for friction, stands for gravity, payload for the payload of a "
+        "link; default: fourier",
         among=("fourier", "bspline", "payload", *ROUTES),
     )
     duration: float = setting(
-        10.0, "length [s]; sweeps and stands take what they need", within=_from(0.1, 3600.0, " s")
+        10.0, "length [s] of fourier, bspline and payload motions", within=_from(0.1, 3600.0, " s")
     )
     harmonics: int = setting(
-        5, "of the series; B-splines have twice as many pieces", within=_from(2, 100)
+        5,
+        "harmonics of the Fourier series; B-splines have twice as many pieces",
+        within=_from(2, 100),
     )
     criterion: str | None = setting(
         None,
-        "of the information: D (volume), A (mean), E (weakest), condition, or widest (the quarter "
-        "that RESULT knows the least); default: widest with --given, else D",
+        "optimality criterion: D (determinant of the information), A (mean variance), E (smallest "
+        "eigenvalue), condition (number), or widest (the quarter of the parameters with the "
+        "largest variance in RESULT); default: widest with --given, else D",
         among=("D", "A", "E", "condition", "widest"),
     )
-    share: float = setting(0.9, "of the URDF's limits", within=_from(1e-3, 1.0, " of the limits"))
+    share: float = setting(
+        0.9, "usable share of the URDF's limits", within=_from(1e-3, 1.0, " of the limits")
+    )
     acceleration: Mapping[str, float] = setting(
         {}, "largest acceleration of a joint [rad/s^2 or m/s^2]"
     )
     jerk: Mapping[str, float] = setting({}, "largest jerk of a joint [rad/s^3 or m/s^3]")
     power: Mapping[str, float] = setting({}, "largest power of a joint [W]")
     clearance: float | None = setting(
-        0.02, "distance kept from collisions [m], or none to leave them unlooked at", within=_PLACE
+        0.02, "smallest distance to a collision [m]; none: no collision check", within=_PLACE
     )
     floor: float | None = setting(
         None, "height of the floor in the root link's frame [m]", within=_PLACE
     )
-    boxes: Sequence[Any] = setting(
-        (), "a box beside the robot, from its lower to its upper corner [m]"
-    )
+    boxes: Sequence[Any] = setting((), "obstacle: a box, from its lower to its upper corner [m]")
     noise: Mapping[str, float] = setting({}, "standard deviation of a joint's torque [N m or N]")
     seed: int = setting(
         0,
-        "of the random starts",
+        "seed of the random starts",
         within=Range("0 or a positive whole number", lambda x: 0 <= x < 2**63),
     )
-    starts: int = setting(3, "random starts that are followed to the end", within=_from(1, 1000))
+    starts: int = setting(3, "random starts of the optimisation", within=_from(1, 1000))
     seconds: float = setting(
         float("inf"),
-        "time after which the best so far is taken [s]",
+        "limit of the computing time [s]; the best motion found by then is written",
         within=Range("0.001 or more s", lambda x: x >= 1e-3),
     )
     points: float = setting(
-        100.0, "rows per second that are written", within=_from(0.1, 1e5, " rows per second")
+        100.0, "rows per second of the file", within=_from(0.1, 1e5, " rows per second")
     )
-    payload: Payload = setting(Payload(), "what hangs on which link, as far as it is known")
+    payload: Payload = setting(Payload(), "link, mass and centre of mass of the payload, if known")
     moving: Sequence[str] = setting(
-        (), "joints that move for a payload, by comma; default: the fewest that suffice"
+        (),
+        "joints that move for payload identification, separated by commas; default: the fewest "
+        "that suffice",
     )
 
     def __post_init__(self) -> None:
@@ -91,6 +96,5 @@ class MotionSettings(Settings):
                     )
         if self.kind != "payload" and (self.moving or self.payload != Payload()):
             raise SettingsError(
-                f"a payload or joints that move are stated, but kind is {self.kind!r}; wanted "
-                "payload"
+                f"a payload or moving joints are stated, but kind is {self.kind!r}, wanted payload"
             )

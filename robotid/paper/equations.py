@@ -1,6 +1,6 @@
 """The equations of the paper: dynamics linear in their parameters, control, proximity, update.
 
-The formulas take leading axes, so that many runs go at once: "..." stands for () or (R,).
+The formulas accept leading axes for several runs together: "..." stands for () or (R,).
 """
 
 from collections.abc import Sequence
@@ -29,16 +29,16 @@ __all__ = [
     "torque",
 ]
 
-#: Sign of the second term of (23): minus makes it a gradient, plus is what the paper prints.
+#: Sign of the second term of (23): with minus it is a gradient, plus is printed in the paper.
 Sign: TypeAlias = Literal["corrected", "printed"]
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """The bounded set Omega in which the parameters are known to lie: a box.
+    """The bounded set Omega of the parameters: a box.
 
     Attributes:
-        lower: Least value of each parameter, shape (c,); -inf for none.
+        lower: Smallest value of each parameter, shape (c,); -inf for none.
         upper: Largest value of each parameter, shape (c,); inf for none.
 
     References:
@@ -54,7 +54,9 @@ class Bounds:
             raise DataError(f"bounds have shapes {lower.shape} and {upper.shape}, wanted one (c,)")
         if not (lower <= upper).all():  # NaN is refused too
             i = int(np.flatnonzero(~(lower <= upper))[0])
-            raise DataError(f"bounds of parameter {i} are {lower[i]} to {upper[i]}: an empty set")
+            raise DataError(
+                f"bounds of parameter {i} are {lower[i]} to {upper[i]}, wanted lower <= upper"
+            )
 
     def project(self, P: Array) -> Array:
         """Return the nearest parameters of the set.
@@ -81,7 +83,7 @@ def reference_acceleration(
         beta: Gain of the position, shape () or (..., 1) [1/s^2].
 
     Returns:
-        The acceleration that brings the robot back to its program, shape (..., n).
+        The reference acceleration, which returns the robot to its program, shape (..., n).
 
     References:
         Tzvetkova, (15).
@@ -92,14 +94,14 @@ def reference_acceleration(
 
 
 def proximity(Psi: Array, P: Array, u: Array, *, sign: Sign = "corrected") -> Array:
-    """Return PRX = Psi^T Psi P - Psi^T u, or with a plus, as the paper prints it.
+    """Return PRX = Psi^T Psi P - Psi^T u, or with a plus, as printed in the paper.
 
     With the minus it is the gradient (4) of the criterion (3), J = |u - Psi P|^2 / 2, and zero at
     the true parameters. With the plus it is 2 Psi^T u there.
 
     Args:
-        Psi: Regressor of the motion that the torque u made, G at the measured acceleration, shape
-            (..., n, c). With that of (22), at q_*, PRX tells nothing: u is Psi P by (21).
+        Psi: Regressor of the motion caused by the torque u, G at the measured acceleration, shape
+            (..., n, c). With that of (22), at q_*, PRX is always 0: u is Psi P by (21).
         P: Estimate, shape (..., c).
         u: Torque, shape (..., n) [N m or N].
         sign: ``"corrected"`` (minus) or ``"printed"`` (plus).
@@ -130,10 +132,10 @@ def recursive_update(
         P: Estimate, shape (..., c).
         Psi: Gradient (22) of the control, shape (..., n, c).
         eta: Deviation (20), shape (..., n).
-        sigma: sigma_D, the smallest eigenvalue of D(q, P), shape (...). Where it is not positive
-            the estimate is no arm, (24) would climb, and nothing is changed.
-        is_open: lambda, True where PRX is not zero, shape (...).
-        eps2: Where |Psi|^2 is not above it, nothing is changed [1/s^4].
+        sigma: sigma_D, the smallest eigenvalue of D(q, P), shape (...). If it is not positive, the
+            estimate is not physical, (24) would increase the error, and P is not changed.
+        is_open: lambda, True if PRX is not zero, shape (...).
+        eps2: If |Psi|^2 is not above it, P is not changed [1/s^4].
 
     Returns:
         The next estimate, shape (..., c).
@@ -151,13 +153,13 @@ def recursive_update(
 def one_shot(G: Array, G_star: Array, P: Array, names: Sequence[str]) -> Array:
     """Return the parameters from one recorded motion, P = G^+ G_* P^.
 
-    The same torque is G P, with the acceleration measured, and G_* P^, with the reference
-    acceleration (15) that it was computed from.
+    The torque is G P, with the measured acceleration, and G_* P^, with the reference acceleration
+    (15) from which it was computed.
 
     Args:
         G: Regressors G(q, v, a) of all samples, stacked, shape (N n, c).
         G_star: Regressors G(q, v, q_*), stacked, shape (N n, c).
-        P: The estimate P^ in use, shape (c,).
+        P: The current estimate P^, shape (c,).
         names: Names of the c parameters.
 
     Returns:
@@ -207,7 +209,7 @@ class LinearDynamics(Protocol):
 
 
 class Plant(Protocol):
-    """A robot that moves when torque is applied."""
+    """A robot that is simulated."""
 
     def acceleration(self, q: Array, v: Array, u: Array) -> Array:
         """Return the accelerations of R robots.
@@ -227,7 +229,7 @@ class PlanarDynamics(LinearDynamics):
     """The paper's arm in closed form.
 
     Attributes:
-        form: Which of its regressors: ``"printed"``, ``"corrected_five"`` or ``"corrected"``.
+        form: Its regressor: ``"printed"``, ``"corrected_five"`` or ``"corrected"``.
     """
 
     form: planar_2r.Form = "corrected"
@@ -285,7 +287,7 @@ def torque(dynamics: LinearDynamics, q: Array, v: Array, a: Array, P: Array) -> 
 
 
 def mass_matrix(dynamics: LinearDynamics, q: Array, P: Array) -> Array:
-    """Return D(q, P) from the parameters that the torque shows, base parameters, alone.
+    """Return D(q, P) from the base parameters.
 
     Column j is (G(q, 0, e_j) - G(q, 0, 0)) P: the torque of a unit acceleration without that of
     gravity and constant offsets.
@@ -296,7 +298,7 @@ def mass_matrix(dynamics: LinearDynamics, q: Array, P: Array) -> Array:
         P: Parameters, shape (c,) or (R, c).
 
     Returns:
-        Mass matrices, shape (R, n, n); they are positive definite only if P is possible.
+        Mass matrices, shape (R, n, n); positive definite if P is physically consistent.
 
     References:
         Tzvetkova, (11); sigma_D of (24) needs it.

@@ -1,4 +1,4 @@
-"""What the paper's errata amount to: in torque, and in energy that the printed arm invents."""
+"""The effect of the paper's errata: torque differences, and energy gained by the printed arm."""
 
 from dataclasses import dataclass
 
@@ -19,20 +19,20 @@ from robotid.simulation.plant import rk4
 __all__ = ["EnergyDrift", "Erratum", "energy_drift", "errata"]
 
 _STATES = 2000
-_REACH = (np.pi, 10.0, 20.0)  # [rad], [rad/s], [rad/s^2] of the random states
+_RANGE = (np.pi, 10.0, 20.0)  # [rad], [rad/s], [rad/s^2] of the random states
 _FREE = (np.array([[0.0, 1.0]]), np.array([[1.0, 2.0]]))  # [rad], [rad/s] start of free motion
 
 
 @dataclass(frozen=True)
 class Erratum:
-    """One place where the printed text is wrong.
+    """One error of the printed text.
 
     Attributes:
         where: The equation.
-        printed: What it says.
-        corrected: What it must say.
+        printed: The printed text.
+        corrected: The corrected text.
         max_torque_difference: The largest over random states [N m]; for (23) that of the residual
-            whose gradient PRX is.
+            with the gradient PRX.
         max_torque_difference_on_program: The largest along the program motion [N m].
     """
 
@@ -45,11 +45,11 @@ class Erratum:
 
 @dataclass(frozen=True)
 class EnergyDrift:
-    """Kinetic energy of the arm when no torque acts on it.
+    """Kinetic energy of the arm without torque.
 
     Attributes:
         t: Times, shape (N,) [s].
-        gained: Per model, the energy gained since the start as a share of it, shape (N,).
+        gained: Per model, the energy gained since the start over the initial energy, shape (N,).
     """
 
     t: Array
@@ -57,18 +57,19 @@ class EnergyDrift:
 
 
 def errata(rng: np.random.Generator) -> list[Erratum]:
-    """Return the errata that change a torque, each with the largest difference it makes.
+    """Return the errata that change a torque, each with its largest torque difference.
 
     The last one is that of (22) in (23). Proof: u of (21) is C(q, v, P^) + D(q, P^) q_*, linear in
     P^, so u = Psi P^ with its gradient Psi (22), and PRX = Psi^T (Psi P^ - u) = 0 for every P^.
 
     Args:
-        rng: Source of the random states: q within pi rad, v within 10 rad/s, a within 20 rad/s^2.
+        rng: Random generator of the states: q within pi rad, v within 10 rad/s, a within
+            20 rad/s^2.
 
     References:
         Tzvetkova, (21)-(27).
     """
-    somewhere = tuple(reach * rng.uniform(-1, 1, (_STATES, 2)) for reach in _REACH)
+    somewhere = tuple(size * rng.uniform(-1, 1, (_STATES, 2)) for size in _RANGE)
     program = PROGRAM.evaluate(np.linspace(0, DURATION, 401))
     largest = [
         [float(np.abs(difference).max()) for difference in _differences(*states)]
@@ -85,7 +86,7 @@ def errata(rng: np.random.Generator) -> list[Erratum]:
 
 
 def energy_drift(*, duration: float = 10.0, dt: float = 4e-3) -> EnergyDrift:
-    """Return the energy of each model in free motion, which a rigid arm keeps.
+    """Return the energy of each model in free motion; that of a rigid arm is constant.
 
     Args:
         duration: Length of the motion [s].
@@ -97,7 +98,7 @@ def energy_drift(*, duration: float = 10.0, dt: float = 4e-3) -> EnergyDrift:
 
 
 def _differences(q: Array, v: Array, a: Array) -> list[Array]:
-    """Return the torque that each erratum adds at N states, each shape (N, 2)."""
+    """Return the torque difference of each erratum at N states, each shape (N, 2)."""
     P = parameters(PAPER_LINKS)
     five = parameters(PAPER_LINKS, form="corrected_five")
     h = printed_velocity_coefficient(q, PAPER_LINKS)
@@ -106,12 +107,12 @@ def _differences(q: Array, v: Array, a: Array) -> list[Array]:
     G, G_printed = (regressor(q, v, a, form=form) for form in ("corrected_five", "printed"))
     swapped = (G_printed - G) @ five
     p4 = G_printed @ (PAPER_PARAMETERS - five)
-    residual = 2 * (regressor(q, v, a) @ P)  # Psi P + u, where it should be Psi P - u = 0
-    return [missing, swapped, p4, residual, _unseen(q, v, a, P)]
+    residual = 2 * (regressor(q, v, a) @ P)  # Psi P + u instead of Psi P - u = 0
+    return [missing, swapped, p4, residual, _omitted_residual(q, v, a, P)]
 
 
-def _unseen(q: Array, v: Array, q_star: Array, P: Array) -> Array:
-    """Return the residual of P^ = P / 2 that (22) hides, G P^ - Psi P^, shape (N, 2)."""
+def _omitted_residual(q: Array, v: Array, q_star: Array, P: Array) -> Array:
+    """Return the residual of P^ = P / 2 that (22) omits, G P^ - Psi P^, shape (N, 2)."""
     arm, P_hat = PlanarDynamics("corrected"), P / 2
     u = torque(arm, q, v, q_star, P_hat)  # (21), Psi P^
     a = LinearPlant(arm, P).acceleration(q, v, u)

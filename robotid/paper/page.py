@@ -1,4 +1,4 @@
-"""The page of the paper's simulation: figures, tables and what they say."""
+"""The page of the paper's simulation: figures and tables with explanations."""
 
 from collections.abc import Mapping
 from html import escape
@@ -17,20 +17,20 @@ def paper_page(content: Mapping[str, Any], figures: Mapping[str, tuple[str, str]
     """Return the page.
 
     Args:
-        content: What paper.json holds.
+        content: The content of paper.json.
         figures: Caption and ``<svg>`` element of each figure, by name.
     """
-    shown = {name: figure(escape(said), svg) for name, (said, svg) in figures.items()}
+    shown = {name: figure(escape(caption), svg) for name, (caption, svg) in figures.items()}
     first = [shown[name] for name in ("figure_3a", "figure_3b", "figure_4a", "figure_4b")]
     sections = {
         "result": (
-            "What the simulation reaches",
+            "Accuracy of the estimates",
             _result_table(content) + _parameter_tables(content) + _vector_table(content),
         ),
         "figures": ("The paper's figures", "".join([*first, shown["figure_5"]])),
         "convergence": ("Proximity and error", shown["convergence"]),
         "disturbance": ("Disturbance and noise", _disturbance(content) + shown["disturbance"]),
-        "trajectories": ("Numerous trajectories", _trajectories(content) + shown["trajectories"]),
+        "trajectories": ("Random trajectories", _trajectories(content) + shown["trajectories"]),
         "errata": ("Errata", _errata(content)),
         "energy": ("Energy", _energy(content) + shown["energy"]),
         "settings": ("Settings", _settings(content)),
@@ -44,27 +44,27 @@ def _summary(content: Mapping[str, Any]) -> str:
     status = "good" if max(last.values()) <= 1e-4 else "poor"
     count = len(next(iter(models.values()))["relative_error"]) - 1
     reached = "".join(
-        f"<li>{escape(name)}: relative error {number(error, '.2g').html}, or "
-        f"{number(content['on_program'][name]['relative_error'][-1], '.2g').html} where the robot "
-        "starts on its program and not one degree beside it</li>"
+        f"<li>{escape(name)}: relative error {number(error, '.2g').html}; with a start on the "
+        "program instead of one degree off it: "
+        f"{number(content['on_program'][name]['relative_error'][-1], '.2g').html}</li>"
         for name, error in last.items()
     )
     beside = np.degrees(np.max(np.abs(content["settings"]["start_beside_program_rad"])))
     gains = [content["on_program"][n]["relative_error"][-1] / error for n, error in last.items()]
     start = (
-        f"<p>These errors depend on where the robot starts, {beside:.3g} degree off its program: "
-        "its controller then swings it in, which excites what the program alone does not. From the "
-        f"program itself the same {count} iterations leave an error {min(gains):.2g} to "
+        f"<p>These errors depend on the start, {beside:.3g} degree off the program: the transient "
+        "of the controller excites the parameters more than the program does. With a start on the "
+        f"program, the error after the same {count} iterations is {min(gains):.2g} to "
         f"{max(gains):.2g} times as large.</p>\n"
     )
     return (
         "<h1>Extracting inertial parameters: the paper's simulation</h1>\n"
         f'<div class="verdict {status}"><p>After <strong>{count} iterations</strong> from half of '
         f"the parameters</p><ul>{reached}</ul>{start}</div>\n"
-        "<p>The planar arm of G. V. Tzvetkova's paper, whose parameters are found while it moves "
-        "along the program motion (28). One iteration is one run of that motion. The model is "
-        "taken as printed, with the regressor corrected (five columns), and as the physical arm "
-        "(four parameters).</p>\n"
+        "<p>The parameters of the planar arm of G. V. Tzvetkova's paper are identified during the "
+        "program motion (28). One iteration is one run of that motion. There are three models: "
+        "as printed, with the corrected regressor (five columns), and the physical arm (four "
+        "parameters).</p>\n"
         f'<p class="note">Written by robotid {__version__}. Numbers of equations are those of the '
         "paper.</p>\n"
     )
@@ -86,16 +86,16 @@ def _result_table(content: Mapping[str, Any]) -> str:
                 number(content["one_shot"][name], ".2g"),
             ]
         )
-    headers = ["model", "start", "after 1", "after 10", "at the end", "started on program"]
+    headers = ["model", "start", "after 1", "after 10", "at the end", "start on program"]
     headers += ["NA (25)", "one-shot (18)"]
-    said = (
-        "<p>The description leaves open where the robot starts. Exactly on the program, the "
-        "samples of all runs stay near one curve and the error falls slowly; the main simulation "
-        "starts joint 1 one degree beside it. NA is the iteration in which PRX (23) is zero for "
-        "the first time; a dash: not within the iterations that were allowed. The one-shot update "
-        "(18) needs a single run where nothing disturbs it.</p>\n"
+    note = (
+        "<p>The paper does not state where the robot starts. With a start exactly on the program, "
+        "the samples of all runs are near one curve and the error decreases slowly. In the main "
+        "simulation joint 1 starts one degree off the program. NA is the iteration in which PRX "
+        "(23) is zero for the first time; a dash: not within the allowed iterations. Without "
+        "disturbance, the one-shot update (18) needs a single run.</p>\n"
     )
-    return said + table("Relative error |P̂ − P| / |P|", headers, rows)
+    return note + table("Relative error |P̂ − P| / |P|", headers, rows)
 
 
 def _parameter_tables(content: Mapping[str, Any]) -> str:
@@ -118,9 +118,9 @@ def _vector_table(content: Mapping[str, Any]) -> str:
     rows = [[code(name), number(true), number(found, ".7g")] for name, true, found in values]
     return (
         "<p>The physical arm's inertial parameters in the order of (9)-(10), about the joint "
-        "frames. Torque shows four sums of the twenty; identified are the values nearest to the "
-        "first guess, half of the true ones, that have the four sums P̂. What no torque of the arm "
-        "depends on stays at the guess.</p>\n"
+        "frames. The torque determines four sums of the twenty. The identified values are those "
+        "nearest to the initial values (half of the true ones) that have the four sums P̂. "
+        "Parameters without effect on the torque are equal to the initial values.</p>\n"
         + table("Inertial vector (9)-(10), SI units", ["parameter", "true", "identified"], rows)
     )
 
@@ -146,7 +146,7 @@ def _disturbance(content: Mapping[str, Any]) -> str:
 def _trajectories(content: Mapping[str, Any]) -> str:
     rows = []
     for key, start in (
-        ("trajectories", "up to 0.05 rad beside"),
+        ("trajectories", "up to 0.05 rad off"),
         ("trajectories_on_program", "on"),
     ):
         for name, found in content[key].items():
@@ -162,11 +162,11 @@ def _trajectories(content: Mapping[str, Any]) -> str:
                 ]
             )
     headers = ["model", "start", "runs", "converged", "least", "median", "90 %", "most", "allowed"]
-    said = (
-        "<p>Random motions (28), first guesses (0.3 to 1.7 times each parameter), gains and "
-        "starts. A run has converged when its relative error is below 10⁻³.</p>\n"
+    note = (
+        "<p>Random motions (28), initial values (0.3 to 1.7 times each parameter), gains and "
+        "starts. A run has converged if its relative error is below 10⁻³.</p>\n"
     )
-    parts = [said, table("Iterations to a relative error of 10⁻³", headers, rows)]
+    parts = [note, table("Iterations to a relative error of 10⁻³", headers, rows)]
     for key, title in (("trajectories", ""), ("trajectories_on_program", ", start on the program")):
         parts.append(_failure_table(content[key], title))
     return "".join(parts)
@@ -185,7 +185,7 @@ def _failure_table(by_model: Mapping[str, Any], title: str) -> str:
     if not rows:
         return ""
     headers = ["model", "reason", "runs", "median error", "largest error"]
-    return table(f"Runs that did not converge{title}; each one is in paper.json", headers, rows)
+    return table(f"Runs without convergence{title}; all are listed in paper.json", headers, rows)
 
 
 def _errata(content: Mapping[str, Any]) -> str:
@@ -202,14 +202,14 @@ def _errata(content: Mapping[str, Any]) -> str:
     headers = ["where", "printed", "corrected", "anywhere [N m]", "on the program [N m]"]
     return (
         "<p>Largest torque difference on the physical arm. Anywhere: random states within π rad, "
-        "10 rad/s and 20 rad/s². (23) changes no torque of the arm; its row gives the residual "
-        "ΨP̂ + u that the printed sign leaves at the true parameters, where it should be 0: with "
-        "it the procedure never stops.</p>\n"
+        "10 rad/s and 20 rad/s². (23) changes no torque of the arm. Its row is the residual "
+        "ΨP̂ + u with the printed sign at the true parameters, where it should be 0: with this "
+        "sign the procedure never stops.</p>\n"
         "<p>(22) in (23): u of (21) is linear in P̂, so that u = ΨP̂ with its gradient Ψ (22), and "
-        "PRX = Ψᵀ(ΨP̂ − u) = 0 for every P̂: to the letter λ is 0 and nothing is learnt. The "
-        "regressor in (23) is therefore taken at the measured acceleration, Ψ = G(q, q̇, q̈); its "
-        "row gives the residual ΨP̂ − u that this shows at half of the parameters, where the "
-        "letter has 0.</p>\n" + table("Errata", headers, rows)
+        "PRX = Ψᵀ(ΨP̂ − u) = 0 for every P̂: as printed, λ is 0 and no parameter is updated. "
+        "Therefore the regressor in (23) is that of the measured acceleration, Ψ = G(q, q̇, q̈). "
+        "The row is its residual ΨP̂ − u at half of the parameters, where the printed one is 0."
+        "</p>\n" + table("Errata", headers, rows)
     )
 
 
@@ -220,9 +220,9 @@ def _energy(content: Mapping[str, Any]) -> str:
     ]
     return (
         f"<p>Free motion for {drift['duration']:g} s from q = (0, 1) rad, q̇ = (1, 2) rad/s: no "
-        "torque, no friction, no gravity. A rigid body keeps its energy. The printed arm does not, "
-        "nor do five columns with p3 ≠ p4, as the paper's steady state has them.</p>\n"
-        + table("Largest change of energy", ["model", "%"], rows)
+        "torque, no friction, no gravity. The energy of rigid bodies is constant. That of the "
+        "printed arm is not, nor that of five columns with p3 ≠ p4 as in the paper's steady "
+        "state.</p>\n" + table("Largest change of energy", ["model", "%"], rows)
     )
 
 

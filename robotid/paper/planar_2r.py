@@ -1,7 +1,7 @@
-"""The paper's planar two-joint arm in closed form, as printed and as mechanics has it.
+"""The paper's planar two-joint arm in closed form, as printed and corrected by mechanics.
 
-Its axes are vertical, so gravity does no work; at q = 0 it is stretched along x. The form
-``"printed"`` keeps three errata of the paper (Tzvetkova), the other forms correct them:
+Its axes are vertical, so gravity does no work; at q = 0 it is extended along x. The form
+``"printed"`` has three errata of the paper (Tzvetkova), the other forms correct them:
 
 1. (26) gives C122 = C211 = h and no C112, where h = L1 s2 (L2 m2 + m2 xbar2) + L1 c2 m2 ybar2;
    mechanics gives C122 = -h, C211 = h, C112 = -2 h.
@@ -31,7 +31,7 @@ __all__ = [
     "urdf_text",
 ]
 
-#: As printed; errata 1 to 3 corrected but p3 and p4 kept apart; columns 3 and 4 added up.
+#: As printed; errata 1 to 3 corrected, with separate p3 and p4; with columns 3 and 4 added.
 Form: TypeAlias = Literal["printed", "corrected_five", "corrected"]
 #: Names of the c parameters of each form.
 PARAMETER_NAMES: dict[Form, tuple[str, ...]] = {
@@ -86,7 +86,7 @@ class PlanarLinks:
     def __post_init__(self) -> None:
         if not all(0 < x < np.inf for x in (self.L1, self.L2, self.m1, self.m2, *self.central)):
             inertias = f"inertias about the centres of mass {self.central}"
-            raise ModelError(f"lengths, masses and {inertias} must be positive: {self}")
+            raise ModelError(f"lengths, masses and {inertias} of {self}: wanted positive numbers")
 
     @property
     def central(self) -> tuple[float, float]:
@@ -96,7 +96,7 @@ class PlanarLinks:
         return Izz1, Izz2
 
 
-#: A physically possible arm for which (27) as printed gives exactly ``PAPER_PARAMETERS``.
+#: A physically consistent arm for which (27) as printed gives exactly ``PAPER_PARAMETERS``.
 PAPER_LINKS = PlanarLinks(1.0, 1.0, 10.0, -0.5, 0.0, 20.1, 1.9, 1.1 / 1.9, 0.1 / 1.9, 0.9)
 
 
@@ -105,7 +105,7 @@ def parameters(links: PlanarLinks, *, form: Form = "corrected") -> Array:
 
     Args:
         links: Lengths and inertia of the links.
-        form: ``"printed"`` takes p4 as (27) has it, ``"corrected_five"`` takes p4 = p3.
+        form: With ``"printed"`` p4 is that of (27), with ``"corrected_five"`` p4 = p3.
 
     Returns:
         Parameters, shape (c,) [kg m^2], in the order of ``PARAMETER_NAMES[form]``.
@@ -134,7 +134,7 @@ def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Arra
         q: Joint angles, shape (..., 2) [rad].
         v: Joint velocities, shape (..., 2) [rad/s].
         a: Joint accelerations, shape (..., 2) [rad/s^2].
-        form: Which of the three regressors.
+        form: One of the three regressors.
 
     Returns:
         Regressor, shape (..., 2, c) [1/s^2].
@@ -144,7 +144,7 @@ def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Arra
         SettingsError: If there is no such form.
 
     References:
-        Tzvetkova, (13) and the matrix G that stands before (27).
+        Tzvetkova, (13) and the matrix G before (27).
     """
     _check_form(form)
     (_, q2), (v1, v2), (a1, a2) = _pair("q", q), _pair("v", v), _pair("a", a)
@@ -162,7 +162,7 @@ def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Arra
 
 
 def printed_velocity_coefficient(q: Array, links: PlanarLinks) -> Array:
-    """Return h of erratum 1, which (26) prints for both C122 and C211.
+    """Return h of erratum 1, printed in (26) for both C122 and C211.
 
     Args:
         q: Joint angles, shape (..., 2) [rad].
@@ -184,7 +184,7 @@ def printed_velocity_coefficient(q: Array, links: PlanarLinks) -> Array:
 
 
 def urdf_text(links: PlanarLinks = PAPER_LINKS) -> str:
-    """Return the arm as URDF, in the frames of the joints and with every digit kept.
+    """Return the arm as URDF, in the frames of the joints and with all digits.
 
     Args:
         links: Lengths and inertia of the links.
@@ -205,7 +205,7 @@ def urdf_text(links: PlanarLinks = PAPER_LINKS) -> str:
 
 def _body(i: int, parent: str, *numbers: float) -> str:
     length, x, y, m, Izz = (float(number) for number in numbers)
-    # thin, yet possible: second moments 0.9 Izz along, 0.1 Izz across, 0.01 Izz normal to the link
+    # thin, but consistent: second moments 0.9 Izz along, 0.1 Izz across, 0.01 Izz normal to it
     Ixx, Iyy = 0.11 * Izz, 0.91 * Izz
     return _BODY.format(i=i, parent=parent, length=length, x=x, y=y, m=m, Ixx=Ixx, Iyy=Iyy, Izz=Izz)
 

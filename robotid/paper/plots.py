@@ -14,7 +14,7 @@ __all__ = ["paper_figures"]
 
 # readable on white and on black
 _COLOURS = ("#0b7fd1", "#d4622a", "#23985f", "#b08400", "#b5539c")
-_STYLES = ("-", "--", ":")  # of models whose curves lie on each other
+_STYLES = ("-", "--", ":")  # of models with coincident curves
 _SHOWN = (1, 2, 5, 20, 100)  # iterations drawn in figure 4
 _WIDTH = 9.3  # [inch] of every figure
 _FONT = 8.5  # [pt]
@@ -24,7 +24,7 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 def paper_figures(
     studies: Sequence[ModelStudy], runs: Mapping[str, RandomRuns], drift: EnergyDrift
 ) -> dict[str, tuple[str, Any]]:
-    """Return the caption of every figure, and the figure of Matplotlib, by the name of its file.
+    """Return the caption and the Matplotlib figure of each figure, by the name of its file.
 
     Args:
         studies: The models.
@@ -58,7 +58,7 @@ def paper_figures(
             _disturbed_figure(studies),
         ),
         "trajectories": (
-            "Iterations that random motions took to a relative error of 10⁻³",
+            "Iterations of random motions to a relative error of 10⁻³",
             _trajectories_figure(runs),
         ),
         "energy": ("Energy gained in free motion", _energy_figure(drift)),
@@ -81,8 +81,8 @@ def _figure_4(studies: Sequence[ModelStudy], joint: int) -> Any:  # noqa: ANN401
     """Draw the control (21) of one joint in successive iterations."""
     figure, rows = _grid(2, len(studies), height=4.4, share=True)
     for upper, lower, study in zip(*rows, studies, strict=True):
-        kept = study.history.torques
-        torques: Sequence[Array] = [] if kept is None else list(kept[:, :, 0, joint])
+        stored = study.history.torques
+        torques: Sequence[Array] = [] if stored is None else list(stored[:, :, 0, joint])
         for number, colour in zip(_SHOWN, _COLOURS, strict=True):
             if number <= len(torques):
                 u = torques[number - 1]
@@ -94,7 +94,7 @@ def _figure_4(studies: Sequence[ModelStudy], joint: int) -> Any:  # noqa: ANN401
         upper.set_title(study.name, fontsize=_FONT)
         lower.set_xlabel("time [s]")
     rows[0][0].set_ylabel(f"torque u{joint + 1} [N m]")
-    rows[1][0].set_ylabel("less the last iteration [N m]")
+    rows[1][0].set_ylabel("minus the last iteration [N m]")
     _legend(figure, rows[0][0])
     return figure
 
@@ -149,20 +149,19 @@ def _disturbed_figure(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
 
 
 def _trajectories_figure(runs: Mapping[str, RandomRuns]) -> Any:  # noqa: ANN401
-    """Draw how many iterations the random motions took."""
+    """Draw the numbers of iterations of the random motions."""
     figure, row = _figure(len(runs), height=2.8, share=True)
     for axes, (name, found), colour in zip(row, runs.items(), _COLOURS, strict=False):
         most, count = len(found.errors) - 1, len(found.guess)
         axes.hist(found.iterations, bins=np.linspace(0, most, 31), color=colour)
-        left = count - len(found.iterations)
         axes.set_xlabel("iterations to 10⁻³")
-        axes.set_title(f"{name}: {count - left} of {count} converged", fontsize=_FONT)
+        axes.set_title(f"{name}: {len(found.iterations)} of {count} converged", fontsize=_FONT)
     row[0].set_ylabel("random motions")
     return figure
 
 
 def _energy_figure(drift: EnergyDrift) -> Any:  # noqa: ANN401
-    """Draw the energy that each model gains in free motion."""
+    """Draw the energy gained by each model in free motion."""
     figure, (axes,) = _figure(1, height=2.8)
     for (name, gained), colour in zip(drift.gained.items(), _COLOURS, strict=False):
         axes.plot(drift.t, 100 * gained, color=colour, lw=1.2, label=name)
@@ -198,7 +197,7 @@ def _legend(figure: Any, axes: Any) -> None:  # noqa: ANN401
 
 
 def _label_decades(axes: Any) -> None:  # noqa: ANN401
-    """Write the decades as 10⁻³: Matplotlib's own labels need its mathematics, which is off."""
+    """Write the decades as 10⁻³: Matplotlib's own labels need its math parser, which is off."""
     axes.yaxis.set_major_formatter(_power)
     axes.yaxis.set_minor_formatter("")
 

@@ -1,8 +1,8 @@
-"""The closed-loop procedure: a robot follows a program while its parameters are being found.
+"""The closed-loop procedure: a robot follows a program while its parameters are identified.
 
 One iteration is one run of the program motion. At each of its updates the control (21) is computed
-from the estimate, the plant moves, and the estimate follows its deviation (24). Many runs go at
-once: R is their number, one row each.
+from the estimate, the plant moves, and the estimate is updated by the deviation (24). R runs are
+computed together, one row each.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ from robotid.simulation.plant import rk4
 
 __all__ = ["History", "Influences", "LoopSettings", "random_torque", "run_procedure"]
 
-_RUNAWAY = 1e3  # [rad or m] from the program, or 1e3 times a second: the run is given up
+_DIVERGED = 1e3  # [rad or m; per s] deviation from the program beyond which a run is stopped
 
 
 @dataclass(frozen=True)
@@ -41,16 +41,16 @@ class LoopSettings:
     Attributes:
         alpha: Gain of the velocity in (15) [1/s].
         beta: Gain of the position in (15) [1/s^2].
-        iterations: Most runs of the motion.
-        updates: Updates per run; the torque is held in between.
+        iterations: Largest number of runs of the motion.
+        updates: Updates per run; the torque is constant between them (zero-order hold).
         substeps: Runge-Kutta steps per update; stiff friction needs several.
         method: ``"recursive"``, (24) at each update, or ``"one_shot"``, (18) after each run.
         sign: Sign in (23); with the printed one the procedure never stops.
         prx_acceleration: Acceleration of the regressor in (23): ``"measured"``, or ``"reference"``,
-            q_* (15), as (22) has it to the letter. Then Psi P^ = u by (21): with the corrected
-            sign PRX is zero whatever the estimate, which never moves.
-        eps1: Where no entry of PRX is larger, it counts as zero [N m / s^2].
-        eps2: Where |Psi|^2 is not above it, nothing is updated [1/s^4].
+            q_* (15), as printed in (22). Then Psi P^ = u by (21): with the corrected sign PRX is
+            zero for any estimate, so that the estimate never changes.
+        eps1: If no entry of PRX is larger, it counts as zero [N m / s^2].
+        eps2: If |Psi|^2 is not above it, there is no update [1/s^4].
         bounds: Omega of (8), or None.
     """
 
@@ -81,14 +81,14 @@ class LoopSettings:
 
 @dataclass(frozen=True)
 class Influences:
-    """What acts on the plant and its sensors beside the control.
+    """Disturbance of the plant and noise of its sensors.
 
     Attributes:
         torque: v(t) of (11), from the times, shape (R,), and the control, shape (R, n), to
-            torques, shape (R, n); asked for once per update and held. None for none.
+            torques, shape (R, n); computed once per update and constant in between. None for none.
         q, v, a: Standard deviations of white noise on positions [rad or m], velocities and
-            accelerations; each a number or an array that fits (R, n).
-        rng: Source of the noise; needed if there is any.
+            accelerations; each a number or an array that broadcasts to (R, n).
+        rng: Random generator of the noise; required if there is any.
     """
 
     torque: Callable[[Array, Array], Array] | None = None
@@ -99,30 +99,30 @@ class Influences:
 
     def __post_init__(self) -> None:
         if self.rng is None and any(np.any(np.asarray(x) != 0) for x in (self.q, self.v, self.a)):
-            raise SettingsError("sensor noise needs rng, the source of its random numbers")
+            raise SettingsError("sensor noise is stated, but rng is None, wanted a generator")
 
 
 @dataclass(frozen=True)
 class History:
-    """What happened, over L iterations of R runs.
+    """The course of R runs over L iterations.
 
     Attributes:
         estimates: P^ before the first iteration and after each, shape (L + 1, R, c).
         prx: Largest entry of PRX (23) during each iteration, shape (L, R) [N m / s^2].
         tracking: Largest distance from the program in each iteration, shape (L, R) [rad or m].
-        NA: The iteration in which PRX was zero throughout for the first time (25), after which
-            the estimate stays; 0 if there was none, shape (R,).
-        lost: The iteration in which the robot ran away from its program, 0 if it did not, shape
-            (R,). Its estimate stays from there on.
-        skipped: Updates left out since D(q, P^) was not positive definite, shape (R,).
-        torques: Control u (21), shape (L, updates, R, n) [N m or N], if it was asked for.
+        NA: The first iteration in which PRX was zero throughout (25), after which the estimate is
+            constant; 0 if there was none, shape (R,).
+        diverged: The iteration in which the robot diverged from its program, 0 if it did not, shape
+            (R,). Its estimate is constant afterwards.
+        skipped: Number of updates omitted since D(q, P^) was not positive definite, shape (R,).
+        torques: Control u (21), shape (L, updates, R, n) [N m or N], if requested.
     """
 
     estimates: Array
     prx: Array
     tracking: Array
     NA: NDArray[np.int_]
-    lost: NDArray[np.int_]
+    diverged: NDArray[np.int_]
     skipped: NDArray[np.int_]
     torques: Array | None = field(default=None, repr=False)
 
@@ -145,8 +145,9 @@ def random_torque(
     """Return a disturbance v(t), uniform within a share of the control at every update.
 
     Args:
-        share: Largest size as a share of the control, a number or an array that fits (R, n) [-].
-        rng: Source of the disturbance.
+        share: Largest disturbance over the control, a number or an array that broadcasts to (R, n)
+            [-].
+        rng: Random generator of the disturbance.
 
     Returns:
         A function for ``Influences``.
@@ -174,24 +175,25 @@ def run_procedure(
     keep_torques: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> History:
-    """Run the closed-loop procedure from a first guess.
+    """Run the closed-loop procedure from initial values.
 
     Each iteration starts at rest at the start of the program, or at an offset from it.
 
     Args:
-        dynamics: The model whose parameters are looked for.
+        dynamics: The model whose parameters are identified.
         plant: The true robot.
         motion: The program (28), one for all runs or one each.
-        P0: First guess of the parameters, shape (R, c).
+        P0: Initial values of the parameters, shape (R, c).
         settings: Gains, numbers of iterations and updates, bounds; the defaults if None.
-        offset: Where the robot starts, from the start of the program, shape (n,) or (R, n).
+        offset: Start of the robot relative to the program, shape (n,) or (R, n).
         influences: Disturbance and noise; none if None.
-        keep_torques: Whether the history keeps the control.
-        progress: Called with the number of each iteration that is done.
+        keep_torques: Whether the history contains the control.
+        progress: Called with the number of each completed iteration.
 
     Raises:
-        DataError: If P0 does not fit the dynamics.
-        RankDeficientError: If the method is one-shot and the motion leaves parameters open.
+        DataError: If the shape of P0 is not that of the dynamics.
+        RankDeficientError: If the method is one-shot and the motion does not determine all
+            parameters.
 
     References:
         Tzvetkova, (14)-(25).
@@ -211,7 +213,7 @@ def run_procedure(
 
 
 class _Loop:
-    """The state of all runs, and what is remembered of them."""
+    """The state and the history of all runs."""
 
     def __init__(
         self,
@@ -232,14 +234,14 @@ class _Loop:
         self.start = motion.evaluate(np.zeros(R))[0] + np.broadcast_to(offset, (R, n))
         self.P = P0 if settings.bounds is None else settings.bounds.project(P0)
         self.active = np.ones(R, dtype=bool)
-        self.NA, self.lost, self.skipped = (np.zeros(R, dtype=int) for _ in range(3))
+        self.NA, self.diverged, self.skipped = (np.zeros(R, dtype=int) for _ in range(3))
         self.estimates: list[Array] = [self.P]
         self.prx: list[Array] = []
         self.tracking: list[Array] = []
         self.torques: list[Array] = []
 
     def iterate(self, number: int, keep_torques: bool) -> None:
-        """Run the motion once, updating along it."""
+        """Run the motion once, with its updates."""
         R, n = self.start.shape
         q, v = self.start, np.zeros((R, n))
         largest, distance = np.zeros(R), np.zeros(R)
@@ -247,7 +249,7 @@ class _Loop:
         for k in range(self.settings.updates):
             t = k * self.dt
             q_pr = self.motion.evaluate(t)
-            q, v = self._hold_lost(number, q, v, q_pr)
+            q, v = self._reset_diverged(number, q, v, q_pr)
             distance = np.maximum(distance, np.abs(q - q_pr[0]).max(axis=1))
             q_seen = self._sensed(q, self.influences.q)
             v_seen = self._sensed(v, self.influences.v)
@@ -271,10 +273,10 @@ class _Loop:
             q, v = self._advance(q, v, a, applied)
         if samples:
             self._update_once(samples)
-        self._remember(number, largest, distance, torques)
+        self._store(number, largest, distance, torques)
 
     def _sensed(self, value: Array, level: float | Array) -> Array:
-        """Return what a sensor reads, with white noise of a standard deviation."""
+        """Return a measured value, with white noise of a standard deviation."""
         rng = self.influences.rng
         if rng is None or not np.any(np.asarray(level) != 0):
             return value
@@ -282,7 +284,7 @@ class _Loop:
         return noisy
 
     def _update(self, q: Array, Psi: Array, eta: Array, is_open: NDArray[np.bool_]) -> None:
-        """Do (24), then (8)."""
+        """Apply (24), then (8)."""
         sigma = smallest_eigenvalue(mass_matrix(self.dynamics, q, self.P))
         self.skipped = self.skipped + (self.active & (sigma <= 0.0))
         is_open = is_open & self.active
@@ -290,7 +292,7 @@ class _Loop:
         self.P = self._bounded(P)
 
     def _update_once(self, samples: list[tuple[Array, Array]]) -> None:
-        """Do (18) with the samples of one run, then (8)."""
+        """Apply (18) to the samples of one run, then (8)."""
         G, G_star = (np.stack(part, axis=1) for part in zip(*samples, strict=True))
         c, P = self.P.shape[1], self.P.copy()
         for r in np.flatnonzero(self.active):
@@ -303,7 +305,7 @@ class _Loop:
         return P if bounds is None else np.where(self.active[:, None], bounds.project(P), P)
 
     def _advance(self, q: Array, v: Array, a: Array, u: Array) -> tuple[Array, Array]:
-        """Return the state one update later: Runge-Kutta of order 4, the torque held."""
+        """Return the state one update later: Runge-Kutta of order 4 with constant torque."""
         h = (self.dt / self.settings.substeps)[:, None]
         for step in range(self.settings.substeps):
             q, v = rk4(
@@ -311,20 +313,21 @@ class _Loop:
             )
         return q, v
 
-    def _hold_lost(
+    def _reset_diverged(
         self, number: int, q: Array, v: Array, program: tuple[Array, Array, Array]
     ) -> tuple[Array, Array]:
-        """Put robots that ran away, and those that are done, back on their program."""
-        away = np.maximum(np.abs(q - program[0]), np.abs(v - program[1])).max(axis=1)
-        is_lost = ~(away < _RUNAWAY)  # NaN is lost too
-        self.lost = np.where(is_lost & self.active, number, self.lost)
-        self.active = self.active & ~is_lost
-        gone = is_lost | (self.lost > 0)
-        if not gone.any():
+        """Reset robots that have diverged to their program."""
+        deviation = np.maximum(np.abs(q - program[0]), np.abs(v - program[1])).max(axis=1)
+        diverges = ~(deviation < _DIVERGED)  # also with NaN
+        self.diverged = np.where(diverges & self.active, number, self.diverged)
+        self.active = self.active & ~diverges
+        has_diverged = diverges | (self.diverged > 0)
+        if not has_diverged.any():
             return q, v
-        return np.where(gone[:, None], program[0], q), np.where(gone[:, None], program[1], v)
+        reset = has_diverged[:, None]
+        return np.where(reset, program[0], q), np.where(reset, program[1], v)
 
-    def _remember(self, number: int, largest: Array, distance: Array, torques: list[Array]) -> None:
+    def _store(self, number: int, largest: Array, distance: Array, torques: list[Array]) -> None:
         is_zero = self.active & (largest <= self.settings.eps1)
         self.NA = np.where(is_zero, number, self.NA)  # (25)
         self.active = self.active & ~is_zero
@@ -335,19 +338,19 @@ class _Loop:
             self.torques.append(np.stack(torques))
 
     def history(self) -> History:
-        """Return what is remembered."""
+        """Return the history of the runs."""
         return History(
             estimates=np.stack(self.estimates),
             prx=np.stack(self.prx),
             tracking=np.stack(self.tracking),
             NA=self.NA,
-            lost=self.lost,
+            diverged=self.diverged,
             skipped=self.skipped,
             torques=np.stack(self.torques) if self.torques else None,
         )
 
 
 def _column(gain: float | Array) -> Array:
-    """Return a gain that multiplies arrays of shape (R, n)."""
+    """Return a gain as a factor of arrays of shape (R, n)."""
     array = np.asarray(gain, dtype=float)
     return array[:, None] if array.ndim == 1 else array

@@ -1,4 +1,4 @@
-"""Run the paper's simulation and write its figures, tables and numbers."""
+"""Run the paper's simulation and write its figures, tables and numerical results."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -49,15 +49,16 @@ def run_paper(
     settings: PaperSettings | None = None,
     progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
-    """Run the paper's simulation with its three models and write it; return paper.json's content.
+    """Run the paper's simulation with its three models, write it and return paper.json's content.
 
-    Every file is made in a folder of its own inside the target and then put in place.
+    Every file is written in a temporary folder inside the target and then moved.
 
     Args:
-        folder: Where to write paper.json, paper.html and the figures as PNG and SVG; made if it is
+        folder: Folder for paper.json, paper.html and the figures as PNG and SVG; created if it is
             missing.
-        settings: How much is simulated; the defaults if None.
-        progress: Called with the part of the work, iterations done, at most, and their name.
+        settings: Numbers of iterations and runs; the defaults if None.
+        progress: Called with the part of the work, completed iterations, their largest number, and
+            their name.
 
     References:
         Tzvetkova, section VI.
@@ -71,7 +72,7 @@ def run_paper(
         study_model(name, chosen, progress=_counter(name, chosen.iterations, report))
         for name in MODELS
     ]
-    near = _trajectories(chosen, "beside", 0.05, chosen.patience, report)
+    near = _trajectories(chosen, "off", 0.05, chosen.patience, report)
     exact = _trajectories(chosen, "on", 0.0, min(chosen.patience, chosen.iterations), report)
     drift = energy_drift()
     arm, physical = _arm(), studies[list(MODELS).index("physical")]
@@ -83,16 +84,16 @@ def run_paper(
 
 
 def _trajectories(
-    settings: PaperSettings, where: str, reach: float, most: int, report: ProgressCallback
+    settings: PaperSettings, where: str, largest: float, most: int, report: ProgressCallback
 ) -> dict[str, RandomRuns]:
-    """Return the random motions of each model; each model meets other ones."""
+    """Return the random motions of each model; they differ between the models."""
     found = {}
     for k, name in enumerate(MODELS):
-        rng = np.random.default_rng([settings.seed, k, int(reach > 0)])
+        rng = np.random.default_rng([settings.seed, k, int(largest > 0)])
         what = f"{name}, {settings.runs} motions from {where} the program"
         counter = _counter(what, most, report)
         found[name] = random_runs(
-            *paper_arm(name), settings.runs, most, rng, reach=reach, progress=counter
+            *paper_arm(name), settings.runs, most, rng, largest_offset=largest, progress=counter
         )
     return found
 
@@ -167,10 +168,10 @@ def _reason(case: str, errors: Array) -> str:
     if case == "on_program":
         return "slow: every run follows the same curve, which excites the parameters too little"
     return (
-        "A disturbance v enters the deviation, η = D⁻¹(ΨP̃ + v), and the step (24) does not shrink "
-        "with it: the estimate does not settle but stays in a band about the truth, as wide as v "
-        "is large. Small samples weigh as much as large ones, since the step is divided by |Ψ|²; "
-        "a larger ε₂ leaves them out."
+        "A disturbance v is part of the deviation, η = D⁻¹(ΨP̃ + v), and the step (24) does not "
+        "decrease with it. The estimate does not converge: it remains in a band about the true "
+        "value, with a width proportional to v. Small samples have the same weight as large ones, "
+        "since the step is divided by |Ψ|²; a larger ε₂ excludes them."
     )
 
 
@@ -185,8 +186,8 @@ def _arm() -> RobotModel:
 def _inertial_vector(arm: RobotModel, study: ModelStudy) -> dict[str, Any]:
     """Return the arm's inertial parameters in the order of (9)-(10), true and identified.
 
-    Identified are those nearest to the first guess, half of the true ones, whose torque is that of
-    the estimate, W_b beta = G P^: the torque shows four sums of the twenty.
+    The identified ones are those nearest to the initial values (half of the true ones) with the
+    torque of the estimate, W_b beta = G P^: the torque determines four sums of the twenty.
     """
     pi = arm.standard_parameters()[: arm.layout.n_inertial]
     q, v, a = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 20, 2))
@@ -208,7 +209,7 @@ def _write(
     arm: RobotModel,
     study: ModelStudy,
 ) -> None:
-    """Write all files beside their places, then put each in place."""
+    """Write all files in a temporary folder, then move them."""
     import matplotlib
 
     with folder_beside(target) as beside:
@@ -216,7 +217,7 @@ def _write(
         with matplotlib.rc_context(STYLE):
             for name, (caption, figure) in figures.items():
                 figure.savefig(beside / f"{name}.png", dpi=150, facecolor="white")
-                figure.set_layout_engine("none")  # it is laid out now
+                figure.set_layout_engine("none")  # the layout is complete
                 figure.savefig(beside / f"{name}.svg", facecolor="white", metadata={"Date": None})
                 shown[name] = (caption, svg_element(figure, caption, name))
         (beside / "planar_2r.urdf").write_text(urdf_text(), encoding="utf-8")
@@ -232,13 +233,13 @@ def _write_replay(arm: RobotModel, study: ModelStudy, target: Path) -> None:
     dynamics = PlanarDynamics("corrected")
     estimates = study.history.estimates[:, 0]
     last = len(estimates) - 1
-    guesses = {"first guess": estimates[0], f"after {last} iterations": estimates[-1]}
+    guesses = {"initial values": estimates[0], f"after {last} iterations": estimates[-1]}
     torques = Torques(
         t,
         torque(dynamics, q, v, a, study.P),
         {label: torque(dynamics, q, v, a, P) for label, P in guesses.items()},
     )
-    notes = ["Program motion (28); arcs are coloured by the residual of the first guess."]
+    notes = ["Program motion (28). Colour of the arcs: residual of the initial values."]
     replay(arm, t, q, torques=torques, notes=notes).write(target)
 
 

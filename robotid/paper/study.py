@@ -1,8 +1,8 @@
-"""The paper's simulation: three models of its arm, found on its program and on random motions.
+"""The paper's simulation: three models of its arm, identified on its program and random motions.
 
-The paper leaves open where the robot starts. On the program exactly, the samples of a run stay so
-near one curve that 100 iterations leave 2 % of error; one degree beside it, the same procedure
-reaches 1e-5. The simulation starts one degree off, and tells both.
+The paper does not state where the robot starts. With a start exactly on the program, the samples of
+a run are so near one curve that the error after 100 iterations is 2 %; with a start one degree off
+it, the error is 1e-5. The simulation starts one degree off, and reports both.
 """
 
 from collections.abc import Callable
@@ -45,23 +45,23 @@ MODELS: dict[str, Form] = {
 AMPLITUDE = (1.0, 1.5)  # [rad] of the program motion
 DURATION = 2.0  # [s]
 PROGRAM = ProgramMotion(np.array(AMPLITUDE), DURATION)
-_START = (np.pi / 180, 0.0)  # [rad] where the robot starts, from its program
+_START = (np.pi / 180, 0.0)  # [rad] start of the robot relative to its program
 _EPS1 = 1e-9  # [N m / s^2] PRX below it is zero
 TOLERANCE = 1e-3  # [-] relative error at which a run has converged
-_DRAWN = ("amplitude", "duration", "gain", "guess", "offset")  # what is random of a run
-_STALLED = 1e-3  # [-] a smaller share of the error lost over ten iterations is none
+_DRAWN = ("amplitude", "duration", "gain", "guess", "offset")  # random properties of a run
+_STALLED = 1e-3  # [-] smallest relative decrease of the error over ten iterations
 
 
 @dataclass(frozen=True)
 class Case:
-    """Under which conditions the simulation runs.
+    """The conditions of a simulation.
 
     Attributes:
-        title: What is special, in words.
-        offset: Where the robot starts, from its program [rad].
+        title: Description.
+        offset: Start of the robot relative to its program [rad].
         torque: Disturbance as a share of the control [-].
         noise: Whether the sensors are noisy.
-        eps2: |Psi|^2 up to which samples are not used [1/s^4].
+        eps2: Largest |Psi|^2 of samples that are not used [1/s^4].
     """
 
     title: str
@@ -74,7 +74,7 @@ class Case:
 #: Noise of the sensors: positions [rad], velocities [rad/s], accelerations [rad/s^2].
 _NOISE = {"q": 1e-5, "v": 1e-4, "a": 1e-2}
 CASES = {
-    "clean": Case("no disturbance, start 1° beside the program"),
+    "clean": Case("no disturbance, start 1° off the program"),
     "on_program": Case("no disturbance, start on the program", offset=(0.0, 0.0)),
     "disturbed": Case("torque disturbed by up to ±10 % at random", torque=0.1),
     "noisy": Case("noise of 1e-5 rad, 1e-4 rad/s, 0.01 rad/s²", noise=True),
@@ -84,14 +84,14 @@ CASES = {
 
 @dataclass(frozen=True)
 class PaperSettings:
-    """How much is simulated.
+    """Numbers of iterations and runs.
 
     Attributes:
         iterations: Runs of the motion in the simulation of the figures.
-        longest: Most iterations until PRX is zero.
+        longest: Largest number of iterations until PRX is zero.
         runs: Random motions per model.
-        patience: Most iterations along each random motion.
-        seed: Of the random numbers.
+        patience: Largest number of iterations for each random motion.
+        seed: Seed of the random numbers.
     """
 
     iterations: int = 100
@@ -108,15 +108,15 @@ class PaperSettings:
 
 @dataclass(frozen=True)
 class ModelStudy:
-    """What the simulation of one model gave.
+    """The results of the simulation of one model.
 
     Attributes:
         name: Its name in ``MODELS``.
         dynamics: Its regressor.
         P: Its true parameters, shape (c,) [kg m^2].
         history: One run per case, in the order of ``CASES``.
-        NA: Iteration in which PRX was zero for the first time without disturbance, or None.
-        one_shot_error: Relative error that (18) leaves after one run of the motion.
+        NA: First iteration in which PRX was zero without disturbance, or None.
+        one_shot_error: Relative error of (18) after one run of the motion.
     """
 
     name: str
@@ -139,10 +139,10 @@ class ModelStudy:
         return column
 
     def program_control(self, points: int) -> tuple[Array, Array]:
-        """Return the control that the program motion needs, G(q_pr, v_pr, a_pr) P.
+        """Return the control of the program motion, G(q_pr, v_pr, a_pr) P.
 
         Args:
-            points: Number N of instants.
+            points: Number N of samples.
 
         Returns:
             Times, shape (N,) [s], and torques, shape (N, 2) [N m].
@@ -180,8 +180,8 @@ def study_model(
 
     Args:
         name: Name in ``MODELS``.
-        settings: How much is simulated.
-        progress: Called with the number of each iteration that is done.
+        settings: Numbers of iterations and runs.
+        progress: Called with the number of each completed iteration.
 
     References:
         Tzvetkova, section VI.
@@ -227,16 +227,16 @@ def _influences(cases: list[Case], rng: np.random.Generator) -> Influences:
 
 @dataclass(frozen=True)
 class RandomRuns:
-    """R random motions, and what became of the estimate on each.
+    """R random motions, and the course of the estimate on each.
 
     Attributes:
         amplitude: Of each motion (28), shape (R, n) [rad].
         duration: Of each motion, shape (R,) [s].
         gain: Bandwidth w of the control, alpha = 2 w and beta = w^2, shape (R,) [1/s].
-        guess: First guess, shape (R, c).
-        offset: Where the robot starts, from its program, shape (R, n) [rad].
+        guess: Initial values, shape (R, c).
+        offset: Start of the robot relative to its program, shape (R, n) [rad].
         errors: Relative error before the first iteration and after each, shape (L + 1, R).
-        history: What happened.
+        history: The course of the runs.
     """
 
     amplitude: Array
@@ -254,13 +254,13 @@ class RandomRuns:
 
     @property
     def iterations(self) -> list[int]:
-        """Iterations that each converged run took."""
+        """Number of iterations of each converged run."""
         first = (self.errors < TOLERANCE).argmax(axis=0)
         return [int(k) for k in first[self.has_converged]]
 
     @property
     def failures(self) -> list[dict[str, Any]]:
-        """Each run that did not converge: its number, why, the final error, and what it was."""
+        """Each run without convergence: its number, the reason, the final error, its settings."""
         return [self._failure(int(r)) for r in np.flatnonzero(~self.has_converged)]
 
     def to_dict(self) -> dict[str, Any]:
@@ -283,11 +283,11 @@ class RandomRuns:
         }
 
     def _reason(self, r: int) -> str:
-        if self.history.lost[r]:
-            return f"the robot ran away from its program in iteration {self.history.lost[r]}"
+        if self.history.diverged[r]:
+            return f"the robot diverged from its program in iteration {self.history.diverged[r]}"
         reason = _course(self.errors[:, r])
         if skipped := self.history.skipped[r]:
-            reason += f"; {skipped} updates were left out, as D(q, P^) was not positive definite"
+            reason += f"; {skipped} updates were omitted, since D(q, P^) was not positive definite"
         return reason
 
 
@@ -298,28 +298,28 @@ def random_runs(
     iterations: int,
     rng: np.random.Generator,
     *,
-    reach: float = 0.05,
+    largest_offset: float = 0.05,
     progress: Callable[[int], None] | None = None,
 ) -> RandomRuns:
-    """Run the procedure on random motions, first guesses, gains and starts.
+    """Run the procedure with random motions, initial values, gains and starts.
 
-    Each joint moves by 0.5 to 2 rad either way in 1 to 3 s; each parameter is guessed at 0.3 to
-    1.7 times its value; the bandwidth is 5 to 20 1/s.
+    Each joint moves by 0.5 to 2 rad in either direction in 1 to 3 s. The initial value of each
+    parameter is 0.3 to 1.7 times its true value. The bandwidth is 5 to 20 1/s.
 
     Args:
         dynamics: The model.
         P: Its true parameters, shape (c,).
         runs: Number R of motions.
-        iterations: Most iterations of each.
-        rng: Source of all that is random.
-        reach: How far beside the program the robot may start [rad].
-        progress: Called with the number of each iteration that is done.
+        iterations: Largest number of iterations of each.
+        rng: Random generator.
+        largest_offset: Largest distance of the start from the program [rad].
+        progress: Called with the number of each completed iteration.
     """
     n = dynamics.n_joints
     amplitude = rng.uniform(0.5, 2.0, (runs, n)) * rng.choice([-1.0, 1.0], (runs, n))
     duration, gain = rng.uniform(1.0, 3.0, runs), rng.uniform(5.0, 20.0, runs)
     guess = P * rng.uniform(0.3, 1.7, (runs, len(P)))
-    offset = reach * rng.uniform(-1.0, 1.0, (runs, n))
+    offset = largest_offset * rng.uniform(-1.0, 1.0, (runs, n))
     history = run_procedure(
         dynamics,
         LinearPlant(dynamics, P),
@@ -337,12 +337,12 @@ def _course(error: Array) -> str:
     """Return why an error, shape (L + 1,), is not small at its end."""
     count = len(error) - 1
     last = min(count, 10)
-    lost = 1.0 - error[-1] / error[count - last]
+    decrease = 1.0 - error[-1] / error[count - last]
     if error[-1] > error[0]:
-        return f"the error grew, from {error[0]:.2g} to {error[-1]:.2g}"
-    if lost < _STALLED:
-        return f"stalled: the motion excites too little; an error of {error[-1]:.2g} is left"
+        return f"the error increased: from {error[0]:.2g} to {error[-1]:.2g}"
+    if decrease < _STALLED:
+        return f"stalled: the motion excites too little; the error is {error[-1]:.2g}"
     return (
-        f"slow: an error of {error[-1]:.2g} is left after {count} iterations and falls by "
-        f"{100 * lost:.2g} % in the last {last}"
+        f"slow: the error is {error[-1]:.2g} after {count} iterations, with a decrease of "
+        f"{100 * decrease:.2g} % in the last {last}"
     )

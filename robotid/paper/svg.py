@@ -1,4 +1,4 @@
-"""Figures of Matplotlib as SVG whose colours follow the page: light, dark or on paper."""
+"""Figures of Matplotlib as SVG with the colours of the page: light, dark or print."""
 
 import re
 from html import escape
@@ -37,12 +37,12 @@ STYLE: dict[Any, Any] = {
 
 
 def svg_element(figure: Any, title: str, key: str) -> str:  # noqa: ANN401
-    """Return a figure as an element that can stand in a page beside others.
+    """Return a figure as an SVG element of a page.
 
     Args:
         figure: A figure of Matplotlib, drawn in ``STYLE``.
-        title: What it shows, for those who cannot see it.
-        key: A word that no other plot on the page has.
+        title: Its description, for screen readers.
+        key: Prefix of its ids, unique on the page.
     """
     import matplotlib
 

@@ -1,4 +1,4 @@
-"""The torque regressor along motions, its gradient, and where bodies are, by compiled code."""
+"""The torque regressor along motions, its gradient, and the poses of bodies, by compiled code."""
 
 from dataclasses import dataclass
 
@@ -20,10 +20,10 @@ def fixed_tree(model: RobotModel) -> Tree:
 
     Raises:
         DataError: If the base floats.
-        SettingsError: If a joint is of a kind that is not compiled.
+        SettingsError: If the compiled code does not support a joint.
     """
     if model.free_flyer:
-        raise DataError("the base floats; motions are designed for robots with a fixed base")
+        raise DataError("the base floats; motion design requires a robot with a fixed base")
     if (why := why_not(model)) is not None:
         raise SettingsError(f"{model.name}: no motion can be designed: {why}")
     return flatten(model)
@@ -34,25 +34,25 @@ class MotionRegressor:
 
     Args:
         model: The robot, with a fixed base.
-        kept: Which b standard parameters have columns, shape (b,); those of drives are 0 here.
+        columns: Indices of the b standard parameters, shape (b,); columns of drives are 0 here.
 
     Raises:
         DataError: If the base floats.
-        SettingsError: If a joint is of a kind that is not compiled.
+        SettingsError: If the compiled code does not support a joint.
     """
 
-    def __init__(self, model: RobotModel, kept: Array) -> None:
+    def __init__(self, model: RobotModel, columns: Array) -> None:
         self._tree = fixed_tree(model)
-        self._shape = model.n_rows, len(kept)
+        self._shape = model.n_rows, len(columns)
         wanted = np.full((model.n_rows, model.layout.n_inertial), -1)
-        is_inertial = kept < model.layout.n_inertial
-        places = np.arange(model.n_rows * len(kept)).reshape(self._shape)
-        wanted[:, kept[is_inertial]] = places[:, is_inertial]
+        is_inertial = columns < model.layout.n_inertial
+        places = np.arange(model.n_rows * len(columns)).reshape(self._shape)
+        wanted[:, columns[is_inertial]] = places[:, is_inertial]
         self._places = self._tree.places(wanted)
         self._work = self._tree.work_space()
 
     def __call__(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the columns at N instants, shape (n, b, N).
+        """Return the columns at N samples, shape (n, b, N).
 
         Args:
             q: Joint coordinates, shape (N, n) [rad, m].
@@ -73,7 +73,7 @@ class MotionRegressor:
             q: Joint coordinates, shape (N, n) [rad, m].
             v: Velocities, shape (N, n) [rad/s, m/s].
             a: Accelerations, shape (N, n) [rad/s^2, m/s^2].
-            weights: What each entry counts, shape (n, b, N).
+            weights: Weight of each entry, shape (n, b, N).
         """
         by_column = np.array(weights.reshape(-1, len(q)), order="C")
         motion, out = own_motion(q, v, a), np.zeros((3, *q.shape))
@@ -83,7 +83,7 @@ class MotionRegressor:
 
 @dataclass(frozen=True, eq=False)
 class Placements:
-    """Where the m bodies of a robot are at N instants, in the frame of its root link.
+    """Poses of the m bodies of a robot at N samples, in the frame of its root link.
 
     Attributes:
         R: Their rotations, shape (3, 3, m, N).
@@ -95,7 +95,7 @@ class Placements:
 
     @classmethod
     def along(cls, tree: Tree, q: Array) -> "Placements":
-        """Return where bodies are.
+        """Return the poses of the bodies.
 
         Args:
             tree: The robot, with a fixed base.

@@ -1,7 +1,7 @@
-"""Base parameters: which combinations of the standard parameters any motion can show.
+"""Base parameters: the combinations of the standard parameters that affect the torque.
 
-QR with column pivoting of the regressor at random states: W P = Q [R1 R2], so the columns that
-stay behind are combinations of the chosen ones, W_2 = W_1 R1^-1 R2, and W pi = W_1 beta with
+QR with column pivoting of the regressor at random states: W P = Q [R1 R2], so the dependent columns
+are combinations of the independent ones, W_2 = W_1 R1^-1 R2, and W pi = W_1 beta with
 beta = K pi = pi_1 + R1^-1 R2 pi_2 (Gautier 1991).
 """
 
@@ -26,14 +26,14 @@ __all__ = [
     "structural_mapping",
 ]
 
-#: Pivots below this share of the largest are no structure. Over example-robot-data, every pivot
-#: lies above 1e-3 or below 1e-12, but for angles that a URDF rounds (3.1416), at 1e-5 to 1e-6.
+#: Pivots below this share of the largest count as 0. Over example-robot-data, every pivot is above
+#: 1e-3 or below 1e-12, except with rounded angles in a URDF (3.1416): 1e-5 to 1e-6.
 RANK_TOLERANCE = 1e-4
-_TIE = 1e-6  # share by which each column is shortened against the one before it
-_FAINTEST = 1e-12  # length of a column that is 0 at every state
+_TIE = 1e-6  # share by which each column is shortened relative to the one before it
+_FAINTEST = 1e-12  # norm of a column that is 0 at every state
 _PANEL = 24  # columns eliminated at a time
-_CLEAN = 1e-10  # smaller coefficients, relative to the scales, are rounding
-_SHOWN = 1e-6  # smaller coefficients are left out of the expressions, not of K
+_CLEAN = 1e-10  # smaller coefficients, relative to the scales, are rounding errors
+_SHOWN = 1e-6  # smaller coefficients are omitted in the expressions, not in K
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +42,9 @@ class BaseMapping:
 
     Attributes:
         K: Map with beta = K pi and W pi = W[:, independent] beta, shape (b, p).
-        independent: Columns of W that are kept, shape (b,), ascending.
+        independent: Independent columns of W, shape (b,), ascending.
         names: Names of the p standard parameters.
-        pivots: Sizes of all p pivots in order of choice, relative to the first, shape (p,).
+        pivots: Absolute values of all p pivots, descending, relative to the first, shape (p,).
     """
 
     K: Array
@@ -54,12 +54,12 @@ class BaseMapping:
 
     @property
     def base_names(self) -> tuple[str, ...]:
-        """Name of each base parameter: that of the column kept for it."""
+        """Name of each base parameter: that of its independent column."""
         return tuple(self.names[i] for i in self.independent)
 
     @cached_property
     def expressions(self) -> tuple[str, ...]:
-        """Each base parameter in words, as ``link_2.Izz + 0.5 link_3.m``."""
+        """Each base parameter as a sum, for example ``link_2.Izz + 0.5 link_3.m``."""
         return tuple(
             _expression(row, self.names, int(first))
             for row, first in zip(self.K, self.independent, strict=True)
@@ -67,18 +67,18 @@ class BaseMapping:
 
     @cached_property
     def unidentifiable(self) -> tuple[str, ...]:
-        """Names of the standard parameters that load no joint in any motion."""
+        """Names of the standard parameters that affect no torque in any motion."""
         return tuple(self.names[i] for i in np.flatnonzero(~self.K.any(axis=0)))
 
     def described(self, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-        """Return how far each of some standard parameters can be known from any motion.
+        """Return how some standard parameters are structurally identifiable.
 
         Args:
             names: Standard parameters.
 
         Returns:
-            The names by what holds of them: "alone", a base parameter of its own; "in sums", only
-            its sum with others loads a joint; "never", no motion shows it.
+            The names by kind: "alone", the parameter is a base parameter itself; "in sums", only
+            its sum with others is identifiable; "never", not identifiable by any motion.
         """
         terms = np.abs(self.K) > 0
         kinds: dict[str, tuple[str, ...]] = {"alone": (), "in sums": (), "never": ()}
@@ -110,15 +110,15 @@ class BaseMapping:
 
         Args:
             beta: Base parameters, shape (b,).
-            prior: Standard parameters to stay near, shape (p,).
-            spread: How far each may lie from its prior, shape (p,); 1 if None.
+            prior: Prior standard parameters, shape (p,).
+            spread: Prior standard deviation of each, shape (p,); 1 if None.
 
         Returns:
             Standard parameters, shape (p,), with K pi = beta. They need not be physically
             consistent.
 
         Raises:
-            DataError: If a shape does not fit.
+            DataError: If a shape is not the expected one.
         """
         if beta.shape != (len(self.K),):
             raise DataError(f"beta has shape {beta.shape}, wanted ({len(self.K)},)")
@@ -126,13 +126,13 @@ class BaseMapping:
         return pi
 
     def gain(self, spread: Array | None = None) -> Array:
-        """Return G = S^2 K^T (K S^2 K^T)^-1, shape (p, b): how a change of beta spreads over pi.
+        """Return G = S^2 K^T (K S^2 K^T)^-1, shape (p, b): the change of pi per change of beta.
 
         Args:
-            spread: How far each standard parameter may lie from its prior, shape (p,); 1 if None.
+            spread: Prior standard deviation of each standard parameter, shape (p,); 1 if None.
         """
         s = np.ones(self.K.shape[1]) if spread is None else spread
-        # K S = (Q R)^T, so that S (K S)^+ = S Q R^-T keeps all digits
+        # K S = (Q R)^T, so that S (K S)^+ = S Q R^-T has no loss of digits
         Q, R = scipy.linalg.qr((self.K * s).T, mode="economic")
         gain: Array = s[:, None] * scipy.linalg.solve_triangular(R, Q.T).T
         return gain
@@ -148,8 +148,8 @@ class BaseMapping:
         """
         if problem.names != self.names:
             raise DataError(
-                f"the problem has {len(problem.names)} columns that are not the "
-                f"{len(self.names)} of the mapping; build both from one model"
+                f"the problem has {len(problem.names)} columns, wanted the {len(self.names)} of "
+                "the mapping; build both from one model"
             )
         return problem.select(self.independent)
 
@@ -165,22 +165,22 @@ def base_mapping(
 ) -> BaseMapping:
     """Return the base parameters of a regressor taken at random states.
 
-    The columns are compared after multiplication by ``scales``, physical magnitudes, and never
-    divided by their own norm: that would turn a column of rounding noise into a parameter.
+    The columns are compared after multiplication by ``scales``, physical magnitudes. They are not
+    normalised, since a column of rounding errors would become a parameter.
 
     Args:
         W: Regressor at enough random states, shape (m, p), m >= p.
         names: Names of the columns.
         scales: Magnitude of each parameter, shape (p,); 1 if None. See
             ``ParameterLayout.scales``.
-        preference: Factor by which each column is favoured when the columns to keep are chosen,
-            shape (p,); 1 if None. It changes which groups are formed, not how many. See
+        preference: Preference of each column when the independent columns are chosen, shape (p,);
+            1 if None. It changes which groups are formed, not their number. See
             ``ParameterLayout.preference``.
         rtol: Pivots below this share of the largest count as 0.
-        n_rows: Rows of W that one sample has, each of another equation.
+        n_rows: Rows of W per sample, each of another equation.
 
     Raises:
-        DataError: If a shape does not fit, W is not finite or all zero.
+        DataError: If a shape is not the expected one, W is not finite or all zero.
 
     References:
         Gautier (1991), Numerical calculation of the base inertial parameters of robots.
@@ -188,13 +188,13 @@ def base_mapping(
     if W.ndim != 2 or W.shape[1] != len(names) or len(W) < len(names):
         raise DataError(f"W has shape {W.shape}, wanted at least {len(names)} rows of {len(names)}")
     if not np.isfinite(W).all() or not W.any():
-        raise DataError("W must be finite and not all zero")
+        raise DataError("W is all zero or not finite, wanted finite numbers")
     magnitude = np.ones(len(names)) if scales is None else scales
     favour = np.ones(len(names)) if preference is None else preference
     parts = [(own, R * magnitude[own]) for own, R in independent_factors(W, n_rows)]
     first = [_pivot(R, columns) for columns, R in parts]
     pivots = np.sort(np.concatenate([sizes for _, sizes in first]))[::-1]
-    K, kept = np.zeros((len(names), len(names))), np.zeros(len(names), dtype=bool)
+    K, independent = np.zeros((len(names), len(names))), np.zeros(len(names), dtype=bool)
     for (columns, R), (order, sizes) in zip(parts, first, strict=True):
         rank = int(np.sum(sizes > rtol * pivots[0]))
         order = order if preference is None else _pivot(R * favour[columns], columns)[0]
@@ -203,23 +203,23 @@ def base_mapping(
         X = scipy.linalg.solve_triangular(triangle[:, :rank], triangle[:, rank:])  # scaled
         X[np.abs(X) < _CLEAN] = 0.0
         own, others = columns[own], columns[others]
-        kept[own] = True
+        independent[own] = True
         K[own, own] = 1.0
         K[np.ix_(own, others)] = X * magnitude[own][:, None] / magnitude[others]
-    return BaseMapping(K[kept], np.flatnonzero(kept), names, pivots / pivots[0])
+    return BaseMapping(K[independent], np.flatnonzero(independent), names, pivots / pivots[0])
 
 
 def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
-    """Return factors of parts of a regressor that have no equation and no column in common.
+    """Return factors of the parts of a regressor that have no equation and no column in common.
 
-    Arms on a base at rest are such parts.
+    For example, arms on a common fixed base are such parts.
 
     Args:
         W: Regressor, shape (N n_rows, p).
-        n_rows: Rows, each of another equation, of one sample.
+        n_rows: Rows per sample, each of another equation.
 
     Returns:
-        Of each part its c columns, and R with R^T R = W^T W of them, shape (c, c).
+        For each part its c columns, and their R with R^T R = W^T W, shape (c, c).
     """
     from scipy.sparse.csgraph import connected_components
 
@@ -227,7 +227,7 @@ def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
     filled = (samples != 0.0).any(axis=0)  # (n_rows, p)
     linked = filled.astype(float) @ filled.T > 0.0
     count, label = connected_components(linked, directed=False)
-    # a column without an entry goes with the first equation
+    # a column of zeros is assigned to the first equation
     of_column = label[filled.argmax(axis=0)]
     parts = [(np.flatnonzero(label == k), np.flatnonzero(of_column == k)) for k in range(count)]
     return [
@@ -240,20 +240,20 @@ def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
 def _factor(rows: Array, filled: Array) -> Array:
     """Return R with R^T R = W^T W.
 
-    An equation has the columns of what its joint carries, those of every joint behind it among
-    them. From the ends of the robot to its base, each is folded into these columns, which are
-    neighbours in a suitable order. A robot whose equations are not nested so is factored as a
-    whole.
+    The equation of a joint has the columns of all bodies that the joint moves, so it contains those
+    of every joint after it. The equations are folded from the ends of the robot to its base; the
+    columns of each are adjacent in a suitable order. If the equations are not nested so, the rows
+    are factored as a whole.
 
     Args:
         rows: W, shape (N, m, c).
-        filled: Which columns an equation has, shape (m, c), bool.
+        filled: Columns of each equation, shape (m, c), bool.
     """
     c, filled = rows.shape[2], _with_carried(filled)
     fewest = np.argsort(filled.sum(axis=1), kind="stable")
     place = np.lexsort(filled[fewest])  # by the equation with the most columns first
     spans = [_span(own) for own in filled[:, place]]
-    if None in spans:  # equations that share columns without one having the other's
+    if None in spans:  # equations with common columns of which neither contains the other
         R: Array = scipy.linalg.qr(rows.reshape(-1, c), mode="r", check_finite=False)[0]
         return R[:c]
     R = np.zeros((c, c))
@@ -263,7 +263,7 @@ def _factor(rows: Array, filled: Array) -> Array:
             continue
         own = slice(first, last)
         panel = min(_PANEL, last - first)
-        # pentagonal of height 0: no row below the triangle is triangular itself
+        # pentagonal of height 0: the rows below the triangle are full
         R[own, own] = scipy.linalg.lapack.dtpqrt(
             0, panel, np.asfortranarray(R[own, own]), np.asfortranarray(rows[:, k, place[own]])
         )[0]
@@ -273,9 +273,9 @@ def _factor(rows: Array, filled: Array) -> Array:
 
 
 def _with_carried(filled: Array) -> Array:
-    """Return the columns of each equation with all of those of which it has most.
+    """Return the columns of each equation, extended by all of an equation of which it has most.
 
-    A parameter that loads a joint loads none before it if its axis happens to be so.
+    A parameter may affect a joint, but not the one before it, if its axis has a special direction.
     """
     wider, sizes = filled.copy(), filled.sum(axis=1)
     for k in np.argsort(sizes, kind="stable"):
@@ -285,7 +285,7 @@ def _with_carried(filled: Array) -> Array:
 
 
 def _span(own: Array) -> tuple[int, int] | None:
-    """Return first and end of columns, None if they are no neighbours."""
+    """Return first and end of columns, None if they are not adjacent."""
     places = np.flatnonzero(own)
     if not len(places):
         return 0, 0
@@ -294,14 +294,14 @@ def _span(own: Array) -> tuple[int, int] | None:
 
 
 def _pivot(R: Array, columns: Array) -> tuple[Array, Array]:
-    """Return the order in which columns are chosen and the size of each when it was.
+    """Return the order in which columns are chosen and the pivot of each.
 
-    LAPACK's QR with column pivoting takes the longest remaining column; later columns are
-    shortened by a hair, so that among equal ones the first wins and rounding does not choose.
+    LAPACK's QR with column pivoting chooses the remaining column with the largest norm; later
+    columns are slightly shortened, so that of equal ones the first is chosen despite rounding.
 
     Args:
         R: The columns.
-        columns: Their numbers among all.
+        columns: Their indices among all columns.
     """
     triangle, order = scipy.linalg.qr(R * (1.0 - _TIE * columns), mode="r", pivoting=True)
     sizes = np.zeros(len(columns))
@@ -322,14 +322,14 @@ def _expression(row: Array, names: tuple[str, ...], first: int) -> str:
 
 
 def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> BaseMapping:
-    """Return the base parameters that any motion of a robot can show, always the same for it.
+    """Return the structural base parameters of a robot, always the same for one robot.
 
-    Further terms of single drives change nothing in those of the others: they are new ones, or, as
-    a torque that turns like gravity, in the sums of those that there are.
+    Further terms of single drives do not change the base parameters without them. They add new
+    ones, or are added to existing sums, for example a torque with the period of gravity.
 
     Args:
         model: The robot.
-        inertial_only: Whether to leave the drive terms out.
+        inertial_only: Whether to exclude the drive terms.
     """
     columns = model.layout.n_inertial if inertial_only else len(model.layout.names)
     if model.layout.own and not inertial_only:
@@ -346,27 +346,27 @@ def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> Bas
 
 
 def _with_own_terms(model: RobotModel, plain: BaseMapping) -> BaseMapping:
-    """Return the mapping of a robot with further drive terms, beside that without them."""
+    """Return the mapping of a robot with further drive terms, from that without them."""
     names = model.layout.names
     place = [names.index(name) for name in plain.names]
     own = np.setdiff1d(np.arange(len(names)), place)
-    kept = np.array(place)[plain.independent]
+    base = np.array(place)[plain.independent]
     W = random_regressor(model, 2 * len(names) // model.n_rows + 20, np.random.default_rng(0))
-    Q, R = scipy.linalg.qr(W[:, kept], mode="economic")
+    Q, R = scipy.linalg.qr(W[:, base], mode="economic")
     size = np.maximum(np.linalg.norm(W[:, own], axis=0), _FAINTEST)
     T = Q.T @ W[:, own] / size
     S, order = scipy.linalg.qr(W[:, own] / size - Q @ T, mode="r", pivoting=True)
     rank = int(np.sum(np.abs(np.diag(S)) > RANK_TOLERANCE))
     first, rest = order[:rank], order[rank:]
-    # W_rest = W_kept A + W_first B
+    # W_rest = W_base A + W_first B
     B = scipy.linalg.solve_triangular(S[:rank, :rank], S[:rank, rank:])
     A = scipy.linalg.solve_triangular(R, T[:, rest] - T[:, first] @ B)
-    K = np.zeros((len(kept) + rank, len(names)))
-    K[: len(kept), place] = plain.K
-    K[len(kept) + np.arange(rank), own[first]] = 1.0
-    K[: len(kept), own[rest]] = np.where(np.abs(A) < _CLEAN, 0.0, A) * size[rest]
-    K[len(kept) :, own[rest]] = B * size[rest] / size[first][:, None]
-    independent = np.concatenate([kept, own[first]])
-    turn = np.argsort(independent)
+    K = np.zeros((len(base) + rank, len(names)))
+    K[: len(base), place] = plain.K
+    K[len(base) + np.arange(rank), own[first]] = 1.0
+    K[: len(base), own[rest]] = np.where(np.abs(A) < _CLEAN, 0.0, A) * size[rest]
+    K[len(base) :, own[rest]] = B * size[rest] / size[first][:, None]
+    independent = np.concatenate([base, own[first]])
+    ascending = np.argsort(independent)
     pivots = np.append(plain.pivots, np.abs(np.diag(S)))
-    return BaseMapping(K[turn], independent[turn], names, pivots)
+    return BaseMapping(K[ascending], independent[ascending], names, pivots)

@@ -1,4 +1,4 @@
-"""What each row of the regressor consists of: drive columns, and the plan of a block of rows."""
+"""The drive columns of the regressor, and the plan of a block of rows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,14 +27,14 @@ __all__ = [
 
 @dataclass(frozen=True)
 class RowPlan:
-    """Which columns a block of rows has and in which place, joint after joint.
+    """The columns of a block of rows and their places, joint by joint.
 
     Attributes:
-        inertial: Per row the inertial columns wanted, n arrays of shape (c_j,).
+        inertial: Per row its inertial columns, n arrays of shape (c_j,).
         places: Per row their places in the block, likewise.
-        drives: Per row the place of each drive column, which drive parameter it is, and its ratio.
-        torques: Per row the place of the torque, its last one.
-        first: Place at which each row begins, and the end, shape (n + 1,), int.
+        drives: Per row the place of each drive column, its drive parameter, and its ratio.
+        torques: Per row the place of the torque, the last one of the row.
+        first: First place of each row, and the end, shape (n + 1,), int.
     """
 
     inertial: tuple[Array, ...]
@@ -52,9 +52,9 @@ def drive_values(
     direction: Array,
     memory: Array | None = None,
 ) -> Array:
-    """Return what drive parameters multiply, shape (k, N), by the speed w of their drives.
+    """Return the columns of drive parameters, shape (k, N), at the speed w of their drives.
 
-    Row j of the regressor holds them times ``layout.drive_loads[j]``.
+    Row j of the regressor has them times ``layout.drive_loads[j]``.
 
     Args:
         layout: The standard parameters.
@@ -65,31 +65,32 @@ def drive_values(
         memory: As of ``Trajectory.memory``, shape (N, m); None if the layout has none.
 
     Raises:
-        DataError: If a shape of direction or memory is another one.
+        DataError: If the shape of direction or memory is not the expected one.
     """
     motion = drive_motion(layout, q, v, a, direction)
-    kept = np.empty((len(v), 0)) if memory is None else memory
-    if kept.shape != (len(v), len(layout.remembering)):
+    states = np.empty((len(v), 0)) if memory is None else memory
+    if states.shape != (len(v), len(layout.remembering)):
         raise DataError(
-            f"memory has shape {kept.shape}, wanted {(len(v), len(layout.remembering))}: a column "
-            "for each drive parameter that remembers; give the trajectory to remember() first"
+            f"memory has shape {states.shape}, wanted {(len(v), len(layout.remembering))}: a "
+            "column for each drive parameter with internal state or load; call remember() with "
+            "the trajectory first"
         )
     place = {k: m for m, k in enumerate(layout.remembering)}
     values = np.empty((len(layout.drive_parameters), len(v)))
     for k, (x, (d, term)) in enumerate(zip(values, layout.drive_parameters, strict=True)):
-        x[:] = kept[:, place[k]] if k in place else term.column(motion.of(d))
+        x[:] = states[:, place[k]] if k in place else term.column(motion.of(d))
     return values
 
 
 def trajectory_values(
     layout: ParameterLayout, motion: Trajectory, part: slice = slice(None)
 ) -> Array:
-    """Return what drive parameters multiply along a trajectory, shape (k, N); see ``drive_values``.
+    """Return the columns of drive parameters along a trajectory, (k, N); see ``drive_values``.
 
     Args:
         layout: The standard parameters.
         motion: The trajectory.
-        part: Which N samples of it.
+        part: N samples of it.
     """
     direction, memory = (None if x is None else x[part] for x in (motion.direction, motion.memory))
     signs = friction_directions(layout, motion.v[part], direction)
@@ -107,7 +108,7 @@ def drive_motion(
     rate: Array | None = None,
     begins: Array | None = None,
 ) -> DriveMotion:
-    """Return how drives move and what loads them, arrays of shape (d, N).
+    """Return the motion and load of drives, arrays of shape (d, N).
 
     Args:
         layout: The standard parameters.
@@ -116,8 +117,8 @@ def drive_motion(
         a: Accelerations, as of ``drive_values``.
         direction: As of ``friction_directions``, shape (N, c).
         load: Torque of the rigid bodies in the rows of the joints, shape (N, n) [N m, N]; None: 0.
-        rate: Change of the whole torque in them, shape (N, n) [N m/s, N/s]; None: 0.
-        begins: Where a segment begins, shape (N,), bool; None: the instants do not follow another.
+        rate: Time derivative of the whole torque in them, shape (N, n) [N m/s, N/s]; None: 0.
+        begins: First samples of segments, shape (N,), bool; None: the samples are not a sequence.
     """
     R = layout.drive_ratios
     n = R.shape[1]
@@ -138,9 +139,9 @@ def drive_motion(
 def instant_state(
     layout: ParameterLayout, q: Array, v: Array, a: Array, direction: Array | None, load: Array
 ) -> Array:
-    """Return what drives remember at instants that do not follow each other, shape (N, m).
+    """Return the columns with internal state or load at independent samples, shape (N, m).
 
-    Their drives have slid for long, and their torque does not change.
+    Internal states are at their steady value, and the torque is constant.
 
     Args:
         layout: The standard parameters.
@@ -155,49 +156,49 @@ def instant_state(
 
 
 def remembered(layout: ParameterLayout, motion: DriveMotion) -> Array:
-    """Return what drive parameters multiply that an instant alone does not show, shape (N, m).
+    """Return the columns of drive parameters with internal state or load, shape (N, m).
 
     Args:
         layout: The standard parameters.
-        motion: How the d drives move, arrays of shape (d, N).
+        motion: Motion of the d drives, arrays of shape (d, N).
     """
     own = [layout.drive_parameters[k] for k in layout.remembering]
     return np.column_stack([term.column(motion.of(d)) for d, term in own])
 
 
 def friction_speeds(layout: ParameterLayout) -> Array:
-    """Return the speeds whose direction friction follows: those of joints, then of couplings.
+    """Return the speeds whose sign is the direction of friction: of joints, then of couplings.
 
     Args:
         layout: The standard parameters of a robot with n joints.
 
     Returns:
-        Their ratios to the speeds of the joints, w = ratios v, shape (c, n), so that w is in rad/s
-        whether a joint turns or slides (``drive_speeds``); c is the number of drives, or 0 if no
-        term of the layout follows a direction.
+        Their ratios to the speeds of the joints, w = ratios v, shape (c, n), with w in rad/s for
+        prismatic joints too (``drive_speeds``); c is the number of drives, or 0 if no term of the
+        layout depends on a direction.
     """
     ratios: Array = layout.drive_ratios / layout.drive_speeds[:, None]
     return ratios if layout.follows_direction else ratios[:0]
 
 
 def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:
-    """Return where no drive with friction is too slow to tell its sign, shape (N, n_rows), bool.
+    """Return the rows in which the sign of friction is certain, shape (N, n_rows), bool.
 
     Args:
         layout: The standard parameters.
         v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
-        least: Speed from which the sign is sure [rad/s]; ``drive_speeds`` times that of sliders.
+        least: Speed from which the sign is certain [rad/s], times ``drive_speeds``.
     """
     ratios = friction_speeds(layout)
     first = v.shape[1] - ratios.shape[1]
     slow = np.abs(v[:, first:] @ ratios.T) < least  # (N, c)
-    sure = np.ones(v.shape, dtype=bool)
-    sure[:, first:] = ~(slow @ (ratios != 0.0))
-    return sure
+    certain = np.ones(v.shape, dtype=bool)
+    certain[:, first:] = ~(slow @ (ratios != 0.0))
+    return certain
 
 
 def friction_directions(layout: ParameterLayout, v: Array, direction: Array | None) -> Array:
-    """Return the directions that friction follows, shape (N, c): those given, or the speeds' signs.
+    """Return the directions of friction, shape (N, c): those given, or the signs of the speeds.
 
     Args:
         layout: The standard parameters.
@@ -205,7 +206,7 @@ def friction_directions(layout: ParameterLayout, v: Array, direction: Array | No
         direction: Filtered signs of the speeds, shape (N, c), or None.
 
     Raises:
-        DataError: If the shape of those given is another one.
+        DataError: If the shape of those given is not the expected one.
     """
     speeds = friction_speeds(layout)
     if direction is None:
@@ -225,10 +226,10 @@ def plan_rows(layout: ParameterLayout, columns: Sequence[Array]) -> RowPlan:
 
     Args:
         layout: The standard parameters.
-        columns: Which of the p standard parameters each row has, n arrays.
+        columns: Indices of the standard parameters of each row, n arrays.
     """
     loads, size = layout.drive_loads, layout.n_inertial
-    base = len(columns) - len(loads)  # rows of a floating base, which no drive loads
+    base = len(columns) - len(loads)  # rows of a floating base, without drives
     first = np.concatenate([[0], np.cumsum([len(row) + 1 for row in columns])])
     inertial = [np.flatnonzero(row < size) for row in columns]
     return RowPlan(

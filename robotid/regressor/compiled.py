@@ -1,8 +1,8 @@
-"""The compiled way to the inertial columns of the regressor.
+"""The compiled path to the inertial columns of the regressor.
 
-A robot's tree is flattened to arrays that ``lanes`` works on. Any joint's placement is
-R(q) = A + B cos q + C sin q, p(q) = p0 + d q, with the axis measured from Pinocchio's own joint, so
-that aligned and unaligned, turning and sliding joints are one case.
+A robot's tree is flattened to arrays for ``lanes``. Any joint's placement is
+R(q) = A + B cos q + C sin q, p(q) = p0 + d q, with the axis from Pinocchio's own joint, so that
+revolute and prismatic joints, aligned or not, are one case.
 """
 
 from functools import cache
@@ -32,15 +32,15 @@ __all__ = [
     "work_per_sample",
 ]
 
-#: Work, samples times ``work_per_sample``, from which the compiled path pays its start of about
-#: half a second in every process (importing Numba, reading the compiled code). For seven joints in
-#: a row that is 1e5 samples. Compiling it takes some 10 s, once per installation.
+#: Work, samples times ``work_per_sample``, from which the compiled path is faster despite its start
+#: of about 0.5 s per process (importing Numba, reading the compiled code). For seven joints in
+#: series that is 1e5 samples. Compiling it takes some 10 s, once per installation.
 LONG_ENOUGH = 3_500_000
 _DOUBLINGS = 6
 
 
 def work_per_sample(model: "RobotModel") -> int:
-    """Return the work of one sample: pairs of a body and a joint that carries it, and a start.
+    """Return the work of one sample: pairs of a body and a joint that moves it, plus a constant.
 
     Args:
         model: The robot.
@@ -52,7 +52,7 @@ def work_per_sample(model: "RobotModel") -> int:
 
 
 def why_not(model: "RobotModel") -> str | None:
-    """Return in words why the compiled path cannot take a robot, or None if it can.
+    """Return why the compiled path does not support a robot, or None if it does.
 
     Args:
         model: The robot.
@@ -60,21 +60,21 @@ def why_not(model: "RobotModel") -> str | None:
     joints, first = list(model.pin_model.joints), 2 if model.free_flyer else 1
     for name, joint in list(zip(model.pin_model.names, joints, strict=True))[first:]:
         if joint.nv != 1 or not _is_simple(_joint_axis(model.pin_model, joint.id)):
-            return f"joint {name!r} is a {joint.shortname()}, which is not compiled"
+            return f"the compiled code does not support joint {name!r} ({joint.shortname()})"
     try:
         row_lanes()
     except ImportError as error:
-        return f"Numba does not run here: {error}"
+        return f"Numba cannot be imported: {error}"
     return None
 
 
 def keeps_code() -> bool:
-    """Return whether there is a folder for compiled code, which is else lost with the process."""
+    """Return whether there is a cache folder for compiled code."""
     return row_lanes().inertial_rows.stats.cache_path is not None
 
 
 class CompiledWriter:
-    """Writes one block of rows after the other into the same memory: one thread, one writer."""
+    """Writes blocks of rows into the same memory; one writer per thread."""
 
     def __init__(self, model: "RobotModel", tree: "Tree", plan: RowPlan, out: Array) -> None:
         """Prepare to write to ``out``, shape (C, k), k a multiple of 64; see ``why_not`` before."""
@@ -89,16 +89,16 @@ class CompiledWriter:
         self._work = tree.work_space()
 
     def load(self, motion: Trajectory, part: slice, values: Array, weights: Array | None) -> None:
-        """Take the samples of the next blocks, and what drive parameters multiply in them.
+        """Load the samples of the next blocks, and their drive columns.
 
         Args:
             motion: The trajectory.
-            part: Which of its samples.
+            part: Its samples to load.
             values: As of ``drive_values``, shape (k, N).
             weights: Weight of each row; None: all 1.
         """
         q, v, a, tau = motion.q[part], motion.v[part], motion.a[part], motion.tau[part]
-        if self._model.free_flyer:  # the pose has one entry more than the twist
+        if self._model.free_flyer:  # the pose has one more entry than the twist
             self._motion = own_motion(q[:, 1:], v, a, _base_state(self._model, q, v, a))
         else:
             self._motion = own_motion(q, v, a)
@@ -118,16 +118,16 @@ class CompiledWriter:
 
 
 class Tree(NamedTuple):
-    """A robot's B bodies as arrays, as compiled code takes them. Bodies follow their parents.
+    """A robot's B bodies as arrays for compiled code. Parents come before their children.
 
     Attributes:
         parents: Parent of each body, shape (B,), int; -1: the world.
         joints: Constants of each joint, its ratio to its coordinate and its offset, shape (B, 41).
         leaders: Coordinate that moves each joint, shape (B,), int.
-        rows: Row of the regressor of each slot of each body, shape (B, D), int; -1 beyond.
-        depths: Number of rows that each body loads, shape (B,), int.
-        slots: Which of a body's rows its own joint belongs to, shape (B,), int; -1: floating base.
-        is_below: Whether joint k carries body i, itself included, shape (B, B), bool, [i, k].
+        rows: Row of the regressor of each slot of each body, shape (B, D), int; -1 if unused.
+        depths: Number of rows that each body affects, shape (B,), int.
+        slots: Slot of a body's own joint, shape (B,), int; -1: floating base.
+        is_below: Whether joint k moves body i, its own included, shape (B, B), bool, [i, k].
         gravity: Shape (3,) [m/s^2].
     """
 
@@ -141,10 +141,10 @@ class Tree(NamedTuple):
     gravity: Array
 
     @property
-    def slides(self) -> Array:
+    def prismatic(self) -> Array:
         """Which joints are prismatic, shape (B,), bool."""
-        slides: Array = np.any(self.joints[:, 33:36], axis=1)
-        return slides
+        prismatic: Array = np.any(self.joints[:, 33:36], axis=1)
+        return prismatic
 
     @property
     def axes(self) -> Array:
@@ -159,7 +159,7 @@ class Tree(NamedTuple):
         return work
 
     def places(self, wanted: Array) -> Array:
-        """Return where the columns of each body in each of its rows go, shape (B, D, 10).
+        """Return the places of the columns of each body in each of its rows, shape (B, D, 10).
 
         Args:
             wanted: Place of each inertial column in each row, shape (n_rows, 10 B), int; -1: none.
@@ -169,10 +169,10 @@ class Tree(NamedTuple):
         return np.where(self.rows[..., None] >= 0, found, -1)
 
     def part(self, bodies: Array) -> "Tree":
-        """Return some bodies as a tree of their own.
+        """Return some bodies as a separate tree.
 
         Args:
-            bodies: Their numbers, ascending, shape (k,); none hangs on one that is left out.
+            bodies: Their indices, ascending, shape (k,); with each body also its parents.
         """
         place = {-1: -1} | {int(body): k for k, body in enumerate(bodies)}
         parents = np.array([place[int(i)] for i in self.parents[bodies]])
@@ -184,7 +184,7 @@ class Tree(NamedTuple):
 def own_motion(
     q: Array, v: Array, a: Array, base: Array | None = None
 ) -> tuple[Array, Array, Array, Array]:
-    """Return copies that Numba finds writable and in C order: others would be compiled again.
+    """Return writable copies in C order: for other arrays Numba would compile again.
 
     Args:
         q: Coordinates, shape (N, n_rows) [rad, m].
@@ -230,7 +230,7 @@ def flatten(model: "RobotModel") -> Tree:
 
 
 def _places(tree: Tree, plan: RowPlan) -> Array:
-    """Return where each body's columns in each of its rows go, shape (B, D, 10); -1: nowhere."""
+    """Return the places of each body's columns in each of its rows, (B, D, 10); -1: none."""
     table = np.full((len(plan.inertial), 10 * len(tree.parents)), -1)
     for row, wanted, place in zip(table, plan.inertial, plan.places, strict=True):
         row[wanted] = place
@@ -242,15 +242,15 @@ def joint_constants(pin_model: pin.Model, body: int) -> Array:
 
     Args:
         pin_model: The robot.
-        body: Number of the joint.
+        body: Index of the joint.
     """
-    slide, turn = _joint_axis(pin_model, body).reshape(2, 3)
+    linear, angular = _joint_axis(pin_model, body).reshape(2, 3)
     P, p0 = pin_model.jointPlacements[body].rotation, pin_model.jointPlacements[body].translation
-    along = np.outer(turn, turn)
-    about = np.eye(3) - along if turn.any() else np.zeros((3, 3))
+    along = np.outer(angular, angular)
+    about = np.eye(3) - along if angular.any() else np.zeros((3, 3))
     A = P @ (np.eye(3) - about)
-    rotation = [(P @ M).T.reshape(-1) for M in (about, pin.skew(turn))]
-    return np.concatenate([A.T.reshape(-1), *rotation, p0, P @ slide, slide, turn])
+    rotation = [(P @ M).T.reshape(-1) for M in (about, pin.skew(angular))]
+    return np.concatenate([A.T.reshape(-1), *rotation, p0, P @ linear, linear, angular])
 
 
 def _joint_axis(pin_model: pin.Model, body: int) -> Array:
@@ -265,7 +265,7 @@ def _joint_axis(pin_model: pin.Model, body: int) -> Array:
 
 
 def _is_simple(axis: Array) -> bool:
-    """Return whether a joint either slides along or turns about its axis of length 1."""
+    """Return whether a joint is prismatic or revolute with an axis of length 1."""
     lengths = np.linalg.norm(axis.reshape(2, 3), axis=1)
     return bool(np.allclose(np.sort(lengths), [0.0, 1.0]))
 
@@ -273,7 +273,7 @@ def _is_simple(axis: Array) -> bool:
 def _base_state(model: "RobotModel", q: Array, v: Array, a: Array) -> Array:
     """Return v, w, a - g, dw of the floating base in its own frame, shape (12, k)."""
     g = model.pin_model.gravity.linear
-    # R^T g with the rotation matrix of the quaternion, as Pinocchio forms it
+    # R^T g with the rotation matrix of the quaternion, computed as in Pinocchio
     u = np.cross(g, q[:, 3:6])
     gravity = g + 2 * (q[:, 6:7] * u + np.cross(u, q[:, 3:6]))
     return np.vstack([v[:, :6].T, (a[:, :3] - gravity).T, a[:, 3:6].T])

@@ -1,9 +1,8 @@
 """The compressed problem: one triangular factor per joint, by sequential QR.
 
-All that least squares, weighted least squares and convex fits need of W and tau is the
-triangular factor R_j of each joint's rows, with R_j^T R_j = [W_j tau_j]^T [W_j tau_j].
-Factors of two logs merge into the factor of both. A reduction is what a segment of a log comes
-down to: its factors, and what else is summed over its samples.
+Least squares, weighted least squares and convex fits need only the triangular factor R_j of each
+joint's rows, with R_j^T R_j = [W_j tau_j]^T [W_j tau_j]. The factors of two logs merge into the
+factor of both. A reduction of a segment of a log has its factors and other sums over its samples.
 """
 
 import os
@@ -39,16 +38,16 @@ __all__ = [
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
 
-_PART = 16384  # samples per part: long enough that merging costs nothing, short enough to share
+_PART = 16384  # samples per part: merging costs little, and there are enough parts for threads
 
 
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """Triangular factors of [W_j tau_j], joint by joint, each with the columns that it has.
+    """Triangular factors of [W_j tau_j], joint by joint, each with its own columns.
 
     Attributes:
         triangles: Upper triangular factors, n arrays of shape (c_j + 1, c_j + 1).
-        columns: The columns that joint j has, n arrays of shape (c_j,), ascending.
+        columns: The columns of joint j, n arrays of shape (c_j,), ascending.
         rows: Number of rows folded in per joint, shape (n,), int.
         names: Names of the c columns.
     """
@@ -60,7 +59,7 @@ class Factors:
 
     @property
     def R(self) -> Array:
-        """The factors over all c columns, shape (n, c + 1, c + 1), zeros where a joint has none."""
+        """The factors over all c columns, shape (n, c + 1, c + 1), 0 for columns not of a joint."""
         size = len(self.names) + 1
         dense = np.zeros((len(self.triangles), size, size))
         for R, triangle, own in zip(dense, self.triangles, self.columns, strict=True):
@@ -72,22 +71,22 @@ class Factors:
         """Return the factors of the same rows with fewer columns.
 
         Args:
-            columns: Indices of the columns kept, shape (b,).
+            columns: Indices of the remaining columns, shape (b,).
         """
         columns = np.asarray(columns, dtype=int)
-        triangles, kept = [], []
+        triangles, remaining = [], []
         for triangle, own in zip(self.triangles, self.columns, strict=True):
-            kept.append(np.flatnonzero(np.isin(columns, own)))
-            places = np.append(np.searchsorted(own, columns[kept[-1]]), len(own))
+            remaining.append(np.flatnonzero(np.isin(columns, own)))
+            places = np.append(np.searchsorted(own, columns[remaining[-1]]), len(own))
             triangles.append(triangle_of(triangle[:, places]))
         names = tuple(self.names[i] for i in columns)
-        return Factors(tuple(triangles), tuple(kept), self.rows, names)
+        return Factors(tuple(triangles), tuple(remaining), self.rows, names)
 
     def weighted(self, sigma: Array) -> Array:
         """Return one factor, shape (c + 1, c + 1), of all joints' rows [W_j tau_j] / sigma_j.
 
-        From the fingers to the base, each factor is folded into the smallest one that has all its
-        columns: a joint's are among those of the joint that carries it.
+        From the ends of the robot to its base, each factor is folded into the smallest one that has
+        all its columns: a joint's columns are among those of the joint before it.
 
         Args:
             sigma: Noise level per joint, shape (n,) [N m or N], positive.
@@ -185,7 +184,7 @@ class Factors:
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
-    """What the rows of a piece, or of many, come down to.
+    """The reduction of the rows of one piece of a log, or of several.
 
     Attributes:
         factors: Their triangular factors.
@@ -214,7 +213,7 @@ class Reduction:
         return cls(compress(problem, threads=threads), trajectory.squares, len(trajectory.t))
 
     def to_arrays(self) -> dict[str, Array]:
-        """Return the reduction as plain arrays by name, as for a checkpoint."""
+        """Return the reduction as arrays by name, for a checkpoint."""
         return {
             **{f"R_{j}": R for j, R in enumerate(self.factors.triangles)},
             **{f"columns_{j}": own for j, own in enumerate(self.factors.columns)},
@@ -226,7 +225,7 @@ class Reduction:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> "Reduction":
-        """Return the reduction that arrays hold, to the same bits; see ``to_arrays``.
+        """Return the reduction from its arrays, bit by bit the same; see ``to_arrays``.
 
         Args:
             arrays: The arrays by name.
@@ -248,10 +247,10 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
     order: the result does not depend on the number of threads.
 
     Args:
-        problem: The rows; each is scaled by the square root of its weight, so that a weight of 0
-            leaves it out.
-        threads: Number of threads, at least 1; None: one per core where the problem's rows come
-            faster that way, otherwise one.
+        problem: The rows; each is scaled by the square root of its weight, so a weight of 0
+            excludes it.
+        threads: Number of threads, at least 1; None: one per core if the problem's rows are
+            computed faster so, otherwise one.
 
     Raises:
         DataError: If a row is not finite.
@@ -273,18 +272,18 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
 def compress_segments(
     problem: Problem, length: int, *, threads: int | None = None
 ) -> tuple[Factors, ...]:
-    """Fold each segment of a problem into factors of its own, as for held-out segments.
+    """Fold each segment of a problem into its own factors, for held-out segments.
 
     Args:
-        problem: The rows, of one log or several; not one that comes in blocks only.
+        problem: The rows of one log or several; a problem with row sources.
         length: Samples per segment, at least 1; the last segment of each log may have fewer.
         threads: As of ``compress``.
 
     Raises:
-        DataError: If a row is not finite, or the problem comes in blocks only.
+        DataError: If a row is not finite, or the problem has no row sources.
     """
     if not problem.sources:
-        raise DataError("the problem comes in blocks only; it cannot be cut into segments")
+        raise DataError("the problem has blocks only, wanted row sources to cut into segments")
     columns = tuple(np.flatnonzero(row) for row in problem.support)
     part = -(-_PART // length) * length  # whole segments
     found = []
@@ -303,7 +302,7 @@ def compress_segments(
 
 
 def merge(factors: Sequence[Factors]) -> Factors:
-    """Return the factors of all rows of several logs, as if they had been folded in one pass.
+    """Return the factors of all rows of several logs.
 
     Args:
         factors: At least one; all with the same columns and joints.
@@ -312,7 +311,7 @@ def merge(factors: Sequence[Factors]) -> Factors:
         DataError: If there is none, or their columns or joints differ.
     """
     if not factors:
-        raise DataError("no factors were given; at least one log is needed")
+        raise DataError("there are no factors, wanted those of at least one log")
     first = factors[0]
     for other in factors[1:]:
         if other.names != first.names or len(other.rows) != len(first.rows):
@@ -334,18 +333,18 @@ def merge(factors: Sequence[Factors]) -> Factors:
 
 
 def gather(segments: Sequence[Factors], count: int) -> tuple[Factors, ...]:
-    """Return fewer, longer segments: neighbours merged, as for held-out segments.
+    """Return fewer, longer segments: neighbours are merged, for held-out segments.
 
     Args:
         segments: Factors of segments, in order.
-        count: Number wanted, at least 1.
+        count: Wanted number, at least 1.
     """
     edges = np.linspace(0, len(segments), min(count, len(segments)) + 1).round().astype(int)
     return tuple(merge(segments[i:j]) for i, j in pairwise(edges))
 
 
 def join(reductions: Sequence[Reduction]) -> Reduction:
-    """Return what all the rows of several reductions come down to.
+    """Return the reduction of all rows of several reductions.
 
     Args:
         reductions: At least one; all with the same columns and joints.
@@ -354,7 +353,7 @@ def join(reductions: Sequence[Reduction]) -> Reduction:
         DataError: If there is none, or their columns or joints differ.
     """
     if not reductions:
-        raise DataError("no reduction was given; at least one log is needed")
+        raise DataError("there is no reduction, wanted that of at least one log")
     return Reduction(
         merge([r.factors for r in reductions]),
         np.sum([r.squares for r in reductions], axis=0),
@@ -365,7 +364,7 @@ def join(reductions: Sequence[Reduction]) -> Reduction:
 def join_segments(reductions: Iterable[Reduction], count: int, most: int) -> list[Reduction]:
     """Return the reductions of at most so many segments of neighbouring pieces, in order.
 
-    They are joined as they come, so that no more are in memory; the last one may be shorter.
+    They are joined one by one, to limit the memory; the last one may be shorter.
 
     Args:
         reductions: One per piece, in order.
@@ -403,7 +402,7 @@ def _fold_blocks(
         root = np.sqrt(weight).reshape(-1, n)
         rows += (root > 0).sum(axis=0)
         for j, own in enumerate(columns):
-            used = np.flatnonzero(root[:, j] != 0)  # not a number counts as used: it shows in R
+            used = np.flatnonzero(root[:, j] != 0)  # NaN counts as used: it appears in R
             scaled = np.empty((len(used), len(own) + 1), order="F")
             scaled[:, :-1] = by_joint[used, j][:, own]
             scaled[:, -1] = torque[used, j]
@@ -431,7 +430,7 @@ def _fold_sources(
 
 
 def _places(source: RowSource, columns: Sequence[Array]) -> list[Array]:
-    """Return where the columns of each row of a source, and its torque, are among those wanted."""
+    """Return the places of each row's columns, and of its torque, among the wanted columns."""
     return [
         np.append(np.searchsorted(wanted, own), len(wanted))
         for wanted, own in zip(columns, source.columns, strict=True)
@@ -448,15 +447,15 @@ def _placed(R: Array, places: Array, size: int) -> Array:
 
 
 def _require_finite(triangles: Sequence[Array]) -> None:
-    """Refuse factors of rows that are not finite: what is not finite in a row is not in R."""
+    """Refuse factors of rows that are not finite: R is not finite then either."""
     if not all(np.isfinite(R).all() for R in triangles):
-        raise DataError("the problem holds a row that is not finite; check the trajectory")
+        raise DataError("the problem has a row that is not finite; check the trajectory")
 
 
 def _in_order(
     work: Callable[[ItemT], ResultT], items: Sequence[ItemT], is_parallel: bool, threads: int | None
 ) -> Iterator[ResultT]:
-    """Yield what work makes of each item in order, several at a time where that is faster."""
+    """Yield the result of work for each item in order, with threads where that is faster."""
     workers = (available_cores() if is_parallel else 1) if threads is None else threads
     if min(workers, len(items)) <= 1:
         yield from map(work, items)

@@ -1,8 +1,8 @@
-"""Friction of drives on the terms that simulators have: viscous, Coulomb, a spring, an offset.
+"""Projection of drive friction on the terms of simulators: viscous, Coulomb, spring, offset.
 
-A drive's torque X x of all its terms is replaced by Y z of the terms of a format, Y z nearest to
-X x in least squares over the rows of the logs. The mean products of the columns of X and Y over
-the rows are all that this needs, so that a result states these and no logs are read again.
+A drive's torque X x of all its terms is replaced by Y z of the terms of a format, the nearest to
+X x in least squares over the rows of the logs. This needs only the mean products of the columns of
+X and Y over the rows. A result contains them, so that the logs are not needed.
 """
 
 import warnings
@@ -30,12 +30,12 @@ __all__ = [
     "projected_pinocchio_model",
 ]
 
-#: The terms that friction is projected on. An offset is always among them, so that a format
-#: without one does not take it for friction.
+#: The terms that friction is projected on. The offset is always one of them, so that it does not
+#: become friction in a format without offset.
 _SIMPLE: dict[str, DriveTerm] = {
     **{name: TERMS[name] for name in ("viscous", "coulomb", "offset")}, "spring": Spring()
 }  # fmt: skip
-_ROUNDING = 1e-12  # of the largest eigenvalue of products: a smaller one is 0
+_ROUNDING = 1e-12  # of the largest eigenvalue of products: a smaller one counts as 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class DriveMoments:
     """Second moments of the terms of one drive over the rows of the logs.
 
     Attributes:
-        terms: The drive's own terms but inertia, then those of a simulator that it lacks.
+        terms: The drive's own terms except inertia, then the terms of a simulator that it lacks.
         products: Mean products of their columns over the rows, shape (k, k).
         torque: RMS torque of the rows in the drive's joints [N m or N].
     """
@@ -53,17 +53,17 @@ class DriveMoments:
     torque: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values, as result.json has them."""
+        """Return plain values for result.json."""
         return {
             "terms": list(self.terms), "products": self.products.tolist(), "torque": self.torque
         }  # fmt: skip
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> "DriveMoments":
-        """Return the moments of plain values.
+        """Return the moments from plain values.
 
         Args:
-            table: As ``to_dict`` returns them.
+            table: As of ``to_dict``.
 
         Raises:
             DataError: If the products are not a finite matrix over the terms.
@@ -77,11 +77,11 @@ class DriveMoments:
         return cls(terms, products, float(table["torque"]))
 
     def transfer(self, own: Sequence[str], onto: Sequence[str]) -> Array:
-        """Return the linear map from parameters of own terms to those projected on.
+        """Return the linear map from a drive's parameters to those of its projection.
 
         Args:
             own: The drive's terms, in the order of its parameters.
-            onto: Names of the terms projected on.
+            onto: Names of the terms of the projection.
 
         Returns:
             Map T with z = T x, shape (len(onto), len(own)), without the bounds of z.
@@ -116,10 +116,10 @@ class ProjectedDrive:
         name: Joint or coupling.
         replaced: The terms that the format lacks.
         values: Parameters of the terms that the format has, by name.
-        transfer: Map from the drive's parameters to these, shape (len(values), m); rows of a
-            parameter at its bound of 0 are 0.
-        own: Numbers of the drive's m parameters in the layout of the robot.
-        error: RMS torque that the projection leaves [N m or N].
+        transfer: Map from the drive's parameters to these, shape (len(values), m); 0 in the row of
+            a parameter at its bound of 0.
+        own: Indices of the drive's m parameters in the layout of the robot.
+        error: RMS error of the projection [N m or N].
         torque: RMS torque of the drive's joints [N m or N].
     """
 
@@ -140,7 +140,7 @@ class ProjectedDrive:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values, as sidecars have them."""
+        """Return plain values for sidecars."""
         return {
             "replaced": list(self.replaced), **self.values,
             "error": self.error, "torque": self.torque,
@@ -149,12 +149,12 @@ class ProjectedDrive:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """A robot whose drives have the terms of a format only.
+    """A robot whose drives have only the terms of a format.
 
     Attributes:
         model: The robot.
         pi: Its standard parameters, shape (p,), SI units.
-        drives: The drives whose terms were projected; the others are as they were.
+        drives: The drives whose terms were projected; the others are unchanged.
     """
 
     model: RobotModel
@@ -165,13 +165,13 @@ class Projection:
 def drive_moments(
     model: RobotModel, recordings: Iterable[tuple[Trajectory, Array]]
 ) -> dict[str, DriveMoments]:
-    """Return the moments of the drives that have terms of their own, by name.
+    """Return the moments of the drives with further terms, by name.
 
-    Friction is that of ``predict``: of drives that have moved one way for long, without a delay.
+    Friction is that of ``predict``: internal states are at their steady value, without a delay.
 
     Args:
         model: The robot.
-        recordings: Trajectories and their rows used, shape (N, n_rows), bool.
+        recordings: Trajectories and their used rows, shape (N, n_rows), bool.
     """
     layout = model.layout
     sums: dict[str, tuple[tuple[str, ...], Array, float, int]] = {}
@@ -182,11 +182,11 @@ def drive_moments(
         for d, drive in enumerate(layout.drives):
             if drive.name not in layout.own:
                 continue
-            turns = layout.drive_ratios[d] != 0.0
-            rows = mask[:, first:][:, turns].all(axis=1)
+            moved = layout.drive_ratios[d] != 0.0
+            rows = mask[:, first:][:, moved].all(axis=1)
             names, columns = _columns(model, d, motion.of(d))
             X = columns[:, rows]
-            torque = float((trajectory.tau[:, -len(model.joints) :][rows][:, turns] ** 2).sum())
+            torque = float((trajectory.tau[:, -len(model.joints) :][rows][:, moved] ** 2).sum())
             _, products, total, count = sums.get(drive.name, (names, 0.0 * X @ X.T, 0.0, 0))
             sums[drive.name] = (names, products + X @ X.T, total + torque, count + int(rows.sum()))
     return {
@@ -204,7 +204,7 @@ def _columns(model: RobotModel, d: int, motion: DriveMotion) -> tuple[tuple[str,
 
 
 def _own_terms(model: RobotModel, d: int) -> list[tuple[int, DriveTerm]]:
-    """Return numbers and terms of a drive's parameters but inertia."""
+    """Return indices and terms of a drive's parameters except inertia."""
     layout = model.layout
     return [
         (k, term)
@@ -216,16 +216,16 @@ def _own_terms(model: RobotModel, d: int) -> list[tuple[int, DriveTerm]]:
 def project_friction(
     model: RobotModel, pi: Array, moments: Mapping[str, DriveMoments], onto: Collection[str]
 ) -> Projection:
-    """Return a robot whose drives have the terms of a format only, nearest to their own.
+    """Return a robot whose drives have only the terms of a format, by least squares.
 
-    Drives whose terms the format has stay as they are, and so do inertia and, where a format has
-    none, offsets. Viscous and Coulomb friction and a spring stay at 0 or above.
+    Drives whose terms the format has are unchanged. So are inertia and, in a format without them,
+    offsets. Viscous and Coulomb friction and a spring are not negative.
 
     Args:
         model: The robot.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        moments: Of the drives that have terms of their own, as of ``drive_moments``.
-        onto: Names of the terms that the format has.
+        moments: Of the drives with further terms, as of ``drive_moments``.
+        onto: Names of the terms of the format.
 
     Raises:
         DataError: If the moments of a drive are missing.
@@ -233,15 +233,15 @@ def project_friction(
     layout, projected = model.layout, []
     for d, drive in enumerate(layout.drives):
         own = _own_terms(model, d)
-        simple = (*_SIMPLE, Lag.label)  # a delay is no friction: it is left out and named
+        simple = (*_SIMPLE, Lag.label)  # a delay is not friction: it is omitted and named
         excess = [term.name for k, term in own if term.name not in simple and pi[k] != 0.0]
         excess += [t.name for k, t in own if t.name == "spring" not in onto and pi[k] != 0.0]
         if excess:
             if drive.name not in moments:
                 raise DataError(
-                    f"{drive.name} has {', '.join(excess)}, and the result has no drive_moments to "
-                    "project it on simpler friction with: an earlier version wrote it; identify "
-                    "again"
+                    f"{drive.name} has {', '.join(excess)}, but the result of an earlier version "
+                    "has no drive_moments, which the projection on simpler friction needs; "
+                    "identify again"
                 )
             projected.append(_projected(model, d, pi, moments[drive.name], excess, onto))
     if not projected:
@@ -252,7 +252,7 @@ def project_friction(
 def projected_pinocchio_model(
     model: RobotModel, pi: Array, moments: Mapping[str, DriveMoments]
 ) -> Any:  # noqa: ANN401
-    """Return ``pinocchio_model`` of a robot, its friction projected; a warning names what was.
+    """Return ``pinocchio_model`` of a robot with projected friction; a warning names its drives.
 
     Args:
         model: The robot.
@@ -261,10 +261,10 @@ def projected_pinocchio_model(
     """
     projection = project_friction(model, pi, moments, ("viscous", "coulomb", "offset"))
     if projection.drives:
-        said = "; ".join(str(drive) for drive in projection.drives)
+        changes = "; ".join(str(drive) for drive in projection.drives)
         warnings.warn(
-            f"Pinocchio's model has viscous and Coulomb friction and an offset: {said}; "
-            "predict(q, v, a) has all terms",
+            f"Pinocchio's model has only viscous and Coulomb friction and an offset: {changes}; "
+            "predict(q, v, a) includes all terms",
             stacklevel=3,
         )
     return pinocchio_model(projection.model, projection.pi)
@@ -278,7 +278,7 @@ def _projected(
     excess: Sequence[str],
     onto: Collection[str],
 ) -> ProjectedDrive:
-    """Return one drive on the terms that a format has."""
+    """Return one drive with the terms of a format."""
     own = _own_terms(model, d)
     names, x = [term.name for _, term in own], pi[[k for k, _ in own]]
     has_spring = any(term.part in ("spring", "ripple") for _, term in own)
@@ -309,17 +309,17 @@ def _projected(
 def _difference(
     names: Sequence[str], x: Array, others: Sequence[str], z: Array
 ) -> dict[str, float]:
-    """Return the parameters x less z by name of the term."""
-    left = dict(zip(names, x.tolist(), strict=True))
+    """Return the parameters x minus z by name of the term."""
+    difference = dict(zip(names, x.tolist(), strict=True))
     for name, value in zip(others, z.tolist(), strict=True):
-        left[name] = left.get(name, 0.0) - value
-    return left
+        difference[name] = difference.get(name, 0.0) - value
+    return difference
 
 
 def _simplified(
     model: RobotModel, pi: Array, projected: Sequence[ProjectedDrive]
 ) -> tuple[RobotModel, Array]:
-    """Return the robot without the terms that were projected, and its parameters."""
+    """Return the robot without the projected terms, and its parameters."""
     values = dict(zip(model.layout.names, pi.tolist(), strict=True))
     changed = {drive.name: drive.values for drive in projected}
     replaced = {drive.name: (*drive.replaced, "spring") for drive in projected}

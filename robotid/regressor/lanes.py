@@ -1,11 +1,11 @@
-"""Work spaces of lanes, and the algebra of three dimensions, compiled by Numba.
+"""Work spaces of lanes, and vector algebra in three dimensions, compiled by Numba.
 
-Imported only where compiled code is used, for Numba takes a while to import. It keeps the compiled
-code in the folder ``__pycache__`` beside this file or, where that is not writable, in its own
-folder below the user's cache; the environment variable ``NUMBA_CACHE_DIR`` names another one.
+Imported only where compiled code is used, since importing Numba takes time. Numba stores the
+compiled code in the folder ``__pycache__`` beside this file or, if that is not writable, in its own
+folder in the user's cache; the environment variable ``NUMBA_CACHE_DIR`` sets another one.
 
-All numbers of one quantity stand in neighbouring places, one lane each, so that the processor works
-on several states at a time. Entry ``at`` of a work space is one such quantity.
+The values of one quantity are adjacent in memory, one lane each, so that the processor computes
+several states together. Entry ``at`` of a work space is one such quantity.
 """
 
 import math
@@ -48,10 +48,10 @@ _ROUND = 6755399441055744.0  # 1.5 2^52: adding and subtracting it rounds to the
 
 
 class Work(NamedTuple):
-    """A work space: its entries, one after the other, and of how many lanes each is.
+    """A work space: its entries, one after the other, and the number of lanes of each.
 
-    The number of lanes is 2 to the number of ``doublings``: Numba knows how long a tuple is when it
-    compiles, and loops over lanes so become straight.
+    The number of lanes is 2 to the length of ``doublings``: Numba knows the length of a tuple at
+    compile time, so that loops over lanes are vectorised.
     """
 
     numbers: Array
@@ -63,7 +63,7 @@ def work_space(entries: int, doublings: int) -> Work:
 
     Args:
         entries: Number of entries.
-        doublings: Of the lanes, which are 2 to that number.
+        doublings: Binary logarithm of the number of lanes.
     """
     return Work(np.zeros(entries << doublings), (0,) * doublings)
 
@@ -74,29 +74,29 @@ def compiled(function: Any) -> Any:
     Args:
         function: The function.
     """
-    return _kept(njit, function, nogil=True)
+    return _cached(njit, function, nogil=True)
 
 
 def pointed(function: Callable[..., Any], arguments: int) -> Any:
-    """Compile a function of numbers that returns two, for ``applied``, which takes its address.
+    """Compile a function of numbers that returns two, for ``applied``, which uses its address.
 
     Args:
         function: The function.
-        arguments: How many numbers it takes.
+        arguments: Number of its arguments.
     """
-    return _kept(partial(cfunc, _PAIR(*[types.float64] * arguments)), function)
+    return _cached(partial(cfunc, _PAIR(*[types.float64] * arguments)), function)
 
 
-def _kept(compile: Any, function: Any, **options: Any) -> Any:
+def _cached(compile: Any, function: Any, **options: Any) -> Any:
     options |= {"fastmath": {"contract"}, "error_model": "numpy"}
     try:
         return compile(cache=True, **options)(function)
-    except RuntimeError:  # no folder to keep the code in: it lasts as long as the process
+    except RuntimeError:  # no cache folder: the code exists only in this process
         return compile(**options)(function)
 
 
 def _applied(typing, address, x):
-    """Return what the function at an address of ``pointed`` returns of a tuple of numbers."""
+    """Return the result of the function at an address of ``pointed`` for a tuple of numbers."""
 
     def code(context, builder, signature, given):
         numbers = unpack_tuple(builder, given[1])
@@ -118,7 +118,7 @@ def width(work):
 @compiled
 def get(work, at, lane):
     """Return a quantity of one lane."""
-    # an unsigned index spares Numba's look for negative ones, which would keep lanes apart
+    # an unsigned index avoids Numba's check of negative ones, which prevents vectorisation
     return work.numbers[np.uintp(at * (1 << len(work.doublings)) + lane)]
 
 

@@ -1,8 +1,8 @@
 """Rows folded into a triangular factor by LAPACK, in place.
 
-dtpqrt keeps the triangle a triangle: the QR of [R; rows] without touching the zeros of R. It is
-called through SciPy's own LAPACK by address, which copies nothing and frees the interpreter's lock;
-where that address is not to be had, through SciPy's wrapper.
+dtpqrt computes the QR of [R; rows] without using the zeros of R. It is called through the address
+of SciPy's own LAPACK, which copies nothing and releases the interpreter's lock; if that address is
+not available, through SciPy's wrapper.
 """
 
 import ctypes
@@ -18,20 +18,20 @@ from robotid._typing import Array
 __all__ = ["Triangle"]
 
 _PANEL = 8  # columns eliminated at a time: measured fastest for 20 to 70 columns ...
-_WIDE, _WIDE_PANEL = 200, 24  # ... and from so many columns on, which leave a cache
+_WIDE, _WIDE_PANEL = 200, 24  # ... and from so many columns on, which exceed a cache
 
 
 class Triangle:
-    """A triangular factor that takes in rows.
+    """A triangular factor into which rows are folded.
 
-    It is changed in place, against the house's habit: it is the innermost loop.
+    It is changed in place, unlike other objects of the package: it is the innermost loop.
 
     Attributes:
-        R: Upper triangular factor of all rows so far, shape (c, c), column-major; to be read only.
+        R: Upper triangular factor of all rows so far, shape (c, c), column-major; read only.
     """
 
     def __init__(self, columns: int) -> None:
-        """Begin with no rows of so many columns."""
+        """Initialise for rows of so many columns."""
         self.R = np.zeros((columns, columns), order="F")
         self._is_empty = True
         self._panel = min(_PANEL if columns < _WIDE else _WIDE_PANEL, columns)
@@ -40,7 +40,7 @@ class Triangle:
         self._sizes = np.array(
             [0, columns, 0, self._panel, columns, 0, self._panel, 0], dtype=np.intc
         )
-        self._begin = self.R.ctypes.data
+        self._address = self.R.ctypes.data
         self._addresses = self._list_addresses()
 
     def fold(self, rows: Array) -> None:
@@ -56,11 +56,11 @@ class Triangle:
         self._fold(rows, 0, 0)
 
     def fold_triangle(self, other: Array, places: Array) -> None:
-        """Replace R by the triangular factor of [R; other], its zeros left out of the work.
+        """Replace R by the triangular factor of [R; other], without computing with its zeros.
 
         Args:
             other: Upper triangular factor, shape (m, m).
-            places: Which of the c columns it has, shape (m,), ascending.
+            places: Its columns among the c columns, shape (m,), ascending.
         """
         if len(places) == len(self.R):
             if self._is_empty:
@@ -74,7 +74,7 @@ class Triangle:
         self._fold(rows, first, len(rows))
 
     def _fold(self, rows: Array, first: int, triangular: int) -> None:
-        """Fold rows that begin at a column, the last ones of them upper trapezoidal."""
+        """Fold rows from a column on; the last ones of them are upper trapezoidal."""
         if len(rows) == 0:
             return
         self._is_empty = False
@@ -87,23 +87,23 @@ class Triangle:
         ldb = max(len(rows), rows.strides[1] // rows.itemsize)
         self._sizes[:4] = len(rows), width, triangular, panel
         self._sizes[5] = ldb
-        self._addresses[4] = self._begin + first * (len(self.R) + 1) * self.R.itemsize
+        self._addresses[4] = self._address + first * (len(self.R) + 1) * self.R.itemsize
         self._addresses[6] = rows.ctypes.data
         call(*self._addresses)
 
     def _list_addresses(self) -> list[int]:
-        """Return where m, n, l, nb, A, lda, B, ldb, T, ldt, work and info are."""
+        """Return the addresses of m, n, l, nb, A, lda, B, ldb, T, ldt, work and info."""
         sizes, scratch = self._sizes.ctypes.data, self._scratch.ctypes.data
         m, n, pentagon, nb, lda, ldb, ldt, info = range(
             sizes, sizes + self._sizes.nbytes, self._sizes.itemsize
         )
         T, work = scratch, scratch + self._scratch.nbytes // 2
-        return [m, n, pentagon, nb, self._begin, lda, 0, ldb, T, ldt, work, info]
+        return [m, n, pentagon, nb, self._address, lda, 0, ldb, T, ldt, work, info]
 
 
 @cache
 def _dtpqrt() -> Callable[..., None] | None:
-    """Return LAPACK's dtpqrt, or None where SciPy's LAPACK has other integers than C's int."""
+    """Return LAPACK's dtpqrt, or None if the integers of SciPy's LAPACK are not C's int."""
     capsule = scipy.linalg.cython_lapack.__pyx_capi__.get("dtpqrt")
     if capsule is None:
         return None

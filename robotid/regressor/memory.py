@@ -1,4 +1,4 @@
-"""What drives remember along a trajectory: the load of their gears, its change, their reversals."""
+"""Columns of drive terms with internal state, joint load torque or torque rate on a trajectory."""
 
 import numpy as np
 
@@ -18,9 +18,9 @@ __all__ = ["drive_motion_along", "is_loaded", "remember"]
 
 
 def is_loaded(model: RobotModel) -> bool:
-    """Return whether what the drives of a robot remember changes with the torque of its reference.
+    """Return whether these columns depend on the torque of a robot's reference.
 
-    That of bristles does not: it is their way alone.
+    Those of bristles do not: they depend on the displacement only.
 
     Args:
         model: The robot.
@@ -30,14 +30,14 @@ def is_loaded(model: RobotModel) -> bool:
 
 
 def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:
-    """Return a trajectory with what the drives of a robot remember along it.
+    """Return a trajectory with the columns of drive terms with internal state or load.
 
     Args:
-        model: The robot; its reference tells the load of the gears.
+        model: The robot; its reference determines the joint load torques.
         trajectory: N samples in order of time.
 
     Returns:
-        The trajectory with ``memory``; as it is if no drive remembers anything.
+        The trajectory with ``memory``; unchanged if no drive has such a term.
     """
     if not model.layout.remembering:
         return trajectory
@@ -46,10 +46,10 @@ def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:
 
 
 def drive_motion_along(model: RobotModel, trajectory: Trajectory) -> DriveMotion:
-    """Return how the drives of a robot move along a trajectory, and what loads them.
+    """Return the motion and load of the drives of a robot along a trajectory.
 
-    The load is the torque of the bodies, its change that of the whole torque, by the model's
-    reference; what comes late by itself has no part in it.
+    The load is the torque of the bodies, and the rate that of the whole torque, by the model's
+    reference; a delayed torque itself is not included.
 
     Args:
         model: The robot.

@@ -1,4 +1,4 @@
-"""Torques that parameter vectors predict, without the regressor as a whole."""
+"""Torques predicted from parameter vectors, without the whole regressor in memory."""
 
 from collections.abc import Sequence
 
@@ -26,7 +26,7 @@ __all__ = [
     "rigid_parts",
 ]
 
-_START = 5  # work of one call of inverse dynamics beside its joints, as of work_per_sample
+_START = 5  # constant work of one call of inverse dynamics, as of work_per_sample
 
 
 def predict(
@@ -36,14 +36,14 @@ def predict(
     *,
     compiled: bool | None = None,
 ) -> list[Array]:
-    """Return the torque W theta, shape (N, n_rows) [N m, N], that each of several vectors predicts.
+    """Return the torque W theta, shape (N, n_rows) [N m, N], of each of several vectors.
 
-    By the rows of the regressor, times all vectors at once, or, where the rows are not compiled
-    and the vectors are few, by inverse dynamics, once per vector.
+    It is computed by the rows of the regressor for all vectors together, or, if the rows are not
+    compiled and the vectors are few, by inverse dynamics, once per vector.
 
     Args:
         model: The robot.
-        parameters: Vectors of standard parameters, each of shape (p,), possible ones or not.
+        parameters: Vectors of standard parameters, each of shape (p,), consistent or not.
         trajectory: N samples of q, v, a and, if the torque was filtered, direction.
         compiled: As of ``build_problem``.
 
@@ -69,18 +69,18 @@ def predict_instants(
     v: ArrayLike | None = None,
     a: ArrayLike | None = None,
 ) -> Array:
-    """Return the torques that parameters predict at instants that need not follow each other.
+    """Return the torques predicted from parameters at independent samples.
 
-    Friction acts by the sign of the speed: at rest, where it holds any torque up to its size, it
-    counts as 0. Drives whose friction has a memory have slid for long one way, under the load that
-    the bodies make, and nothing comes late. Velocities and accelerations of a robot whose
-    ``dynamics`` is "static" have no part but for the sign of friction.
+    Friction has the sign of the speed: at rest, where it can have any value within its limits, it
+    counts as 0. Internal states of friction are at their steady value, under the torque of the
+    bodies, and there is no delay. Velocities and accelerations of a robot whose ``dynamics`` is
+    "static" affect only the sign of friction.
 
     Args:
-        model: The robot; its reference tells the load of the gears.
+        model: The robot; its reference determines the joint load torques.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        q: Joint coordinates in the model's order, shape (n,) or (N, n) [rad, m]; seven more first
-            with a floating base.
+        q: Joint coordinates in the model's order, shape (n,) or (N, n) [rad, m]; with a floating
+            base, the seven of its pose before them.
         v: Velocities, shape (n_rows,) or (N, n_rows) [rad/s, m/s]; None: at rest.
         a: Accelerations, likewise [rad/s^2, m/s^2]; None: 0.
 
@@ -88,7 +88,7 @@ def predict_instants(
         Torques, shape (n_rows,) or (N, n_rows) [N m, N].
 
     Raises:
-        DataError: If a shape does not fit, or a value is not finite.
+        DataError: If a shape is not the expected one, or a value is not finite.
     """
     q = real_numbers(q, "q")
     wanted = (*q.shape[:-1], model.n_rows)
@@ -123,17 +123,17 @@ def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> l
     """Return gravity, inertia and velocity torques of the bodies, each (N, n_rows) [N m, N].
 
     They are g(q) = tau(q, 0, 0), M(q) a = tau(q, 0, a) - g(q) and C(q, v) v = tau(q, v, a) -
-    tau(q, 0, a), so that their sum is the torque of the bodies.
+    tau(q, 0, a). Their sum is the torque of the bodies.
 
     Args:
         model: The robot.
-        pi: Standard parameters, shape (p,), possible ones or not; those of drives add nothing.
+        pi: Standard parameters, shape (p,), consistent or not; those of drives have no effect.
         q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
         v: Velocities, shape (N, n_rows) [rad/s, m/s].
         a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
 
     Raises:
-        DataError: If q does not fit the model.
+        DataError: If the shape of q is not that of the model.
     """
     bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
     rigid = _newton_euler if _has_centres(model, pi) else _rows_by_pi
@@ -145,7 +145,7 @@ def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> l
 def _rows_by_pi(
     model: RobotModel, pi: Array, q: Array, v: Array, a: Array, direction: Array | None = None
 ) -> Array:
-    """Return Y pi at instants that need not follow each other, shape (N, n_rows), by blocks."""
+    """Return Y pi at independent samples, shape (N, n_rows), by blocks."""
     torque = np.empty_like(v)
     for start in range(0, len(v), BLOCK):
         k = slice(start, start + BLOCK)
@@ -169,7 +169,7 @@ def _from_rows(source: TrajectoryRows, stacked: Array) -> list[Array]:
 
 
 def _from_kept(source: TrajectoryRows, inertial: InertialRows, stacked: Array) -> list[Array]:
-    """Return the rows times the columns of (p, k), the inertial ones computed before."""
+    """Return the rows times the columns of (p, k), with the inertial columns in memory."""
     layout, n = source.model.layout, len(source.model.joints)
     torques, theta = inertial.torque(stacked), stacked[layout.n_inertial :]
     if theta.any():
@@ -180,9 +180,9 @@ def _from_kept(source: TrajectoryRows, inertial: InertialRows, stacked: Array) -
 
 
 def _has_centres(model: RobotModel, pi: Array) -> bool:
-    """Return whether every body is one that Pinocchio's (m, c, I about c) holds to all digits.
+    """Return whether Pinocchio's (m, c, I about c) represents every body without loss of digits.
 
-    Base parameters have first moments without a mass; a possible body has |m c|^2 <= m tr I / 2.
+    Base parameters have first moments without a mass; a consistent body has |m c|^2 <= m tr I / 2.
     """
     bodies = pi[: model.layout.n_inertial].reshape(-1, 10)
     moments = np.sum(bodies[:, 1:4] ** 2, axis=1)
@@ -192,18 +192,18 @@ def _has_centres(model: RobotModel, pi: Array) -> bool:
 def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
     """Return the torque W pi by the recursive Newton-Euler algorithm and the drives' terms.
 
-    Of bodies that cannot be, as those of ordinary least squares, it is the difference of the
-    torques of bodies that can.
+    For inconsistent bodies, as of ordinary least squares, it is the difference of the torques of
+    two sets of consistent bodies.
 
     Args:
         model: The robot.
-        pi: Standard parameters, shape (p,), possible ones or not.
+        pi: Standard parameters, shape (p,), consistent or not.
         trajectory: N samples of q, v, a and, if the torque was filtered, direction.
 
     Returns:
         Torques, shape (N, n_rows) [N m, N].
     """
-    m, added = trajectory, _making_possible(model, pi)
+    m, added = trajectory, _consistent_addition(model, pi)
     torque = _newton_euler(model, pi + added, m.q, m.v, m.a)
     if added.any():
         torque -= _newton_euler(model, added, m.q, m.v, m.a)
@@ -213,7 +213,7 @@ def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Ar
 
 
 def drive_torque(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
-    """Return the torque of the drives' terms alone, shape (N, n) [N m, N].
+    """Return the torque of the drives' terms, shape (N, n) [N m, N].
 
     Args:
         model: The robot.
@@ -226,20 +226,21 @@ def drive_torque(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
 
 
 def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueSlopes:
-    """Return how the torque of the bodies changes with the motion, gravity and origins of joints.
+    """Return the derivatives of the bodies' torque by motion, gravity and origins of joints.
 
     Args:
         model: The robot, with a fixed base.
-        pi: Standard parameters, shape (p,), possible ones or not.
+        pi: Standard parameters, shape (p,), consistent or not.
         trajectory: N samples of q, v and a.
     """
-    state, added = (trajectory.q, trajectory.v, trajectory.a), _making_possible(model, pi)
+    added = _consistent_addition(model, pi)
+    state = trajectory.q, trajectory.v, trajectory.a
     slopes = torque_slopes(model, pi + added, *state)
     return slopes - torque_slopes(model, added, *state) if added.any() else slopes
 
 
-def _making_possible(model: RobotModel, pi: Array) -> Array:
-    """Return bodies that make those of pi possible where they are added, shape (p,)."""
+def _consistent_addition(model: RobotModel, pi: Array) -> Array:
+    """Return bodies whose sum with those of pi is physically consistent, shape (p,)."""
     added = np.zeros_like(pi)
     if _has_centres(model, pi):
         return added

@@ -1,4 +1,4 @@
-"""The linear problem W theta = tau as a stream of row blocks; W as a whole is never held."""
+"""The linear problem W theta = tau as a stream of row blocks; W is never in memory as a whole."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,7 +13,7 @@ from robotid.exceptions import DataError
 
 __all__ = ["Block", "Problem", "RowSource", "Sample", "concatenate", "shuffled"]
 
-_SHUFFLED = 8192  # samples held while they are shuffled: all of a short log, 30 MB of a long one
+_SHUFFLED = 8192  # samples in the buffer of the shuffle: all of a short log, 30 MB of a long one
 
 #: Rows of k samples: W (k n, c), tau (k n,), weight (k n,); row of sample k, joint j: k n + j.
 Block: TypeAlias = tuple[Array, Array, Array]
@@ -21,12 +21,12 @@ Block: TypeAlias = tuple[Array, Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One instant, for recursive estimators.
+    """One sample, for recursive estimators.
 
     Attributes:
         Y: Regressor, shape (n, c).
         tau: Measured torque, shape (n,) [N m or N].
-        weight: Row weights, shape (n,); 0 leaves a row out.
+        weight: Row weights, shape (n,); 0 excludes a row.
         mass_regressor: Regressor of the mass matrix, shape (n, n, c), or None.
     """
 
@@ -37,7 +37,7 @@ class Sample:
 
 
 class RowSource(ABC):
-    """A problem's rows joint by joint, without the columns that are zero or not wanted."""
+    """A problem's rows joint by joint, without columns that are zero or not selected."""
 
     @property
     @abstractmethod
@@ -47,21 +47,21 @@ class RowSource(ABC):
     @property
     @abstractmethod
     def columns(self) -> tuple[Array, ...]:
-        """The columns that row j has here, n arrays of shape (c_j,), ascending."""
+        """The columns of row j, n arrays of shape (c_j,), ascending."""
 
     @abstractmethod
     def rows(self, start: int, stop: int) -> Array:
         """Return the number of rows with a positive weight per joint, shape (n,), int.
 
         Args:
-            start: First sample that counts.
+            start: First sample.
             stop: Sample after the last one.
         """
 
     @property
     @abstractmethod
     def is_parallel(self) -> bool:
-        """Whether several threads read it faster than one."""
+        """Whether several threads are faster than one."""
 
     @abstractmethod
     def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
@@ -70,11 +70,11 @@ class RowSource(ABC):
         Args:
             start: First sample.
             stop: Sample after the last one.
-            segment: After so many samples each a block ends; None: wherever it does.
+            segment: A block ends after each multiple of this number of samples; None: anywhere.
 
         Yields:
             Per joint j the rows sqrt(weight) [W_j tau_j], shape (k, c_j + 1), column-major. They
-            belong to the caller until the next ones are asked for.
+            are valid until the next iteration.
         """
 
     @abstractmethod
@@ -82,22 +82,22 @@ class RowSource(ABC):
         """Return the same rows with fewer columns, column k being ``columns[k]`` of this one.
 
         Args:
-            columns: Indices of the columns kept, shape (b,), of those of the whole problem.
+            columns: Indices of the selected columns, shape (b,), in the whole problem.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """The rows of W theta = tau, read in blocks as often as wanted.
+    """The rows of W theta = tau, which can be read in blocks repeatedly.
 
     Attributes:
-        stream: Starts a fresh pass and yields the blocks in order.
+        stream: Starts a new pass and yields the blocks in order.
         names: Names of the c columns.
         n_joints: Number n of rows per sample.
         support: Shape (n, c), bool: False where row j is zero for every motion.
-        mass_stream: Starts a fresh pass over the regressors of the mass matrix of each block's
+        mass_stream: Starts a new pass over the regressors of the mass matrix of each block's
             samples, shape (k, n, n, c), or None if the problem has none.
-        sources: The same rows joint by joint, in order; empty if they are only to be had in blocks.
+        sources: The same rows joint by joint, in order; empty if there are only blocks.
     """
 
     stream: Callable[[], Iterator[Block]]
@@ -117,7 +117,7 @@ class Problem:
         return self.stream()
 
     def samples(self) -> Iterator[Sample]:
-        """Yield the problem instant by instant, for recursive estimators."""
+        """Yield the problem sample by sample, for recursive estimators."""
         n, c = self.n_joints, len(self.names)
         masses = repeat(None) if self.mass_stream is None else self.mass_stream()
         for (W, tau, weight), mass in zip(self.blocks(), masses, strict=False):
@@ -130,7 +130,7 @@ class Problem:
         """Return the same rows with only the given columns.
 
         Args:
-            columns: Indices of the columns kept, shape (b,).
+            columns: Indices of the selected columns, shape (b,).
         """
 
         def stream() -> Iterator[Block]:
@@ -154,7 +154,7 @@ class Problem:
 
 
 def concatenate(problems: Sequence[Problem]) -> Problem:
-    """Return one problem with the rows of several in order, as of several logs of one robot.
+    """Return one problem with the rows of several in order, for several logs of one robot.
 
     Args:
         problems: At least one problem; all with the same columns and joints.
@@ -163,7 +163,7 @@ def concatenate(problems: Sequence[Problem]) -> Problem:
         DataError: If there is none, or their columns or joints differ.
     """
     if not problems:
-        raise DataError("no problem was given; at least one log is needed")
+        raise DataError("there is no problem, wanted that of at least one log")
     first = problems[0]
     for other in problems[1:]:
         if other.names != first.names or other.n_joints != first.n_joints:
@@ -185,11 +185,11 @@ def concatenate(problems: Sequence[Problem]) -> Problem:
 
 
 def shuffled(samples: Iterable[Sample], rng: np.random.Generator) -> Iterator[Sample]:
-    """Yield samples in random order, of a long stream by drawing from a buffer of 8192.
+    """Yield samples in random order; those of a long stream are drawn from a buffer of 8192.
 
     Args:
         samples: The samples.
-        rng: Source of the order.
+        rng: Random generator of the order.
 
     Yields:
         Each sample once.

@@ -1,13 +1,13 @@
-"""Rows of the regressor for many samples at once, and their gradient, compiled by Numba.
+"""Rows of the regressor for several samples together, and their gradient, compiled by Numba.
 
-Row j of body i is what the forces that its parameters make do along the axis (u, e) of joint j. In
-the frame of the body, with its velocity (v, w), its acceleration (a, dw), that of its origin
-d = a + w x v, gravity taken off, B = [dw]x + [w]x [w]x and N I = I dw + w x I w, it is
+Row j of body i is the component of its force along the axis (u, e) of joint j. In the frame of the
+body, with its velocity (v, w), its acceleration (a, dw), that of its origin d = a + w x v minus
+gravity, B = [dw]x + [w]x [w]x and N I = I dw + w x I w, it is
 
     s_j . f_i = u . (m d + B mc) + e . (mc x d + N I).
 
-The gradient goes the same way back (reverse mode, by hand): ``pull``s are what a sum counts each
-motion, forces all of them, and are handed on as forces are.
+The gradient is computed backwards (reverse mode, by hand): ``pull``s are the adjoints of motions.
+They are spatial forces and are transformed like these.
 """
 
 import numpy as np
@@ -56,8 +56,8 @@ __all__ = [
     "work_space",
 ]
 
-# what of one body is at hand: q, v, a of its joint; what its rows share; ten columns. No int of
-# Python's, for which Numba would compile a function once more for each number that it is given.
+# entries of one body: q, v, a of its joint; quantities common to its rows; ten columns. They are
+# not Python's int, for which Numba would compile a function once more for each value.
 _MOTION, _D, _X, _Y, _Z, _DW, _WW, _COLUMNS, _WORLD = np.array([0, 3, 6, 9, 12, 15, 18, 21, 31])
 
 
@@ -66,14 +66,14 @@ def rows_size(bodies: int, depth: int) -> int:
 
     Args:
         bodies: Number of bodies.
-        depth: Largest number of rows that one body loads.
+        depth: Largest number of rows that one body affects.
     """
     return int(_WORLD) + (bodies + 1) * (FRAME + 12 * depth + 12)
 
 
 @compiled
 def _load(work, tree, i, motion, first, last):
-    """Write q, v, a of a joint that follows a coordinate; past the end, the last."""
+    """Write q, v, a of a joint from its coordinate; past the end, those of the last sample."""
     q, v, a, _ = motion
     leader, ratio, offset = tree.leaders[i], tree.joints[i, 39], tree.joints[i, 40]
     for lane in range(width(work)):
@@ -85,15 +85,15 @@ def _load(work, tree, i, motion, first, last):
 
 @compiled
 def _above(tree, i):
-    """Return how many rows the parent of a body loads."""
+    """Return the number of rows that the parent of a body affects."""
     return tree.depths[tree.parents[i]] if tree.parents[i] >= 0 else 0
 
 
 @compiled
 def _follow(work, tree, i, size, motion, first, last):
-    """Write placement, velocity, acceleration and axes of a body, where those of its parent are."""
+    """Write placement, velocity, acceleration and axes of a body from those of its parent."""
     own, up = _WORLD + (i + 1) * size, _WORLD + (tree.parents[i] + 1) * size
-    if tree.slots[i] < 0:  # the floating base: its state is given, its axes stand
+    if tree.slots[i] < 0:  # the floating base: its state is given, its axes are fixed
         for k in range(12):
             for lane in range(width(work)):
                 put(work, own + VELOCITY + k, lane, motion[3][k, min(first + lane, last)])
@@ -108,7 +108,7 @@ def _follow(work, tree, i, size, motion, first, last):
     for row in range(above):
         carry(work, own, up + FRAME + 6 * row, own + FRAME + 6 * row)
     s, to = times6(joint[39], axis(joint)), own + FRAME + 6 * tree.slots[i]
-    if tree.slots[i] < above:  # a coordinate that moves the parent, too
+    if tree.slots[i] < above:  # a coordinate that also moves the parent
         for lane in range(width(work)):
             gather(work, to, lane, s)
     else:
@@ -118,7 +118,7 @@ def _follow(work, tree, i, size, motion, first, last):
 
 @compiled
 def _share(work, own):
-    """Write d, B by columns, dw and the products of w, which all rows of a body share."""
+    """Write d, B by columns, dw and the products of w, common to all rows of a body."""
     for lane in range(width(work)):
         v, w = get6(work, own + VELOCITY, lane)
         a, dw = get6(work, own + ACCELERATION, lane)
@@ -152,7 +152,7 @@ def _row(work, at):
 
 @compiled
 def _write(work, out, places, start, stride):
-    """Copy those of the ten columns that are wanted to their places in the block."""
+    """Copy the wanted ones of the ten columns to their places in the block."""
     for k in range(10):
         if places[k] >= 0:
             to = places[k] * stride + start
@@ -162,7 +162,7 @@ def _write(work, out, places, start, stride):
 
 @compiled
 def _begin(work, tree):
-    """Write what accelerates the world: the negative of gravity."""
+    """Write the acceleration of the world: the negative of gravity."""
     for k in range(3):
         for lane in range(width(work)):
             put(work, _WORLD + ACCELERATION + k, lane, -tree.gravity[k])
@@ -176,7 +176,7 @@ def inertial_rows(tree, places, motion, work, out, span):
         tree: The robot.
         places: Row of ``out`` for each body, row and parameter, shape (B, D, 10), int; -1: none.
         motion: Coordinates, velocities and accelerations, shape (N, n_rows) each, and v, w, a, dw
-            of a floating base, gravity taken off, shape (12, N).
+            of a floating base, minus gravity, shape (12, N).
         work: Work space of ``rows_size``.
         out: The columns, shape (columns, k); k a multiple of the lanes; written.
         span: First sample, and the one after the last.
@@ -196,12 +196,12 @@ def inertial_rows(tree, places, motion, work, out, span):
 
 @compiled
 def finish_rows(values, places, widths, weights, root, out, span):
-    """Write drive columns and torques of a block, and weigh its rows.
+    """Write drive columns and torques of a block, and scale its rows by their weights.
 
     Args:
         values: Drive columns and torques, shape (E, N).
         places: Place of each, shape (E,), int.
-        widths: Number of columns that each row has in ``out``, shape (n_rows,), int.
+        widths: Number of columns of each row in ``out``, shape (n_rows,), int.
         weights: Weights, shape (N, n_rows), or (0, 0) if all are 1.
         root: Work space, shape (k,).
         out: The columns, shape (columns, k); written.
@@ -213,17 +213,17 @@ def finish_rows(values, places, widths, weights, root, out, span):
             out[places[e], k] = values[e, first + k]
     end = 0
     for j in range(len(widths) if len(weights) else 0):
-        begin, end = end, end + widths[j]
+        head, end = end, end + widths[j]
         for k in range(count):
             root[k] = np.sqrt(weights[first + k, j])
-        for column in range(begin, end):
+        for column in range(head, end):
             for k in range(count):
                 out[column, k] *= root[k]
 
 
 @compiled
 def _weigh(work, weights, places, first, last):
-    """Write what the ten columns of one body in one row count."""
+    """Write the weights of the ten columns of one body in one row."""
     for k in range(10):
         for lane in range(width(work)):
             weight = weights[places[k], min(first + lane, last)] if places[k] >= 0 else 0.0
@@ -232,7 +232,7 @@ def _weigh(work, weights, places, first, last):
 
 @compiled
 def _pull_row(work, own, at, pull, pulls):
-    """Add what the ten columns pull at an axis, and at velocity and acceleration of its body."""
+    """Add the adjoints by the ten columns: of an axis, and of the body's motion."""
     for lane in range(width(work)):
         u, e = get6(work, at, lane)
         v, w = get6(work, own + VELOCITY, lane)
@@ -253,9 +253,9 @@ def _pull_row(work, own, at, pull, pulls):
 
 @compiled
 def _pull_joint(work, own, joint, axes, pull, pulls, above):
-    """Write what is pulled at q, v and a of a joint to where these are, and free its pulls of it.
+    """Write the derivatives by q, v and a of a joint in their places, and update the adjoints.
 
-    What is left of them is pulled at the velocity and the acceleration that the parent hands on.
+    The updated adjoints are those of the parent's velocity and acceleration in the body's frame.
     """
     s = axis(joint)
     for lane in range(width(work)):
@@ -283,7 +283,7 @@ def pull_rows(tree, places, motion, weights, work, out):
         tree: The robot.
         places: Row of ``weights`` for each body, row and parameter, shape (B, D, 10); -1: none.
         motion: As of ``inertial_rows``.
-        weights: What each column counts at each sample, shape (columns, N).
+        weights: Weight of each column at each sample, shape (columns, N).
         work: Work space of ``rows_size``.
         out: The gradient, shape (3, N, n_rows), 0 at first; written.
     """
@@ -317,7 +317,7 @@ def pull_rows(tree, places, motion, weights, work, out):
 
 @compiled
 def placements(tree, q, work, R, p):
-    """Write where bodies are in the frame of the root link.
+    """Write the poses of bodies in the frame of the root link.
 
     Args:
         tree: The robot, with a fixed base.

@@ -37,36 +37,36 @@ __all__ = [
     "trajectory_rows",
 ]
 
-BLOCK = 512  # samples per block: fits in the cache with 100 columns
+BLOCK = 512  # samples per block: with 100 columns it fits in the cache
 COMPILED = "compiled by Numba"
 
 _LANES = 64  # the compiled path works on whole groups of so many samples
-_BLOCK_SIZE = 2**18  # numbers per block, 2 MiB, if that leaves it a group of samples
-_LOADED = 8  # blocks that a writer takes at once
-_KEPT = 2**25  # bytes of inertial columns that are kept with a trajectory
+_BLOCK_SIZE = 2**18  # numbers per block, 2 MiB, but at least one group of samples
+_LOADED = 8  # blocks that a writer loads together
+_MOST_BYTES = 2**25  # of inertial columns that are stored with a trajectory
 
 _log = logging.getLogger(__name__)
 
 
 def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str:
-    """Return what computes the rows, in words, and log it.
+    """Return the name of the code that computes the rows, and log it.
 
     Args:
         model: The robot.
         samples: Number of samples.
-        compiled: Whether to compile; None: if it is worth it.
+        compiled: Whether to use the compiled path; None: if it is faster.
 
     Returns:
-        ``COMPILED``, or "Pinocchio" with the reason where the compiled path was to be used.
+        ``COMPILED``, or "Pinocchio" with the reason why the compiled path is not used.
     """
     enough = -(-LONG_ENOUGH // work_per_sample(model))
     engine = "Pinocchio"
     if compiled is None and samples < enough:
-        engine += f" (fewer than {enough} samples do not pay the start of the compiled path)"
+        engine += f" (the compiled path is slower below {enough} samples)"
     elif compiled is not False:
         reason = why_not(model)
         if reason is None and compiled is None and not keeps_code():
-            reason = "no folder to keep compiled code in; name one as NUMBA_CACHE_DIR"
+            reason = "no folder for compiled code; set one as NUMBA_CACHE_DIR"
         engine = COMPILED if reason is None else f"{engine} ({reason})"
     _log.info("%s: regressor of %d samples: %s", model.name, samples, engine)
     return engine
@@ -74,12 +74,12 @@ def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str
 
 @dataclass(frozen=True, eq=False)
 class InertialRows:
-    """Inertial columns of a trajectory's regressor, which neither drives nor their terms change.
+    """Inertial columns of a trajectory's regressor, which are independent of drives.
 
     Attributes:
-        pin_model: The robot that they are of.
-        columns: Which of the inertial parameters each row has, n_rows arrays of shape (c_j,).
-        values: Row after row the columns of each, shape (sum of c_j, N).
+        pin_model: The robot.
+        columns: Indices of the inertial parameters of each row, n_rows arrays of shape (c_j,).
+        values: The columns of each row, one row after another, shape (sum of c_j, N).
     """
 
     pin_model: pin.Model
@@ -88,14 +88,14 @@ class InertialRows:
 
     @cached_property
     def first(self) -> Array:
-        """Place at which each row begins, and the end, shape (n_rows + 1,), int."""
+        """First place of each row, and the end, shape (n_rows + 1,), int."""
         return np.concatenate([[0], np.cumsum([len(own) for own in self.columns])])
 
     def write(self, samples: Array | slice, Y: Array) -> None:
         """Write those of N samples into regressors, shape (N, n_rows, p).
 
         Args:
-            samples: Which samples.
+            samples: The samples.
             Y: The regressors, 0 where nothing is written.
         """
         rows = zip(self.columns, pairwise(self.first), strict=True)
@@ -113,9 +113,10 @@ class InertialRows:
 
 
 def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
-    """Compute the inertial columns of a trajectory once and keep them with it.
+    """Compute the inertial columns of a trajectory once and store them with it.
 
-    Not if they are many, or compiled code computes them in less time than they are read in.
+    They are not stored if they are too many, or if compiled code computes them faster than they can
+    be read from memory.
 
     Args:
         model: The robot.
@@ -124,8 +125,8 @@ def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
     size, samples = model.layout.n_inertial, len(trajectory.t)
     columns = tuple(np.flatnonzero(row[:size]) for row in model.support())
     number = samples * sum(map(len, columns))
-    is_kept = kept_rows(model, trajectory) is not None
-    if is_kept or 8 * number > _KEPT or choose_engine(model, samples, None) == COMPILED:
+    is_stored = kept_rows(model, trajectory) is not None
+    if is_stored or 8 * number > _MOST_BYTES or choose_engine(model, samples, None) == COMPILED:
         return
     plan = plan_rows(model.layout, columns)
     out = np.empty((plan.first[-1], samples))
@@ -140,7 +141,7 @@ def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
 
 
 def kept_rows(model: RobotModel, trajectory: Trajectory) -> InertialRows | None:
-    """Return the inertial columns that are kept with a trajectory, if they are of that robot.
+    """Return the inertial columns that are stored with a trajectory, None if of another robot.
 
     Args:
         model: The robot.
@@ -159,16 +160,16 @@ class TrajectoryRows(RowSource):
         trajectory: N samples.
         weights: Weight of each row, shape (N, n_rows).
         support: Shape (n_rows, p), bool: False where row j is zero for every motion.
-        kept: Which of the p columns these are, shape (c,).
-        engine: What computes the regressor.
-        inertial: Its inertial columns if they were computed before.
+        selected: Indices of its columns among the p columns, shape (c,).
+        engine: Name of the code that computes the regressor, as of ``choose_engine``.
+        inertial: Its inertial columns if they are stored with the trajectory.
     """
 
     model: RobotModel
     trajectory: Trajectory
     weights: Array
     support: Array
-    kept: Array
+    selected: Array
     engine: str
     inertial: InertialRows | None = None
 
@@ -182,14 +183,14 @@ class TrajectoryRows(RowSource):
 
     @cached_property
     def columns(self) -> tuple[Array, ...]:
-        return tuple(np.flatnonzero(row) for row in self.support[:, self.kept])
+        return tuple(np.flatnonzero(row) for row in self.support[:, self.selected])
 
     def rows(self, start: int, stop: int) -> Array:
         used: Array = np.count_nonzero(self.weights[start:stop] > 0, axis=0)
         return used
 
     def select(self, columns: Array) -> "TrajectoryRows":
-        return replace(self, kept=self.kept[columns])
+        return replace(self, selected=self.selected[columns])
 
     def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
         plan, segment = self._plan, segment or stop - start
@@ -219,7 +220,7 @@ class TrajectoryRows(RowSource):
 
     @cached_property
     def _plan(self) -> RowPlan:
-        return plan_rows(self.model.layout, [self.kept[columns] for columns in self.columns])
+        return plan_rows(self.model.layout, [self.selected[columns] for columns in self.columns])
 
     @cached_property
     def _is_weighted(self) -> bool:
@@ -238,40 +239,40 @@ def trajectory_rows(
         compiled: As of ``choose_engine``.
 
     Raises:
-        DataError: If joints or shapes do not fit the model.
+        DataError: If joints or shapes are not those of the model.
     """
     if trajectory.joints != model.joints:
         raise DataError(
-            f"the trajectory has the joints {listed(trajectory.joints)}, the model has "
-            f"{listed(model.joints)}; read the log with joints=model.joints"
+            f"the trajectory has the joints {listed(trajectory.joints)}, wanted those of the "
+            f"model, {listed(model.joints)}; read the log with joints=model.joints"
         )
     shape = (len(trajectory.t), model.n_rows)
     weights = np.broadcast_to(1.0, shape) if weight is None else weight
     if weights.shape != shape:
         raise DataError(f"weight has shape {weights.shape}, wanted {shape}")
-    kept, engine = np.arange(len(model.layout.names)), choose_engine(model, shape[0], compiled)
+    every, engine = np.arange(len(model.layout.names)), choose_engine(model, shape[0], compiled)
     inertial = kept_rows(model, trajectory)
-    return TrajectoryRows(model, trajectory, weights, model.support(), kept, engine, inertial)
+    return TrajectoryRows(model, trajectory, weights, model.support(), every, engine, inertial)
 
 
 class _PinocchioWriter:
-    """Writes the inertial columns with Pinocchio's own function, sample by sample, or kept ones."""
+    """Writes inertial columns: stored ones, or by Pinocchio's function, sample by sample."""
 
     def __init__(
         self, model: RobotModel, plan: RowPlan, out: Array, inertial: InertialRows | None = None
     ) -> None:
         G, nv = model.velocity_map, model.pin_model.nv
         self._model, self._plan, self._out = model, plan, out
-        self._kept: Array | None = None
+        self._stored: Array | None = None
         if inertial is not None:
             own = zip(inertial.first, inertial.columns, plan.inertial, strict=False)
-            self._kept = inertial.values
+            self._stored = inertial.values
             self._from = np.concatenate([i + np.searchsorted(x, wanted) for i, x, wanted in own])
             self._to = _as_slice(np.concatenate(plan.places))
         self._data = model.pin_model.createData()
         size = 10 * (model.pin_model.njoints - 1)
         self._map = None if np.array_equal(G, np.eye(nv)) else G
-        # tau = G^T tau_pinocchio: row j gathers those of Pinocchio's rows that it drives
+        # tau = G^T tau_pinocchio: row j is the sum of the Pinocchio rows that its joint moves
         wanted, end = [], 0
         self._sources: list[tuple[Array | slice, float, slice, bool]] = []
         for j, (columns, places) in enumerate(zip(plan.inertial, plan.places, strict=True)):
@@ -283,17 +284,17 @@ class _PinocchioWriter:
         self._raw = np.empty((out.shape[1], end))
 
     def load(self, motion: Trajectory, part: slice, values: Array, weights: Array | None) -> None:
-        """Take the samples of the next blocks, and what drive parameters multiply in them."""
+        """Load the samples of the next blocks, and their drive columns."""
         self._motion, self._first, self._weights, self._values = motion, part.start, weights, values
 
     def write(self, start: int, stop: int) -> None:
         """Write the rows of samples start to stop of those loaded."""
         part, m = slice(start, stop), self._motion
         own = slice(self._first + start, self._first + stop)
-        if self._kept is None:
+        if self._stored is None:
             self.write_inertial(m.q[own], m.v[own], m.a[own])
         else:
-            self._out[self._to, : stop - start] = self._kept[self._from, own]
+            self._out[self._to, : stop - start] = self._stored[self._from, own]
         out = self._out[:, : stop - start]
         for place, k, ratio in chain.from_iterable(self._plan.drives):
             np.multiply(ratio, self._values[k, part], out=out[place])
@@ -314,7 +315,7 @@ class _PinocchioWriter:
             self._raw, np.ascontiguousarray(self._model.configurations(q)), v, a, strict=False
         )
         for raw_k, q_k, v_k, a_k in instants:
-            # only what is wanted, before the regressor leaves the cache; no bound is checked
+            # only the wanted entries, while the regressor is in the cache; without bound checks
             regressor(model, data, q_k, v_k, a_k).take(wanted, None, raw_k, "clip")
         out, raw = self._out[:, : len(q)], self._raw[: len(q)].T
         for places, ratio, part, is_added in self._sources:
@@ -323,12 +324,12 @@ class _PinocchioWriter:
 
 
 def _as_slice(places: Array) -> Array | slice:
-    """Return a run of consecutive places as a slice, which is written to faster."""
+    """Return consecutive places as a slice, for which writing is faster."""
     if len(places) and (np.diff(places) == 1).all():
         return slice(int(places[0]), int(places[-1]) + 1)
     return places
 
 
 def _block_length(columns: int) -> int:
-    """Return the samples per block, a multiple of 64, such that it stays in the cache."""
+    """Return the samples per block, a multiple of 64, such that it fits in the cache."""
     return max(_LANES, min(BLOCK, _BLOCK_SIZE // columns // _LANES * _LANES))

@@ -1,6 +1,6 @@
 """Regressor of joint torques: RobotModel + Trajectory -> Problem.
 
-Pinocchio computes the inertial columns; the drive columns stand beside them.
+Pinocchio computes the inertial columns; the drive columns follow them.
 """
 
 from collections.abc import Iterator
@@ -27,8 +27,8 @@ __all__ = [
     "trajectory_regressor",
 ]
 
-_DECADES = 3.0  # of speeds, at random states of a robot whose friction is a curve
-_INSTANTS = 32  # whose whole regressors are in memory together, where a part of them is kept
+_DECADES = 3.0  # of speeds, at random states of a robot with nonlinear friction
+_INSTANTS = 32  # samples whose whole regressors are in memory together
 _BLOCK_SIZE = 2**19  # numbers per block of W, 4 MiB
 
 
@@ -40,26 +40,26 @@ def joint_torque_regressor(
     direction: Array | None = None,
     memory: Array | None = None,
 ) -> Array:
-    """Return the regressor Y with tau = Y pi at each of N instants.
+    """Return the regressor Y with tau = Y pi at each of N samples.
 
-    The columns are the ten inertial parameters of each body, from Pinocchio, and then
-    ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off`` and the like for couplings.
+    The columns are those of the ten inertial parameters of each body, from Pinocchio, and then of
+    the drives: ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off``, likewise for couplings.
 
     Args:
         model: The robot.
         q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
         v: Velocities, shape (N, n_rows) [rad/s, m/s].
         a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-        direction: What stands for the signs in the c Coulomb columns, shape (N, c), as
-            ``Trajectory.direction``; None: the signs.
-        memory: What an instant alone does not show, shape (N, m), as ``Trajectory.memory``; None:
-            drives that have slid for long, under the load of the model's reference.
+        direction: Direction of friction in the c Coulomb columns, shape (N, c), as
+            ``Trajectory.direction``; None: the signs of the speeds.
+        memory: Columns with internal state or load, shape (N, m), as ``Trajectory.memory``; None:
+            internal states at their steady value, under the torque of the model's reference.
 
     Returns:
         Regressors, shape (N n_rows, p): row of sample k, joint j is k n_rows + j.
 
     Raises:
-        DataError: If a shape does not fit the model, or a value is not finite.
+        DataError: If a shape is not that of the model, or a value is not finite.
 
     References:
         Atkeson, An, Hollerbach (1986), Estimation of Inertial Parameters of Manipulator Loads and
@@ -77,9 +77,9 @@ def joint_torque_regressor(
 
 
 def carried_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
-    """Return the inertial columns of the bodies that each row carries, and no others.
+    """Return the inertial columns of the bodies that affect each row.
 
-    Of robots of many joints they are a tenth of the regressor.
+    For robots with many joints they are a tenth of the regressor.
 
     Args:
         model: The robot.
@@ -88,10 +88,10 @@ def carried_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
         a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
 
     Returns:
-        Columns, row after row, as ``model.support()`` has them, shape (N, columns).
+        Columns, row by row, in the order of ``model.support()``, shape (N, columns).
 
     Raises:
-        DataError: If a shape does not fit the model, or a value is not finite.
+        DataError: If a shape is not that of the model, or a value is not finite.
     """
     _check_motion(model, q, v, a)
     carried = model.support()[:, : model.layout.n_inertial]
@@ -107,8 +107,8 @@ def carried_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
     pin_model, wanted = model.pin_model, np.flatnonzero(carried)
     data, regressor = pin_model.createData(), pin.computeJointTorqueRegressor
     instants = zip(found, np.ascontiguousarray(model.configurations(q)), v, a, strict=True)
-    for kept, q_k, v_k, a_k in instants:
-        regressor(pin_model, data, q_k, v_k, a_k).take(wanted, None, kept, "clip")
+    for found_k, q_k, v_k, a_k in instants:
+        regressor(pin_model, data, q_k, v_k, a_k).take(wanted, None, found_k, "clip")
     return found
 
 
@@ -117,19 +117,19 @@ def trajectory_regressor(
 ) -> Array:
     """Return the regressor of N samples of a trajectory, shape (N n_rows, p).
 
-    As ``joint_torque_regressor``; inertial columns that are kept with it are not computed again.
+    As ``joint_torque_regressor``; inertial columns stored with the trajectory are used.
 
     Args:
         model: The robot.
-        trajectory: The trajectory, with what the model's drives remember.
-        samples: Which samples; None: all.
+        trajectory: The trajectory, with the internal states of the model's drives.
+        samples: Indices of the samples; None: all.
     """
     m = trajectory if samples is None else trajectory.at(samples)
-    kept, layout = kept_rows(model, trajectory), model.layout
-    if kept is None or (m.memory is None and layout.remembering):
+    stored, layout = kept_rows(model, trajectory), model.layout
+    if stored is None or (m.memory is None and layout.remembering):
         return joint_torque_regressor(model, m.q, m.v, m.a, m.direction, m.memory)
     Y = np.zeros((len(m.t), model.n_rows, len(layout.names)))
-    kept.write(slice(None) if samples is None else samples, Y)
+    stored.write(slice(None) if samples is None else samples, Y)
     _write_drives(model, m.q, m.v, m.a, m.direction, m.memory, Y[:, :, layout.n_inertial :])
     return Y.reshape(len(m.t) * model.n_rows, -1)
 
@@ -137,14 +137,14 @@ def trajectory_regressor(
 def mass_regressor(model: RobotModel, q: Array) -> Array:
     """Return the regressor of D(q, pi) = mass_regressor @ pi, shape (N, n_rows, n_rows, p).
 
-    Drives included, column j is W(q, 0, e_j) - W(q, 0, 0), where gravity and offsets cancel.
+    With drives, column j is W(q, 0, e_j) - W(q, 0, 0), where gravity and offsets cancel.
 
     Args:
         model: The robot.
         q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
 
     Raises:
-        DataError: If q does not fit the model.
+        DataError: If the shape of q is not that of the model.
 
     References:
         Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (11), (13).
@@ -160,11 +160,11 @@ def mass_regressor(model: RobotModel, q: Array) -> Array:
 
 
 class InstantRegressor:
-    """The regressor of one instant at a time, without setting anything up anew.
+    """The regressor of one sample at a time, without repeated initialisation.
 
     Args:
         model: The robot, with a fixed base.
-        columns: Indices of the standard parameters wanted, shape (c,).
+        columns: Indices of the wanted standard parameters, shape (c,).
 
     Raises:
         DataError: If the base floats.
@@ -172,7 +172,7 @@ class InstantRegressor:
 
     def __init__(self, model: RobotModel, columns: Array) -> None:
         if model.free_flyer:
-            raise DataError("a robot with a floating base has no row regressor of joints alone")
+            raise DataError("the base floats, wanted a robot with a fixed base")
         self._model, self._data = model, model.pin_model.createData()
         self._columns = np.asarray(columns)
         G = model.velocity_map
@@ -181,7 +181,7 @@ class InstantRegressor:
         self._is_plain &= model.pin_model.nq == model.pin_model.nv
         layout = model.layout
         self._Y = np.zeros((model.n_rows, len(layout.names)))
-        # place of each term that all joints have; other drives are written as of a trajectory
+        # place of each term that all joints have; other drives are written as for a trajectory
         count, joints = len(layout.terms), np.arange(len(layout.joints))
         self._terms = [
             (TERMS[name], layout.n_inertial + joints * count + k)
@@ -190,7 +190,7 @@ class InstantRegressor:
         self._is_uniform = not (layout.couplings or layout.own)
 
     def __call__(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the regressor of one instant, shape (n, c), as of ``joint_torque_regressor``.
+        """Return the regressor of one sample, shape (n, c), as of ``joint_torque_regressor``.
 
         Args:
             q: Joint coordinates, shape (n,) [rad, m].
@@ -237,20 +237,20 @@ def build_problem(
 ) -> Problem:
     """Return the problem W pi = tau of a trajectory: a stream of row blocks with p columns.
 
-    Its blocks come from Pinocchio. Its rows joint by joint, which the factors are made of, come
-    from Pinocchio too, or from the compiled path, equal to 1e-12;
-    ``problem.sources[0].engine`` and the log "robotid" say from which, and why.
+    Its blocks are computed by Pinocchio. Its rows joint by joint, which the factors need, are
+    computed by Pinocchio or by the compiled path, equal to 1e-12; ``problem.sources[0].engine`` and
+    the logger "robotid" state by which of them, and why.
 
     Args:
         model: The robot; the trajectory's joints must be its joints, in its order.
         trajectory: N samples of q, v, a, tau.
-        weight: Weight of each row, shape (N, n_rows), 0 to leave it out; all 1 if None.
-        with_mass: Whether each sample also carries the regressor of its mass matrix.
-        compiled: Whether to use the compiled path where it supports the robot; None: where the
-            trajectory is long enough to pay its start.
+        weight: Weight of each row, shape (N, n_rows), 0 excludes it; all 1 if None.
+        with_mass: Whether each sample has the regressor of its mass matrix.
+        compiled: Whether to use the compiled path if it supports the robot; None: if the trajectory
+            is so long that it is faster.
 
     Raises:
-        DataError: If joints or shapes do not fit the model.
+        DataError: If joints or shapes are not those of the model.
     """
     source = trajectory_rows(model, trajectory, weight, compiled)
     shape, weights = source.weights.shape, source.weights
@@ -273,25 +273,25 @@ def build_problem(
 
 
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
-    """Return the regressor at random states, shape (N n_rows, p): what any motion can excite.
+    """Return the regressor at random states, shape (N n_rows, p), for structural properties.
 
-    Of a static model, the states have no speed but for the direction of friction.
+    For a static model, the speeds of the states affect only the direction of friction.
 
     The states are scaled to the robot: speeds sqrt(g / length), accelerations g / length, so that
-    gravity and inertia weigh alike on a finger and on a crane.
+    the ratio of gravity to inertia is the same for a finger and a crane.
 
     Args:
         model: The robot.
         samples: Number N of states.
-        rng: Source of the random states.
+        rng: Random generator of the states.
     """
     n = len(model.joints)
     rate = np.sqrt(9.81 / model.length)  # [1/s]
-    reach = np.array([model.length if j.type == "prismatic" else np.pi for j in model.limits])
-    q = rng.uniform(-1, 1, (samples, n)) * reach
-    unit = np.minimum(reach, 1.0)  # [rad or m]
+    size = np.array([model.length if j.type == "prismatic" else np.pi for j in model.limits])
+    q = rng.uniform(-1, 1, (samples, n)) * size
+    unit = np.minimum(size, 1.0)  # [rad or m]
     v = rng.uniform(-1, 1, (samples, n)) * unit * rate
-    if model.layout.own:  # terms that only slow motion shows
+    if model.layout.own:  # terms that only slow motion excites
         v *= 10.0 ** rng.uniform(-_DECADES, 0.0, v.shape)
     a = rng.uniform(-1, 1, (samples, n)) * unit * rate**2
     if model.free_flyer:
@@ -302,8 +302,8 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
         q = np.hstack([pose, q])
         v = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate, v])
         a = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate**2, a])
-    kept = len(model.layout.remembering)  # loads and pasts are any, whatever the state
-    memory = rng.uniform(-1, 1, (samples, kept)) if kept else None
+    count = len(model.layout.remembering)  # internal states and loads are random, too
+    memory = rng.uniform(-1, 1, (samples, count)) if count else None
     signs = friction_directions(model.layout, v, None)
     if model.is_static:
         v, a = 0.0 * v, 0.0 * a
@@ -311,7 +311,7 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
 
 
 def _check_motion(model: RobotModel, q: Array, v: Array, a: Array) -> None:
-    """Refuse velocities and accelerations of another shape than the positions', or not finite."""
+    """Refuse velocities and accelerations with a wrong shape, or not finite."""
     wanted = (len(q), model.n_rows)
     if v.shape != wanted or a.shape != wanted:
         raise DataError(f"v and a have shapes {v.shape} and {a.shape}, wanted {wanted}")
@@ -339,7 +339,7 @@ def _write_drives(
 
 
 def _write_inertial(model: RobotModel, q: Array, v: Array, a: Array, out: Array) -> None:
-    """Write Pinocchio's joint-torque regressor at each instant, shape (N, n_rows, 10 bodies)."""
+    """Write Pinocchio's joint-torque regressor at each sample, shape (N, n_rows, 10 bodies)."""
     pin_model, G = model.pin_model, model.velocity_map
     data, regressor = pin_model.createData(), pin.computeJointTorqueRegressor
     is_plain = np.array_equal(G, np.eye(len(G)))

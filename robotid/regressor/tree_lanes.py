@@ -1,22 +1,22 @@
 """One compiled tree of bodies: placements, motions, inverse dynamics, mass matrix, derivatives.
 
 Spatial vectors are pairs, of motion (linear, angular) and of force (force, moment), in the frame of
-a body, and stand in six neighbouring entries of a work space. The entries of the world come first,
-those of body i begin ``BODY`` further each. ``FRAME`` entries of a body are its placement in its
-parent, its velocity and its acceleration; the world's acceleration is the negative of gravity.
+a body, in six adjacent entries of a work space. The entries of the world come first, then those of
+each body, ``BODY`` entries each. ``FRAME`` entries of a body are its placement in its parent, its
+velocity and its acceleration; the world's acceleration is the negative of gravity.
 
     V_i = X^-1 V + s v_i,    A_i = X^-1 A + s a_i + V_i x s v_i    from those of the parent.
 
-As joint i turns its body by d q_i, whatever the body sees of a motion m changes by m x s d q_i.
+With a displacement d q_i of joint i, a motion m in the frame of its body changes by m x s d q_i.
 
-Arguments that the kernels share:
+Common arguments of the kernels:
 
 - work: The work space.
 - tree: The bodies and their joints; see ``compiled.Tree``.
-- own, up: Where the entries of a body and of its parent begin.
+- own, up: First entries of a body and of its parent.
 - joint: Constants of a joint; see ``compiled.joint_constants``.
 - bodies: Ten inertial parameters of each joint's body, shape (n, 10).
-- v, a: Where speeds and accelerations of the joints stand.
+- v, a: First entries of the speeds and accelerations of the joints.
 
 References:
     Featherstone (2008), Rigid Body Dynamics Algorithms, chapters 2, 5 and 6.
@@ -105,13 +105,13 @@ def along(x, f):
 
 @compiled
 def motion_cross(x, y):
-    """Return x x y, the change of the motion y that moves as x."""
+    """Return x x y, the derivative of the motion y fixed in a body with velocity x."""
     return add(cross(x[1], y[0]), cross(x[0], y[1])), cross(x[1], y[1])
 
 
 @compiled
 def _force_cross(x, f):
-    """Return x x* f, the change of the force f that moves as x."""
+    """Return x x* f, the derivative of the force f fixed in a body with velocity x."""
     return cross(x[1], f[0]), add(cross(x[1], f[1]), cross(x[0], f[0]))
 
 
@@ -123,7 +123,7 @@ def axis(joint):
 
 @compiled
 def placement(work, own, lane):
-    """Return columns of R and p of a body in its parent."""
+    """Return the columns of R, and p, of a body in its parent."""
     return (
         get3(work, own + _R, lane), get3(work, own + _R + 3, lane),
         get3(work, own + _R + 6, lane), get3(work, own + _P, lane),
@@ -132,7 +132,7 @@ def placement(work, own, lane):
 
 @compiled
 def _into_child(T, x):
-    """Return a motion of the parent as the body sees it: X^-1 x."""
+    """Return a motion from the parent's frame in the body's frame: X^-1 x."""
     X, Y, Z, p = T
     u, e = add(x[0], cross(x[1], p)), x[1]
     return (dot(X, u), dot(Y, u), dot(Z, u)), (dot(X, e), dot(Y, e), dot(Z, e))
@@ -147,15 +147,15 @@ def turned(T, u):
 
 @compiled
 def _into_parent(T, f):
-    """Return a force on the body as its parent sees it: X^-T f."""
+    """Return a force from the body's frame in its parent's frame: X^-T f."""
     force = turned(T, f[0])
     return force, add(turned(T, f[1]), cross(T[3], force))
 
 
 @compiled
 def place(work, own, joint, q, zero):
-    """Write R = A + B cos q + C sin q and p = p0 + d q of a body; q is where coordinates stand."""
-    cosine, sine = own + VELOCITY, own + VELOCITY + 1  # of which there is none yet
+    """Write R = A + B cos q + C sin q and p = p0 + d q of a body; q is the entry of coordinates."""
+    cosine, sine = own + VELOCITY, own + VELOCITY + 1  # the velocity is not written yet
     for lane in range(width(work)):
         c, s = cos_sin(get(work, q, lane) + zero)
         put(work, cosine, lane, c)
@@ -187,7 +187,7 @@ def move(work, own, up, joint, v, a):
 
 @compiled
 def carry(work, own, seen, to):
-    """Write a motion that the parent sees as the body sees it."""
+    """Write a motion from the parent's frame in the body's frame."""
     for lane in range(width(work)):
         T = placement(work, own, lane)
         put6(work, to, lane, _into_child(T, get6(work, seen, lane)))
@@ -195,7 +195,7 @@ def carry(work, own, seen, to):
 
 @compiled
 def pass_up(work, own, force, to):
-    """Add a force on the body to one that the parent sees."""
+    """Add a force on the body to one in its parent's frame."""
     for lane in range(width(work)):
         T = placement(work, own, lane)
         gather(work, to, lane, _into_parent(T, get6(work, force, lane)))
@@ -203,7 +203,7 @@ def pass_up(work, own, force, to):
 
 @compiled
 def _momentum(body, x):
-    """Return J x of ten inertial parameters: momentum of a velocity, force of an acceleration."""
+    """Return J x from ten inertial parameters: momentum of a velocity, force of an acceleration."""
     m, c = body[0], (body[1], body[2], body[3])
     J = body[4], body[5], body[6], body[7], body[8], body[9]
     return add(scale(m, x[0]), cross(x[1], c)), add(cross(c, x[0]), times(J, x[1]))
@@ -220,7 +220,7 @@ def _force(work, own, body, to):
 
 @compiled
 def _give(work, force, joint, to):
-    """Write the part of a body's force that its joint has to give."""
+    """Write the component of a body's force along its joint."""
     s = axis(joint)
     for lane in range(width(work)):
         put(work, to, lane, along(s, get6(work, force, lane)))
@@ -228,7 +228,7 @@ def _give(work, force, joint, to):
 
 @compiled
 def inverse_dynamics(work, tree, bodies, v, a, tau):
-    """Write the torques of the bodies for the placements, speeds and accelerations."""
+    """Write the torques of the bodies from placements, speeds and accelerations."""
     n = len(tree.parents)
     for i in range(n):
         own, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
@@ -269,7 +269,7 @@ def mass_matrix(work, tree, bodies, M):
 
 @compiled
 def _composite(work, own, lane):
-    """Return the ten parameters of a body and all that it carries."""
+    """Return the ten parameters of the composite of a body and its descendants."""
     at = own + _C
     return (
         get(work, at, lane), get(work, at + 1, lane), get(work, at + 2, lane),
@@ -281,13 +281,13 @@ def _composite(work, own, lane):
 
 @compiled
 def _join_bodies(work, own, up):
-    """Add a composite body, seen from its parent, to the parent's."""
+    """Add a composite body, in its parent's frame, to the parent's."""
     for lane in range(width(work)):
         T = placement(work, own, lane)
         p = T[3]
         m, c0, c1, c2, xx, xy, yy, xz, yz, zz = _composite(work, own, lane)
         c = turned(T, (c0, c1, c2))
-        # R J R^T: R times the columns of J, then times the rows of that
+        # R J R^T: R times the columns of J, then R times the rows of the product
         U, V, W = turned(T, (xx, xy, xz)), turned(T, (xy, yy, yz)), turned(T, (xz, yz, zz))
         u = turned(T, (U[0], V[0], W[0]))
         v = turned(T, (U[1], V[1], W[1]))
@@ -308,9 +308,9 @@ def _join_bodies(work, own, up):
 
 @compiled
 def _change_motion(work, own, up, joint, v, is_first, is_speed):
-    """Write how velocity and acceleration of a body change with a position or speed.
+    """Write the derivatives of a body's velocity and acceleration by a position or speed.
 
-    That is its own joint's if it is the first of the bodies that change.
+    It is that of its own joint if the body is the first one that changes.
     """
     s = axis(joint)
     for lane in range(width(work)):
@@ -330,7 +330,7 @@ def _change_motion(work, own, up, joint, v, is_first, is_speed):
 
 @compiled
 def _change_force(work, own, body):
-    """Write how the force on a body changes, from the changes of velocity and acceleration."""
+    """Write the derivative of a body's force from those of its velocity and acceleration."""
     for lane in range(width(work)):
         V, TV = get6(work, own + VELOCITY, lane), get6(work, own + _TV, lane)
         f = _momentum(body, get6(work, own + _TA, lane))
@@ -349,9 +349,9 @@ def _clear(work, at):
 
 @compiled
 def derivatives(work, tree, bodies, v, T):
-    """Write the derivatives of the torques by positions and speeds, for placed and moved bodies.
+    """Write the derivatives of the torques by positions and speeds, after inverse dynamics.
 
-    T[i, k] = d tau_i / d q_k; n^2 entries further stands d tau_i / d v_k.
+    T[i, k] = d tau_i / d q_k; n^2 entries further is d tau_i / d v_k.
     """
     n = len(tree.parents)
     for kind in range(2):
@@ -366,7 +366,7 @@ def derivatives(work, tree, bodies, v, T):
                     continue
                 own, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
                 _give(work, own + _TF, tree.joints[i], T + (kind * n + i) * n + k)
-                if i == k and kind == 0:  # its force turns with it
+                if i == k and kind == 0:  # the force rotates with its frame
                     s = axis(tree.joints[k])
                     for lane in range(width(work)):
                         bent = _force_cross(s, get6(work, own + _F, lane))
@@ -377,7 +377,7 @@ def derivatives(work, tree, bodies, v, T):
 
 @compiled
 def _change_bodies(work, tree, bodies, v, k, is_speed):
-    """Write how forces on bodies change with the position or speed of joint k."""
+    """Write the derivatives of the bodies' forces by the position or speed of joint k."""
     for i in range(len(tree.parents)):
         own, up = (i + 1) * BODY, (tree.parents[i] + 1) * BODY
         if tree.is_below[i, k]:

@@ -1,4 +1,4 @@
-"""Rows of a trajectory: which of them are used, and what they count."""
+"""The used rows of a trajectory, and the base problem."""
 
 from dataclasses import replace
 
@@ -16,15 +16,15 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["base_problem", "independent_share", "row_mask", "static_rows"]
 
-_MOVES = 2e-3  # [rad/s] the mean over a segment of a slow log tells the sign from this on
-_NEGLECTED = 0.02  # share of gravity's torque on a link that its inertia may have
+_MOVES = 2e-3  # [rad/s] mean speed of a segment of a slow log from which its sign is certain
+_NEGLECTED = 0.02  # largest inertial torque that is neglected, over gravity's torque on a link
 
 
 def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> Array:
-    """Return which rows are used, (N, n_rows): those where every friction speed's sign is sure.
+    """Return the used rows, (N, n_rows), bool: those where the sign of friction is certain.
 
     Args:
-        model: The robot. Without Coulomb friction to identify every row is used.
+        model: The robot. If no Coulomb friction is identified, every row is used.
         trajectory: N samples.
         min_velocity: Bound on the speed of a joint or of a coupled drive, as of ``sure_rows``.
     """
@@ -32,31 +32,31 @@ def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> 
 
 
 def static_rows(model: RobotModel, log: Log, signals: SignalSettings) -> tuple[Trajectory, Array]:
-    """Return what a static model uses of a log: stands and slow segments, one sample each.
+    """Return the samples of a log for a static model: rest phases and slow segments, one each.
 
-    Where a joint moves, friction has its sign. Where it stands, friction holds anything between
-    its two bounds: stands are used without friction, which leaves that in the residual, and only
-    of joints that move in fewer samples of the log than there are stands.
+    Where a joint moves, friction has its sign. Where it is at rest, friction is anywhere within its
+    limits: rest phases are used without friction, which is part of the residual then, and only for
+    joints that move in fewer samples of the log than there are rest phases.
 
     Args:
         model: The robot, static.
-        log: The log, without full turns.
-        signals: The settings, resolved; of them, gaps and the least speed are used.
+        log: The log, with unwrapped positions.
+        signals: The settings, resolved; of these, gaps and the smallest speed are used.
 
     Returns:
-        The samples, without velocities and accelerations, with directions of friction; and which
-        rows are used, shape (N, n_rows), bool.
+        The samples, without velocities and accelerations, with directions of friction; and the
+        used rows, shape (N, n_rows), bool.
     """
     layout, n = model.layout, len(model.joints)
     unit, least = layout.drive_speeds[:n], min(signals.min_velocity, _MOVES)
-    # a length's inertia against its gravity: a l / g and v^2 l / g
-    hardest = _NEGLECTED * float(np.linalg.norm(model.pin_model.gravity.linear)) / model.length
-    reach = np.where(np.isin(model.joints, list(layout.prismatic)), model.length, 1.0)
-    motion, stands = standing_motion(
-        log, signals.max_gap or np.inf, least * unit, np.sqrt(hardest) * reach, hardest * reach
+    # inertial over gravity torque of a link of length l: a l / g and v^2 l / g
+    largest = _NEGLECTED * float(np.linalg.norm(model.pin_model.gravity.linear)) / model.length
+    size = np.where(np.isin(model.joints, list(layout.prismatic)), model.length, 1.0)
+    motion, at_rest = standing_motion(
+        log, signals.max_gap or np.inf, least * unit, np.sqrt(largest) * size, largest * size
     )
     moves = sure_rows(layout, motion.v, least)
-    used = moves | (stands[:, None] & (moves.sum(axis=0) <= stands.sum()))
+    used = moves | (at_rest[:, None] & (moves.sum(axis=0) <= at_rest.sum()))
     signs, still = friction_directions(layout, motion.v, None), np.zeros_like(motion.v)
     return replace(motion, v=still, direction=signs if signs.shape[1] else None), used
 
@@ -76,7 +76,7 @@ def base_problem(
         model: The robot.
         mapping: Standard to base parameters.
         trajectory: N samples.
-        weight: Weight of each row, shape (N, n_rows); or which rows are used, bool.
+        weight: Weight of each row, shape (N, n_rows); or the used rows, bool.
         with_mass: As of ``build_problem``.
         compiled: As of ``build_problem``.
 
@@ -89,7 +89,7 @@ def base_problem(
 
 
 def independent_share(signals: SignalSettings) -> float:
-    """Return the share of rows that are independent behind the filter: its band over Nyquist's.
+    """Return the share of independent rows after the filter: its band over the Nyquist frequency.
 
     Args:
         signals: The settings, resolved.

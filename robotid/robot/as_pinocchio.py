@@ -1,4 +1,4 @@
-"""An identified robot as a model of Pinocchio's own, drives included."""
+"""An identified robot as a Pinocchio model, drives included."""
 
 import warnings
 
@@ -15,26 +15,26 @@ __all__ = ["pinocchio_model"]
 def pinocchio_model(model: RobotModel, pi: Array) -> pin.Model:
     """Return Pinocchio's model with inertias, armature, damping and dry friction of parameters.
 
-    Locked joints are part of the links that carry them. With q, v and a of Pinocchio's model,
+    Bodies behind locked joints are part of the links before them. With q, v and a of the model,
 
     ``tau = rnea(q, v, a) + damping v - where(v > 0, lowerDryFrictionLimit, upperDryFrictionLimit)``
 
-    is the torque that the parameters predict of joints that move: ``rnea`` has the armature, and
-    the dry friction of a joint that moves forwards is at its lower limit. Coulomb friction Fc and
-    offset make the limits -Fc - offset and Fc - offset; a joint at rest holds what lies between.
-    With mimic joints or another order of joints, ``RobotModel.configurations`` and
-    ``velocity_map`` lead from the joints identified to Pinocchio's, and torques back.
+    is the predicted torque of moving joints: ``rnea`` includes the armature, and the dry friction
+    of a joint that moves forwards is at its lower limit. Coulomb friction Fc and offset give the
+    limits -Fc - offset and Fc - offset; at rest, dry friction is anywhere between them. With mimic
+    joints or another order of joints, ``RobotModel.configurations`` and ``velocity_map`` convert
+    the identified joints to Pinocchio's, and torques back.
 
-    What is beyond these fields is left out, and a warning names it: drives that turn with several
-    joints, whose friction and inertia load them all, and friction that depends on load, position,
-    past or, other than linearly, on speed.
+    Terms without such a field are omitted, and a warning names them: friction and inertia of
+    couplings, and friction that depends on load, position or an internal state or, other than
+    linearly, on speed.
 
     Args:
         model: The robot.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
 
     Returns:
-        A model of its own; what its URDF states of friction and damping is replaced.
+        A new model; the URDF's friction and damping are replaced.
 
     Raises:
         DataError: If pi has another length, or a value that is no finite number below 1e30.
@@ -51,7 +51,7 @@ def pinocchio_model(model: RobotModel, pi: Array) -> pin.Model:
             missing += [name] if value != 0.0 and ratios else []
             continue
         ((joint, ratio),) = ratios
-        # tau_j = r f(r v_j): a turn the other way round changes the sign of the offset alone
+        # tau_j = r f(r v_j): a negative ratio changes the sign of the offset only
         share = {"coulomb": abs(ratio), "offset": ratio}.get(term.name, ratio**2)
         fields[term.name][made.joints[made.getJointId(joint)].idx_v] += share * value
     made.armature, made.damping = fields["armature"], fields["viscous"]
@@ -59,8 +59,8 @@ def pinocchio_model(model: RobotModel, pi: Array) -> pin.Model:
     made.upperDryFrictionLimit = fields["coulomb"] - fields["offset"]
     if missing:
         warnings.warn(
-            f"Pinocchio's model has no place for {listed(missing)}: torques from it are without "
-            "them; predict(q, v, a) has them",
+            f"Pinocchio's model has no field for {listed(missing)}: its torques are without these "
+            "terms; predict(q, v, a) includes them",
             stacklevel=4,
         )
     return made

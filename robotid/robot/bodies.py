@@ -1,4 +1,4 @@
-"""Which link's mass is in which body: links joined by fixed or locked joints are one body."""
+"""The bodies of a robot: links joined by fixed or locked joints are one body."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,13 +32,13 @@ __all__ = [
 
 @dataclass(frozen=True)
 class LinkPlace:
-    """Where a link sits in the model.
+    """The body that a link belongs to.
 
     Attributes:
         link: Name of the link.
         body: Index of its body in ``layout.bodies``; -1 if it is fixed to the world.
         role: "moved": the link that the body's joint moves; "fixed": joined to it by fixed joints
-            alone; "held": behind a locked joint.
+            only; "held": behind a locked joint.
         parameters: Its inertial parameters in the body's frame, shape (10,); 0 without inertial.
     """
 
@@ -49,23 +49,23 @@ class LinkPlace:
 
     @property
     def is_lumped(self) -> bool:
-        """Whether its mass counts as that of the moved link of its body."""
+        """Whether its mass is lumped into the moved link of its body."""
         return self.body >= 0 and self.role == "fixed"
 
 
 def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
-    """Return where each link of the URDF sits in the model, in the order of the file.
+    """Return the body of each link of the URDF, in the order of the file.
 
     Args:
         model: The robot.
     """
     arriving = {joint.child: joint for joint in model.tree.joints}
     frames = {link: _frame(model, link) for link in model.tree.links}
-    heavy = model.tree.inertials
-    transfers = _transfers([frames[link] for link in heavy])
+    inertials = model.tree.inertials
+    transfers = _transfers([frames[link] for link in inertials])
     parameters = {
         link: transfer @ inertial_parameters(inertial)
-        for (link, inertial), transfer in zip(heavy.items(), transfers, strict=True)
+        for (link, inertial), transfer in zip(inertials.items(), transfers, strict=True)
     }
     places = []
     for link, frame in frames.items():
@@ -79,7 +79,7 @@ def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
 
 
 def link_transfer(model: RobotModel, link: str) -> tuple[int, Array]:
-    """Return what of the model a mass in a link's frame adds to.
+    """Return the body of a link, and the map of parameters from its frame to the body's.
 
     Args:
         model: The robot.
@@ -108,16 +108,16 @@ def _frame(model: RobotModel, link: str) -> pin.Frame:
 
 def _transfers(frames: Sequence[pin.Frame]) -> Array:
     """Return the map of ``link_transfer`` of k frames, shape (k, 10, 10)."""
-    # a pseudo-inertia moves with a homogeneous matrix H as H J H^T, massless links too
+    # a homogeneous matrix H transforms a pseudo-inertia to H J H^T, also without mass
     H = np.array([frame.placement.homogeneous for frame in frames]).reshape(-1, 1, 4, 4)
     moved: Array = H @ pseudo_inertia_basis() @ H.swapaxes(-1, -2)
     return inertial_from_pseudo_inertia(moved).swapaxes(-1, -2)
 
 
 def held_parameters(model: RobotModel) -> Array:
-    """Return the share of each body that belongs to links on locked joints, (10 bodies,).
+    """Return the share of each body of links behind locked joints, (10 bodies,).
 
-    They keep the inertials the URDF gives them, so the rest of the body must be possible alone.
+    They keep the URDF's inertials, so the rest of the body must be physically consistent by itself.
 
     Args:
         model: The robot.
@@ -133,7 +133,7 @@ def inertial_parameters(inertial: Inertial) -> Array:
     """Return the ten inertial parameters of a link about its own frame, shape (10,).
 
     Args:
-        inertial: What its URDF states.
+        inertial: Its inertial in the URDF.
     """
     ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
     moments = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
@@ -145,7 +145,7 @@ def inertial_parameters(inertial: Inertial) -> Array:
 
 
 def central_inertial(parameters: Array) -> Inertial:
-    """Return the mass, centre and inertia about it of ten parameters about the link's own frame.
+    """Return mass, centre of mass and inertia about it from ten parameters in the link's frame.
 
     Args:
         parameters: Inertial parameters of a body with mass, shape (10,).
@@ -161,7 +161,8 @@ def central_inertial(parameters: Array) -> Inertial:
 def principal_moments(parameters: Array) -> tuple[Array, Array]:
     """Return the second moments of mass about the centre along the principal axes, and the axes.
 
-    The body is possible if none is negative. The moments of inertia are their sums by pairs.
+    The body is physically consistent if none is negative. The moments of inertia are their sums by
+    pairs.
 
     Args:
         parameters: Inertial parameters of a body with mass, shape (10,).
@@ -178,14 +179,14 @@ def principal_moments(parameters: Array) -> tuple[Array, Array]:
 def least_density(parameters: Array) -> float:
     """Return the smallest density that a body's mass and second moments of mass allow [kg/m^3].
 
-    Of all bodies of one mass and largest density, a homogeneous ellipsoid has the smallest
-    determinant of second moments; with semi-axes a these are m a^2 / 5.
+    Of all bodies with the same mass and the same largest density, a homogeneous ellipsoid has the
+    smallest determinant of second moments; with semi-axes a these are m a^2 / 5.
 
     Args:
         parameters: Inertial parameters of the body, shape (10,).
 
     Returns:
-        The density; inf of a body with mass and without extent, 0 of one without mass.
+        The density; inf for a body with mass and without extent, 0 for one without mass.
     """
     mass = float(parameters[0])
     if mass <= 0:

@@ -1,4 +1,4 @@
-"""What a term of a drive's torque is, and a family of terms that come together.
+"""Base classes of the terms of a drive's torque, and families of terms.
 
 ``drives`` has the terms and the families.
 """
@@ -36,15 +36,15 @@ __all__ = [
 
 #: A law's value and its derivative.
 Slope: TypeAlias = tuple[Array | float, Array | float]
-#: A law of the speed or the position, and of up to four numbers that shape it.
+#: A law of the speed or the position, and of up to four shape parameters.
 Law: TypeAlias = Callable[..., Slope]
-#: What a term is beside a(v) b(q): nothing more; times the direction of friction; times that and
-#: the size of the gear's load; or a deflection that bristles take up over a way instead.
+#: Factors of a term's column: a(v) b(q) only; times the direction of friction; times that and the
+#: absolute joint load torque; or the deflection of bristles instead.
 PLAIN, DIRECTED, LOADED, BRISTLES = range(4)
 
 #: A range without ends.
 ANYWHERE = (-np.inf, np.inf)
-_ENDS = (-1e9, 1e9)  # numbers of a term's shape
+_ENDS = (-1e9, 1e9)  # of a term's shape parameters
 
 
 def linear(z: Array) -> Slope:
@@ -58,17 +58,17 @@ def linear(z: Array) -> Slope:
 
 @dataclass(frozen=True, slots=True)
 class DriveMotion:
-    """How drives move, and what loads them; all arrays of one shape, time along the last axis.
+    """Motion and load of drives; all arrays of one shape, time along the last axis.
 
     Attributes:
-        q: Angles or ways [rad or m].
-        v: Speeds w [rad/s or m/s].
-        a: Their changes dw/dt [rad/s^2 or m/s^2].
-        direction: Which way friction acts: the signs of w, or what stands for them [-].
-        load: Torque of the rigid bodies [N m or N].
-        rate: Change of the whole torque [N m/s or N/s].
-        begins: Where a segment without gaps begins, bool; None of instants that do not follow each
-            other, whose drives have slid for long.
+        q: Positions [rad or m].
+        v: Velocities w [rad/s or m/s].
+        a: Accelerations dw/dt [rad/s^2 or m/s^2].
+        direction: Direction of friction: the signs of w, or smooth values for them [-].
+        load: Joint load torque of the rigid bodies [N m or N].
+        rate: Time derivative of the whole torque [N m/s or N/s].
+        begins: First samples of segments without gaps, bool; None if the samples are not in a
+            sequence: internal states are at their steady value then.
     """
 
     q: Array
@@ -80,10 +80,10 @@ class DriveMotion:
     begins: Array | None = None
 
     def of(self, drive: int | list[int]) -> "DriveMotion":
-        """Return the motion of one drive or of several, of arrays with a row for each.
+        """Return the motion of one drive or of several, from arrays with a row for each drive.
 
         Args:
-            drive: Which one, or which.
+            drive: Index of the drive, or a list of them.
         """
         q, v, a = self.q[drive], self.v[drive], self.a[drive]
         direction, load, rate = self.direction[drive], self.load[drive], self.rate[drive]
@@ -95,26 +95,26 @@ class DriveTerm(ABC):
     """One term of a drive's torque, linear in its parameter.
 
     Attributes:
-        data_range: From where to where the fit has seen what ``guards`` names: q, or the size of v.
+        data_range: Range of the data, of the quantity that ``guards`` names: q, or abs(v).
 
     Class attributes:
         label: Its name in parameters, as ``"elbow.viscous"``.
-        units: Unit of the parameter for a drive that turns, and for one that slides.
+        units: Unit of the parameter for a rotary drive, and for a linear one.
         is_nonnegative: Whether the parameter cannot be negative by physics.
-        highest: The largest parameter that a drive which moves can have.
-        is_shared: Whether a drive that turns with several joints has it too.
+        highest: Largest parameter of a drive that can move.
+        is_shared: Whether couplings have it too.
         is_inertia: Whether it multiplies the acceleration and so adds to the mass matrix.
         is_friction: Whether a job's ``friction`` chooses it; if not, it has a switch of its own.
-        follows_direction: Whether its column holds the direction of friction.
-        has_state: Whether its column needs more than q, v, a and direction of an instant.
-        is_measured: Whether it is in what is measured alone, and does not act on the robot.
-        guards: "v" or "q" if its column stays as it is beyond the range seen, else "".
-        preference: How much it is favoured as the name of a base parameter [-].
-        typical: From where to where it usually lies, for simulated robots.
+        follows_direction: Whether its column contains the direction of friction.
+        has_state: Whether its column depends on more than the current q, v, a and direction.
+        is_measured: Whether it affects the measured torque only, not the motion of the robot.
+        guards: "v" or "q" if its column is constant outside the range of the data, else "".
+        preference: Preference as the name of a base parameter [-].
+        typical: Typical range, for simulated robots.
         dynamics: Attribute of the URDF's ``<dynamics>`` that states it, or None.
-        part: What it counts as where a torque is split: "friction", "spring" and the like.
-        ends: Smallest and largest value of its numbers, by name; -1e9 and 1e9 of others.
-        rising: Names of numbers that increase in this order.
+        part: Its share of a split torque: "friction", "spring" and the like.
+        ends: Smallest and largest value of its shape parameters, by name; -1e9 and 1e9 of others.
+        rising: Names of shape parameters that increase in this order.
     """
 
     data_range: tuple[float, float] = ANYWHERE
@@ -131,7 +131,7 @@ class DriveTerm(ABC):
     is_measured: ClassVar[bool] = False
     guards: ClassVar[str] = ""
     preference: ClassVar[float] = 1.0
-    usual: ClassVar[tuple[float, float]] = (0.2, 0.9)
+    typical: ClassVar[tuple[float, float]] = (0.2, 0.9)
     dynamics: ClassVar[str | None] = None
     part: ClassVar[str] = "friction"
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {}
@@ -150,7 +150,7 @@ class DriveTerm(ABC):
                 raise SettingsError(f"{kind}: {key} is {value!r}, wanted {low:g} to {high:g}")
         if any(shape[low] >= shape[high] for low, high in pairwise(self.rising)):
             found = ", ".join(f"{key} = {shape[key]:g}" for key in self.rising)
-            raise SettingsError(f"{kind}: {found}, wanted each larger than the one before")
+            raise SettingsError(f"{kind}: {found}, wanted increasing values")
 
     @property
     def name(self) -> str:
@@ -159,14 +159,14 @@ class DriveTerm(ABC):
 
     @abstractmethod
     def column(self, motion: DriveMotion) -> Array:
-        """Return what the parameter multiplies, element by element, within the range seen.
+        """Return the factor of the parameter, element by element, within the range of the data.
 
         Args:
-            motion: How a drive moves.
+            motion: Motion of a drive.
         """
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the term as plain values, which ``term_from_dict`` reads."""
+        """Return the term as plain values for ``term_from_dict``."""
         shape = {key: value for key, value in asdict(self).items() if key != "data_range"}
         guard = {} if self.data_range == ANYWHERE else {"data_range": list(self.data_range)}
         return {"term": type(self).__name__, **shape, **guard}
@@ -174,16 +174,16 @@ class DriveTerm(ABC):
 
 @dataclass(frozen=True)
 class MemorylessTerm(DriveTerm):
-    """A term of the speed and position of an instant, a(v) b(q) beside direction and load.
+    """A term without internal state: a(v) b(q), times direction and load.
 
     A law returns a(v) with da/dv, or b(q) with db/dq. Its arguments are the speed or position, and
-    up to four numbers of the term by their names; it works on NumPy's arrays and, compiled by
-    Numba, on single numbers. Regressor, plant and roll-outs follow from it.
+    up to four shape parameters of the term by their names. It is evaluated on NumPy's arrays and,
+    compiled by Numba, on scalars. Regressor, plant and simulations use it.
 
     Class attributes:
         speed_law: The law a of the speed, a static method; None: 1.
         position_law: The law b of the position, likewise.
-        is_loaded: Whether the size of the gear's load multiplies it, as direction does.
+        is_loaded: Whether the absolute joint load torque multiplies it, like the direction.
     """
 
     speed_law: ClassVar[Law | None] = None
@@ -192,12 +192,12 @@ class MemorylessTerm(DriveTerm):
 
     @property
     def kind(self) -> int:
-        """What it is beside a(v) b(q)."""
+        """Its factors besides a(v) b(q)."""
         return LOADED if self.is_loaded else DIRECTED if self.follows_direction else PLAIN
 
     @property
     def affine(self) -> int | None:
-        """Which of 1, the speed and its direction it multiplies by, 0, 1 or 2; None: of others."""
+        """0, 1 or 2 if its column is 1, the speed or its direction; None if it is another one."""
         if self.position_law is not None or self.guards:
             return None
         simple = {(None, PLAIN): 0, (linear, PLAIN): 1, (None, DIRECTED): 2}
@@ -205,12 +205,12 @@ class MemorylessTerm(DriveTerm):
 
     @cached_property
     def speed_shape(self) -> tuple[float, ...]:
-        """The numbers that shape a(v)."""
+        """The shape parameters of a(v)."""
         return self._shape(self.speed_law)
 
     @cached_property
     def position_shape(self) -> tuple[float, ...]:
-        """The numbers that shape b(q)."""
+        """The shape parameters of b(q)."""
         return self._shape(self.position_law)
 
     def _shape(self, law: Law | None) -> tuple[float, ...]:
@@ -219,16 +219,16 @@ class MemorylessTerm(DriveTerm):
 
     @property
     def ranges(self) -> tuple[float, float, float]:
-        """The largest size of v and the range of q beyond which it stays as it is."""
+        """The largest abs(v) and the range of q outside which it is constant."""
         fastest = self.data_range[1] if self.guards == "v" else np.inf
         return (fastest, *(self.data_range if self.guards == "q" else ANYWHERE))
 
     def amplitude(self, q: Array, v: Array) -> Array:
-        """Return a(v) b(q), within the range seen: the column of positive direction and load 1.
+        """Return a(v) b(q) within the range of the data: the column for direction and load 1.
 
         Args:
-            q: Angles or ways [rad or m].
-            v: Speeds, shape as q [rad/s or m/s].
+            q: Positions [rad or m].
+            v: Velocities, shape as q [rad/s or m/s].
         """
         fastest, lowest, highest = self.ranges
         y: Array | float = 1.0
@@ -241,10 +241,10 @@ class MemorylessTerm(DriveTerm):
         return y if isinstance(y, np.ndarray) else np.full_like(v, y)
 
     def column(self, motion: DriveMotion) -> Array:
-        """Return what the parameter multiplies, element by element, within the range seen.
+        """Return the factor of the parameter, element by element, within the range of the data.
 
         Args:
-            motion: How a drive moves.
+            motion: Motion of a drive.
         """
         column = self.amplitude(motion.q, motion.v)
         if self.follows_direction:
@@ -252,19 +252,19 @@ class MemorylessTerm(DriveTerm):
         return np.abs(motion.load) * column if self.is_loaded else column
 
 
-#: Ranges of position "q" and of the size of speed "v" that a fit has seen.
+#: Ranges of the data: of position "q" and of the absolute speed "v".
 DataRange = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape parameter that terms are not linear in.
+    """A shape parameter: terms are nonlinear in it.
 
     Attributes:
-        name: Field of the terms that holds it.
-        units: Its unit for a drive that turns, and for one that slides.
-        bounds: Where it is sought, in units of what it is measured by.
-        of: What it is measured by: "v", the largest speed seen, "q", the range seen; "": itself.
+        name: Field of the terms.
+        units: Its unit for a rotary drive, and for a linear one.
+        bounds: Search bounds, relative to its reference.
+        of: Its reference: "v", the largest speed in the data, "q", the range of positions; "": 1.
     """
 
     name: str
@@ -276,7 +276,7 @@ class Shape:
         """Return the bounds in the shape's own unit.
 
         Args:
-            data_range: Ranges of position "q" and of the size of speed "v" that the fit has seen.
+            data_range: Ranges of position "q" and of the absolute speed "v" in the data.
         """
         low, high = self.bounds
         if not self.of:
@@ -288,23 +288,22 @@ class Shape:
 
 @dataclass(frozen=True)
 class Family:
-    """Terms that come together, with the shape that they share.
+    """Terms that are chosen together, with their common shape parameters.
 
     Attributes:
         name: Its name in a job's ``friction``.
-        meaning: What it is, in words of a finding.
-        make: Returns the terms of the ranges seen and of a shape.
+        meaning: Its description in a finding.
+        make: Returns the terms from the ranges of the data and the shape parameters.
         shapes: Its shape parameters.
-        needs: What the motion must have seen of the position, in full turns; 0: anything.
+        needs: Range of positions that the motion must cover, in revolutions; 0: any.
         is_automatic: Whether ``friction = "auto"`` tries it.
-        code: Code of the finding that a model lacks it; empty: what a fit leaves is not tested for
-            it.
-        tested: Shapes at which it is tested for, speeds over their root mean square.
-        instead: Families advised where the joint turned less than this one needs.
-        advice: What the user can do beside adding it to the model; empty if nothing.
-        has_size: Whether its parameter is its size in a finding; else its torque, root mean square.
-        is_imitated: Whether a drive that sticks at its reversals looks like it behind a filter: it
-            is no more than a note then.
+        code: Code of the finding that a model lacks it; empty: residuals are not tested for it.
+        tested: Shape parameters of the test; speeds relative to their root mean square.
+        instead: Families advised where the joint moved less than this one needs.
+        advice: Advice in addition to adding it to the model; empty if none.
+        has_size: Whether its parameter is its size in a finding; else the RMS of its torque.
+        is_imitated: Whether stiction at reversals, after the filter, resembles it: its finding is
+            a note then.
     """
 
     name: str
@@ -321,7 +320,7 @@ class Family:
     is_imitated: bool = False
 
     def tested_terms(self, speed: float) -> tuple[DriveTerm, ...]:
-        """Return the terms that what a fit leaves is tested against, of no range in particular.
+        """Return the terms for which the residual of a fit is tested, without a range.
 
         Args:
             speed: Root mean square of the speed [rad/s or m/s].

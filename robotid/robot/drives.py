@@ -1,12 +1,12 @@
-"""The terms of a drive's torque: one class each, and the rest of the package loops over them.
+"""The terms of a drive's torque, one class each.
 
 A term adds ``parameter * column`` to the torque of a drive. To add one, write its class with its
-laws, and enter it in ``TERMS`` if it has no shape of its own, else in ``TERM_CLASSES`` and
-``FAMILIES``: its regressor, prior spread, plant, roll-outs with their sensitivities, choice,
-sidecar, tables, curves, exports and job key follow.
+laws, and enter it in ``TERMS`` if it has no shape parameters, else in ``TERM_CLASSES`` and
+``FAMILIES``. Regressor, prior spread, plant, simulations with their sensitivities, choice, sidecar,
+tables, curves, exports and job key need no further code.
 
-The columns of many terms are guarded: beyond the speeds or positions that the fit has seen they
-stay as they were at the end of that range, for no data say how they go on.
+The columns of many terms are guarded: outside the speeds or positions of the data they are constant
+at the value of the end of that range, since no data determine them there.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -44,8 +44,8 @@ __all__ = [
     "MemorylessTerm",
 ]
 
-_LEAST = 1e-12  # [rad/s or m/s]: below it the slope of a power is that at it
-_POSITIVE = (1e-9, 1e9)  # numbers of a term's shape that it is divided by
+_LEAST = 1e-12  # [rad/s or m/s] speed below which the slope of a power is constant
+_POSITIVE = (1e-9, 1e9)  # bounds of shape parameters that are divisors
 
 
 @dataclass(frozen=True)
@@ -58,14 +58,14 @@ class Armature(DriveTerm):
     is_inertia = True
     is_friction = False
     preference = 0.3
-    usual = (0.1, 0.5)
+    typical = (0.1, 0.5)
     part = "motor inertia"
 
     def column(self, motion: DriveMotion) -> Array:
         """Return the acceleration of the drive.
 
         Args:
-            motion: How a drive moves.
+            motion: Motion of a drive.
         """
         return motion.a
 
@@ -78,7 +78,7 @@ class Viscous(MemorylessTerm):
     speed_law = staticmethod(linear)
     units = ("N m s/rad", "N s/m")
     is_nonnegative = True
-    usual = (0.5, 4.0)
+    typical = (0.5, 4.0)
     dynamics = "damping"
 
 
@@ -89,24 +89,24 @@ class Coulomb(MemorylessTerm):
     label = "coulomb"
     is_nonnegative = True
     follows_direction = True
-    usual = (0.5, 5.0)
+    typical = (0.5, 5.0)
     dynamics = "friction"
 
 
 @dataclass(frozen=True)
 class Offset(MemorylessTerm):
-    """A constant torque: of a sensor's zero, or of Coulomb friction that differs by direction."""
+    """A constant torque: a sensor's zero error, or Coulomb friction that differs by direction."""
 
     label = "offset"
     is_shared = False
     is_friction = False
-    usual = (-0.3, 0.3)
+    typical = (-0.3, 0.3)
     part = "offset"
 
 
 @dataclass(frozen=True)
 class Asymmetric(MemorylessTerm):
-    """Viscous friction that differs by direction, tau = x |w|; of Coulomb's, see ``Offset``."""
+    """Viscous friction that differs by direction, tau = x |w|; for Coulomb's see ``Offset``."""
 
     label = "asymmetric"
     units = ("N m s/rad", "N s/m")
@@ -118,7 +118,7 @@ class Asymmetric(MemorylessTerm):
 
 @dataclass(frozen=True)
 class LoadFriction(MemorylessTerm):
-    """Coulomb friction that grows with the load of the gear, tau = mu sign(w) |tau_rigid|.
+    """Coulomb friction proportional to the joint load torque, tau = mu sign(w) |tau_rigid|.
 
     References:
         Hamon, Gautier, Garrec (2010), Dynamic identification of robots with a dry friction model
@@ -128,16 +128,16 @@ class LoadFriction(MemorylessTerm):
     label = "load"
     units = ("N m per N m", "N per N")
     is_nonnegative = True
-    highest = 0.5  # a gear that loses more holds what it should lower
+    highest = 0.5  # a gear with more is self-locking
     follows_direction = True
     is_loaded = True
     has_state = True
-    usual = (0.04, 0.1)
+    typical = (0.04, 0.1)
 
 
 @dataclass(frozen=True)
 class Cubic(MemorylessTerm):
-    """Friction that bends with speed, tau = x w^3."""
+    """Friction with the cube of the speed, tau = x w^3."""
 
     label = "cubic"
     units = ("N m s^3/rad^3", "N s^3/m^3")
@@ -150,9 +150,10 @@ class Cubic(MemorylessTerm):
 
 @dataclass(frozen=True)
 class Stribeck(MemorylessTerm):
-    """Friction beside Coulomb's that fades with speed, tau = x sign(w) exp(-|w| / w_s).
+    """Friction in addition to Coulomb's that decays with speed, tau = x sign(w) exp(-|w| / w_s).
 
-    Above 0 it is Stribeck's hook at low speed; below 0 friction sets in slowly and saturates.
+    A positive x is the Stribeck effect at low speed; with a negative x friction rises with speed
+    and saturates.
 
     References:
         Tustin (1947), The effects of backlash and of speed-dependent friction on the stability of
@@ -168,7 +169,7 @@ class Stribeck(MemorylessTerm):
 
     @property
     def slowest(self) -> float:
-        """The speed below which no data show how it goes on to 0."""
+        """The lowest speed of the data; the column is constant below it."""
         return self.data_range[0]
 
     @staticmethod
@@ -180,7 +181,7 @@ class Stribeck(MemorylessTerm):
 
 @dataclass(frozen=True)
 class Tanh(MemorylessTerm):
-    """Friction that sets in over a speed, tau = x tanh(w / w_t)."""
+    """Friction that rises with speed and saturates, tau = x tanh(w / w_t)."""
 
     speed: float = 0.1
 
@@ -197,7 +198,7 @@ class Tanh(MemorylessTerm):
 
 @dataclass(frozen=True)
 class Power(MemorylessTerm):
-    """Friction that grows with a power of the speed, tau = x sign(w) |w|^p."""
+    """Friction with a power of the speed, tau = x sign(w) |w|^p."""
 
     exponent: float = 1.0 / 3.0
 
@@ -215,7 +216,7 @@ class Power(MemorylessTerm):
 
 @dataclass(frozen=True)
 class Ramp(MemorylessTerm):
-    """One rise of a monotone piecewise-linear curve: from 0 at one speed to 1 at the next."""
+    """One ramp of a monotone piecewise-linear curve: from 0 at one speed to 1 at the next."""
 
     number: int = 1
     low: float = 0.0
@@ -237,9 +238,9 @@ class Ramp(MemorylessTerm):
 
 @dataclass(frozen=True)
 class Harmonic(MemorylessTerm):
-    """A torque that repeats with the angle of joint or motor: cos or sin of ``order`` turns.
+    """A torque that is periodic in the angle of joint or motor: cos or sin of ``order`` times q.
 
-    With ``order`` the gear ratio, or a multiple of it, the angle is that of the motor.
+    With ``order`` equal to the gear ratio, or a multiple of it, it is periodic in the motor angle.
     """
 
     order: float = 1.0
@@ -283,7 +284,7 @@ class PositionCoulomb(MemorylessTerm):
 
 @dataclass(frozen=True)
 class Bristles(DriveTerm):
-    """Friction x z that is taken up over a way: dz/ds = sign(v) - z / g(v) along s = |q| / s_0."""
+    """Friction x z of bristles with deflection z: dz/ds = sign(v) - z / g(v), s = |q| / s_0."""
 
     displacement: float = 0.01
 
@@ -294,18 +295,18 @@ class Bristles(DriveTerm):
 
     @staticmethod
     def law(x: Sequence[float], way: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Return what a way leaves of the deflection z.
+        """Return the coefficients with which a displacement changes the deflection z.
 
-        Over a way in one direction, at one speed, z becomes sign(v) g + (z - sign(v) g) kept;
-        g(v) = 1 + c exp(-(v / w)^2) is that of long sliding.
+        After a displacement in one direction, at one speed, z is sign(v) g + (z - sign(v) g) decay;
+        its steady value is g(v) = 1 + c exp(-(v / w)^2).
 
         Args:
             x: s_0, w and c [rad or m; rad/s or m/s; -].
-            way: How far the drive goes [rad or m].
+            way: Displacement of the drive [rad or m].
             v: Its speed meanwhile [rad/s or m/s].
 
         Returns:
-            g, dg/dv, kept = exp(-|way| / (s_0 g)).
+            g, dg/dv, decay = exp(-|way| / (s_0 g)).
         """
         extra = x[2] * np.exp(-((v / x[1]) ** 2))
         g = 1.0 + extra
@@ -317,7 +318,7 @@ class Bristles(DriveTerm):
         return self.displacement, 1.0, 0.0
 
     def level(self, v: Array) -> Array:
-        """Return g, what z ends at beside its sign, as v.
+        """Return g, the steady value of abs(z), shape as v.
 
         Args:
             v: Speeds [rad/s or m/s].
@@ -325,33 +326,32 @@ class Bristles(DriveTerm):
         return self.law(self.numbers, np.zeros_like(v), v)[0]
 
     def column(self, motion: DriveMotion) -> Array:
-        """Return z along segments, from sliding where they begin.
+        """Return z along segments, initialised with its steady value.
 
-        Exact between two samples if v keeps its sign and level there.
+        It is exact between two samples if the sign of v and g are constant there.
 
         Args:
-            motion: How a drive moves; of instants that do not follow each other z is that of
-                sliding.
+            motion: Motion of a drive; z has its steady value if the samples are not in a sequence.
         """
         if motion.begins is None:
             return motion.direction * self.level(motion.v)
         from scipy.linalg.lapack import dtbtrs
 
         way = np.diff(motion.q, prepend=motion.q[:1])
-        level, _, kept = self.law(self.numbers, way, motion.v)
-        # z_k = kept_k z_k-1 + (1 - kept_k) sign(way_k) g_k: a triangle of two diagonals
-        kept = np.where(motion.begins, 0.0, kept)
+        level, _, decay = self.law(self.numbers, way, motion.v)
+        # z_k = decay_k z_k-1 + (1 - decay_k) sign(way_k) g_k: a bidiagonal system
+        decay = np.where(motion.begins, 0.0, decay)
         ends = np.where(motion.begins, motion.direction, np.sign(way)) * level
-        band = np.stack([np.ones_like(way), -np.roll(kept, -1)])
-        z, _ = dtbtrs(band, ((1.0 - kept) * ends)[:, None], uplo="L", diag="U", overwrite_b=1)
+        band = np.stack([np.ones_like(way), -np.roll(decay, -1)])
+        z, _ = dtbtrs(band, ((1.0 - decay) * ends)[:, None], uplo="L", diag="U", overwrite_b=1)
         return np.asarray(z[:, 0])
 
 
 @dataclass(frozen=True)
 class Presliding(Bristles):
-    """Friction that a drive takes up over a way after each reversal, tau = x z.
+    """Friction x z that builds up over a displacement after each reversal.
 
-    dz/ds = 1 - z sign(v) along the way s = q / s_0: z goes from -1 to 1 after a reversal.
+    dz/ds = 1 - z sign(v) with the displacement s = q / s_0: z goes from -1 to 1 after a reversal.
 
     References:
         Dahl (1968), A solid friction model.
@@ -362,7 +362,7 @@ class Presliding(Bristles):
 
 @dataclass(frozen=True)
 class LuGre(Bristles):
-    """Presliding with Stribeck's hook: dz/ds = 1 - z sign(v) / g(v), g = 1 + c exp(-(w/w_s)^2).
+    """Presliding with Stribeck effect: dz/ds = 1 - z sign(v) / g(v), g = 1 + c exp(-(w/w_s)^2).
 
     References:
         Canudas de Wit, Olsson, Astrom, Lischinsky (1995), A new model for control of systems with
@@ -385,7 +385,7 @@ class LuGre(Bristles):
 
 @dataclass(frozen=True)
 class Spring(MemorylessTerm):
-    """A linear spring, tau = k q; the torque at q = 0 is the offset's."""
+    """A linear spring, tau = k q; the torque at q = 0 is part of the offset."""
 
     label = "spring"
     position_law = staticmethod(linear)
@@ -423,10 +423,10 @@ class Hat(MemorylessTerm):
 
 @dataclass(frozen=True)
 class Counterbalance(MemorylessTerm):
-    """A spring between two points of stated place, tau = k (L - L_0) dL/dq.
+    """A spring between two known points, tau = k (L - L_0) dL/dq.
 
-    One point turns with the joint at a distance a from its axis, the other stands at a distance b;
-    L^2 = a^2 + b^2 - 2 a b cos(q - q_0) is the length of the spring, shortest at q_0.
+    One point moves with the joint at a distance a from its axis, the other is fixed at a distance
+    b. The length of the spring is L with L^2 = a^2 + b^2 - 2 a b cos(q - q_0), smallest at q_0.
     """
 
     arm: float = 0.1
@@ -439,7 +439,7 @@ class Counterbalance(MemorylessTerm):
     units = ("N/m", "N/m")
     is_nonnegative = True
     is_shared = False
-    usual = (50.0, 90.0)
+    typical = (50.0, 90.0)
     part = "spring"
 
     @staticmethod
@@ -454,34 +454,34 @@ class Counterbalance(MemorylessTerm):
 
 @dataclass(frozen=True)
 class Lag(DriveTerm):
-    """A torque that comes late, by a delay or an elastic gear: to first order -T d(tau)/dt."""
+    """A delayed torque, by a delay T or an elastic gear: to first order -T d(tau)/dt."""
 
     label = "lag"
     units = ("s", "s")
     has_state = True
     is_measured = True
     is_friction = True
-    usual = (0.005, 0.02)
+    typical = (0.005, 0.02)
     part = "delay"
 
     def column(self, motion: DriveMotion) -> Array:
-        """Return the change of the whole torque.
+        """Return minus the time derivative of the whole torque.
 
         Args:
-            motion: How a drive moves.
+            motion: Motion of a drive.
         """
         return -motion.rate
 
 
-#: The terms without a shape of their own, by name, in the order of the parameters.
+#: The terms without shape parameters, by name, in the order of the parameters.
 TERMS: dict[str, DriveTerm] = {
     term.name: term for term in (Armature(), Viscous(), Coulomb(), Offset())
 }
-#: Names of the terms that are identified unless told otherwise.
+#: Names of the terms that are identified by default.
 DRIVE_TERMS = tuple(TERMS)
 
 
-#: The terms that have a shape of their own, or are in no model unless stated, by class.
+#: The terms with shape parameters, and those that are in a model only if stated, by class.
 TERM_CLASSES: dict[str, type[DriveTerm]] = {
     kind.__name__: kind
     for kind in (
@@ -501,7 +501,7 @@ _TABLE = 8  # entries of a tabulated spring
 
 
 def _curve(data_range: DataRange) -> tuple[DriveTerm, ...]:
-    """Return the rises of a monotone curve over the speeds seen, closer together at low speed."""
+    """Return the ramps of a monotone curve over the data's speeds, narrower at low speed."""
     knots = data_range["v"][1] * np.linspace(0.0, 1.0, _KNOTS + 1) ** 2
     return tuple(
         Ramp(number=k, low=a, high=b) for k, (a, b) in enumerate(pairwise(knots.tolist()), start=1)
@@ -509,7 +509,7 @@ def _curve(data_range: DataRange) -> tuple[DriveTerm, ...]:
 
 
 def _table(data_range: DataRange) -> tuple[DriveTerm, ...]:
-    """Return the entries of a tabulated spring but the middle one, which is the offset's."""
+    """Return the entries of a tabulated spring except the middle one, which the offset covers."""
     knots = np.linspace(*data_range["q"], _TABLE + 1).tolist()
     step = knots[1] - knots[0]
     return tuple(
@@ -531,7 +531,7 @@ def _harmonics(highest: int) -> Callable[[DataRange], tuple[DriveTerm, ...]]:
 
 
 def _once_a_turn() -> tuple[DriveTerm, ...]:
-    """Return cosine and sine of the position: gravity has a part of them, beyond the range, too."""
+    """Return cosine and sine of the position, unguarded, since gravity contains them too."""
     return (Harmonic(), Harmonic(is_sine=True))
 
 
@@ -542,52 +542,52 @@ def _by_position(data_range: DataRange) -> tuple[DriveTerm, ...]:
     )
 
 
-_OTHER = "friction that is not viscous and Coulomb"
-_SLOW = "raise min_velocity to leave the slow rows out"
-#: What a job's ``friction`` may name beside viscous and Coulomb friction, by name.
+_OTHER = "friction that is not viscous plus Coulomb"
+_SLOW = "raise min_velocity to exclude the slow samples"
+#: The families of a job's ``friction`` in addition to viscous and Coulomb friction, by name.
 FAMILIES: dict[str, Family] = {
     family.name: family
     for family in (
         Family("load", "friction that grows with the load", lambda data_range: (LoadFriction(),),
                is_automatic=True, code="load_friction", has_size=True),
-        Family("stribeck", f"{_OTHER} but rises towards standstill (Stribeck)",
+        Family("stribeck", f"{_OTHER} but increases towards zero speed (Stribeck)",
                lambda own, speed: (Stribeck(data_range=own["v"], speed=speed),), (_SPEED,),
                is_automatic=True, code="friction_shape", tested=((0.05,), (0.2,)),
                advice=f"{_SLOW[0].upper()}{_SLOW[1:]}"),
-        Family("tanh", f"{_OTHER} but sets in with speed, or a drive that sticks",
+        Family("tanh", f"{_OTHER} but rises with speed and saturates, or stiction",
                lambda data_range, speed: (Tanh(data_range=data_range["v"], speed=speed),), (_RISE,),
                is_automatic=True, code="friction_shape", tested=((0.03,), (0.15,)),
                advice=f"Set friction_band, or {_SLOW}", is_imitated=True),
-        Family("presliding", "friction that is taken up after each reversal",
+        Family("presliding", "friction that builds up after each reversal (presliding)",
                lambda data_range, way: (Presliding(displacement=way),), (_WAY,), is_automatic=True),
-        Family("lag", "a torque that comes late (a delay, an elastic gear)",
+        Family("lag", "a delayed torque (a delay, an elastic gear)",
                lambda data_range: (Lag(),), is_automatic=True),
-        Family(COUNTERBALANCE, "a torque that repeats once a turn, as a counterbalance's",
+        Family(COUNTERBALANCE, "a torque with one period per revolution, as of a counterbalance",
                lambda data_range: _once_a_turn(), needs=0.1),
-        Family("harmonics2", "a spring or counterbalance that follows the joint's position",
+        Family("harmonics2", "a spring or counterbalance torque that depends on the position",
                _harmonics(2), needs=0.5, is_automatic=True, code="spring",
                instead=(COUNTERBALANCE, "spring")),
         Family("harmonics4",
-               "a torque that repeats with the joint's position (cogging, an eccentric gear)",
+               "a torque that is periodic in the joint's position (cogging, an eccentric gear)",
                _harmonics(4), needs=0.5, is_automatic=True, code="position_periodic"),
         Family("asymmetric", "viscous friction that differs by direction",
                lambda data_range: (Asymmetric(),), is_automatic=True, code="friction_shape",
                has_size=True),
-        Family("power", f"{_OTHER} but bends with speed, as |v|^(1/3) does",
+        Family("power", f"{_OTHER} but nonlinear in the speed, as |v|^(1/3)",
                lambda data_range, exponent: (Power(data_range=data_range["v"], exponent=exponent),),
                (Shape("exponent", ("-", "-"), (0.1, 0.9)),), code="friction_shape",
                tested=((1.0 / 3.0,),)),
-        Family("cubic", f"{_OTHER} but bends with speed, as v^3 does",
+        Family("cubic", f"{_OTHER} but nonlinear in the speed, as v^3",
                lambda data_range: (Cubic(data_range=data_range["v"]),), code="friction_shape"),
-        Family("curve", "friction by a monotone curve over speed", _curve),
-        Family("lugre", "presliding with a hook at low speed",
+        Family("curve", "friction as a monotone curve over speed", _curve),
+        Family("lugre", "presliding with Stribeck effect (LuGre)",
                lambda data_range, way, speed, excess: (
                    LuGre(displacement=way, speed=speed, excess=excess),
                ),
                (_WAY, _SPEED, Shape("excess", ("-", "-"), (0.01, 3.0)))),
         Family("position", "Coulomb friction that depends on the position", _by_position),
-        Family("spring", "a spring on the joint", lambda own: (Spring(data_range=own["q"]),),
+        Family("spring", "a linear spring at the joint", lambda own: (Spring(data_range=own["q"]),),
                code="spring", has_size=True),
-        Family("spring_table", "a spring of any curve", _table),
+        Family("spring_table", "a nonlinear spring (table)", _table),
     )
 }  # fmt: skip

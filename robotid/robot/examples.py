@@ -1,4 +1,4 @@
-"""Robots of the installed package example-robot-data, found by file name."""
+"""URDFs of the installed package example-robot-data, by file name."""
 
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
@@ -17,7 +17,7 @@ def example_urdfs() -> tuple[Path, ...]:
     Raises:
         MissingDependencyError: If example-robot-data is not installed.
     """
-    # its wheel ships data without a Python loader, so the files are found in its own record
+    # its wheel contains data without a Python loader, so its record lists the files
     try:
         found = distribution("example-robot-data")
     except PackageNotFoundError as error:
@@ -32,14 +32,14 @@ def example_urdf(name: str) -> Path:
     """Return the path of one example robot.
 
     Args:
-        name: File name, as "ur5_robot.urdf".
+        name: File name, for example "ur5_robot.urdf".
 
     Returns:
         Its path.
 
     Raises:
         MissingDependencyError: If example-robot-data is not installed.
-        ModelError: If it holds no such file.
+        ModelError: If it has no such file.
     """
     urdfs = example_urdfs()
     for path in urdfs:

@@ -1,4 +1,4 @@
-"""What a job says of drives: names of families in ``friction``, terms and families in [drives]."""
+"""The drive settings of a job: families in ``friction``, terms and families in [drives]."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -21,34 +21,35 @@ __all__ = [
     "wanted_families",
 ]
 
-#: What ``friction`` says to have the families of each joint chosen.
+#: Value of ``friction`` with which the families of each joint are chosen.
 AUTO = "auto"
-_OF_MODEL = ("none", "viscous", "coulomb")  # named in ``friction``, and terms of the model
-_SPARE = 1.1  # times what a family needs of the position, from which it is advised
+_OF_MODEL = ("none", "viscous", "coulomb")  # allowed in ``friction``, and terms of the model
+_SPARE = 1.1  # factor on the range that a family needs, from which it is advised
 
 
 def spring_family(turned: float, *families: str) -> str:
-    """Return the first family of a spring that a joint turned far enough for.
+    """Return the first spring family whose required range a joint covered.
 
     Args:
         turned: Range of its positions [rad].
-        families: Names of families, those that need most first; "spring" needs nothing.
+        families: Names of families, in descending order of the required range; "spring" requires
+            none.
     """
     return next((name for name in families if has_turned(name, turned)), "spring")
 
 
 def has_turned(family: str, turned: float) -> bool:
-    """Return whether a joint turned as far as a family of its torque needs, with room to spare.
+    """Return whether a joint covered 1.1 times the range of positions that a family needs.
 
     Args:
         family: Its name.
-        turned: Range of the joint's positions [rad]; 0 of a prismatic joint.
+        turned: Range of the joint's positions [rad]; 0 for a prismatic joint.
     """
     return _SPARE * FAMILIES[family].needs * 2 * np.pi <= turned
 
 
 def drive_line(joint: str, *entries: str | DriveTerm) -> str:
-    """Return the line of a job's [drives] that gives a joint families or terms.
+    """Return the line of a job's [drives] with the families or terms of a joint.
 
     Args:
         joint: The joint.
@@ -67,12 +68,12 @@ def _toml_entry(entry: str | DriveTerm) -> str:
 def wanted_families(
     friction: str | Mapping[str, str], joints: Sequence[str]
 ) -> dict[str, tuple[str, ...] | None]:
-    """Return the names of the families each joint is to have; None where they are to be chosen.
+    """Return the names of each joint's families; None where they are chosen from the data.
 
     Args:
-        friction: "auto", or names of friction with + between them; or that by joint, "*" for all
-            joints that are not named ("auto" if it is left out). Viscous and Coulomb friction are
-            the model's terms.
+        friction: "auto", or names of families joined by +; or these by joint, "*" for all joints
+            that are not named ("auto" if it is omitted). Viscous and Coulomb friction are terms of
+            the model.
         joints: Names of the joints.
 
     Raises:
@@ -83,10 +84,10 @@ def wanted_families(
     for joint, names in friction.items() if isinstance(friction, Mapping) else ():
         require_kind(names, str, f"friction of {joint}", wanted_kind)
     stated = {"*": friction} if isinstance(friction, str) else {"*": AUTO, **friction}
-    strangers = [joint for joint in stated if joint not in (*joints, "*")]
-    if strangers:
+    unknown_joints = [joint for joint in stated if joint not in (*joints, "*")]
+    if unknown_joints:
         raise SettingsError(
-            f"friction is stated for {listed(strangers)}, not among the joints to identify: "
+            f"friction is stated for {listed(unknown_joints)}, wanted joints that are identified: "
             f"{listed(joints)}"
         )
     wanted: dict[str, tuple[str, ...] | None] = {}
@@ -104,17 +105,18 @@ def wanted_families(
 
 
 def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:
-    """Return a term of its plain values, as ``DriveTerm.to_dict`` gives them.
+    """Return a term from its plain values, as of ``DriveTerm.to_dict``.
 
     Args:
-        table: Its class under "term", and the fields that are not left as they are.
+        table: Its class under "term", and the fields that differ from their defaults.
 
     Raises:
-        SettingsError: If there is no such term, or a field of it is unknown or no number.
+        SettingsError: If there is no such term, or a field is unknown or not a number.
     """
     if not isinstance(table, Mapping):
         raise SettingsError(
-            f"a drive term is {table!r}, wanted a table, as {{ term = 'Stribeck', speed = 0.1 }}"
+            f"a drive term is {table!r}, wanted a table, for example "
+            "{ term = 'Stribeck', speed = 0.1 }"
         )
     kind = TERM_CLASSES.get(str(table.get("term")))
     if kind is None:

@@ -1,4 +1,4 @@
-"""The extent of each body by the URDF's collision or visual geometry, for bounds on its mass."""
+"""The extent of each body from the URDF's collision or visual geometry, for bounds on its mass."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -23,14 +23,14 @@ __all__ = [
 ]
 
 _SIDES = 16  # of the prism around a cylinder
-_MOST_FACES = 100  # a hull with more is replaced by a polytope of this many faces around it
-_GROWN = 0.05  # of its diagonal by which the box of a body's geometry is grown on each side
-_GROWN_BLIND = 0.35  # the same of the box around its frames alone, which have no width ...
+_MOST_FACES = 100  # a hull with more is replaced by an outer polytope with this many faces
+_GROWN = 0.05  # enlargement on each side of the box of a body's geometry, over its diagonal
+_GROWN_BLIND = 0.35  # the same of the box of its frames only, which have no width ...
 _NARROWEST = 0.1  # ... and at least this share of the longest link
 
 
 def geometry_half_spaces(model: RobotModel, shape: str) -> dict[str, tuple[Array, Array]]:
-    """Return where the URDF's geometry allows the centres of mass to be.
+    """Return bounds on the centres of mass from the URDF's geometry.
 
     Args:
         model: The robot.
@@ -38,7 +38,7 @@ def geometry_half_spaces(model: RobotModel, shape: str) -> dict[str, tuple[Array
 
     Returns:
         Half-spaces A c <= b in the frame of each body's moved link, by its name; see
-        ``body_points`` for the bodies that have none.
+        ``body_points`` for the bodies without bounds.
 
     Raises:
         SettingsError: If geometry is asked for and no body has any that can be read.
@@ -48,19 +48,19 @@ def geometry_half_spaces(model: RobotModel, shape: str) -> dict[str, tuple[Array
     points = body_points(model)
     if not points:
         raise SettingsError(
-            f"com_within is {shape!r}, but no link has geometry in {Path(model.tree.path).name} "
-            "whose meshes are found; state boxes with 'com', or leave it out"
+            f"com_within is {shape!r}, but no link has readable geometry in "
+            f"{Path(model.tree.path).name}; state boxes with 'com', or omit com_within"
         )
     around = box_half_spaces if shape == "box" else hull_half_spaces
     return {body: around(cloud) for body, cloud in points.items()}
 
 
 def body_points(model: RobotModel) -> dict[str, Array]:
-    """Return points whose convex hull holds each body, in the frame of its moved link.
+    """Return points whose convex hull contains each body, in the frame of its moved link.
 
-    A link's collision geometry counts, or its visual one if it has none. Curved shapes are
-    replaced by polyhedra around them. A body of which a link with mass has no geometry, or a mesh
-    that is not found, is left out: nothing bounds its mass.
+    They are those of a link's collision geometry, or of its visual one if it has none. Curved
+    shapes are replaced by polyhedra around them. A body is omitted if one of its links with mass
+    has no geometry, or a mesh that is not found: its mass has no bounds.
 
     Args:
         model: The robot.
@@ -87,9 +87,9 @@ def body_points(model: RobotModel) -> dict[str, Array]:
 
 
 def link_clouds(model: RobotModel) -> tuple[list[tuple[str, int, Array]], list[str]]:
-    """Return points whose convex hulls hold each shape of each link, in the frame of its body.
+    """Return points whose convex hulls contain each shape of each link, in the frame of its body.
 
-    A link's collision geometry counts, or its visual one if it has none.
+    They are those of a link's collision geometry, or of its visual one if it has none.
 
     Args:
         model: The robot.
@@ -113,12 +113,12 @@ def link_clouds(model: RobotModel) -> tuple[list[tuple[str, int, Array]], list[s
 
 
 def body_boxes(model: RobotModel) -> dict[str, Array]:
-    """Return a box that holds all mass of each body, in the frame of its moved link.
+    """Return a box that contains all mass of each body, in the frame of its moved link.
 
-    It holds the body's geometry, grown by 5 % of its diagonal on each side; of a body without
-    geometry its frames (those of its joints, links and tools), grown by 35 % and at least 10 % of
-    the robot's longest link. It is widened to hold the URDF's own body: the uniform box of equal
-    mass, centre and second moments.
+    It contains the body's geometry, enlarged by 5 % of its diagonal on each side. For a body
+    without geometry it contains its frames (of its joints, links and tools), enlarged by 35 % and
+    at least 10 % of the robot's longest link. It also contains the URDF's body: the uniform box of
+    equal mass, centre and second moments.
 
     Args:
         model: The robot.
@@ -170,9 +170,9 @@ def hull_half_spaces(points: Array) -> tuple[Array, Array]:
         points: Shape (k, 3) [m].
 
     Returns:
-        A, unit rows, shape (f, 3), and b, shape (f,) [m]. Beyond 100 faces it is the polytope of
-        100 directions spread over the sphere that touches the hull from outside; flat points give
-        their box.
+        A, unit rows, shape (f, 3), and b, shape (f,) [m]. A hull with more than 100 faces is
+        replaced by its outer polytope with 100 uniformly distributed normals, flat points by their
+        box.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -184,8 +184,9 @@ def hull_half_spaces(points: Array) -> tuple[Array, Array]:
     if len(planes) <= _MOST_FACES:
         return planes[:, :3], -planes[:, 3]
     k = np.arange(_MOST_FACES) + 0.5
-    polar, turn = np.arccos(1 - 2 * k / _MOST_FACES), np.pi * (1 + 5**0.5) * k
-    A = np.column_stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)])
+    polar, angle = np.arccos(1 - 2 * k / _MOST_FACES), np.pi * (1 + 5**0.5) * k
+    x, y = np.cos(angle) * np.sin(polar), np.sin(angle) * np.sin(polar)
+    A = np.column_stack([x, y, np.cos(polar)])
     return A, (A @ points.T).max(axis=1)
 
 
@@ -203,7 +204,7 @@ def _by_link(shapes: Iterable[Shape]) -> dict[str, list[Shape]]:
 
 
 def _link_points(shapes: Sequence[Shape], urdf: Path) -> Array | None:
-    """Return points of a link's shapes in its frame; None if one is not understood or found."""
+    """Return points of a link's shapes in its frame; None if one is not known or not found."""
     parts = [np.zeros((0, 3))]
     for shape in shapes:
         points = _shape_points(shape, urdf)
@@ -224,9 +225,9 @@ def _shape_points(shape: Shape, urdf: Path) -> Array | None:
             corners *= size[0]
             return corners
         case "cylinder":
-            turn = 2 * np.pi * np.arange(_SIDES) / _SIDES
+            angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
             radius, length = size
-            ring = np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+            ring = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
             ring *= radius / np.cos(np.pi / _SIDES)
             half = 0.5 * length * np.array([0.0, 0.0, 1.0])
             return np.vstack([ring - half, ring + half])
@@ -235,7 +236,7 @@ def _shape_points(shape: Shape, urdf: Path) -> Array | None:
         return None
     try:
         surfaces = read_surfaces(path)
-    except ValueError:  # said by "geometry_unread"
+    except ValueError:  # reported by the finding "geometry_unread"
         return None
     return np.vstack([s.vertices for s in surfaces]) * size if surfaces else None
 

@@ -1,4 +1,4 @@
-"""Whether the mass matrix is positive definite wherever the joints can go."""
+"""The mass matrix, and whether it is positive definite over the joints' ranges."""
 
 from dataclasses import dataclass
 
@@ -44,19 +44,16 @@ def check_mass_matrix(
     Args:
         model: The robot.
         pi: Standard parameters, shape (p,).
-        poses: Number of poses, uniform within the joints' limits; a joint without limits turns
-            once around or slides by 1 m to either side.
+        poses: Number of poses, uniform within the joints' limits; a joint without limits has the
+            range +-pi rad or +-1 m.
         seed: Seed of the poses.
-
-    Returns:
-        What was found.
     """
     rng = np.random.default_rng(seed)
     free = [1.0 if joint.type == "prismatic" else np.pi for joint in model.limits]
     lower = [j.lower if j.has_limits else -x for j, x in zip(model.limits, free, strict=True)]
     upper = [j.upper if j.has_limits else x for j, x in zip(model.limits, free, strict=True)]
     q = rng.uniform(lower, upper, (poses, len(free)))
-    if model.free_flyer:  # where the base is changes nothing
+    if model.free_flyer:  # the pose of the base has no effect
         q = np.hstack([np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (poses, 1)), q])
     bodies, smallest, positive = model.with_parameters(pi), np.inf, 0
     for first in range(0, poses, _BLOCK):
@@ -70,11 +67,11 @@ def check_mass_matrix(
 
 
 def _are_above(M: Array, least: float) -> bool:
-    """Return whether all eigenvalues of all matrices are larger: it takes less than to find them.
+    """Return whether all eigenvalues of all matrices exceed a bound, without computing them.
 
     Args:
         M: Symmetric matrices, shape (N, n, n).
-        least: What they are compared with.
+        least: The bound.
     """
     try:
         np.linalg.cholesky(M - least * np.eye(M.shape[-1]))
@@ -95,7 +92,7 @@ def joint_mass_matrices(model: RobotModel, pi: Array, q: Array) -> Array:
 
 
 def _mass_matrices(bodies: RobotModel, pi: Array, q: Array) -> Array:
-    """Return ``joint_mass_matrices`` of a robot that has the parameters."""
+    """Return ``joint_mass_matrices`` of a robot that already has the parameters."""
     M = rigid_mass_matrices(bodies, bodies.configurations(q))
     first = bodies.n_rows - len(bodies.joints)
     M[:, first:, first:] += drive_inertia(bodies.layout, pi)
@@ -124,7 +121,7 @@ def rigid_mass_matrices(
 
 
 def drive_inertia(layout: ParameterLayout, pi: Array) -> Array:
-    """Return what the drives add to the mass matrix of the joints, (n, n) [kg m^2, or kg].
+    """Return the drives' contribution to the mass matrix of the joints, (n, n) [kg m^2, or kg].
 
     Args:
         layout: The standard parameters of a robot with n joints.
@@ -136,7 +133,7 @@ def drive_inertia(layout: ParameterLayout, pi: Array) -> Array:
 
 
 def carried_inertia(model: RobotModel) -> Array:
-    """Return the inertia that each joint carries at the neutral posture, (n,) [kg m^2, or kg].
+    """Return the diagonal of the bodies' mass matrix at the neutral pose, (n,) [kg m^2, or kg].
 
     Args:
         model: The robot.

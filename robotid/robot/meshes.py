@@ -1,4 +1,4 @@
-"""What a robot looks like: the shapes in its URDF, meshes found and read."""
+"""The visual and collision shapes of a URDF, and its meshes."""
 
 import os
 import re
@@ -19,9 +19,9 @@ from robotid.robot.urdf_text import LARGEST, numbers
 __all__ = ["Shape", "Surface", "find_mesh", "joined", "read_shapes", "read_surfaces"]
 
 _FORMATS = (".stl", ".dae", ".obj", ".ply", ".off", ".glb", ".gltf")
-_MOST_BYTES = 2**28  # of a mesh; a link's has 2**20
+_MOST_BYTES = 2**28  # of a mesh; that of a link has about 2**20
 
-GREY = (0.6, 0.65, 0.7, 1.0)  # what has no colour
+GREY = (0.6, 0.65, 0.7, 1.0)  # of shapes without colour
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Surface:
         vertices: Corners, shape (V, 3) [m].
         faces: Triangles as indices of corners, shape (F, 3).
         rgba: Colour, shape (4,), 0 to 1; None if the file states none.
-        is_closed: Whether it, with the other colours of its file, is known to have an inside.
+        is_closed: Whether it is known to be closed, together with the other colours of its file.
     """
 
     vertices: Array
@@ -48,10 +48,10 @@ class Shape:
     Attributes:
         link: Name of the link.
         placement: Pose in the link's frame, shape (4, 4).
-        kind: "mesh", "box", "cylinder" or "sphere"; "" if it is not understood.
+        kind: "mesh", "box", "cylinder" or "sphere"; "" if it is another one or not valid.
         size: Scale of a mesh [-]; edges of a box, radius and length of a cylinder, radius of a
             sphere [m].
-        file: What the URDF calls the mesh; empty if it is none.
+        file: File name of the mesh in the URDF; empty if it is not a mesh.
         rgba: Colour that the URDF states, shape (4,), 0 to 1; None if it states none.
     """
 
@@ -68,7 +68,7 @@ def read_shapes(robot: ET.Element, tag: str = "visual") -> tuple[Shape, ...]:
 
     Args:
         robot: The ``<robot>`` of the file.
-        tag: Which of them: "visual" or "collision".
+        tag: "visual" or "collision".
     """
     colours = {m.get("name"): _colour(m) for m in robot.findall("material")}
     found = []
@@ -87,12 +87,12 @@ def read_shapes(robot: ET.Element, tag: str = "visual") -> tuple[Shape, ...]:
 def find_mesh(name: str, urdf: str | Path) -> Path | None:
     """Return the file of a mesh, None if there is none.
 
-    A path with ``package://`` or none is looked for in ROS_PACKAGE_PATH, in the URDF's folder and
-    those above it, and in example-robot-data, with the name of its package and without it; a path
-    in a package does not leave it by "..". Folders, pipes and devices are no meshes.
+    A relative path, or one with ``package://``, is searched in ROS_PACKAGE_PATH, in the URDF's
+    folder and its parents, and in example-robot-data, with the name of its package and without it.
+    A path in a package with ".." is not accepted. Folders, pipes and devices are not meshes.
 
     Args:
-        name: What the URDF calls it.
+        name: Its name in the URDF.
         urdf: The URDF file.
     """
     if name.startswith("file://"):
@@ -109,7 +109,7 @@ def find_mesh(name: str, urdf: str | Path) -> Path | None:
     for folder in _folders(Path(urdf)):
         if os.path.isfile(folder / inside):  # unlike Path.is_file, it never raises
             return folder / inside
-        # the folder may be that of the package, whatever it is called here
+        # the folder may be that of the package under another name
         if is_package and without and os.path.isfile(folder / without):
             return folder / without
     return None
@@ -122,18 +122,18 @@ def read_surfaces(path: Path) -> tuple[Surface, ...]:
         path: The file.
 
     Returns:
-        Its surfaces [m], none if it holds no triangles.
+        Its surfaces [m], none if it has no triangles.
 
     Raises:
-        ValueError: If the file cannot be read, is larger than 256 MiB, or a corner of it is no
-            finite place.
+        ValueError: If the file cannot be read, is larger than 256 MiB, or has a corner that is not
+            finite.
     """
     if path.suffix.lower() not in _FORMATS:
-        raise ValueError(f"{path.name} is no mesh, wanted {', '.join(_FORMATS)}")
+        raise ValueError(f"{path.name} is not a mesh, wanted {', '.join(_FORMATS)}")
     # the readers of the formats raise errors of every kind
     try:
         if path.stat().st_size > _MOST_BYTES:
-            raise ValueError(f"it has more than {_MOST_BYTES // 2**20} MiB")
+            raise ValueError(f"the file has more than {_MOST_BYTES // 2**20} MiB")
         return _read_surfaces(path)
     except Exception as error:
         raise ValueError(f"{path.name} cannot be read: {error}") from error
@@ -152,7 +152,7 @@ def _read_surfaces(path: Path) -> tuple[Surface, ...]:
             rgba = _mesh_colour(mesh.visual)
             surface = Surface(metres * np.asarray(mesh.vertices), np.asarray(mesh.faces), rgba)
             if not np.abs(surface.vertices).max(initial=0.0) <= LARGEST:
-                raise ValueError("a corner lies nowhere, or too far away")
+                raise ValueError(f"a corner is not finite, or beyond {LARGEST:g} m")
             by_colour.setdefault(rgba, []).append(surface)
     return tuple(joined(surfaces) for surfaces in by_colour.values())
 
@@ -171,7 +171,7 @@ def _folders(urdf: Path) -> Iterator[Path]:
 
 
 def _geometry(element: ET.Element) -> tuple[str, tuple[float, ...], str]:
-    """Return the kind, size and file of what a shape shows."""
+    """Return the kind, size and file of a shape."""
     for shape in element.iterfind("geometry/*"):
         get = shape.get
         match shape.tag:
@@ -197,7 +197,7 @@ def _colour(material: ET.Element) -> tuple[float, ...] | None:
 
 
 def _placement(origin: ET.Element | None) -> tuple[Array, bool]:
-    """Return the pose, shape (4, 4), and whether it is understood."""
+    """Return the pose, shape (4, 4), and whether it is valid."""
     M = np.eye(4)
     pose = {} if origin is None else origin.attrib
     xyz, rpy = (numbers(pose.get(key, "0 0 0"), 3) for key in ("xyz", "rpy"))

@@ -25,10 +25,10 @@ from robotid.robot.urdf_text import LARGEST
 __all__ = ["GRAVITY", "RobotModel"]
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
-_STRONGEST = 100.0  # [m/s^2] beyond it, what accelerations show is lost beside what gravity shows
+_STRONGEST = 100.0  # [m/s^2] with more, accelerations are negligible beside gravity
 _MOST_JOINTS = 300  # memory grows with their square, time with their cube: 2 GiB, 75 s
-_MOST = 1e30  # largest size of a parameter, SI units: products of a few of them stay finite
-_UNIT = 1e-6  # how far from 1 the length of a quaternion may be
+_MOST = 1e30  # largest absolute value of a parameter, SI units: products of a few are finite
+_UNIT = 1e-6  # tolerance of the norm of a quaternion
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,21 +37,21 @@ class RobotModel:
 
     Joint coordinates q are one angle or length per joint, in the order of ``joints``; for a
     floating base they start with its pose [x y z qx qy qz qw], and v with its twist in the base
-    frame. Continuous joints are angles here too; ``configuration`` gives Pinocchio's form.
+    frame. Continuous joints are angles here too; ``configurations`` returns Pinocchio's form.
 
     Attributes:
-        tree: The URDF it was built from.
-        pin_model: Pinocchio's model, locked joints lumped.
+        tree: The URDF.
+        pin_model: Pinocchio's model; bodies behind locked joints are lumped.
         layout: Names and order of the standard parameters.
         velocity_map: Matrix G with v_pinocchio = G v, shape (nv, n_rows): order of joints, mimic.
         position_offset: Constant part of the joint coordinates of mimic joints, shape (nv,).
         free_flyer: Whether the base floats.
-        locked: Positions of the joints held still [rad or m].
-        mimic: How mimic joints are treated: "independent" or "coupled".
-        reference: Standard parameters by which torques that drive terms depend on are reckoned,
-            the load of a gear among them, shape (p,); None: those of the URDF.
-        dynamics: "full", or "static": of logs of poses and slow motion, velocities and
-            accelerations are not used but for the sign of friction.
+        locked: Positions of the locked joints [rad or m].
+        mimic: Treatment of mimic joints: "independent" or "coupled".
+        reference: Standard parameters for torques in drive terms, for example the joint load
+            torque, shape (p,); None: those of the URDF.
+        dynamics: "full", or "static" for logs of poses and slow motion: velocities and
+            accelerations are used for the sign of friction only.
     """
 
     tree: Tree
@@ -90,27 +90,27 @@ class RobotModel:
         """Read a robot from a URDF. Meshes are not needed.
 
         Args:
-            path: The URDF file, or what was read of it.
-            joints: Names of the joints that move, in the order wanted; all movable ones, in
+            path: The URDF file, or its tree.
+            joints: Names of the joints that move, in the wanted order; all movable ones, in
                 Pinocchio's order, if None.
-            locked: Positions of joints held still [rad or m], "*" that of all others; a joint that
-                is neither in ``joints`` nor here is held at 0, or follows the one it mimics.
-            free_flyer: Whether the base floats; its six rows then come first.
-            mimic: "independent" treats a mimic joint as a joint of its own with its own torque;
-                "coupled" moves it with the joint it mimics, whose torque then carries both.
+            locked: Positions of locked joints [rad or m], "*" that of all others; a joint that is
+                neither in ``joints`` nor here is locked at 0, or follows the joint that it mimics.
+            free_flyer: Whether the base floats; its six rows are the first ones.
+            mimic: "independent" treats a mimic joint as a joint with its own torque; "coupled"
+                moves it with the joint that it mimics, whose torque drives both.
             gravity: Gravity in the frame of the root link, shape (3,) [m/s^2].
             terms: Drive terms that are parameters, a subset of armature, viscous, coulomb, offset.
-            couplings: Drives that turn with several joints.
+            couplings: Drives that move several joints.
             own_terms: Further terms of single drives, by name of the joint or coupling.
-            dynamics: "full"; or "static" for gravity alone, with terms that act without speed.
-            snap_angles: Whether angles of joints that the file rounds, 3.1416, become the multiple
-                of pi/12 that they round; see ``exact_angle`` for which are taken as rounded.
+            dynamics: "full"; or "static" for gravity, with drive terms that act at zero speed.
+            snap_angles: Whether rounded angles of joint origins, 3.1416, are replaced by the exact
+                multiple of pi/12; see ``exact_angle``.
 
         Returns:
             The model.
 
         Raises:
-            ModelError: If the URDF cannot be used, a joint is not in it, or a number is not usable.
+            ModelError: If the URDF or a number is not usable, or a joint is not in the URDF.
             SettingsError: If a term or a coupling is unknown.
         """
         require_kind(path, (str, Path, Tree), "path", "the path of a URDF")
@@ -137,7 +137,7 @@ class RobotModel:
         if dynamics not in DYNAMICS:
             raise ModelError(f"dynamics is {dynamics!r}, wanted one of {listed(DYNAMICS)}")
         if dynamics == "static":
-            _check_pull(gravity)
+            _check_gravity(gravity)
             terms = [x for x in terms if x not in TERMS or _acts_at_rest(TERMS[x])]
             own_terms = {
                 name: [term for term in own if _acts_at_rest(term)]
@@ -146,7 +146,7 @@ class RobotModel:
         if not (tree.movable or free_flyer):
             raise ModelError(
                 f"{Path(tree.path).name}: robot {tree.name!r} has no movable joint, so there is "
-                "nothing to identify; a body that flies has ten parameters with free_flyer=True"
+                "nothing to identify; a free body needs free_flyer=True"
             )
         followers = _followers(tree) if mimic == "coupled" else {}
         full = _build(tree, free_flyer, gravity)
@@ -154,23 +154,23 @@ class RobotModel:
         free = [name for name in list(full.names)[first:] if name not in followers]
         moving, positions = _choose_joints(tree, free, joints, locked or {}, followers)
         if not moving and not free_flyer:
-            raise ModelError("all joints are locked, so there is nothing to identify; free one")
+            raise ModelError("all joints are locked, so there is nothing to identify; unlock one")
         reduced = _reduce(full, positions)
         G, shift = _velocity_map(reduced, moving, followers, free_flyer)
         child = {joint.name: joint.child for joint in tree.movable}
-        slides = [joint for joint in tree.movable if joint.type == "prismatic"]
+        prismatic = [joint for joint in tree.movable if joint.type == "prismatic"]
         layout = ParameterLayout(
             bodies=((tree.root,) if free_flyer else ())
             + tuple(child[name] for name in list(reduced.names)[first:]),
             joints=moving,
             terms=tuple(terms),
             couplings=tuple(couplings),
-            prismatic=frozenset(joint.name for joint in slides),
-            strokes={j.name: j.upper - j.lower for j in slides if j.has_limits},
+            prismatic=frozenset(joint.name for joint in prismatic),
+            strokes={j.name: j.upper - j.lower for j in prismatic if j.has_limits},
             own={name: tuple(terms) for name, terms in own_terms.items() if terms},
         )
-        held = MappingProxyType(positions)
-        return cls(tree, reduced, layout, G, shift, free_flyer, held, mimic, dynamics=dynamics)
+        fixed = MappingProxyType(positions)
+        return cls(tree, reduced, layout, G, shift, free_flyer, fixed, mimic, dynamics=dynamics)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "locked": dict(self.locked)}
@@ -180,7 +180,7 @@ class RobotModel:
 
     @property
     def options(self) -> dict[str, Any]:
-        """What of ``from_urdf``'s arguments makes this model of its tree, couplings aside."""
+        """The arguments of ``from_urdf`` that build this model from its tree, except couplings."""
         followers = {j.name for j in self.tree.movable if j.mimic and self.mimic == "coupled"}
         return {
             "joints": list(self.joints),
@@ -197,12 +197,12 @@ class RobotModel:
 
     @property
     def is_static(self) -> bool:
-        """Whether only what stands and slow motion show is identified."""
+        """Whether only poses at rest and slow motion are used."""
         return self.dynamics == "static"
 
     @property
     def name(self) -> str:
-        """Name of the robot, as the URDF says."""
+        """Name of the robot in the URDF."""
         return self.tree.name
 
     @property
@@ -242,13 +242,13 @@ class RobotModel:
 
     @property
     def carried_by(self) -> Array:
-        """Standard parameters by which the load of the drives is reckoned, shape (p,)."""
+        """Standard parameters for the joint load torques in drive terms, shape (p,)."""
         return self.standard_parameters() if self.reference is None else self.reference
 
     def standard_parameters(self) -> Array:
-        """Return the standard parameters as the URDF states them, shape (p,), SI units.
+        """Return the standard parameters of the URDF, shape (p,), SI units.
 
-        The drive terms are 0, since what a URDF says of them is not used.
+        The drive terms are 0, since the URDF's values of them are not used.
         """
         inertial = [inertia.toDynamicParameters() for inertia in self.pin_model.inertias[1:]]
         return np.concatenate([*inertial, np.zeros(len(self.layout.drive_names))])
@@ -260,10 +260,10 @@ class RobotModel:
             own: The terms, by name of the joint or coupling.
 
         Raises:
-            SettingsError: If a name is no drive's.
+            SettingsError: If a name is not that of a drive.
         """
-        kept = {name: tuple(terms) for name, terms in own.items() if terms}
-        return replace(self, layout=replace(self.layout, own=kept), reference=None)
+        by_drive = {name: tuple(terms) for name, terms in own.items() if terms}
+        return replace(self, layout=replace(self.layout, own=by_drive), reference=None)
 
     def with_gravity(self, gravity: Array) -> "RobotModel":
         """Return the same robot under another gravity.
@@ -276,7 +276,7 @@ class RobotModel:
         return replace(self, pin_model=pin_model)
 
     def with_reference(self, pi: Array) -> "RobotModel":
-        """Return the same robot with other parameters that drive terms depend on.
+        """Return the same robot with another reference for the torques in drive terms.
 
         Args:
             pi: Standard parameters, shape (p,).
@@ -290,10 +290,10 @@ class RobotModel:
             pi: Standard parameters, shape (p,) or only the inertial ones, shape (10 bodies,).
 
         Returns:
-            A new model; the drive terms have no place in it.
+            A new model; the drive terms of pi are not part of it.
 
         Raises:
-            DataError: If pi has another length, or a value that is no finite number below 1e30.
+            DataError: If pi has another length, or a value that is not finite or not below 1e30.
         """
         size = self.layout.n_inertial
         if pi.shape not in ((size,), (len(self.layout.names),)):
@@ -307,7 +307,7 @@ class RobotModel:
         return replace(self, pin_model=copy)
 
     def configurations(self, q: Array) -> Array:
-        """Return Pinocchio's configurations of joint coordinates.
+        """Return Pinocchio's configurations from joint coordinates.
 
         Args:
             q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
@@ -332,7 +332,7 @@ class RobotModel:
             for row in np.flatnonzero(np.abs(sizes - 1.0) > _UNIT).tolist():
                 raise DataError(
                     f"q[{row}, 3:7], the quaternion of the base, has length {sizes[row]:g}, wanted "
-                    "1; it is stated as qx qy qz qw"
+                    "1, in the order qx qy qz qw"
                 )
         first = 6 if self.free_flyer else 0
         angles = q[:, base:] @ self.velocity_map[first:, first:].T + self.position_offset[first:]
@@ -350,7 +350,7 @@ class RobotModel:
         return configuration
 
     def support(self) -> Array:
-        """Return which parameters can load which row, shape (n_rows, p), bool.
+        """Return which parameters can affect which row, shape (n_rows, p), bool.
 
         False where the regressor is 0 for every motion.
         """
@@ -379,18 +379,20 @@ def _acts_at_rest(term: DriveTerm) -> bool:
     return bool(term.column(slow).any())
 
 
-def _check_pull(gravity: Sequence[float]) -> None:
+def _check_gravity(gravity: Sequence[float]) -> None:
     if not np.any(_gravity(gravity)):
-        raise SettingsError("dynamics is 'static', but gravity is 0: nothing would load the joints")
+        raise SettingsError(
+            "dynamics is 'static', but gravity is 0, wanted gravity that loads the joints"
+        )
 
 
 def _inertia(values: Array) -> pin.Inertia:
-    """Return Pinocchio's inertia of ten parameters; without mass it has no centre of mass."""
+    """Return Pinocchio's inertia from ten parameters; without mass it has no centre of mass."""
     if values[0] != 0.0:
         return pin.Inertia.FromDynamicParameters(values)
     xx, xy, yy, xz, yz, zz = values[4:]
     massless = pin.Inertia.Zero()
-    massless.inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])  # impossible ones, too
+    massless.inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])  # inconsistent ones too
     return massless
 
 
@@ -405,19 +407,19 @@ def _choose_joints(
     _check_joints(tree, [*(joints or ()), *(name for name in locked if name != "*")], followers)
     if joints is None and "*" in locked:
         raise ModelError(
-            "locked has '*', all joints that are not named, and joints does not say which move; "
-            "name those that are to be identified in joints"
+            "locked has '*' (all joints that are not named), but joints is not stated; list the "
+            "joints to identify in joints"
         )
     moving = tuple(name for name in free if name not in locked) if joints is None else tuple(joints)
     both = [name for name in moving if name in locked]
     if both:
-        raise ModelError(f"joints {listed(both)} are both identified and locked; choose one")
+        raise ModelError(f"joints {listed(both)} are in both joints and locked; remove them in one")
     if len(set(moving)) != len(moving):
-        raise ModelError(f"joints to identify must be named once each, got {listed(moving)}")
+        raise ModelError(f"joints is {listed(moving)}, wanted each name once")
     if len(moving) > _MOST_JOINTS:
         raise ModelError(
             f"{Path(tree.path).name}: {len(moving)} joints move, wanted at most {_MOST_JOINTS}; "
-            "name those that are to be identified (joints), or lock others"
+            "list the joints to identify in joints, or lock others"
         )
     for name, position in locked.items():
         is_number = isinstance(position, int | float | np.number)
@@ -441,8 +443,8 @@ def _check_joints(tree: Tree, names: Sequence[str], followers: Mapping[str, obje
     for name in names:
         if name in followers:
             raise ModelError(
-                f"joint {name!r} mimics another one and moves with it (mimic = 'coupled'); leave "
-                "it out, or use mimic = 'independent'"
+                f"joint {name!r} mimics another joint and moves with it (mimic = 'coupled'); omit "
+                "it, or use mimic = 'independent'"
             )
         if name not in known:
             if any(joint.name == name for joint in tree.joints):
@@ -457,7 +459,7 @@ def _check_joints(tree: Tree, names: Sequence[str], followers: Mapping[str, obje
 
 
 def _followers(tree: Tree) -> dict[str, tuple[str, float, float]]:
-    """Return each mimic joint with the joint that leads it in the end, ratio and offset."""
+    """Return each mimic joint with its leading joint, ratio and offset; chains are resolved."""
     by_name = {joint.name: joint for joint in tree.movable}
     resolved = {}
     for joint in tree.movable:
@@ -468,8 +470,8 @@ def _followers(tree: Tree) -> dict[str, tuple[str, float, float]]:
         while True:
             if leader not in by_name or leader in seen:
                 raise ModelError(
-                    f"joint {joint.name!r} mimics {leader!r}, which is not a movable joint that "
-                    "leads it; correct the <mimic>, or use mimic = 'independent'"
+                    f"joint {joint.name!r} mimics {leader!r}, wanted another movable joint that "
+                    "does not mimic it in turn; correct the <mimic>, or use mimic = 'independent'"
                 )
             up = by_name[leader].mimic
             if up is None:
@@ -478,8 +480,8 @@ def _followers(tree: Tree) -> dict[str, tuple[str, float, float]]:
             leader, ratio, offset = up[0], ratio * up[1], ratio * up[2] + offset
         if not max(abs(ratio), abs(offset)) <= LARGEST:
             raise ModelError(
-                f"joint {joint.name!r} mimics {leader!r} in the end with multiplier {ratio:g} and "
-                f"offset {offset:g}, wanted numbers within +-{LARGEST:g}; correct the <mimic>"
+                f"joint {joint.name!r} mimics {leader!r} with a total multiplier of {ratio:g} and "
+                f"offset of {offset:g}, wanted numbers within +-{LARGEST:g}; correct the <mimic>"
             )
         resolved[joint.name] = (leader, ratio, offset)
     return resolved
@@ -494,8 +496,8 @@ def _check_mimic(
         leader = joint.mimic[0]
         if (joint.name in locked) != (leader in locked) and leader in (*moving, *locked):
             raise ModelError(
-                f"joint {joint.name!r} mimics {leader!r}: one cannot be locked while the other "
-                "moves; name both in joints, or lock both, or use mimic = 'coupled'"
+                f"joint {joint.name!r} mimics {leader!r}, but only one of them is locked; list "
+                "both in joints, or lock both, or use mimic = 'coupled'"
             )
 
 
@@ -508,9 +510,9 @@ def _build(tree: Tree, free_flyer: bool, gravity: Sequence[float]) -> pin.Model:
             model = pin.buildModelFromXML(tree.xml, *root)
         except (ValueError, RuntimeError) as error:
             refused = str(error)
-    if refused or messages:  # what it complains of, it leaves out
-        said = "; ".join([*messages, *([refused] if refused else [])])
-        raise ModelError(f"{Path(tree.path).name}: Pinocchio refuses it: {said}")
+    if refused or messages:  # it omits the elements of its messages
+        text = "; ".join([*messages, *([refused] if refused else [])])
+        raise ModelError(f"{Path(tree.path).name}: Pinocchio cannot read it: {text}")
     model.gravity.linear = acceleration
     return model
 

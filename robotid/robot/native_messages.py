@@ -1,4 +1,4 @@
-"""What compiled libraries print on stderr, which Python's own redirection does not reach."""
+"""Messages of compiled libraries on stderr, which Python's redirection does not catch."""
 
 import os
 import sys
@@ -10,31 +10,31 @@ from contextlib import contextmanager
 __all__ = ["caught_messages"]
 
 _ONE_AT_A_TIME = threading.Lock()
-_KINDS = ("Error:", "Warning:")  # how console_bridge, which urdfdom prints by, begins a message
-_PLACE = "         at line "  # how it goes on: a line of urdfdom's source
+_KINDS = ("Error:", "Warning:")  # first word of console_bridge's messages, which urdfdom uses
+_PLACE = "         at line "  # the second line of such a message: a line of urdfdom's source
 
 
 @contextmanager
 def caught_messages() -> Iterator[list[str]]:
-    """Catch the complaints that urdfdom and Pinocchio print on file descriptor 2.
+    """Catch the messages that urdfdom and Pinocchio print on file descriptor 2.
 
-    What others print there meanwhile is printed afterwards.
+    Other output there is printed at the end of the block.
 
     Yields:
-        The complaints, filled in when the block ends.
+        The messages, complete at the end of the block.
     """
-    complaints: list[str] = []
+    messages: list[str] = []
     with _ONE_AT_A_TIME, tempfile.TemporaryFile() as caught:
         try:
             stderr = os.dup(2)
-        except OSError:  # there is no stderr, so nothing can be printed there
-            yield complaints
+        except OSError:  # no stderr: nothing can be printed there
+            yield messages
             return
         if sys.stderr is not None:
             sys.stderr.flush()
         os.dup2(caught.fileno(), 2)
         try:
-            yield complaints
+            yield messages
         finally:
             os.dup2(stderr, 2)
             os.close(stderr)
@@ -43,7 +43,7 @@ def caught_messages() -> Iterator[list[str]]:
         for line in caught.read().decode(errors="replace").splitlines():
             kind, _, text = line.partition(" ")
             if kind in _KINDS:
-                complaints.append(text.strip())
+                messages.append(text.strip())
             elif not line.startswith(_PLACE):
                 others.append(f"{line}\n")
         if others:

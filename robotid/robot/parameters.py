@@ -26,7 +26,7 @@ __all__ = [
     "to_paper_order",
 ]
 
-#: What of the dynamics is identified: all, or what stands and slow motion show.
+#: The identified dynamics: all, or those of poses at rest and slow motion.
 DYNAMICS = ("full", "static")
 #: Inertial parameters of one body in Pinocchio's order; inertia about the joint frame.
 INERTIAL_TERMS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
@@ -36,16 +36,16 @@ PAPER_TERMS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "m
 
 @dataclass(frozen=True)
 class Coupling:
-    """A drive that turns with several joints, at the speed w = sum_j ratio_j v_j.
+    """A drive that moves with several joints, at the speed w = sum_j ratio_j v_j.
 
-    Its drive terms load every joint it turns with:
+    Its drive terms load each of these joints:
     ``tau_j += ratio_j (Ia dw/dt + Fv w + Fc sign w)``.
 
     Attributes:
         name: Name of the drive, used in parameter names.
         ratios: Pairs of joint name and ratio [-].
-        replaces: Whether it stands in the place of the own drive of the joint whose name it has,
-            with an offset then; if not, it is beside those of the joints.
+        replaces: Whether it replaces the own drive of the joint with its name, and has an offset
+            then; if not, it is an additional drive.
     """
 
     name: str
@@ -64,18 +64,18 @@ class Coupling:
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Which standard parameters a model has, and in which order.
+    """The standard parameters of a model and their order.
 
     Ten inertial parameters per body, then the drive terms joint by joint, then those of each
-    coupling (which has no offset of its own, unless it replaces the drive of a joint).
+    coupling (without an offset, unless it replaces the drive of a joint).
 
     Attributes:
         bodies: Names of the bodies, one per movable joint (and one for a floating base).
         joints: Names of the driven joints.
         terms: The drive terms that are identified, names in ``TERMS`` in its order.
-        couplings: Drives that turn with several joints.
+        couplings: Drives that move several joints.
         prismatic: Names of the prismatic joints.
-        strokes: Ranges of those whose range the URDF states, by name [m].
+        strokes: Ranges of the prismatic joints with limits, by name [m].
         own: Further terms of single drives, by the drive's name; they follow the others.
     """
 
@@ -97,8 +97,8 @@ class ParameterLayout:
             missing = [joint for joint in named if joint not in self.joints]
             if missing:
                 raise SettingsError(
-                    f"coupling {coupling.name!r} names the joints {listed(missing)}, which are "
-                    f"not identified; joints: {listed(self.joints)}"
+                    f"coupling {coupling.name!r} has the joints {listed(missing)}, wanted joints "
+                    f"that are identified: {listed(self.joints)}"
                 )
             for joint, ratio in coupling.ratios:
                 if not abs(ratio) <= LARGEST:
@@ -108,19 +108,19 @@ class ParameterLayout:
                     )
             if not any(ratio for _, ratio in coupling.ratios):
                 raise SettingsError(
-                    f"coupling {coupling.name!r} turns with no joint: its ratios are "
-                    f"{dict(coupling.ratios)}, wanted one that is not 0; state it, as "
-                    f"ratios = {{ {self.joints[0]} = 1.0 }}, or leave the coupling out"
+                    f"coupling {coupling.name!r} moves no joint: its ratios are "
+                    f"{dict(coupling.ratios)}, wanted one that is not 0; state it, for example "
+                    f"ratios = {{ {self.joints[0]} = 1.0 }}, or omit the coupling"
                 )
             if sum(drive.name == coupling.name for drive in self.drives) > 1:
                 raise SettingsError(
-                    f"coupling {coupling.name!r} has the name of a joint or of another drive; give "
-                    "it another name"
+                    f"coupling {coupling.name!r} has the name of a joint or of another drive, "
+                    "wanted a unique name"
                 )
-        strangers = [name for name in self.own if name not in {d.name for d in self.drives}]
-        if strangers:
+        unknown = [name for name in self.own if name not in {d.name for d in self.drives}]
+        if unknown:
             raise SettingsError(
-                f"terms are stated for {listed(strangers)}, which are no drives; drives: "
+                f"terms are stated for {listed(unknown)}, wanted drives: "
                 f"{listed(drive.name for drive in self.drives)}"
             )
 
@@ -131,14 +131,14 @@ class ParameterLayout:
 
     @property
     def coupling_terms(self) -> tuple[str, ...]:
-        """Drive terms of a coupling beside the joints' drives: those without the offset."""
+        """Drive terms of a coupling that replaces no joint's drive: those without the offset."""
         return tuple(term for term in self.terms if TERMS[term].is_shared)
 
     @cached_property
     def drives(self) -> tuple[Coupling, ...]:
-        """The drives: one per joint, which turns with it alone, then the couplings.
+        """The drives: one per joint, which moves this joint only, then the couplings.
 
-        A coupling that replaces the drive of a joint stands in its place.
+        A coupling that replaces the drive of a joint has its index.
         """
         instead = {c.name: c for c in self.couplings if c.replaces}
         own = [instead.get(joint, Coupling(joint, ((joint, 1.0),))) for joint in self.joints]
@@ -156,22 +156,23 @@ class ParameterLayout:
 
     @cached_property
     def drive_speeds(self) -> Array:
-        """Speed of each of the d drives that counts as 1 rad/s, shape (d,) [rad/s or m/s].
+        """Speed of each of the d drives that is equivalent to 1 rad/s, (d,) [rad/s or m/s].
 
-        A prismatic joint crosses its stroke (1 m if the URDF states none) at it in the time of a
-        full turn at 1 rad/s. A coupling has the mean of its joints, weighted by their ratios.
+        At this speed a prismatic joint crosses its stroke (1 m if the URDF states none) in the time
+        of one revolution at 1 rad/s. A coupling has the mean of its joints, weighted by their
+        ratios.
         """
         joints = [
             self.strokes.get(joint, 1.0) / (2 * np.pi) if joint in self.prismatic else 1.0
             for joint in self.joints
         ]
-        weight = np.abs(self.drive_ratios) + 1e-300  # also of a coupling that turns with no joint
+        weight = np.abs(self.drive_ratios) + 1e-300  # also of a coupling without a ratio yet
         speeds: Array = weight @ np.array(joints) / weight.sum(axis=1)
         return speeds
 
     @cached_property
     def drive_parameters(self) -> tuple[tuple[int, DriveTerm], ...]:
-        """Which of ``drives`` each drive parameter belongs to, and its term."""
+        """Index in ``drives`` of each drive parameter, and its term."""
         beside = len(self.drives) - len(self.joints)
         shared = [self.terms] * len(self.joints) + [self.coupling_terms] * beside
         return tuple(
@@ -182,12 +183,12 @@ class ParameterLayout:
 
     @cached_property
     def remembering(self) -> tuple[int, ...]:
-        """Which drive parameters multiply more than an instant shows; see ``Trajectory.memory``."""
+        """Drive parameters of terms with internal state or load; see ``Trajectory.memory``."""
         return tuple(k for k, (_, term) in enumerate(self.drive_parameters) if term.has_state)
 
     @property
     def follows_direction(self) -> bool:
-        """Whether a term holds the direction of friction."""
+        """Whether a term depends on the direction of friction."""
         return any(term.follows_direction for _, term in self.drive_parameters)
 
     @cached_property
@@ -198,18 +199,18 @@ class ParameterLayout:
 
     @cached_property
     def drive_loads(self) -> Array:
-        """Ratio of each row of a joint to what a drive parameter multiplies, shape (n, k) [-]."""
+        """Ratio of each joint's row to the column of a drive parameter, shape (n, k) [-]."""
         loads: Array = self.drive_ratios[[d for d, _ in self.drive_parameters]].T
         return loads
 
     @cached_property
     def inertial_names(self) -> tuple[str, ...]:
-        """Names of the inertial parameters, as ``"forearm.mcx"``."""
+        """Names of the inertial parameters, for example ``"forearm.mcx"``."""
         return tuple(f"{body}.{term}" for body in self.bodies for term in INERTIAL_TERMS)
 
     @cached_property
     def drive_names(self) -> tuple[str, ...]:
-        """Names of the drive parameters, as ``"elbow.viscous"``."""
+        """Names of the drive parameters, for example ``"elbow.viscous"``."""
         return tuple(f"{self.drives[d].name}.{term.name}" for d, term in self.drive_parameters)
 
     @cached_property
@@ -221,7 +222,7 @@ class ParameterLayout:
     def units(self) -> tuple[str, ...]:
         """Unit of each of the p parameters."""
         inertial = ["kg", *["kg m"] * 3, *["kg m^2"] * 6] * len(self.bodies)
-        drive = [term.units[self._slides(d)] for d, term in self.drive_parameters]
+        drive = [term.units[self._is_linear(d)] for d, term in self.drive_parameters]
         return tuple(inertial + drive)
 
     def owned_by(self, owners: Sequence[str]) -> Array:
@@ -233,7 +234,7 @@ class ParameterLayout:
         return np.isin([name.rsplit(".", 1)[0] for name in self.names], list(owners))
 
     def scales(self, length: float) -> Array:
-        """Return the magnitude 1 kg length^k of each parameter, which makes columns comparable.
+        """Return the scale 1 kg length^k of each parameter, with which columns are comparable.
 
         Args:
             length: A length of the robot [m].
@@ -243,14 +244,14 @@ class ParameterLayout:
             armature of a rotary joint, 1 for other drive terms.
         """
         inertial = [1.0, *[length] * 3, *[length**2] * 6] * len(self.bodies)
-        turns = [t.is_inertia and not self._slides(d) for d, t in self.drive_parameters]
-        return np.append(inertial, np.where(turns, length**2, 1.0))
+        rotary = [t.is_inertia and not self._is_linear(d) for d, t in self.drive_parameters]
+        return np.append(inertial, np.where(rotary, length**2, 1.0))
 
     def preference(self) -> Array:
-        """Return how much each parameter is favoured as the name of a base parameter, shape (p,).
+        """Return the preference of each parameter as the name of a base parameter, shape (p,).
 
-        Inertias before first moments before masses: the groups then have short expressions, for
-        example 59 coefficients beside the kept columns on a UR where plain pivoting leaves 142.
+        Inertias have a larger one than first moments, and these than masses. The groups are short
+        then: on a UR they have 59 further coefficients, with plain pivoting 142.
         """
         inertial = [0.1, *[0.3] * 3, *[1.0] * 6] * len(self.bodies)
         return np.array(inertial + [term.preference for _, term in self.drive_parameters])
@@ -260,7 +261,7 @@ class ParameterLayout:
         drive = [term.is_nonnegative for _, term in self.drive_parameters]
         return np.array([False] * self.n_inertial + drive)
 
-    def _slides(self, d: int) -> bool:
+    def _is_linear(self, d: int) -> bool:
         return {joint for joint, _ in self.drives[d].ratios} <= self.prismatic
 
 
@@ -272,7 +273,7 @@ def to_paper_order(pi: Array) -> Array:
 
     Returns:
         The same values, shape (10 n,), body by body as
-        [Ixx Ixy Ixz Iyy Iyz Izz mx my mz m]. Frames are not moved.
+        [Ixx Ixy Ixz Iyy Iyz Izz mx my mz m], in the same frames.
 
     Raises:
         DataError: If the number of entries is not a multiple of 10.
@@ -305,7 +306,7 @@ def pseudo_inertia_basis() -> Array:
 def pseudo_inertia(pi: Array) -> Array:
     """Return the pseudo-inertia J = [[Sigma, m c], [(m c)^T, m]] of each body.
 
-    A body is physically possible exactly when J is positive semidefinite.
+    A body is physically consistent if and only if J is positive semidefinite.
 
     Args:
         pi: Inertial parameters in Pinocchio's order, shape (10 n,).
@@ -342,6 +343,6 @@ def _by_body(pi: Array | Sequence[float]) -> Array:
     values = np.asarray(pi, dtype=float)
     if values.ndim != 1 or values.size % 10:
         raise DataError(
-            f"inertial parameters come as a vector of 10 per body, but the shape is {values.shape}"
+            f"inertial parameters have shape {values.shape}, wanted a vector of 10 per body"
         )
     return values.reshape(-1, 10)

@@ -1,4 +1,4 @@
-"""What is known before any data: the URDF's parameters and how far the truth may lie from them."""
+"""The prior: the URDF's parameters and their plausible deviations."""
 
 import numpy as np
 
@@ -10,24 +10,24 @@ from robotid.robot.parameters import pseudo_inertia
 
 __all__ = ["payload_spread", "prior_spread"]
 
-_SMALLEST_MASS = 0.1  # of the mean mass: a link may be that wrong even if its URDF says 0
+_SMALLEST_MASS = 0.1  # of the mean mass: deviation of a link's mass even if its URDF states 0
 _SMALLEST_RADIUS = 0.1  # of the robot's length: the same for a link's size
-_POSITIONS = 16  # around a turn at which terms that depend on the position are looked at
-_FAINTEST = 1e-6  # size of a column that says nothing of its parameter
+_POSITIONS = 16  # of a revolution at which terms that depend on the position are evaluated
+_FAINTEST = 1e-6  # smallest RMS of a column
 
 
 def prior_spread(model: RobotModel, squares: Array, samples: int) -> Array:
-    """Return how far each standard parameter may plausibly lie from its prior value, shape (p,).
+    """Return the prior standard deviation of each standard parameter, shape (p,).
 
-    The spread of a body is its own size: its mass m, m r and m r^2, with r the distance of the
-    centre of mass plus the radius of gyration. That of a drive term is what would alone explain
-    the measured torque: rms(tau) over rms of what it multiplies; an armature at least the inertia
-    its joint carries.
+    That of a body is its own size: its mass m, m r and m r^2, with r the distance of the centre of
+    mass plus the radius of gyration. That of a drive term is the value with which it alone would
+    have the RMS of the measured torque: rms(tau) over the RMS of its column; for an armature at
+    least the inertia of the bodies about its joint.
 
     Args:
         model: The robot, with the URDF's parameters.
-        squares: Sums of tau^2, v^2 and a^2 over the samples, shape (3, n_rows), which drive terms
-            are scaled with; see ``Trajectory.squares``.
+        squares: Sums of tau^2, v^2 and a^2 over the samples, shape (3, n_rows), for the scale of
+            drive terms; see ``Trajectory.squares``.
         samples: Number of samples.
     """
     rms = np.sqrt(squares / max(samples, 1))
@@ -35,9 +35,9 @@ def prior_spread(model: RobotModel, squares: Array, samples: int) -> Array:
 
 
 def payload_spread(model: RobotModel) -> Array:
-    """Return how large the parameters of a payload may plausibly be, shape (10,).
+    """Return the prior standard deviations of a payload's parameters, shape (10,).
 
-    Those of the robot's mass at the distance of its longest link.
+    They are those of the robot's mass at the distance of its longest link.
 
     Args:
         model: The robot, with the URDF's parameters.
@@ -65,12 +65,12 @@ def _drive_spread(model: RobotModel, rms: Array) -> Array:
     tau, v, a = (_positive(row[first:]) for row in rms)
     carried = carried_inertia(model)
     q = np.linspace(-np.pi, np.pi, _POSITIONS, endpoint=False)[:, None] + 0.0 * v
-    usual = DriveMotion(
+    typical = DriveMotion(
         q, v + 0.0 * q, a + 0.0 * q, np.ones_like(q), tau + 0.0 * q, tau * a / v + 0.0 * q
     )
     spread = []
     for d, term in model.layout.drive_parameters:
-        size = np.sqrt(np.mean(term.column(usual) ** 2, axis=0))
+        size = np.sqrt(np.mean(term.column(typical) ** 2, axis=0))
         alone = tau / np.maximum(size, _FAINTEST)
         rows = [model.joints.index(joint) for joint, _ in model.layout.drives[d].ratios]
         spread.append((np.maximum(carried, alone) if term.is_inertia else alone)[rows].mean())

@@ -1,4 +1,4 @@
-"""Fewer triangles: surfaces of a robot light enough for a page, closed where they were."""
+"""Mesh simplification for pages: closed surfaces stay closed."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,24 +10,24 @@ from robotid.robot.meshes import Surface, joined
 
 __all__ = ["thin"]
 
-_CREASE = np.radians(30.0)  # faces that meet at a sharper angle than this show an edge
-_WELD = 1e-6  # corners this near are one, over the size of the largest surface
-# whether rims stay, and how fast the bound on the error grows, until few enough are left
+_CREASE = np.radians(30.0)  # angle between two faces beyond which their edge is sharp
+_WELD = 1e-6  # distance of corners that are merged, over the size of the largest surface
+# whether rims are preserved, and growth rate of the error bound, until few enough remain
 _ATTEMPTS = ((True, 3.0), (False, 3.0), (False, 7.0))
-_APART = 3.0  # distance between patches that are simplified together, over their size
+_GAP = 3.0  # distance between patches that are simplified together, over their size
 
 
 def thin(solids: Sequence[Sequence[Surface]], most: int) -> list[list[Surface]]:
-    """Return surfaces with so few triangles together: closed where they were, edges kept sharp.
+    """Return surfaces with at most so many triangles in total; closed ones stay closed.
 
-    Edges are collapsed by fast-simplification, those first that change the shape least; an edge
-    that becomes a point opens no hole. The triangles of a surface turn the same way, outwards where
-    it is closed, and each side of a sharp edge has a corner of its own.
+    fast-simplification collapses edges in the order of the change of shape; a collapsed edge opens
+    no hole. The triangles of a surface have one orientation, outwards if it is closed. Each side of
+    a sharp edge has its own corners, so the edge stays sharp.
 
     Args:
         solids: The surfaces of each file of a robot, all in one scale; those of one file are
             patches of one surface.
-        most: Triangles that may be left of all of them.
+        most: Largest total number of triangles.
 
     References:
         Garland, Heckbert (1997), Surface simplification using quadric error metrics.
@@ -59,7 +59,7 @@ def thin(solids: Sequence[Sequence[Surface]], most: int) -> list[list[Surface]]:
 
 
 def _cells(V: Array, solid: Array, cell: float) -> tuple[Array, Array]:
-    """Return the cell of its solid's grid that each corner lies in, and the mean of each cell."""
+    """Return the cell of each corner in its solid's grid, and the mean of each cell."""
     keys = solid.astype(np.int64)
     for column in np.floor((V - V.min(axis=0)) / cell + 0.5).astype(np.int64).T:
         _, keys = np.unique(keys * (column.max() + 1) + column, return_inverse=True)
@@ -68,7 +68,7 @@ def _cells(V: Array, solid: Array, cell: float) -> tuple[Array, Array]:
 
 
 def _proper(F: Array, patch: Array) -> tuple[Array, Array]:
-    """Return the triangles that are none of a line, one of those on the same three corners."""
+    """Return the triangles without degenerate ones and duplicates."""
     F, patch = (x[(np.roll(F, 1, axis=1) != F).all(axis=1)] for x in (F, patch))
     _, first = np.unique(_keys(np.sort(F, axis=1)), return_index=True)
     first.sort()
@@ -77,7 +77,7 @@ def _proper(F: Array, patch: Array) -> tuple[Array, Array]:
 
 def _keys(rows: Array) -> Array:
     """Return one number for each row of indices."""
-    n = np.int64(rows.max(initial=0) + 1)  # below 2 million, whose cube is a number yet
+    n = np.int64(rows.max(initial=0) + 1)  # below 2 million, whose cube does not overflow
     key = rows[:, 0].astype(np.int64)
     for column in rows.T[1:]:
         key = key * n + column
@@ -85,36 +85,37 @@ def _keys(rows: Array) -> Array:
 
 
 def _edges(F: Array) -> tuple[Array, Array, Array]:
-    """Return the sides (3 F, 2) of triangles, their faces, and whether they were turned to sort."""
+    """Return the edges (3 F, 2) of triangles, their faces, and whether their ends were swapped."""
     ends = np.stack([F, np.roll(F, -1, axis=1)], axis=2).reshape(-1, 2)
-    turned = ends[:, 0] > ends[:, 1]
-    ends = np.where(turned[:, None], ends[:, ::-1], ends)
+    swapped = ends[:, 0] > ends[:, 1]
+    ends = np.where(swapped[:, None], ends[:, ::-1], ends)
     order = np.argsort(_keys(ends), kind="stable")
-    return ends[order], order // 3, turned[order]
+    return ends[order], order // 3, swapped[order]
 
 
 def _open_faces(F: Array) -> Array:
-    """Return the triangles with a side that is not that of one other, which runs it backwards."""
-    ends, face, turned = _edges(F)
+    """Return the triangles with an edge that is not shared with one oppositely directed edge."""
+    ends, face, swapped = _edges(F)
     starts = np.flatnonzero(np.r_[True, (ends[1:] != ends[:-1]).any(axis=1)])
     sides = np.diff(np.r_[starts, len(ends)])
-    senses = np.add.reduceat(turned.astype(int), starts)
+    senses = np.add.reduceat(swapped.astype(int), starts)
     open_faces: Array = face[np.repeat((sides != 2) | (senses != 1), sides)]
     return open_faces
 
 
 def _oriented(V: Array, F: Array) -> Array:
-    """Return the triangles with one sense of turning on each connected surface, outwards."""
+    """Return the triangles with one orientation on each connected surface, outwards."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    ends, face, turned = _edges(F)
+    ends, face, swapped = _edges(F)
     same = (ends[1:] == ends[:-1]).all(axis=1)
     alone = ~np.r_[False, same[:-1]] & same & ~np.r_[same[1:], False]  # two faces, no third
     k = np.flatnonzero(alone)
-    f, g, odd = face[k], face[k + 1], turned[k] == turned[k + 1]  # neighbours turn an edge apart
-    n = len(F)  # f stands for a face as it is, f + n for its reverse
-    rows, columns = np.r_[f, f + n], np.r_[g + n * odd, g + n * ~odd]
+    f, g = face[k], face[k + 1]
+    opposed = swapped[k] == swapped[k + 1]  # orientations of the neighbours
+    n = len(F)  # f is a face as it is, f + n its reverse
+    rows, columns = np.r_[f, f + n], np.r_[g + n * opposed, g + n * ~opposed]
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * n, 2 * n))
     _, part = connected_components(graph, directed=False)
     corners = V[F] - V.mean(axis=0)
@@ -127,8 +128,8 @@ def _oriented(V: Array, F: Array) -> Array:
 def _simplified(V: Array, F: Array, patch: Array, most: int) -> tuple[Array, Array, Array]:
     """Return corners, at most so many triangles, and their patches; no two share a corner.
 
-    Rims of patches stay where they are, so that neighbours still meet, unless too many triangles
-    would be left. The library's bound on the error is of corners that are about 1 in size.
+    Rims of patches are preserved, so that neighbours still meet, unless too many triangles would
+    remain. The library's error bound assumes coordinates of about 1.
     """
     import fast_simplification
     from scipy.spatial import cKDTree
@@ -137,8 +138,8 @@ def _simplified(V: Array, F: Array, patch: Array, most: int) -> tuple[Array, Arr
         return V, F, patch
     own, F = np.unique(F + len(V) * patch[:, None], return_inverse=True)  # corners of patches
     number, corner = np.divmod(own, len(V))
-    apart = np.array([_APART, 0.0, 0.0])
-    V = V[corner] + number[:, None] * apart  # the library knows nothing of patches
+    gap = np.array([_GAP, 0.0, 0.0])
+    V = V[corner] + number[:, None] * gap  # the library does not distinguish patches
     for keeps_rims, step in _ATTEMPTS:
         places, faces = fast_simplification.simplify(
             V, F.astype(np.int32), target_count=most, preserve_border=keeps_rims, agg=step
@@ -149,11 +150,11 @@ def _simplified(V: Array, F: Array, patch: Array, most: int) -> tuple[Array, Arr
     patch = patch[nearest]
     number = np.zeros(len(places), dtype=int)
     number[faces] = patch[:, None]
-    return places - number[:, None] * apart, faces.astype(np.int64), patch
+    return places - number[:, None] * gap, faces.astype(np.int64), patch
 
 
 def _creased(surface: Surface) -> Surface:
-    """Return a surface that has a corner for each side of a sharp edge, so that it shows."""
+    """Return a surface with separate corners for each side of a sharp edge."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -163,8 +164,8 @@ def _creased(surface: Surface) -> Surface:
     corner = np.arange(3 * len(F)).reshape(-1, 3)  # corner k of face f is 3 f + k
     ends = np.stack([np.roll(F, -k, axis=1) for k in (0, 1)], axis=2).reshape(-1, 2)
     pairs = np.stack([np.roll(corner, -k, axis=1) for k in (0, 1)], axis=2).reshape(-1, 2)
-    turned = ends[:, 0] > ends[:, 1]
-    ends[turned], pairs[turned] = ends[turned, ::-1], pairs[turned, ::-1]
+    swap = ends[:, 0] > ends[:, 1]
+    ends[swap], pairs[swap] = ends[swap, ::-1], pairs[swap, ::-1]
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     ends, pairs = ends[order], pairs[order]
     meets = (ends[1:] == ends[:-1]).all(axis=1)  # two faces on one edge

@@ -1,7 +1,7 @@
-"""How the torque of the bodies changes with the motion, gravity, and where the joints lie.
+"""Derivatives of the bodies' torque by the motion, gravity, and the origins of the joints.
 
-Derivatives of inverse dynamics by Pinocchio. Before each joint the robot gets three that slide and
-stand at 0: what they would do is what another origin of the joint does.
+They are Pinocchio's derivatives of inverse dynamics. Three prismatic joints at position 0 are added
+before each joint: their displacements are those of the joint's origin.
 """
 
 from dataclasses import dataclass
@@ -17,14 +17,14 @@ __all__ = ["TorqueSlopes", "torque_slopes"]
 
 @dataclass(frozen=True, eq=False)
 class TorqueSlopes:
-    """Derivatives of the torque of the bodies at N instants, of a robot with n joints.
+    """Derivatives of the torque of the bodies at N samples, of a robot with n joints.
 
     Attributes:
         by_q: By the positions, shape (N, n, n).
         by_v: By the velocities, likewise.
         by_a: By the accelerations, likewise: the mass matrix of the bodies.
         by_gravity: By gravity, along the axes of the world, shape (N, n, 3).
-        by_origin: By where each joint lies in the frame of the body before, shape (N, n, n, 3):
+        by_origin: By the origin of each joint in the frame of the body before, shape (N, n, n, 3):
             torque, joint, axis.
     """
 
@@ -45,38 +45,38 @@ class TorqueSlopes:
 
 
 def torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> TorqueSlopes:
-    """Return how the torque of bodies changes with the motion, gravity and origins of joints.
+    """Return the derivatives of the bodies' torque by motion, gravity and origins of joints.
 
     Args:
         model: The robot, with a fixed base.
-        pi: Standard parameters, shape (p,), of bodies that can be.
+        pi: Standard parameters, shape (p,), physically consistent.
         q: Joint coordinates, shape (N, n) [rad, m].
         v: Velocities, shape (N, n) [rad/s, m/s].
         a: Accelerations, shape (N, n) [rad/s^2, m/s^2].
 
     Raises:
-        DataError: If pi or q does not fit the model.
+        DataError: If the shape of pi or q is not that of the model.
 
     References:
         Carpentier, Mansard (2018), Analytical Derivatives of Rigid Body Dynamics Algorithms.
     """
     plain, G = model.with_parameters(pi).pin_model, model.velocity_map
-    sliding, joints = _with_sliding_origins(plain)
-    own = np.array([sliding.joints[k].idx_v for k in joints])  # rows of the robot's own joints
-    before = np.array([sliding.joints[k - 1].idx_v for k in joints])  # and of their origins
-    first_q = [(sliding.joints[k].idx_q, plain.joints[i].idx_q, plain.joints[i].nq)
+    extended, joints = _with_movable_origins(plain)
+    own = np.array([extended.joints[k].idx_v for k in joints])  # rows of the robot's own joints
+    before = np.array([extended.joints[k - 1].idx_v for k in joints])  # and of their origins
+    first_q = [(extended.joints[k].idx_q, plain.joints[i].idx_q, plain.joints[i].nq)
                for i, k in enumerate(joints, start=1)]  # fmt: skip
-    configurations = np.zeros((len(q), sliding.nq))
+    configurations = np.zeros((len(q), extended.nq))
     known = model.configurations(q)
     for to, here, size in first_q:
         configurations[:, to : to + size] = known[:, here : here + size]
-    rates, changes = np.zeros((2, len(v), sliding.nv))
-    rates[:, own], changes[:, own] = v @ G.T, a @ G.T
-    slopes = np.empty((3, len(q), len(own), sliding.nv))
-    derive, data = pin.computeRNEADerivatives, sliding.createData()
-    states = zip(configurations, rates, changes, strict=True)
+    velocities, accelerations = np.zeros((2, len(v), extended.nv))
+    velocities[:, own], accelerations[:, own] = v @ G.T, a @ G.T
+    slopes = np.empty((3, len(q), len(own), extended.nv))
+    derive, data = pin.computeRNEADerivatives, extended.createData()
+    states = zip(configurations, velocities, accelerations, strict=True)
     for D_q, D_v, D_a, state in zip(*slopes, states, strict=True):
-        by_q, by_v, by_a = derive(sliding, data, *state)
+        by_q, by_v, by_a = derive(extended, data, *state)
         D_q[:], D_v[:], D_a[:] = by_q[own], by_v[own], by_a[own]
     D: Array = G.T @ slopes  # tau = G^T tau_pinocchio
     by_q, by_v, by_a = D[..., own] @ G
@@ -87,17 +87,17 @@ def torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) ->
     return TorqueSlopes(by_q, by_v, by_a, -falling, D[0][..., axes])
 
 
-def _with_sliding_origins(model: pin.Model) -> tuple[pin.Model, list[int]]:
-    """Return a robot whose joints each slide along three axes first, and its own joints in it."""
-    sliding, joints = pin.Model(), [0]
-    sliding.gravity = model.gravity
+def _with_movable_origins(model: pin.Model) -> tuple[pin.Model, list[int]]:
+    """Return a robot with a 3-axis prismatic joint before each joint, and its own joints in it."""
+    extended, joints = pin.Model(), [0]
+    extended.gravity = model.gravity
     for i in range(1, model.njoints):
         place, name = model.jointPlacements[i], model.names[i]
         there = pin.SE3(np.eye(3), place.translation)
-        origin = sliding.addJoint(
+        origin = extended.addJoint(
             joints[model.parents[i]], pin.JointModelTranslation(), there, f"{name} origin"
         )
-        turned = pin.SE3(place.rotation, np.zeros(3))
-        joints.append(sliding.addJoint(origin, model.joints[i], turned, name))
-        sliding.appendBodyToJoint(joints[-1], model.inertias[i], pin.SE3.Identity())
-    return sliding, joints[1:]
+        rotated = pin.SE3(place.rotation, np.zeros(3))
+        joints.append(extended.addJoint(origin, model.joints[i], rotated, name))
+        extended.appendBodyToJoint(joints[-1], model.inertias[i], pin.SE3.Identity())
+    return extended, joints[1:]

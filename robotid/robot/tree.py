@@ -1,8 +1,8 @@
-"""The one parse of a URDF, and what of it the dynamics need: links, inertials, joints.
+"""The only parser of URDFs in the package: links, inertials and joints.
 
-Pinocchio's parser wants meshes' neighbours, limits and ``<dynamics>`` to be right, although the
-dynamics never use them, and only prints what it misses. So the XML is read here, every fault that
-matters is refused by name, and Pinocchio gets the kinematic tree alone, in the numbers read here.
+Pinocchio's parser requires valid geometry, limits and ``<dynamics>``, which the dynamics do not
+use, and only prints its errors. So the XML is read here, each relevant fault raises an error, and
+Pinocchio receives only the kinematic tree, with the numbers read here.
 """
 
 import copy
@@ -22,13 +22,13 @@ __all__ = ["MOMENTS", "MOVABLE", "Inertial", "Joint", "Tree", "read_tree"]
 
 #: The types of joint that have a degree of freedom.
 MOVABLE = ("revolute", "continuous", "prismatic")
-_ENDLESS = 200.0  # [rad or m] a stated range this wide is none: no cable winds 30 turns
+_ENDLESS = 200.0  # [rad or m] range that counts as no limit: no cable allows 30 revolutions
 _ZERO = (0.0, 0.0, 0.0)
 #: Attributes of an ``<inertia>``, in the order of ``Inertial.inertia``.
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-_LIGHTEST = 1e-15  # [kg] of a link that has a mass: what is divided by it stays finite
-_DEEPEST = 500  # joints from the root to a link; Pinocchio goes down them by recursion
-_TAKEN = ("universe", "root_joint")  # Pinocchio's names of the world and of a floating base
+_LIGHTEST = 1e-15  # [kg] smallest mass of a link that has one: quotients stay finite
+_DEEPEST = 500  # joints from the root to a link; Pinocchio uses recursion
+_RESERVED = ("universe", "root_joint")  # Pinocchio's names of the world and of a floating base
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Inertial:
     Attributes:
         mass: Mass [kg].
         com: Centre of mass in the link frame [m].
-        rpy: Roll, pitch, yaw of the frame that the inertia is stated in [rad].
+        rpy: Roll, pitch, yaw of the frame of the inertia [rad].
         inertia: ixx ixy ixz iyy iyz izz about the centre of mass [kg m^2].
     """
 
@@ -55,16 +55,16 @@ class Joint:
     Attributes:
         name: Its name.
         type: fixed, revolute, continuous or prismatic.
-        parent: Link it hangs on.
-        child: Link it moves.
+        parent: Parent link.
+        child: Child link.
         lower: Lower position limit [rad or m], -inf if none is stated.
         upper: Upper position limit [rad or m], inf if none is stated.
         velocity: Velocity limit [rad/s or m/s], inf if none is stated.
         effort: Effort limit [N m or N], inf if none is stated.
-        mimic: Name of the joint it mimics, multiplier [-], offset [rad or m]; or None.
+        mimic: Name of the joint that it mimics, multiplier [-], offset [rad or m]; or None.
         xyz: Origin in the parent's frame [m].
         rpy: Roll, pitch, yaw there [rad].
-        axis: Direction that it turns about or slides along, of any length.
+        axis: Direction of the joint axis, of any length.
     """
 
     name: str
@@ -89,13 +89,13 @@ class Joint:
     def has_limits(self) -> bool:
         """Whether the URDF states a range of positions.
 
-        lower = upper = 0 states none, and neither does a range that no joint has, as +-10000 rad.
+        lower = upper = 0 counts as none, and so does a range of 200 rad or more.
         """
         return 0.0 < self.upper - self.lower < _ENDLESS
 
     @property
     def turns_freely(self) -> bool:
-        """Whether the joint may turn without end, as far as the URDF says."""
+        """Whether the URDF states no limits of the rotation."""
         return self.type == "continuous" or (self.type == "revolute" and not self.has_limits)
 
 
@@ -110,7 +110,7 @@ class Tree:
         links: Names of the links, in the file's order.
         joints: The joints, in the file's order.
         inertials: The ``<inertial>`` of each link that has one, by its name.
-        robot: The ``<robot>`` as parsed, for what the dynamics do not need.
+        robot: The parsed ``<robot>``, for elements that the dynamics do not need.
     """
 
     path: str
@@ -134,10 +134,10 @@ class Tree:
 
     @property
     def reductions(self) -> dict[str, float]:
-        """Gear ratios that a ``<transmission>`` of one joint and one actuator states, by joint.
+        """Gear ratios of the ``<transmission>`` elements with one joint and one actuator, by joint.
 
         Raises:
-            ModelError: If one is no number.
+            ModelError: If one is not a number.
         """
         found = {}
         for element in self.robot.findall("transmission"):
@@ -157,7 +157,7 @@ class Tree:
 
     @property
     def xml(self) -> str:
-        """A URDF with nothing but the links, inertials and joints, its numbers as read here."""
+        """A URDF with only the links, inertials and joints, with the numbers read here."""
         minimal = ET.Element("robot", name=self.name)
         for link in self.links:
             element = ET.SubElement(minimal, "link", name=link)
@@ -168,7 +168,7 @@ class Tree:
         return ET.tostring(minimal, encoding="unicode")
 
     def snapped(self) -> "Tree":
-        """Return the same robot with the exact angles that its joints' origins round."""
+        """Return the same robot with exact angles for the rounded ones of its joints' origins."""
         robot = copy.deepcopy(self.robot)
         write_exact_angles(robot)
         return _tree(robot, self.path)
@@ -178,11 +178,11 @@ def read_tree(path: str | Path) -> Tree:
     """Read the kinematic tree of a URDF file.
 
     Args:
-        path: The URDF file. Meshes are not looked for.
+        path: The URDF file. Meshes are not read.
 
     Raises:
-        ModelError: If the file is missing, is no URDF, is no tree, or if a number that the dynamics
-            use is missing, or is not what urdfdom reads the same way.
+        ModelError: If the file is missing, is not a URDF or not a tree, or if a number that the
+            dynamics use is missing, or is one that urdfdom would read differently.
     """
     return _tree(parse_urdf(path), str(path))
 
@@ -211,12 +211,12 @@ def _unique(elements: list[ET.Element], kind: str, where: str) -> dict[str, ET.E
         name = element.get("name")
         if not name:
             raise ModelError(f"{where}: a <{kind}> has no name; give it one")
-        if kind == "joint" and name in _TAKEN:
+        if kind == "joint" and name in _RESERVED:
             raise ModelError(
-                f"{where}: a joint is named {name!r}, a name that Pinocchio has taken; rename it"
+                f"{where}: a joint is named {name!r}, which is reserved by Pinocchio; rename it"
             )
         if name in named:
-            raise ModelError(f"{where}: two {kind}s are named {name!r}; names must be unique")
+            raise ModelError(f"{where}: two {kind}s are named {name!r}, wanted unique names")
         named[name] = element
     return named
 
@@ -226,22 +226,22 @@ def _joint(element: ET.Element, links: dict[str, ET.Element], where: str) -> Joi
     at = f"{where}: joint {name!r}"
     if kind not in (*MOVABLE, "fixed"):
         raise ModelError(
-            f"{at} has type {kind!r}; robotid handles fixed, revolute, continuous and prismatic "
-            "joints (a floating base is asked for with free_flyer=True, not with a joint)"
+            f"{at} has type {kind!r}, wanted fixed, revolute, continuous or prismatic (for a "
+            "floating base use free_flyer=True, not a joint)"
         )
     ends = {}
     for end in ("parent", "child"):
         tag = element.find(end)
         ends[end] = tag.get("link", "") if tag is not None else ""
         if ends[end] not in links:
-            raise ModelError(f"{at} has the {end} link {ends[end]!r}, which the file does not hold")
+            raise ModelError(f"{at} has the {end} link {ends[end]!r}, which is not in the file")
     xyz, rpy = _pose(element, f"{at}:")
     if kind == "fixed":
         return Joint(name, kind, ends["parent"], ends["child"], xyz=xyz, rpy=rpy)
     axis, limit = element.find("axis"), element.find("limit")
     direction = (1.0, 0.0, 0.0) if axis is None else read_numbers(axis, "xyz", f"{at}:")
     if math.hypot(*direction) < 1e-9:
-        raise ModelError(f"{at}: axis xyz is zero; give it a direction")
+        raise ModelError(f"{at}: axis xyz is zero, wanted a direction")
     keys = ("velocity", "effort") + (("lower", "upper") if kind != "continuous" else ())
     bounds = {
         key: read_numbers(limit, key, f"{at}:")[0]
@@ -259,7 +259,7 @@ def _pose(element: ET.Element, at: str) -> tuple[tuple[float, ...], tuple[float,
     """Return xyz and rpy of an element's origin."""
     origin = element.find("origin")
     if origin is not None and origin.get("quat_xyzw") is not None:
-        raise ModelError(f"{at} origin has quat_xyzw, wanted rpy; write its angles as rpy")
+        raise ModelError(f"{at} origin has quat_xyzw, wanted rpy; convert it to rpy angles")
     return read_numbers(origin, "xyz", at, _ZERO), read_numbers(origin, "rpy", at, _ZERO)
 
 
@@ -272,20 +272,20 @@ def _mimic(element: ET.Element | None, at: str) -> tuple[str, float, float] | No
 
 
 def _root(links: tuple[str, ...], joints: tuple[Joint, ...], where: str) -> str:
-    """Return the link that no joint moves, after checking that all others hang on it."""
+    """Return the root link, after checking that all others are connected to it."""
     children: dict[str, list[str]] = {link: [] for link in links}
     moved: set[str] = set()
     for joint in joints:
         if joint.child in moved:
             raise ModelError(
-                f"{where}: link {joint.child!r} is the child of two joints; a URDF is a tree, so "
-                "closed chains must be opened"
+                f"{where}: link {joint.child!r} is the child of two joints, wanted one; open the "
+                "closed kinematic chain"
             )
         moved.add(joint.child)
         children[joint.parent].append(joint.child)
     level = roots = [link for link in links if link not in moved]
     if len(roots) != 1:
-        raise ModelError(f"{where}: a URDF has one root link, but this one has {listed(roots, 9)}")
+        raise ModelError(f"{where}: the root links are {listed(roots, 9)}, wanted exactly one")
     reached, depth = set(roots), 0
     while level:
         level = [child for link in level for child in children[link]]
@@ -293,13 +293,13 @@ def _root(links: tuple[str, ...], joints: tuple[Joint, ...], where: str) -> str:
         depth += 1
         if depth > _DEEPEST:
             raise ModelError(
-                f"{where}: a chain has more than {_DEEPEST} joints, one behind the other; robotid "
-                f"handles {_DEEPEST}"
+                f"{where}: a chain has more than {_DEEPEST} joints in series, wanted at most "
+                f"{_DEEPEST}"
             )
     if circle := [link for link in links if link not in reached]:
         raise ModelError(
-            f"{where}: the links {listed(circle, 9)} hang on each other in a circle, not on the "
-            f"root link {roots[0]!r}; correct the parent of one of their joints"
+            f"{where}: the links {listed(circle, 9)} form a closed loop that is not connected to "
+            f"the root link {roots[0]!r}; correct the parent of one of their joints"
         )
     return roots[0]
 
@@ -337,5 +337,5 @@ def _add_joint(robot: ET.Element, joint: Joint) -> None:
     ET.SubElement(element, "child", link=joint.child)
     if joint.is_movable:
         ET.SubElement(element, "axis", xyz=_text(joint.axis))
-        # the parser demands limits; the dynamics do not use them, `Joint` keeps the stated ones
+        # the parser requires limits; the dynamics do not use them, `Joint` has the stated ones
         ET.SubElement(element, "limit", lower="-1e9", upper="1e9", velocity="1e9", effort="1e9")

@@ -1,7 +1,6 @@
-"""The text of a URDF: its XML within bounds, its numbers as urdfdom reads them, rounded angles.
+"""The text of a URDF: checked XML, numbers as urdfdom reads them, rounded angles.
 
-Everything that takes a number from a URDF takes it from here, so that no text is a number for one
-reader and nothing for another.
+All numbers of URDFs are read here, so that a text is a number in all places or in none.
 """
 
 import logging
@@ -27,25 +26,25 @@ __all__ = [
     "write_exact_angles",
 ]
 
-#: Numbers beyond this are refused, SI units: squares and products of them stay finite.
+#: Largest absolute value of numbers, SI units: squares and products of them stay finite.
 LARGEST = 1e9
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-_MOST_BYTES = 2**26  # of a file; a robot of a thousand links has 2**20
-_DEEPEST = 100  # elements in elements; other readers of XML allow 256
+_MOST_BYTES = 2**26  # of a file; that of a robot with a thousand links has 2**20
+_DEEPEST = 100  # nested elements; other readers of XML allow 256
 _LONGEST = 4096  # characters of an attribute, as many as a path may have
-_EXACT = 1e-7  # [rad] an angle nearer than this to a multiple of pi/12 is one
-_NEAR = 2e-5  # [rad] one nearer than this is meant to be one: 0.001 degrees, nobody calibrates so
+_EXACT = 1e-7  # [rad] an angle within this of a multiple of pi/12 counts as exact
+_NEAR = 2e-5  # [rad] one within this (0.001 degrees) counts as rounded, not as calibrated
 
 
 def parse_urdf(path: str | Path) -> ET.Element:
-    """Return the ``<robot>`` of a URDF file, whatever is in it.
+    """Return the ``<robot>`` of a URDF file, without checking its content.
 
     Args:
         path: The URDF file.
 
     Raises:
-        ModelError: If the file is missing or cannot be read, is no XML or another one, or is
-            larger, more nested or has longer attributes than any robot needs.
+        ModelError: If the file is missing, cannot be read or is not XML of a ``<robot>``, or if
+            its size, nesting or attributes exceed the bounds.
     """
     path = Path(path)
     if path.suffix == ".xacro":
@@ -61,12 +60,15 @@ def parse_urdf(path: str | Path) -> ET.Element:
     if size > _MOST_BYTES:
         raise ModelError(
             f"{path.name} has {size / 2**20:.0f} MiB, wanted a URDF of at most "
-            f"{_MOST_BYTES // 2**20} MiB; meshes and logs go into files of their own"
+            f"{_MOST_BYTES // 2**20} MiB; move meshes and logs to separate files"
         )
-    if b"<!ENTITY" in content:  # a few of them can stand for more than the memory holds
-        raise ModelError(f"{path.name} declares entities, which other readers of URDFs do not know")
+    if b"<!ENTITY" in content:  # a few of them can expand beyond the memory
+        raise ModelError(
+            f"{path.name} declares XML entities, which other URDF parsers do not support; replace "
+            "them by their text"
+        )
     try:
-        robot = ET.fromstring(content)  # in one piece: in pieces a long name takes its square
+        robot = ET.fromstring(content)  # as a whole: in parts a long name takes quadratic time
     except (ET.ParseError, LookupError, ValueError) as error:  # the latter two: its encoding
         raise ModelError(f"{path.name} is not well-formed XML: {error}") from error
     if robot.tag != "robot":
@@ -78,12 +80,12 @@ def parse_urdf(path: str | Path) -> ET.Element:
 
 
 def numbers(text: str, count: int, most: float = LARGEST) -> tuple[float, ...]:
-    """Return the numbers of an attribute as urdfdom reads them, none if it does not hold them.
+    """Return the numbers of an attribute as urdfdom reads them, none if it is not valid.
 
     Args:
-        text: The attribute: decimal numbers with blanks between them; none behind a single one.
-        count: How many it must hold.
-        most: Their largest size.
+        text: The attribute: decimal numbers separated by blanks; no blank after a single one.
+        count: Required number of them.
+        most: Their largest absolute value.
     """
     words = [word for word in text.split(" ") if word]
     if len(words) != count or not all(map(_NUMBER.fullmatch, words)):
@@ -94,7 +96,7 @@ def numbers(text: str, count: int, most: float = LARGEST) -> tuple[float, ...]:
 
 
 def number_fault(element: ET.Element, key: str) -> str | None:
-    """Return what is wrong with an attribute that must hold numbers, None if nothing is.
+    """Return the fault of an attribute that must be numbers, None if there is none.
 
     Args:
         element: The element.
@@ -105,12 +107,9 @@ def number_fault(element: ET.Element, key: str) -> str | None:
         return None
     found = "missing" if text is None else _shown(text)
     kind = "finite number" if math.isinf(most) else "number"
-    amount = f"one {kind}" if count == 1 else f"{count} {kind}s with blanks between them"
+    amount = f"one {kind}" if count == 1 else f"{count} {kind}s separated by blanks"
     bound = "" if math.isinf(most) else f" within +-{most:g}"
-    return (
-        f"{element.tag} {key} is {found}, wanted {amount}{bound}, written like 0.25 or 2.5e-1 and "
-        "nothing else"
-    )
+    return f"{element.tag} {key} is {found}, wanted {amount}{bound}, written like 0.25 or 2.5e-1"
 
 
 def read_numbers(
@@ -121,11 +120,11 @@ def read_numbers(
     Args:
         element: The element; None if the file has none.
         key: Name of its attribute.
-        at: What has the element, for errors.
-        default: What stands for an attribute that is not stated; it must be stated if empty.
+        at: Place of the element, for errors.
+        default: Value of an attribute that is not stated; it must be stated if empty.
 
     Raises:
-        ModelError: If it is missing, or is not what urdfdom reads the same way.
+        ModelError: If it is missing, or is one that urdfdom would read differently.
     """
     if default and (element is None or element.get(key) is None):
         return default
@@ -137,15 +136,15 @@ def read_numbers(
 
 
 def exact_angle(word: str) -> float | None:
-    """Return the multiple of pi/12 that an angle is a rounded form of, None if it is of none.
+    """Return the multiple of pi/12 that an angle approximates, None if it is not a rounded one.
 
-    It is one if the multiple, rounded or cut to as many decimals as the word has, is the word:
-    3.14, 3.1416 and 3.1415 for pi. Quarter turns need two decimals, other multiples four. So is
-    what lies within 2e-5 rad, 3.14158. An angle that was calibrated, 1.570912, has more decimals
-    than it shares with pi/2, and is none.
+    An angle is a rounded one if the multiple, rounded or truncated to its number of decimals, is
+    equal to it: 3.14, 3.1416 and 3.1415 for pi. Multiples of pi/2 need two decimals, others four.
+    So is an angle within 2e-5 rad of a multiple: 3.14158. A calibrated angle, such as 1.570912,
+    differs from pi/2 in its decimals, and is not a rounded one.
 
     Args:
-        word: The angle as it is written [rad].
+        word: The angle as text [rad].
     """
     values = numbers(word, 1)
     twelfths = round(values[0] / (math.pi / 12)) if values else 0
@@ -160,10 +159,10 @@ def exact_angle(word: str) -> float | None:
 
 
 def write_exact_angles(robot: ET.Element) -> None:
-    """Put the exact angle in place of each rounded one in the joints' origins.
+    """Replace each rounded angle in the joints' origins by the exact one.
 
     Args:
-        robot: Root element of a URDF, which is changed.
+        robot: Root element of a URDF; it is changed.
     """
     for origin in robot.iterfind("joint/origin"):
         words = origin.get("rpy", "").split()
@@ -174,30 +173,30 @@ def write_exact_angles(robot: ET.Element) -> None:
 
 
 def read_with_yourdfpy(path: str | Path) -> Any:  # noqa: ANN401
-    """Read a URDF with yourdfpy, a reader that shares no line with this package's.
+    """Read a URDF with yourdfpy, a reader independent of this package's.
 
     Args:
         path: The URDF file. Meshes are not loaded.
 
     Returns:
-        yourdfpy's ``Robot``: its damping and friction are text, and None what is not stated.
+        yourdfpy's ``Robot``: its damping and friction are text; None if not stated.
 
     Raises:
         ModelError: If yourdfpy cannot read the file.
     """
     import yourdfpy
 
-    logging.getLogger("yourdfpy").addHandler(logging.NullHandler())  # its remarks say nothing new
+    logging.getLogger("yourdfpy").addHandler(logging.NullHandler())  # its messages are not needed
     try:
         return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
-    except Exception as error:  # it checks nothing by itself: a fault of the file is any of them
+    except Exception as error:  # it checks nothing, so a faulty file raises errors of any kind
         fault = f"{type(error).__name__}: {error}"
         raise ModelError(f"yourdfpy cannot read {Path(path).name}: {fault}") from error
 
 
 def _wanted(element: ET.Element, key: str) -> tuple[int, float]:
-    """Return how many numbers an attribute holds, and their largest size."""
-    # limits and damping do not reach the dynamics, and some exporters write 1e308 for "no limit"
+    """Return the number of an attribute's numbers, and their largest absolute value."""
+    # limits and damping do not affect the dynamics; some exporters write 1e308 for "no limit"
     most = math.inf if element.tag in ("limit", "dynamics") else LARGEST
     return 3 if key in ("xyz", "rpy") else 1, most
 
@@ -207,20 +206,20 @@ def _shown(text: str) -> str:
 
 
 def _check_bounds(robot: ET.Element, where: str) -> None:
-    """Raise if elements are nested or attributes are long beyond any use."""
+    """Raise if elements are nested too deep or attributes are too long."""
     level, depth = [robot], 0
     while level:
         level, depth = [child for element in level for child in element], depth + 1
         if depth > _DEEPEST:
             raise ModelError(
-                f"{where}: elements are nested {depth} deep, wanted at most {_DEEPEST}; a URDF "
-                "needs six"
+                f"{where}: elements are nested {depth} levels deep, wanted at most {_DEEPEST}; a "
+                "URDF needs six"
             )
     for element, key, text in _attributes(robot):
         if len(text) > _LONGEST:
             raise ModelError(
                 f"{where}: <{element.tag[:80]}>: {key[:80]} has {len(text)} characters, wanted at "
-                f"most {_LONGEST}; it begins with {_shown(text)}"
+                f"most {_LONGEST}; it starts with {_shown(text)}"
             )
 
 

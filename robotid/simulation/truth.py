@@ -35,7 +35,7 @@ def draw_parameters(model: RobotModel, settings: Truth, rng: np.random.Generator
     has_drives = settings.drives == "usual"
     effort = {joint.name: joint.effort for joint in model.limits}
     for i, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
-        drawn = rng.uniform(*term.usual)
+        drawn = rng.uniform(*term.typical)
         own = [x / _TYPICAL_EFFORT for j, _ in layout.drives[d].ratios if (x := effort[j]) > 0]
         is_share = isinstance(term, MemorylessTerm) and term.is_loaded
         size = 1.0 if is_share or term.is_measured else min([1.0, *own])
@@ -108,7 +108,7 @@ def another_robot(model: RobotModel, rng: np.random.Generator) -> Array:
     by_body[-1] += tool
     by_body[-1] += [0, 0, 0, 0, 1e-3, 0, 1e-3, 0, 0, 1e-3]  # a tool has an extent
     for i, (_, term) in enumerate(model.layout.drive_parameters, start=size):
-        pi[i] = rng.uniform(*term.usual)
+        pi[i] = rng.uniform(*term.typical)
     return pi
 
 

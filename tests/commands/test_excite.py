@@ -79,7 +79,7 @@ def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
         (["--clearance", "near"], "--clearance 'near': wanted metres, or none"),
         (["--box", "post=1,2,3"], "--box 'post=1,2,3': wanted NAME=x0,y0,z0,x1,y1,z1"),
         (["--duration", "-1"], "duration is -1.0, wanted 0.1 to 3600 s"),
-        (["--max-jerk", "elbow=3"], "jerk is stated of 'elbow', which is no joint that moves"),
+        (["--max-jerk", "elbow=3"], "jerk is stated for 'elbow', which is not a moving joint"),
         (["--noise", "wrist_1_joint=-1"], "noise of 'wrist_1_joint' is -1, wanted 1e-09 to 1e+12"),
         (["--harmonics", "1"], "harmonics is 1, wanted 2 to 100"),
         (["--harmonics", "100000"], "harmonics is 100000, wanted 2 to 100"),
@@ -129,9 +129,9 @@ def test_the_page_says_what_is_used_of_each_limit_and_draws_it(tmp_path, capsys)
         for text in re.findall(r'<script type="application/json">(.*?)</script>', html)
     ]
     drawn = {chart["title"]: [s["label"] for s in chart["series"]] for chart in charts}
-    assert drawn["acceleration of each joint as a share of its limit"][2:] == ["wrist_2_joint"]
+    assert drawn["acceleration of each joint relative to its limit"][2:] == ["wrist_2_joint"]
     assert drawn["acceleration of each joint"] == ["wrist_1_joint", "wrist_3_joint"]
-    assert "floor and boxes" in drawn["distance of the two hulls that are nearest"]
+    assert "floor and boxes" in drawn["distance of the two nearest hulls"]
     velocity = next(c for c in charts if c["title"].startswith("velocity"))
     assert velocity["link"] == "time"
     assert [velocity["series"][k]["y"]["low"] for k in (0, 1)] == [100.0, -100.0]
@@ -178,7 +178,7 @@ def test_a_payload_is_found_by_a_motion_of_the_few_joints_that_show_it(tmp_path,
     assert np.ptp(columns["q_elbow_joint"]) == 0.0
     assert told["resting"]["elbow_joint"] == pytest.approx(columns["q_elbow_joint"][0])
     assert (
-        "For what hangs on wrist_3_link, wrist_1_joint, wrist_2_joint, wrist_3_joint move;"
+        "For a payload on wrist_3_link, wrist_1_joint, wrist_2_joint, wrist_3_joint move;"
         in (tmp_path / "motion.html").read_text()
     )
     plant = tmp_path / "plant.toml"
@@ -202,8 +202,11 @@ def test_a_payload_is_found_by_a_motion_of_the_few_joints_that_show_it(tmp_path,
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--mass", "2"], "a payload or joints that move are stated, but kind is 'fourier'"),
-        (["--kind", "payload", "--moving", "elbow"], "elbow cannot move wrist_3_link; joints that"),
+        (["--mass", "2"], "a payload or moving joints are stated, but kind is 'fourier'"),
+        (
+            ["--kind", "payload", "--moving", "elbow"],
+            "elbow cannot move wrist_3_link, wanted joints that",
+        ),
         (["--kind", "payload", "--mass", "-1"], "mass"),
         (["--kind", "payload", "--com", "1,2,3"], "--com '1,2,3': wanted three numbers"),
         (["--kind", "payload", "--mass", "1", "--com", "1,2"], "--com '1,2': wanted three"),

@@ -162,7 +162,7 @@ WRONG = {
     "gearless": ("[estimator]", "[[transmission]]\nmatrix = [[1.0]]\n[estimator]",
                  "a [[transmission]] has no key 'joints'"),
     "term in lists": ("[estimator]", "[drives]\nj1 = [[]]\n[estimator]",
-                      "a drive term is [], wanted a table, as { term = 'Stribeck'"),
+                      "a drive term is [], wanted a table, for example { term = 'Stribeck'"),
     "group": ('"wls"', '"simulation"\n[controller]\ngroups = { a = "j1" }',
               "groups.a is 'j1', wanted a list"),
     "step": ('"wls"', '"simulation"\nstep = 1e-9', "step is 1e-09, wanted 2e-5 to 0.1"),

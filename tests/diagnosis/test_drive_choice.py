@@ -388,7 +388,7 @@ def test_a_joint_that_moves_in_one_of_several_logs_is_judged_by_that(plain, case
     [
         ("viscous+stribek", "friction of shoulder_lift_joint has stribek, wanted auto, or some of"),
         ({ELBOW: "load+x"}, "friction of elbow_joint has x, wanted auto, or some of load, "),
-        ({"elbow": "load"}, "friction is stated for elbow, not among the joints to identify: "),
+        ({"elbow": "load"}, "friction is stated for elbow, wanted joints that are identified: "),
     ],
 )
 def test_names_that_are_none_are_refused(stated, message):

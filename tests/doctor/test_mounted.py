@@ -33,7 +33,7 @@ def recorded(model, seed, without=0.0):
     links = pi[:size].reshape(-1, 10)
     links[-1] -= without
     links *= 1 + rng.uniform(0.1, 0.3, (len(links), 1)) * rng.choice([-1, 1], (len(links), 1))
-    pi[size:] = [rng.uniform(*term.usual) for _, term in model.layout.drive_parameters]
+    pi[size:] = [rng.uniform(*term.typical) for _, term in model.layout.drive_parameters]
     motion = random_fourier(model, rng, period=5.0)
     sensors = Sensors(noise=NOISE)
     return perfect(model, pi, motion, rng, rate=100.0, duration=10.0, sensors=sensors)

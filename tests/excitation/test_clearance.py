@@ -80,7 +80,7 @@ def test_the_nearest_place_is_a_lower_bound_within_a_millimetre(panda, seed):
     contact = clearance.nearest(motion, 3.0)
     q = motion.evaluate(np.linspace(0.0, 3.0, 3001))[0]
     dense = clearance.near(clearance.placed(q), 0.07, clearance.everything).distance.min(axis=1)
-    margins = dense - clearance.kept
+    margins = dense - clearance.required
     assert margins.min() - 2e-3 < contact.margin <= margins.min()
     pair = clearance.named.index((contact.first, contact.second))
     assert margins[pair] < margins.min() + 1e-4  # it is that pair, not one that has a lower bound
@@ -132,9 +132,9 @@ def test_links_that_are_built_near_each_other_are_watched_and_those_that_touch_a
     tilts = np.random.default_rng(1).uniform(-0.35, 0.35, 2000)
     apart = 0.015 - 0.05 * np.sin(np.abs(tilts))
     usual = np.median(apart[apart > 1e-3])
-    assert clearance.kept == pytest.approx(usual / 2, abs=5e-4)
-    assert clearance.room == pytest.approx(usual / 2, abs=5e-4)
-    assert clearance.built_near == [f"base and plate ({1e3 * clearance.kept[0]:.0f} mm)"]
+    assert clearance.required == pytest.approx(usual / 2, abs=5e-4)
+    assert clearance.slack == pytest.approx(usual / 2, abs=5e-4)
+    assert clearance.built_near == [f"base and plate ({1e3 * clearance.required[0]:.0f} mm)"]
     assert clearance.likely.all()
     far, less = (
         clearance.nearest(ProgramMotion(np.array([0.0, speed, 0.0]), 2.0, np.zeros(3)), 2.0)
@@ -142,7 +142,7 @@ def test_links_that_are_built_near_each_other_are_watched_and_those_that_touch_a
     )
     assert {far.first, far.second} == {"base", "plate"}
     assert far.margin < 0.0 < less.margin
-    assert far.kept == clearance.kept[0]
+    assert far.required == clearance.required[0]
 
 
 def test_links_that_touch_in_almost_every_pose_but_not_at_zero_are_watched(tmp_path):
@@ -155,7 +155,7 @@ def test_links_that_touch_in_almost_every_pose_but_not_at_zero_are_watched(tmp_p
     clearance = Clearance(RobotModel.from_urdf(tmp_path / "driven.urdf"))
     assert len(clearance.made_to) == 1  # the pin
     assert clearance.named == [("base", "plate")]
-    assert 0.0005 < clearance.kept[0] < 0.002  # half of what lies between 1 and 4 mm
+    assert 0.0005 < clearance.required[0] < 0.002  # half of what lies between 1 and 4 mm
 
 
 def test_links_that_stay_at_their_distance_are_kept_at_half_of_it():
@@ -167,14 +167,16 @@ def test_links_that_stay_at_their_distance_are_kept_at_half_of_it():
     q = np.random.default_rng(0).uniform(
         [j.lower for j in model.limits], [j.upper for j in model.limits], (100, 6)
     )
-    near = np.isfinite(clearance.room)
+    near = np.isfinite(clearance.slack)
     distance = clearance.near(clearance.placed(q), 0.05, clearance.everything).distance
     assert near.sum() == 2
     np.testing.assert_allclose(
-        clearance.kept[near], np.median(distance[near], axis=1) / 2, rtol=0.1
+        clearance.required[near], np.median(distance[near], axis=1) / 2, rtol=0.1
     )
-    assert (clearance.kept[~near] == 0.02).all()
-    assert ((distance >= clearance.kept[:, None]).all(axis=0)).any()  # there are postures to be in
+    assert (clearance.required[~near] == 0.02).all()
+    assert (
+        (distance >= clearance.required[:, None]).all(axis=0)
+    ).any()  # there are postures to be in
 
 
 @pytest.fixture(scope="module", params=["panda", "ur10_robot"])
@@ -191,11 +193,11 @@ def scattered(request):
 @pytest.mark.parametrize("spare", [0.0, 1.0, 2.0])
 def test_margins_leave_what_is_kept_and_spared(scattered, spare):
     _, clearance, placed, _ = scattered
-    wanted = np.minimum(0.002, clearance.room / 4)[:, None]  # 2 mm, or a quarter of the room
+    wanted = np.minimum(0.002, clearance.slack / 4)[:, None]  # 2 mm, or a quarter of the room
     likely = clearance.near(placed, np.inf).distance
-    exactly = likely - clearance.kept[:, None] - spare * wanted
+    exactly = likely - clearance.required[:, None] - spare * wanted
     found = clearance.margins(placed, spare)
-    near = exactly < np.minimum(0.01, clearance.room / 4)[:, None]
+    near = exactly < np.minimum(0.01, clearance.slack / 4)[:, None]
     assert near.any()
     np.testing.assert_allclose(found[near], exactly[near], atol=1e-9)
     assert (found <= exactly + 1e-9).all()  # farther ones have a lower bound

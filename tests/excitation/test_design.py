@@ -103,7 +103,9 @@ def test_what_is_known_already_is_not_asked_for_again(designer, design):
     fresh = next_one.design(np.random.default_rng(4), starts=1)
     assert fresh.objective < again - 0.02
     # its condition is that of the motion itself, without what was known before
-    own = designer.used_and_told(fresh.motion, 4.0, fresh.intervals / 4.0)[1] - np.eye(len(told))
+    own = designer.used_and_informed(fresh.motion, 4.0, fresh.intervals / 4.0)[1] - np.eye(
+        len(told)
+    )
     assert fresh.condition == pytest.approx(np.sqrt(np.linalg.cond(own)), rel=1e-6)
 
 
@@ -136,17 +138,17 @@ def test_a_design_keeps_clear_of_what_stands_around(wrist, designer):
     assert found.contact is None or found.contact.margin >= 0.0
     t = np.linspace(0.0, 4.0, 4001)
     near = around.near(around.placed(found.motion.evaluate(t)[0]), 0.05, around.everything)
-    assert (near.distance.min(axis=1) >= around.kept).all()
+    assert (near.distance.min(axis=1) >= around.required).all()
 
 
 def test_what_keeps_a_robot_from_resting_is_named(wrist, designer):
     weak = designer.limits.sizes.copy()
     weak[4, 0] = 1e-3
     limits = replace(designer.limits, sizes=weak)
-    with pytest.raises(SettingsError, match=r"wrist_1_joint needs \d+ % of its torque limit"):
+    with pytest.raises(SettingsError, match=r"wrist_1_joint needs at least \d+ % of its torque"):
         replace(designer, limits=limits).design(np.random.default_rng(0), starts=1)
     inside = Clearance(wrist, boxes=[Box("room", (-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))])
-    with pytest.raises(SettingsError, match=r"in the best of them \w+ and room are -\d+"):
+    with pytest.raises(SettingsError, match=r"the distance of \w+ and room is -\d+"):
         replace(designer, clearance=inside).design(np.random.default_rng(0), starts=1)
 
 
@@ -166,12 +168,12 @@ def test_a_motion_whose_middle_collides_is_mixed_with_one_that_keeps_the_limits(
     C[0] += np.pi / 2 * np.array([1.0, 1.0, 0.0])  # the middle, about which it would be scaled
     assert not near.postures.can_rest(C[:1])[0]
     mixed = near._towards(kept, C, 0.997)
-    used, margin, _ = near._kept(mixed, 1.0)
+    used, margin, _ = near._constraints(mixed, 1.0)
     share = np.linalg.norm(mixed - kept) / np.linalg.norm(C - kept)
     assert 0.0 < share < 1.0
     assert np.abs(used).max() <= 0.997
     assert margin >= 0.0
-    used, margin, _ = near._kept(mixed + 2e-3 * (C - kept), 1.0)
+    used, margin, _ = near._constraints(mixed + 2e-3 * (C - kept), 1.0)
     assert np.abs(used).max() > 0.995 or margin < 1e-3  # it can hardly go farther
 
 
@@ -197,11 +199,11 @@ def test_distances_without_a_cost_are_not_looked_at_and_change_nothing(wrist, de
     aim = near._wanted
     some, every = (
         held.of_distances(around.near(placed, within).distance, aim)
-        for within in (held.reach(aim), np.inf)
+        for within in (held.distance_without_cost(aim), np.inf)
     )
     assert some[0] == pytest.approx(every[0], rel=1e-12)
     np.testing.assert_allclose(some[1], every[1], atol=1e-12)
-    looked_at = len(around.near(placed, held.reach(aim)).pairs)
+    looked_at = len(around.near(placed, held.distance_without_cost(aim)).pairs)
     assert 0 < looked_at < len(around.near(placed, np.inf).pairs) / 2
 
 
@@ -210,12 +212,12 @@ def test_a_posture_in_collision_counts_by_what_its_distances_are_short_of(wrist,
     near = replace(designer, clearance=inside).postures
     q = near._drawn(np.random.default_rng(0), 20)
     distance = inside.near(inside.placed(q), np.inf, inside.everything).distance
-    short = np.maximum(inside.kept[:, None] + inside.spare - distance, 0.0)
+    short = np.maximum(inside.required[:, None] + inside.spare - distance, 0.0)
     limits = replace(near, clearance=None)._broken_by_joint(q)
     of_pairs = (near._broken_by_joint(q) - limits).sum(axis=1)
     np.testing.assert_allclose(of_pairs, short.sum(axis=0) / 0.05, rtol=1e-6)
-    told = near._why_not(*near._at_rest(q))
-    found, wanted = re.search(r"room are (\S+) mm apart, wanted (\S+) mm", told).groups()
+    text = near._why_not(*near._at_rest(q))
+    found, wanted = re.search(r"room is (\S+) mm at most, wanted (\S+) mm", text).groups()
     assert float(found) in [pytest.approx(1e3 * own.max(), abs=0.06) for own in distance]
     assert float(wanted) == pytest.approx(1e3 * (0.01 + inside.spare.max()), abs=0.06)
 
@@ -229,7 +231,7 @@ def test_what_a_joint_needs_to_rest_is_the_least_of_what_postures_need(wrist, de
     weak[4, 0] = tau.min() / 3
     postures = replace(designer.postures, limits=replace(designer.limits, sizes=weak))
     words = postures._why_not(*postures._at_rest(q))
-    assert "wrist_1_joint needs 300 % of its torque limit at the least" in words
+    assert "wrist_1_joint needs at least 300 % of its torque limit; state" in words
 
 
 def test_postures_are_drawn_from_the_middle_of_wide_ranges(designer):

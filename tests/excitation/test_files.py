@@ -61,7 +61,7 @@ def test_a_ur_is_told_every_8_ms(motion, tmp_path):
 
 
 def test_what_cannot_be_written_is_refused(motion, tmp_path):
-    with pytest.raises(SettingsError, match="6 joints; this robot has 2"):
+    with pytest.raises(SettingsError, match="this robot has 2 joints, wanted 6"):
         write_motion(motion, JOINTS[:2], 2.0, 10.0, tmp_path / "m.script")
     with pytest.raises(SettingsError, match="rate is 0, wanted a positive number"):
         write_motion(motion, JOINTS, 2.0, 0.0, tmp_path / "m.csv")

@@ -43,7 +43,7 @@ def test_bad_numbers_are_refused(panda):
         MotionLimits.of_model(panda, share=1.2)
     with pytest.raises(SettingsError, match="jerk of panda_joint1 is -1, wanted a positive number"):
         MotionLimits.of_model(panda, jerk={"panda_joint1": -1})
-    with pytest.raises(SettingsError, match="power is stated of 'x', which is no joint that moves"):
+    with pytest.raises(SettingsError, match="power is stated for 'x', which is not a moving joint"):
         MotionLimits.of_model(panda, power={"x": 1})
 
 

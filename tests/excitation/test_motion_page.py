@@ -74,7 +74,7 @@ def test_the_distance_of_a_course_is_that_of_all_pairs(course):
     distance, pairs = found.nearness(around.everything)
     np.testing.assert_allclose(distance, exact.min(axis=0), atol=1e-9)
     np.testing.assert_array_equal(exact[pairs, np.arange(len(distance))], exact.min(axis=0))
-    margins = (exact - around.kept[:, None])[found.changes(around)]
+    margins = (exact - around.required[:, None])[found.changes(around)]
     assert found.nearest.margin == pytest.approx(margins.min())
     assert found.nearest.time == found.t[np.unravel_index(margins.argmin(), margins.shape)[1]]
     floor = np.array(["the floor" in pair for pair in around.named])
@@ -112,6 +112,6 @@ def test_the_least_certain_base_parameters_have_their_own_names(ur5):
     )  # fmt: skip
     first, second = (mapping.base_names[k] for k in (7, 30))
     assert mapping.names[7] != first
-    assert f"The least certain, as shares of that: {first} 90 %, {second} 70 %." in _expected(
+    assert f"Largest, in % of the plausible range: {first} 90 %, {second} 70 %." in _expected(
         preview
     )

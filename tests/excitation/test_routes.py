@@ -6,7 +6,14 @@ from robotid.excitation.clearance import Clearance
 from robotid.excitation.course import Course
 from robotid.excitation.design import Designer
 from robotid.excitation.limits import LIMITS, MotionLimits
-from robotid.excitation.routes import _PLACES, Route, _room, _sweeps, design_stands, design_sweeps
+from robotid.excitation.routes import (
+    _PLACES,
+    Route,
+    _free_range,
+    _sweeps,
+    design_stands,
+    design_sweeps,
+)
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -41,7 +48,7 @@ def test_room_ends_at_the_nearest_place_where_the_robot_cannot_rest(designer):
     low, high = (designer.limits.middle + s * designer.limits.sizes[0] for s in (-1, 1))
     step, blocked = (high - low) / (_PLACES - 1), 0
     for posture in designer.postures.resting(np.random.default_rng(0), 200)[:5]:
-        for j, room in enumerate(_room(designer, posture)):
+        for j, room in enumerate(_free_range(designer, posture)):
             for way, left in zip((-1.0, 1.0), room, strict=True):
                 q = np.tile(posture, (50, 1))
                 q[:, j] += way * np.linspace(0.0, max(left - step[j], 0.0), 50)

@@ -289,7 +289,7 @@ def page_content(html):
         except ValueError:
             continue
     # how long a design took is drawn, too
-    drawn = [] if "design time [s]" in html else page.drawn
+    drawn = [] if "computing time [s]" in html else page.drawn
     drawn = [summary(x, _OF_CHART) for x in drawn if len(x) > _LONG]
     return {"texts": page.texts, "charts": charts, "drawings": drawn}
 
@@ -305,7 +305,7 @@ def unpacked(value):
             return told_columns(value)
         usual = {"faint": False, "hidden": False, "half": None, "marks": [], "logarithmic": "",
                  "x_names": [], "spans": []}  # fmt: skip
-        if value.get("x_label") == "design time [s]":
+        if value.get("x_label") == "computing time [s]":
             value = {key: x for key, x in value.items() if key != "x"}
         return {k: unpacked(x) for k, x in value.items() if k not in usual or x != usual[k]}
     return [unpacked(x) for x in value] if isinstance(value, list) else value

@@ -328,7 +328,7 @@ def test_runs_at_once_are_the_runs_one_by_one(rng):
 def test_an_impossible_guess_is_not_updated_and_a_runaway_is_told():
     # D of -P is negative definite: the control drives the robot away
     history = run(np.stack([-P4, P4 / 2]), settings=short(2), offset=DEGREE)
-    np.testing.assert_array_equal(history.lost, [1, 0])
+    np.testing.assert_array_equal(history.diverged, [1, 0])
     assert history.skipped[0] > 0 == history.skipped[1]
     np.testing.assert_array_equal(history.estimates[-1, 0], -P4)
     alone = run(settings=short(2), offset=DEGREE)
@@ -337,7 +337,7 @@ def test_an_impossible_guess_is_not_updated_and_a_runaway_is_told():
 
 def test_a_run_that_is_lost_keeps_its_estimate():
     history = run(settings=short(2), offset=np.array([2e3, 0.0]))  # [rad]
-    np.testing.assert_array_equal(history.lost, [1])
+    np.testing.assert_array_equal(history.diverged, [1])
     assert len(history.estimates) == 2  # there was nothing left to do
     np.testing.assert_array_equal(history.estimates[-1], [P4 / 2])
 
@@ -374,5 +374,5 @@ def test_a_setting_out_of_range_is_named(settings, message):
 
 
 def test_noise_without_a_source_is_refused():
-    with pytest.raises(SettingsError, match=r"^sensor noise needs rng, the source of its random"):
+    with pytest.raises(SettingsError, match=r"^sensor noise is stated, but rng is None"):
         Influences(q=1e-3)

@@ -74,7 +74,7 @@ def test_random_runs_tell_every_failure(rng):
     assert (content["runs"], content["most_iterations"], content["tolerance"]) == (8, 12, 1e-3)
     for failure in content["failures"]:
         assert runs.errors[:, failure["run"]].min() >= 1e-3
-        assert re.match(r"slow: an error of .* is left after 12 iterations", failure["reason"])
+        assert re.match(r"slow: the error is .* after 12 iterations", failure["reason"])
     for number, r in zip(runs.iterations, np.flatnonzero(runs.has_converged), strict=True):
         assert runs.errors[number, r] < 1e-3 <= runs.errors[number - 1, r]
 
@@ -98,25 +98,25 @@ def test_a_random_run_is_critically_damped_at_its_bandwidth(rng):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"lost": 3}, "the robot ran away from its program in iteration 3"),
+        ({"diverged": 3}, "the robot diverged from its program in iteration 3"),
         (
             {"skipped": 7},
-            "slow: an error of 0.4 is left after 1 iterations and falls by 20 % in the last 1; 7 "
-            "updates were left out, as D(q, P^) was not positive definite",
+            "slow: the error is 0.4 after 1 iterations, with a decrease of 20 % in the last 1; 7 "
+            "updates were omitted, since D(q, P^) was not positive definite",
         ),
-        ({"errors": [0.5, 0.6]}, "the error grew, from 0.5 to 0.6"),
-        ({"errors": [0.5, 0.5]}, "stalled: the motion excites too little; an error of 0.5 is left"),
+        ({"errors": [0.5, 0.6]}, "the error increased: from 0.5 to 0.6"),
+        ({"errors": [0.5, 0.5]}, "stalled: the motion excites too little; the error is 0.5"),
         (
             {"errors": [0.9, 0.8, 0.5, *[0.48] * 9, 0.45]},
-            "slow: an error of 0.45 is left after 12 iterations and falls by 10 % in the last 10",
+            "slow: the error is 0.45 after 12 iterations, with a decrease of 10 % in the last 10",
         ),
         (
             {"errors": [0.8, *[0.7] * 8, 0.6]},
-            "slow: an error of 0.6 is left after 9 iterations and falls by 25 % in the last 9",
+            "slow: the error is 0.6 after 9 iterations, with a decrease of 25 % in the last 9",
         ),
         (
             {"errors": [0.9, *[0.4] * 11]},
-            "stalled: the motion excites too little; an error of 0.4 is left",
+            "stalled: the motion excites too little; the error is 0.4",
         ),
     ],
 )

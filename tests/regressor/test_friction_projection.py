@@ -130,7 +130,7 @@ def test_what_a_format_states_stays_to_the_last_bit(case, ur5):
     kept = project_friction(plain, values, {}, ("viscous", "coulomb", "spring"))
     assert kept.model is plain
     assert kept.pi is values
-    with pytest.raises(DataError, match="elbow_joint has spring, and the result has no drive_mo"):
+    with pytest.raises(DataError, match="elbow_joint has spring, but the result of an earlier"):
         project_friction(plain, values, {}, ("viscous", "coulomb"))
     # a term of size 0 needs no projection
     zero = pi.copy()

@@ -86,14 +86,14 @@ def test_the_parts_of_a_rigid_torque_are_gravity_inertia_and_speed(rng):
 
 
 @pytest.mark.parametrize(
-    ("term", "by_load"), [(Presliding(), False), (LoadFriction(), True), (Lag(), True)]
+    ("term", "depends"), [(Presliding(), False), (LoadFriction(), True), (Lag(), True)]
 )
-def test_bristles_alone_remember_the_same_whatever_the_bodies_weigh(ur5, rng, term, by_load):
+def test_bristles_alone_remember_the_same_whatever_the_bodies_weigh(ur5, rng, term, depends):
     model = ur5.with_terms({ur5.joints[1]: (term,)})
-    assert is_loaded(model) is by_load
+    assert is_loaded(model) is depends
     trajectory, pi = motion(model, rng, 50), model.standard_parameters()
     light, heavy = (remember(model.with_reference(x * pi), trajectory).memory for x in (1.0, 2.0))
-    assert np.array_equal(light, heavy) is not by_load
+    assert np.array_equal(light, heavy) is not depends
 
 
 def test_one_drive_that_bears_a_load_is_enough(ur5):

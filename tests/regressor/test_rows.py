@@ -67,7 +67,7 @@ def test_what_is_kept_is_of_one_robot_and_goes_with_its_motion_alone(ur5, rng, m
     assert kept_rows(ur5, trajectory.part(0, 20)) is None
     keep_inertial_rows(other, trajectory)  # those of the last robot stay
     assert kept_rows(ur5, trajectory) is None
-    monkeypatch.setattr(rows, "_KEPT", 8 * 40 * 209)  # bytes; a UR5 has 210 columns
+    monkeypatch.setattr(rows, "_MOST_BYTES", 8 * 40 * 209)  # bytes; a UR5 has 210 columns
     large = motion(ur5, rng, 40)
     keep_inertial_rows(ur5, large)
     assert kept_rows(ur5, large) is None

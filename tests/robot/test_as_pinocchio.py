@@ -43,7 +43,7 @@ def test_its_rnea_plus_friction_is_the_prediction(case, rng):
         shared = []
         made = pinocchio_model(model, pi)
     else:
-        words = "has no place for motor.armature, motor.viscous, motor.coulomb: torques"
+        words = "has no field for motor.armature, motor.viscous, motor.coulomb: its torques"
         with pytest.warns(UserWarning, match=words):
             made = pinocchio_model(model, pi)
     expressed = np.where(np.isin(model.layout.names, shared), 0.0, pi)
@@ -68,7 +68,7 @@ def test_what_it_has_no_place_for_is_named_if_it_is_not_zero(ur5):
         warnings.simplefilter("error")
         pinocchio_model(model, pi)
     pi[list(model.layout.names).index("wrist_1_joint.load")] = 0.05
-    with pytest.warns(UserWarning, match=r"no place for wrist_1_joint\.load: torques"):
+    with pytest.warns(UserWarning, match=r"no field for wrist_1_joint\.load: its torques"):
         pinocchio_model(model, pi)
 
 

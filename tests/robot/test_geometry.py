@@ -86,7 +86,7 @@ def test_a_shape_that_is_not_understood_leaves_its_body_unbounded(tmp_path, shap
 
 def test_a_body_whose_link_has_mass_but_no_shape_is_not_bounded(tmp_path):
     assert body_points(arm(tmp_path, BOX)) == {}
-    with pytest.raises(SettingsError, match=r"no link has geometry in arm\.urdf"):
+    with pytest.raises(SettingsError, match=r"no link has readable geometry in arm\.urdf"):
         geometry_half_spaces(arm(tmp_path, BOX), "hull")
     assert geometry_half_spaces(arm(tmp_path, BOX), "none") == {}
 
@@ -181,7 +181,7 @@ def test_geometry_that_cannot_be_read_bounds_nothing_and_is_named(tmp_path, shap
     (tmp_path / "folder.stl").mkdir()
     model = arm(tmp_path, one=shape, flange=BOX)
     assert body_points(model) == {}
-    with pytest.raises(SettingsError, match="com_within is 'hull', but no link has geometry in"):
+    with pytest.raises(SettingsError, match="com_within is 'hull', but no link has readable"):
         geometry_half_spaces(model, "hull")
     codes = {finding.code for finding in inspect_urdf(model.tree.path).findings}
     assert ("geometry_unread" in codes) == ("mesh" in shape)

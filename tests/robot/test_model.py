@@ -107,9 +107,9 @@ def test_a_mimic_joint_moves_with_its_leader_when_coupled(tmp_path):
         coupled.configurations(np.array([[0.3]])),
         independent.configurations(np.array([[0.3, -0.1]])),
     )
-    with pytest.raises(ModelError, match="joint 'elbow' mimics another one and moves with it"):
+    with pytest.raises(ModelError, match="joint 'elbow' mimics another joint and moves with it"):
         RobotModel.from_urdf(path, mimic="coupled", joints=["elbow"])
-    with pytest.raises(ModelError, match="one cannot be locked while the other moves"):
+    with pytest.raises(ModelError, match="but only one of them is locked"):
         RobotModel.from_urdf(path, joints=["shoulder"])
 
 
@@ -145,10 +145,10 @@ BAD = {
         dict(joints=["elbow2"]),
         "joint 'elbow2' is not in two.urdf; joints: shoulder, elbow. Did you mean 'elbow'?",
     ),
-    "all others locked, but of none": (dict(locked={"*": 0.0}), "name those that are to be"),
+    "all others locked, but of none": (dict(locked={"*": 0.0}), "list the joints to identify in"),
     "identified and locked": (
         dict(joints=["elbow"], locked={"elbow": 0.0}),
-        "joints elbow are both identified and locked",
+        "joints elbow are in both joints and locked",
     ),
     "unknown mimic mode": (dict(mimic="yes"), "mimic is 'yes', wanted 'independent' or 'coupled'"),
     "gravity of two numbers": (dict(gravity=(0, 9.81)), "wanted three finite numbers"),
@@ -170,7 +170,11 @@ FAULTS = {
     "no axis": ('axis xyz="0 1 0"', 'axis xyz="0 0 0"', "axis xyz is zero"),
     "planar joint": ('type="revolute"', 'type="planar"', "has type 'planar'"),
     "unknown link": ('parent link="upper"', 'parent link="uper"', "has the parent link 'uper'"),
-    "two roots": ('<link name="base"/>', '<link name="base"/><link name="x"/>', "one root link"),
+    "two roots": (
+        '<link name="base"/>',
+        '<link name="base"/><link name="x"/>',
+        "wanted exactly one",
+    ),
     "twice the same link": ('name="upper"', 'name="lower"', "two links are named 'lower'"),
     "no mass": ('<mass value="2"/>', "", "needs both <mass> and <inertia>"),
     "no XML": ("</robot>", "", "is not well-formed XML"),

@@ -42,7 +42,7 @@ def test_pseudo_inertia_is_pinocchios(rng):
 
 
 def test_an_incomplete_body_is_refused():
-    with pytest.raises(DataError, match=r"10 per body, but the shape is \(13,\)"):
+    with pytest.raises(DataError, match=r"have shape \(13,\), wanted a vector of 10 per body"):
         pseudo_inertia(np.zeros(13))
 
 
@@ -74,12 +74,12 @@ def test_a_coupling_may_stand_in_the_place_of_a_joints_own_drive():
     np.testing.assert_array_equal(layout.is_coupled, [True] * 3 + [False] * 5)
     with pytest.raises(SettingsError, match=r"coupling 'elbow' has the name of a joint or of"):
         replace(layout, couplings=(replace(motor, replaces=False),))
-    with pytest.raises(SettingsError, match=r"coupling 'hip' names the joints hip, which are not"):
+    with pytest.raises(SettingsError, match=r"coupling 'hip' has the joints hip, wanted joints"):
         replace(layout, couplings=(replace(motor, name="hip"),))
 
 
 def test_a_coupling_of_an_unknown_joint_is_refused():
-    with pytest.raises(SettingsError, match=r"coupling 'motor' names the joints wrist, which"):
+    with pytest.raises(SettingsError, match=r"coupling 'motor' has the joints wrist, wanted"):
         ParameterLayout(("a",), ("elbow",), couplings=(Coupling("motor", (("wrist", 1.0),)),))
 
 

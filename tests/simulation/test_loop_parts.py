@@ -105,5 +105,5 @@ def test_a_drive_of_several_joints_is_as_small_as_the_weakest(panda):
         for d, term in model.layout.drive_parameters:
             drive = model.layout.drives[d].name
             weak = 12.0 / 50.0 if drive == "motor" or drive[-1] in "567" else 1.0
-            low, high = (weak * x for x in term.usual)
+            low, high = (weak * x for x in term.typical)
             assert low <= drawn[f"{drive}.{term.name}"] <= high, drive

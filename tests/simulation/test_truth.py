@@ -54,7 +54,7 @@ def test_drives_are_usual_for_the_size_of_their_joint(ur5, panda):
     entries = zip(model.layout.drive_parameters, pi[model.layout.n_inertial :], strict=True)
     for (d, term), value in entries:
         size = min(1.0, effort[model.joints[d]] / 50.0) if term.name != "load" else 1.0
-        low, high = term.usual
+        low, high = term.typical
         assert size * low <= value <= size * high
     none = draw_parameters(ur5, Truth(drives="none", inertials=0.0), np.random.default_rng(3))
     np.testing.assert_array_equal(none, ur5.standard_parameters())
