@@ -91,7 +91,7 @@ def test_what_was_found_is_printed_beside_the_rows(found):
     said = found[1]
     assert "errors are position errors over 0.5 s" in " ".join(said.split())
     heads = said[said.index("not fitted:") :].split("\n")[1:3]
-    assert heads[0].split() == ["joint", "error", "rmse", "torques", "URDF", "same"]
+    assert heads[0].split() == ["joint", "error", "rmse", "torques", "URDF", "constant"]
     assert heads[1].split() == ["%", "alone", "%", "%", "speed", "%"]
 
 

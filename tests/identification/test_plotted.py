@@ -131,7 +131,7 @@ def test_a_notebook_shows_the_page_that_is_written(identified, tmp_path):
     (inside,) = re.findall(r'<iframe [^>]*srcdoc="([^"]*)"', plot._repr_html_())
     assert unescape(inside) == page
     assert repr(plot) == (
-        "<Plot of Friction of elbow_joint against speed; .write('plot.html') keeps it>"
+        "<Plot of Friction of elbow_joint against speed; .write('plot.html') saves it>"
     )
     with pytest.raises(DataError, match="does not exist; create it"):
         plot.write(tmp_path / "none" / "friction.html")

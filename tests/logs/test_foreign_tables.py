@@ -208,7 +208,7 @@ def test_swapped_arguments_are_named(ur5, rng, tmp_path):
         (str(table), str(urdf), "the file run.csv"),
     ):
         for call in (robotid.identify, partial(robotid.identify_payload, reference=[log])):
-            with pytest.raises(ModelError, match=rf"model is {what}, and .*: swap the two"):
+            with pytest.raises(ModelError, match=rf"model is {what}, and .*; swap the two"):
                 call(given, robot)
     with pytest.raises(ModelError, match="model is a Log, wanted a RobotModel or the path"):
         robotid.identify(log, log)

@@ -56,7 +56,7 @@ def test_coulomb_friction_is_found_again_behind_the_filter(robot):
     recording, bare = (hold_log(robot, log, SignalSettings()) for _ in range(2))
     rows = recording.whole
     without = replace(rows, trajectory=replace(rows.trajectory, direction=None))
-    bare.pieces[0].__dict__["_kept"] = without  # as if it had been read so
+    bare.pieces[0].__dict__["_cached"] = without  # as if it had been read so
     found, before = (coulomb_errors(robot, [r], pi) for r in (recording, bare))
     assert before.max() > 2e-3
     # left is what one sample more or less of a sign makes where a smooth speed is next to zero

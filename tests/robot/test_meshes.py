@@ -117,7 +117,7 @@ def test_a_mesh_without_triangles_counts_as_not_found_and_the_body_gets_a_skelet
     urdf = package / "urdf" / "r.urdf"
     urdf.write_text(URDF.replace('<cylinder radius="0.1" length="0.4"/>', ""))
     shown = robot_scene(RobotModel.from_urdf(urdf))
-    assert shown.notes[0].startswith("2 meshes not found or not readable")
+    assert shown.notes[0].startswith("2 meshes were not found or are not readable")
     assert shown.content["meshes"] == []
     assert "#e07b1f" in [p["colour"] for p in shown.content["parts"] if p["node"] == 1]
 
@@ -134,7 +134,7 @@ def test_a_scene_holds_each_mesh_once_and_names_what_is_missing(package):
     assert parts[1]["colour"] == "#00ff00"
     assert len({p["size"][0] for p in parts[1:3]}) == 1
     (note,) = shown.notes
-    assert note.startswith("1 meshes not found or not readable")
+    assert note.startswith("1 meshes were not found or are not readable")
     assert "lost.stl" in note
 
 
