@@ -53,7 +53,8 @@ REFUSED = {
 #: Phrases in which a word has its usual meaning.
 ALLOWED = (
     r"stands? for", r"of late", r"part by part", r"apart from", r"take(s|n)? apart",
-    r"drives = .usual.", r"0: usual, none", r"room temperature", r"false alarms?", r"joint room", r"ends? late",
+    r"drives = .usual.", r"0: usual, none",
+    r"room temperature", r"false alarms?", r"joint room", r"ends? late",
 )  # fmt: skip
 WORDS = {
     re.compile(rf"\b(?:{words})\b", re.IGNORECASE): wanted for words, wanted in REFUSED.items()
