@@ -103,23 +103,14 @@ def test_a_refused_word_is_found_and_the_wanted_one_named():
     assert not faults("isolated, storytelling, missing")
 
 
+@pytest.mark.parametrize("kind", ["docstrings", "messages and help"])
 @pytest.mark.parametrize("part", PARTS)
-def test_messages_and_help_use_the_words_of_the_field(part):
+def test_the_package_uses_the_words_of_the_field(part, kind):
+    which = int(kind != "docstrings")
     found = [
         f"{path.relative_to(ROOT)}: {fault}"
         for path in modules(part)
-        for text in strings(path.read_text())[1]
-        for fault in faults(text)
-    ]
-    assert not found, "\n".join(found)
-
-
-@pytest.mark.parametrize("part", PARTS)
-def test_docstrings_use_the_words_of_the_field(part):
-    found = [
-        f"{path.relative_to(ROOT)}: {fault}"
-        for path in modules(part)
-        for text in strings(path.read_text())[0]
+        for text in strings(path.read_text())[which]
         for fault in faults(text)
     ]
     assert not found, "\n".join(found)
