@@ -113,7 +113,10 @@ def build(name, folder):
                 found = simulated(urdf, locked)
             robotid.save_result(found, written)
             command = f"robotid identify {urdf} first.csv --validate second.csv --out {name}"
-        (folder / "report.html").write_bytes((Path(written) / "report.html").read_bytes())
+        report = (Path(written) / "report.html").read_text()
+        data = os.environ.get("ROBOTID_DATA", written).rstrip("/")
+        report = report.replace(f"{data}/", "").replace(written, name)  # where it was built
+        (folder / "report.html").write_text(report)
         replay_identified(found).write(folder / "replay.html")
     return {"name": name, "title": title, "lesson": lesson, "command": command} | facts_of(found)
 
