@@ -580,7 +580,7 @@ def driven_errors(name, runs, seconds):
             estimate, linear = found.fit.estimate, found.fit.linear
             kinds = [(key, key.rpartition(".")[2]) for key in estimate.names]
             for (key, kind), theta, *said in zip(
-                kinds, estimate.theta, estimate.std_error, estimate.reach, strict=True
+                kinds, estimate.theta, estimate.std_error, estimate.quantile, strict=True
             ):
                 errors[way].setdefault(kind, []).append((theta - plant.truth[key], *said))
         place = linear.model.layout.names.index
@@ -640,7 +640,7 @@ def one_run(name, rng, seconds, *, finds_all=False, torque=False):
     loop = LoopSettings(**gains, groups={first: [first]}, delays="group")
     found = identify_loops(plant.model, [log], [], loop, settings, chooses=False)
     estimate = found.fit.estimate
-    found = zip(estimate.names, estimate.theta, estimate.std_error, estimate.reach, strict=True)
+    found = zip(estimate.names, estimate.theta, estimate.std_error, estimate.quantile, strict=True)
     for key, theta, *said in found:
         joint, _, kind = key.rpartition(".")
         true = truth[key]
@@ -666,7 +666,7 @@ def held_run(name, rng, seconds, *, bits):
     found = identify_loops(plant.model, [log], [], loop, settings, chooses=False)
     estimate, truth = found.fit.estimate, plant.truth
     truth["robot.delay"] = plant.drives[0].delay
-    found = zip(estimate.names, estimate.theta, estimate.std_error, estimate.reach, strict=True)
+    found = zip(estimate.names, estimate.theta, estimate.std_error, estimate.quantile, strict=True)
     for key, theta, *said in found:
         yield key.rpartition(".")[2], theta - truth[key], *said
 

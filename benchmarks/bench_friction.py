@@ -177,7 +177,7 @@ def parameters(found, joint, true):
             if np.count_nonzero(K[k]) > 1:
                 continue
             miss = abs(found.base[k] - true[name])
-            yield term, miss <= found.errors.reach[k] * found.base_error[k]
+            yield term, miss <= found.errors.quantile[k] * found.base_error[k]
     for choice in found.drives:
         for shape in choice.shapes if choice.joint == joint else ():
             yield shape.name, abs(shape.value - SPEED) <= QUANTILE * shape.std_error

@@ -100,7 +100,7 @@ class Study:
             )
             identification = identify(self.model, [log], signals=CHAINS[chain])
             truth = self.mapping.to_base(pi)
-            reach = identification.errors.reach
+            reach = identification.errors.quantile
             wls, consistent = identification.wls, identification
             C = self.mapping.K @ consistent.estimate.covariance @ self.mapping.K.T
             for key, beta, covariance in (
@@ -141,7 +141,7 @@ class EncoderStudy:
             log, truth = self.record(bits, period, np.random.default_rng([7, run]))
             found = identify(self.model, [log], friction=friction, doctor=False)
             own = [found.mapping.base_names.index(key) for key in names]
-            reach, noise = found.errors.reach[own], found.regressor_noise
+            reach, noise = found.errors.quantile[own], found.regressor_noise
             for key, beta, error in (
                 ("wls", found.wls.theta, found.wls.std_error),
                 ("consistent", found.base, found.base_error),
