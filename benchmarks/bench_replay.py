@@ -39,7 +39,7 @@ def pages(seconds):
         "and ghost, ellipsoids, prediction",
         replay(
             model, t, q, torques=Torques(t, tau, {"fit": 0.9 * tau}),
-            masses={"URDF": pi, "fit": pi}, ghost=("ghost", t, q + 0.2),
+            masses={"URDF": pi, "fit": pi}, ghosts={"second": (t, q + 0.2)},
         ),
     )  # fmt: skip
 
