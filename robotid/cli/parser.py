@@ -29,6 +29,24 @@ class CommandParser(argparse.ArgumentParser):
         self.main_flags, self.examples = main_flags, examples
         self.add_argument("--help-all", action=_HelpAll, help="show all flags and exit")
 
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse words; refuse a flag that a command does not have, with the nearest flag.
+
+        Args:
+            args: The words.
+            namespace: Where values are stored.
+        """
+        found, unknown = super().parse_known_args(args, namespace)
+        flags = [word.partition("=")[0] for word in unknown if word.startswith("--")]
+        if flags and self._subparsers is None:
+            known = [flag for action in self._actions for flag in action.option_strings]
+            near = difflib.get_close_matches(flags[0], known, n=1)
+            hint = f"; did you mean {near[0]}?" if near else f"; see '{self.prog} --help'"
+            self.error(f"{flags[0]} is unknown{hint}")
+        return found, unknown
+
     def format_usage(self) -> str:
         """Return the usage; the short one lists the arguments only."""
         return self._usage() if self.main_flags else super().format_usage()

@@ -16,6 +16,11 @@ def printed(capsys, *words):
 @pytest.mark.parametrize(
     ("words", "near"),
     [
+        (
+            ["identify", "r.urdf", "l.csv", "--vaildate", "b.csv"],
+            "--vaildate is unknown; did you m",
+        ),
+        (["replay", "r.urdf", "l.csv", "--xyz=3"], "--xyz is unknown; see 'robotid replay --help'"),
         (["identfy", "robot.urdf"], "argument COMMAND: 'identfy' is unknown; did you mean 'ident"),
         (["export", "r.json", "--format", "mjfc", "--out", "x"], "'mjfc' is unknown; did you mean"),
         (["excite", "r.urdf", "--out", "x", "--kind", "furier"], "did you mean 'fourier'? Known: "),
