@@ -34,6 +34,7 @@ FORMER_CODES: Mapping[str, str] = {
     "unlike_velocity": "velocity_mismatch",
 }
 
+_SPREAD = 0.1  # of the numbers of a setting that is stated once for several findings
 _RANK = {"error": 0, "warning": 1, "note": 2}
 _NUMBER = r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w|\.\w)"
 _RANGE = rf"{_NUMBER}(?: to {_NUMBER})?"
@@ -195,9 +196,25 @@ def _merged(findings: Sequence[Finding], joints: Sequence[str]) -> tuple[str, ..
         alike.setdefault(tuple(parts[::2]), []).append(parts[1::2])
     merged = []
     for texts, filled in alike.items():
-        words = [_in_one(list(dict.fromkeys(values))) for values in zip(*filled, strict=True)]
-        merged.append("".join(a + b for a, b in zip(texts, [*words, ""], strict=True)))
+        columns = list(zip(*filled, strict=True))
+        if any(map(_are_far, columns)):  # one setting does not suit them all
+            words = [list(values) for values in filled]
+        else:
+            words = [[_in_one(list(dict.fromkeys(values))) for values in columns]]
+        merged += ["".join(a + b for a, b in zip(texts, [*own, ""], strict=True)) for own in words]
     return tuple(merged)
+
+
+def _are_far(values: Sequence[str]) -> bool:
+    """Whether settings to type differ in numbers alone, by more than a tenth of the largest."""
+    if not all(re.fullmatch(_TYPED, value) for value in values):
+        return False
+    if len({re.sub(_NUMBER, "", value) for value in values}) > 1:
+        return False
+    numbers = zip(
+        *([float(x) for x in re.findall(_NUMBER, value)] for value in values), strict=True
+    )
+    return any(max(own) - min(own) > _SPREAD * max(map(abs, own)) for own in numbers)
 
 
 def _in_one(values: list[str]) -> str:

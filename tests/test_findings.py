@@ -60,6 +60,23 @@ def test_what_is_typed_keeps_one_value_and_ranges_of_ranges_are_one_range():
     assert "torque_delay = 0.0199 (--torque-delay 0.0199)" in cause.messages[0]
 
 
+def cut(log, start, end):
+    message = f"{log}: at rest for {start} s; cut it with start = {start} and end = {end}"
+    return Finding("standstill", "note", log, message)
+
+
+def test_settings_that_differ_by_log_are_stated_log_by_log():
+    (cause,) = grouped([cut("a", "2.33", "54.03"), cut("b", "4.1", "46.98")])
+    assert cause.messages == (
+        "a: at rest for 2.33 s; cut it with start = 2.33 and end = 54.03",
+        "b: at rest for 4.1 s; cut it with start = 4.1 and end = 46.98",
+    )
+    (cause,) = grouped([cut("a", "2.33", "54.03"), cut("b", "2.4", "54.1")])
+    assert cause.messages == (
+        "a, b: at rest for 2.33 to 2.4 s; cut it with start = 2.33 and end = 54.03",
+    )
+
+
 def test_what_is_typed_for_several_joints_is_typed_for_each():
     todo = "{0} stands at {1}; state locked = {{ {0} = {1} }} (--lock {0}={1})"
     places = (("a", "j6", 0.1824), ("b", "j6", 0.1825), ("a", "j7", 1.0))
