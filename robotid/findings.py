@@ -14,6 +14,7 @@ __all__ = [
     "grouped",
     "listed",
     "log_finding",
+    "not_ignored",
     "toml_key",
 ]
 
@@ -111,6 +112,17 @@ def current_code(code: str) -> str:
         code: The code.
     """
     return FORMER_CODES.get(code, code)
+
+
+def not_ignored(findings: Iterable[Finding], ignore: Iterable[str]) -> tuple[Finding, ...]:
+    """Return the findings whose codes are not ignored.
+
+    Args:
+        findings: The findings.
+        ignore: Codes, current or former.
+    """
+    ignored = {current_code(code) for code in ignore}
+    return tuple(finding for finding in findings if finding.code not in ignored)
 
 
 def listed(names: Iterable[object], limit: int | None = None) -> str:

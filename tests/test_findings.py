@@ -77,6 +77,13 @@ def test_settings_that_differ_by_log_are_stated_log_by_log():
     )
 
 
+def test_settings_of_several_numbers_are_far_if_any_of_them_is():
+    texts = [f"{log}: set mass = [1.0, {high}]" for log, high in (("a", 2.0), ("b", 3.0))]
+    findings = [Finding("bounds", "note", text[0], text) for text in texts]
+    (cause,) = grouped(findings)
+    assert cause.messages == tuple(texts)
+
+
 def test_what_is_typed_for_several_joints_is_typed_for_each():
     todo = "{0} stands at {1}; state locked = {{ {0} = {1} }} (--lock {0}={1})"
     places = (("a", "j6", 0.1824), ("b", "j6", 0.1825), ("a", "j7", 1.0))

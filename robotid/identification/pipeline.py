@@ -23,7 +23,7 @@ from robotid.exceptions import (
     RankDeficientError,
     SettingsError,
 )
-from robotid.findings import Finding, current_code
+from robotid.findings import Finding, not_ignored
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.fit import fit_recordings, rough_choice, solve_recordings
 from robotid.fitting.recordings import Recordings
@@ -184,8 +184,7 @@ def conclude(
     heads = [log.head for log in (*recordings.fitted, *recordings.validation)]
     findings = [*log_findings(heads), *impossible_inertials(model), *merged]
     findings += unwritten(fit, log_errors)
-    ignored = {current_code(code) for code in ignore}
-    counted = [finding for finding in findings if finding.code not in ignored]
+    counted = not_ignored(findings, ignore)
     names = [Path(e.recording.log.path).name for e in fit.validation if not e.is_refitted]
     return replace(
         result,

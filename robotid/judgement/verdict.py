@@ -11,7 +11,7 @@ import numpy as np
 from robotid._settings import require_kind
 from robotid.doctor.diagnosis import CODES
 from robotid.exceptions import SettingsError
-from robotid.findings import Finding, current_code, listed
+from robotid.findings import Finding, current_code, listed, not_ignored
 from robotid.fitting.metrics import Metrics
 from robotid.judgement.evidence import Determined, Predictions, error_of
 from robotid.judgement.scale_check import ScaleCheck
@@ -323,8 +323,7 @@ def blocking(
         ignore: Codes of errors that the user states as wrong.
         is_robust: Whether a robust loss was set, which downweights jumps of the torque.
     """
-    known = {current_code(code) for code in ignore}
-    errors = (f for f in findings if f.severity == "error" and f.code not in known)
+    errors = (f for f in not_ignored(findings, ignore) if f.severity == "error")
     return tuple(f for f in errors if not (is_robust and is_downweighted(f)))
 
 

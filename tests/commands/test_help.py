@@ -17,7 +17,7 @@ def printed(capsys, *words):
     ("words", "near"),
     [
         (
-            ["identify", "r.urdf", "l.csv", "--vaildate", "b.csv"],
+            ["identify", "r.urdf", "l.csv", "--vaildate", "b.csv", "--x"],
             "--vaildate is unknown; did you m",
         ),
         (["replay", "r.urdf", "l.csv", "--xyz=3"], "--xyz is unknown; see 'robotid replay --help'"),

@@ -9,7 +9,7 @@ from robotid.exceptions import SettingsError
 from robotid.export.entries import build_result
 from robotid.export.former_keys import FORMER, from_former_keys, with_former_keys
 from robotid.export.result import load_result
-from robotid.findings import FORMER_CODES, Finding, current_code
+from robotid.findings import FORMER_CODES, Finding, current_code, not_ignored
 from robotid.judgement.verdict import blocking, check_ignored
 from robotid.robot.families import term_from_dict
 
@@ -89,6 +89,10 @@ def test_former_codes_can_be_ignored_and_are_named(caplog):
     ]
     assert blocking([late], ["late_command"]) == blocking([late], ["delayed_command"]) == ()
     assert blocking([late], ["gravity"]) == (late,)
+    other = Finding("clipped", "warning", "log", "clipped")
+    assert not_ignored([late, other], ["gravity", "late_command"]) == (other,)
+    assert not_ignored([late, other], ["clipped", "delayed_command"]) == ()
+    assert not_ignored([late, other], []) == (late, other)
     with pytest.raises(SettingsError, match="unknown code 'nothing'"):
         check_ignored(["nothing"])
 
