@@ -3,7 +3,7 @@
 import os
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +21,10 @@ from robotid.fitting.settings import (
 from robotid.logs.columns import Needs
 from robotid.logs.data import Log
 from robotid.logs.read import LogLayout, lay_out, read_log
-from robotid.logs.settings import LogSource, LogUnits, SignalSettings
+from robotid.logs.settings import BaseSource, LogSource, LogUnits, SignalSettings
 from robotid.logs.table import Table
 from robotid.logs.transmission import Transmission, check_transmissions
+from robotid.robot.constraints import Contact
 from robotid.robot.drives import DRIVE_TERMS, FAMILIES, TERMS, DriveTerm
 from robotid.robot.families import AUTO, term_from_dict
 from robotid.robot.parameters import DYNAMICS, Coupling
@@ -137,7 +138,7 @@ class Job(Settings):
         (0.0, 0.0, -9.81), "gravity in the root link's frame [m/s^2]"
     )
     free_flyer: bool = setting(
-        False, "whether the base floats; no log format has the motion of a base yet"
+        False, "whether the base floats; logs have its pose, base_x to base_qw"
     )
     mimic: str = setting(
         "independent", "independent, or coupled: a mimic joint moves with its leader"
@@ -192,6 +193,16 @@ class Job(Settings):
     )
     source: LogSource = setting(LogSource(), "location of the signals in the log files", at="log")
     units: LogUnits = setting(LogUnits(), "units of the logs, if not SI")
+    base: BaseSource = setting(BaseSource(), "motion of a floating base in the logs")
+    contacts: tuple[Contact, ...] = setting(
+        (),
+        "links that may touch the ground, with kind point or surface; logs have contact_<link>, 1 "
+        "or 0. The contact forces are unknown",
+        at="contact",
+        reads=[{"frame": (str,), "kind": (str,)}],
+        load=lambda tables: tuple(Contact(**table) for table in tables),
+        dump=lambda contacts: [asdict(contact) for contact in contacts],
+    )
     estimator: EstimatorSettings = setting(ConsistentSettings(), "estimator and its settings")
     controller: LoopSettings = setting(
         LoopSettings(),
@@ -246,12 +257,6 @@ class Job(Settings):
                 f"[controller] is stated, but the estimator is {self.estimator.name!r}, wanted "
                 "'simulation'; set [estimator] name = 'simulation', or remove [controller]"
             )
-        if self.free_flyer:
-            raise SettingsError(
-                "free_flyer is true, but no log format that robotid reads has the pose and motion "
-                "of a floating base. Set free_flyer = false, or compute the regressor in Python, "
-                "joint_torque_regressor(RobotModel.from_urdf(..., free_flyer=True), q, v, a)"
-            )
 
     def model(self) -> "RobotModel":
         """Return the robot, with the job's joints, gravity and drive terms.
@@ -278,6 +283,7 @@ class Job(Settings):
             },
             dynamics=self.model_dynamics,
             snap_angles=self.snap_angles,
+            constraints=self.contacts,
         )
 
     def placed(self, model: "RobotModel") -> tuple[str, ...]:
@@ -338,6 +344,9 @@ class Job(Settings):
             "units": self.units,
             "prismatic": tuple(model.layout.prismatic),
             "source": self.source,
+            "floats": model.free_flyer,
+            "contacts": model.contacts,
+            "base": self.base,
             "transmissions": [gear.stated(model.tree.reductions) for gear in self.transmissions],
         }
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.findings import listed
 from robotid.fitting.velocity_choice import prefers_measured
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.formats import open_table
@@ -28,6 +29,7 @@ from robotid.logs.time_stamps import blocks_of, map_stamps, median_step
 from robotid.logs.units import check_reach, check_units
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import friction_speeds
+from robotid.regressor.constraints import constrained
 from robotid.regressor.factors import Reduction
 from robotid.regressor.memory import is_loaded, remember
 from robotid.regressor.rows import COMPILED, choose_engine
@@ -126,7 +128,8 @@ class LogPiece:
         model, motion, mask = self.header.model, rows.trajectory, rows.mask
         if model.layout != before.layout or is_loaded(model):
             motion = remember(model, motion.with_states(None))
-        if not model.is_static:  # static rows were chosen by their speeds already
+        # static rows were chosen by their speeds already, constrained ones with their forces
+        if not (model.is_static or model.constraints):
             mask = row_mask(model, motion, self.header.signals.min_velocity)
         vars(self)["_cached"] = replace(rows, trajectory=motion, mask=mask)
 
@@ -151,6 +154,7 @@ class LogPiece:
                 speeds=friction_speeds(header.model.layout),
             )
             mask = row_mask(header.model, trajectory, header.signals.min_velocity)
+            trajectory, mask = constrained(header.model, trajectory, mask)
         trajectory = remember(header.model, trajectory)
         return Rows(raw.q[rows], raw.tau[rows], trajectory, mask, (log.q != raw.q).any(axis=0))
 
@@ -342,6 +346,20 @@ class SurveyedLog:
         return tuple(found)
 
 
+def _check_base(model: RobotModel, log: Log) -> None:
+    """Refuse a log without the motion of a floating base, or without a contact of the model."""
+    if model.free_flyer and log.base is None:
+        raise DataError(
+            f"{log.name} has no pose of the floating base; read it with floats=True, or pass "
+            "Log(..., base=BaseMotion(pose))"
+        )
+    if tuple(log.contacts) != model.contacts:
+        raise DataError(
+            f"{log.name} has the contacts {listed(tuple(log.contacts))}, wanted those of the "
+            f"model, {listed(model.contacts)}, in this order; pass Log(..., contacts={{...}})"
+        )
+
+
 def hold_log(
     model: RobotModel, log: Log, signals: SignalSettings, locked: Mapping[str, Array] | None = None
 ) -> SurveyedLog:
@@ -354,6 +372,7 @@ def hold_log(
         locked: Positions of locked joints, if the log has them, by name [rad or m].
     """
     count = len(log.t)
+    _check_base(model, log)
     if model.is_static:  # means of segments replace filters
         signals = replace(
             signals, cutoff=None, rate=None, velocity="differentiated",

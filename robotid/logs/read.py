@@ -8,6 +8,7 @@ columns of the motors are read instead, as `qm_<motor>` and `taum_<motor>` [N m]
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,6 +19,7 @@ from robotid._settings import require_each, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
+from robotid.logs.base import base_columns, base_of, contacts_of
 from robotid.logs.columns import NOUNS, TORQUES, Finder, Needs, without_torque
 from robotid.logs.data import (
     COLUMNS,
@@ -27,7 +29,7 @@ from robotid.logs.data import (
 )
 from robotid.logs.foreign_tables import Frame, is_frame, open_frame, with_own_names
 from robotid.logs.formats import open_table, write_columns
-from robotid.logs.settings import PER_SECOND, LogSource, LogUnits
+from robotid.logs.settings import PER_SECOND, BaseSource, LogSource, LogUnits
 from robotid.logs.table import Table
 from robotid.logs.transmission import Transmission, check_transmissions
 from robotid.logs.units import check_units
@@ -40,6 +42,7 @@ Readable = Log | str | Path | Frame
 
 _SI = LogUnits()
 _WHOLE = LogSource()
+_BASE = BaseSource()
 
 
 def read_log(
@@ -55,6 +58,9 @@ def read_log(
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
     needs: Needs = "torque",
+    floats: bool = False,
+    contacts: Sequence[str] = (),
+    base: BaseSource = _BASE,
 ) -> Log:
     """Return the log in a file or a DataFrame, in SI units; its notes list ignored columns.
 
@@ -73,6 +79,9 @@ def read_log(
         source: The topic of a bag or group of a file, names of joints in it, quantity of effort.
         transmissions: The motors and gears, if the file has columns of motors.
         needs: Quantities that are required besides positions, as of ``lay_out``.
+        floats: As of ``lay_out``.
+        contacts: As of ``lay_out``.
+        base: As of ``lay_out``.
 
     Raises:
         DataError: If a required column is missing, or the values look like other units.
@@ -81,7 +90,8 @@ def read_log(
     """
     layout, table = lay_out(
         path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
-        source=source, transmissions=transmissions, needs=needs,
+        source=source, transmissions=transmissions, needs=needs, floats=floats,
+        contacts=contacts, base=base,
     )  # fmt: skip
     log = layout.to_log(table.read(layout.wanted))
     check_units(log, units, prismatic)
@@ -172,6 +182,8 @@ class LogLayout:
     motors: Mapping[str, tuple[bool, ...]]  # by kind: which columns are of motors
     gears: tuple[Transmission, ...]  # of the motors
     has_torque: bool  # whether the file has a torque or a current of any of the joints
+    contacts: tuple[str, ...] = ()  # links whose contacts are read
+    base: BaseSource = _BASE  # axes of the velocities of a floating base
 
     @property
     def wanted(self) -> list[str]:
@@ -211,6 +223,9 @@ class LogLayout:
                 values[kind] = values[kind] * np.where(is_length, 1.0, np.pi / 180)
             values[kind] = self._of_joints(kind, values[kind])
         t, where = self.stamps(values["time"][:, 0]), Path(self.path).name or "log"
+        base, flags = base_of(values, self.base), values.pop("contact", None)
+        contacts = {} if flags is None else contacts_of(flags, self.contacts, where)
+        values = {kind: array for kind, array in values.items() if not kind.startswith("base ")}
         for kind, array in values.items():
             names = ["time"] if kind == "time" else [f"{kind}_{joint}" for joint in self.joints]
             require_finite(array, t, names, where, first)
@@ -222,7 +237,7 @@ class LogLayout:
         arrays = {name: values[kind] for kind, name in COLUMNS.items() if kind in values}
         return Log(
             t=t, joints=self.joints, path=self.path, notes=self.notes, has_torque=has_torque,
-            **arrays,
+            base=base, contacts=contacts, **arrays,
         )  # fmt: skip
 
     def _of_joints(self, kind: str, values: Array) -> Array:
@@ -253,6 +268,9 @@ def lay_out(
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
     needs: Needs = "torque",
+    floats: bool = False,
+    contacts: Sequence[str] = (),
+    base: BaseSource = _BASE,
 ) -> tuple[LogLayout, Table]:
     """Return the layout of a log in a file, before its columns are read, and its open table.
 
@@ -309,7 +327,9 @@ def lay_out(
         where, opened.names, stated, tuple(joints), gains or {}, source, gears, needs,
         [*opened.notes],
     )  # fmt: skip
-    found = finder.find_all()  # names of columns by kind
+    of_base = base_columns(where, opened.names, contacts, floats=floats)
+    finder.seen.update(chain.from_iterable(of_base.values()))
+    found = finder.find_all() | of_base  # names of columns by kind
     layout = LogLayout(
         path=str(Path(path)) if isinstance(path, str | Path) else "",
         joints=tuple(joints),
@@ -322,6 +342,8 @@ def lay_out(
         motors={kind: finder.of_motors(kind) for kind in NOUNS},
         gears=gears,
         has_torque=any(finder.has_torque(joint) for joint in joints),
+        contacts=tuple(contacts),
+        base=base,
     )
     return layout, opened
 

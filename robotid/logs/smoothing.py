@@ -10,6 +10,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
+from robotid.logs.base import BaseMotion, base_state
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.filters import butterworth_poles, zero_phase
 from robotid.logs.friction_direction import acting_directions
@@ -24,6 +25,7 @@ _SETTLED = 42.0  # [time constants] after which a filter's transient is negligib
 _LONGEST = 8.0  # [periods of the filter] longest time of stiction
 _FINEST = 1000  # largest number of points of the uniform grid per row of the log
 _ALL = slice(None)
+_BASE = ("pose", "twist", "base acceleration")  # channels of a floating base
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ def process_segments(
         segments. Its directions are those of Coulomb friction after the filter of the torque; None
         without speeds, and if they are the signs of the speeds.
     """
-    n = len(log.joints)
+    n, base = len(log.joints), 0 if log.base is None else 6
     is_sharp = settings.cutoff is None and settings.friction_band == 0
     ratios = np.empty((0, n)) if speeds is None or is_sharp else speeds
     parts, counts = [], []
@@ -79,12 +81,16 @@ def process_segments(
         part = _process_part(log, rows, segment, settings, first, own, ratios)
         counts.append(0 if part is None else len(part[0]))
         parts += [] if part is None else [part]
-    nothing = (np.empty(0), *[np.empty((0, n))] * 4, np.empty((0, len(ratios))))
+    rows = np.empty((0, base + n))
+    q0 = np.empty((0, n + (base and 7)))
+    nothing = (np.empty(0), q0, rows, rows, rows, np.empty((0, len(ratios))))
     t, q, v, a, tau, direction = (np.concatenate(x) for x in zip(nothing, *parts, strict=True))
+    contacts = _contacts(log, t, settings) if log.contacts else (None, None)
     return Trajectory(
         t=t, q=q, v=v, a=a, tau=tau, joints=log.joints, rate=settings.rate,
         segment=np.repeat([segment.number for segment in segments], counts),
         direction=direction if len(ratios) else None,
+        contacts=contacts[0], switching=contacts[1],
     )  # fmt: skip
 
 
@@ -164,6 +170,8 @@ def _process_part(
         channels["v"] = log.v
     if settings.acceleration == "measured" and log.a is not None:
         channels["a"] = log.a
+    if log.base is not None:
+        channels |= _base_channels(log.base, settings)
     delay = {"tau": settings.torque_delay, "v": settings.velocity_delay}
     smooth = {
         name: low_pass(_resample(t - delay.get(name, 0.0), x[rows], times), grid.rate, settings)
@@ -183,8 +191,37 @@ def _process_part(
     chosen = np.flatnonzero(inside)
     if len(chosen) == 0:
         return None
-    q, tau = smooth["q"][chosen], smooth["tau"][chosen]
-    return times[chosen], q, v[chosen], a[chosen], tau, direction[chosen]
+    q, tau = smooth["q"], smooth["tau"]
+    if log.base is not None:
+        state = base_state(times, *(smooth.get(name) for name in _BASE))
+        q, v, a = (np.hstack(pair) for pair in zip(state, (q, v, a), strict=True))
+        tau = np.hstack([np.zeros((len(tau), 6)), tau])  # no torque acts on the base
+    return times[chosen], q[chosen], v[chosen], a[chosen], tau[chosen], direction[chosen]
+
+
+def _base_channels(base: BaseMotion, settings: SignalSettings) -> dict[str, Array]:
+    """Return the channels of a floating base by name, measured ones where the joints' are."""
+    channels = {"pose": base.pose}
+    if settings.velocity == "measured" and base.twist is not None:
+        channels["twist"] = base.twist
+    if settings.acceleration == "measured" and base.acceleration is not None:
+        channels["base acceleration"] = base.acceleration
+    return channels
+
+
+def _contacts(log: Log, t: Array, settings: SignalSettings) -> tuple[Array, Array]:
+    """Return which links touch the ground at times (N, k), and where that changes, (N,), bool.
+
+    The change is between two rows of the log, and affects half a period of the filter around it.
+    """
+    flags = np.column_stack(list(log.contacts.values()))
+    last = np.searchsorted(log.t, t * (1 + 1e-12), side="right") - 1
+    changes = np.flatnonzero((flags[1:] != flags[:-1]).any(axis=1))
+    reach = 0.5 / settings.cutoff if settings.cutoff else 0.0
+    reach += 1e-9 * float(log.t[-1] - log.t[0])
+    begins, ends = log.t[changes] - reach, log.t[changes + 1] + reach
+    within = np.searchsorted(begins, t, side="right") - np.searchsorted(ends, t, side="left")
+    return flags[last.clip(0)], within > 0
 
 
 @dataclass(frozen=True)

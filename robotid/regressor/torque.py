@@ -12,7 +12,8 @@ from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import drive_values, friction_directions, instant_state
-from robotid.regressor.problem import Block, Problem
+from robotid.regressor.constraints import ProjectedRows, without_forces
+from robotid.regressor.problem import Block, Problem, RowSource
 from robotid.regressor.rows import BLOCK, kept_rows, trajectory_rows
 from robotid.robot.drives import TERMS, DriveMotion
 from robotid.robot.model import RobotModel
@@ -252,8 +253,13 @@ def build_problem(
     Raises:
         DataError: If joints or shapes are not those of the model.
     """
-    source = trajectory_rows(model, trajectory, weight, compiled)
-    shape, weights = source.weights.shape, source.weights
+    source: RowSource = trajectory_rows(model, trajectory, weight, compiled)
+    weights, support = source.weights, source.support
+    if trajectory.basis is not None:
+        own = trajectory_rows(model, trajectory, None, compiled)
+        source = ProjectedRows(own, trajectory.basis, weights)
+        support = np.broadcast_to(support.any(axis=0), support.shape)
+    shape = weights.shape
     length = max(1, min(BLOCK, _BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
 
     def stream() -> Iterator[Block]:
@@ -262,6 +268,9 @@ def build_problem(
             m = trajectory
             direction, memory = (None if x is None else x[part] for x in (m.direction, m.memory))
             W = joint_torque_regressor(model, m.q[part], m.v[part], m.a[part], direction, memory)
+            if m.basis is not None:
+                Y = W.reshape(-1, model.n_rows, W.shape[1])
+                W = without_forces(m.basis[part], Y).reshape(W.shape)
             yield W, trajectory.tau[part].reshape(-1), weights[part].reshape(-1)
 
     def mass_stream() -> Iterator[Array]:
@@ -269,7 +278,7 @@ def build_problem(
             yield mass_regressor(model, trajectory.q[start : start + length])
 
     masses = mass_stream if with_mass else None
-    return Problem(stream, model.layout.names, model.n_rows, source.support, masses, (source,))
+    return Problem(stream, model.layout.names, model.n_rows, support, masses, (source,))
 
 
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:

@@ -16,6 +16,7 @@ from robotid._settings import require_each, require_flag, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.findings import listed
+from robotid.robot.constraints import Constraint, Contact, check_constraints
 from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveMotion, DriveTerm
 from robotid.robot.native_messages import caught_messages
 from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
@@ -52,6 +53,7 @@ class RobotModel:
             torque, shape (p,); None: those of the URDF.
         dynamics: "full", or "static" for logs of poses and slow motion: velocities and
             accelerations are used for the sign of friction only.
+        constraints: Contacts with the ground, and loops that close kinematic chains.
     """
 
     tree: Tree
@@ -64,6 +66,7 @@ class RobotModel:
     mimic: str
     reference: Array | None = None
     dynamics: str = "full"
+    constraints: tuple[Constraint, ...] = ()
 
     def __repr__(self) -> str:
         return (
@@ -86,6 +89,7 @@ class RobotModel:
         own_terms: Mapping[str, Sequence[DriveTerm]] = MappingProxyType({}),
         dynamics: str = "full",
         snap_angles: bool = False,
+        constraints: Sequence[Constraint] = (),
     ) -> "RobotModel":
         """Read a robot from a URDF. Meshes are not needed.
 
@@ -105,6 +109,8 @@ class RobotModel:
             dynamics: "full"; or "static" for gravity, with drive terms that act at zero speed.
             snap_angles: Whether rounded angles of joint origins, 3.1416, are replaced by the exact
                 multiple of pi/12; see ``exact_angle``.
+            constraints: Contacts with the ground, and loops that close kinematic chains; their
+                forces are unknown.
 
         Returns:
             The model.
@@ -132,6 +138,7 @@ class RobotModel:
             require_flag(flag, name)
         tree = path if isinstance(path, Tree) else read_tree(path)
         tree = tree.snapped() if snap_angles else tree
+        check_constraints(constraints, tree.links, Path(tree.path).name)
         if mimic not in ("independent", "coupled"):
             raise ModelError(f"mimic is {mimic!r}, wanted 'independent' or 'coupled'")
         if dynamics not in DYNAMICS:
@@ -170,7 +177,10 @@ class RobotModel:
             own={name: tuple(terms) for name, terms in own_terms.items() if terms},
         )
         fixed = MappingProxyType(positions)
-        return cls(tree, reduced, layout, G, shift, free_flyer, fixed, mimic, dynamics=dynamics)
+        return cls(
+            tree, reduced, layout, G, shift, free_flyer, fixed, mimic,
+            dynamics=dynamics, constraints=tuple(constraints),
+        )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "locked": dict(self.locked)}
@@ -199,6 +209,11 @@ class RobotModel:
     def is_static(self) -> bool:
         """Whether only poses at rest and slow motion are used."""
         return self.dynamics == "static"
+
+    @property
+    def contacts(self) -> tuple[str, ...]:
+        """The links that may touch the ground, in the order of the constraints."""
+        return tuple(x.frame for x in self.constraints if isinstance(x, Contact))
 
     @property
     def name(self) -> str:

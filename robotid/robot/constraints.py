@@ -1,0 +1,145 @@
+"""Constraints between frames: contacts with the ground, and joints that close kinematic chains."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._settings import require_each, require_kind
+from robotid._typing import Array
+from robotid.exceptions import ModelError, SettingsError
+from robotid.findings import listed
+
+__all__ = ["Constraint", "Contact", "Loop", "check_constraints", "frame_id"]
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A link that touches the ground at some samples of a log.
+
+    Attributes:
+        frame: The link, whose frame is at the point or on the surface of contact.
+        kind: "point", which transmits a force, or "surface", which also transmits a moment.
+    """
+
+    frame: str
+    kind: str = "point"
+
+    sizes: ClassVar[dict[str, int]] = {"point": 3, "surface": 6}
+
+    def __post_init__(self) -> None:
+        _check_kind(self, f"contact {self.frame!r}")
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The link."""
+        return (self.frame,)
+
+    @property
+    def name(self) -> str:
+        """Name for messages."""
+        return self.frame
+
+    def rows(self, jacobians: Sequence[Array], _rotation: Array) -> Array:
+        """Return the velocity that the contact prevents, per speed of the robot, shape (m, nv).
+
+        Args:
+            jacobians: Jacobian of the frame with the axes of the world, shape (6, nv).
+        """
+        return jacobians[0][: self.sizes[self.kind]]
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Two links that are connected at all samples, which closes a kinematic chain.
+
+    Attributes:
+        frames: The two links, whose frames have their origins at the connection.
+        kind: "point", a ball joint; "hinge", a revolute joint; or "rigid", no relative motion.
+        axis: Axis of the hinge in the frame of the first link, shape (3,).
+    """
+
+    frames: tuple[str, str]
+    kind: str = "hinge"
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    sizes: ClassVar[dict[str, int]] = {"point": 3, "hinge": 5, "rigid": 6}
+
+    def __post_init__(self) -> None:
+        _check_kind(self, f"loop {listed(self.frames)}")
+        if len(self.frames) != 2 or self.frames[0] == self.frames[1]:
+            raise SettingsError(f"loop has the frames {listed(self.frames)}, wanted two links")
+        size = np.linalg.norm(np.asarray(self.axis, dtype=float))
+        if np.shape(self.axis) != (3,) or not 1e-6 < size < np.inf:
+            raise SettingsError(f"axis of loop {listed(self.frames)} is {self.axis}, wanted x, y, z")
+
+    @property
+    def name(self) -> str:
+        """Name for messages."""
+        return " - ".join(self.frames)
+
+    def rows(self, jacobians: Sequence[Array], rotation: Array) -> Array:
+        """Return the relative velocity that the loop prevents, per speed, shape (m, nv).
+
+        Args:
+            jacobians: Jacobians of the two frames with the axes of the world, each (6, nv).
+            rotation: Axes of the first frame in the world, shape (3, 3).
+        """
+        relative = jacobians[0] - jacobians[1]
+        if self.kind != "hinge":
+            return relative[: self.sizes[self.kind]]
+        axis = rotation @ np.asarray(self.axis, dtype=float)
+        across = np.linalg.svd(axis[None])[2][1:]  # (2, 3), perpendicular to the axis
+        return np.vstack([relative[:3], across @ relative[3:]])
+
+
+Constraint = Contact | Loop
+
+
+def _check_kind(constraint: Any, where: str) -> None:  # noqa: ANN401
+    for frame in constraint.frames:
+        require_kind(frame, str, "a frame", "the name of a link")
+    if constraint.kind not in constraint.sizes:
+        raise SettingsError(
+            f"kind of {where} is {constraint.kind!r}, wanted one of {listed(constraint.sizes)}"
+        )
+
+
+def check_constraints(constraints: Sequence[Constraint], links: Sequence[str], file: str) -> None:
+    """Refuse constraints of links that are not in the URDF, or that are stated twice.
+
+    Args:
+        constraints: The constraints.
+        links: Names of the URDF's links.
+        file: Name of the URDF.
+
+    Raises:
+        ModelError: If a link is unknown or repeated.
+    """
+    import difflib
+
+    require_each(constraints, (Contact, Loop), "constraints", "a list of Contact and Loop")
+    for constraint in constraints:
+        for frame in constraint.frames:
+            if frame not in links:
+                near = difflib.get_close_matches(frame, links, n=1)
+                hint = f". Did you mean {near[0]!r}?" if near else ""
+                raise ModelError(
+                    f"contact or loop at {frame!r}, which is not a link of {file}; links: "
+                    f"{listed(links)}{hint}"
+                )
+    stated = [constraint.frames for constraint in constraints]
+    if twice := [x for k, x in enumerate(stated) if x in stated[:k]]:
+        raise ModelError(f"the contact or loop at {listed(twice[0])} is stated twice; remove one")
+
+
+def frame_id(pin_model: pin.Model, link: str) -> int:
+    """Return the number of a link's frame.
+
+    Args:
+        pin_model: The robot.
+        link: Name of the link.
+    """
+    return int(pin_model.getFrameId(link, pin.FrameType.BODY))
