@@ -278,7 +278,10 @@ def build_problem(
             yield mass_regressor(model, trajectory.q[start : start + length])
 
     masses = mass_stream if with_mass else None
-    return Problem(stream, model.layout.names, model.n_rows, support, masses, (source,))
+    return Problem(
+        stream, model.layout.names, model.n_rows, support, masses, (source,),
+        is_projected=trajectory.basis is not None,
+    )  # fmt: skip
 
 
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
