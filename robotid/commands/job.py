@@ -24,6 +24,7 @@ from robotid.logs.read import LogLayout, lay_out, read_log
 from robotid.logs.settings import BaseSource, LogSource, LogUnits, SignalSettings
 from robotid.logs.table import Table
 from robotid.logs.transmission import Transmission, check_transmissions
+from robotid.regressor.constraints import logged_base
 from robotid.robot.constraints import Contact
 from robotid.robot.drives import DRIVE_TERMS, FAMILIES, TERMS, DriveTerm
 from robotid.robot.families import AUTO, term_from_dict
@@ -107,6 +108,12 @@ def _dump_couplings(couplings: Sequence[Coupling]) -> list[dict[str, Any]]:
         | ({"replaces": True} if coupling.replaces else {})
         for coupling in couplings
     ]
+
+
+def _load_contacts(tables: Sequence[Mapping[str, Any]]) -> tuple[Contact, ...]:
+    return tuple(
+        Contact(**{**table, "measured": tuple(table.get("measured", ()))}) for table in tables
+    )
 
 
 def _motors(gear: Transmission) -> list[Coupling]:
@@ -196,12 +203,21 @@ class Job(Settings):
     base: BaseSource = setting(BaseSource(), "motion of a floating base in the logs")
     contacts: tuple[Contact, ...] = setting(
         (),
-        "links that may touch the ground, with kind point or surface; logs have contact_<link>, 1 "
-        "or 0. The contact forces are unknown",
+        "links that may touch the ground: frame, the link; kind, point or surface; measured, "
+        "components of the wrench that logs have as wrench_fz_<link>, of fx to mz, the others are "
+        "unknown; always, whether it always touches the ground, else logs have contact_<link>, 1 "
+        "or 0",
         at="contact",
-        reads=[{"frame": (str,), "kind": (str,)}],
-        load=lambda tables: tuple(Contact(**table) for table in tables),
-        dump=lambda contacts: [asdict(contact) for contact in contacts],
+        reads=[
+            {
+                "frame": (str,),
+                "kind": (str,),
+                "measured": Entries(list, (str,)),
+                "always": (bool,),
+            }
+        ],
+        load=_load_contacts,
+        dump=lambda contacts: [asdict(x) | {"measured": list(x.measured)} for x in contacts],
     )
     estimator: EstimatorSettings = setting(ConsistentSettings(), "estimator and its settings")
     controller: LoopSettings = setting(
@@ -344,9 +360,7 @@ class Job(Settings):
             "units": self.units,
             "prismatic": tuple(model.layout.prismatic),
             "source": self.source,
-            "floats": model.free_flyer,
-            "contacts": model.contacts,
-            "base": self.base,
+            "base": logged_base(model, self.base.twist),
             "transmissions": [gear.stated(model.tree.reductions) for gear in self.transmissions],
         }
 

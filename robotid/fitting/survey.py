@@ -29,7 +29,7 @@ from robotid.logs.time_stamps import blocks_of, map_stamps, median_step
 from robotid.logs.units import check_reach, check_units
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import friction_speeds
-from robotid.regressor.constraints import constrained
+from robotid.regressor.constraints import constrained, logged_base
 from robotid.regressor.factors import Reduction
 from robotid.regressor.memory import is_loaded, remember
 from robotid.regressor.rows import COMPILED, choose_engine
@@ -154,7 +154,9 @@ class LogPiece:
                 speeds=friction_speeds(header.model.layout),
             )
             mask = row_mask(header.model, trajectory, header.signals.min_velocity)
-            trajectory, mask = constrained(header.model, trajectory, mask)
+            trajectory, mask = constrained(
+                header.model, trajectory, mask, has_torque=log.has_torque
+            )
         trajectory = remember(header.model, trajectory)
         return Rows(raw.q[rows], raw.tau[rows], trajectory, mask, (log.q != raw.q).any(axis=0))
 
@@ -348,16 +350,19 @@ class SurveyedLog:
 
 def _check_base(model: RobotModel, log: Log) -> None:
     """Refuse a log without the motion of a floating base, or without a contact of the model."""
-    if model.free_flyer and log.base is None:
+    wanted = logged_base(model)
+    if wanted.floats and log.base is None:
         raise DataError(
-            f"{log.name} has no pose of the floating base; read it with floats=True, or pass "
-            "Log(..., base=BaseMotion(pose))"
+            f"{log.name} has no pose of the floating base; read it with "
+            "base=BaseColumns(floats=True), or pass Log(..., base=BaseMotion(pose))"
         )
-    if tuple(log.contacts) != model.contacts:
-        raise DataError(
-            f"{log.name} has the contacts {listed(tuple(log.contacts))}, wanted those of the "
-            f"model, {listed(model.contacts)}, in this order; pass Log(..., contacts={{...}})"
-        )
+    for kind in ("contacts", "wrenches"):
+        found, names = tuple(getattr(log, kind)), getattr(wanted, kind)
+        if found != names:
+            raise DataError(
+                f"{log.name} has the {kind} {listed(found)}, wanted those of the model, "
+                f"{listed(names)}, in this order; pass Log(..., {kind}={{...}})"
+            )
 
 
 def hold_log(

@@ -212,6 +212,7 @@ def judge(
     ]
     notes = [
         *determined.notes(),
+        *predictions.of_base(),
         *([scale_check.message] if scale_check is not None and not is_contradicted else []),
         *([f"{listed(hidden)}: {_HIDDEN}: not evaluated"] if hidden else []),
         *([_STATIC] if determined.is_static else []),

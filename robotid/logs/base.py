@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
-from robotid.logs.settings import BaseSource
 
 __all__ = [
     "POSE",
+    "BaseColumns",
     "BaseMotion",
     "base_columns",
     "base_of",
@@ -20,6 +20,7 @@ __all__ = [
     "contacts_of",
     "in_base",
     "quaternions_of_angles",
+    "table_of_base",
 ]
 
 #: Names of the coordinates of a pose: position [m], and the orientation as a quaternion.
@@ -78,22 +79,44 @@ class BaseMotion:
         return replace(self, **parts)
 
 
+@dataclass(frozen=True)
+class BaseColumns:
+    """The columns of a floating base and of contacts that are read from a file.
+
+    Attributes:
+        floats: Whether the motion of a floating base is read: ``base_x`` to ``base_z`` [m] and
+            ``base_qx`` to ``base_qw``, or ``base_roll``, ``base_pitch``, ``base_yaw`` [rad]; also
+            velocities ``base_vx`` to ``base_wz`` and accelerations ``base_ax`` to ``base_alz``, if
+            they are there.
+        contacts: Links whose contacts are read from ``contact_<link>``, 1 or 0.
+        wrenches: Components of wrenches, as "fz l_sole" from ``wrench_fz_l_sole``. With these, a
+            log need not have torques.
+        twist: Axes of the velocities: "base" or "world".
+    """
+
+    floats: bool = False
+    contacts: tuple[str, ...] = ()
+    wrenches: tuple[str, ...] = ()
+    twist: str = "base"
+
+
 def base_columns(
-    where: str, names: Sequence[str], contacts: Sequence[str], *, floats: bool
+    where: str, names: Sequence[str], wanted: BaseColumns, columns: Mapping[str, str]
 ) -> dict[str, list[str]]:
     """Return the columns of a floating base and of contacts in a file, by kind.
 
     Args:
         where: Name of the file.
         names: Names of its columns.
-        contacts: Links that may touch the ground.
-        floats: Whether the base floats.
+        wanted: Which are read.
+        columns: Names in the file by standard name, if they differ.
 
     Raises:
         DataError: If the pose of a floating base, or a contact, is missing.
     """
     found: dict[str, list[str]] = {}
-    if floats:
+    names = [*names, *columns]
+    if wanted.floats:
         forms = {"pose": POSE, "angles": _ANGLES, "twist": _TWIST, "acceleration": _ACCELERATION}
         whole = {kind: [f"base_{end}" for end in ends] for kind, ends in forms.items()}
         found = {k: own for k, own in whole.items() if set(own) <= set(names)}
@@ -109,25 +132,35 @@ def base_columns(
                 "base_yaw [rad]",
                 code="missing_column",
             )
-    if contacts:
-        found["contact"] = [f"contact_{link}" for link in contacts]
-        if missing := [name for name in found["contact"] if name not in names]:
-            seen = [name for name in names if name.startswith("contact_")]
+    found["contact"] = [f"contact_{link}" for link in wanted.contacts]
+    found["wrench"] = [f"wrench_{name.replace(' ', '_', 1)}" for name in wanted.wrenches]
+    remedies = {
+        "contact": "Record 1 while the link touches the ground, 0 otherwise; or state always = "
+        "true in [[contact]]",
+        "wrench": "Name the column in [columns], or remove the component from measured in "
+        "[[contact]]",
+    }
+    for kind, remedy in remedies.items():
+        if missing := [name for name in found[kind] if name not in names]:
+            seen = [name for name in names if name.startswith(f"{kind}_")]
             raise DataError(
-                f"{where} has no column {listed(missing)}; columns of contacts found: "
-                f"{listed(seen)}. Record 1 while the link touches the ground, 0 otherwise, or "
-                "remove the [[contact]]",
+                f"{where} has no column {listed(missing)}; columns of that kind found: "
+                f"{listed(seen)}. {remedy}",
                 code="missing_column",
             )
-    return {f"base {kind}" if kind != "contact" else kind: own for kind, own in found.items()}
+    return {
+        kind if kind in remedies else f"base {kind}": [columns.get(name, name) for name in own]
+        for kind, own in found.items()
+        if own
+    }
 
 
-def base_of(values: Mapping[str, Array], source: BaseSource) -> BaseMotion | None:
+def base_of(values: Mapping[str, Array], twist: str) -> BaseMotion | None:
     """Return the motion of the base from its columns, None without these.
 
     Args:
         values: Columns by kind, as of ``base_columns``, each of shape (N, k).
-        source: The axes of the twist.
+        twist: Axes of the velocities: "base" or "world".
 
     Raises:
         DataError: If a value is not finite, or a quaternion is not of length 1.
@@ -138,7 +171,7 @@ def base_of(values: Mapping[str, Array], source: BaseSource) -> BaseMotion | Non
     if pose is None:
         return None
     base = BaseMotion(pose, values.get("base twist"), values.get("base acceleration"))
-    if source.twist == "base" or base.twist is None:
+    if twist == "base" or base.twist is None:
         return base
     quaternion = base.pose[:, 3:]
     parts = [in_base(quaternion, part) for part in (base.twist[:, :3], base.twist[:, 3:])]
@@ -165,6 +198,26 @@ def contacts_of(values: Array, links: Sequence[str], where: str) -> dict[str, Ar
     return {link: flags == 1.0 for link, flags in zip(links, values.T, strict=True)}
 
 
+def table_of_base(
+    base: BaseMotion | None, contacts: Mapping[str, Array], wrenches: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Return the columns of a log with the motion of a base, contacts and wrenches, by name.
+
+    Args:
+        base: The motion, or None.
+        contacts: As of ``Log.contacts``.
+        wrenches: As of ``Log.wrenches``.
+    """
+    table: dict[str, Array] = {}
+    forms = {"pose": POSE, "twist": _TWIST, "acceleration": _ACCELERATION}
+    for kind, ends in forms.items():
+        values = getattr(base, kind, None)
+        if values is not None:
+            table |= {f"base_{end}": values[:, k] for k, end in enumerate(ends)}
+    table |= {f"contact_{link}": flags.astype(float) for link, flags in contacts.items()}
+    return table | {f"wrench_{x.replace(' ', '_', 1)}": values for x, values in wrenches.items()}
+
+
 def base_state(
     t: Array, pose: Array, twist: Array | None, acceleration: Array | None
 ) -> tuple[Array, Array, Array]:
@@ -184,9 +237,7 @@ def base_state(
     if twist is None:
         rate = np.gradient(pose, t, axis=0)
         vector, scalar = quaternion[:, :3], quaternion[:, 3:]
-        w = 2.0 * (
-            scalar * rate[:, 3:6] - rate[:, 6:] * vector - np.cross(vector, rate[:, 3:6])
-        )
+        w = 2.0 * (scalar * rate[:, 3:6] - rate[:, 6:] * vector - np.cross(vector, rate[:, 3:6]))
         twist = np.hstack([in_base(quaternion, rate[:, :3]), w])
     if acceleration is None:
         acceleration = np.gradient(twist, t, axis=0)

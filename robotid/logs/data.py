@@ -37,7 +37,8 @@ _SHORTEST = 1e-12  # [s] smallest mean time step
 _REQUIRED = ("q", "tau")
 _NO_TORQUE = "; without torques, pass zeros and has_torque=False"
 _BY_SAMPLE = (
-    "t", "q", "v", "a", "tau", "segment", "direction", "memory", "contacts", "switching", "basis",
+    "t", "q", "v", "a", "tau", "segment", "direction", "memory", "contacts",
+    "wrenches", "switching", "basis",
 )  # fmt: skip
 _LARGEST = 1e30  # in any unit, so that squares and products are finite
 
@@ -61,6 +62,8 @@ class Log:
         has_torque: Whether torques were recorded.
         base: Motion of the base of a robot whose base floats, or None.
         contacts: Whether links touch the ground, by link, each of shape (N,), bool.
+        wrenches: Measured components of the wrenches of the ground, by name as "fz l_sole", each of
+            shape (N,) [N or N m].
     """
 
     t: Array
@@ -77,6 +80,7 @@ class Log:
     has_torque: bool = True
     base: BaseMotion | None = None
     contacts: Mapping[str, Array] = field(default_factory=dict)
+    wrenches: Mapping[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_kind(self.path, (str, Path), "path", "the path of the log's file, or ''")
@@ -98,13 +102,16 @@ class Log:
                 f"{where}: the pose of the base has {len(self.base.pose)} rows, wanted "
                 f"{len(self.t)}, one for each time stamp"
             )
-        contacts = {link: _frozen(x, np.bool_) for link, x in self.contacts.items()}
-        for link, flags in contacts.items():
-            if flags.shape != self.t.shape:
-                raise DataError(
-                    f"{where}: contact {link!r} has shape {flags.shape}, wanted {self.t.shape}"
-                )
-        object.__setattr__(self, "contacts", contacts)
+        for kind, dtype in (("contacts", np.bool_), ("wrenches", np.float64)):
+            own = {name: _frozen(x, dtype) for name, x in getattr(self, kind).items()}
+            for name, values in own.items():
+                if values.shape != self.t.shape:
+                    raise DataError(
+                        f"{where}: {name!r} of {kind} has shape {values.shape}, wanted "
+                        f"{self.t.shape}"
+                    )
+                require_finite(values[:, None], self.t, [f"{kind} {name}"], where)
+            object.__setattr__(self, kind, own)
 
     @property
     def name(self) -> str:
@@ -142,6 +149,7 @@ class Log:
             t=self.t[within],
             base=None if self.base is None else self.base.at(within),
             contacts={link: flags[within] for link, flags in self.contacts.items()},
+            wrenches={name: values[within] for name, values in self.wrenches.items()},
             **{k: x[within] for k, x in self._arrays().items()},
         )
 
@@ -198,6 +206,7 @@ class Trajectory:
         memory: Regressor columns of drive parameters that depend on internal states, shape (N, m),
             in the order of ``ParameterLayout.remembering``; None if there are none.
         contacts: Which contacts touch the ground, shape (N, k), bool; None without contacts.
+        wrenches: Measured components of wrenches, shape (N, m) [N or N m]; None without any.
         switching: Samples at which a contact changes, shape (N,), bool; None without contacts.
         basis: Basis of the torques of constraint forces, shape (N, n_rows, m), as of
             ``force_basis``; None without constraints.
@@ -214,6 +223,7 @@ class Trajectory:
     direction: Array | None = None
     memory: Array | None = None
     contacts: Array | None = None
+    wrenches: Array | None = None
     switching: Array | None = None
     basis: Array | None = None
 

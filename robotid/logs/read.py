@@ -7,7 +7,7 @@ columns of the motors are read instead, as `qm_<motor>` and `taum_<motor>` [N m]
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, get_args
@@ -19,7 +19,7 @@ from robotid._settings import require_each, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
-from robotid.logs.base import base_columns, base_of, contacts_of
+from robotid.logs.base import BaseColumns, base_columns, base_of, contacts_of, table_of_base
 from robotid.logs.columns import NOUNS, TORQUES, Finder, Needs, without_torque
 from robotid.logs.data import (
     COLUMNS,
@@ -29,7 +29,7 @@ from robotid.logs.data import (
 )
 from robotid.logs.foreign_tables import Frame, is_frame, open_frame, with_own_names
 from robotid.logs.formats import open_table, write_columns
-from robotid.logs.settings import PER_SECOND, BaseSource, LogSource, LogUnits
+from robotid.logs.settings import PER_SECOND, LogSource, LogUnits
 from robotid.logs.table import Table
 from robotid.logs.transmission import Transmission, check_transmissions
 from robotid.logs.units import check_units
@@ -42,7 +42,7 @@ Readable = Log | str | Path | Frame
 
 _SI = LogUnits()
 _WHOLE = LogSource()
-_BASE = BaseSource()
+_BASE = BaseColumns()
 
 
 def read_log(
@@ -58,9 +58,7 @@ def read_log(
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
     needs: Needs = "torque",
-    floats: bool = False,
-    contacts: Sequence[str] = (),
-    base: BaseSource = _BASE,
+    base: BaseColumns = _BASE,
 ) -> Log:
     """Return the log in a file or a DataFrame, in SI units; its notes list ignored columns.
 
@@ -79,9 +77,7 @@ def read_log(
         source: The topic of a bag or group of a file, names of joints in it, quantity of effort.
         transmissions: The motors and gears, if the file has columns of motors.
         needs: Quantities that are required besides positions, as of ``lay_out``.
-        floats: As of ``lay_out``.
-        contacts: As of ``lay_out``.
-        base: As of ``lay_out``.
+        base: Columns of a floating base and of contacts; none if not stated.
 
     Raises:
         DataError: If a required column is missing, or the values look like other units.
@@ -90,8 +86,7 @@ def read_log(
     """
     layout, table = lay_out(
         path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
-        source=source, transmissions=transmissions, needs=needs, floats=floats,
-        contacts=contacts, base=base,
+        source=source, transmissions=transmissions, needs=needs, base=base,
     )  # fmt: skip
     log = layout.to_log(table.read(layout.wanted))
     check_units(log, units, prismatic)
@@ -104,6 +99,7 @@ def read_logs(
     *,
     prismatic: Collection[str] = (),
     needs: Needs = "torque",
+    base: BaseColumns = _BASE,
 ) -> tuple[Log, ...]:
     """Return the logs of a user, one or several; files and DataFrames are read.
 
@@ -112,6 +108,7 @@ def read_logs(
         joints: Names of the required joints, in the required order.
         prismatic: Names of prismatic joints; the others are revolute.
         needs: Quantities that are required besides positions, as of ``lay_out``.
+        base: As of ``read_log``.
 
     Raises:
         DataError: If it is no log, or a required quantity is missing.
@@ -124,9 +121,9 @@ def read_logs(
     else:
         raise _no_log(given)
     return tuple(
-        _of_joints(log, joints, needs)
+        _of_joints(log, joints, "motion" if log.wrenches else needs)
         if isinstance(log, Log)
-        else read_log(log, joints, prismatic=prismatic, needs=needs)
+        else read_log(log, joints, prismatic=prismatic, needs=needs, base=base)
         for log in logs
     )
 
@@ -182,8 +179,7 @@ class LogLayout:
     motors: Mapping[str, tuple[bool, ...]]  # by kind: which columns are of motors
     gears: tuple[Transmission, ...]  # of the motors
     has_torque: bool  # whether the file has a torque or a current of any of the joints
-    contacts: tuple[str, ...] = ()  # links whose contacts are read
-    base: BaseSource = _BASE  # axes of the velocities of a floating base
+    base: BaseColumns = _BASE  # of a floating base and of contacts
 
     @property
     def wanted(self) -> list[str]:
@@ -223,8 +219,10 @@ class LogLayout:
                 values[kind] = values[kind] * np.where(is_length, 1.0, np.pi / 180)
             values[kind] = self._of_joints(kind, values[kind])
         t, where = self.stamps(values["time"][:, 0]), Path(self.path).name or "log"
-        base, flags = base_of(values, self.base), values.pop("contact", None)
-        contacts = {} if flags is None else contacts_of(flags, self.contacts, where)
+        base, flags = base_of(values, self.base.twist), values.pop("contact", None)
+        contacts = {} if flags is None else contacts_of(flags, self.base.contacts, where)
+        forces = values.pop("wrench", np.empty((0, 0)))
+        wrenches = dict(zip(self.base.wrenches, forces.T, strict=True))
         values = {kind: array for kind, array in values.items() if not kind.startswith("base ")}
         for kind, array in values.items():
             names = ["time"] if kind == "time" else [f"{kind}_{joint}" for joint in self.joints]
@@ -237,7 +235,7 @@ class LogLayout:
         arrays = {name: values[kind] for kind, name in COLUMNS.items() if kind in values}
         return Log(
             t=t, joints=self.joints, path=self.path, notes=self.notes, has_torque=has_torque,
-            base=base, contacts=contacts, **arrays,
+            base=base, contacts=contacts, wrenches=wrenches, **arrays,
         )  # fmt: skip
 
     def _of_joints(self, kind: str, values: Array) -> Array:
@@ -268,9 +266,7 @@ def lay_out(
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
     needs: Needs = "torque",
-    floats: bool = False,
-    contacts: Sequence[str] = (),
-    base: BaseSource = _BASE,
+    base: BaseColumns = _BASE,
 ) -> tuple[LogLayout, Table]:
     """Return the layout of a log in a file, before its columns are read, and its open table.
 
@@ -287,6 +283,7 @@ def lay_out(
             "motion", none; "commands", a commanded position of every joint, and torques and other
             commands if every joint has them; "any", torques or commands, and both if every joint
             has them. Other quantities are ignored; torques that are not read are 0.
+        base: As of ``read_log``.
 
     Raises:
         DataError: If a required column is missing.
@@ -323,12 +320,15 @@ def lay_out(
     check_transmissions(transmissions, joints)
     gears = tuple(transmissions)
     stated = {key: opened.renamed.get(name, name) for key, name in (columns or {}).items()}
+    of_base = base_columns(where, opened.names, base, stated)
+    of_joints = {x: y for x, y in stated.items() if y not in chain.from_iterable(of_base.values())}
     finder = Finder(
-        where, opened.names, stated, tuple(joints), gains or {}, source, gears, needs,
+        where, opened.names, of_joints, tuple(joints), gains or {}, source, gears, needs,
         [*opened.notes],
     )  # fmt: skip
-    of_base = base_columns(where, opened.names, contacts, floats=floats)
     finder.seen.update(chain.from_iterable(of_base.values()))
+    if base.wrenches and needs == "torque" and not any(map(finder.has_torque, joints)):
+        finder = replace(finder, needs="motion")
     found = finder.find_all() | of_base  # names of columns by kind
     layout = LogLayout(
         path=str(Path(path)) if isinstance(path, str | Path) else "",
@@ -342,7 +342,6 @@ def lay_out(
         motors={kind: finder.of_motors(kind) for kind in NOUNS},
         gears=gears,
         has_torque=any(finder.has_torque(joint) for joint in joints),
-        contacts=tuple(contacts),
         base=base,
     )
     return layout, opened
@@ -369,4 +368,5 @@ def write_log(log: Log, path: str | Path) -> None:
         values = getattr(log, name)
         if values is not None and (kind != "tau" or log.has_torque):
             table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
+    table |= table_of_base(log.base, log.contacts, log.wrenches)
     write_columns(table, Path(path))

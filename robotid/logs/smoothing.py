@@ -25,7 +25,6 @@ _SETTLED = 42.0  # [time constants] after which a filter's transient is negligib
 _LONGEST = 8.0  # [periods of the filter] longest time of stiction
 _FINEST = 1000  # largest number of points of the uniform grid per row of the log
 _ALL = slice(None)
-_BASE = ("pose", "twist", "base acceleration")  # channels of a floating base
 
 
 @dataclass(frozen=True)
@@ -81,16 +80,22 @@ def process_segments(
         part = _process_part(log, rows, segment, settings, first, own, ratios)
         counts.append(0 if part is None else len(part[0]))
         parts += [] if part is None else [part]
-    rows = np.empty((0, base + n))
+    empty = np.empty((0, base + n))
     q0 = np.empty((0, n + (base and 7)))
-    nothing = (np.empty(0), q0, rows, rows, rows, np.empty((0, len(ratios))))
-    t, q, v, a, tau, direction = (np.concatenate(x) for x in zip(nothing, *parts, strict=True))
+    nothing = (
+        np.empty(0), q0, empty, empty, empty, np.empty((0, len(ratios))),
+        np.empty((0, len(log.wrenches))),
+    )  # fmt: skip
+    t, q, v, a, tau, direction, wrenches = (
+        np.concatenate(x) for x in zip(nothing, *parts, strict=True)
+    )
     contacts = _contacts(log, t, settings) if log.contacts else (None, None)
     return Trajectory(
         t=t, q=q, v=v, a=a, tau=tau, joints=log.joints, rate=settings.rate,
         segment=np.repeat([segment.number for segment in segments], counts),
         direction=direction if len(ratios) else None,
         contacts=contacts[0], switching=contacts[1],
+        wrenches=wrenches if log.wrenches else None,
     )  # fmt: skip
 
 
@@ -154,8 +159,8 @@ def _process_part(
     first: int,
     own: slice,
     speeds: Array,
-) -> tuple[Array, Array, Array, Array, Array, Array] | None:
-    """Return t, q, v, a, tau and direction of the own rows, None if there are none."""
+) -> tuple[Array, Array, Array, Array, Array, Array, Array] | None:
+    """Return t, q, v, a, tau, direction and wrenches of the own rows, None if there are none."""
     t = log.t[rows]
     if segment.rows < 5 or segment.end - segment.start <= 2 * settings.trim:
         return None
@@ -172,6 +177,7 @@ def _process_part(
         channels["a"] = log.a
     if log.base is not None:
         channels |= _base_channels(log.base, settings)
+    channels["wrenches"] = np.array([*log.wrenches.values()]).reshape(-1, len(log.t)).T
     delay = {"tau": settings.torque_delay, "v": settings.velocity_delay}
     smooth = {
         name: low_pass(_resample(t - delay.get(name, 0.0), x[rows], times), grid.rate, settings)
@@ -193,10 +199,12 @@ def _process_part(
         return None
     q, tau = smooth["q"], smooth["tau"]
     if log.base is not None:
-        state = base_state(times, *(smooth.get(name) for name in _BASE))
+        measured = smooth.get("twist"), smooth.get("base acceleration")
+        state = base_state(times, smooth["pose"], *measured)
         q, v, a = (np.hstack(pair) for pair in zip(state, (q, v, a), strict=True))
         tau = np.hstack([np.zeros((len(tau), 6)), tau])  # no torque acts on the base
-    return times[chosen], q[chosen], v[chosen], a[chosen], tau[chosen], direction[chosen]
+    arrays = times, q, v, a, tau, direction, smooth["wrenches"]
+    return tuple(x[chosen] for x in arrays)  # type: ignore[return-value]
 
 
 def _base_channels(base: BaseMotion, settings: SignalSettings) -> dict[str, Array]:

@@ -1,8 +1,9 @@
 """Elimination of unknown constraint forces: contacts with the ground and closed chains.
 
-With the Jacobian J of the constraints, W pi = tau + J^T f with unknown forces f. The rows are
-projected orthogonally to the columns of J^T, P W pi = P tau with P = I - B B^T and B an orthonormal
-basis of these columns: the force disappears, as many equations as it has components are lost.
+With the Jacobian J of the constraints, W pi = tau + J^T f with the forces f. The rows are
+projected orthogonally to the columns of J^T of unknown forces, P W pi = P tau with P = I - B B^T
+and B an orthonormal basis of these columns. The forces disappear, and as many equations as they
+have components. A force of 1 N counts as much as a torque of 1 N m.
 """
 
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
+from robotid.logs.base import BaseColumns
 from robotid.logs.data import Trajectory
 from robotid.regressor.problem import RowSource
 from robotid.robot.constraints import Contact, frame_id
@@ -23,6 +25,7 @@ __all__ = [
     "constrained",
     "constraint_jacobian",
     "force_basis",
+    "logged_base",
     "without_forces",
 ]
 
@@ -58,26 +61,23 @@ def constraint_jacobian(model: RobotModel, q: Array, contacts: Array) -> Array:
     return J
 
 
-def force_basis(model: RobotModel, q: Array, contacts: Array, used: Array) -> Array:
-    """Return orthonormal bases of the torques that constraint forces can cause.
+def force_basis(J: Array, used: Array) -> Array:
+    """Return orthonormal bases of the torques that unknown constraint forces can cause.
 
     Args:
-        model: The robot.
-        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
-        contacts: As of ``constraint_jacobian``.
+        J: Jacobians of the constraints, shape (N, m, n_rows).
         used: Rows used, shape (N, n_rows), bool: the torques are those in these rows.
 
     Returns:
-        B with columns of length 1 or 0, shape (N, n_rows, m).
+        B with columns of length 1 or 0, shape (N, n_rows, k), k the smaller of m and n_rows.
     """
+    A = J.swapaxes(1, 2) * used[:, :, None]
     parts = []
-    for start in range(0, len(q), _BLOCK):
-        k = slice(start, start + _BLOCK)
-        A = constraint_jacobian(model, q[k], contacts[k]).swapaxes(1, 2) * used[k, :, None]
-        U, s, _ = np.linalg.svd(A, full_matrices=False)
-        is_independent = s > _RANK * s.max(axis=1, keepdims=True, initial=0.0)
+    for start in range(0, len(A), _BLOCK):
+        U, s, _ = np.linalg.svd(A[start : start + _BLOCK], full_matrices=False)
+        is_independent = s > _RANK * s.max(axis=1, keepdims=True, initial=1e-300)
         parts.append(U * is_independent[:, None])
-    return np.concatenate(parts)
+    return np.concatenate(parts) if parts else A
 
 
 def without_forces(basis: Array, rows: Array) -> Array:
@@ -120,8 +120,8 @@ class ProjectedRows(RowSource):
 
     @cached_property
     def columns(self) -> tuple[Array, ...]:
-        every = np.unique(np.concatenate(self.own.columns))
-        return (every,) * self.weights.shape[1]
+        every: Array = np.unique(np.concatenate(self.own.columns))
+        return tuple([every] * self.weights.shape[1])
 
     def rows(self, start: int, stop: int) -> Array:
         k = slice(start, stop)
@@ -145,22 +145,57 @@ class ProjectedRows(RowSource):
 
 
 def constrained(
-    model: RobotModel, motion: Trajectory, used: Array
+    model: RobotModel, motion: Trajectory, used: Array, *, has_torque: bool = True
 ) -> tuple[Trajectory, Array]:
     """Return a motion with torques without those of constraint forces, and the rows used.
 
-    Rows in which nothing remains, and samples at which a contact changes, are not used.
+    Torques of measured forces are subtracted, those of unknown forces are eliminated. Rows in which
+    nothing remains, and samples at which a contact changes, are not used.
 
     Args:
         model: The robot.
-        motion: Its motion, with contacts.
+        motion: Its motion, with contacts and wrenches.
         used: Rows used for other reasons, shape (N, n_rows), bool.
+        has_torque: Whether torques of the joints were measured; else their rows are not used.
     """
+    if not has_torque:
+        used = used & (np.arange(model.n_rows) < model.n_rows - len(model.joints))
     if not model.constraints:
         return motion, used
-    contacts = np.zeros((len(motion.t), 0), dtype=bool)
-    if motion.contacts is not None:
-        contacts, used = motion.contacts, used & ~motion.switching[:, None]
-    basis = force_basis(model, motion.q, contacts, used)
+    N = len(motion.t)
+    contacts = np.ones((N, len(model.contacts)), dtype=bool)
+    if motion.contacts is not None and motion.switching is not None:
+        contacts[:, [not x.always for x in model.contacts]] = motion.contacts
+        used = used & ~motion.switching[:, None]
+    J = constraint_jacobian(model, motion.q, contacts)
+    known, tau = _measured(model), motion.tau
+    if motion.wrenches is not None:
+        tau = tau + np.einsum("kmj,km->kj", J[:, known], motion.wrenches)
+    basis = force_basis(np.delete(J, known, axis=1), used)
     used = used & (np.sum(basis**2, axis=2) < 1.0 - _RANK)
-    return motion.projected(basis, without_forces(basis, motion.tau)), used
+    return motion.projected(basis, without_forces(basis, tau)), used
+
+
+def logged_base(model: RobotModel, twist: str = "base") -> BaseColumns:
+    """Return the columns of a floating base and of contacts that logs of a robot have.
+
+    Args:
+        model: The robot.
+        twist: Axes of the velocities of the base: "base" or "world".
+    """
+    return BaseColumns(
+        model.free_flyer,
+        tuple(x.frame for x in model.contacts if not x.always),
+        tuple(f"{part} {x.frame}" for x in model.contacts for part in x.measured),
+        twist,
+    )
+
+
+def _measured(model: RobotModel) -> list[int]:
+    """Return the rows of the Jacobian whose forces are measured."""
+    rows, first = [], 0
+    for x in model.constraints:
+        if isinstance(x, Contact):
+            rows += [first + k for k in x.rows_measured]
+        first += x.sizes[x.kind]
+    return rows

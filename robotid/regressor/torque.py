@@ -253,8 +253,9 @@ def build_problem(
     Raises:
         DataError: If joints or shapes are not those of the model.
     """
-    source: RowSource = trajectory_rows(model, trajectory, weight, compiled)
-    weights, support = source.weights, source.support
+    own = trajectory_rows(model, trajectory, weight, compiled)
+    source: RowSource = own
+    weights, support = own.weights, own.support
     if trajectory.basis is not None:
         own = trajectory_rows(model, trajectory, None, compiled)
         source = ProjectedRows(own, trajectory.basis, weights)

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pinocchio as pin
 
-from robotid._settings import require_each, require_kind
+from robotid._settings import require_each, require_flag, require_kind
 from robotid._typing import Array
 from robotid.exceptions import ModelError, SettingsError
 from robotid.findings import listed
@@ -17,20 +17,40 @@ __all__ = ["Constraint", "Contact", "Loop", "check_constraints", "frame_id"]
 
 @dataclass(frozen=True)
 class Contact:
-    """A link that touches the ground at some samples of a log.
+    """A link that touches the ground.
 
     Attributes:
         frame: The link, whose frame is at the point or on the surface of contact.
         kind: "point", which transmits a force, or "surface", which also transmits a moment.
+        measured: Components of the wrench of the ground on the link that are measured, of fx, fy,
+            fz, mx, my, mz with the axes of the world and the origin of the link. The others are
+            unknown.
+        always: Whether it touches the ground at all samples; else logs state when.
     """
 
     frame: str
     kind: str = "point"
+    measured: tuple[str, ...] = ()
+    always: bool = False
 
     sizes: ClassVar[dict[str, int]] = {"point": 3, "surface": 6}
+    components: ClassVar[tuple[str, ...]] = ("fx", "fy", "fz", "mx", "my", "mz")
 
     def __post_init__(self) -> None:
         _check_kind(self, f"contact {self.frame!r}")
+        known = self.components[: self.sizes[self.kind]]
+        for component in require_each(self.measured, str, "measured", f"a list of {listed(known)}"):
+            if component not in known or self.measured.count(component) > 1:
+                raise SettingsError(
+                    f"measured of the {self.kind} contact {self.frame!r} has {component!r}, wanted "
+                    f"some of {listed(known)}, each once"
+                )
+        require_flag(self.always, "always")
+
+    @property
+    def rows_measured(self) -> list[int]:
+        """Indices of the measured components."""
+        return [self.components.index(component) for component in self.measured]
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -73,7 +93,9 @@ class Loop:
             raise SettingsError(f"loop has the frames {listed(self.frames)}, wanted two links")
         size = np.linalg.norm(np.asarray(self.axis, dtype=float))
         if np.shape(self.axis) != (3,) or not 1e-6 < size < np.inf:
-            raise SettingsError(f"axis of loop {listed(self.frames)} is {self.axis}, wanted x, y, z")
+            raise SettingsError(
+                f"axis of loop {listed(self.frames)} is {self.axis}, wanted x, y, z"
+            )
 
     @property
     def name(self) -> str:

@@ -211,9 +211,9 @@ class RobotModel:
         return self.dynamics == "static"
 
     @property
-    def contacts(self) -> tuple[str, ...]:
-        """The links that may touch the ground, in the order of the constraints."""
-        return tuple(x.frame for x in self.constraints if isinstance(x, Contact))
+    def contacts(self) -> tuple[Contact, ...]:
+        """The contacts with the ground, in the order of the constraints."""
+        return tuple(x for x in self.constraints if isinstance(x, Contact))
 
     @property
     def name(self) -> str:
