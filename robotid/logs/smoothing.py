@@ -177,7 +177,8 @@ def _process_part(
         channels["a"] = log.a
     if log.base is not None:
         channels |= _base_channels(log.base, settings)
-    channels["wrenches"] = np.array([*log.wrenches.values()]).reshape(-1, len(log.t)).T
+    if log.wrenches:
+        channels["wrenches"] = np.column_stack([*log.wrenches.values()])
     delay = {"tau": settings.torque_delay, "v": settings.velocity_delay}
     smooth = {
         name: low_pass(_resample(t - delay.get(name, 0.0), x[rows], times), grid.rate, settings)
@@ -203,7 +204,8 @@ def _process_part(
         state = base_state(times, smooth["pose"], *measured)
         q, v, a = (np.hstack(pair) for pair in zip(state, (q, v, a), strict=True))
         tau = np.hstack([np.zeros((len(tau), 6)), tau])  # no torque acts on the base
-    arrays = times, q, v, a, tau, direction, smooth["wrenches"]
+    wrenches = smooth.get("wrenches", np.empty((len(times), 0)))
+    arrays = times, q, v, a, tau, direction, wrenches
     return tuple(x[chosen] for x in arrays)  # type: ignore[return-value]
 
 
