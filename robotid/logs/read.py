@@ -327,7 +327,7 @@ def lay_out(
         [*opened.notes],
     )  # fmt: skip
     finder.seen.update(chain.from_iterable(of_base.values()))
-    if base.wrenches and needs == "torque" and not any(map(finder.has_torque, joints)):
+    if base.wrenches and needs in ("torque", "any") and not any(map(finder.has_torque, joints)):
         finder = replace(finder, needs="motion")
     found = finder.find_all() | of_base  # names of columns by kind
     layout = LogLayout(
