@@ -55,6 +55,13 @@ def pairs(words: Sequence[str], flag: str) -> dict[str, float]:
     return pairs
 
 
+def _names(words: Sequence[str], flag: str) -> dict[str, str]:
+    """Return names by joint."""
+    if wrong := [word for word in words if not all(word.partition("=")[::2])]:
+        raise SettingsError(f"{flag} {wrong[0]!r}: wanted JOINT=NAME")
+    return dict(word.split("=", 1) for word in words)
+
+
 def _of_all_or_pairs(words: Sequence[str], flag: str) -> float | dict[str, float]:
     """Return one number for all joints, or numbers by joint."""
     if len(words) > 1 or "=" in words[0]:
@@ -206,9 +213,11 @@ JOB = Flags(
         "--angle-unit": ("units.angle", "UNIT"),
         "--topic": ("log.topic", "NAME"),
         "--command-topic": ("log.command", "NAME"),
+        "--rename": ("log.joints", "JOINT=NAME"),
         "--effort": ("log.effort", "MEANING"),
         "--stamp": ("log.stamp", "CLOCK"),
     },
+    {"--rename": _names},
 )
 #: Flags of the estimator.
 FIT = ("--estimator", "--kp", "--kd")
