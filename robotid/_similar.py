@@ -89,7 +89,7 @@ def _likeness(name: str, starts: Sequence[str], joint: str) -> float:
     quantities = [rest for has_joint, rest in sides if has_joint == own]
     for start in starts:
         first = _words(start)
-        rest = words[len(first) :]
+        rest = tuple(word for word in words[len(first) :] if word in own or word not in _NO_MEANING)
         if words[: len(first)] == first and _letters(rest) == _letters(own):
             best = max(best, _ratio(own, rest))  # the quantity is right
         for rest in quantities:

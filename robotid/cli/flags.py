@@ -346,8 +346,9 @@ def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "
         given = _given(options)
         if options.logs or given:
             raise SettingsError(
-                f"{options.source} is a job file; it states the logs and settings. "
-                f"Remove {listed(options.logs or given)}"
+                f"{options.source} is a job file; it states the logs and settings. Remove "
+                f"{listed([*options.logs, *given])}, and state in the job file: "
+                f"{listed(_keys_of(options.logs, given))}"
             )
         return read_job(options.source)
     if not options.logs and needs_logs:
@@ -398,6 +399,18 @@ def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
 def _given(options: argparse.Namespace) -> list[str]:
     validate = ["--validate"] if getattr(options, "validate", None) is not None else []
     return validate + JOB.given(options)
+
+
+def _keys_of(logs: Sequence[str], flags: Sequence[str]) -> list[str]:
+    """Return the keys of a job file that state what logs and flags state."""
+    keys = ["log in [[identification]]"] if logs else []
+    for flag in flags:
+        if flag == "--validate":
+            keys.append("log in [[validation]]")
+            continue
+        table, _, key = JOB.keys[flag][0].rpartition(".")
+        keys.append(f"{key} in [{table}]" if table else f"{key} at the top")
+    return keys
 
 
 def _name(flag: str) -> str:

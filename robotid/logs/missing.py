@@ -159,7 +159,7 @@ class Missing:
             kind, joint = self._of(name)
             if joint in self._read_names():
                 least = 2
-            elif joint:
+            elif joint and not joint.endswith(("]", ")")):  # no unit
                 kinds.setdefault(joint, set()).add(kind)
         first = {"q", *(kind for kind, _ in self.absent if kind == "qm")}
         return [joint for joint, of in kinds.items() if of & first and len(of) >= least]

@@ -65,6 +65,14 @@ def test_other_separators_are_similar(name):
     ]
 
 
+def test_units_in_names_make_no_difference():
+    found = said(
+        [f"{name} [{unit}]" for kind, unit in (("q", "rad"), ("tau", "Nm")) for name in of(kind)]
+    )
+    assert 'q_wrist_1 = "q_wrist_1 [rad]"' in found
+    assert 'tau_wrist_3 = "tau_wrist_3 [Nm]"' in found
+
+
 def test_the_joint_may_come_first():
     found = said([*of("q"), *(f"{joint}_torque" for joint in UR)])
     assert 'tau_wrist_2 = "wrist_2_torque"' in found
