@@ -9,9 +9,9 @@ import numpy as np
 
 from robotid._settings import is_number
 from robotid.exceptions import DataError, SettingsError
-from robotid.findings import listed, toml_key
+from robotid.findings import listed, quoted, toml_key
 from robotid.logs.data import repeated, suggestion
-from robotid.logs.missing import NOUNS, Missing, quoted
+from robotid.logs.missing import NOUNS, Missing
 from robotid.logs.settings import LogSource
 from robotid.logs.table import prefixes
 from robotid.logs.transmission import Transmission

@@ -1,16 +1,15 @@
 """The error of a log that lacks required columns: similar names in it, and what to state."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from robotid._similar import is_commanded, similar_columns, similar_joints
 from robotid.exceptions import DataError
-from robotid.findings import listed, toml_key
+from robotid.findings import listed, quoted, toml_key
 from robotid.logs.settings import LogSource
 from robotid.logs.table import prefixes, quantity_of
 
-__all__ = ["NOUNS", "Missing", "quoted"]
+__all__ = ["NOUNS", "Missing"]
 
 #: Nouns for the columns of each kind.
 NOUNS = {
@@ -23,15 +22,6 @@ NOUNS = {
     "tauref": "commanded torque",
 }
 _SHOWN = 12  # names in a list
-
-
-def quoted(name: str) -> str:
-    """Return a name as text of a job file.
-
-    Args:
-        name: The name, as of a column.
-    """
-    return json.dumps(name, ensure_ascii=False)
 
 
 @dataclass(frozen=True)
