@@ -72,7 +72,7 @@ def check_logs(
             prismatic=model.layout.prismatic,
             needs="any",
             base=logged_base(model),
-        )  # fmt: skip
+        )
         for some in (logs, validation)
     )
     return diagnose(model, first, second, signals or SignalSettings())
