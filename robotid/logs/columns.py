@@ -315,7 +315,8 @@ class Finder:
         return DataError(
             f"{self.where}: {has} but no gain; state it in N m/A: "
             f"gains={{{without[0]!r}: ...{more}}} (job file table [torque], key gains; CLI "
-            f"{flags}){also}",
+            f"{flags}){also}. A payload of known mass determines unknown gains: robotid payload "
+            "URDF LOADED --reference BARE --mass KG --gains",
             code="missing_gain",
         )
 

@@ -30,6 +30,12 @@ STATE = "sensor_msgs/msg/JointState"
 HOW = "(job file table [log], CLI --topic, Python source=LogSource(topic=...))"
 
 
+CURE = (
+    ". A payload of known mass determines unknown gains: robotid payload URDF LOADED --reference "
+    "BARE --mass KG --gains"
+)
+
+
 def refused(text, kind=DataError):
     return pytest.raises(kind, match="^" + re.escape(text) + "$")
 
@@ -279,7 +285,7 @@ def test_effort_is_a_current_if_stated(tmp_path):
     with refused(
         "run.mcap: joints shoulder, elbow have currents but no gain; state it in N m/A: "
         "gains={'shoulder': ..., ...} (job file table [torque], key gains; CLI --gain "
-        "shoulder=... --gain elbow=...)"
+        "shoulder=... --gain elbow=...)" + CURE
     ):
         read_log(path, JOINTS, source=current)
 
