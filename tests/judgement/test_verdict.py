@@ -523,6 +523,15 @@ def test_the_worst_of_several_recordings_refutes_no_hypothesis(errors):
     assert note.message.endswith("rejected: torque error on validation logs at most 4.5 %")
 
 
+def test_drive_parameters_that_the_prior_determines_are_named_and_change_no_verdict():
+    for undetermined in ((), ("a.m",)):
+        more = Determined(undetermined, is_poorly_excited=False, uncertain_drives=["a.coulomb"])
+        assert more.warnings() == []
+        assert "a.coulomb: the standard error is as large as that of the prior" in more.notes()[-1]
+        plain = Determined(undetermined, is_poorly_excited=False).notes()
+        assert more.notes()[:-1] == plain
+
+
 MASS = ("total_mass",)
 
 
