@@ -484,7 +484,9 @@ def test_csv_that_is_not_utf8_is_refused(text, content):
 # --- files ----------------------------------------------------------------------------------------
 
 
-def test_other_suffixes_are_refused(tmp_path):
+def test_other_suffixes_are_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.xlsx").touch()
     known = ".csv, .parquet, .npz, .h5, .hdf5, .mat"
     for path in (tmp_path / "run.xlsx", "run.xlsx"):
         with refused(
