@@ -68,8 +68,8 @@ def fit_findings(
     if determined.groups:
         message = (
             f"the data determine {determined.rank} of {len(determined.names)} base parameters: "
-            f"{determined.described()}. What is not determined keeps the URDF's values; record a "
-            "richer motion"
+            f"{determined.described()}. What is not determined keeps the URDF's values, because "
+            "the data reduce its prior uncertainty by less than 10 %; record a richer motion"
         )
         severity = "warning" if fit.is_poorly_excited else "note"
         findings.append(Finding("undetermined", severity, "base_parameters", message))

@@ -24,6 +24,7 @@ __all__ = ["Origin", "Step", "loop_steps", "next_steps"]
 _MOST = 3  # steps
 _NAMED = 4  # joints that a step names
 _NEW = "NEW.csv"
+_LOADED = "LOADED.csv"
 _PLAIN = "viscous+coulomb"
 _APPENDED = ("--validate",)  # flags that add to what was stated before
 
@@ -219,11 +220,30 @@ def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     check = ""
     if any(cause.code in ("total_mass", "urdf_mismatch") for cause in causes):
         check = "Check the sign, the order and the unit of the torques and the URDF's masses. "
+    masses = f"{after:.4g} kg identified, {before:.4g} kg in the URDF"
+    if found.scale_check.is_total_determined:
+        words = (
+            f"{check}State the measured mass of the moving links to verify the torque scale: "
+            f"{masses}."
+        )
+        return Step(words, origin.stating("[estimator.constraints]", "total_mass = KG"))
     words = (
-        f"{check}State the measured mass of the moving links to verify the torque scale: "
-        f"{after:.4g} kg identified, {before:.4g} kg in the URDF."
+        f"{check}Verify the torque scale with a payload of known mass, because torque does not "
+        f"determine the total mass ({masses}): record a log with it and compare the identified "
+        "payload. If the torques are motor currents, the last command identifies their gains."
     )
-    return Step(words, origin.stating("[estimator.constraints]", "total_mass = KG"))
+    urdf, result = str(found.model.tree.path), f"{origin.folder}/result.json"
+    compared = origin.using("payload", urdf, _LOADED, "--reference", result)
+    return Step(words, (*compared, *_payload_gains(found)))
+
+
+def _payload_gains(found: Identification) -> tuple[str, ...]:
+    """Return the command that identifies the gains of currents; nothing without files."""
+    urdf, log = str(found.model.tree.path), str(found.fitted[0].recording.log.path)
+    if not log:
+        return ()
+    flags = ("--reference", log, "--mass", "KG", "--gains")
+    return (shlex.join(["robotid", "payload", urdf, _LOADED, *flags]),)
 
 
 def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -231,11 +251,11 @@ def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     words = (
         f"If the column is a current, state the gain of {listed(joints or ['the joints'], _NAMED)} "
         "in N m per A (N per A for a prismatic joint): the torque is consistent with the URDF only "
-        "at another scale."
+        "at another scale. A payload of known mass determines unknown gains: the last command."
     )
     line = "\n".join(f"{toml_key(joint)} = GAIN" for joint in joints or ["JOINT"])
     flags = [x for joint in joints or ["JOINT"] for x in ("--gain", f"{joint}=GAIN")]
-    return Step(words, origin.stating("[torque.gains]", line, *flags))
+    return Step(words, (*origin.stating("[torque.gains]", line, *flags), *_payload_gains(found)))
 
 
 def _delay(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:

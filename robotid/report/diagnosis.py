@@ -122,11 +122,11 @@ def information_section(found: Identification) -> str:
     )
     singular = singular_chart(info.singular_values, found.wls.rank)
     return (
-        f"<p>Condition number {found.wls.condition:.3g}; singular values from "
-        f"{info.singular_values[0]:.3g} to {info.singular_values[-1]:.2g}. The data determine the "
-        f"base parameters by {shares.mean():.0f} % on average and the weakest by {shares.min()} "
-        "%, the URDF determines the rest: S²/(S² + s²) with the prior's spread S and the standard "
-        "error s of WLS.</p>\n"
+        f"<p>Condition number {found.wls.condition:.3g} (regressor, unit columns); singular values "
+        f"from {info.singular_values[0]:.3g} to {info.singular_values[-1]:.2g}. The data determine "
+        f"the base parameters by {shares.mean():.0f} % on average and the weakest by "
+        f"{shares.min()} %, the URDF determines the rest: S²/(S² + s²) with the prior's "
+        "spread S and the standard error s of WLS.</p>\n"
         f"{chart_html(singular, singular.title)}{known}" + _correlations(info, names)
     )
 

@@ -261,7 +261,7 @@ def open_section(found: Identification) -> str:
     fixed = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
     return (
         f"<p>The data determine {found.determination.rank} of {len(found.base)} base parameters; "
-        f"condition number {wls.condition:.3g} (columns scaled to unit norm).</p>\n"
+        f"condition number {wls.condition:.3g} (regressor, unit columns).</p>\n"
         + _indistinguishable(found)
         + _listed("Parameters without effect on the torque", found.mapping.unidentifiable)
         + _combinations(found)

@@ -130,7 +130,7 @@ def _facts(found: Identification) -> dict[str, str]:
         "Total mass": f"<strong>{before:.2f} → {after:.2f} kg</strong>{change}",
         "Base parameters determined": (
             f"<strong>{found.determination.rank} of {len(found.base)}</strong>, condition number "
-            f"{found.wls.condition:.3g}"
+            f"{found.wls.condition:.3g} (regressor, unit columns)"
         ),
     }
 

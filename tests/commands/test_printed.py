@@ -47,7 +47,8 @@ def test_excite(shown):
         "payload": {"words": ["a word", "another"]},
     }  # fmt: skip
     assert shown(excite._show, content) == [
-        "arm: a motion of 4.5 s for 2 joints, condition number 123; 3 starts in 2.3 s, converged",
+        "arm: a motion of 4.5 s for 2 joints, condition number 123 (regressor, columns in units",
+        "of the prior); 3 starts in 2.3 s, converged",
         "designed for the parameters with the widest intervals: p1, p2",
         "",
         "smallest margin to each limit",
@@ -62,8 +63,8 @@ def test_excite(shown):
     ]
     other = content | {"starts": 1, "converged": False, "condition_number": None}
     assert shown(excite._show, other)[:2] == [
-        "arm: a motion of 4.5 s for 2 joints, condition number infinite; 1 start in 2.3 s, not",
-        "converged: increase --seconds",
+        "arm: a motion of 4.5 s for 2 joints, condition number infinite (regressor, columns in",
+        "units of the prior); 1 start in 2.3 s, not converged: increase --seconds",
     ]
 
 
@@ -273,8 +274,8 @@ def test_identify(shown):
     }  # fmt: skip
     assert shown(identify.show_result, content) == [
         "",
-        "arm: 2 joints, 12 base parameters (8 inertial), condition number 45.7, total mass 11.90",
-        "-> 10.23 kg",
+        "arm: 2 joints, 12 base parameters (8 inertial), condition number 45.7 (regressor, unit",
+        "columns), total mass 11.90 -> 10.23 kg",
         "",
         "fitted: fit.csv 0.5-9.75 s",
         "  joint    error   rmse         URDF +   WLS   URDF  gravity",

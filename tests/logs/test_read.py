@@ -22,6 +22,12 @@ FOLDERS = (os.environ.get("ROBOTID_DATA"), Path(__file__).resolve().parents[3] /
 BOTH = pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 
 
+CURE = (
+    ". A payload of known mass determines unknown gains: robotid payload URDF LOADED --reference "
+    "BARE --mass KG --gains"
+)
+
+
 def refused(text, kind=DataError):
     return pytest.raises(kind, match="^" + re.escape(text) + "$")
 
@@ -260,7 +266,7 @@ def test_current_without_gain_is_refused(run):
     path = run(make_table(tau_elbow=None, i_elbow=np.ones(300)))
     with refused(
         f"{path.name}: joint 'elbow' has the current 'i_elbow' but no gain; state it in N m/A: "
-        "--gain elbow=..., or in the job file [torque] gains = { elbow = ... }"
+        "--gain elbow=..., or in the job file [torque] gains = { elbow = ... }" + CURE
     ):
         read_log(path, JOINTS)
 
@@ -273,7 +279,7 @@ def test_joints_without_gain_and_those_without_torque_are_all_named_at_once(run)
         f"{path.name}: joints a, b have currents but no gain; state it in N m/A: "
         "--gain a=... --gain b=..., or in the job file [torque] gains = { a = ..., b = ... }. "
         "No torque of finger was found; if at rest, lock them at their positions, as "
-        "with --lock finger=0"
+        "with --lock finger=0" + CURE
     ):
         read_log(path, ("a", "b", "c", "finger"))
 

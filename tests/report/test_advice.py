@@ -239,12 +239,13 @@ def test_an_error_comes_before_a_warning_and_three_steps_are_enough(identified):
 )
 def test_a_setting_is_a_line_of_the_job_file_or_a_flag(identified, code, evidence, table, flags):
     found = told(identified, warning(code, **evidence))
-    assert next_steps(found, FLAGS)[0].blocks == (
-        f"robotid identify arm.urdf first.csv --cutoff 8 {flags} --out out",
-    )
+    block, *of_payload = next_steps(found, FLAGS)[0].blocks
+    assert block == f"robotid identify arm.urdf first.csv --cutoff 8 {flags} --out out"
+    assert len(of_payload) == (code == "current_for_torque")
     assert next_steps(found, JOB)[0].blocks == (
         table,
         "robotid identify 'my job.toml' --out out",
+        *of_payload,
     )
 
 
@@ -262,7 +263,9 @@ def test_whatever_leaves_a_result_in_doubt_has_a_step(identified, code):
 def test_what_two_steps_ask_to_be_typed_is_typed_last(identified):
     found = told(identified, warning("current_for_torque"), warning("torque_delay", delay=0.01))
     first, second, *_ = next_steps(found, JOB)
-    assert first.blocks == ("[torque.gains]\nelbow_joint = GAIN",)
+    table, command = first.blocks
+    assert table == "[torque.gains]\nelbow_joint = GAIN"
+    assert command.endswith("--mass KG --gains")
     assert second.blocks[-1] == "robotid identify 'my job.toml' --out out"
 
 
@@ -319,7 +322,13 @@ def test_figures_in_steps_are_those_of_all_findings_and_of_the_result(identified
     assert step.words.endswith("; of elbow_joint by -0.0123; of wrist_1_joint by 0.5.")
     before, after = (pi[:60:10].sum() for pi in (identified.prior, identified.standard))
     step = next_steps(told(identified, warning("total_mass", "robot")), JOB)[0]
-    assert f"{after:.4g} kg identified, {before:.4g} kg in the URDF." in step.words
+    assert f"({after:.4g} kg identified, {before:.4g} kg in the URDF)" in step.words
+    weighed = replace(identified.scale_check, is_total_determined=True)
+    found = told(identified, warning("total_mass", "robot"))
+    found.__dict__["scale_check"] = weighed
+    step = next_steps(found, JOB)[0]
+    assert "State the measured mass of the moving links" in step.words
+    assert step.blocks[0] == "[estimator.constraints]\ntotal_mass = KG"
     assert f"{after:.4g}" != f"{before:.4g}"
     assert step.blocks[0] == "[estimator.constraints]\ntotal_mass = KG"
 
