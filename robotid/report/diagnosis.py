@@ -22,15 +22,8 @@ from robotid.identification.pictures import (
 from robotid.identification.result import Identification
 from robotid.pages.charts import Chart, chart_html
 from robotid.pages.html import code, figure, folded, number, table, text
-from robotid.robot.parameters import INERTIAL_TERMS
 
-__all__ = [
-    "body_figures",
-    "drive_figures",
-    "friction_section",
-    "information_section",
-    "residual_section",
-]
+__all__ = ["drive_figures", "friction_section", "information_section", "residual_section"]
 
 _PAIRS = 15  # strongest correlations that are listed
 _STRONG = 0.8  # smallest correlation that is listed
@@ -114,16 +107,6 @@ def drive_figures(found: Identification) -> str:
             f"decrease.</p>\n{choice}"
         )
     return f'{choice}<h3>Values</h3>\n<div class="plots">\n{bars}</div>\n'
-
-
-def body_figures(found: Identification) -> str:
-    """Return each inertial parameter of all bodies with error bars, and the URDF's values.
-
-    Args:
-        found: The identification.
-    """
-    figures = "".join(map(_parameter_figure, parameter_charts(found, INERTIAL_TERMS)))
-    return f'<div class="plots">\n{figures}</div>\n'
 
 
 def information_section(found: Identification) -> str:

@@ -19,9 +19,9 @@ from robotid.logs.settings import SignalSettings
 from robotid.pages.charts import chart_html
 from robotid.pages.html import percent
 from robotid.report.advice import Origin, next_steps
+from robotid.report.bodies import parameter_picture
 from robotid.report.curves import curves_section, drawn
 from robotid.report.diagnosis import (
-    body_figures,
     drive_figures,
     friction_section,
     information_section,
@@ -93,6 +93,7 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
         errors=(_ERRORS, ""),
         curves=("Torques", torques_section(found, verdict["per_joint"], worst, replay)),
         friction=friction_section(found, worst),
+        bodies=parameter_picture(found),
         why=why_section(found),
         parameters=parameter_section(
             found.model,
@@ -105,7 +106,6 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
         appendix={
             "residuals": ("Residual spectra", residual_section(found)),
             "drives": ("Drive parameters", drive_figures(found)),
-            "bodies": ("Comparison with the URDF", body_figures(found)),
             "base": ("Base parameters", base_table(found)),
             "consistency": ("Physical consistency", consistency_section(found)),
             "information": ("Excitation and correlation", information_section(found)),
