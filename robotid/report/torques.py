@@ -27,6 +27,7 @@ from robotid.report.diagnosis import (
     information_section,
     residual_section,
 )
+from robotid.report.ellipsoids import ellipsoid_pictures
 from robotid.report.errors import TORQUE, Errors, worst_errors
 from robotid.report.shown import Shown
 from robotid.report.tables import (
@@ -93,7 +94,7 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
         errors=(_ERRORS, ""),
         curves=("Torques", torques_section(found, verdict["per_joint"], worst, replay)),
         friction=friction_section(found, worst),
-        bodies=parameter_picture(found),
+        bodies=parameter_picture(found) + ellipsoid_pictures(found),
         why=why_section(found),
         parameters=parameter_section(
             found.model,
