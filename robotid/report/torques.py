@@ -19,13 +19,15 @@ from robotid.logs.settings import SignalSettings
 from robotid.pages.charts import chart_html
 from robotid.pages.html import percent
 from robotid.report.advice import Origin, next_steps
+from robotid.report.bodies import parameter_picture
 from robotid.report.curves import curves_section, drawn
 from robotid.report.diagnosis import (
-    body_figures,
     drive_figures,
+    friction_section,
     information_section,
     residual_section,
 )
+from robotid.report.ellipsoids import ellipsoid_pictures
 from robotid.report.errors import TORQUE, Errors, worst_errors
 from robotid.report.shown import Shown
 from robotid.report.tables import (
@@ -76,7 +78,7 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
     counted = [errors for errors, e in zip(validation, found.validation, strict=True)
                if not e.is_refitted] or [fitted]  # fmt: skip
     entries = [entry for part in parameter_entries(found) for entry in part]
-    verdict = found.verdict.to_dict()
+    verdict, worst = found.verdict.to_dict(), [*worst_errors(counted)]
     return Shown(
         title=f"{found.model.name}: identified parameters",
         robot=found.model.name,
@@ -90,16 +92,21 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
         steps=next_steps(found, origin),
         made="".join(f"<p>{escape(text)}</p>\n" for text in (_method(found), _totals(found))),
         errors=(_ERRORS, ""),
-        curves=("Torques", torques_section(found, verdict["per_joint"], [*worst_errors(counted)],
-                                           replay)),
+        curves=("Torques", torques_section(found, verdict["per_joint"], worst, replay)),
+        friction=friction_section(found, worst),
+        bodies=parameter_picture(found) + ellipsoid_pictures(found),
         why=why_section(found),
-        parameters=parameter_section(found.model, found.standard if found.has_urdf else None,
-                                     entries, _PARAMETERS, found.on_misfit),
+        parameters=parameter_section(
+            found.model,
+            found.standard if found.has_urdf else None,
+            entries,
+            _PARAMETERS,
+            found.on_misfit,
+        ),
         entries=entries,
         appendix={
             "residuals": ("Residual spectra", residual_section(found)),
-            "drives": ("Friction and drives", drive_figures(found)),
-            "bodies": ("Comparison with the URDF", body_figures(found)),
+            "drives": ("Drive parameters", drive_figures(found)),
             "base": ("Base parameters", base_table(found)),
             "consistency": ("Physical consistency", consistency_section(found)),
             "information": ("Excitation and correlation", information_section(found)),
@@ -108,7 +115,7 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
             "inputs": ("Inputs", input_table(input_entries(found))),
             "versions": ("Versions", version_table(versions())),
         },
-    )  # fmt: skip
+    )
 
 
 def _joints(metrics: Metrics, wls: Metrics) -> dict[str, dict[str, Any]]:

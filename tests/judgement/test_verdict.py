@@ -90,6 +90,14 @@ def test_alarms_come_before_everything_and_constants_before_the_rest():
     assert found.reasons[2].startswith("a: error 60.0 %")
 
 
+def test_the_largest_error_is_the_first_reason():
+    found = verdict({"a": joint(16.2), "b": joint(4.0), "c": joint(17.4)})
+    assert [reason[:16] for reason in found.reasons] == ["c: error 17.4 % ", "a: error 16.2 % "]
+    assert list(found.joints) == ["a", "b", "c"]
+    found = verdict({"a": joint(60.0), "c": joint(70.0)})
+    assert [reason[:16] for reason in found.reasons] == ["c: error 70.0 % ", "a: error 60.0 % "]
+
+
 def test_worse_than_the_urdf_is_poor():
     found = verdict({"a": joint(8.0, urdf=6.0)})
     assert found.status == "poor"

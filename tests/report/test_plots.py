@@ -17,7 +17,6 @@ from robotid.fitting.information import information
 from robotid.identification.pictures import QUANTILE, torque_charts
 from robotid.report import torques as torques_module
 from robotid.report.torques import torques_section
-from robotid.robot.parameters import INERTIAL_TERMS
 
 JOINTS = range(6)
 
@@ -147,19 +146,6 @@ def test_drives_show_their_values_with_two_standard_errors(report, identified, t
     assert np.isinf(error).tolist() == [j == "elbow_joint" and term == "viscous" for j in joints]
     close(ours["y"], identified.standard[part])
     close(ours["half"], np.where(np.isinf(error), np.nan, 2 * error))  # at its bound: no bar
-
-
-@pytest.mark.parametrize("k", range(10))
-def test_bodies_show_the_urdf_beside_what_was_identified(report, identified, k):
-    term, part = INERTIAL_TERMS[k], slice(k, 60, 10)
-    what = chart(report, f"{term} of each body")
-    assert what["x_names"] == list(identified.model.layout.bodies)
-    *before, ours = what["series"]
-    close(ours["y"], identified.standard[part])
-    close(ours["half"], 2 * identified.standard_error[part])
-    assert bool(before) == bool(identified.prior[part].any())
-    for series in before:
-        close(series["y"], identified.prior[part])
 
 
 def test_singular_values_are_those_of_the_regressor(report, identified):
