@@ -35,6 +35,7 @@ def curves_section(
     worst: Sequence[str],
     charts: Callable[[RunT, int, str, int], str],
     note: Callable[[int], str],
+    most: int = _OPEN,
 ) -> str:
     """Return a part for each joint; the worst joint and the worst ones that are not good are open.
 
@@ -47,9 +48,10 @@ def curves_section(
         charts: Returns the charts of a recording, given the number of a joint, the name that
             links the charts, and the number of points.
         note: Returns the HTML above the charts of the joint with a number.
+        most: Number of joints that are open at most.
     """
     points = min(_LONGEST, max(200, _ROWS // (2 * len(rows) * max(1, len(runs)))))
-    parts, first = [intro], [*worst][:_OPEN]
+    parts, first = [intro], [*worst][:most]
     for row, name in enumerate(rows):
         status = verdict_cell(name, verdicts[name]) if name in verdicts else ""
         html = note(row) + "".join(charts(run, row, link, points) for link, run in runs.items())

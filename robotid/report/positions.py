@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from robotid._typing import Array
-from robotid.closed_loop.evaluation import DRIFTS, OpenLoop
+from robotid.closed_loop.evaluation import DRIFTS, OpenLoop, position_metrics
 from robotid.exceptions import DataError
 from robotid.export.ranges import source_of
-from robotid.findings import Finding, listed
+from robotid.findings import Finding, grouped, listed
 from robotid.pages.charts import Chart, Series, chart_html
 from robotid.pages.html import code, number, table, text
 from robotid.report.advice import Origin, loop_steps
@@ -92,22 +92,24 @@ def shown_positions(
         for key in ("standard_parameters", "drive_parameters")
         for entry in content[key]
     ]
-    worst = list(worst_errors(validated or [whole]))
-    source = "torque-driven simulation" if is_driven else "commands"
     model, standard = changed or (None, np.zeros(0))
+    counted = _counted(model, validation or fitted, bool(validation)) or validated or [whole]
+    worst = list(worst_errors(counted))
+    source = "torque-driven simulation" if is_driven else "commands"
+    findings = [
+        Finding(entry["code"], entry["severity"], entry["where"], entry["message"])
+        for entry in content.get("warnings", [])
+    ]
     return Shown(
         title=f"{content['robot']}: drives from {source}",
         robot=content["robot"],
         rows=joints,
         verdict=content["verdict"],
-        findings=[
-            Finding(entry["code"], entry["severity"], entry["where"], entry["message"])
-            for entry in content.get("warnings", [])
-        ],
+        findings=findings,
         quantity=POSITION,
-        counted=validated or [whole],
+        counted=counted,
         recordings=[*validated, whole],
-        facts=_facts(content),
+        facts=_facts(content) | _warned(findings, joints),
         steps=loop_steps(content, origin),
         made=f"<p>{escape(_method(content, names))}</p>\n",
         errors=(_DRIVEN_ERRORS if is_driven else _ERRORS, _horizons(content)),
@@ -127,6 +129,24 @@ def shown_positions(
             ),
         },
     )
+
+
+def _counted(
+    model: RobotModel | None, runs: Sequence[OpenLoop], is_validation: bool
+) -> list[Errors]:
+    """Return the errors that the verdict uses: of all logs that move a joint, together."""
+    if model is None or not runs:
+        return []
+    name = runs[0].name if len(runs) == 1 else f"{len(runs)} logs together"
+    joints = position_metrics(model, runs, moving=True).to_dict()["per_joint"]
+    return [Errors(name, joints, is_fitted=not is_validation)]
+
+
+def _warned(findings: Sequence[Finding], joints: Sequence[str]) -> dict[str, str]:
+    """Return links to the errors and warnings, for the figures beside the verdict."""
+    causes = grouped([f for f in findings if f.severity != "note"], joints)
+    links = [f'<a href="#cause-{escape(c.code)}">{escape(c.code)}</a>' for c in causes]
+    return {"Errors and warnings": ", ".join(links)} if links else {}
 
 
 def _is_driven(content: Mapping[str, Any]) -> bool:
@@ -281,7 +301,7 @@ def _positions(
         return worst_html(seconds, joints[row], unit, replay, POSITION.scale)
 
     verdicts = content["verdict"].get("per_joint", {})
-    return curves_section(intro, runs, joints, verdicts, worst, charts, note)
+    return curves_section(intro, runs, joints, verdicts, worst, charts, note, most=1)
 
 
 def _residuals(runs: Sequence[OpenLoop], j: int) -> Iterator[Residual]:

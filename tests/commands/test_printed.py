@@ -304,8 +304,8 @@ def test_identify(shown):
         "1 finding, 1 cause; worst: one, torque error 150.0 %; 1 note hidden (--verbose)",
         "",
         "verdict: poor",
-        "  one: good",
         "  slide: poor: worse",
+        "  one: good",
     ]
 
 
@@ -357,8 +357,8 @@ def test_validate(shown):
         "  * worse than a constant",
         "",
         "verdict: poor",
-        "  one: good",
         "  slide: poor: worse",
+        "  one: good",
     ]
 
 

@@ -16,7 +16,7 @@ from robotid.diagnosis.misfit_findings import misfit_findings, setting_of
 from robotid.findings import Finding
 from robotid.fitting.joint_motion import JointMotion
 from robotid.judgement.verdict import WARNING_CODES
-from robotid.report.advice import Origin, next_steps
+from robotid.report.advice import Origin, loop_steps, next_steps
 from robotid.robot.examples import example_urdf
 
 JOB = Origin(("my job.toml",), "out")
@@ -354,3 +354,56 @@ def test_joints_that_any_recording_misses_are_looked_at_and_the_first_is_played(
     assert f"the residual of {names[0]}, {names[4]} in" in look.words
     (played,) = [b for step in steps for b in step.blocks if b.startswith("robotid replay")]
     assert " x.csv out" in played
+
+
+# --- results from commands and positions ----------------------------------------------------------
+
+
+def loop_content(status, *, log_errors=(), warnings=()):
+    inputs = [{"role": "urdf", "path": "arm.urdf"}, {"role": "identification", "path": "a.csv"}]
+    per_joint = {joint: {"status": "good", "reasons": []} for joint in ("one", "two", "three")}
+    per_joint["two"] = {"status": status, "reasons": []}
+    return {
+        "robot": "arm", "joints": list(per_joint), "inputs": inputs,
+        "simulation": {"controller": {"kind": "pd"}}, "warnings": list(warnings),
+        "verdict": {"status": status, "log_errors": list(log_errors), "per_joint": per_joint},
+    }  # fmt: skip
+
+
+def loop_warning(code, where):
+    message = f"{where} has {code}; do something"
+    return {"code": code, "severity": "warning", "where": where, "message": message}
+
+
+def test_a_usable_result_of_commands_is_exported():
+    steps = loop_steps(loop_content("usable"), JOB)
+    assert [step.blocks[0].split()[1] for step in steps] == ["replay", "export", "export", "export"]
+    assert loop_steps(loop_content("usable"), Origin()) == ()
+
+
+def test_a_poor_result_of_commands_is_repaired_and_not_used():
+    warnings = [loop_warning("alike", "one"), loop_warning("small", "a.csv: two")]
+    steps = loop_steps(loop_content("poor", warnings=warnings), JOB)
+    assert [step.words.partition(":")[0] for step in steps] == [
+        "A.csv",  # of the poor joint
+        "One has alike; do something.",
+        "Do not use the result",
+    ]
+    assert "position of two is wrong" in steps[-1].words
+    assert [block.split()[1] for step in steps for block in step.blocks] == ["replay", "identify"]
+
+
+def test_errors_of_a_log_of_commands_are_corrected_first():
+    content = loop_content("poor", log_errors=["a.csv: two moves before its command"])
+    (step,) = loop_steps(content, JOB)
+    assert "Correct the logs, then repeat the identification: a.csv: two moves" in step.words
+    assert [block.split()[1] for block in step.blocks] == ["doctor", "identify"]
+
+
+def test_a_poor_result_of_torques_is_not_exported(identified):
+    wrong = told(identified)
+    vars(wrong)["verdict"] = replace(identified.verdict, status="poor")
+    blocks = [block for step in next_steps(wrong, JOB) for block in step.blocks]
+    assert wrong.has_urdf
+    assert blocks
+    assert not any(block.split()[1] in ("export", "validate") for block in blocks)
