@@ -52,6 +52,7 @@ class Findings:
     commanded: Mapping[str, Result] = field(default_factory=dict)  # results with gains of drives
     track: Mapping[str, Any] | None = None  # content of a track.json
     folder: Path = Path()  # of the track.json and its history
+    beside: Path = Path()  # folder of the first file
 
     @property
     def settings(self) -> Mapping[str, Any] | None:
@@ -72,6 +73,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
     results: dict[str, Mapping[str, Any]] = {}
     commanded: dict[str, Result] = {}
     tracks: list[tuple[Path, Mapping[str, Any]]] = []
+    beside: list[Path] = []
     for path in map(Path, paths):
         files = [path]
         if path.is_dir():
@@ -79,6 +81,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
             files = [file for file in files if file.is_file()]
             if not files:
                 raise DataError(f"{str(path)!r} has no result.json and no track.json")
+        beside.append(files[0].parent)
         for file in files:
             track = _track(file)
             if track is not None:
@@ -93,7 +96,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
     if len(tracks) > 1:
         raise DataError(f"{len(tracks)} tracks are given, wanted at most one")
     folder, content = tracks[0] if tracks else (Path(), None)
-    return Findings(results, commanded, content, folder)
+    return Findings(results, commanded, content, folder, (beside or [Path()])[0])
 
 
 def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:

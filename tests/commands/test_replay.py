@@ -74,6 +74,16 @@ def test_a_result_predicts_and_shows_masses_before_and_after(folder):
         assert body["mass"] == pytest.approx(stated[f"{body['name']}.m"])
 
 
+def test_the_page_is_beside_the_first_result_unless_stated(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    log, out = str(folder / "log.csv"), folder / "out"
+    for words, page in (([str(out / "result.json")], out), ([], tmp_path)):
+        assert main(["replay", URDF, log, *words]) == 0
+        assert capsys.readouterr().err.startswith("written: ")
+        assert (page / "replay.html").is_file()
+        (page / "replay.html").unlink()
+
+
 def test_masses_are_shown_of_a_result_whose_drives_have_more_terms(tmp_path):
     urdf = ROOT / "urdf" / "planar_2r.urdf"
     model, rng = RobotModel.from_urdf(urdf), np.random.default_rng(0)
