@@ -30,7 +30,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add_robot_and_log(parser)
     results = "result.json, track.json or their folder"
     add("results", nargs="*", metavar="RESULT", help=results)
-    add("--html", metavar="FILE", help="page to write; default: replay.html, beside the first RESULT")
+    add("--html", metavar="FILE", help="page to write; default: replay.html beside the RESULT")
     add("--ghost", metavar="LOG", help="second motion, shown as a ghost")
     add_serve(parser, "track the log again in real time, and show it in the browser")
     group = parser.add_argument_group("the log, unless a RESULT is given")

@@ -160,7 +160,7 @@ def _write(
         if job.report:
             found = replace(found, report=str(target / report))
             links = {"result": "result.json", **written, **(beside or {})}
-            origin = Origin(tuple(source), str(target))
+            origin = Origin(tuple(source), str(target), "replay.html")
             write_report(found, partial / report, files=links, origin=origin)
             outputs["report"] = report
         if written:
