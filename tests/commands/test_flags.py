@@ -41,7 +41,7 @@ def test_every_other_flag_states_its_key_too():
         *("--gain", "b=2", "--gain", "a=-3", "--friction", "viscous", "--estimator", "ols"),
         *("--time-unit", "ms", "--angle-unit", "deg", "--topic", "/arm"),
         *("--command-topic", "/wanted", "--effort", "current", "--stamp", "log"),
-        *("--ignore", "late", "--ignore", "clipped", "--dynamics", "--no-report"),
+        *("--ignore", "late", "--ignore", "clipped", "--dynamics", "--no-report", "--replay"),
     ]
     found = job(identify, *words)
     assert [entry.path.name for entry in found.identification] == ["run.csv", "second.csv"]
@@ -55,7 +55,7 @@ def test_every_other_flag_states_its_key_too():
     assert (found.units.time, found.units.angle) == ("ms", "deg")
     assert found.source == LogSource("/arm", command="/wanted", effort="current", stamp="log")
     assert tuple(found.ignore) == ("late", "clipped")
-    assert (found.dynamics, found.report) == (True, False)
+    assert (found.dynamics, found.report, found.replay) == (True, False, True)
     usual = job(identify)
     assert (usual.joints, usual.locked, usual.gains) == (None, {}, {})
     assert (usual.dynamics, usual.report, usual.snap_angles) == (False, True, False)

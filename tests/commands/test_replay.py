@@ -92,6 +92,30 @@ def test_the_page_is_beside_the_first_result_unless_stated(folder, tmp_path, mon
         (page / "replay.html").unlink()
 
 
+def test_identify_writes_the_replay_that_its_report_links_to(tmp_path, capsys):
+    urdf, out = str(ROOT / "urdf" / "planar_2r.urdf"), tmp_path / "out"
+    model, rng = RobotModel.from_urdf(urdf), np.random.default_rng(0)
+    for name in ("log", "kept"):
+        log = exact_log(model, truth(model), rng, samples=300, rate=100.0)
+        write_log(log, tmp_path / f"{name}.csv")
+    words = [urdf, str(tmp_path / "log.csv"), "--validate", str(tmp_path / "kept.csv")]
+    words = ["identify", *words, "--estimator", "wls", "--friction", "none", "--out", str(out)]
+    assert main([*words, "--replay"]) == 0
+    assert f"  {out}/replay.html\n" in capsys.readouterr().out
+    data = shown((out / "replay.html").read_text(encoding="utf-8"))
+    assert data["log"] == "kept.csv"
+    assert data["torques"]["labels"] == ["measured", "identified", "URDF + drives", "URDF"]
+    report = (out / "report.html").read_text()
+    assert '<a href="replay.html">replay</a>' in report
+    assert 'href="replay.html#t=' in report
+    assert load_result(out).content["outputs"]["replay"] == "replay.html"
+    # the replay of an earlier result would be that of another robot
+    assert main(words) == 0
+    assert "/replay.html of an earlier run" in capsys.readouterr().err
+    assert not (out / "replay.html").exists()
+    assert 'href="#replay"' in (out / "report.html").read_text()
+
+
 def test_the_urdf_with_drives_is_rnea_and_drive_terms(identified):
     data = shown(replay_identified(identified).html)
     torques, (evaluation, *_) = data["torques"], identified.validation
