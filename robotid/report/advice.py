@@ -50,10 +50,12 @@ class Origin:
         source: The arguments of ``robotid identify``: a job file, or URDF, logs and flags; empty
             if no command made the result.
         folder: Folder of the results; "" if they were not written.
+        replay: File that ``robotid replay`` writes, from the report's folder; "" if there is none.
     """
 
     source: tuple[str, ...] = ()
     folder: str = ""
+    replay: str = ""
 
     @property
     def job(self) -> str:

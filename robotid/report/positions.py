@@ -17,6 +17,7 @@ from robotid.pages.charts import Chart, Series, chart_html
 from robotid.pages.html import code, number, table, text
 from robotid.report.advice import Origin, loop_steps
 from robotid.report.curves import curves_section, drawn
+from robotid.report.dock import Clip, Dock
 from robotid.report.errors import POSITION, Errors, worst_errors
 from robotid.report.shown import Shown
 from robotid.report.tables import input_table, parameter_section, version_table
@@ -113,7 +114,7 @@ def shown_positions(
         steps=loop_steps(content, origin),
         made=f"<p>{escape(_method(content, names))}</p>\n",
         errors=(_DRIVEN_ERRORS if is_driven else _ERRORS, _horizons(content)),
-        curves=("Positions", _positions(content, fitted, validation, worst, replay)),
+        curves=("Positions", _positions(content, fitted, validation, worst, origin, replay)),
         why="",
         parameters=parameter_section(
             model, standard, entries, _DRIVEN if is_driven else _PARAMETERS
@@ -268,6 +269,7 @@ def _positions(
     fitted: Sequence[OpenLoop],
     validation: Sequence[OpenLoop],
     worst: Sequence[str],
+    origin: Origin,
     replay: str,
 ) -> str:
     """Return charts of each joint in every log."""
@@ -291,6 +293,11 @@ def _positions(
         f"log {k}": (run, "not fitted" if k < count else "fitted") for k, run in enumerate(shown)
     }
 
+    urdf = next((x["path"] for x in content["inputs"] if x["role"] == "urdf"), "")
+    clips = [Clip(link, str(run.log.path), float(run.log.t[0]), float(run.log.t[-1]))
+             for link, (run, _) in runs.items()]  # fmt: skip
+    dock = Dock(replay, origin, urdf, clips)
+
     def charts(of: tuple[OpenLoop, str], row: int, link: str, points: int) -> str:
         unit = units.get(joints[row], "rad")
         return _charts(*of, row, joints[row], unit, link=link, points=points)
@@ -298,10 +305,12 @@ def _positions(
     def note(row: int) -> str:
         unit = f"{POSITION.prefix}{units.get(joints[row], 'rad')}"
         seconds = worst_second(_residuals(validation or fitted, row))
-        return worst_html(seconds, joints[row], unit, replay, POSITION.scale)
+        return worst_html(seconds, joints[row], unit, dock, POSITION.scale)
 
     verdicts = content["verdict"].get("per_joint", {})
-    return curves_section(intro, runs, joints, verdicts, worst, charts, note, most=1)
+    return curves_section(
+        dock.html + intro, runs, joints, verdicts, worst, charts, note, most=1
+    )
 
 
 def _residuals(runs: Sequence[OpenLoop], j: int) -> Iterator[Residual]:

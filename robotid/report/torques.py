@@ -27,6 +27,7 @@ from robotid.report.diagnosis import (
     information_section,
     residual_section,
 )
+from robotid.report.dock import Clip, Dock
 from robotid.report.ellipsoids import ellipsoid_pictures
 from robotid.report.errors import TORQUE, Errors, worst_errors
 from robotid.report.shown import Shown
@@ -92,7 +93,7 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
         steps=next_steps(found, origin),
         made="".join(f"<p>{escape(text)}</p>\n" for text in (_method(found), _totals(found))),
         errors=(_ERRORS, ""),
-        curves=("Torques", torques_section(found, verdict["per_joint"], worst, replay)),
+        curves=("Torques", torques_section(found, verdict["per_joint"], worst, origin, replay)),
         friction=friction_section(found, worst),
         bodies=parameter_picture(found) + ellipsoid_pictures(found),
         why=why_section(found),
@@ -184,6 +185,7 @@ def torques_section(
     found: Identification,
     verdicts: Mapping[str, Mapping[str, Any]],
     worst: Sequence[str],
+    origin: Origin,
     replay: str = "",
 ) -> str:
     """Return charts of torques and residuals over time.
@@ -192,11 +194,16 @@ def torques_section(
         found: The identification.
         verdicts: The verdict on each joint, as in result.json.
         worst: Joints that have errors, the worst first.
+        origin: Folder of the results, for commands.
         replay: File of the replay in the page's folder; "" if there is none.
     """
     evaluations, rows = found.validation or found.fitted, found.model.row_names
     shown = drawn(evaluations, rows)
     runs = {f"recording {k}": (e, found.band(e)) for k, e in enumerate(shown)}
+
+    clips = [Clip(link, str(e.recording.log.path), e.recording.extent.start, e.recording.extent.end)
+             for link, (e, _) in runs.items()]  # fmt: skip
+    dock = Dock(replay, origin, str(found.model.tree.path), clips)
 
     def charts(run: tuple[Evaluation, TorqueBand], row: int, link: str, points: int) -> str:
         return _charts(found, *run, row, link=link, points=points)
@@ -204,9 +211,9 @@ def torques_section(
     def note(row: int) -> str:
         name, unit = rows[row], found.model.row_units[row]
         seconds = None if found.model.is_static else worst_second(_residuals(evaluations, row))
-        return worst_html(seconds, name, unit, replay)
+        return worst_html(seconds, name, unit, dock)
 
-    intro = _intro(found, shown, evaluations[len(shown) :])
+    intro = dock.html + _intro(found, shown, evaluations[len(shown) :])
     return curves_section(intro, runs, rows, verdicts, worst, charts, note)
 
 

@@ -14,6 +14,7 @@ from robotid.closed_loop.identify import identify_loops, with_gravity
 from robotid.closed_loop.second_order import SecondOrder
 from robotid.closed_loop.settings import LoopSettings
 from robotid.closed_loop.term_choice import _Fold, _gains
+from robotid.commands.identify import save_result
 from robotid.estimators.output_error import OutputError
 from robotid.exceptions import DataError
 from robotid.export.entries import build_result
@@ -442,3 +443,9 @@ def test_what_whitening_leaves_correlated_widens_the_scale_of_gains(found):
     np.testing.assert_allclose(twice.error, 2.0 * plain.error)
     assert twice.common_error == pytest.approx(2.0 * plain.common_error)
     np.testing.assert_allclose(less.error, plain.error)
+
+
+def test_a_replay_of_logs_in_memory_is_refused(found, tmp_path):
+    with pytest.raises(DataError, match="the logs are in memory, and a replay of position-contr"):
+        save_result(found, tmp_path / "out", report=False, replay=True)
+    assert list((tmp_path / "out").iterdir()) == []

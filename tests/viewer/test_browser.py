@@ -64,6 +64,7 @@ def page(ur5, tmp_path_factory):
         ghosts={"designed </script>": (T, q + 0.3)},
         bands=Bands(T, ["elbow.m", "wrist.m"], ["kg", "kg"], theta, 0.1 + 0 * theta),
         marks=[Mark(T[0] + 3.0, "payload <b>2 kg</b>", "payload", ur5.joints[2])],
+        log="own.csv",
     )  # fmt: skip
     return shown.write(tmp_path_factory.mktemp("page") / "replay.html")
 

@@ -91,7 +91,7 @@ function showArcs(row) {
     if (!arcs.length) return;
     const { measured, predicted } = arcs[j];
     measured.show(row[j] / (largest[j] || 1));
-    if (predicted) predicted.show(row[count + j] / (largest[j] || 1));
+    if (predicted) predicted.show(predictedOf(row, j) / (largest[j] || 1));
     measured.material.color.set(colour);
   });
 }

@@ -35,6 +35,7 @@ function showRobot(time) {
 function showReadings(time) {
   const from = clock.end - clock.start || 1;
   moveCursor(time);
+  tellReport(time);
   byId("now").style.left = `${(100 * (time - clock.start)) / from}%`;
   slider.value = time;
   clockText.textContent = `${digits(time)} of ${digits(clock.end)} s`;
@@ -115,6 +116,7 @@ let isRestored = false;
 function keep() {
   if (!isRestored || !hasAddress || data.live) return;
   const state = { t: clock.time.toFixed(3) };
+  if (chosen) state.model = models[chosen];
   if (picked) state.joint = data.scene.nodes[picked].name;
   if (isTurned) {
     const { position } = viewer.camera, { target } = viewer.controls;
@@ -125,7 +127,7 @@ function keep() {
 
 function restore() { // at the start, and when a link of another page changes the address
   const stored = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
-  const isOther = stored.log && !data.notes.some((note) => note.includes(stored.log));
+  const isOther = stored.log && data.log && stored.log !== data.log;
   byId("state").textContent = isOther ? `The link is to ${stored.log}; this replay shows another recording.` : "";
   if (stored.t !== undefined && Number.isFinite(Number(stored.t))) { pause(); seek(Number(stored.t)); }
   const place = (stored.camera || "").split(" ").map(Number);
@@ -136,6 +138,8 @@ function restore() { // at the start, and when a link of another page changes th
     viewer.controls.update();
     isTurned = true;
   }
+  const wanted = models.indexOf(stored.model);
+  if (wanted >= 0 && wanted !== chosen) choose(wanted);
   if (stored.joint) pick(nodeOf(stored.joint));
   isRestored = true;
 }

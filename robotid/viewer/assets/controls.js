@@ -15,7 +15,7 @@ document.addEventListener("keydown", (event) => {
   const step = event.shiftKey ? 1 / 30 : 1;
   const acts = { " ": toggle, ArrowLeft: () => seek(clock.time - step),
     ArrowRight: () => seek(clock.time + step), Home: () => seek(clock.start), End: () => seek(clock.end) };
-  if (!(event.key in acts) || (own && (event.key === " " || at.matches("select")))) return;
+  if (!(event.key in acts) || (own && (event.key === " " || at.matches("select, [type=radio]")))) return;
   event.preventDefault();
   acts[event.key]();
 });

@@ -31,16 +31,16 @@ function resting(j) { // segments in which a joint is not used, from the columns
   return found;
 }
 
-function torqueRows(j) { // measured, predicted, and residual of the first prediction
+function torqueRows(j) { // measured, predicted, and residual of the shown prediction
   const { rows } = torqueTable;
   const ys = torques.labels.map((_, k) => rows.map((row) => row[k * count + j]));
-  if (predictions) ys.push(ys[0].map((y, k) => y - ys[1][k]));
+  if (predictions) ys.push(ys[0].map((y, k) => y - ys[1 + chosen][k]));
   return ys;
 }
 
 function drawTorques() {
   const tones = torques.labels.map((label, k) => ["text", "predicted"][k]
-    || (label === "commanded" ? "tone-5" : `tone-${k + 1}`));
+    || { commanded: "tone-5", URDF: "urdf" }[label] || `tone-${k + 1}`);
   const marks = data.marks.map(({ t }) => t);
   const section = element("section", {}, element("h2", {}, isTorque ? "Torque" : "Position"));
   byId("plots").append(section);
@@ -51,7 +51,8 @@ function drawTorques() {
     place.dataset.node = node;
     section.append(place);
     const ys = torqueRows(j), series = torques.labels.map((label, k) =>
-      ({ label, tone: tones[k], kind: "line", y: ys[k], half: null, faint: k > 1 }));
+      ({ label, tone: tones[k], kind: "line", y: ys[k], half: null, faint: k > 1,
+        hidden: models.length > 0 && k > 0 && k - 1 !== chosen }));
     if (predictions) series.push(
       { label: "residual", tone: "residual", kind: "line", y: ys[ys.length - 1], half: null });
     torqueCharts.push(new charts.Chart(place, { title: `${torques.quantity} of ${name} over time`, link: "time",

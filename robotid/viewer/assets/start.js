@@ -8,6 +8,7 @@ if (torques) { measureTorques(); drawTorques(); }
 if (bands) drawBands();
 byId("side").hidden = false;
 drawSwitches();
+drawModels();
 data.marks.forEach(addMark);
 if (data.live) listen();
 restore();
@@ -15,10 +16,11 @@ showMasses();
 chooseArcs();
 buttons();
 show();
+greetReport();
 requestAnimationFrame(tick);
 
 // for scripts and notebooks: the clock, and the world pose of every node as 16 numbers by columns
-window.replay = { clock, seek, play, pause, pick, draw, pace, viewer, motion, arcs, masses,
+window.replay = { clock, seek, choose, play, pause, pick, draw, pace, viewer, motion, arcs, masses,
   level, bins, torqueCharts, bandCharts,
   ghosts, robot, get picked() { return picked && data.scene.nodes[picked].name; },
   poses: (which = robot) => {
