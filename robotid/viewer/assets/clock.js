@@ -93,7 +93,6 @@ function wake() { // asks for one frame; nothing is drawn while nothing changes
   isAsked = true;
 }
 function tick(now) {
-  isAsked = false;
   const passed = last === null ? 0 : (now - last) / 1000;
   last = now;
   clock.at = now;
@@ -113,6 +112,7 @@ function tick(now) {
     viewer.render();
     placeNames();
   }
+  isAsked = false; // only now: what was changed above is drawn
   clearTimeout(next);
   if (clock.playing || clock.follow) next = setTimeout(wake, EVERY);
   else last = null;

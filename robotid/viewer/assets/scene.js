@@ -84,7 +84,12 @@ data.scene.nodes.forEach((_, node) => {
 // The sky's light and that of two lamps beside the camera, at the corners of triangles: a
 // processor draws it in half the time of three's own materials. A ghost is behind what is as near.
 const LIGHT = `
-  #ifndef DARK
+  #ifdef FLAT
+  vColor = vec3(1.0);
+  #ifdef DOUBLE_SIDED
+  vBack = vColor;
+  #endif
+  #else
   vec3 normalSeen = normalize(normalMatrix * normal);
   float sky = 0.5 + 0.5 * dot(normalSeen, (viewMatrix * vec4(0.0, 1.0, 0.0, 0.0)).xyz);
   float key = dot(normalSeen, vec3(-0.54, 0.65, 0.54)), fill = dot(normalSeen, vec3(0.92, 0.07, 0.39));
@@ -117,7 +122,7 @@ function skin(side, { behind = 0, ...settings } = {}) {
 }
 
 class Robot { // the nodes of one robot in the viewer's tree, posed by a row of a motion
-  constructor(root, dress) { // dress: the meshes of a body
+  constructor(root, meshOf) { // meshOf: makes the mesh of a body
     this.root = viewer.scene_tree.find([root]).object;
     const paths = [];
     this.joints = data.scene.nodes.map((node, i) => {
@@ -133,13 +138,13 @@ class Robot { // the nodes of one robot in the viewer's tree, posed by a row of 
       const axis = new THREE.Vector3(...node.axis);
       return { ...node, object, rest, axis, skins: new Map() };
     });
-    this.solids = bodies.flatMap((body) => dress(body).map((mesh) => {
-      const joint = this.joints[body.node];
-      joint.skins.set(mesh.uuid, mesh.material);
+    this.solids = bodies.map((body) => {
+      const mesh = meshOf(body), { skins, object } = this.joints[body.node];
+      skins.set(body.side, mesh.material);
       mesh.userData.node = body.node;
-      joint.object.add(mesh);
+      object.add(mesh);
       return mesh;
-    }));
+    });
   }
   pose(row) {
     if (!row) return;
@@ -182,19 +187,20 @@ const GHOSTS = ["#3b82f6", "#d9820f", "#3a9d5d"];
 const BOOST = 10;
 const BEHIND = 0.008; // of the distance of the camera: a ghost this near to the robot is hidden by it
 let boost = 1; // factor on the distance of a ghost from the robot
-const robot = viewer && new Robot("robot", ({ shape, side }) => [new THREE.Mesh(shape, skin(side))]);
+const robot = viewer && new Robot("robot", ({ shape, side }) => new THREE.Mesh(shape, skin(side)));
 
-function ghostly(k) { // first the nearest surface of each pixel, then its colour: no parts show through
+function ghostly(k) { // one even colour, drawn once at each pixel: no parts show through
   const color = GHOSTS[k % GHOSTS.length];
-  const colour = { color, opacity: 0.4, depthWrite: false, blending: THREE.CustomBlending };
-  return ({ shape, side }) => [{ colorWrite: false }, colour].map((settings, pass) => {
-    const made = skin(side, { ...settings, behind: BEHIND });
-    made.defines = pass ? {} : { DARK: "" };
-    made.userData.ownColour.value = 0;
+  return ({ shape, side }) => {
+    const made = skin(side, { color, behind: BEHIND, opacity: 0.4, depthWrite: false,
+      blending: THREE.CustomBlending, // sides of transparent materials would be drawn one by one
+      stencilWrite: true, stencilRef: k + 1, stencilFunc: THREE.NotEqualStencilFunc,
+      stencilZPass: THREE.ReplaceStencilOp });
+    made.defines = { FLAT: "" };
     const mesh = new THREE.Mesh(shape, made);
-    mesh.renderOrder = 2 + (2 * k + pass) / 100;
+    mesh.renderOrder = 2 + k / 100;
     return mesh;
-  });
+  };
 }
 const ghosts = !viewer ? [] : ghostMotions.map((_, k) => new Robot(`ghost ${k}`, ghostly(k)));
 const floats = data.scene.nodes.some((node) => node.kind === "free");
