@@ -1,5 +1,6 @@
 """Files: written to a temporary name and renamed when complete; identified by their hash."""
 
+import difflib
 import hashlib
 import json
 import math
@@ -254,7 +255,20 @@ def missing_file(path: Path, what: str) -> str:
         return f"{str(path)!r} is a folder, wanted a {what}"
     if path.exists():
         return f"{str(path)!r} is a pipe or a device, wanted a {what}; copy it to a file"
-    return f"there is no {what} {str(path)!r}"
+    return f"there is no {what} {str(path)!r}{_similar_file(path)}"
+
+
+def _similar_file(path: Path) -> str:
+    """Return which part of a missing path does not exist, or which existing file is similar."""
+    folder = path.parent
+    if not folder.is_dir():
+        return f"; there is no folder {str(folder)!r}"
+    try:
+        by_name = {file.name.lower(): file.name for file in folder.iterdir()}
+    except OSError:  # not readable
+        return ""
+    near = difflib.get_close_matches(path.name.lower(), by_name, n=1, cutoff=0.75)
+    return f". Did you mean {str(path.with_name(by_name[near[0]]))!r}?" if near else ""
 
 
 def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
@@ -274,7 +288,9 @@ def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
         content = json.loads(source.read_text(encoding="utf-8"))
         json.dumps(content, allow_nan=False, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{source.name} is not JSON: {str(error)[:200]}") from error
+        raise DataError(
+            f"{source.name} is not JSON: {str(error)[:200]}; wanted a {what}"
+        ) from error
     inside = [content]
     for _ in range(_DEEPEST):
         lists = [

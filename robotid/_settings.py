@@ -164,9 +164,8 @@ class Settings:
 
     def __init_subclass__(cls) -> None:
         own = {name: f.metadata["key"] for name, f in vars(cls).items() if isinstance(f, Field)}
-        lines = [
-            f"    {name}: {key.words[:1].upper()}{key.words[1:]}." for name, key in own.items()
-        ]
+        texts = {name: key.words.replace("; false", "; None") for name, key in own.items()}
+        lines = [f"    {name}: {text[:1].upper()}{text[1:]}." for name, text in texts.items()]
         cls.__doc__ = "\n".join([f"{cls.__doc__}\n\nAttributes:", *lines])
 
     def __post_init__(self) -> None:
@@ -259,7 +258,7 @@ def check_keys(
             near = difflib.get_close_matches(key, schema, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else "."
             raise SettingsError(
-                f"{_shown(at)[1:-1]} is not a known key{hint} Known: {sorted(schema)}"
+                f"{_shown(at)[1:-1]} is not a known key{hint} Known: {listed(sorted(schema))}"
             )
         wanted = schema[key]
         if isinstance(wanted, dict):
@@ -287,6 +286,9 @@ def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str
 
 
 def _check_entries(value: object, wanted: Entries, at: str) -> None:
+    if wanted.count is not None and not isinstance(value, wanted.outer):
+        kind = "numbers" if float in wanted.inner else "entries"
+        raise SettingsError(f"{at} is {_shown(value)}, wanted a list of {wanted.count} {kind}")
     _check_type(value, (wanted.outer,), at)
     if isinstance(value, Mapping):
         for name, entry in value.items():

@@ -15,6 +15,7 @@ __all__ = [
     "listed",
     "log_finding",
     "not_ignored",
+    "quoted",
     "toml_key",
 ]
 
@@ -139,6 +140,15 @@ def listed(names: Iterable[object], limit: int | None = None) -> str:
     shown = words[:limit]
     more = f" and {len(words) - len(shown)} more" if len(words) > len(shown) else ""
     return (", ".join(shown) or "none") + more
+
+
+def quoted(name: str) -> str:
+    """Return a name as text of a job file.
+
+    Args:
+        name: The name, as of a column.
+    """
+    return json.dumps(name, ensure_ascii=False)
 
 
 def toml_key(name: str) -> str:

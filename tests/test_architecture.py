@@ -17,7 +17,7 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 LINES = [
     "",
-    "exceptions _text _typing",
+    "exceptions _text _typing _similar",
     "findings versions _files pages",
     "_settings pages",
     "robot logs",

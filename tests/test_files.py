@@ -13,6 +13,7 @@ from robotid._files import (
     check_folder,
     file_sha256,
     folder_beside,
+    missing_file,
     write_text,
     written_whole,
 )
@@ -160,3 +161,16 @@ def test_what_has_no_end_has_no_hash(tmp_path):
     (tmp_path / "log.csv").symlink_to("/dev/null")
     with pytest.raises(DataError, match=r"log.csv' is a pipe or a device, wanted a file; copy it"):
         file_sha256(tmp_path / "log.csv")
+
+
+def test_a_missing_file_is_answered_with_a_similar_one(tmp_path):
+    (tmp_path / "Run_1.csv").touch()
+    near = f". Did you mean {str(tmp_path / 'Run_1.csv')!r}?"
+    for name in ("run_1.csv", "run1.csv", "Rum_1.cvs"):
+        said = missing_file(tmp_path / name, "log file")
+        assert said == f"there is no log file {str(tmp_path / name)!r}{near}"
+    other = tmp_path / "friction.urdf"
+    assert missing_file(other, "URDF file") == f"there is no URDF file {str(other)!r}"
+    inside = tmp_path / "none" / "Run_1.csv"
+    said = missing_file(inside, "log file")
+    assert said.endswith(f"; there is no folder {str(tmp_path / 'none')!r}")

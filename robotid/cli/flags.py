@@ -55,6 +55,13 @@ def pairs(words: Sequence[str], flag: str) -> dict[str, float]:
     return pairs
 
 
+def _names(words: Sequence[str], flag: str) -> dict[str, str]:
+    """Return names by joint."""
+    if wrong := [word for word in words if not all(word.partition("=")[::2])]:
+        raise SettingsError(f"{flag} {wrong[0]!r}: wanted JOINT=NAME")
+    return dict(word.split("=", 1) for word in words)
+
+
 def _of_all_or_pairs(words: Sequence[str], flag: str) -> float | dict[str, float]:
     """Return one number for all joints, or numbers by joint."""
     if len(words) > 1 or "=" in words[0]:
@@ -206,9 +213,11 @@ JOB = Flags(
         "--angle-unit": ("units.angle", "UNIT"),
         "--topic": ("log.topic", "NAME"),
         "--command-topic": ("log.command", "NAME"),
+        "--rename": ("log.joints", "JOINT=NAME"),
         "--effort": ("log.effort", "MEANING"),
         "--stamp": ("log.stamp", "CLOCK"),
     },
+    {"--rename": _names},
 )
 #: Flags of the estimator.
 FIT = ("--estimator", "--kp", "--kd")
@@ -337,8 +346,9 @@ def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "
         given = _given(options)
         if options.logs or given:
             raise SettingsError(
-                f"{options.source} is a job file; it states the logs and settings. "
-                f"Remove {listed(options.logs or given)}"
+                f"{options.source} is a job file; it states the logs and settings. Remove "
+                f"{listed([*options.logs, *given])}, and state in the job file: "
+                f"{listed(_keys_of(options.logs, given))}"
             )
         return read_job(options.source)
     if not options.logs and needs_logs:
@@ -389,6 +399,18 @@ def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
 def _given(options: argparse.Namespace) -> list[str]:
     validate = ["--validate"] if getattr(options, "validate", None) is not None else []
     return validate + JOB.given(options)
+
+
+def _keys_of(logs: Sequence[str], flags: Sequence[str]) -> list[str]:
+    """Return the keys of a job file that state what logs and flags state."""
+    keys = ["log in [[identification]]"] if logs else []
+    for flag in flags:
+        if flag == "--validate":
+            keys.append("log in [[validation]]")
+            continue
+        table, _, key = JOB.keys[flag][0].rpartition(".")
+        keys.append(f"{key} in [{table}]" if table else f"{key} at the top")
+    return keys
 
 
 def _name(flag: str) -> str:

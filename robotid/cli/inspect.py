@@ -1,6 +1,7 @@
 """robotid inspect: list joints, parameters and faults of a URDF."""
 
 import argparse
+import shlex
 from functools import partial
 from typing import Any
 
@@ -40,12 +41,12 @@ def run(options: argparse.Namespace) -> None:
     content = inspect_urdf(options.urdf, free_flyer=options.free_flyer).to_dict()
     if not (content["robot"] or options.json):
         raise ModelError(content["findings"][0]["message"])
-    show_found(content, options, partial(_show, is_verbose=options.verbose, with_base=options.base))
+    show_found(content, options, partial(_show, options=options))
     if content["structure"] is None:
         raise ModelError(f"{options.urdf} does not give a valid model; see the findings")
 
 
-def _show(content: dict[str, Any], *, is_verbose: bool, with_base: bool) -> None:
+def _show(content: dict[str, Any], *, options: argparse.Namespace) -> None:
     structure, joints = content["structure"], content["joints"]
     findings = [
         {**finding, "where": finding.get("link") or finding.get("joint") or ""}
@@ -59,10 +60,12 @@ def _show(content: dict[str, Any], *, is_verbose: bool, with_base: bool) -> None
             f"base; with drives {structure['base']}"
         )
     names = list(dict.fromkeys([*joints, *(finding["where"] for finding in findings)]))
-    print_causes(findings, [name for name in names if name], is_verbose=is_verbose)
-    if with_base:
+    print_causes(findings, [name for name in names if name], is_verbose=options.verbose)
+    if options.base:
         print("\nbase parameters, inertial")
         for group in content["base_groups"]:
             echo(f"  {group}", "    ")
     elif structure:
-        echo("list of base parameters: --base")
+        flags = ["--free-flyer", "--base"] if options.free_flyer else ["--base"]
+        command = shlex.join(["robotid", "inspect", options.urdf, *flags])
+        echo(f"list of base parameters: {command}")

@@ -3,7 +3,7 @@
 import argparse
 import difflib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 __all__ = ["CommandParser"]
 
@@ -45,7 +45,20 @@ class CommandParser(argparse.ArgumentParser):
             near = difflib.get_close_matches(flags[0], known, n=1)
             hint = f"; did you mean {near[0]}?" if near else f"; see '{self.prog} --help'"
             self.error(f"{flags[0]} is unknown{hint}")
+        if unknown and self._subparsers is None:
+            self.error(
+                f"{unknown[0]!r} is one word too many; a flag takes one word, as JOINT=NUMBER or "
+                f"A,B; see '{self.prog} --help'"
+            )
         return found, unknown
+
+    def error(self, message: str) -> NoReturn:
+        """Print the arguments and a message, and exit with code 2.
+
+        Args:
+            message: The message.
+        """
+        self.exit(2, f"{self._usage()}{self.prog}: error: {message}\n")
 
     def format_usage(self) -> str:
         """Return the usage; the short one lists the arguments only."""

@@ -34,7 +34,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     words = "from a known mass, estimate the gains of logged currents without --gain"
     add("--gains", action="store_true", help=words)
     add_json(parser)
-    JOB.add(parser.add_argument_group("the logs, unless a RESULT is given"), LOG)
+    flags = [flag for flag in LOG if flag != "--ignore"]  # the logs are not examined
+    JOB.add(parser.add_argument_group("the logs, unless a RESULT is given"), flags)
 
 
 def run(options: argparse.Namespace) -> None:

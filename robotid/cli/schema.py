@@ -15,7 +15,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         parser: Its parser.
     """
     parser.epilog = (
-        "robotid schema > job.schema.json; then write `#:schema job.schema.json` in the job file"
+        "robotid schema > job.schema.json; the first line of the job file is then "
+        "#:schema job.schema.json"
     )
 
 

@@ -1,6 +1,7 @@
 """The job: robot, logs and settings, read from TOML; every key is checked."""
 
 import os
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass
@@ -131,7 +132,7 @@ class Job(Settings):
         None, "joints to identify, in order; all movable joints if not stated"
     )
     locked: Mapping[str, float] = setting(
-        {}, 'positions of locked joints, `"*"` for all other joints [rad or m]'
+        {}, 'positions of locked joints, "*" for all other joints [rad or m]'
     )
     gravity: tuple[float, float, float] = setting(
         (0.0, 0.0, -9.81), "gravity in the root link's frame [m/s^2]"
@@ -358,7 +359,14 @@ def read_job(path: str | Path) -> Job:
     if not source.is_file():
         raise SettingsError(missing_file(source, "job file"))
     try:
-        table = tomllib.loads(source.read_text(encoding="utf-8-sig"))
+        table = tomllib.loads(text := source.read_text(encoding="utf-8-sig"))
+    except tomllib.TOMLDecodeError as error:
+        at = re.search(r"at line (\d+)", str(error))
+        line = ": " + text.split("\n")[int(at[1]) - 1].strip()[:80] if at else ""
+        raise SettingsError(
+            f"{source.name} is not valid TOML: {error}{line}. Text and paths need quotes; a key "
+            "or [table] occurs once"
+        ) from error
     except (ValueError, RecursionError) as error:  # not UTF-8, numbers too long, tables too deep
         raise SettingsError(f"{source.name} is not valid TOML: {error}") from error
     return job_from_settings(table, source.name, source.parent)

@@ -13,7 +13,7 @@ from robotid._typing import STAGES, ProgressCallback, report_stage
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.locked_joints import STILL, check_locked
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, SettingsError
 from robotid.export.result import Result, load_result, stated_model, stated_parameters
 from robotid.findings import Finding, by_severity
 from robotid.fitting.recordings import Recordings
@@ -110,6 +110,8 @@ def examine(
         SettingsError: If a setting does not fit, or a code to ignore is unknown.
     """
     check_ignored(job.ignore)
+    if not (job.identification or job.validation):
+        raise SettingsError("the job has no log; state one: [[identification]] with log = FILE")
     model = model or job.model()
     refused: list[Finding] = []
 

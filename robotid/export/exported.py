@@ -131,5 +131,7 @@ def unstated_terms(
         if value != 0.0
         and not (term.name in terms and (has_couplings or layout.drives[d] not in layout.couplings))
     ]
-    sentence = f"{name} cannot state {listed(missing)}; the sidecar of the URDF has them"
+    sentence = (
+        f"{name} cannot state {listed(missing)}; the drive parameters file of the URDF has them"
+    )
     return [sentence] if missing else []

@@ -46,7 +46,7 @@ class Format:
 DELAYS = ("history", "filter")
 #: The formats by name.
 FORMATS: dict[str, Format] = {
-    "urdf": Format("URDF with <dynamics>, and its sidecar", ".urdf"),
+    "urdf": Format("URDF with <dynamics>, and its drive parameters file", ".urdf"),
     "mjcf": Format(
         "MuJoCo model",
         ".xml",

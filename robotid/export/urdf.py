@@ -190,12 +190,12 @@ def read_sidecar(path: str | Path) -> dict[str, Any]:
     Raises:
         DataError: If it is missing, not JSON, or not of the schema of a sidecar.
     """
-    source, content = Path(path), read_json(path, "sidecar")
+    source, content = Path(path), read_json(path, "drive parameters file")
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != _SCHEMA_VERSION:
         raise DataError(
-            f"{source.name} has schema_version {version!r}, wanted {_SCHEMA_VERSION} of a sidecar "
-            "written by write_urdf"
+            f"{source.name} has schema_version {version!r}, wanted {_SCHEMA_VERSION} of a drive "
+            "parameters file written by robotid"
         )
     check_shape(content, _SHAPE, source.name)
     return dict(content)

@@ -309,7 +309,8 @@ def check_ignored(ignore: Sequence[str]) -> None:
             near = difflib.get_close_matches(code, known, n=1)
             hint = f". Did you mean {near[0]!r}?" if near else ""
             raise SettingsError(
-                f"doctor: ignore has the unknown code {code!r}, wanted: {listed(known)}{hint}"
+                f"doctor: ignore has the code {code!r}, which is unknown or changes no verdict; "
+                f"wanted: {listed(known)}{hint}"
             )
 
 

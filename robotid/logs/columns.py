@@ -1,7 +1,7 @@
 """Columns of a table: positions, velocities, torques and commands of the joints by their names."""
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
@@ -9,13 +9,11 @@ import numpy as np
 
 from robotid._settings import is_number
 from robotid.exceptions import DataError, SettingsError
-from robotid.findings import listed
-from robotid.logs.data import (
-    repeated,
-    suggestion,
-)
+from robotid.findings import listed, quoted, toml_key
+from robotid.logs.data import repeated, suggestion
+from robotid.logs.missing import NOUNS, Missing
 from robotid.logs.settings import LogSource
-from robotid.logs.table import prefixes, quantity_of
+from robotid.logs.table import prefixes
 from robotid.logs.transmission import Transmission
 
 __all__ = ["NOUNS", "TORQUES", "Finder", "Needs", "without_torque"]
@@ -23,16 +21,6 @@ __all__ = ["NOUNS", "TORQUES", "Finder", "Needs", "without_torque"]
 #: Quantities that are read besides the positions, as of ``lay_out``.
 Needs: TypeAlias = Literal["torque", "motion", "commands", "any"]
 
-#: Nouns for the columns of each kind.
-NOUNS = {
-    "q": "position",
-    "dq": "velocity",
-    "ddq": "acceleration",
-    "tau": "torque or current",
-    "qref": "commanded position",
-    "dqref": "commanded velocity",
-    "tauref": "commanded torque",
-}
 #: Kinds of columns with torques.
 TORQUES = ("tau", "tauref")
 _SIZES = ("loadsize_", "load_size_")  # absolute values of loads, as bus servos report them
@@ -82,13 +70,12 @@ class Finder:
     def find_all(self) -> dict[str, list[str]]:
         """Return the columns to read: time, q, required quantities, complete optional ones."""
         self._check_arguments()
-        found = {
-            "time": [self._find("time", ["time", "t"]) or self._missing("time", "")],
-            "q": [column or self._missing(*at) for at, column in self._each("q")],
-        }
+        found = {"time": [self._find("time", ["time", "t"]) or self._no_time()]}
         optional, wanted = ["dq", "ddq"], self._wanted()
+        self._require(wanted)
+        found["q"] = [column for _, column in self._each("q") if column]
         if "commands" in wanted:
-            found["qref"] = self._find_commands()
+            found["qref"] = [column for _, column in self._each("qref") if column]
             optional += ["dqref", "tauref"]
         if "torque" in wanted or ("commands" in wanted and self._is_torque_whole()):
             found["tau"] = [
@@ -102,7 +89,7 @@ class Finder:
             self.notes.append(f"columns ignored: {listed(extra)}")
         if twice := repeated([name for names in found.values() for name in names]):
             raise SettingsError(
-                f"{self.where}: {listed(twice)} are read twice; correct columns={{...}}"
+                f"{self.where}: {listed(twice)} are read twice; correct columns in the job file"
             )
         return found
 
@@ -206,7 +193,8 @@ class Finder:
         if len(found) > 1:
             raise DataError(
                 f"{self.where} has {found[0]!r} and {found[1]!r}, two names of the same quantity; "
-                f"remove one, or pass columns={{{standard!r}: ...}}"
+                f"remove one, or state in the job file columns = {{ {toml_key(standard)} = "
+                f"{quoted(found[0])} }}"
             )
         self.seen.update(found)
         return found[0] if found else None
@@ -235,7 +223,7 @@ class Finder:
             self.notes.append(f"the gain of {joint!r} is not used: {tau} is a torque")
         if current and not has_gain:
             raise self._no_gain(joint, current)
-        return tau or current or self._missing(f"tau{m}", joint)
+        return tau or current or ""
 
     def _wanted(self) -> set[str]:
         """Return which of torque and commands are required of every joint."""
@@ -261,28 +249,6 @@ class Finder:
             )
         return not without
 
-    def _find_commands(self) -> list[str]:
-        """Return the columns of the commanded position of every joint."""
-        found = self._each("qref")
-        without = [joint for (_, joint), column in found if column is None]
-        if not without:
-            return [column for _, column in found if column]
-        known = [name for name in self.names if (quantity_of(name) or ("",))[0] == "qref"]
-        if len(without) == len(found):
-            raise DataError(
-                f"{self.where} has no commanded position, as 'qref_{self.joints[0]}', of any joint "
-                f"read; columns of commanded positions found: {listed(known)}. Record the commands "
-                "of the controller, rename the columns, or pass columns={'qref_<joint>': ...}"
-                + "".join(f"; {note}" for note in self.notes),
-                code="missing_column",
-            )
-        raise DataError(
-            f"{self.where} has no commanded positions of {listed(without)}: no column "
-            f"'qref_{self._named(without[0])}'; found: {listed(known)}. Record them, rename the "
-            "columns, pass columns={'qref_<joint>': ...}, or lock joints that were at rest",
-            code="missing_column",
-        )
-
     def _note_sizes(self) -> None:
         """Add a note on loads without sign, which are not used."""
         sizes = [name for name in self.names if name.startswith(_SIZES) and name not in self.seen]
@@ -302,7 +268,7 @@ class Finder:
         has = f"joint {joint!r} has the current {current!r}"
         if len(without) > 1:
             has = f"joints {listed(without)} have currents"
-        more = ", ..." if len(without) > 1 else ""
+        gains = ", ".join(f"{toml_key(name)} = ..." for name in without)
         flags = " ".join(f"--gain {name}=..." for name in without)
         absent = [x for x in self.joints if not (self._has("tau", x) or self._has("current", x))]
         also = ""
@@ -313,9 +279,8 @@ class Finder:
                 f"positions, as with {locks}"
             )
         return DataError(
-            f"{self.where}: {has} but no gain; state it in N m/A: "
-            f"gains={{{without[0]!r}: ...{more}}} (job file table [torque], key gains; CLI "
-            f"{flags}){also}",
+            f"{self.where}: {has} but no gain; state it in N m/A: {flags}, or in the job file "
+            f"[torque] gains = {{ {gains} }}{also}",
             code="missing_gain",
         )
 
@@ -328,61 +293,62 @@ class Finder:
             self.notes.append(f"{listed(names)} ignored: {listed(without)} have no {NOUNS[kind]}")
         return [] if without else names
 
-    def _missing(self, kind: str, joint: str) -> str:
-        """Reject a file without a column; the error names the columns of its kind."""
-        standard = f"{kind}_{joint}" if joint else kind
-        noun = f"{NOUNS[kind.removesuffix('m')]} columns" if joint else "columns"
-        kinds, named = (kind, "current") if kind == "tau" else (kind,), self._named(joint)
-        others = {self._named(other) for other in self.joints}
-        found, ends = [], {}  # columns; and by their joint, unless it is another one
-        for name in self.names:
-            quantity, end = quantity_of(name, self.source.effort) or ("", name)
-            if quantity in kinds or not joint:
-                found.append(name)
-                if end not in others:
-                    ends[end] = name
-        nearest = difflib.get_close_matches(named or kind, ends, n=1)
-        near = repr(ends[nearest[0]]) if nearest else "..."
-        hint = f"Did you mean {near}? " if nearest else ""
-        sought = f"{kind}_{named}" if joint else kind
-        remedy = ""
-        if joint in self.joints and kind in NOUNS:
-            remedy = f"; if {joint!r} was at rest, leave it out of joints and lock it"
-            remedy += self._how_to_lock()
-        if at_motors := [name for name in self.names if name.startswith(f"{kind}m_")]:
-            remedy = (
-                f". For columns of motors, as {at_motors[0]}, state [[transmission]] with joints "
-                "and matrix"
-            )
-        if kind == "tau" and not any(self.has_torque(other) for other in self.joints):
-            is_commanded = all(self._has("qref", other) for other in self.joints)
-            remedy = f". {without_torque(is_commanded)}"
+    def _no_time(self) -> str:
+        """Reject a log without a time column."""
+        by_words = {name.lower(): name for name in self.names}
+        near = difflib.get_close_matches("time", by_words, n=1)
+        hint = f"Did you mean {by_words[near[0]]!r}? " if near else ""
+        stated = quoted(by_words[near[0]] if near else "NAME")
         raise DataError(
-            f"{self.where} has no column {sought!r}; {noun} found: {listed(found)}. {hint}"
-            f"Rename it, or pass columns={{{standard!r}: {near}}}{remedy}",
+            f"{self.where} has no column 'time'; columns found: {listed(self.names)}. {hint}"
+            f"Rename it, or state it in the job file: columns = {{ time = {stated} }}",
             code="missing_column",
         )
 
-    def _how_to_lock(self) -> str:
-        """Return the flags that lock the joints without columns, "" if all joints are such."""
-        logged = [joint for joint in self.joints if self._is_logged(joint)]
-        absent = [joint for joint in self.joints if joint not in logged]
-        if not logged:
-            return ""
-        locks = " ".join(f"--lock {joint}=0" for joint in absent)
-        locked = ", ".join(f"{joint!r}: 0" for joint in absent)
-        return (
-            f" at its position, as with --joints {','.join(logged)} {locks}; in Python "
-            f"RobotModel.from_urdf(..., locked={{{locked}}})"
+    def _require(self, wanted: Collection[str]) -> None:
+        """Reject a log without a required column of any joint."""
+        kinds = ["q", *(["qref"] if "commands" in wanted else [])]
+        absent = [at for kind in kinds for at, column in self._each(kind) if column is None]
+        if "torque" in wanted:
+            absent += [
+                (f"tau{m}", name)
+                for joint, is_motor in zip(self.joints, self.of_motors("tau"), strict=True)
+                for m, name in [("m", self.motors[joint]) if is_motor else ("", joint)]
+                if not (self._has(f"tau{m}", name) or self._has(f"current{m}", name))
+            ]
+        if not absent:
+            return
+        missing = Missing(
+            self.where, self.names, absent, (*self.joints, *self.motors.values()), self.source
         )
+        has_no_gain = any(self._has("current", x) and x not in self.gains for x in self.joints)
+        if has_no_gain and all(kind == "tau" for kind, _ in absent) and not missing.similar():
+            return  # that error names these joints, too
+        raise missing.error(self._remedy(absent))
 
-    def _is_logged(self, joint: str) -> bool:
-        """Return whether the file has the required columns of a joint."""
-        wanted = self._wanted()
+    def _remedy(self, absent: Sequence[tuple[str, str]]) -> str:
+        """Return what to do if no column is similar to a missing one, with its separator."""
+        if at_motors := [name for name in self.names if name.startswith(("qm_", "taum_"))]:
+            return (
+                f". For columns of motors, as {at_motors[0]}, state [[transmission]] with joints "
+                "and matrix"
+            )
+        kind, joints = absent[0][0], [joint for _, joint in absent]
+        if kind == "tau" and not any(map(self.has_torque, self.joints)):
+            return f". {without_torque(all(self._has('qref', other) for other in self.joints))}"
+        if kind == "qref" and not any(self._has("qref", other) for other in self.joints):
+            return "".join(
+                [". Record the commands of the controller", *(f"; {note}" for note in self.notes)]
+            )
+        at_rest = [joint for joint in self.joints if joint in joints]
+        if len(at_rest) == len(self.joints):
+            return ""
+        locks = " ".join(f"--lock {joint}=0" for joint in at_rest)
+        locked = ", ".join(f"{toml_key(joint)} = 0" for joint in at_rest)
+        one = len(at_rest) == 1
+        how = "was at rest, lock it at its position" if one else "were at rest, lock them there"
         return (
-            self._has("q", joint)
-            and ("torque" not in wanted or self.has_torque(joint))
-            and ("commands" not in wanted or self._has("qref", joint))
+            f". If {listed(at_rest)} {how}, as {locks}, or locked = {{ {locked} }} in the job file"
         )
 
     def has_torque(self, joint: str) -> bool:

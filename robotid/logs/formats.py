@@ -68,6 +68,8 @@ def _format_of(path: Path) -> Format:
         is_dataset = (path / "meta" / "info.json").is_file()
         return LeRobotFormat() if is_dataset else BagFormat()
     suffix = path.suffix.lower()
+    if not path.exists():
+        raise DataError(missing_file(path, "log file"))
     if suffix not in _FORMATS:
         raise DataError(
             f"{path.name}: the suffix is {suffix!r}, wanted a log file of type "

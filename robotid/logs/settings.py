@@ -34,7 +34,7 @@ class SignalSettings(Settings):
     )
     cutoff: float | None = setting(
         8.0,
-        "cut-off of the zero-phase Butterworth filter [Hz]; false (None in Python) for no filter",
+        "cut-off of the zero-phase Butterworth filter [Hz]; false for no filter",
         within=_HZ,
         reads=(int, float, bool),
         load=_load_cutoff,
@@ -93,7 +93,7 @@ class SignalSettings(Settings):
 
 @dataclass(frozen=True)
 class LogUnits(Settings):
-    """Units of a log file; None is SI, and an error if the numbers look like another unit."""
+    """Units of a log file; SI if not stated, and an error if the numbers look like another unit."""
 
     _table: ClassVar[str] = "units"
 

@@ -13,6 +13,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from robotid._files import missing_file
 from robotid.exceptions import ModelError
 
 __all__ = [
@@ -51,7 +52,7 @@ def parse_urdf(path: str | Path) -> ET.Element:
         raise ModelError(f"{path.name} is xacro, not URDF; expand it first: xacro {path.name}")
     try:
         if not path.is_file():  # folders, pipes and devices are not read
-            raise ModelError(f"there is no URDF file {str(path)!r}")
+            raise ModelError(missing_file(path, "URDF file"))
         size, content = path.stat().st_size, b""
         if size <= _MOST_BYTES:
             content = path.read_bytes()
@@ -70,7 +71,9 @@ def parse_urdf(path: str | Path) -> ET.Element:
     try:
         robot = ET.fromstring(content)  # as a whole: in parts a long name takes quadratic time
     except (ET.ParseError, LookupError, ValueError) as error:  # the latter two: its encoding
-        raise ModelError(f"{path.name} is not well-formed XML: {error}") from error
+        raise ModelError(
+            f"{path.name} is not well-formed XML: {error}; wanted a URDF file"
+        ) from error
     if robot.tag != "robot":
         raise ModelError(
             f"{path.name}: the top element is <{robot.tag[:_LONGEST]}>, wanted <robot>"

@@ -143,8 +143,7 @@ class Actuator(Settings):
 
     effort: float | None = setting(
         None,
-        "torque limit of each drive, relative to the URDF's effort limit; false (None in Python): "
-        "no limit",
+        "torque limit of each drive, relative to the URDF's effort limit; false: no limit",
         within=POSITIVE,
         reads=(int, float, bool),
         load=_effort_from,

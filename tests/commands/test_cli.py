@@ -340,8 +340,11 @@ def test_a_job_file_states_its_logs_itself(arm_logs, tmp_path, capsys):
     )
     assert main(["identify", str(job), "--out", str(tmp_path / "out")]) == 0
     assert "verdict: good" in capsys.readouterr().out
-    assert main(["identify", str(job), "--cutoff", "5"]) == 2
-    assert "is a job file; it states the logs and settings" in capsys.readouterr().err
+    assert main(["identify", str(job), "a.csv", "--cutoff", "5", "--lock", "a=0"]) == 2
+    assert capsys.readouterr().err.endswith(
+        "is a job file; it states the logs and settings. Remove a.csv, --lock, --cutoff, and state "
+        "in the job file: log in [[identification]], locked at the top, cutoff in [signals]\n"
+    )
 
 
 def test_rounded_angles_are_named_and_snapped_where_asked(tmp_path, rng, capsys):

@@ -56,7 +56,7 @@ def test_each_format_is_written_and_what_it_does_not_state_is_said(result, tmp_p
     has_place = [f"{j}.{t}" for j in ("joint_1", "joint_2") for t in ("armature", "offset")]
     missing = ", ".join(name for name in has_place if values[name])
     said = " ".join(line.strip() for line in lines[1:])
-    assert said == f"URDF cannot state {missing}; the sidecar of the URDF has them"
+    assert said == f"URDF cannot state {missing}; the drive parameters file of the URDF has them"
     dynamics = read_with_yourdfpy(tmp_path / "a.urdf").joints[-1].dynamics
     assert float(dynamics.damping) == values["joint_2.viscous"]
     _, again = load_identified(tmp_path / "a.urdf", tmp_path / "a.drive.json")

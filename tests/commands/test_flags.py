@@ -41,6 +41,7 @@ def test_every_other_flag_states_its_key_too():
         *("--gain", "b=2", "--gain", "a=-3", "--friction", "viscous", "--estimator", "ols"),
         *("--time-unit", "ms", "--angle-unit", "deg", "--topic", "/arm"),
         *("--command-topic", "/wanted", "--effort", "current", "--stamp", "log"),
+        *("--rename", "b=2", "--rename", "a=one=1"),
         *("--ignore", "late", "--ignore", "clipped", "--dynamics", "--no-report"),
     ]
     found = job(identify, *words)
@@ -53,13 +54,21 @@ def test_every_other_flag_states_its_key_too():
     assert found.terms == ("armature", "viscous", "offset")
     assert found.estimator.name == "ols"
     assert (found.units.time, found.units.angle) == ("ms", "deg")
-    assert found.source == LogSource("/arm", command="/wanted", effort="current", stamp="log")
+    assert found.source == LogSource(
+        "/arm", command="/wanted", joints={"b": "2", "a": "one=1"}, effort="current", stamp="log"
+    )
     assert tuple(found.ignore) == ("late", "clipped")
     assert (found.dynamics, found.report) == (True, False)
     usual = job(identify)
     assert (usual.joints, usual.locked, usual.gains) == (None, {}, {})
     assert (usual.dynamics, usual.report, usual.snap_angles) == (False, True, False)
     assert usual.source == LogSource()
+
+
+def test_a_name_in_the_log_needs_its_joint():
+    for word in ("b", "=2", "b="):
+        with pytest.raises(SettingsError, match=rf"^--rename '{word}': wanted JOINT=NAME$"):
+            job(identify, "--rename", word)
 
 
 def test_words_that_identify_again_leave_out_what_is_only_shown():

@@ -1,8 +1,11 @@
 """The command line's help, and its answer to a misspelt word."""
 
+import re
+from importlib import import_module
+
 import pytest
 
-from robotid.cli import excite, identify, main
+from robotid.cli import COMMANDS, excite, identify, main
 
 
 def printed(capsys, *words):
@@ -30,6 +33,14 @@ def test_a_misspelt_word_is_answered_with_the_nearest_one(capsys, words, near):
     code, said = printed(capsys, *words)
     assert code == 2
     assert near in said
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_no_words_of_python_or_markdown(capsys, command):
+    words = "--help-all" if hasattr(import_module(f"robotid.cli.{command}"), "MAIN_FLAGS") else "-h"
+    code, said = printed(capsys, command, words)
+    assert code == 0
+    assert not re.search(r"`|\b(None|True|False|Python|sidecar)\b", said)
 
 
 def test_a_word_that_is_near_to_none_is_answered_with_all(capsys):
@@ -70,3 +81,14 @@ def test_a_missing_flag_is_in_the_usage(capsys):
     code, said = printed(capsys, "excite", "robot.urdf")
     assert code == 2
     assert said.startswith("usage: robotid excite JOB.toml | URDF --out FILE [flags]\n")
+
+
+def test_a_word_too_many_is_answered_with_the_form_of_a_flag(capsys):
+    code, said = printed(capsys, "doctor", "r.urdf", "l.csv", "--gain", "elbow", "3")
+    assert code == 2
+    usage, message = said.splitlines()
+    assert usage == "usage: robotid doctor JOB.toml | URDF [LOG ...] [flags]"
+    assert message == (
+        "robotid doctor: error: '3' is one word too many; a flag takes one word, as JOINT=NUMBER "
+        "or A,B; see 'robotid doctor --help'"
+    )

@@ -212,7 +212,7 @@ def test_python_says_what_the_command_line_says(arm, logs, tmp_path, delay):
     known = identify(arm, **logs, ignore=["torque_delay"])
     assert "torque_delay" not in {doubt.code for doubt in (*blind.warnings, *known.warnings)}
     assert known.findings != blind.findings
-    with pytest.raises(SettingsError, match="unknown code 'late'"):
+    with pytest.raises(SettingsError, match=r"has the code 'late', which is unknown or changes"):
         identify(arm, named[:1], ignore=["late"])
 
 

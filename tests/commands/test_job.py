@@ -182,6 +182,10 @@ WRONG = {
     "NUL in a path": ('"robot.urdf"', '"robot\\u0000.urdf"', "is not a valid path"),
     "long path": ('"robot.urdf"', f'"{"r" * 5000}"', "is not a valid path, wanted UTF-8"),
     "misspelt topic": ("topic =", "topics =", "topics is not a known key; did you mean 'topic'?"),
+    "gravity": ("[0.0, -9.81, 0.0]", "9.81", "9.81, wanted a list of 3 numbers"),
+    "no quotes": (
+        'urdf = "robot.urdf"', "urdf = robot.urdf", ": urdf = robot.urdf. Text and paths need",
+    ),
     "no TOML": ("[signals]", "[signals", "is not valid TOML"),
 }  # fmt: skip
 

@@ -276,7 +276,7 @@ def test_an_unknown_code_to_ignore_is_wrong_use(wrong_sign, tmp_path, capsys):
     words = ["identify", URDF, wrong_sign, "--out", str(tmp_path), "--ignore", "torque_sgn"]
     assert main(words) == 2
     assert "Did you mean 'torque_sign'?" in capsys.readouterr().err
-    with pytest.raises(SettingsError, match="unknown code 'x'"):
+    with pytest.raises(SettingsError, match=r"has the code 'x', which is unknown or changes"):
         check_ignored(["x"])
 
 

@@ -68,7 +68,7 @@ def test_terms_of_either_sign_that_have_no_place_are_named_and_those_of_none_are
     stated = {"ja.offset": -0.5, "jb.offset": 0.5, "jb.viscous": 2.0, "motor.viscous": 3.0}
     for name, value in stated.items():
         pi[names.index(name)] = value
-    said = "X cannot state {}; the sidecar of the URDF has them"
+    said = "X cannot state {}; the drive parameters file of the URDF has them"
     missing = "ja.offset, jb.offset, motor.viscous"
     assert unstated_terms(model, pi, "X", ("viscous",)) == [said.format(missing)]
     found = unstated_terms(model, pi, "X", ("viscous",), has_couplings=True)

@@ -205,7 +205,7 @@ def test_a_term_that_mjcf_has_no_place_for_is_named(tmp_path):
     data.qpos = [0.0, 0.4]
     mujoco.mj_forward(robot, data)
     np.testing.assert_allclose(data.qfrc_passive, [0.0, -stiffness * 0.4])
-    assert notes[0] == "MJCF cannot state k.cubic; the sidecar of the URDF has them"
+    assert notes[0] == "MJCF cannot state k.cubic; the drive parameters file of the URDF has them"
     parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))
     comment = ET.parse(tmp_path / "robot.xml", parser).getroot()[0].text
     assert notes[0] in comment

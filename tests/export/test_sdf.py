@@ -106,7 +106,7 @@ def test_limits_friction_mimic_and_what_is_not_stated(tmp_path):
     text = (tmp_path / "robot.sdf").read_text()
     assert all(note in text for note in notes)
     offsets = ", ".join(f"{joint}.offset" for joint in model.joints)
-    assert notes[0] == f"SDF cannot state {offsets}; the sidecar of the URDF has them"
+    assert notes[0] == f"SDF cannot state {offsets}; the drive parameters file of the URDF has them"
     assert "<gravity>0.0 0.0 -9.81</gravity>" in notes[-1]
     top = ET.parse(tmp_path / "robot.sdf").getroot()
     assert top.get("version") == "1.11"  # the first with <mimic>

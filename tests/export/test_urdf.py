@@ -412,7 +412,7 @@ def test_a_pair_that_does_not_belong_together_is_refused(source, tmp_path, rng):
 
 
 SIDECAR_FAULTS = {
-    "missing": (None, "there is no sidecar '.*new.drive.json'"),
+    "missing": (None, "there is no drive parameters file '.*new.drive.json'"),
     "no JSON": ("{", "new.drive.json is not JSON: "),
     "a list": ("[]", "has schema_version None, wanted 1"),
     "other schema": ('{"schema_version": 2}', "has schema_version 2, wanted 1"),

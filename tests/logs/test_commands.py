@@ -184,16 +184,16 @@ def test_a_half_command_names_the_joints():
     with pytest.raises(DataError) as error:
         read_log(frame(qref_elbow=None), JOINTS, needs="commands")
     assert str(error.value) == (
-        "log has no commanded positions of elbow: no column 'qref_elbow'; found: qref_shoulder. "
-        "Record them, rename the columns, pass columns={'qref_<joint>': ...}, or lock joints that "
-        "were at rest"
+        "log has no column 'qref_elbow'; commanded position columns found: qref_shoulder. Rename "
+        'it, or state it in the job file: columns = { qref_elbow = "NAME" }. If elbow was at rest, '
+        "lock it at its position, as --lock elbow=0, or locked = { elbow = 0 } in the job file"
     )
     with pytest.raises(DataError) as error:
         read_log(frame(qref_elbow=None, qref_shoulder=None), JOINTS, needs="commands")
     assert str(error.value) == (
-        "log has no commanded position, as 'qref_shoulder', of any joint read; columns of "
-        "commanded positions found: none. Record the commands of the controller, rename the "
-        "columns, or pass columns={'qref_<joint>': ...}"
+        "log has no columns 'qref_shoulder', 'qref_elbow'; commanded position columns found: none. "
+        'Rename them, or state them in the job file: columns = { qref_shoulder = "NAME" }. Record '
+        "the commands of the controller"
     )
 
 
@@ -212,7 +212,7 @@ def test_of_torques_or_commands_what_there_is_must_be_whole(torques, commands, r
     table |= {f"tau_{joint}": log.t + k for k, joint in enumerate(JOINTS[:torques])}
     table |= {f"qref_{joint}": log.q_ref[:, k] for k, joint in enumerate(JOINTS[:commands])}
     if "_" in read:
-        with pytest.raises(DataError, match=f"no column '{read}'"):
+        with pytest.raises(DataError, match=f"no columns? '{read}'"):
             read_log(pd.DataFrame(table), JOINTS, needs="any")
         return
     found = read_log(pd.DataFrame(table), JOINTS, needs="any")
@@ -251,7 +251,7 @@ def test_a_log_without_torque_is_told_what_it_can_do():
     with pytest.raises(DataError) as error:
         read_log(frame(), JOINTS)
     assert str(error.value).endswith(
-        f"pass columns={{'tau_shoulder': ...}}. Its commands are {WITHOUT}"
+        f'columns = {{ tau_shoulder = "NAME" }}. Its commands are {WITHOUT}'
     )
     with pytest.raises(DataError) as error:
         read_log(frame(qref_elbow=None), JOINTS)
@@ -355,7 +355,7 @@ def test_a_controller_beside_joint_states_is_named(tmp_path):
         '"/arm_controller/state" reads them and their measured positions'
     )
     assert read_log(path, JOINTS).notes == (note,)
-    with pytest.raises(DataError, match=r"no commanded position.* commands are in topics that"):
+    with pytest.raises(DataError, match=r"no columns 'qref_.* commands are in topics that"):
         read_log(path, JOINTS, needs="commands")
     source = LogSource(topic="/arm_controller/state")
     assert_same(read_log(path, JOINTS, needs="commands", source=source), log)

@@ -251,9 +251,10 @@ def test_a_bag_without_efforts_is_refused_as_any_log(tmp_path):
     messages = [(*message[:4], []) for message in messages_of(make_log())]
     path = write_mcap(tmp_path / "run.mcap", messages)
     with refused(
-        "run.mcap has no column 'tau_shoulder'; torque or current columns found: none. Rename it, "
-        "or "
-        "pass columns={'tau_shoulder': ...}. Commanded positions, qref_<joint>, would be enough "
+        "run.mcap has no columns 'tau_shoulder', 'tau_elbow'; torque or current columns found: "
+        "none. Rename them, or state them in the job file: "
+        'columns = { tau_shoulder = "NAME" }. '
+        "Commanded positions, qref_<joint>, would be enough "
         'for [estimator] name = "simulation" with a [controller] table; all other estimators need '
         "tau_<joint> or current_<joint>"
     ):
@@ -278,8 +279,8 @@ def test_effort_is_a_current_if_stated(tmp_path):
     np.testing.assert_array_equal(back.tau, log.tau * [2.0, 3.0])
     with refused(
         "run.mcap: joints shoulder, elbow have currents but no gain; state it in N m/A: "
-        "gains={'shoulder': ..., ...} (job file table [torque], key gains; CLI --gain "
-        "shoulder=... --gain elbow=...)"
+        "--gain shoulder=... --gain elbow=..., or in the job file [torque] gains = "
+        "{ shoulder = ..., elbow = ... }"
     ):
         read_log(path, JOINTS, source=current)
 
@@ -379,7 +380,7 @@ def test_arrays_without_joint_names_are_numbered_and_mapped(tmp_path):
     log = make_log()
     path = tmp_path / "run.npz"
     np.savez(path, time=log.t, q=log.q, tau=log.tau, mass=3.0, image=np.zeros((60, 2, 2)))
-    with pytest.raises(DataError, match=r"position columns found: q_0, q_1"):
+    with pytest.raises(DataError, match=r"names in the log: 0, 1"):
         read_log(path, JOINTS)
     numbered = LogSource(joints={"shoulder": "0", "elbow": "1"})
     assert_same(read_log(path, JOINTS, source=numbered), log, ("t", "q", "tau"))
@@ -408,14 +409,15 @@ def test_one_joint_needs_no_second_axis(tmp_path):
         (
             {"time": None},
             "run.npz has no column 'time'; columns found: q_shoulder, q_elbow, "
-            "dq_shoulder, dq_elbow, tau_shoulder, tau_elbow. Rename it, or pass "
-            "columns={'time': ...}",
+            "dq_shoulder, dq_elbow, tau_shoulder, tau_elbow. Rename it, or state "
+            'it in the job file: columns = { time = "NAME" }',
         ),
         (
             {"tau": np.array([None] * 60)},
-            "run.npz has no column 'tau_shoulder'; torque or current columns found: none. Rename "
-            "it, "
-            "or pass columns={'tau_shoulder': ...}. Commanded positions, qref_<joint>, would be "
+            "run.npz has no columns 'tau_shoulder', 'tau_elbow'; torque or current columns found: "
+            "none. Rename them, or state them in the job file: "
+            'columns = { tau_shoulder = "NAME" }. '
+            "Commanded positions, qref_<joint>, would be "
             'enough for [estimator] name = "simulation" with a [controller] table; all other '
             "estimators need tau_<joint> or current_<joint>",
         ),
@@ -451,10 +453,10 @@ def test_joints_may_have_other_names_in_the_file(tmp_path):
     swapped = LogSource(joints={"M1": "M2", "M2": "M1"})
     np.testing.assert_array_equal(read_log(path, ("M1", "M2"), source=swapped).q, log.q[:, ::-1])
     with refused(
-        "run.csv has no column 'q_M3'; position columns found: q_M1, q_M2. Rename it, or "
-        "pass columns={'q_elbow': ...}; if 'elbow' was at rest, leave it out of joints and lock it "
-        "at its position, as with --joints shoulder --lock elbow=0; in Python "
-        "RobotModel.from_urdf(..., locked={'elbow': 0})"
+        "run.csv has no columns of joints elbow under the names of the URDF; names in the log: M2. "
+        "State the name of each joint in the job file, or with one flag per joint, as --rename "
+        "elbow=M2. This table is a guess: check each line, an exchange of joints gives wrong "
+        'parameters.\n[log.joints]\nelbow = "M2"  # by order'
     ):
         read_log(path, JOINTS, source=LogSource(joints={"shoulder": "M1", "elbow": "M3"}))
     with refused(

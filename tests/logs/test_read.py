@@ -120,7 +120,7 @@ def test_two_names_of_one_quantity_are_refused(run):
     path = run(make_table(position_elbow=np.zeros(300)))
     with refused(
         f"{path.name} has 'q_elbow' and 'position_elbow', two names of the same quantity; remove "
-        "one, or pass columns={'q_elbow': ...}"
+        'one, or state in the job file columns = { q_elbow = "q_elbow" }'
     ):
         read_log(path, JOINTS)
     log = read_log(path, JOINTS, columns={"q_elbow": "position_elbow"})
@@ -134,17 +134,16 @@ def test_two_names_of_one_quantity_are_refused(run):
 def test_missing_column_is_named_with_those_of_its_kind(run):
     path = run(make_table(tau_elbow=None))
     with refused(
-        f"{path.name} has no column 'tau_elbow'; torque or current columns found: "
-        "tau_shoulder. Rename it, or pass columns={'tau_elbow': ...}; "
-        "if 'elbow' was at rest, leave it out of joints and lock it at its position, as with "
-        "--joints shoulder --lock elbow=0; in Python RobotModel.from_urdf(..., "
-        "locked={'elbow': 0})"
+        f"{path.name} has no column 'tau_elbow'; torque or current columns found: tau_shoulder. "
+        'Rename it, or state it in the job file: columns = { tau_elbow = "NAME" }. If elbow was at '
+        "rest, lock it at its position, as --lock elbow=0, or locked = { elbow = 0 } in the "
+        "job file"
     ):
         read_log(path, JOINTS)
     path = run({k: v for k, v in make_table().items() if not k.startswith("q_")})
     with refused(
-        f"{path.name} has no column 'q_shoulder'; position columns found: none. Rename it, or pass "
-        "columns={'q_shoulder': ...}; if 'shoulder' was at rest, leave it out of joints and lock it"
+        f"{path.name} has no columns 'q_shoulder', 'q_elbow'; position columns found: none. Rename "
+        'them, or state them in the job file: columns = { q_shoulder = "NAME" }'
     ):
         read_log(path, JOINTS)
 
@@ -153,10 +152,8 @@ def test_misspelt_column_is_suggested(run):
     path = run(make_table(q_elbow=None, q_elbow2=np.zeros(300)))
     with refused(
         f"{path.name} has no column 'q_elbow'; position columns found: q_shoulder, q_elbow2. "
-        "Did you mean 'q_elbow2'? Rename it, or pass columns={'q_elbow': 'q_elbow2'}; "
-        "if 'elbow' was at rest, leave it out of joints and lock it at its position, as with "
-        "--joints shoulder --lock elbow=0; in Python RobotModel.from_urdf(..., "
-        "locked={'elbow': 0})"
+        "Did you mean 'q_elbow2'? Rename it, or state it in the job file: "
+        'columns = { q_elbow = "q_elbow2" }'
     ):
         read_log(path, JOINTS)
     log = read_log(path, JOINTS, columns={"q_elbow": "q_elbow2"})
@@ -168,10 +165,9 @@ def test_the_column_of_another_joint_is_not_suggested(run):
     path = run({"time": np.arange(3), "q_joint_1": zeros, "q_joint_2": zeros, "tau_joint_1": zeros})
     with refused(
         f"{path.name} has no column 'tau_joint_2'; torque or current columns found: "
-        "tau_joint_1. Rename it, or pass columns={'tau_joint_2': ...}; "
-        "if 'joint_2' was at rest, leave it out of joints and lock it at its position, as with "
-        "--joints joint_1 --lock joint_2=0; in Python RobotModel.from_urdf(..., "
-        "locked={'joint_2': 0})"
+        "tau_joint_1. Rename it, or state it in the job file: "
+        'columns = { tau_joint_2 = "NAME" }. If joint_2 was at rest, lock it at its position, '
+        "as --lock joint_2=0, or locked = { joint_2 = 0 } in the job file"
     ):
         read_log(path, ["joint_1", "joint_2"])
 
@@ -180,8 +176,8 @@ def test_missing_time_lists_all_columns(run):
     path = run(make_table(time=None, Time=np.arange(300.0)))
     with refused(
         f"{path.name} has no column 'time'; columns found: q_shoulder, q_elbow, "
-        "tau_shoulder, tau_elbow, Time. Did you mean 'Time'? Rename it, or pass "
-        "columns={'time': 'Time'}"
+        "tau_shoulder, tau_elbow, Time. Did you mean 'Time'? Rename it, or state it in the job "
+        'file: columns = { time = "Time" }'
     ):
         read_log(path, JOINTS)
 
@@ -207,7 +203,7 @@ def test_columns_may_swap_but_not_share(run):
     log = read_log(path, JOINTS, columns={"q_elbow": "q_shoulder", "q_shoulder": "q_elbow"})
     np.testing.assert_array_equal(log.q, make_log().q[:, ::-1])
     with refused(
-        f"{path.name}: tau_elbow are read twice; correct columns={{...}}",
+        f"{path.name}: tau_elbow are read twice; correct columns in the job file",
         SettingsError,
     ):
         read_log(path, JOINTS, columns={"tau_shoulder": "tau_elbow", "tau_elbow": "tau_elbow"})
@@ -264,7 +260,7 @@ def test_current_without_gain_is_refused(run):
     path = run(make_table(tau_elbow=None, i_elbow=np.ones(300)))
     with refused(
         f"{path.name}: joint 'elbow' has the current 'i_elbow' but no gain; state it in N m/A: "
-        "gains={'elbow': ...} (job file table [torque], key gains; CLI --gain elbow=...)"
+        "--gain elbow=..., or in the job file [torque] gains = { elbow = ... }"
     ):
         read_log(path, JOINTS)
 
@@ -275,8 +271,8 @@ def test_joints_without_gain_and_those_without_torque_are_all_named_at_once(run)
     path = run({"time": one, **dict.fromkeys(names, one)})
     with refused(
         f"{path.name}: joints a, b have currents but no gain; state it in N m/A: "
-        "gains={'a': ..., ...} (job file table [torque], key gains; CLI --gain a=... --gain "
-        "b=...). No torque of finger was found; if at rest, lock them at their positions, as "
+        "--gain a=... --gain b=..., or in the job file [torque] gains = { a = ..., b = ... }. "
+        "No torque of finger was found; if at rest, lock them at their positions, as "
         "with --lock finger=0"
     ):
         read_log(path, ("a", "b", "c", "finger"))
@@ -442,8 +438,8 @@ def test_csv_dialects(text, content):
         (ROWS, "run.csv has no header; its first line must name the columns"),
         (
             (HEADER + ROWS).replace(",", " "),
-            "run.csv has no column 'time'; columns found: time q_a tau_a. Rename it, or pass "
-            "columns={'time': ...}",
+            "run.csv has no column 'time'; columns found: time q_a tau_a. Rename it, or state "
+            'it in the job file: columns = { time = "NAME" }',
         ),
         (
             "time,q_a,q_a,tau_a\n0,1,2,3\n1,1,2,3\n",
@@ -488,7 +484,9 @@ def test_csv_that_is_not_utf8_is_refused(text, content):
 # --- files ----------------------------------------------------------------------------------------
 
 
-def test_other_suffixes_are_refused(tmp_path):
+def test_other_suffixes_are_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.xlsx").touch()
     known = ".csv, .parquet, .npz, .h5, .hdf5, .mat"
     for path in (tmp_path / "run.xlsx", "run.xlsx"):
         with refused(
@@ -500,7 +498,7 @@ def test_other_suffixes_are_refused(tmp_path):
     for name, suffix in (("run", ""), ("run.mcap", ".mcap")):
         with refused(f"{name}: logs are written as {written} files, not {suffix!r}"):
             write_log(make_log(), tmp_path / name)
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["run.xlsx"]
 
 
 def test_capital_suffix_is_read(tmp_path):

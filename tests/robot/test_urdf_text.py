@@ -111,7 +111,7 @@ def test_files_without_end_or_bottom_are_refused_at_once(tmp_path):
         stream.truncate(2**33)
     with pytest.raises(ModelError, match=r"huge.urdf has 8192 MiB, wanted a URDF of at most 64"):
         parse_urdf(huge)
-    with pytest.raises(ModelError, match="there is no URDF file"):
+    with pytest.raises(ModelError, match="is a folder, wanted a URDF file"):
         parse_urdf(tmp_path)
     with pytest.raises(ModelError, match="cannot be read: File name too long"):
         parse_urdf(tmp_path / ("x" * 300))
