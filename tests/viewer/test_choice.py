@@ -27,7 +27,7 @@ def page(tmp_path_factory):
 def seen(browser, page):
     with visit(browser, page, size=(900, 620), reduced_motion="reduce") as opened:
         opened.page.locator(".plot").first.scroll_into_view_if_needed()
-        until(opened, "replay.torqueCharts[0].plot !== null")
+        until(opened, "replay.torqueCharts[0].below.plot !== null")
         yield opened
         assert opened.errors == []
 
@@ -36,9 +36,9 @@ def shown(seen):
     """Return the mean residual that chart, strip and arc show of the first joint [N m]."""
     return seen.page.evaluate(
         """() => {
-          const chart = replay.torqueCharts[0], labels = chart.what.series.map((s) => s.label);
-          const visible = labels.filter((_, i) => !chart.hidden.has(i));
-          const residual = chart.ys[labels.indexOf("residual")];
+          const { chart, below } = replay.torqueCharts[0];
+          const labels = chart.what.series.map((s) => s.label);
+          const visible = labels.filter((_, i) => !chart.hidden.has(i)), [residual] = below.ys;
           replay.seek(4);
           return { visible, chart: residual.reduce((a, b) => a + b) / residual.length,
             strip: 0.1 * replay.level(10, 0),
@@ -51,7 +51,7 @@ def shown(seen):
 def test_charts_strip_and_arcs_show_the_selected_prediction(seen, label):
     seen.page.get_by_label(label, exact=True).check()
     found = shown(seen)
-    assert found["visible"] == ["measured", label, "residual"]
+    assert found["visible"] == ["measured", label]
     assert found["chart"] == pytest.approx(-SIZES[label], abs=1e-3)
     assert found["strip"] == pytest.approx(SIZES[label], abs=2e-3)
     share = SIZES[label] / 0.1 / 6.0  # of the full scale: blue, yellow, red

@@ -18,10 +18,11 @@ function choose(k) { // arcs, links, heat strip and charts show it
   byId("models").querySelector(`[value="${k}"]`).checked = true;
   levels = unpack(torques.strips[k]);
   drawStrip();
-  torqueCharts.forEach((chart, j) => {
+  torqueCharts.forEach(({ chart, below }, j) => {
     models.forEach((_, i) => { if (chart.hidden.has(1 + i) === (i === k)) chart.toggle(1 + i); });
-    chart.setData(torqueTable.t, torqueRows(j));
+    below.setData(torqueTable.t, [torqueRows(j)[1]]);
   });
   shown = readings = null;
   keep();
+  wake();
 }

@@ -2,6 +2,7 @@
 // ---- the clock: the log's own time -----------------------------------------------------------
 
 const SLOW = 0.045; // [s] a frame
+const READINGS = onProcessor ? 250 : 100; // [ms] between two changes of the page about the view
 const COARSEST = 0.5; // share of the pixels' width that a slow processor draws at least
 const clock = { time: data.start, playing: !matchMedia("(prefers-reduced-motion: reduce)").matches,
   speed: 1, loop: true, follow: Boolean(data.live), start: data.start, end: 0, frames: 0, at: 0 };
@@ -10,11 +11,11 @@ const slider = byId("time"), clockText = byId("clock"), playButton = byId("play"
 let shown = null, readings = null, announced = -Infinity;
 const digits = (time) => time.toFixed(2);
 
-function show() { // the robot in every frame, the page about it ten times a second
+function show() { // the robot in every frame, the page about it less often
   if (shown !== clock.time) showRobot(clock.time);
   shown = clock.time;
   const now = performance.now();
-  if (readings && (readings.time === clock.time || (clock.playing && now - readings.at < 100))) return;
+  if (readings && (readings.time === clock.time || (clock.playing && now - readings.at < READINGS))) return;
   readings = { time: clock.time, at: now };
   showReadings(clock.time);
 }
@@ -24,6 +25,7 @@ function showRobot(time) {
   const row = motion.at(time);
   robot.pose(row);
   follow(row);
+  castShadow();
   ghosts.forEach((ghost, k) => {
     const own = ghostMotions[k].at(time); // how far it is from the robot may be shown larger
     ghost.pose(boost === 1 ? own : own.map((x, i) => row[i] + boost * (x - row[i])));
@@ -68,6 +70,7 @@ function toggle() { if (clock.playing) pause(); else play(); }
 function buttons() {
   playButton.textContent = clock.playing ? "Pause" : "Play";
   byId("live").setAttribute("aria-pressed", clock.follow);
+  wake();
 }
 
 const pace = { mean: 0, frames: 0, pixels: 1 }; // of the last frames [s]; share of the pixels' width
@@ -84,7 +87,12 @@ function draw(pixels) {
 }
 function sharpen() { if (viewer && pace.pixels < 1) draw(1); } // full resolution of a still picture
 
-let last = null;
+const EVERY = 22; // [ms] to the next frame of a playing page, which is the second one of 60 Hz
+let last = null, isAsked = false, next = 0;
+function wake() { // asks for one frame; nothing is drawn while nothing changes
+  if (!isAsked) requestAnimationFrame(tick);
+  isAsked = true;
+}
 function tick(now) {
   const passed = last === null ? 0 : (now - last) / 1000;
   last = now;
@@ -105,7 +113,10 @@ function tick(now) {
     viewer.render();
     placeNames();
   }
-  requestAnimationFrame(tick);
+  isAsked = false; // only now: what was changed above is drawn
+  clearTimeout(next);
+  if (clock.playing || clock.follow) next = setTimeout(wake, EVERY);
+  else last = null;
 }
 
 // ---- the address stores time, joint and camera -------------------------------------------------

@@ -53,7 +53,7 @@ function drawSwitches() {
   const place = byId("switches");
   const add = (label, checked, act) => place.append(box(label, checked, act).label);
   if (viewer) {
-    add("transparent robot", false, (on) => { seeThrough = on; showMasses(); });
+    add("transparent robot", false, (on) => robot.fade(on ? 0.35 : 1));
     if (isTorque) add("torque arcs", true, (on) => { showsArcs = on; chooseArcs(); });
     if (predictions) add("links coloured by residual", false, tint);
     ghosts.forEach((ghost, k) => {

@@ -25,6 +25,7 @@ function greetReport() {
     isHeard = true;
     document.body.classList.add("embedded"); // without heading, switches and charts
     readings = null;
+    wake();
   });
   report.postMessage({ robotid: "replay", log: data.log, start: clock.start, end: clock.end }, "*");
 }
