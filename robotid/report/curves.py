@@ -11,7 +11,7 @@ __all__ = ["curves_section", "drawn"]
 
 _ROWS = 24_000  # of all charts: about half a MB
 _LONGEST = 2000  # rows of one chart
-_OPEN = 3  # joints that are open at most
+_OPEN = 2  # joints that are open at most
 _MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
 
 RunT = TypeVar("RunT")

@@ -16,6 +16,7 @@ from robotid.diagnosis.residuals import autocorrelation, spectrum
 from robotid.fitting.information import information
 from robotid.identification.pictures import QUANTILE, torque_charts
 from robotid.report import torques as torques_module
+from robotid.report.advice import Origin
 from robotid.report.torques import torques_section
 
 JOINTS = range(6)
@@ -224,7 +225,9 @@ def test_each_recording_has_its_own_band_error_and_share_of_the_points(identifie
     monkeypatch.setattr(torques_module, "chart_html", noted)
     monkeypatch.setattr("robotid.report.curves._ROWS", 9600)
     verdicts = identified.verdict.to_dict()["per_joint"]
-    torques_section(replace(identified, validation=()), verdicts, identified.model.joints)
+    torques_section(
+        replace(identified, validation=()), verdicts, identified.model.joints, Origin()
+    )
     fitted, joints = identified.fitted, identified.model.joints
     assert {points for *_, points in drawn} == {9600 // (2 * 6 * 2)}
     above, below = drawn[::2], drawn[1::2]
