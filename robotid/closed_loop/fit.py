@@ -55,6 +55,7 @@ STAGES = (
 _NAMES = {"output": "output error", "input": "input error", "direct": "direct input error"}
 _WHITE = 2.0  # cut-off of the whitening, relative to 1 / time constant of the loop
 _FEW = 12  # number of windows of the first fit
+_SOME = 48  # number of windows of the fits before the last improvement of initial states
 _STARTS = 3  # number of fits with improved initial states of the windows
 _WINDOW, _LEAD = 2.5, 0.6  # default window and lead of closed-loop simulations [s]
 _BOTH = 2.0  # variance factor: the noise of a torque is in its rows and in the simulation it drives
@@ -133,18 +134,24 @@ def fit_loops(
     theta = simulator.prior.copy()
     theta[drives] = replace(estimator, rounds=1).fit(few).theta
     simulator = replace(simulator, error=settings.error)
-    is_plain = settings.error == "output" and initialised.linear is None
+    is_plain, every = settings.error == "output" and initialised.linear is None, simulator.windows
+    if is_plain:
+        simulator = replace(simulator, windows=_few(every, _SOME))
     for left in reversed(range(_STARTS)):
+        if not left and len(simulator.windows) < len(every):
+            simulator = replace(simulator, windows=every).with_better_start(theta)
         simulator = simulator.with_better_start(theta)
         if simulator.lag is not None:
             outs = simulator.roll_out(theta, _few(simulator.windows))
             gains, is_last = (simulator.loops(theta), _free_gains(loop, model)), left == 0
             lag, _ = find_gains(outs, *gains, knows_delay=True, is_whole=not is_last)
             simulator = replace(simulator, lag=lag)
-        # one round is enough while the initial states still change
-        rounds = 1 if left and is_plain else estimator.rounds
+        # one round is enough while the initial states or the terms still change
+        is_rough = is_plain and (left > 0 or chooses)
+        rounds = 1 if is_rough else estimator.rounds
         estimate = replace(estimator, rounds=rounds).fit(simulator, theta, exact=simulator.exact)
-        theta = estimator.joint_step(simulator, estimate.theta)
+        if left:
+            theta = estimator.joint_step(simulator, estimate.theta)
         if initialised.linear is not None and simulator.torque is not None:
             estimator = replace(estimator, inflation=_BOTH * estimate.details["inflation"])
     tried: list[Tried] = []
@@ -159,7 +166,7 @@ def fit_loops(
         found = choose(wide, theta, offered, replace(estimator, inflation=1.0))
         tried = [*(t for t in tried if t.is_chosen), *found]
         chosen = [set_ for set_, t in zip(offered, found, strict=True) if t.is_chosen]
-        if not chosen:
+        if not chosen and not is_rough:
             break
         report_stage(progress, "fitting loops", STAGES)
         simulator, theta = _with(simulator, estimate.theta, chosen)
@@ -167,7 +174,7 @@ def fit_loops(
             own = with_terms(model, simulator.base)
             rows = torque_rows(identified_rows(own, logs, signals), initialised.share)
             simulator = replace(simulator, torque=rows)
-        estimate = estimator.fit(simulator, theta, exact=simulator.exact)
+        estimate, is_rough = estimator.fit(simulator, theta, exact=simulator.exact), False
     scale = None
     if initialised.linear is None:
         simulator, estimate = refine_steps(simulator, estimator, estimate)
@@ -433,9 +440,9 @@ def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
     )
 
 
-def _few(windows: Sequence[Window]) -> tuple[Window, ...]:
-    """Return some of many windows."""
-    return tuple(windows[:: max(1, len(windows) // _FEW)])
+def _few(windows: Sequence[Window], count: int = _FEW) -> tuple[Window, ...]:
+    """Return some of many windows, at least ``count``."""
+    return tuple(windows[:: max(1, len(windows) // count)])
 
 
 def _free_gains(loop: LoopSettings, model: RobotModel) -> Array:
