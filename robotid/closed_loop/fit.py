@@ -132,7 +132,7 @@ def fit_loops(
         free_parameters=tuple(simulator.free_parameters[k] for k in drives),
     )
     theta = simulator.prior.copy()
-    theta[drives] = replace(estimator, rounds=1).fit(few).theta
+    theta[drives] = replace(estimator, rounds=1).minimise(few)
     simulator = replace(simulator, error=settings.error)
     is_plain, every = settings.error == "output" and initialised.linear is None, simulator.windows
     if is_plain:
@@ -148,10 +148,13 @@ def fit_loops(
             simulator = replace(simulator, lag=lag)
         # one round is enough while the initial states or the terms still change
         is_rough = is_plain and (left > 0 or chooses)
-        rounds = 1 if is_rough else estimator.rounds
-        estimate = replace(estimator, rounds=rounds).fit(simulator, theta, exact=simulator.exact)
+        if is_rough:
+            theta = replace(estimator, rounds=1).minimise(simulator, theta)
+        else:
+            estimate = estimator.fit(simulator, theta, exact=simulator.exact)
+            theta = estimate.theta
         if left:
-            theta = estimator.joint_step(simulator, estimate.theta)
+            theta = estimator.joint_step(simulator, theta)
         if initialised.linear is not None and simulator.torque is not None:
             estimator = replace(estimator, inflation=_BOTH * estimate.details["inflation"])
     tried: list[Tried] = []
@@ -162,19 +165,21 @@ def fit_loops(
             for set_ in candidates(simulator, initialised.torque)
             if set_[0].name not in simulator.names
         ]
-        wide, theta = _with(simulator, estimate.theta, offered)
-        found = choose(wide, theta, offered, replace(estimator, inflation=1.0))
+        found = choose(
+            *_with(simulator, theta, offered), offered, replace(estimator, inflation=1.0)
+        )
         tried = [*(t for t in tried if t.is_chosen), *found]
         chosen = [set_ for set_, t in zip(offered, found, strict=True) if t.is_chosen]
         if not chosen and not is_rough:
             break
         report_stage(progress, "fitting loops", STAGES)
-        simulator, theta = _with(simulator, estimate.theta, chosen)
+        simulator, theta = _with(simulator, theta, chosen)
         if simulator.torque is not None:
             own = with_terms(model, simulator.base)
             rows = torque_rows(identified_rows(own, logs, signals), initialised.share)
             simulator = replace(simulator, torque=rows)
         estimate, is_rough = estimator.fit(simulator, theta, exact=simulator.exact), False
+        theta = estimate.theta
     scale = None
     if initialised.linear is None:
         simulator, estimate = refine_steps(simulator, estimator, estimate)
