@@ -124,15 +124,7 @@ def fit_loops(
     initialise = _initialise_from_torque if loop.kind == "torque" else _initialise_from_commands
     initialised = initialise(model, logs, loop, settings, signals, progress)
     simulator, estimator = initialised.simulator, initialised.estimator
-    # first with the URDF's bodies: with free bodies, many scales have nearly the same residual
-    drives = [k for k, free in enumerate(simulator.free_parameters) if free.what != "body"]
-    few = replace(
-        simulator,
-        windows=_few(simulator.windows),
-        free_parameters=tuple(simulator.free_parameters[k] for k in drives),
-    )
-    theta = simulator.prior.copy()
-    theta[drives] = replace(estimator, rounds=1).minimise(few)
+    theta = _with_bodies_of_urdf(simulator, estimator)
     simulator = replace(simulator, error=settings.error)
     is_plain, every = settings.error == "output" and initialised.linear is None, simulator.windows
     if is_plain:
@@ -187,6 +179,22 @@ def fit_loops(
             scale = gain_scale(simulator, estimator, estimate)
     others = (initialised.encoders, tuple(tried), initialised.linear, scale)
     return Fitted(simulator, estimate, initialised.plain, *others)
+
+
+def _with_bodies_of_urdf(simulator: LoopSimulator, estimator: OutputError) -> Array:
+    """Return the parameters of a first fit of the drives alone to few windows, shape (c,).
+
+    With free bodies, many scales have nearly the same residual.
+    """
+    drives = [k for k, free in enumerate(simulator.free_parameters) if free.what != "body"]
+    few = replace(
+        simulator,
+        windows=_few(simulator.windows),
+        free_parameters=tuple(simulator.free_parameters[k] for k in drives),
+    )
+    theta = simulator.prior.copy()
+    theta[drives] = replace(estimator, rounds=1).minimise(few)
+    return theta
 
 
 @dataclass(frozen=True, eq=False)
