@@ -308,9 +308,7 @@ def _positions(
         return worst_html(seconds, joints[row], unit, dock, POSITION.scale)
 
     verdicts = content["verdict"].get("per_joint", {})
-    return curves_section(
-        dock.html + intro, runs, joints, verdicts, worst, charts, note, most=1
-    )
+    return curves_section(dock.html + intro, runs, joints, verdicts, worst, charts, note, most=1)
 
 
 def _residuals(runs: Sequence[OpenLoop], j: int) -> Iterator[Residual]:

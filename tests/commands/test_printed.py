@@ -1,5 +1,8 @@
 """What commands print, figure by figure: every value of a made-up content at its place and unit."""
 
+from argparse import Namespace
+from functools import partial
+
 import pytest
 
 from robotid.cli import (
@@ -372,14 +375,16 @@ def test_inspect(shown):
             {"code": "bare", "severity": "note", "joint": "two", "message": "two: no limits"},
         ],
     }  # fmt: skip
-    assert shown(inspect._show, content, is_verbose=False, with_base=False) == [
+    options = partial(Namespace, urdf="my arm.urdf", free_flyer=True)
+    assert shown(inspect._show, content, options=options(base=False, verbose=False)) == [
         "arm: 2 joints: one, two",
         "20 standard inertial parameters, 8 base; with drives 16",
         "warning: light: hand: 1 g",
         "1 finding, 1 cause; 1 note hidden (--verbose)",
-        "list of base parameters: --base",
+        "list of base parameters:",
+        "  robotid inspect 'my arm.urdf' --free-flyer --base",
     ]
-    assert shown(inspect._show, content, is_verbose=True, with_base=True) == [
+    assert shown(inspect._show, content, options=options(base=True, verbose=True)) == [
         "arm: 2 joints: one, two",
         "20 standard inertial parameters, 8 base; with drives 16",
         "warning: light: hand: 1 g",

@@ -225,9 +225,7 @@ def test_each_recording_has_its_own_band_error_and_share_of_the_points(identifie
     monkeypatch.setattr(torques_module, "chart_html", noted)
     monkeypatch.setattr("robotid.report.curves._ROWS", 9600)
     verdicts = identified.verdict.to_dict()["per_joint"]
-    torques_section(
-        replace(identified, validation=()), verdicts, identified.model.joints, Origin()
-    )
+    torques_section(replace(identified, validation=()), verdicts, identified.model.joints, Origin())
     fitted, joints = identified.fitted, identified.model.joints
     assert {points for *_, points in drawn} == {9600 // (2 * 6 * 2)}
     above, below = drawn[::2], drawn[1::2]
