@@ -142,7 +142,7 @@ def test_what_was_found_is_printed_with_its_values(folder, result, capsys, tmp_p
             continue
         value, error, *unit = lines[entry["name"]]
         if entry["source"] == "bound":
-            assert [error, *unit] == ["at", "bound", entry["unit"]]
+            assert " ".join([error, *unit]) == f"at bound {entry['unit']}"
             continue
         assert value == f"{entry['value']:.4g}"
         assert error == f"{entry['std_error']:.2g}"
