@@ -86,5 +86,6 @@ def test_excitation_is_that_of_the_weighted_rows_of_all_motions(planar, motions)
     assert found.severity == "note"
     assert found.message.startswith(f"one, other: the motion determines {b} of {b} base parameters")
     assert (
-        f"(condition number {found.evidence['condition']:.3g}); no action needed" in found.message
+        f"(condition number {found.evidence['condition']:.3g} of the regressor, unit columns); no "
+        "action needed" in found.message
     )

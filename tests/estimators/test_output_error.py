@@ -83,6 +83,16 @@ def test_parameters_are_recovered_without_noise(rng):
     assert found.names == ("gain", "time", "offset")
 
 
+@pytest.mark.parametrize("rounds", [1, 5])
+def test_parameters_alone_are_those_of_the_fit(rng, rounds):
+    lag, estimator = lagging(rng), OutputError(rounds=rounds)
+    found = estimator.fit(lag, START).theta
+    np.testing.assert_array_equal(estimator.minimise(lag, START), found)
+    about_start = replace(lag, prior=START, prior_std=np.full(3, 1e3))
+    np.testing.assert_allclose(estimator.minimise(about_start), found, rtol=1e-6)
+    assert (found != OutputError(rounds=6 - rounds).fit(lag, START).theta).any()
+
+
 def test_the_noise_that_is_left_is_found(rng):
     found = OutputError().fit(lagging(rng, windows=100), START)
     np.testing.assert_allclose(found.details["correlation"], [RHO], atol=0.03)
