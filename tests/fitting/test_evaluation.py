@@ -8,6 +8,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.fitting.evaluation import (
     _joined,
     _parts,
+    _Score,
     evaluate_logs,
     hidden_joints,
     pool,
@@ -192,3 +193,37 @@ def test_more_than_two_percent_and_more_than_one_row_make_a_shared_log(rng, rows
     q, other = rng.standard_normal((2, rows, 2))
     other[:same] = q[:same]
     assert shares_rows(log(q), log(other)) is shared
+
+
+def test_of_a_long_log_its_start_its_middle_and_its_end_are_shown():
+    def shown(count, is_in_memory=False):
+        pieces = [SimpleNamespace(first=100 * k) for k in range(count)]
+        log = SimpleNamespace(pieces=pieces, first=0, stop=100 * count, is_in_memory=is_in_memory)
+        return [part.shown for part in _parts(log)]
+
+    start, end = slice(10_000), slice(-10_000, None)
+    assert shown(5) == [start, None, start, None, end]
+    assert shown(4) == [start, None, start, end]
+    assert shown(2) == [start, end]
+    assert shown(1, is_in_memory=True) == [slice(None)]
+
+
+def test_scores_of_pieces_join_field_by_field(rng):
+    def score(k):
+        tau = rng.standard_normal((4, 2))
+        sums = TorqueSums.of(tau, 0.5 * tau, np.ones((4, 2), dtype=bool), {"urdf": 0.1 * tau})
+        return _Score(
+            sums={"x": sums}, smooth=3 + k, used=5 * k, segments=frozenset({k, 7}),
+            turned=np.arange(3) == k, shown=((k, k, {}),), sampled=rng.standard_normal((k, 4)),
+            found=(np.arange(4) == k, np.arange(3) < k),
+        )  # fmt: skip
+
+    one, two = score(1), score(2)
+    both = one.join(two)
+    assert (both.smooth, both.used, both.segments) == (9, 15, {1, 2, 7})
+    assert both.turned.tolist() == [False, True, True]
+    assert both.shown == ((1, 1, {}), (2, 2, {}))
+    np.testing.assert_array_equal(both.sampled, np.concatenate([one.sampled, two.sampled]))
+    assert [x.tolist() for x in both.found] == [[False, True, True, False], [True, True, False]]
+    wanted = one.sums["x"].residual + two.sums["x"].residual
+    np.testing.assert_allclose(both.sums["x"].residual, wanted)
