@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,13 @@ from helpers.synthetic import exact_log, truth
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.identification.pipeline import identify
-from robotid.identification.summary import cell, error_lines, friction_lines
+from robotid.identification.summary import (
+    _tables,
+    cell,
+    error_lines,
+    friction_lines,
+    joint_reason,
+)
 from robotid.logs.read import write_log
 from robotid.robot.model import RobotModel
 
@@ -178,3 +185,23 @@ def test_an_estimate_lists_every_parameter(found):
         (line,) = [line for line in text.splitlines() if line.split()[0] == name]
         assert float(line.split()[1]) == pytest.approx(value, rel=1e-3)
         assert name in "".join(Words(html).words)
+
+
+def test_each_validation_log_has_errors_of_its_own_and_a_reason_loses_its_joint_only():
+    logs = [
+        SimpleNamespace(
+            recording=SimpleNamespace(name=name),
+            metrics={"estimate": f"{name} ours", "wls": f"{name} wls"},
+        )
+        for name in ("a.csv", "b.csv")
+    ]
+    found = SimpleNamespace(validation=logs, metrics=lambda name="estimate": f"fitted {name}")
+    assert _tables(found) == [
+        ("a.csv: not fitted", "a.csv ours", "a.csv wls"),
+        ("b.csv: not fitted", "b.csv ours", "b.csv wls"),
+        ("fitted rows", "fitted estimate", "fitted wls"),
+    ]
+    assert joint_reason("b", ["a, b: too slow", "b: no"]) == "too slow"
+    assert joint_reason("bb", ["a, b: too slow"]) == "a, b: too slow"
+    assert joint_reason("b", ["the whole: is wrong"]) == "the whole: is wrong"
+    assert joint_reason("b", []) == ""
