@@ -228,3 +228,35 @@ def test_a_delay_of_one_joint_is_beside_that_of_the_others(rng):
     assert own.explained == pytest.approx(1 - then / now, abs=2e-3)
     assert own.is_significant
     assert not misfit.own_delay(0).is_significant
+
+
+def test_an_instant_is_as_far_from_a_slow_one_as_the_nearest_on_either_side(rng):
+    slow, at = np.sort(rng.random(7)), np.sort(rng.uniform(-0.3, 1.4, 60))
+    wanted = np.abs(at[:, None] - slow).min(axis=1)
+    np.testing.assert_allclose(torque_delay._distance(at, slow), wanted, rtol=1e-12)
+    assert np.isinf(torque_delay._distance(at, slow[:0])).all()
+
+
+def test_what_a_torque_leaves_at_each_delay_is_of_least_squares_in_blocks(rng):
+    """Of two windows, the rows far from stiction only; the second joint's own columns."""
+    windows = []
+    for count in (90, 110):
+        inertial, drive = rng.standard_normal((count, 7)), rng.standard_normal((count, 2, 5))
+        inertial[:, 5] = 2.0 * inertial[:, 4] - inertial[:, 6]  # dependent
+        steady = rng.random((count, 2)) < 0.7
+        delayed = rng.standard_normal((2, 81, count)) + 4.0
+        windows.append(torque_delay._Window(inertial, drive, steady, delayed))
+    squares, used = torque_delay._squares(windows, 1, slice(3, 7))
+    at = [window.steady[:, 1] for window in windows]
+    X = np.concatenate(
+        [np.column_stack([w.inertial[k, 3:7], w.drive[k, 1], np.ones(k.sum())])
+         for w, k in zip(windows, at, strict=True)]
+    )  # fmt: skip
+    tau = np.concatenate([w.delayed[1][:, k] for w, k in zip(windows, at, strict=True)], axis=1)
+    assert used == len(X) == sum(k.sum() for k in at)
+    left = tau.T - X @ np.linalg.pinv(X, rcond=1e-8) @ tau.T
+    size = np.sum((tau - tau.mean(axis=1, keepdims=True)) ** 2, axis=1)
+    wanted = [np.sum(part**2, axis=0) / size for part in np.array_split(left, 8)]
+    np.testing.assert_allclose(squares, wanted, rtol=1e-8)
+    few = [replace(w, steady=w.steady & (np.arange(len(w.steady))[:, None] < 40)) for w in windows]
+    assert torque_delay._squares(few, 1, slice(3, 7)) is None
