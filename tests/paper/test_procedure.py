@@ -396,18 +396,18 @@ def test_an_iteration_is_its_equations_update_by_update(rng):
     alpha, beta = np.array([20.0, 11.0]), np.array([100.0, 40.0])
     bounds = Bounds(np.full(4, -30.0), np.array([13.0, 30.0, 30.0, 30.0]))
     levels = 0.01 * np.array([1.0, 2.0]), np.full(2, 0.05), np.array([0.7, 0.2])
-    drawn = rng.standard_normal((4, 3, 2, 2))
+    drawn = rng.standard_normal((40, 3, 2, 2))
     influences = Influences(
-        lambda t, u: 0.1 * u + t[:, None], *levels, rng=Given(*drawn.reshape(12, 2, 2))
+        lambda t, u: 0.1 * u + t[:, None], *levels, rng=Given(*drawn.reshape(120, 2, 2))
     )
     guesses, offset = np.array([P4 / 2, P4 * 0.8]), np.array([[0.05, -0.4], [0.0, 0.1]])
-    settings = short(1, updates=4, alpha=alpha, beta=beta, bounds=bounds)
+    settings = short(1, updates=40, alpha=alpha, beta=beta, bounds=bounds)
     loop = _Loop(ARM, PLANT, motion, settings, influences, guesses, offset)
     loop.iterate(1, keep_torques=True)
-    P, dt = np.clip(guesses, bounds.lower, bounds.upper), np.array([0.5, 0.375])
+    P, dt = np.clip(guesses, bounds.lower, bounds.upper), np.array([0.05, 0.0375])
     start = P.copy()
     q, v = motion.evaluate(np.zeros(2))[0] + offset, np.zeros((2, 2))
-    largest, distance, torques = np.zeros(2), np.zeros(2), []
+    largest, distance, torques, met = np.zeros(2), np.zeros(2), [], 0
     for k, noisy in enumerate(drawn):
         q_pr, v_pr, a_pr = motion.evaluate(k * dt)
         distance = np.maximum(distance, np.abs(q - q_pr).max(axis=1))
@@ -424,12 +424,13 @@ def test_an_iteration_is_its_equations_update_by_update(rng):
         for r, (X, D) in enumerate(zip(Psi, mass_matrix(ARM, q_seen, P), strict=True)):
             sigma = max(np.linalg.eigvalsh(D)[0], 0.0)
             P[r] -= sigma / np.sum(X**2) * X.T @ (a_seen - q_star)[r]
+        met += np.sum(bounds.upper < P)
         P = np.clip(P, bounds.lower, bounds.upper)
         torques.append(u)
         q, v = loop._advance(q, v, a, applied)
     history = loop.history()
     np.testing.assert_allclose(history.estimates, [start, P], rtol=1e-9)
-    assert (P[:, 0] == 13.0).any()
+    assert met > 0
     np.testing.assert_allclose(history.prx, [largest], rtol=1e-9)
     np.testing.assert_allclose(history.tracking, [distance], rtol=1e-9)
     assert history.tracking[0, 0] > 0.39  # of the second joint
