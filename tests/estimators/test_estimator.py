@@ -82,6 +82,6 @@ def test_too_few_rows_are_told_with_ten_samples_per_parameter_over_the_joints(ro
     )
     with pytest.raises(DataError, match=f"^{re.escape(text)}$"):
         require_rows(rows, 58, 6)
-    with pytest.raises(DataError, match="^0 torque rows for 58 parameters: no joint moves"):
+    with pytest.raises(DataError, match=r"^0 torque rows for 58 parameters: no joint moves"):
         require_rows(0, 58, 6)
     require_rows(58, 58, 6)
