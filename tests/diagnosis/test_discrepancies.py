@@ -358,3 +358,28 @@ def test_a_second_difference_is_sized_beside_the_first_and_confirmed_by_validati
     assert (second.finding.evidence["size"], second.finding.evidence["std_error"]) == (
         5.0, pytest.approx(0.3),
     )  # fmt: skip
+
+
+def test_columns_of_terms_stand_at_their_joint_and_leave_what_fitted_logs_hold(monkeypatch, rng):
+    motions = (3.0, 5.0, 7.0)
+
+    def lacking(joint, count):
+        return SimpleNamespace(
+            joint=joint, term=SimpleNamespace(columns=lambda m: m * np.ones((4, count)))
+        )
+
+    sample = SimpleNamespace(joints=("a", "b", "c"), motions=motions, fitted=5)
+    Z = discrepancies._columns([lacking("c", 1), lacking("a", 2)], sample)
+    assert Z.shape == (4, 3, 3)
+    np.testing.assert_array_equal(Z[0], [[0, 3, 3], [0, 0, 0], [7, 0, 0]])
+    left = rng.random(8)
+    given = []
+
+    def trials(sample, Z):
+        return SimpleNamespace(
+            held_out=SimpleNamespace(left=lambda which: given.append(which) or left)
+        )
+
+    monkeypatch.setattr(discrepancies, "Trials", trials)
+    assert discrepancies._left(sample, Z) == pytest.approx(left[:5].sum())
+    assert given == [[0, 1, 2]]

@@ -568,3 +568,65 @@ def test_a_candidate_counts_if_all_of_its_parameters_are_possible():
     given.clear()
     every.left_each({4: [0]})
     assert given == {4: [0, 1, 7]}
+
+
+def test_each_joint_is_given_its_own_drive_and_what_is_wanted_of_it(monkeypatch, rng):
+    """The second joint has no sample that is used, the fourth is to have nothing."""
+    names, n = ("a", "b", "c", "d"), 9
+    q, v, tau = rng.standard_normal((3, n, 4)) * [1.0, 50.0, 7.0, 2.0]
+    weight = np.ones((n, 4))
+    weight[:, 1] = 0.0
+    weight[2, 2] = 0.0
+    U = rng.standard_normal((3, 3))
+    sample = SimpleNamespace(
+        joints=names, weight=weight, taken=(np.arange(n),), is_prismatic=np.array([0, 0, 1, 0]),
+        recordings=[SimpleNamespace(trajectory=None)], at=[SimpleNamespace(tau=tau)], U=U,
+        of_joint=lambda j: ("of", j),
+    )  # fmt: skip
+    motion = SimpleNamespace(of=lambda j: SimpleNamespace(q=q[:, j], v=v[:, j]))
+    monkeypatch.setattr(drive_choice, "take_sample", lambda fit, for_drives: sample)
+    monkeypatch.setattr(drive_choice, "drive_motion_along", lambda model, trajectory: motion)
+    monkeypatch.setattr(drive_choice, "_auto", lambda *given: ("auto", *given))
+    monkeypatch.setattr(drive_choice, "_fixed", lambda *given: ("fixed", *given))
+    model = SimpleNamespace(free_flyer=False, with_reference=lambda pi: None)
+    mapping = SimpleNamespace(base_names=("c.viscous", "cc.viscous", "c.offset"))
+    fit = SimpleNamespace(model=model, mapping=mapping, standard=None)
+    wanted = {"a": None, "b": None, "c": ("load", "tanh"), "d": ()}
+    first, second = choose_drives(fit, wanted, {"a": "harmonics1", "c": "spring"})
+    assert (first[:2], first[3]) == (("auto", ("of", 0)), ["harmonics1"])
+    assert (second[:2], second[3]) == (("fixed", ("of", 2)), ("load", "tanh"))
+    for (_, _, drive, _), j in ((first, 0), (second, 2)):
+        used = weight[:, j] > 0
+        assert drive.largest == np.abs(tau[:, j]).max()
+        assert drive.is_prismatic is (j == 2)
+        speed = np.abs(v[used, j])
+        assert drive.data_range == {
+            "q": (q[used, j].min(), q[used, j].max()), "v": (speed.min(), speed.max()),
+        }  # fmt: skip
+    assert first[2].plain == {}
+    assert list(second[2].plain) == ["c.viscous", "c.offset"]
+    np.testing.assert_array_equal(second[2].plain["c.offset"], U[:, 2])
+
+
+def test_stated_families_are_sized_one_after_the_other_until_they_agree(monkeypatch):
+    """Of two families with three sizes each, whose best pair is found in the second pass."""
+    own = [(FAMILIES[name], [k]) for name in ("load", "tanh") for k in range(3)]
+    cost = np.array([[5.0, 9.0, 9.0], [9.0, 6.0, 4.0], [8.0, 9.0, 3.0]])
+
+    def left(chosen):
+        if not chosen:
+            return np.array([30.0, 20.0])
+        one, two = sorted(chosen)
+        return np.array([cost[one, two - 3] - 1.0, 1.0])
+
+    every = SimpleNamespace(own=own, left=left)
+    monkeypatch.setattr(drive_choice, "_candidates", lambda *_: own)
+    monkeypatch.setattr(drive_choice, "_Options", SimpleNamespace(of=lambda *_: every))
+    monkeypatch.setattr(drive_choice, "_found", lambda *given: given[2:])
+    sample = SimpleNamespace(torque=np.array([200.0]), joints=("a",))
+    chosen, (none, both) = drive_choice._fixed(sample, None, ("load", "tanh"))
+    assert [sizes for _, sizes in chosen] == [[2], [2]]
+    assert (none.families, none.is_selected, both.is_selected) == ((), False, True)
+    assert both.families == ("load", "tanh")
+    assert none.held_out_error_pct == pytest.approx(100 * np.sqrt(50.0 / 200.0))
+    assert both.held_out_error_pct == pytest.approx(100 * np.sqrt(3.0 / 200.0))

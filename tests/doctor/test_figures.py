@@ -352,3 +352,14 @@ def test_a_body_is_small_beside_the_mass_of_all():
         assert outside.severity == severity
         assert outside.evidence == {"outside": pytest.approx(0.4)}
         assert one(found, "density").evidence == {"density": pytest.approx(mass / 0.08)}
+
+
+def test_a_spike_is_one_by_the_noise_of_its_own_channel():
+    """Both channels rest and jump by 0.4; the noise of the first is larger."""
+    values = np.zeros((400, 2))
+    values[:, 0], values[:, 1] = np.sin(np.arange(400) / 30), np.cos(np.arange(400) / 30)
+    values[[100, 250]] += 4.0
+    log = SimpleNamespace(name="run.csv", joints=("a", "b"), t=T[:400])
+    (found,) = channels._spikes(log, "tau", values, np.array([0.5, 0.01]))
+    assert found.where == "run.csv: tau_b"
+    assert found.evidence["rows"] == 2

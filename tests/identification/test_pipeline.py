@@ -1,4 +1,4 @@
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -352,3 +352,37 @@ def test_drive_terms_that_were_selected_join_those_of_the_model():
     wanted = [values.get(name, 0.0) for name in robot.layout.names]
     assert len(wanted) == len(values) + 2
     np.testing.assert_array_equal(robot.carried_by, wanted)
+
+
+@pytest.mark.parametrize("settles", [(), (2,)])
+def test_fits_are_counted_and_end_with_the_shapes_that_settled(monkeypatch, settles):
+    """A first fit, two with shapes, a last one; shapes that do not move end it earlier."""
+    reported, solved = [], []
+    drives = [(SimpleNamespace(terms=("x",), shapes=("s",), k=k),) for k in range(4)]
+
+    def solve(recordings, choice, is_last=True):
+        solved.append((recordings, choice, is_last))
+        return SimpleNamespace(solution=Solved(len(solved)))
+
+    moved = iter([*(drives[k] for k in range(1, 3) if k not in settles), None])
+    monkeypatch.setattr(pipeline, "solve_recordings", solve)
+    monkeypatch.setattr(pipeline, "rough_choice", lambda choice: "rough")
+    monkeypatch.setattr(pipeline, "choose_drives", lambda *_: drives[0])
+    monkeypatch.setattr(pipeline, "_with_own", lambda recordings, fit, own: (fit.k, own[0].k))
+    monkeypatch.setattr(pipeline, "settled_shapes", lambda fit: next(moved))
+    monkeypatch.setattr(pipeline, "fit_recordings", lambda own, choice: Solved(own))
+    found = pipeline.with_drives("all", "exact", {}, progress=lambda *x: reported.append(x))
+    last = reported.pop()
+    assert last == ("fits", 3, 4, "fits")
+    assert reported == [("fits", 0, 1, "fits"), ("fits", 1, 4, "fits"), ("fits", 2, 4, "fits")]
+    assert solved == [("all", "exact", True), ((1, 0), "rough", False), ((2, 1), "rough", False)]
+    final = 1 if settles else 2
+    assert (found.k, found.drives) == ((3, final), drives[final])
+
+
+@dataclass(frozen=True)
+class Solved:
+    """What a fit is here: its number, or what was fitted."""
+
+    k: object
+    drives: tuple = ()

@@ -13,6 +13,7 @@ from scipy.stats import norm
 from robotid.diagnosis.torque_split import joint_torques
 from robotid.exceptions import DataError
 from robotid.identification import pictures
+from robotid.identification import result as result_module
 from robotid.identification.pictures import residual_charts
 from robotid.identification.why_pictures import why_charts
 from robotid.logs.data import Trajectory
@@ -244,3 +245,51 @@ def test_reasons_of_two_recordings_show_the_first_over_time(identified):
         np.testing.assert_array_equal(series(chart, "mean").y, mean)
         np.testing.assert_allclose(series(chart, "mean").half, 1.96 * error)
     assert why_charts(torque, link="shared")["time"].link == "shared"
+
+
+def test_each_torque_has_the_band_of_its_own_row(identified):
+    e = identified.fitted[0]
+    band, motion = identified.band(e), e.recording.trajectory
+    for j in (1, 4):
+        torque, residual = pictures.torque_charts(identified, e, j)
+        used = e.recording.mask[:, j].astype(bool)
+        half = 1.96 * np.interp(np.arange(len(used)), band.samples, band.total[:, j])
+        kept = np.isin(torque.x, motion.t) & np.isfinite(series(torque, "measured").y)
+        for chart, label in ((torque, "identified"), (residual, "95 % band")):
+            np.testing.assert_allclose(series(chart, label).half[kept], half)
+        for label, key in (("identified", "estimate"), ("URDF", "urdf")):
+            y = series(torque, label).y[kept]
+            np.testing.assert_allclose(y[used], e.torques[key][used, j])
+            assert np.isnan(y[~used]).all()
+
+
+@pytest.mark.parametrize("rank", [3, 5])
+def test_singular_values_are_split_at_the_rank(rank):
+    values = np.array([9.0, 4.0, 1.0, 1e-3, 0.0])
+    chart = pictures.singular_chart(values, rank)
+    shown = np.array([9.0, 4.0, 1.0, 1e-3, 9e-17])
+    assert len(chart.series) == (2 if rank < 5 else 1)
+    for part, is_shown in zip(
+        chart.series, (np.arange(5) < rank, np.arange(5) >= rank), strict=False
+    ):
+        np.testing.assert_allclose(part.y, np.where(is_shown, shown, np.nan))
+    assert chart.x.tolist() == [1, 2, 3, 4, 5]
+
+
+def test_plots_of_torques_are_of_each_joint_in_turn(identified, monkeypatch):
+    given = []
+
+    def charts(found, evaluation, row, *, band):
+        given.append((evaluation, row, band))
+        return f"torque {row}", f"residual {row}"
+
+    monkeypatch.setattr(result_module, "torque_charts", charts)
+    e = identified.fitted[1]
+    plot = identified.plot_torques("wrist_1_joint", "shoulder_lift_joint", recording=e)
+    assert plot.charts == (
+        ("torque 3", "wrist_1_joint: torque"), ("residual 3", "wrist_1_joint: residual"),
+        ("torque 1", "shoulder_lift_joint: torque"),
+        ("residual 1", "shoulder_lift_joint: residual"),
+    )  # fmt: skip
+    assert [row for _, row, _ in given] == [3, 1]
+    assert all(shown is e and band is identified.band(e) for shown, _, band in given)

@@ -488,8 +488,33 @@ def test_the_run_alone_is_judged_with_its_own_weight_of_the_prior(rng, monkeypat
     )
     motion = held.whole.trajectory
     run = Run((part,), truth(model), motion.squares, len(motion.t), 0.2, 0.01, (30.0, 2.0))
-    previews.preview_logs(model, [held], EstimatorSettings("consistent", draws=0), run=run)
+    noise = TorqueNoise(STD[:3], np.array([0.0, 0.02, 0.5]), ("stated",) * 3)
+    choice = EstimatorSettings("consistent", draws=0)
+    found = previews.preview_logs(model, [held], choice, noise=noise, run=run)
     (both, *_, weight), (alone, *_, other) = given
     assert weight == other == (30.0, 2.0)
     np.testing.assert_array_equal(both.factors.rows, 2 * part.rows)
     np.testing.assert_array_equal(alone.factors.rows, part.rows)
+    # the density in each row over the variance behind the filter
+    ((_, level),) = both.levels
+    np.testing.assert_allclose(level, STD[:3] ** 2 * [1.0, 2.0, 50.0])
+    expected = found.expected
+    assert expected.errors.inflation == pytest.approx(np.mean(level / both.sigma**2))
+    assert np.ptp(level / both.sigma**2) > 1e-3
+    np.testing.assert_array_equal(expected.standard, truth(model))
+    np.testing.assert_array_equal(expected.prior, model.standard_parameters())
+    np.testing.assert_allclose(expected.base, expected.mapping.K @ truth(model))
+    C = expected.mapping.K @ expected.standard_covariance @ expected.mapping.K.T
+    np.testing.assert_allclose(expected.base_error, np.sqrt(np.diag(C)), rtol=1e-6)
+
+
+def test_words_of_a_preview_are_of_all_motions_each_named_once(monkeypatch):
+    monkeypatch.setattr(
+        previews, "excitation_finding", lambda *given: SimpleNamespace(message=given)
+    )
+    fitted = [
+        SimpleNamespace(recording=SimpleNamespace(log=SimpleNamespace(name=name)))
+        for name in ("a.csv", "b.csv", "a.csv")
+    ]
+    expected = SimpleNamespace(fitted=fitted, wls="wls", determination="determined")
+    assert Preview(expected, white()).words == ("wls", "determined", "a.csv, b.csv")

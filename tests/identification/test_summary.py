@@ -6,18 +6,22 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.pages import tables
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
+from robotid.fitting.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import identify
 from robotid.identification.summary import (
+    _errors,
     _tables,
     cell,
     error_lines,
     friction_lines,
     joint_reason,
+    verdict_lines,
 )
 from robotid.logs.read import write_log
 from robotid.robot.model import RobotModel
@@ -205,3 +209,30 @@ def test_each_validation_log_has_errors_of_its_own_and_a_reason_loses_its_joint_
     assert joint_reason("bb", ["a, b: too slow"]) == "a, b: too slow"
     assert joint_reason("b", ["the whole: is wrong"]) == "the whole: is wrong"
     assert joint_reason("b", []) == ""
+
+
+def test_a_reason_that_stands_at_a_joint_is_not_said_twice():
+    verdict = {
+        "status": "poor",
+        "reasons": ["a: bad", "c: late", "a: slow", "no log"],
+        "per_joint": {
+            "a": {"status": "poor", "reasons": ["a: bad", "a: slow"]},
+            "b": {"status": "good", "reasons": ["error 3 %"]},
+            "c": {"status": "usable", "reasons": ["c: late"]},
+            "d": {"status": "good", "reasons": ["error 4 %"]},
+        },
+    }
+    assert verdict_lines(verdict) == [
+        "verdict: poor", "  - a: slow", "  - no log", "  a: poor: bad", "  b, d: good",
+        "  c: usable: late",
+    ]  # fmt: skip
+    alone = {"status": "good", "reasons": ["fine"], "per_joint": {"b": verdict["per_joint"]["b"]}}
+    assert verdict_lines(alone) == ["verdict: good", "  - fine", "  every joint: good"]
+
+
+def test_a_notebook_shows_each_joint_s_error_before_that_of_the_urdf():
+    one = JointMetrics(0.125, "N m", 2.5, 0.9, 7, {"urdf": 41.5}, True)
+    other = JointMetrics(3.0, "N", 7.5, 0.9, 7, {"urdf": None}, True)
+    metrics = Metrics({"a": one, "b": other}, 1.0)
+    rows = tables(_errors("log.csv: not fitted", metrics))["log.csv: not fitted"].rows
+    assert rows == [["a", "2.5", "0.125", "N m", "41.5"], ["b", "7.5", "3", "N", "–"]]
