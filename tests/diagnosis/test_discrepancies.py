@@ -263,7 +263,7 @@ def test_what_may_be_otherwise_changes_torques_as_differences_do(model, rng):
     np.testing.assert_allclose(own["angle_scale", ""], every, rtol=1e-4, atol=1e-3)
 
 
-def test_what_differs_is_told_with_the_norm_of_its_sizes_and_others_that_would_do():
+def test_what_differs_is_reported_with_the_norm_of_its_sizes_and_others_that_would_do():
     def alteration(code, where, words=lambda x, error: f"{x.tolist()} {error.tolist()}"):
         return discrepancies._Alteration(code, where, None, 0.1, words)
 
@@ -283,7 +283,7 @@ def test_what_differs_is_told_with_the_norm_of_its_sizes_and_others_that_would_d
 
 def test_sentences_have_sizes_and_errors_of_their_own():
     x, error = np.array([-0.123]), np.array([0.0456])
-    told = {
+    reported = {
         name: make(x, error)
         for name, make in (
             ("zero", discrepancies._zero("a", "rad")),
@@ -292,14 +292,14 @@ def test_sentences_have_sizes_and_errors_of_their_own():
             ("gains", discrepancies._gains("a, b")), ("clock", discrepancies._clock),
         )
     }  # fmt: skip
-    assert told["zero"].startswith("a: position offset 0.123 +- 0.046 rad: correct q_a")
-    assert "differs by 0.12 +- 0.05 m between the directions" in told["lost"]
-    assert told["scale"].startswith("q_a fits best with a factor of 0.877 +- 0.046: ")
-    assert "its torque is about 0.88 (+- 0.05) times the value" in told["gain"]
-    assert "their torques are at most 0.88 (+- 0.05) times the values" in told["gains"]
+    assert reported["zero"].startswith("a: position offset 0.123 +- 0.046 rad: correct q_a")
+    assert "differs by 0.12 +- 0.05 m between the directions" in reported["lost"]
+    assert reported["scale"].startswith("q_a fits best with a factor of 0.877 +- 0.046: ")
+    assert "its torque is about 0.88 (+- 0.05) times the value" in reported["gain"]
+    assert "their torques are at most 0.88 (+- 0.05) times the values" in reported["gains"]
     assert "at least 1.12 (" in discrepancies._gains("a, b")(-x, error)
-    assert "inertial torques are 0.877 +- 0.046 times the value" in told["clock"]
-    assert f"run {np.sqrt(0.877):.3f} times as fast" in told["clock"]
+    assert "inertial torques are 0.877 +- 0.046 times the value" in reported["clock"]
+    assert f"run {np.sqrt(0.877):.3f} times as fast" in reported["clock"]
     down, across = np.array([0.0, 0.0, -9.81]), np.eye(3)[:2]
     x, error = np.tan(np.radians([3.0, 0.0])), np.tan(np.radians([0.3, 0.4]))
     tilt = discrepancies._tilt(across, down)(x, error)
@@ -360,7 +360,7 @@ def test_a_second_difference_is_sized_beside_the_first_and_confirmed_by_validati
     )  # fmt: skip
 
 
-def test_columns_of_terms_stand_at_their_joint_and_leave_what_fitted_logs_hold(monkeypatch, rng):
+def test_columns_of_terms_are_of_their_joint_and_the_residual_of_fitted_logs(monkeypatch, rng):
     motions = (3.0, 5.0, 7.0)
 
     def lacking(joint, count):

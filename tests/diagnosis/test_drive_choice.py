@@ -502,19 +502,19 @@ def test_identify_chooses_unless_told_otherwise(plain, cases):
     assert fitted_in(plain, [log], friction="viscous+coulomb").drives == ()
 
 
-def test_derivatives_of_terms_by_each_shape_stand_behind_their_columns(rng):
+def test_derivatives_of_terms_by_each_shape_follow_their_columns(rng):
     """Of Stribeck and tanh, whose shapes differ, in a sample of one joint."""
     n = 60
     v, still, weight = 0.8 * rng.standard_normal(n), np.zeros(n), rng.uniform(0.5, 2.0, (n, 1))
     motion = DriveMotion(still, v, still, np.sign(v), still, still)
-    seen = {"v": (0.02, 2.0), "q": (-1.0, 1.0)}
+    ranges = {"v": (0.02, 2.0), "q": (-1.0, 1.0)}
     W = weight[:, :, None] * rng.standard_normal((n, 1, 2))
     families, sizes = [FAMILIES["stribeck"], FAMILIES["tanh"]], np.array([0.1, 0.6])
 
     def columns(at):
         return np.column_stack(
             [term.column(motion) for family, x in zip(families, at, strict=True)
-             for term in family.make(seen, x)]
+             for term in family.make(ranges, x)]
         )  # fmt: skip
 
     Z = columns(sizes)
@@ -525,7 +525,7 @@ def test_derivatives_of_terms_by_each_shape_stand_behind_their_columns(rng):
         weight=weight, torque=np.ones(1), segments=segments, rows=n, W=W, r=r,
         independent=np.arange(2), U=np.eye(2), normal=Normal.of(W, r, segments, 6),
     )  # fmt: skip
-    drive = drive_choice._Drive(False, (motion,), (np.arange(n),), seen, 9.0, {})
+    drive = drive_choice._Drive(False, (motion,), (np.arange(n),), ranges, 9.0, {})
     count, trial = drive_choice._with_slopes(sample, drive, families, sizes)
     assert count == 2
     X = np.concatenate([x for _, x in trial.rows])

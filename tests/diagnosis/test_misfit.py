@@ -618,7 +618,7 @@ def test_entries_keep_other_families_and_a_term_replaces_all_that_it_explains():
     assert last.evidence["replaces"] == 1.0
 
 
-def test_a_misfit_is_told_with_the_intervals_of_its_own_joint():
+def test_a_misfit_is_reported_with_the_intervals_of_its_own_joint():
     still = np.zeros(3)
     (load,) = (c for c in CANDIDATES if c.name == "load")
     found = misfit.Misfit(
@@ -627,14 +627,14 @@ def test_a_misfit_is_told_with_the_intervals_of_its_own_joint():
     )  # fmt: skip
     fit = SimpleNamespace()
     names = ["a.viscous", "b.coulomb", "bb.offset", "b.viscous"]
-    (told,) = misfit_findings(fit, [found], names)
-    assert "; the intervals of b.coulomb, b.viscous include this misfit" in told.message
+    (reported,) = misfit_findings(fit, [found], names)
+    assert "; the intervals of b.coulomb, b.viscous include this misfit" in reported.message
     assert (
         "b: " + load.meaning + ": 0.125 +- 0.01 N m per N m. It would explain 36 % of"
-        in told.message
+        in reported.message
     )
-    assert "(0 % on the validation logs); the residual is 4.0 % of the torque" in told.message
-    assert told.evidence == pytest.approx({
+    assert "(0 % on the validation logs); the residual is 4.0 % of the torque" in reported.message
+    assert reported.evidence == pytest.approx({
         "share_pct": 36, "error_pct": 4, "size": 0.125, "std_error": 0.01, "p_value": 1e-9,
         "validation_share_pct": -20,
     })  # fmt: skip

@@ -246,21 +246,21 @@ def test_a_clean_robot_has_the_errors_of_its_noise(plain):
 
 def two_shapes():
     """Return a fit of two joints, the second of which has two terms with a shape each."""
-    seen = {"v": (0.02, 2.0), "q": (-1.0, 1.0)}
-    terms = (Stribeck(data_range=seen["v"], speed=0.2), Tanh(data_range=seen["v"], speed=0.7))
+    ranges = {"v": (0.02, 2.0), "q": (-1.0, 1.0)}
+    terms = (Stribeck(data_range=ranges["v"], speed=0.2), Tanh(data_range=ranges["v"], speed=0.7))
     shapes = tuple(FoundShape(n, x, 0.1, "", False) for n, x in (("s", 0.2), ("t", 0.7)))
     choice = DriveChoice(
-        "b", ("stribeck", "tanh"), terms, shapes=shapes, sizes=((0.2,), (0.7,)), data_range=seen,
+        "b", ("stribeck", "tanh"), terms, shapes=shapes, sizes=((0.2,), (0.7,)), data_range=ranges,
         shape_covariance=((0.04, 0.03), (0.03, 0.09)),
     )  # fmt: skip
     names = ("b.stribeck", "a.stribeck", "a.tanh", "b.tanh")
     layout = SimpleNamespace(names=names)
     standard = np.array([3.0, 70.0, 90.0, -2.0])
-    return SimpleNamespace(model=SimpleNamespace(layout=layout), standard=standard), choice, seen
+    return SimpleNamespace(model=SimpleNamespace(layout=layout), standard=standard), choice, ranges
 
 
 def test_a_torque_changes_with_each_shape_as_differences_do(rng):
-    found, choice, seen = two_shapes()
+    found, choice, ranges = two_shapes()
     v = 2.0 * rng.standard_normal(30)
     motion = DriveMotion(*[np.zeros(30)] * 1, v, np.zeros(30), np.sign(v), *[np.zeros(30)] * 2)
     step = 1e-6
@@ -269,8 +269,8 @@ def test_a_torque_changes_with_each_shape_as_differences_do(rng):
         sizes = np.array([0.2, 0.7])
         sizes[k] += sign * step
         own = (
-            Stribeck(data_range=seen["v"], speed=sizes[0]),
-            Tanh(data_range=seen["v"], speed=sizes[1]),
+            Stribeck(data_range=ranges["v"], speed=sizes[0]),
+            Tanh(data_range=ranges["v"], speed=sizes[1]),
         )
         return sum(x * t.column(motion) for x, t in zip((3.0, -2.0), own, strict=True))
 

@@ -205,7 +205,7 @@ def test_what_a_motion_determines_is_the_same_of_its_halves():
     assert 0 < whole.evidence["weakest"] < 1
 
 
-def test_quantised_channels_are_told_with_each_joint_s_own_steps():
+def test_quantised_channels_are_reported_with_each_joint_s_own_steps():
     t, rng = 3.0 + np.arange(2000) / 100, np.random.default_rng(0)
     steps, sizes = (0.5, 0.25, 0.01, 0.005), (4.0, 3.5, 3.0, 2.0)
     tau = np.column_stack(
@@ -234,8 +234,8 @@ def test_the_error_of_a_delay_is_of_the_joints_that_have_one(monkeypatch, stated
     (found,) = channels._velocity_delay(log_of(), stated)
     error = 1.48 * 0.001 / np.sqrt(3)
     assert found.evidence == pytest.approx({"delay": 0.012 - stated, "std_error": error})
-    told = f"a delay of {12 - 1e3 * stated:.1f} +- {1e3 * error:.1f} ms"
-    assert told in found.message
+    reported = f"a delay of {12 - 1e3 * stated:.1f} +- {1e3 * error:.1f} ms"
+    assert reported in found.message
     assert found.message.endswith("or set [signals] velocity_delay = 0.0120")
 
 
@@ -253,8 +253,8 @@ def test_a_torque_is_clipped_at_either_limit_and_held_by_groups():
         share = np.mean(tau[:-1, 0] == limit) * 1999 / 2000
         assert finding.evidence == pytest.approx({"limit": limit, "share": share})
         assert f"at its limit {limit:g} in {100 * share:.3g} % of the rows" in finding.message
-    held = {f.where: f.evidence for f in found if f.code == "repeated_torque"}
-    assert held == {
+    repeated = {f.where: f.evidence for f in found if f.code == "repeated_torque"}
+    assert repeated == {
         "run.csv: b, d": pytest.approx({"rows": 4.0, "delay": 0.015}),
         "run.csv: c": pytest.approx({"rows": 7.0, "delay": 0.03}),
     }
@@ -280,7 +280,7 @@ def test_proportional_commands_are_alike_in_their_changes_too():
     assert f"(correlation {same[1, 2]:.3f} or more)" in found.message
 
 
-def test_slow_commands_are_told_with_the_widest_range_and_the_fastest_frequency():
+def test_slow_commands_are_reported_with_the_widest_range_and_the_fastest_frequency():
     def loop(name, f, delays, lag=0.3, bandwidth=np.nan):
         return SimpleNamespace(
             name=name, response=(np.array(f), None, None), delays=delays, lag=(lag, 0.0),
@@ -299,7 +299,7 @@ def test_slow_commands_are_told_with_the_widest_range_and_the_fastest_frequency(
     assert "Any delay from 11 to 121 ms" in found.message
 
 
-def test_a_saturated_drive_is_told_with_the_largest_error_of_all_movements():
+def test_a_saturated_drive_is_reported_with_the_largest_error_of_all_movements():
     """Four movements at 1.25 per second, whose commands jump."""
     dt, q, command = 0.01, [0.0], [0.0]
     rows = 0
@@ -320,7 +320,7 @@ def test_a_saturated_drive_is_told_with_the_largest_error_of_all_movements():
     assert "in 4 movements" in found.message
 
 
-def test_rounded_angles_are_told_by_what_they_change_with_the_largest_error(monkeypatch):
+def test_rounded_angles_are_reported_by_what_they_change_with_the_largest_error(monkeypatch):
     angles = {
         "a": {"3.1416": np.pi, "1.57": np.pi / 2}, "b": {"0.785": np.pi / 4},
         "c": {"-1.5708": -np.pi / 2},

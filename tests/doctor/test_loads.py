@@ -207,7 +207,7 @@ def test_what_a_counterbalance_cancels_is_its_share_of_gravity(ur5, ur5_log):
         assert found == pytest.approx(wanted, rel=1e-6)
 
 
-def test_scales_of_torques_are_told_together_if_alike_else_joint_by_joint():
+def test_scales_of_torques_are_reported_together_if_alike_else_joint_by_joint():
     probe = SimpleNamespace(model=SimpleNamespace(joints=tuple("abcd")))
     scale = np.array([12.0, 1.0, 18.0, 15.0])
     (together,) = loads_module._scaled(probe, scale, np.array([0, 2, 3]), "run.csv")

@@ -27,13 +27,15 @@ def reading(kind, share, joints=(), values=()):
     ],
 )
 def test_a_sign_is_reported_of_each_joint_that_it_explains(kind, key, words):
-    told = reading(kind, [0.1, 0.3, 0.04, 0.15], (0, 1, 3))
-    found = list(torques._FINDINGS[kind](told))
+    reported = reading(kind, [0.1, 0.3, 0.04, 0.15], (0, 1, 3))
+    found = list(torques._FINDINGS[kind](reported))
     assert [(f.code, f.where) for f in found] == [(kind, "run.csv: a"), (kind, "run.csv: d")]
     for finding, before, after in zip(found, (0.9, 0.5), (0.1, 0.15), strict=True):
         assert finding.evidence == {"unexplained": before, key: after}
-        told = f"{100 * before:.0f} % of its variance is unexplained, {words} {100 * after:.2g} %"
-        assert told in finding.message
+        reported = (
+            f"{100 * before:.0f} % of its variance is unexplained, {words} {100 * after:.2g} %"
+        )
+        assert reported in finding.message
     if kind == "torque_sign":  # of a torque that was explained before, the other sign is no news
         assert list(torques._sign(reading(kind, [0.9, 0.6, 0.01, 0.5], (2,)))) == []
 
@@ -46,14 +48,14 @@ def test_a_sign_is_reported_of_each_joint_that_it_explains(kind, key, words):
         ("joint_order", "all columns of a, c are exchanged"),
     ],
 )
-def test_exchanged_columns_are_told_with_the_largest_shares(kind, words):
+def test_exchanged_columns_are_reported_with_the_largest_shares(kind, words):
     values = (2.0, 1.0, 0.0, 3.0) if kind == "torque_order" else ()
-    told = reading(kind, [0.08, 0.01, 0.02, 0.03], (0, 2), values)
-    (finding,) = torques._exchanged(told)
+    reported = reading(kind, [0.08, 0.01, 0.02, 0.03], (0, 2), values)
+    (finding,) = torques._exchanged(reported)
     assert words.rstrip("; ") in finding.message
     assert "largest unexplained share of a torque decreases from 90 to 8 %" in finding.message
     assert (finding.code, finding.severity, finding.where) == (kind, "error", "run.csv: a, c")
-    gain = np.sum(np.log(STATED.share + 1e-3)) - np.sum(np.log(told.best.share + 1e-3))
+    gain = np.sum(np.log(STATED.share + 1e-3)) - np.sum(np.log(reported.best.share + 1e-3))
     assert finding.evidence == pytest.approx(
         {"gain": gain, "unexplained": 0.9, "unexplained_so_read": 0.08}
     )
@@ -68,10 +70,10 @@ def test_exchanged_columns_are_told_with_the_largest_shares(kind, words):
         ("position_offset", "the zero position of d has an error of about -0.37 rad"),
     ],
 )
-def test_a_position_is_told_with_the_torque_that_gains_most(kind, words):
+def test_a_position_is_reported_with_the_torque_that_gains_most(kind, words):
     """Which is neither that of the joint nor the one explained worst."""
-    told = reading(kind, [0.85, 0.05, 0.04, 0.1], (3,), (-0.37,))
-    (finding,) = torques._position(told)
+    reported = reading(kind, [0.85, 0.05, 0.04, 0.1], (3,), (-0.37,))
+    (finding,) = torques._position(reported)
     assert finding.message.startswith(f"run.csv: {words}")
     assert "share of the torque of b then decreases from 60 to 5 %" in finding.message
     assert finding.where == "run.csv: d"
@@ -79,17 +81,17 @@ def test_a_position_is_told_with_the_torque_that_gains_most(kind, words):
 
 
 @pytest.mark.parametrize(("degrees", "severity"), [(40.0, "error"), (12.0, "warning"), (3.0, None)])
-def test_gravity_is_told_with_its_angle_and_vector(degrees, severity):
+def test_gravity_is_reported_with_its_angle_and_vector(degrees, severity):
     angle = np.radians(degrees)
     g = 9.81 * np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, -np.cos(angle)])
-    told = reading("gravity", [0.1, 0.05, 0.04, 0.1], (0, 1, 2, 3), tuple(g))
-    found = list(torques._gravity(told))
+    reported = reading("gravity", [0.1, 0.05, 0.04, 0.1], (0, 1, 2, 3), tuple(g))
+    found = list(torques._gravity(reported))
     assert [f.severity for f in found] == ([severity] if severity else [])
     for finding in found:
         shown = ", ".join(f"{x:.2f}" for x in g)
         assert f"gravity [{shown}] m/s^2 explains the torques best" in finding.message
         assert f"{degrees:.0f} degrees from the stated [0.00, 0.00, -9.81]" in finding.message
-        wanted = {"angle_deg": degrees, "x": g[0], "y": g[1], "z": g[2], "gain": told.gain}
+        wanted = {"angle_deg": degrees, "x": g[0], "y": g[1], "z": g[2], "gain": reported.gain}
         assert finding.evidence == pytest.approx(wanted)
 
 
@@ -108,7 +110,7 @@ def test_a_load_excuses_a_sign_if_it_explains_every_joint_named():
         assert torques._is_excused(best, loaded) is is_excused
 
 
-def test_torques_that_are_not_explained_are_told_one_by_one_or_as_most_of_all():
+def test_torques_that_are_not_explained_are_reported_one_by_one_or_as_most_of_all():
     found = list(torques._unexplained(PROBE, np.array([0.3, 0.1, 0.4, 0.2]), "run.csv"))
     assert [(f.where, f.evidence) for f in found] == [
         ("run.csv: a", {"share": 0.3}), ("run.csv: c", {"share": 0.4}),

@@ -74,7 +74,7 @@ def test_an_estimator_says_how_its_rows_weigh(estimator, weighing):
 
 
 @pytest.mark.parametrize(("rows", "wanted"), [(57, 97), (41, 97)])
-def test_too_few_rows_are_told_with_ten_samples_per_parameter_over_the_joints(rows, wanted):
+def test_too_few_rows_are_reported_with_ten_samples_per_parameter_over_the_joints(rows, wanted):
     """Of six joints: a sample has six rows."""
     text = (
         f"{rows} torque rows for 58 parameters: too few rows to fit; record at least {wanted} "

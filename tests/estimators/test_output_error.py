@@ -452,7 +452,7 @@ def test_noise_and_correlation_of_a_joint_are_those_of_all_its_windows(rng):
 
 
 def test_a_step_stops_at_bounds_and_the_others_go_as_far_as_is_best_then(rng):
-    """Two of five reach their bounds; their damped normal equations are solved by hand."""
+    """Two of five are at their bounds; their damped normal equations are solved by hand."""
     A = rng.standard_normal((20, 5)) * [1.0, 30.0, 0.1, 4.0, 2.0]
     H, theta = A.T @ A, np.array([1.0, 2.0, 30.0, 4.0, 5.0])
     step = np.array([-3.0, 0.1, 5.0, -6.0, 0.7])

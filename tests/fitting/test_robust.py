@@ -228,15 +228,15 @@ def test_a_reversal_excuses_the_step_of_coulomb_friction_of_its_own_joint(model)
     """Where |v| <= |a| / cutoff, an error is counted beyond twice the joint's friction."""
     t, pi = np.arange(400) / 100, truth(model)
     step = 2 * pi[[model.layout.names.index(f"{joint}.coulomb") for joint in model.joints]]
-    usual, off = 1.4826 * np.array([0.2, 0.3, 0.5]), np.zeros((400, 3))
+    typical, off = 1.4826 * np.array([0.2, 0.3, 0.5]), np.zeros((400, 3))
     slow = {(60, 0): 0.19, (120, 0): 0.21, (60, 1): 0.2, (180, 1): 0.0, (60, 2): 0.1, (240, 2): 0.3}
     for k, (row, j) in enumerate(slow):
-        off[row, j] = step[j] + (11.0, 12.5, 13.5, 11.5, 14.5, 11.9)[k] * usual[j]
+        off[row, j] = step[j] + (11.0, 12.5, 13.5, 11.5, 14.5, 11.9)[k] * typical[j]
     v, a = np.ones((400, 3)), np.zeros((400, 3))
     for (row, j), speed in slow.items():
         v[row, j], a[row, j] = -speed, 1.0
     predicted = np.where(np.arange(400)[:, None] % 2, 3.0, -3.0) * np.ones(3)
-    left = usual / 1.4826 * np.where(np.arange(400)[:, None] % 4 < 2, 1, -1)
+    left = typical / 1.4826 * np.where(np.arange(400)[:, None] % 4 < 2, 1, -1)
     tau = predicted + np.where(off > 0, off, left)
     motion = Trajectory(t, v, v, a, tau, model.joints, 100.0, np.zeros(400, dtype=int))
     recording = SimpleNamespace(
@@ -247,7 +247,7 @@ def test_a_reversal_excuses_the_step_of_coulomb_friction_of_its_own_joint(model)
     found = find_outliers(model, [evaluation], pi)
     sizes = {(round(100 * o.t), model.joints.index(o.joint)): o.size for o in found}
     wanted = {(60, 1): 13.5, (60, 2): 14.5}  # excused in part; in full beside a reversal
-    wanted |= {(120, 0): step[0] / usual[0] + 12.5, (240, 2): step[2] / usual[2] + 11.9}
+    wanted |= {(120, 0): step[0] / typical[0] + 12.5, (240, 2): step[2] / typical[2] + 11.9}
     assert sizes == pytest.approx(wanted)
 
 

@@ -311,7 +311,7 @@ def test_with_active_bounds_errors_are_those_of_resampled_fits(W, rng, count):
     estimate = replace(
         wls, theta=theta, covariance=C, names=tuple("abcdef"), details={"active": ("x y",)}
     )
-    solved = [distances, ["slow", "late"]]
+    solved = [distances, ["slow", "other"]]
 
     def redrawn(*arguments):
         given.append(arguments)
@@ -339,7 +339,7 @@ def test_with_active_bounds_errors_are_those_of_resampled_fits(W, rng, count):
         f"{without.method}; bounds are active: 8 fits to resampled data and prior "
         "(2 more not solved: slow)"
     )
-    solved[:] = distances[:7], ["slow", "late", "late"]
+    solved[:] = distances[:7], ["slow", "other", "other"]
     with pytest.raises(NotConvergedError, match="solved 7 of 10 fits") as error:
         measured_errors(*every, redraws=Redraws(fit, 10, "noise"))
     assert error.value.status == "slow"

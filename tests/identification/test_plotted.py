@@ -168,14 +168,14 @@ def test_friction_is_drawn_at_position_and_load_of_the_samples_used(rng, monkeyp
     assert given == [
         ("b", {"q": pytest.approx(np.median(q[used, row])), "load": pytest.approx(load)})
     ]
-    kept = np.isfinite(series(chart, "measured").y)
+    drawn = np.isfinite(series(chart, "measured").y)
     speed = v[used, row]
-    np.testing.assert_array_equal(chart.x[kept], speed)
-    np.testing.assert_array_equal(series(chart, "measured").y[kept], left[used, row])
-    np.testing.assert_array_equal(series(chart, "identified").y[kept], friction[used, row])
+    np.testing.assert_array_equal(chart.x[drawn], speed)
+    np.testing.assert_array_equal(series(chart, "measured").y[drawn], left[used, row])
+    np.testing.assert_array_equal(series(chart, "identified").y[drawn], friction[used, row])
     steady = series(chart, f"steady at a load of {load:.3g} N, 95 % band")
-    np.testing.assert_array_equal(steady.y[kept], speed**3)
-    np.testing.assert_allclose(steady.half[kept], 1.96 * (0.5 + speed**2))
+    np.testing.assert_array_equal(steady.y[drawn], speed**3)
+    np.testing.assert_allclose(steady.half[drawn], 1.96 * (0.5 + speed**2))
     assert (chart.x_label, chart.y_label) == ("speed [m/s]", "friction [N]")
     mask[:, row] = False
     assert pictures.friction_chart(found, "b", split=(left, friction)) is None
@@ -254,11 +254,11 @@ def test_each_torque_has_the_band_of_its_own_row(identified):
         torque, residual = pictures.torque_charts(identified, e, j)
         used = e.recording.mask[:, j].astype(bool)
         half = 1.96 * np.interp(np.arange(len(used)), band.samples, band.total[:, j])
-        kept = np.isin(torque.x, motion.t) & np.isfinite(series(torque, "measured").y)
+        drawn = np.isin(torque.x, motion.t) & np.isfinite(series(torque, "measured").y)
         for chart, label in ((torque, "identified"), (residual, "95 % band")):
-            np.testing.assert_allclose(series(chart, label).half[kept], half)
+            np.testing.assert_allclose(series(chart, label).half[drawn], half)
         for label, key in (("identified", "estimate"), ("URDF", "urdf")):
-            y = series(torque, label).y[kept]
+            y = series(torque, label).y[drawn]
             np.testing.assert_allclose(y[used], e.torques[key][used, j])
             assert np.isnan(y[~used]).all()
 

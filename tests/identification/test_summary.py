@@ -211,20 +211,20 @@ def test_each_validation_log_has_errors_of_its_own_and_a_reason_loses_its_joint_
     assert joint_reason("b", []) == ""
 
 
-def test_a_reason_that_stands_at_a_joint_is_not_said_twice():
+def test_a_reason_of_a_joint_is_shown_once():
     verdict = {
         "status": "poor",
-        "reasons": ["a: bad", "c: late", "a: slow", "no log"],
+        "reasons": ["a: bad", "c: slow", "a: slow", "no log"],
         "per_joint": {
             "a": {"status": "poor", "reasons": ["a: bad", "a: slow"]},
             "b": {"status": "good", "reasons": ["error 3 %"]},
-            "c": {"status": "usable", "reasons": ["c: late"]},
+            "c": {"status": "usable", "reasons": ["c: slow"]},
             "d": {"status": "good", "reasons": ["error 4 %"]},
         },
     }
     assert verdict_lines(verdict) == [
         "verdict: poor", "  - a: slow", "  - no log", "  a: poor: bad", "  b, d: good",
-        "  c: usable: late",
+        "  c: usable: slow",
     ]  # fmt: skip
     alone = {"status": "good", "reasons": ["fine"], "per_joint": {"b": verdict["per_joint"]["b"]}}
     assert verdict_lines(alone) == ["verdict: good", "  - fine", "  every joint: good"]

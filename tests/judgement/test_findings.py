@@ -354,7 +354,9 @@ def test_what_the_user_asks_of_the_fit_is_named():
 
 
 @pytest.mark.parametrize("rank", [7, 9])
-def test_a_fit_is_told_by_its_determination_its_refitted_logs_and_costly_joints(monkeypatch, rank):
+def test_a_fit_is_reported_by_its_determination_its_refitted_logs_and_costly_joints(
+    monkeypatch, rank
+):
     for name in ("_static_findings", "consistency_findings", "_bound_findings", "_total_mass",
                  "_impossible_shapes", "_dense_bodies", "_outlier_findings", "_drive_findings",
                  "_correlated", "encoder_findings"):  # fmt: skip

@@ -379,7 +379,7 @@ def test_noise_without_a_source_is_refused():
 
 
 class Given:
-    """A random generator that gives what it is told to, one array after the other."""
+    """A random generator that returns stated arrays, one after the other."""
 
     def __init__(self, *arrays):
         self.arrays = iter(arrays)
@@ -439,7 +439,7 @@ def test_an_iteration_is_its_equations_update_by_update(rng):
     np.testing.assert_array_equal([history.NA, history.diverged], np.zeros((2, 2)))
 
 
-def test_runs_are_lost_by_position_or_speed_in_the_iteration_in_which_they_are(rng):
+def test_runs_diverge_by_position_or_speed_in_their_own_iteration(rng):
     motion = ProgramMotion(np.tile([1.0, 1.5], (4, 1)), np.full(4, 2.0))
     loop = _Loop(ARM, PLANT, motion, short(1), Influences(), np.tile(P4, (4, 1)), 0.0)
     program = motion.evaluate(np.full(4, 0.7))
@@ -453,7 +453,7 @@ def test_runs_are_lost_by_position_or_speed_in_the_iteration_in_which_they_are(r
     np.testing.assert_array_equal(found, program[:2])
     np.testing.assert_array_equal(loop.diverged, [0, 3, 5, 5])
     np.testing.assert_array_equal(loop.active, [True, False, False, False])
-    q, v = program[0] + 0.5, program[1] + 0.25  # those that were lost stay on the program
+    q, v = program[0] + 0.5, program[1] + 0.25  # those that diverged stay on the program
     for moved, part in zip(loop._reset_diverged(6, q, v, program), program, strict=False):
         np.testing.assert_array_equal(moved[1:], part[1:])
     np.testing.assert_array_equal(loop._reset_diverged(6, q, v, program)[0][0], q[0])

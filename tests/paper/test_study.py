@@ -197,7 +197,7 @@ def test_random_properties_are_each_run_s_and_each_joint_s_own(monkeypatch):
     assert np.abs(np.corrcoef(every.T) - np.eye(every.shape[1])).max() < 0.06
 
 
-def test_a_slow_course_is_told_by_its_last_ten_iterations():
+def test_a_slow_course_is_reported_by_its_last_ten_iterations():
     error = 0.8 * 0.97 ** np.arange(26)
     assert study._course(error) == (
         f"slow: the error is {error[-1]:.2g} after 25 iterations, with a decrease of "
