@@ -350,3 +350,32 @@ def test_shapes_of_every_joint_must_settle(monkeypatch, shares, is_settled):
         for found, share in ((first, shares[0]), (last, shares[1])):
             values = [shape.value for shape in found.shapes]
             assert values == pytest.approx([0.2 + error * share, 0.7 - 0.05 * error])
+
+
+def test_drive_parameters_whose_error_grows_by_a_third_are_named(monkeypatch):
+    """Not those of bodies, nor one without an error before."""
+    before = SimpleNamespace(
+        drives=(), standard_error=np.array([1.0, 1.0, 2.0, 3.0, np.inf, 2.0]),
+        model=SimpleNamespace(layout=SimpleNamespace(n_inertial=2)),
+        mapping=SimpleNamespace(names=tuple("abcdef")),
+    )  # fmt: skip
+    after = SimpleNamespace(standard_error=np.array([9.0, 1.0, 2.5, 4.0, np.inf, 9.0]))
+    given = []
+
+    def wider(found, sample, moves):
+        given.append(list(moves))
+        return after if len(given) == 3 else before
+
+    monkeypatch.setattr(model_error, "_wider", wider)
+    monkeypatch.setattr(model_error, "_of_misfit", lambda misfit: f"move of {misfit}")
+    found, names = with_model_error(before, "sample", ["x", "y"])
+    assert given == [[], [], ["move of x", "move of y"]]
+    assert (found is after, names) == (True, ("d", "f"))
+
+
+def test_a_fixed_parameter_moves_a_millionth_of_the_smallest_spread():
+    given = []
+    mapping = SimpleNamespace(gain=lambda spread: given.append(spread) or "gain")
+    found = SimpleNamespace(prior_std=np.array([0.0, 2e-3, 5.0]), mapping=mapping)
+    assert model_error._gain(found) == "gain"
+    np.testing.assert_allclose(given, [[2e-9, 2e-3, 5.0]])

@@ -408,3 +408,40 @@ def test_only_what_fitted_recordings_could_have_shown_has_changed(rng):
         )
         changed[key] = replace(found, fitted=before)._has_changed("speed")
     assert changed == {"significant": False, "none": True, "short": False, "other": False}
+
+
+def test_samples_of_all_recordings_together_are_at_most_so_many(identified, monkeypatch):
+    """A half of them of each of two fitted logs, whose parts follow each other."""
+    monkeypatch.setattr(torque_split, "_ROWS", 90)
+    found = torque_split._torques_of(identified, identified.fitted)
+    assert [torque.joint for torque in found] == list(identified.model.joints)
+    taken = []
+    for e in identified.fitted:
+        count = len(e.recording.trajectory.t)
+        taken.append(np.linspace(0, count - 1, 45).round().astype(int))
+    for j, torque in enumerate(found):
+        for name, own in (
+            (
+                "tau",
+                [
+                    e.recording.trajectory.tau[k, j]
+                    for e, k in zip(identified.fitted, taken, strict=True)
+                ],
+            ),
+            (
+                "used",
+                [e.recording.mask[k, j] for e, k in zip(identified.fitted, taken, strict=True)],
+            ),
+        ):
+            np.testing.assert_array_equal(getattr(torque, name), np.concatenate(own))
+        whole = np.concatenate(
+            [e.torques["estimate"][k, j] for e, k in zip(identified.fitted, taken, strict=True)]
+        )
+        np.testing.assert_allclose(sum(torque.parts.values()), whole, atol=1e-8)
+        for part, terms in torque.terms.items():
+            np.testing.assert_allclose(sum(terms.values()), torque.parts[part], atol=1e-9)
+        speed = [
+            e.recording.trajectory.v[k, j] for e, k in zip(identified.fitted, taken, strict=True)
+        ]
+        assert torque.quantities["speed"][0] == "rad/s"
+        np.testing.assert_array_equal(torque.quantities["speed"][1], np.concatenate(speed))

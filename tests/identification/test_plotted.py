@@ -140,8 +140,10 @@ def test_a_notebook_shows_the_page_that_is_written(identified, tmp_path):
         plot.write(tmp_path / "none" / "friction.html")
 
 
-def test_friction_is_drawn_at_position_and_load_of_the_samples_used(rng, monkeypatch):
-    n, row = 301, 1
+@pytest.mark.parametrize("n", [301, 4001])
+def test_friction_is_drawn_at_position_and_load_of_the_samples_used(rng, monkeypatch, n):
+    """Of at most 800 samples, spread over the recording."""
+    row = 1
     v, q = rng.standard_normal((2, n, 2))
     mask = rng.random((n, 2)) < 0.6
     q[~mask[:, row], row] += 50.0
@@ -163,6 +165,7 @@ def test_friction_is_drawn_at_position_and_load_of_the_samples_used(rng, monkeyp
     monkeypatch.setattr(pictures, "drive_motion_along", lambda model, motion: along)
     chart = pictures.friction_chart(found, "b", split=(left, friction))
     used = np.flatnonzero(mask[:, row])
+    used = used[:: -(-len(used) // 800)]
     used = used[np.argsort(v[used, row])]
     load = np.sqrt(np.mean(loads[row, used] ** 2))
     assert given == [
