@@ -7,9 +7,11 @@ import pytest
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
+from robotid.fitting.estimators import Known
 from robotid.fitting.fit import rough_choice
 from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import BaseMapping
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -37,3 +39,12 @@ def test_a_base_parameter_of_terms_at_their_bound_alone_has_no_error(rng):
     np.testing.assert_array_equal(is_open, wanted)
     C = found.standard_covariance
     np.testing.assert_allclose(found.base_error[~is_open] ** 2, np.diag(K @ C @ K.T)[~is_open])
+
+
+def test_what_is_known_of_base_parameters_follows_from_the_standard_ones(rng):
+    K = np.hstack([np.eye(3), rng.standard_normal((3, 2))])
+    mapping = BaseMapping(K, np.arange(3), tuple("abcde"), np.ones(5))
+    pi, spread = rng.standard_normal(5), np.array([0.1, 2.0, 0.5, 7.0, 1.5])
+    known = Known(None, mapping, pi, spread, 0.3, np.ones(2))
+    np.testing.assert_allclose(known.beta, K @ pi)
+    np.testing.assert_allclose(known.covariance, K @ np.diag(spread**2) @ K.T)

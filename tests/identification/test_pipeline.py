@@ -276,7 +276,10 @@ def test_what_is_concluded_counts_all_findings_but_the_ignored_ones(
 ):
     """Of a fit that is given: notes of all logs, errors and warnings of the doctor."""
     fit = Fit(**{f.name: getattr(identified, f.name) for f in fields(Fit) if f.init})
-    monkeypatch.setattr(pipeline, "with_drives", lambda *_, **__: fit)
+    given, springs = [], []
+    monkeypatch.setattr(pipeline, "with_drives", lambda *x, **_: (given.append(x), fit)[1])
+    monkeypatch.setattr(pipeline, "counterbalanced", lambda *x: x)
+    monkeypatch.setattr(pipeline, "with_known_springs", lambda *x: (springs.append(x), x[0])[1])
     monkeypatch.setattr(pipeline, "take_sample", lambda fit: None)
     monkeypatch.setattr(pipeline, "explain_residual", lambda fit, sample: ((), ()))
     monkeypatch.setattr(pipeline, "with_model_error", lambda fit, *_: (fit, ("a.viscous",)))
@@ -310,6 +313,10 @@ def test_what_is_concluded_counts_all_findings_but_the_ignored_ones(
     )
     assert result.asked == Asked(SignalSettings(cutoff=3.0), "none", ignore)
     assert result.on_misfit == ("a.viscous",)
+    ((_, asked, wanted, balanced),) = given
+    assert (asked, set(wanted.values())) == (choice, {()})
+    assert balanced == (found, ["a.csv", "b.csv"])  # of the fitted logs
+    assert springs == [(found[:2], fit)]
 
 
 def test_a_verdict_is_given_all_that_is_known_of_a_result(monkeypatch):
