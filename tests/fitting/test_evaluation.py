@@ -6,6 +6,7 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.fitting.evaluation import (
+    _conclude,
     _joined,
     _parts,
     _Score,
@@ -19,6 +20,7 @@ from robotid.fitting.metrics import TorqueSums
 from robotid.fitting.survey import hold_log
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import turns_note
 from robotid.regressor.used_rows import row_mask
 from robotid.robot.parameters import Coupling
 
@@ -227,3 +229,39 @@ def test_scores_of_pieces_join_field_by_field(rng):
     assert [x.tolist() for x in both.found] == [[False, True, True, False], [True, True, False]]
     wanted = one.sums["x"].residual + two.sums["x"].residual
     np.testing.assert_allclose(both.sums["x"].residual, wanted)
+
+
+def test_an_evaluation_of_a_window_has_its_extent_and_what_its_pieces_show(rng):
+    """Rows 3 to 8 of twelve in a file; the position of the second joint was unwrapped."""
+    stamps, values = 1.0 + 0.5 * np.arange(12), rng.standard_normal((6, 2))
+    head = Log(stamps[3:9], values, 2 * values, ("a", "b"), path="x/run.csv")
+    motions = [
+        Trajectory(stamps[k], *[rng.standard_normal((2, 2)) for _ in range(4)], ("a", "b"), 2.0,
+                   np.zeros(2, dtype=int))
+        for k in (slice(3, 5), slice(6, 8))
+    ]  # fmt: skip
+    masks, torques = rng.random((2, 2, 2)) < 0.7, rng.standard_normal((2, 2, 2))
+    tau = rng.standard_normal((9, 2))
+    sums = {"x": TorqueSums.of(tau, 0.5 * tau, np.ones((9, 2), dtype=bool), {})}
+    score = _Score(
+        sums=sums, smooth=41, used=77, segments=frozenset({2, 5, 7}),
+        turned=np.array([False, True]), sampled=None, found=(),
+        shown=tuple((m, k, {"x": t}) for m, k, t in zip(motions, masks, torques, strict=True)),
+    )  # fmt: skip
+    model = SimpleNamespace(row_names=("a", "b"), row_units=("N m", "N"))
+    log = SimpleNamespace(
+        first=3, stop=9, step=0.5, stamps=stamps, head=head, model=model, signals=EXACT
+    )
+    found = _conclude(log, score, True)
+    extent, recording = found.recording.extent, found.recording
+    assert (extent.samples, extent.rate, extent.start, extent.end) == (6, 2.0, 2.5, 5.0)
+    assert (extent.smooth, extent.rows_used, extent.segments) == (41, 77, 3)
+    assert (recording.name, recording.is_partial) == ("run.csv 2.5-5 s", True)
+    assert recording.log.notes == (*head.notes, turns_note(["b"]))
+    np.testing.assert_array_equal(recording.mask, np.concatenate(masks))
+    np.testing.assert_array_equal(found.torques["x"], np.concatenate(torques))
+    np.testing.assert_array_equal(recording.trajectory.q, np.concatenate([m.q for m in motions]))
+    assert (found.metrics["x"].per_joint["b"].unit, found.is_refitted) == ("N", True)
+    assert found.metrics["x"].per_joint["a"].rmse == pytest.approx(
+        0.5 * np.sqrt(np.mean(tau[:, 0] ** 2))
+    )
