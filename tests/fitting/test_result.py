@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from robotid.fitting import result as result_module
 from robotid.fitting.result import Fit
 from robotid.fitting.settings import EstimatorSettings
 
@@ -63,3 +64,23 @@ def test_intervals_are_each_value_s_own_quantile_times_its_own_error():
     found = SimpleNamespace(base=np.array([1.0, -2.0]), standard=np.array([7.0, 5.0]), **half)
     assert Fit.base_interval.fget(found).tolist() == [[0.0, 2.0], [-2.75, -1.25]]
     assert Fit.standard_interval.fget(found).tolist() == [[5.0, 9.0], [-np.inf, np.inf]]
+
+
+def test_predictions_are_of_logs_without_fitted_rows():
+    validation = [
+        SimpleNamespace(
+            recording=SimpleNamespace(name=name), is_refitted=is_refitted,
+            metrics={"estimate": f"{name} estimate", "wls": f"{name} wls"},
+        )
+        for name, is_refitted in (("a", True), ("b", False), ("c", False))
+    ]  # fmt: skip
+    found = SimpleNamespace(validation=validation)
+    assert Fit.predictions.fget(found) == {"b": "b estimate", "c": "c estimate"}
+    assert Fit.refitted.fget(found) == (validation[0],)
+
+
+def test_a_band_is_that_of_the_recording_or_of_the_noise_of_the_fit(monkeypatch):
+    monkeypatch.setattr(result_module, "expected_band", lambda found, e: ("expected", e))
+    a, b, c, other = (SimpleNamespace(name=name) for name in "abcd")
+    own = SimpleNamespace(fitted=(a, b), validation=(c,), _bands=(1, 2, 3))
+    assert [Fit.band(own, e) for e in (a, b, c, other)] == [1, 2, 3, ("expected", other)]

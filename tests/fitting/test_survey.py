@@ -257,3 +257,23 @@ def test_positions_of_locked_joints_are_those_of_all_windows_in_radians():
     layout.units = LogUnits("s", "rad")
     plain = survey._positions({"b": "x"}, windows[1:], layout, model)
     np.testing.assert_array_equal(plain["b"], [40.0, 50.0])
+
+
+def test_windows_of_a_long_log_are_named_by_their_own_rows(monkeypatch):
+    monkeypatch.setattr(survey, "_WINDOW", 100)
+    q = np.zeros((2, 1))
+    windows = tuple(Log(np.arange(2.0), q, q, ("a",), path="run.csv", notes=(n,)) for n in "xyz")
+    log = SimpleNamespace(windows=windows, first=7, stop=1008)
+    looks = survey.SurveyedLog.looks.fget(log)
+    assert [own.path for own in looks] == [
+        "run.csv rows 7-107", "run.csv rows 457-557", "run.csv rows 908-1008",
+    ]  # fmt: skip
+    assert {own.notes for own in looks} == {()}
+    head = survey.SurveyedLog.head.fget(log)
+    assert head.notes == (
+        "x", "the log is too long for the memory; the doctor checked rows 7-107, 457-557, "
+        "908-1008 only",
+    )  # fmt: skip
+    short = SimpleNamespace(windows=windows[:1], first=7, stop=300)
+    assert survey.SurveyedLog.looks.fget(short) == windows[:1]
+    assert survey.SurveyedLog.head.fget(short) is windows[0]

@@ -296,3 +296,23 @@ def test_plots_of_torques_are_of_each_joint_in_turn(identified, monkeypatch):
     )  # fmt: skip
     assert [row for _, row, _ in given] == [3, 1]
     assert all(shown is e and band is identified.band(e) for shown, _, band in given)
+
+
+def test_charts_of_reasons_are_named_by_what_they_show(identified):
+    (j,) = (k for k, n in enumerate(identified.model.joints) if n == "wrist_2_joint")
+    torque = joint_torques(identified)[j]
+    plot = identified.plot_why("wrist_2_joint")
+    names = [f"residual against {x}" for x in ("position", "speed", "acceleration", "load", "time")]
+    wanted = [torque.sentence, *names, "mechanical power"]
+    assert [caption for _, caption in plot.charts] == [f"wrist_2_joint: {x}" for x in wanted]
+    # a part that is 0 is not drawn
+    parts = {"gravity": 0.0 * torque.tau, **torque.parts, "ripple": 0.0 * torque.tau}
+    split = why_charts(replace(torque, parts=parts))["split"]
+    present = [name for name, x in torque.parts.items() if np.abs(x).max() > 1e-6]
+    assert [s.label for s in split.series] == [*present, "residual", "measured"]
+    for part in split.series[:-2]:
+        shown = np.isfinite(part.y)
+        np.testing.assert_allclose(part.y[shown], torque.parts[part.label])
+    assert split.title == (
+        f"Torque of wrist_2_joint over time, the sum of {', '.join(present)} and residual"
+    )
