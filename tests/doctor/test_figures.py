@@ -8,7 +8,15 @@ import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.doctor import channels, command_channels, hypotheses, urdf_base, urdf_geometry
+from robotid.doctor import (
+    channels,
+    command_channels,
+    hypotheses,
+    loads,
+    mounted,
+    urdf_base,
+    urdf_geometry,
+)
 from robotid.doctor.channels import check_channels
 from robotid.doctor.clock import check_clock
 from robotid.doctor.command_channels import _held, _Loop
@@ -363,3 +371,67 @@ def test_a_spike_is_one_by_the_noise_of_its_own_channel():
     (found,) = channels._spikes(log, "tau", values, np.array([0.5, 0.01]))
     assert found.where == "run.csv: tau_b"
     assert found.evidence["rows"] == 2
+
+
+def test_velocities_of_another_joint_are_reported_with_both_correlations():
+    log = log_of()
+    alike = np.array([[0.31, 0.93], [0.2, 0.9]])
+    [found] = channels._velocity_order(log, alike)
+    assert found.where == "run.csv: a"
+    assert found.evidence == {"correlation": 0.93, "own_correlation": 0.31}
+    assert "dq_b is d(q)/dt of q_a (correlation 0.93; with dq_a 0.31)" in found.message
+
+
+def test_a_bandwidth_starts_at_the_largest_of_the_slow_responses():
+    loop = _Loop(log_of(q_ref=log_of().q), 0)
+    f = np.linspace(0.5, 8.0, 16)
+    size = np.array(
+        [0.6, 0.6, 1.3, 1.3, 1.3, 1.0, 1.0, 1.0, 1.0, 1.0, 0.7, 0.7, 0.7, 0.7, 0.4, 0.4]
+    )
+    loop.__dict__["response"] = (f, size * np.exp(0.3j * f), np.ones(16))
+    # the medians of five are 0.6, 0.6, 1.3, 1.3 ...: 0.92 is the limit
+    assert loop.bandwidth == f[10]
+
+
+@pytest.mark.parametrize(("needed", "named"), [((0, 3), [0, 3]), ((3,), [3]), ((1, 3), [1, 3])])
+def test_scales_are_named_of_the_joints_that_need_them(monkeypatch, needed, named):
+    scale, other = np.array([0.2, 7.0, 1.1, 30.0]), np.array([0, 1, 3])
+    model = SimpleNamespace(fit=lambda scale: (scale, scale, scale))
+    found = scale.tolist()
+
+    def fits(_model, scale, _theta):
+        return all(scale[j] == found[j] for j in needed)
+
+    monkeypatch.setattr(loads, "_is_this_robot", fits)
+    assert loads._needed(model, scale, other).tolist() == named
+    every = np.arange(4)
+    assert loads._needed(model, scale, every).tolist() == [0, 1, 2, 3]
+    assert scale.tolist() == found
+
+
+@pytest.mark.parametrize(
+    ("left", "loaded", "is_named"), [(86.0, 85.5, True), (88.0, 87.0, False), (86.0, 83.0, False)]
+)
+def test_a_part_is_not_mounted_by_its_gain_over_the_whole(monkeypatch, left, loaded, is_named):
+    model = RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
+    pi = model.standard_parameters()
+    size = model.layout.n_inertial
+    mass = 0.3 * pi[size - 10]
+    misfits = iter([91.0, 95.0, left])
+    probe = SimpleNamespace(model=model, of=lambda lighter: lighter)
+    parts = [
+        (["lid"], np.eye(10)[0] * 0.25 * pi[size - 10]),
+        (["hand", "tool"], np.eye(10)[0] * mass),
+    ]
+    stub = SimpleNamespace(fit=lambda scale: (loaded, None, None))
+    monkeypatch.setattr(mounted, "load_model", lambda probe, share: stub)
+    monkeypatch.setattr(mounted, "_misfit_without_load", lambda model: next(misfits))
+    monkeypatch.setattr(mounted, "_parts", lambda probe: parts)
+    found = list(mounted.check_unmounted_parts(probe, np.zeros(2), "run.csv"))
+    assert bool(found) == is_named
+    if is_named:
+        assert found[0].evidence == {
+            "mass": pytest.approx(mass),
+            "gain": pytest.approx(91.0 - left),
+        }
+        assert "without hand, tool, with a total mass" in found[0].message

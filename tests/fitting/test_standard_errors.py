@@ -112,6 +112,21 @@ def test_independent_rows_need_no_inflation_and_coloured_ones_do(W):
     assert coloured.inflation > 5  # (1 + 0.9) / (1 - 0.9) = 19 for rows that never change
 
 
+def test_an_open_parameter_has_no_error_and_leaves_that_of_others(W):
+    tau = W @ TRUTH + noise(np.random.default_rng(3), 0.5)
+    parts = segments(W, tau)
+    whole = merge(parts)
+    rough = WLS().fit(whole)
+    wanted = measured_errors(rough, parts, whole, 1.0, np.eye(4), rough.sigma)[0].covariance
+    open_one = rough.covariance.copy()
+    open_one[2, 2] = np.inf
+    given = replace(rough, covariance=open_one)
+    found = measured_errors(given, parts, whole, 1.0, np.eye(4), rough.sigma)[0].covariance
+    others = wanted.copy()
+    others[2, 2] = np.inf
+    np.testing.assert_allclose(found, others, rtol=1e-9)
+
+
 def test_one_parameter_is_the_closed_form_of_cr2(rng):
     x, e = rng.standard_normal((20, 10)), rng.standard_normal((20, 10))
     y = 0.7 * x + e

@@ -172,6 +172,12 @@ def test_one_shot_finds_the_parameters_after_one_run():
     np.testing.assert_allclose(history.estimates[-1], [P4], rtol=1e-11)
 
 
+def test_one_shot_takes_each_run_from_its_own_guess():
+    guess = P4 * np.array([[0.5], [0.8], [1.3]])
+    history = run(guess, settings=short(1, method="one_shot", updates=40), offset=DEGREE)
+    np.testing.assert_allclose(history.estimates[-1], np.tile(P4, (3, 1)), rtol=1e-10)
+
+
 def test_one_shot_says_what_the_motion_leaves_open():
     still, settings = ProgramMotion(np.zeros(2), 2.0), short(1, method="one_shot")
     with pytest.raises(RankDeficientError, match=r"^the data excite 0 of 4 base parameters"):
@@ -373,9 +379,10 @@ def test_a_setting_out_of_range_is_named(settings, message):
         LoopSettings(**settings)
 
 
-def test_noise_without_a_source_is_refused():
+@pytest.mark.parametrize("channel", ["q", "v", "a"])
+def test_noise_without_a_source_is_refused(channel):
     with pytest.raises(SettingsError, match=r"^sensor noise is stated, but rng is None"):
-        Influences(q=1e-3)
+        Influences(**{channel: np.array([0.0, 1e-3])})
 
 
 class Given:

@@ -316,6 +316,42 @@ def test_errata_energy_and_settings(shown, content):
     assert dict(shown["Settings"].rows) == {k: str(v) for k, v in content["settings"].items()}
 
 
+def test_settings_are_written_each_under_its_name():
+    drift = EnergyDrift(np.array([0.0, 1.0]), {"a": np.array([0.0, 0.1])})
+    settings = PaperSettings(iterations=19, longest=31, runs=4, patience=2, seed=23)
+    found = paper._content(settings, [], {}, {}, drift)["settings"]
+    assert found == {
+        "iterations": 19, "updates_per_iteration": 100, "amplitude_rad": [1.0, 1.5],
+        "duration_s": 2.0, "alpha": 20.0, "beta": 100.0, "first_guess": "P / 2",
+        "start_beside_program_rad": [np.pi / 180, 0.0], "most_iterations_until_PRX_is_zero": 31,
+        "random_motions": 4, "seed": 23,
+    }  # fmt: skip
+
+
+def test_random_motions_differ_by_model_and_by_start(monkeypatch):
+    made_of, reported = [], []
+
+    def runs(dynamics, P, count, most, rng, *, largest_offset, progress):
+        made_of.append((dynamics.form, len(P), count, most, largest_offset, rng.uniform()))
+        progress(7)
+        return len(made_of)
+
+    monkeypatch.setattr(paper, "random_runs", runs)
+    settings = PaperSettings(runs=4, seed=5)
+    for where, largest in (("beside", 0.05), ("on", 0.0)):
+        made = paper._trajectories(
+            settings, where, largest, 31, lambda *parts: reported.append(parts)
+        )
+        assert list(made) == list(MODELS)
+    assert len({first for *_, first in made_of}) == 6
+    for k, (*given, first) in enumerate(made_of):
+        wanted = paper_arm(list(MODELS)[k % 3])
+        assert given == [wanted[0].form, len(wanted[1]), 4, 31, 0.05 if k < 3 else 0.0]
+        assert first == np.random.default_rng([5, k % 3, int(k < 3)]).uniform()
+        what = f"{list(MODELS)[k % 3]}, 4 motions from {('beside', 'on')[k // 3]} the program"
+        assert reported[k] == (what, 7, 31, "iterations")
+
+
 def test_the_verdict_is_that_of_the_last_iteration(html, content):
     box = html.split('<div class="verdict ')[1].split("</div>")[0]
     last = [content["models"][name]["relative_error"][-1] for name in MODELS]

@@ -132,6 +132,19 @@ def test_each_kind_of_failure_has_its_reason(change, reason, rng):
     assert [failure["reason"] for failure in found] == [reason]
 
 
+def test_each_failure_has_the_end_and_the_omitted_updates_of_its_run(rng):
+    history = SimpleNamespace(diverged=[0, 0, 0, 0], skipped=[0, 5, 9, 0])
+    errors = np.array([[0.9, 0.8, 0.7, 0.6], [0.2, 0.1, 1e-4, 0.3], [0.4, 0.3, 0.5, 0.2]])
+    drawn = {name: rng.uniform(0.5, 2.0, (4, 2)) for name in ("amplitude", "guess", "offset")}
+    drawn |= {name: rng.uniform(0.5, 2.0, 4) for name in ("duration", "gain")}
+    found = study.RandomRuns(errors=errors, history=history, **drawn).failures
+    assert [(f["run"], f["relative_error"]) for f in found] == [(0, 0.4), (1, 0.3), (3, 0.2)]
+    assert ["5 updates were omitted" in f["reason"] for f in found] == [False, True, False]
+    for failure in found:
+        for name, values in drawn.items():
+            assert failure[name] == values[failure["run"]].tolist()
+
+
 @pytest.mark.parametrize("name", ["iterations", "longest", "runs", "patience"])
 def test_settings_below_one_are_named(name):
     with pytest.raises(SettingsError, match=f"^{name} is 0, wanted 1 or more$"):
@@ -174,6 +187,17 @@ def test_a_study_is_its_cases_an_endless_run_and_a_single_one(monkeypatch):
     for options in (endless, once):
         np.testing.assert_array_equal(options["offset"], degree)
     assert (found.NA, found.one_shot_error, found.name) == (31, 0.75, "printed")
+
+
+def test_the_program_control_has_the_true_parameters():
+    dynamics, P = paper_arm("physical")
+    history = SimpleNamespace(estimates=np.zeros((3, 5, len(P))))
+    t, control = study.ModelStudy("physical", dynamics, P, history, None, 0.0).program_control(5)
+    np.testing.assert_allclose(t, [0.0, 0.5, 1.0, 1.5, 2.0])
+    for k, parts in enumerate(zip(*PROGRAM.evaluate(t), strict=True)):
+        wanted = dynamics.regressor(*parts) @ P
+        np.testing.assert_allclose(control[k], wanted, rtol=1e-12)
+    assert np.abs(control).max() > 0.1
 
 
 def test_random_properties_are_each_run_s_and_each_joint_s_own(monkeypatch):
