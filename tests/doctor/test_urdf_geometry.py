@@ -107,6 +107,7 @@ def test_numbers_of_templates_are_named(tmp_path):
     (found,) = audit(tmp_path, **numbers)
     assert found.code == "default_inertial"
     assert "1 kg and 0.001 kg m^2 about every axis" in found.message
+    assert found.evidence == {"mass": 1.0, "moment": 0.001}
 
 
 def test_a_mesh_that_is_not_found_is_one_note(tmp_path):

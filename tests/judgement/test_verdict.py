@@ -593,3 +593,21 @@ def test_good_needs_a_witness_or_says_that_there_is_none(scale_check, status, sa
     )
     assert found.status == status
     assert said in found.reasons[-1]
+
+
+def test_joints_better_by_the_urdf_are_those_of_all_logs():
+    better, worse = {"urdf_with_drives": 3.0}, {"urdf_with_drives": 9.0}
+    logs = {
+        "one": {"a": joint(4.0, **worse), "b": joint(4.0, **better), "c": joint(4.0, **worse)},
+        "two": {"a": joint(4.0, **better), "b": joint(4.0, **better)},
+    }
+    fit = Metrics({name: joint(4.0) for name in "abcd"}, 1.0)
+    found = Predictions(fit, {name: Metrics(own, 1.0) for name, own in logs.items()}, "abcde")
+    (reason,) = found.better_by_urdf()
+    assert reason.startswith("the URDF with fitted drives predicts b, a better than")
+    assert found.at_rest() == [
+        "the joints e do not move in any recording: not evaluated",
+        "the joints d do not move in any validation log: not evaluated",
+    ]
+    errors = {name: own for name, (_, _, own) in found.on_each().items()}
+    assert errors == {"a": [4.0, 4.0], "b": [4.0, 4.0], "c": [4.0], "d": [], "e": []}
