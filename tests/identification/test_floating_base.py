@@ -90,7 +90,7 @@ def test_the_residual_at_the_truth_is_the_noise(found):
 def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_path):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
     job = read_job(JOBS / "solo12.toml")
-    result, _ = run_job(replace_estimator(job), tmp_path)
+    result, _ = run_job(rough(job), tmp_path)
     (validation,) = result.validation
     tau, used = validation.recording.trajectory.tau, validation.recording.mask
     errors = {
@@ -106,7 +106,7 @@ def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_p
     assert result.verdict.status == "good"
 
 
-def replace_estimator(job):
+def rough(job):
     from dataclasses import replace
 
     return replace(job, estimator=ConsistentSettings(prior_weight=1.0, draws=0), report=False)
@@ -114,7 +114,7 @@ def replace_estimator(job):
 
 def test_a_humanoid_is_weighed_by_its_feet(recordings, monkeypatch, tmp_path):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    result, content = run_job(replace_estimator(read_job(JOBS / "icub.toml")), tmp_path)
+    result, content = run_job(rough(read_job(JOBS / "icub.toml")), tmp_path)
     (recording,) = (e.recording for e in result.fitted)
     force = sum(recording.log.wrenches.values()).mean() / 9.81
     assert content["consistency"]["total_mass"] == pytest.approx(force, rel=0.01)
