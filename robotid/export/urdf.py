@@ -69,6 +69,7 @@ _SHAPE = {
     "dynamics?": TEXT,
     "terms": [TEXT],
     "own_terms?": {...: [TABLE]},
+    "passive?": [TEXT],
     "drives": {...: {...: NUMBER}},
     "couplings": [{"name": TEXT, "ratios": {...: NUMBER}, "replaces?": FLAG}],
     "lumped": TABLE,
@@ -233,6 +234,7 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
         couplings=couplings,
         own_terms=terms_from_facts(facts.get("own_terms", {})),
         dynamics=facts.get("dynamics", "full"),
+        passive=facts.get("passive", ()),
         **{
             key: facts[key]
             for key in ("joints", "locked", "free_flyer", "mimic", "gravity", "terms")

@@ -23,6 +23,7 @@ from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
 from robotid.robot.bodies import link_transfer
+from robotid.robot.closure import require_tree
 from robotid.robot.drives import DriveTerm
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
@@ -328,6 +329,7 @@ def fit_payloads(
     Raises:
         DataError, ModelError, SettingsError, NotConvergedError: As of ``identify_payload``.
     """
+    require_tree(loaded.model, "payload identification")
     if not loaded.model.layout.remembering:
         return _fit(loaded, reference, links, masses, unknown_gains)
     # the unknown bodies load the gears

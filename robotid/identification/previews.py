@@ -48,6 +48,7 @@ from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors, compress, join, merge
 from robotid.regressor.prediction import predict
 from robotid.regressor.used_rows import base_problem, independent_share
+from robotid.robot.closure import require_tree
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
@@ -289,6 +290,7 @@ def preview_logs(
     """
     if not motions:
         raise DataError("no motion was given; at least one is needed to preview anything")
+    require_tree(model, "preview")
     mapping = structural_mapping(model)
     peak, fastest = _largest(model, motions)
     size = largest_torques(model, peak)

@@ -5,6 +5,7 @@ import pytest
 from robotid.commands.job import Job, job_from_settings, read_job
 from robotid.exceptions import SettingsError
 from robotid.logs.settings import LogSource
+from robotid.robot.constraints import Loop
 from robotid.robot.drives import DRIVE_TERMS
 from robotid.robot.families import AUTO
 from robotid.robot.model import GRAVITY
@@ -14,6 +15,7 @@ FULL = """
 urdf = "robot.urdf"
 joints = ["a", "b"]
 locked = { c = 0.8 }
+passive = ["b"]
 gravity = [0.0, -9.81, 0.0]
 
 [signals]
@@ -53,6 +55,10 @@ motors = ["m", "n"]
 matrix = [[32, 0], [45, 45]]
 efficiency = [0.9, 1.0]
 
+[[loop]]
+frames = ["hand", "rod"]
+kind = "point"
+
 [estimator]
 name = "wls"
 
@@ -87,6 +93,8 @@ def test_every_key_of_a_job_arrives(tmp_path):
     assert job.units.time == "ms"
     assert job.source == LogSource("/arm", joints={"a": "M1"}, effort="current", stamp="log")
     assert job.couplings == (Coupling("motor", (("a", 1.0), ("b", -1.0))),)
+    assert job.loops == (Loop(("hand", "rod"), "point"),)
+    assert job.passive == ("b",)
     (gear,) = job.transmissions
     assert (gear.motors, gear.efficiency) == (("m", "n"), (0.9, 1.0))
     assert gear.T.tolist() == [[32.0, 0.0], [45.0, 45.0]]
@@ -131,6 +139,12 @@ WRONG = {
     "one bracket": ("[[validation]]", "[validation]", "wanted tables written as [[validation]]"),
     "no log": ('log = "val.parquet"', "end = 2.0", "a [[validation]] has no key 'log'"),
     "floating base": ("[signals]", "free_flyer = true\n[signals]", "free_flyer is true, but no"),
+    "loop's kind": ('"point"', '"ball"', "loop hand, rod is 'ball', wanted one of point, hinge"),
+    "loop's frames": ('["hand", "rod"]', '["hand"]', "loop has the frames hand, wanted two links"),
+    "no frames": ('frames = ["hand", "rod"]', "", "loop has the frames none, wanted two links"),
+    "loop's axis": ('"point"', '"hinge"\naxis = [0, 1]', "is (0, 1), wanted x, y, z"),
+    "axis as text": ('"point"', '"hinge"\naxis = "z"', "axis is 'z', wanted a list"),
+    "passive": ('passive = ["b"]', 'passive = "b"', "passive is 'b', wanted a list"),
     "no urdf": ('urdf = "robot.urdf"', "", "has no key 'urdf'"),
     "joints text": ('joints = ["a", "b"]', 'joints = "a"', "joints is 'a', wanted a list"),
     "unit": ('time = "ms"', 'time = "sec"', "time is 'sec', wanted one of"),
