@@ -1,15 +1,19 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from robotid.commands.job import Job, job_from_settings, read_job
 from robotid.exceptions import SettingsError
+from robotid.logs.data import Log
+from robotid.logs.read import write_log
 from robotid.logs.settings import LogSource
 from robotid.robot.constraints import Loop
 from robotid.robot.drives import DRIVE_TERMS
 from robotid.robot.families import AUTO
 from robotid.robot.model import GRAVITY
 from robotid.robot.parameters import Coupling
+from tests.helpers.closed_chains import FOUR_BAR, FOUR_BAR_LOOP
 
 FULL = """
 urdf = "robot.urdf"
@@ -230,3 +234,23 @@ def test_a_controller_that_the_estimator_does_not_read_is_refused(tmp_path):
         job_from_settings(table, "job.toml", tmp_path)
     table["estimator"] = {"name": "simulation"}
     assert job_from_settings(table, "job.toml", tmp_path).controller.kp == 20.0
+
+
+def test_a_job_of_a_closed_chain_reads_the_log_of_its_driven_joint(tmp_path):
+    (tmp_path / "bars.urdf").write_text(FOUR_BAR)
+    t = np.linspace(0.0, 1.0, 20)
+    write_log(Log(t, t[:, None], t[:, None], ("drive",)), tmp_path / "log.csv")
+    table = {
+        "urdf": "bars.urdf",
+        "passive": ["elbow", "pivot"],
+        "loop": [{"frames": ["coupler_end", "rocker_end"]}],
+        "drives": {"pivot": [{"term": "Viscous"}]},
+        "identification": [{"log": "log.csv"}],
+    }
+    job = job_from_settings(table, "job.toml", tmp_path)
+    model = job.model()
+    assert model.loops == (FOUR_BAR_LOOP,)
+    assert model.passive == ("elbow", "pivot")
+    assert model.layout.drive_names[-1] == "pivot.viscous"
+    assert job.read(job.identification[0], model).joints == ("drive",)
+    assert job_from_settings(job.to_dict(), "result.json", Path()) == job
