@@ -151,7 +151,8 @@ def _friction_figures(found: Identification) -> str:
     for joint in found.model.row_names:
         chart = friction_chart(found, joint, split=split)
         if chart is None:
-            figures.append(f"<p>{escape(joint)}: no samples used.</p>\n")
+            why = "no drive" if joint in found.model.passive else "no samples used"
+            figures.append(f"<p>{escape(joint)}: {why}.</p>\n")
         else:
             caption = f"<strong>{escape(joint)}</strong>"
             figures.append(chart_html(chart, caption, still=_STILL))
