@@ -9,15 +9,16 @@ variable ROBOTID_DATA names; without it the gallery has the simulated robots alo
 import argparse
 import json
 import os
+import shutil
 import tempfile
 from contextlib import chdir
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 import robotid
 from robotid.commands.demo import run_demo
-from robotid.commands.replay import replay_identified
 from robotid.robot.examples import example_urdf
 from robotid.simulation.closed_loop import Noise, another_robot, simulate
 from robotid.simulation.motions import random_fourier
@@ -105,19 +106,22 @@ def build(name, folder):
             command = "robotid demo"
         elif name in RECORDED:
             title, lesson = RECORDED[name]
-            found = robotid.run_job(robotid.read_job(ROOT / f"tests/jobs/{name}.toml"), written)[0]
+            job = replace(robotid.read_job(ROOT / f"tests/jobs/{name}.toml"), replay=True)
+            found = robotid.run_job(job, written)[0]
             command = f"robotid identify tests/jobs/{name}.toml --out {name}"
         else:
             title, lesson, urdf, locked = SIMULATED[name]
             with chdir(written):
                 found = simulated(urdf, locked)
-            robotid.save_result(found, written)
-            command = f"robotid identify {urdf} first.csv --validate second.csv --out {name}"
+            robotid.save_result(found, written, replay=True)
+            command = (
+                f"robotid identify {urdf} first.csv --validate second.csv --replay --out {name}"
+            )
         report = (Path(written) / "report.html").read_text()
         data = os.environ.get("ROBOTID_DATA", written).rstrip("/")
         report = report.replace(f"{data}/", "").replace(written, name)  # where it was built
         (folder / "report.html").write_text(report)
-        replay_identified(found).write(folder / "replay.html")
+        shutil.copyfile(Path(written) / "replay.html", folder / "replay.html")
     return {"name": name, "title": title, "lesson": lesson, "command": command} | facts_of(found)
 
 

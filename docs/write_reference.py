@@ -127,7 +127,7 @@ def job_file():
         parts += [f"\n## `{title}`\n", f"{about.strip()}\n"]
         parts += listing([row(key.at or field.name, field, key) for field, key in keys(kind)])
         if name == "signals":
-            words = "What is identified, and with which drive terms.\n"
+            words = "What is identified, and with which drive terms ([their names](symbols.md#names-of-parameters)).\n"
             parts += ["\n## `[model]`\n", words, *drive_terms(tables.pop("model"))]
         if name == "units":
             for other, rows in tables.items():

@@ -15,6 +15,7 @@ __all__ = [
     "listed",
     "log_finding",
     "not_ignored",
+    "number_of",
     "quoted",
     "toml_key",
 ]
@@ -193,6 +194,15 @@ def grouped(findings: Iterable[Finding], joints: Sequence[str] = ()) -> tuple[Ca
         messages = _merged(found, joints)
         causes.append(Cause(code, found[0].severity, named, messages, tuple(found)))
     return tuple(causes)
+
+
+def number_of(causes: Iterable[Cause]) -> int:
+    """Return the number of findings; those with one common message count once.
+
+    Args:
+        causes: The causes.
+    """
+    return sum(len(cause.messages) for cause in causes)
 
 
 def _joints_of(finding: Finding, joints: Sequence[str]) -> set[str]:

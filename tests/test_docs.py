@@ -25,12 +25,15 @@ from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement.verdict import WARNING_CODES
 from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
+from robotid.robot.drives import TERM_CLASSES, TERMS
 from robotid.robot.examples import example_urdf
 from robotid.simulation.motions import random_fourier
 
 sys.path.append(str(ROOT / "benchmarks"))
 from write_tables import BLOCK, PAGES, digest
 
+#: Drive parameters as the table of names has them, the first of those with a number.
+PARAMETERS = {cls().name for cls in TERM_CLASSES.values()} | set(TERMS)
 MACHINE = r"Python \d+\.\d+.*(x86_64|aarch64|arm64)"
 
 
@@ -347,3 +350,9 @@ def test_the_site_builds_and_documents_the_public_names(tmp_path):
     assert 'href="first_steps.html"' in links, "the page of the notebook, not its file"
     home = (tmp_path / "index.html").read_text()
     assert "fonts." not in home, "the site is read without a network"
+
+
+def test_every_drive_parameter_is_in_the_table_of_names():
+    page = (DOCS / "reference/symbols.md").read_text()
+    assert len(PARAMETERS) > 15
+    assert [name for name in sorted(PARAMETERS) if f"`{name}`" not in page] == []

@@ -87,7 +87,7 @@ def test_the_command_line_quick_start_runs(folder, capsys):
     table = README.partition("## What you get")[2].partition("## ")[0]
     promised = set(re.findall(r"^\| `(\S+)`", table, re.MULTILINE))
     assert promised <= written, "the table of what you get names what identify writes"
-    assert (folder / "replay.html").is_file()
+    assert (folder / "result" / "replay.html").is_file()
     assert main(["validate", "result/result.json", "second.csv"]) == 0
 
 

@@ -177,8 +177,8 @@ def _show(content: dict[str, Any]) -> None:
     condition = content["condition_number"]
     echo(
         f"{content['robot']}: a motion of {content['duration']:g} s for {len(content['joints'])} "
-        f"joints, condition number {'infinite' if condition is None else format(condition, '.0f')};"
-        f" {done}"
+        f"joints, condition number {'infinite' if condition is None else format(condition, '.0f')} "
+        f"(regressor, columns in units of the prior); {done}"
     )
     if "widest" in content:
         names = content["widest"]

@@ -208,6 +208,7 @@ JOB = Flags(
         "--friction": ("model.friction", "MODEL"),
         "--dynamics": ("output.dynamics", ""),
         "--no-report": ("output.report", "write no report.html"),
+        "--replay": ("output.replay", "also write replay.html: the first validation log"),
         "--ignore": ("doctor.ignore", "CODE"),
         "--time-unit": ("units.time", "UNIT"),
         "--angle-unit": ("units.angle", "UNIT"),
@@ -226,7 +227,7 @@ LOG = tuple(
     flag for flag, (key, _) in JOB.keys.items() if flag not in FIT and not key.startswith("output.")
 )
 #: Flags of the files that "identify" writes.
-OUTPUT = ("--dynamics", "--no-report")
+OUTPUT = ("--dynamics", "--no-report", "--replay")
 #: Flags of a tracked or replayed log.
 ONLINE = tuple(
     flag

@@ -121,7 +121,8 @@ def _found(result: Mapping[str, Any]) -> str:
     structure, (before, after, _) = result["structure"], result["scale_check"]["masses"]
     return (
         f"{structure['base']} base parameters ({structure['base_inertial']} inertial), condition "
-        f"number {structure['condition']:.3g}, total mass {before:.2f} -> {after:.2f} kg"
+        f"number {structure['condition']:.3g} (regressor, unit columns), "
+        f"total mass {before:.2f} -> {after:.2f} kg"
     )
 
 
@@ -132,7 +133,12 @@ def _drive_lines(result: Mapping[str, Any]) -> list[str]:
     if "simulation" not in result:
         return friction_lines(result["friction"])
     rows = [
-        (entry["name"], f"{entry['value']:.4g}", f"{entry['std_error']:.2g}", entry["unit"])
+        (
+            entry["name"],
+            f"{entry['value']:.4g}",
+            "at bound" if entry["source"] == "bound" else f"{entry['std_error']:.2g}",
+            entry["unit"],
+        )
         for entry in result["drive_parameters"]
         if entry["std_error"] is not None
     ]

@@ -68,4 +68,4 @@ def _show(content: dict[str, Any], *, options: argparse.Namespace) -> None:
     elif structure:
         flags = ["--free-flyer", "--base"] if options.free_flyer else ["--base"]
         command = shlex.join(["robotid", "inspect", options.urdf, *flags])
-        echo(f"list of base parameters: {command}")
+        print(f"list of base parameters:\n  {command}")

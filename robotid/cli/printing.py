@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robotid._text import terminal_width, tinted, wrapped
-from robotid.findings import Finding, grouped
+from robotid.findings import Finding, grouped, number_of
 
 if TYPE_CHECKING:
     from robotid.report.advice import Step
@@ -90,16 +90,17 @@ def print_causes(
         printed: Messages that are printed elsewhere.
         none: The text if there is no finding; no line if it is empty.
     """
-    shown = [f for f in findings if is_verbose or f["severity"] != "note"]
-    causes = grouped([Finding(**as_finding(f)) for f in shown], joints)
+    every = [Finding(**as_finding(f)) for f in findings]
+    shown = [f for f in every if is_verbose or f.severity != "note"]
+    causes, others = grouped(shown, joints), grouped([f for f in every if f not in shown], joints)
     for cause in causes:
         for message in cause.messages:
             if message not in printed:
                 echo(f"{cause.severity}: {cause.code}: {message}", "  ", cause.severity)
-    hidden = len(findings) - len(shown)
+    hidden = number_of(others)
     notes = f"{_some(hidden, 'note')} hidden (--verbose)" if hidden else ""
     if shown:
-        count = f"{_some(len(shown), 'finding')}, {_some(len(causes), 'cause')}"
+        count = f"{_some(number_of(causes), 'finding')}, {_some(len(causes), 'cause')}"
         notes = count + (f"; worst: {worst}" if worst else "") + (f"; {notes}" if notes else "")
     if summary := notes or none:
         echo(summary)

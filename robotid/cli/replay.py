@@ -30,7 +30,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add_robot_and_log(parser)
     results = "result.json, track.json or their folder"
     add("results", nargs="*", metavar="RESULT", help=results)
-    add("--html", metavar="FILE", help="page to write; default: replay.html")
+    add("--html", metavar="FILE", help="page to write; default: replay.html beside the RESULT")
     add("--ghost", metavar="LOG", help="second motion, shown as a ghost")
     add_serve(parser, "track the log again in real time, and show it in the browser")
     group = parser.add_argument_group("the log, unless a RESULT is given")
@@ -52,9 +52,9 @@ def run(options: argparse.Namespace) -> None:
         refuse_log_flags(options, "a RESULT states how its logs are read")
         job = stated_job(findings, options.source, options.logs[0])
     if options.html or options.serve is None:
-        check_file(Path(options.html or "replay.html"))
-        page = replay_files(job, findings, ghost=options.ghost)
-        target = page.write(options.html or "replay.html")
+        page_file = Path(options.html or findings.beside / "replay.html")
+        check_file(page_file)
+        target = replay_files(job, findings, ghost=options.ghost).write(page_file)
         print(f"written: {target}, {target.stat().st_size / 1e6:.1f} MB", file=sys.stderr)
     if options.serve is not None:
         serve(job, None, options, lambda found: None)

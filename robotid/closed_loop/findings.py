@@ -78,7 +78,10 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
 
 
 def _settled_delay(finding: Finding, found: LoopIdentification) -> Finding:
-    """Return a finding of the logs; "slow_command" is a note if the fit determines the delay."""
+    """Return a finding of the logs; "slow_command" is a note if the fit determines the delay.
+
+    A delay at its bound of 0 is not determined: the data would fit a negative one better.
+    """
     if finding.code != "slow_command":
         return finding
     estimate, free_parameters = found.estimate, found.fit.simulator.free_parameters
@@ -87,6 +90,12 @@ def _settled_delay(finding: Finding, found: LoopIdentification) -> Finding:
         for free, error in zip(free_parameters, estimate.std_error, strict=True)
         if free.what == "delay"
     ]
+    if any(name.endswith("delay") for name in estimate.details["at_bound"]):
+        known = (
+            "The delay of the fit is 0, its lower bound: its standard error is that of the bound, "
+            "not of the delay"
+        )
+        return replace(finding, message=f"{finding.message}. {known}")
     span = finding.evidence["longest"] - finding.evidence["shortest"]
     error = max(errors, default=0.0)
     if error > _KNOWN * span:
@@ -160,8 +169,9 @@ def _at_bound(names: Sequence[str]) -> Iterator[Finding]:
             "no_delay",
             "warning",
             "delay",
-            "the estimated delay is 0: commands and positions may have different clocks, or the "
-            "motion is too slow to determine the delay. Command a faster motion",
+            "the estimated delay is 0, its lower bound: the data do not determine it. The motion "
+            "is too slow, the model lacks a drive term, or commands and positions have different "
+            "clocks. Command a faster motion",
         )
 
 

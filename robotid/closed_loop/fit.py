@@ -55,6 +55,7 @@ STAGES = (
 _NAMES = {"output": "output error", "input": "input error", "direct": "direct input error"}
 _WHITE = 2.0  # cut-off of the whitening, relative to 1 / time constant of the loop
 _FEW = 12  # number of windows of the first fit
+_SOME = 48  # number of windows of the fits before the last improvement of initial states
 _STARTS = 3  # number of fits with improved initial states of the windows
 _WINDOW, _LEAD = 2.5, 0.6  # default window and lead of closed-loop simulations [s]
 _BOTH = 2.0  # variance factor: the noise of a torque is in its rows and in the simulation it drives
@@ -123,28 +124,29 @@ def fit_loops(
     initialise = _initialise_from_torque if loop.kind == "torque" else _initialise_from_commands
     initialised = initialise(model, logs, loop, settings, signals, progress)
     simulator, estimator = initialised.simulator, initialised.estimator
-    # first with the URDF's bodies: with free bodies, many scales have nearly the same residual
-    drives = [k for k, free in enumerate(simulator.free_parameters) if free.what != "body"]
-    few = replace(
-        simulator,
-        windows=_few(simulator.windows),
-        free_parameters=tuple(simulator.free_parameters[k] for k in drives),
-    )
-    theta = simulator.prior.copy()
-    theta[drives] = replace(estimator, rounds=1).fit(few).theta
+    theta = _with_bodies_of_urdf(simulator, estimator)
     simulator = replace(simulator, error=settings.error)
-    is_plain = settings.error == "output" and initialised.linear is None
+    is_plain, every = settings.error == "output" and initialised.linear is None, simulator.windows
+    if is_plain:
+        simulator = replace(simulator, windows=_few(every, _SOME))
     for left in reversed(range(_STARTS)):
+        if not left and len(simulator.windows) < len(every):
+            simulator = replace(simulator, windows=every).with_better_start(theta)
         simulator = simulator.with_better_start(theta)
         if simulator.lag is not None:
             outs = simulator.roll_out(theta, _few(simulator.windows))
             gains, is_last = (simulator.loops(theta), _free_gains(loop, model)), left == 0
             lag, _ = find_gains(outs, *gains, knows_delay=True, is_whole=not is_last)
             simulator = replace(simulator, lag=lag)
-        # one round is enough while the initial states still change
-        rounds = 1 if left and is_plain else estimator.rounds
-        estimate = replace(estimator, rounds=rounds).fit(simulator, theta, exact=simulator.exact)
-        theta = estimator.joint_step(simulator, estimate.theta)
+        # one round is enough while the initial states or the terms still change
+        is_rough = is_plain and (left > 0 or chooses)
+        if is_rough:
+            theta = replace(estimator, rounds=1).minimise(simulator, theta)
+        else:
+            estimate = estimator.fit(simulator, theta, exact=simulator.exact)
+            theta = estimate.theta
+        if left:
+            theta = estimator.joint_step(simulator, theta)
         if initialised.linear is not None and simulator.torque is not None:
             estimator = replace(estimator, inflation=_BOTH * estimate.details["inflation"])
     tried: list[Tried] = []
@@ -155,19 +157,21 @@ def fit_loops(
             for set_ in candidates(simulator, initialised.torque)
             if set_[0].name not in simulator.names
         ]
-        wide, theta = _with(simulator, estimate.theta, offered)
-        found = choose(wide, theta, offered, replace(estimator, inflation=1.0))
+        found = choose(
+            *_with(simulator, theta, offered), offered, replace(estimator, inflation=1.0)
+        )
         tried = [*(t for t in tried if t.is_chosen), *found]
         chosen = [set_ for set_, t in zip(offered, found, strict=True) if t.is_chosen]
-        if not chosen:
+        if not chosen and not is_rough:
             break
         report_stage(progress, "fitting loops", STAGES)
-        simulator, theta = _with(simulator, estimate.theta, chosen)
+        simulator, theta = _with(simulator, theta, chosen)
         if simulator.torque is not None:
             own = with_terms(model, simulator.base)
             rows = torque_rows(identified_rows(own, logs, signals), initialised.share)
             simulator = replace(simulator, torque=rows)
-        estimate = estimator.fit(simulator, theta, exact=simulator.exact)
+        estimate, is_rough = estimator.fit(simulator, theta, exact=simulator.exact), False
+        theta = estimate.theta
     scale = None
     if initialised.linear is None:
         simulator, estimate = refine_steps(simulator, estimator, estimate)
@@ -175,6 +179,22 @@ def fit_loops(
             scale = gain_scale(simulator, estimator, estimate)
     others = (initialised.encoders, tuple(tried), initialised.linear, scale)
     return Fitted(simulator, estimate, initialised.plain, *others)
+
+
+def _with_bodies_of_urdf(simulator: LoopSimulator, estimator: OutputError) -> Array:
+    """Return the parameters of a first fit of the drives alone to few windows, shape (c,).
+
+    With free bodies, many scales have nearly the same residual.
+    """
+    drives = [k for k, free in enumerate(simulator.free_parameters) if free.what != "body"]
+    few = replace(
+        simulator,
+        windows=_few(simulator.windows),
+        free_parameters=tuple(simulator.free_parameters[k] for k in drives),
+    )
+    theta = simulator.prior.copy()
+    theta[drives] = replace(estimator, rounds=1).minimise(few)
+    return theta
 
 
 @dataclass(frozen=True, eq=False)
@@ -433,9 +453,9 @@ def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
     )
 
 
-def _few(windows: Sequence[Window]) -> tuple[Window, ...]:
-    """Return some of many windows."""
-    return tuple(windows[:: max(1, len(windows) // _FEW)])
+def _few(windows: Sequence[Window], count: int = _FEW) -> tuple[Window, ...]:
+    """Return some of many windows, at least ``count``."""
+    return tuple(windows[:: max(1, len(windows) // count)])
 
 
 def _free_gains(loop: LoopSettings, model: RobotModel) -> Array:

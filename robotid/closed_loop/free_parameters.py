@@ -195,19 +195,22 @@ class LoopSimulator:
             sigma = np.maximum(np.sqrt(np.mean(errors**2, axis=0)), 1e-12)
             best = [float(np.sum((_error(out) / sigma) ** 2)) for out in outs]
             changes = [_better_start(out, sigma) for out in outs]
-            initialised = list(zip(windows, changes, strict=True))
-            tries = [[w.start + share * x for w, x in initialised] for share in _SHARES]
-            tries.append([np.stack([w.around, np.zeros(n)]) for w in windows])  # at rest
+            at_rest = [np.stack([w.around, np.zeros(n)]) for w in windows]
+            corrected = list(zip([w.start for w in windows], changes, strict=True))
+            tries = [at_rest, *([q + share * x for q, x in corrected] for share in _SHARES)]
+            left = list(range(len(windows)))  # without a corrected start that is better
             for starts in tries:
-                tried = [replace(w, given=x) for w, x in zip(windows, starts, strict=True)]
+                tried = {k: replace(windows[k], given=starts[k]) for k in left}
                 try:
-                    outs = (self.fine or self.robot).roll_out(loops, tried)
+                    outs = (self.fine or self.robot).roll_out(loops, list(tried.values()))
                 except NotConvergedError:
                     continue  # these starts cannot be simulated; others can
-                for k, out in enumerate(outs):
+                for k, out in zip(tried, outs, strict=True):
                     cost = float(np.sum((_error(out) / sigma) ** 2))
                     if cost < best[k]:
                         best[k], windows[k] = cost, tried[k]
+                if starts is not at_rest:
+                    left = [k for k in left if windows[k] is not tried[k]]
         both = zip(self.windows, windows, strict=True)
         return replace(self, windows=tuple(replace(w, given=new.start) for w, new in both))
 

@@ -16,6 +16,7 @@ from robotid.exceptions import DataError
 from robotid.findings import Finding
 from robotid.fitting.settings import SimulationSettings
 from robotid.identification.result import Asked
+from robotid.judgement.findings import not_written
 from robotid.judgement.verdict import blocking
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -94,12 +95,13 @@ def identify_loops(
         for part in (logs, validation)
     ]  # fmt: skip
     found = identified_loops(model, loop, settings, fitted, *map(tuple, runs))
+    errors = blocking(examined, ignore)
     found = replace(
         found,
-        log_errors=tuple(finding.message for finding in blocking(examined, ignore)),
+        log_errors=tuple(finding.message for finding in errors),
         asked=Asked(used, ignore=tuple(ignore)),
     )
-    return replace(found, findings=loop_findings(found, examined))
+    return replace(found, findings=(*loop_findings(found, examined), *not_written(errors)))
 
 
 def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, Loops]:

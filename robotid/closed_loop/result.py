@@ -153,8 +153,8 @@ class LoopIdentification(Identified):
 
     @property
     def has_urdf(self) -> bool:
-        """Whether a URDF is written: always, since its simulation shows remaining errors."""
-        return True
+        """Whether a URDF may be written: no fault of the logs makes it wrong."""
+        return not self.log_errors
 
     @property
     def has_gains(self) -> bool:

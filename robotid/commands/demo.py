@@ -9,7 +9,6 @@ from robotid._files import check_folder
 from robotid._typing import Array, ProgressCallback
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
-from robotid.commands.replay import replay_identified
 from robotid.identification.result import Identification
 from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
@@ -65,9 +64,8 @@ def run_demo(
         signals=SignalSettings(cutoff=10.0),
         identification=(entries[0],),
         validation=(entries[1],),
+        replay=True,
     )
-    plan, beside = WorkPlan(progress=progress), {"replay": "replay.html"}
-    found, result = run_job(job, target, plan=plan, beside=beside)
+    found, result = run_job(job, target, plan=WorkPlan(progress=progress))
     identification = cast(Identification, found)  # of the default estimator
-    replay_identified(identification).write(target / "replay.html")
     return identification, result, identification.mapping.to_base(truth)

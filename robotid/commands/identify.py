@@ -1,7 +1,7 @@
 """A job: from its files to the folder of results."""
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,6 +43,7 @@ from robotid.workers.plan import WorkPlan
 if TYPE_CHECKING:
     from robotid.closed_loop.evaluation import OpenLoop
     from robotid.closed_loop.result import LoopIdentification
+    from robotid.viewer.replays import Replay
 
 __all__ = ["identify_job", "run_job", "save_result"]
 
@@ -55,19 +56,17 @@ def run_job(
     *,
     plan: WorkPlan | None = None,
     source: Sequence[str] = (),
-    beside: Mapping[str, str] | None = None,
 ) -> tuple["Identification | LoopIdentification", dict[str, Any]]:
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
-    The settings may exclude the report, and an impossible result has no URDF. All files are first
-    written to a temporary folder and moved when they are complete.
+    The settings may exclude the report and add replay.html; an impossible result has no URDF. All
+    files are first written to a temporary folder and moved when they are complete.
 
     Args:
         job: The job.
         folder: Folder of the results; created if it is missing.
         plan: Workers for long logs; if None those of the job, in this process.
         source: The words after ``robotid identify`` that repeat the run, for the report.
-        beside: Further files of the folder, by their content, for the report.
 
     Returns:
         The identification and the content of result.json.
@@ -98,7 +97,7 @@ def run_job(
         used = _job_of(found)
     report_stage(chosen.progress, "writing", stages)
     with released_on_error(checkpoint):
-        saved = _write(found, used, target, source=source, beside=beside)
+        saved = _write(found, used, target, source=source)
     if checkpoint is not None:
         checkpoint.remove()
     return saved
@@ -109,6 +108,7 @@ def save_result(
     folder: str | Path,
     *,
     report: bool = True,
+    replay: bool = False,
 ) -> Path:
     """Write the files of ``robotid identify``: result.json, report, URDF with its sidecar.
 
@@ -121,26 +121,30 @@ def save_result(
         identification: The identification.
         folder: Folder of the results; created if it is missing.
         report: Whether report.html is written.
+        replay: Whether replay.html is written: the first validation log, or the first fitted log.
 
     Returns:
         Path of the result.json.
 
     Raises:
+        DataError: If a replay is wanted of position-controlled drives whose logs are in memory.
         ModelError: If the URDF of the robot no longer exists.
         SettingsError: If the folder is a file, or is not writable.
     """
     require_kind(folder, (str, Path), "folder", "the path of a folder")
     require_kind(report, bool, "report", "True or False")
+    require_kind(replay, bool, "replay", "True or False")
     target = Path(folder)
     check_folder(target, ["result.json", *_names(identification.model)])
-    _write(identification, replace(_job_of(identification), report=report), target)
+    job = replace(_job_of(identification), report=report, replay=replay)
+    _write(identification, job, target)
     return target / "result.json"
 
 
-def _names(model: RobotModel) -> tuple[str, str, str]:
-    """Return the names of report, URDF and sidecar."""
+def _names(model: RobotModel) -> tuple[str, str, str, str]:
+    """Return the names of report, replay, URDF and sidecar."""
     name = f"{Path(model.tree.path).stem}.identified.urdf"
-    return "report.html", name, str(Path(name).with_suffix(".drive.json"))
+    return "report.html", "replay.html", name, str(Path(name).with_suffix(".drive.json"))
 
 
 def _write(
@@ -149,18 +153,18 @@ def _write(
     target: Path,
     *,
     source: Sequence[str] = (),
-    beside: Mapping[str, str] | None = None,
 ) -> tuple["Identification | LoopIdentification", dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
-    report, name, sidecar = _names(found.model)
+    names = report, replay, name, sidecar = _names(found.model)
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
         outputs = {}
+        played = {"replay": replay} if job.replay else {}
         written = {"urdf": name, "sidecar": sidecar} if found.has_urdf else {}
         if job.report:
             found = replace(found, report=str(target / report))
-            links = {"result": "result.json", **written, **(beside or {})}
-            origin = Origin(tuple(source), str(target))
+            links = {"result": "result.json", **written, **played}
+            origin = Origin(tuple(source), str(target), replay)
             write_report(found, partial / report, files=links, origin=origin)
             outputs["report"] = report
         if written:
@@ -169,11 +173,31 @@ def _write(
             dynamics = job.dynamics and project_friction(model, pi, moments, DYNAMICS_TERMS)
             write_urdf(model, pi, partial / name, dynamics=dynamics)
             outputs |= written
+        outputs |= played
         result = build_result(found, job.to_dict(), outputs=outputs)
         write_json(result, partial / "result.json")
-    others = {report, name, sidecar} - set(outputs.values())
+        if job.replay:
+            _replay_of(found, job, partial).write(partial / replay)
+    others = {*names} - set(outputs.values())
     _remove_stale(target / other for other in sorted(others))
     return found, result
+
+
+def _replay_of(found: "Identification | LoopIdentification", job: Job, folder: Path) -> "Replay":
+    """Return the replay of a result that is written in a folder; its modules are imported here."""
+    from robotid.commands.replay import read_findings, replay_files, replay_identified, stated_job
+
+    if isinstance(found, Identification):
+        return replay_identified(found)
+    entries = (*job.validation, *job.identification)
+    if not entries:
+        raise DataError(
+            "the logs are in memory, and a replay of position-controlled drives reads them from "
+            "their files; write the logs with robotid.write_log and identify from these files"
+        )
+    findings = read_findings([folder])
+    stated = stated_job(findings, job.urdf, entries[0].path)
+    return replay_files(replace(stated, identification=entries[:1]), findings)
 
 
 def _job_of(identification: "Identification | LoopIdentification") -> Job:

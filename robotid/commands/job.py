@@ -266,6 +266,11 @@ class Job(Settings):
         "whether report.html is written",
         at="output.report",
     )
+    replay: bool = setting(
+        False,
+        "whether replay.html is written: the first validation log, or the first fitted log",
+        at="output.replay",
+    )
     identification: tuple[LogEntry, ...] = setting((), "logs to fit")
     validation: tuple[LogEntry, ...] = setting((), "validation logs")
     ignore: tuple[str, ...] = setting(

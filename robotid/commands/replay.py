@@ -15,11 +15,12 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.excitation.clearance import Clearance
 from robotid.excitation.course import Course
 from robotid.excitation.limits import LIMITS, MotionLimits
-from robotid.export.result import Result, load_result, stated_model
+from robotid.export.result import Result, load_result, stated_model, stated_urdf_with_drives
 from robotid.export.shape import FILE, NUMBER, TABLE, TEXT, check_shape
 from robotid.findings import listed
 from robotid.fitting.evaluation import predict
 from robotid.fitting.survey import hold_log
+from robotid.identification.pictures import shown_evaluation
 from robotid.identification.result import Identification
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table
@@ -34,6 +35,9 @@ __all__ = ["Findings", "read_findings", "replay_files", "replay_identified", "st
 
 #: Columns of the pose of a floating base in the world: position [m] and quaternion.
 _BASE = ("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw")
+
+#: Label of the torque of the URDF's bodies with identified drives.
+_DRIVEN = "URDF + drives"
 
 #: The entries of a track.json that are read.
 _TRACK = {
@@ -52,6 +56,7 @@ class Findings:
     commanded: Mapping[str, Result] = field(default_factory=dict)  # results with gains of drives
     track: Mapping[str, Any] | None = None  # content of a track.json
     folder: Path = Path()  # of the track.json and its history
+    beside: Path = Path()  # folder of the first file
 
     @property
     def settings(self) -> Mapping[str, Any] | None:
@@ -72,6 +77,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
     results: dict[str, Mapping[str, Any]] = {}
     commanded: dict[str, Result] = {}
     tracks: list[tuple[Path, Mapping[str, Any]]] = []
+    beside: list[Path] = []
     for path in map(Path, paths):
         files = [path]
         if path.is_dir():
@@ -79,6 +85,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
             files = [file for file in files if file.is_file()]
             if not files:
                 raise DataError(f"{str(path)!r} has no result.json and no track.json")
+        beside.append(files[0].parent)
         for file in files:
             track = _track(file)
             if track is not None:
@@ -93,7 +100,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
     if len(tracks) > 1:
         raise DataError(f"{len(tracks)} tracks are given, wanted at most one")
     folder, content = tracks[0] if tracks else (Path(), None)
-    return Findings(results, commanded, content, folder)
+    return Findings(results, commanded, content, folder, (beside or [Path()])[0])
 
 
 def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
@@ -145,7 +152,8 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         used, further = _limits_used(job, motion, model)
         marks, notes = [*marks, *used], [*notes, *further]
     else:
-        torques = replace(_torques(job, motion, model, robots), noise=_noise(findings, model))
+        torques = _torques(job, motion, model, robots, findings.results)
+        torques = replace(torques, noise=_noise(findings, model))
         marks += _contacts(torques, model)
     n = model.layout.n_inertial  # drives of the result may have further terms
     masses = {"URDF": model.standard_parameters(), **bodies} if bodies else {}
@@ -166,30 +174,36 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         bands=None if findings.track is None else _bands(findings.track, findings.folder),
         marks=marks,
         notes=notes,
+        log=entry.path.name,
     )
 
 
 def replay_identified(identification: Identification) -> Replay:
-    """Return the replay of an identification: its last validation log, or its last fitted one.
+    """Return the replay of an identification: its first validation log, or its first fitted one.
 
     Args:
         identification: The identification.
 
     Returns:
-        The page: measured and predicted torque, masses before and after.
+        The page: measured and predicted torques, masses before and after.
     """
-    shown = (*identification.fitted, *identification.validation)[-1]
-    motion = shown.recording.trajectory
-    predicted = _of_moving(shown.torques["estimate"], shown.recording.mask)
+    shown, model = shown_evaluation(identification), identification.model
+    motion, mask = shown.recording.trajectory, shown.recording.mask
+    wanted = {"identified": "estimate", _DRIVEN: "urdf_with_drives"}
+    if not model.layout.drive_names:
+        del wanted[_DRIVEN]
+    predicted = {label: _of_moving(shown.torques[key], mask) for label, key in wanted.items()}
+    predicted["URDF"] = shown.torques["urdf"]
+    torques = Torques(motion.t, motion.tau, predicted, identification.estimate.sigma)
     return replay(
-        identification.model,
+        model,
         motion.t,
         motion.q,
-        torques=Torques(
-            motion.t, motion.tau, {"identified": predicted}, identification.estimate.sigma
-        ),
+        torques=torques,
         masses={"URDF": identification.prior, "identified": identification.standard},
+        marks=_contacts(torques, model),
         notes=[f"Motion: {shown.recording.name}."],
+        log=Path(shown.recording.log.path).name,
     )
 
 
@@ -223,6 +237,7 @@ def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path
             f"Motion: {entry.path.name}, as measured; ghosts: command and simulation.",
             f"Simulated position error, RMS [mrad or mm]: {listed(worst, 3)}.",
         ],
+        log=entry.path.name,
     )
 
 
@@ -287,16 +302,33 @@ def _track(path: Path) -> Mapping[str, Any] | None:
     return content
 
 
-def _torques(job: Job, log: Log, model: RobotModel, robots: Mapping[str, RobotModel]) -> Torques:
-    """Return measured torques, and those of robots with the parameters of each result."""
-    shown, motion = {}, None
+def _torques(
+    job: Job,
+    log: Log,
+    model: RobotModel,
+    robots: Mapping[str, RobotModel],
+    results: Mapping[str, Mapping[str, Any]],
+) -> Torques:
+    """Return measured torques, and those predicted by each result and by the URDF.
+
+    "URDF + drives" has the bodies of the URDF, and the drives that the first result fits to them.
+    """
+    shown: dict[str, Array] = {}
+    driven: dict[str, Array] = {}
+    motion = None
     for label, robot in robots.items():
         rows = hold_log(robot, log, job.signals).whole
         motion = rows.trajectory
-        shown[label] = _of_moving(predict(robot, [robot.carried_by], motion)[0], rows.mask)
-    if motion is not None:
-        shown["URDF"] = predict(model, [model.standard_parameters()], motion)[0]
-    return Torques(log.t, log.tau) if motion is None else Torques(motion.t, motion.tau, shown)
+        is_driven = not driven and robot.layout.drive_names
+        beside = stated_urdf_with_drives(results[label], robot) if is_driven else None
+        own = [robot.carried_by] if beside is None else [robot.carried_by, beside]
+        predicted = [_of_moving(torque, rows.mask) for torque in predict(robot, own, motion)]
+        shown[label] = predicted[0]
+        driven |= dict(zip([_DRIVEN], predicted[1:], strict=False))
+    if motion is None:
+        return Torques(log.t, log.tau)
+    alone = {"URDF": predict(model, [model.standard_parameters()], motion)[0]}
+    return Torques(motion.t, motion.tau, shown | driven | alone)
 
 
 def _of_moving(torque: Array, mask: Array) -> Array:

@@ -69,7 +69,8 @@ def rewrite_report(
         if what != "report" and goal.resolve().with_name(name) == (folder / name).resolve()
         if (folder / name).is_file()
     }
-    origin = Origin((), str(folder))
+    is_beside = goal.resolve().parent == folder.resolve()
+    origin = Origin((), str(folder), "replay.html" if is_beside else "")
     if found is None:
         validation, fitted = (
             [loaded.open_loop(log_of_commands(job, entry, loaded)) for entry in entries]

@@ -9,6 +9,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.doctor.clock import runs_of
+from robotid.doctor.command_lead import find_lead
 from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Log
 from robotid.logs.measured_velocity import quantum
@@ -187,7 +188,8 @@ class _Loop:
     def _first_lag(self) -> float:
         """Return the lag at which changes of position and command correlate most [s].
 
-        Of several lags with about this correlation, as for a sine, it is the shortest.
+        Of several lags with about this correlation, as for a sine, it is the shortest; nan if none
+        is positive.
         """
         from scipy.signal import correlate
 
@@ -195,6 +197,8 @@ class _Loop:
         rows = np.arange(len(alike)) - len(self.q) + 2
         within = np.abs(rows) * self.step <= _LONGEST
         alike, rows = alike[within], rows[within]
+        if not alike.max() > 0:
+            return np.nan
         best = rows[alike >= _AS_ALIKE * alike.max()]
         return float(best[np.argmin(np.abs(best))]) * self.step
 
@@ -253,7 +257,7 @@ def _without_torque(log: Log) -> Finding:
 
 def _shown(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     """Yield the delays of the joints behind their commands, and the bandwidths of their loops."""
-    lags = {loop.name: loop.lag[0] for loop in loops if np.isfinite(loop.lag[0])}
+    lags = {loop.name: loop.lag[0] for loop in loops if loop.lag[0] > 0}
     if not lags:
         return
     ends = {loop.name: loop.bandwidth for loop in loops if np.isfinite(loop.bandwidth)}
@@ -332,17 +336,21 @@ def _alike(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
 def _early(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     """Yield joints that move before their command, which is impossible."""
     for loop in loops:
-        lag, error = loop.lag
-        if not lag < -max(3 * error, loop.step / 2):
+        found = find_lead(loop.command, loop.q, loop.step, loop.bandwidth, len(loops))
+        if found is None:
             continue
+        t = log.t[loop.rows]
+        is_whole = found.stop - found.start == len(t)
+        part = "" if is_whole else f" from {t[found.start]:.4g} to {t[found.stop - 1]:.4g} s"
         message = (
-            f"{loop.name} moves {-1e3 * lag:.3g} +- {1e3 * error:.2g} ms before its command: the "
-            "logged command is not the command of the drive, or it has another clock; log the "
-            "command that is sent to the drive, with the time of sending"
+            f"{loop.name} moves {1e3 * found.lead:.3g} +- {1e3 * found.std_error:.2g} ms before "
+            f"its command{part}: the logged command is not the command of the drive, or it has "
+            "another clock; log the command that is sent to the drive, with the time of sending"
         )
         yield log_finding(
-            log.name, "delayed_command", "error", message, loop.name, lag=lag, std_error=error
-        )
+            log.name, "delayed_command", "error", message, loop.name,
+            lag=-found.lead, std_error=found.std_error,
+        )  # fmt: skip
 
 
 def _slow(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:

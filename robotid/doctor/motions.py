@@ -120,7 +120,7 @@ def excitation_finding(wls: Estimate, known: Determination, name: str) -> Findin
         evidence["condition"] = wls.condition
     message = (
         f"the motion determines {known.rank} of {count} base parameters "
-        f"(condition number {wls.condition:.3g})"
+        f"(condition number {wls.condition:.3g} of the regressor, unit columns)"
     )
     is_poor = is_poorly_excited(wls, count)
     if known.groups:

@@ -16,6 +16,7 @@ __all__ = ["audit_bodies", "audit_links"]
 
 _DENSEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: about solid tungsten, and foam
 _MARGIN = 0.1  # of the box's diagonal, by which a centre of mass may lie outside
+_LONGEST = 5.0**0.5  # ellipsoid of a body with half of its mass on each of two sides, over the box
 _THIN = 0.01  # [m] least side of a box, so that thin sheets have a volume
 _SMALL = 1e-3  # share of the robot's mass below which a fault of a body is only a note
 _ROUND = tuple(10.0**k for k in range(-6, 3))  # inertias [kg m^2] and masses [kg] of templates
@@ -33,7 +34,8 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
         model: The robot.
 
     Yields:
-        "com_outside", "density", "gyration": a body that does not fit the box around its geometry;
+        "com_outside", "density", "gyration", "ellipsoid": a body that does not fit the box around
+        its geometry;
         "copied_inertial": links of different size with the same inertial; "default_inertial":
         numbers of a template; "geometry_unread": one note if bodies of a file with meshes were not
         checked.
@@ -61,7 +63,8 @@ def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> I
         points: Points of the geometry of each body that has one, shape (k, 3) [m].
 
     Yields:
-        "com_outside", "density", "gyration"; notes for a body of negligible mass.
+        "com_outside", "density", "gyration"; notes for a body of negligible mass. "ellipsoid", a
+        note, without "gyration".
     """
     J = pseudo_inertia(pi[: model.layout.n_inertial])
     for body, J_i in zip(model.layout.bodies, J, strict=True):
@@ -105,6 +108,18 @@ def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
         )
         evidence = {"gyration": gyration, "farthest": farthest}
         yield Finding("gyration", "warning", at, message, evidence)
+        return
+    variance = np.maximum(np.diag(J)[:3] / mass - centre**2, 0.0)  # (3,), of the mass [m^2]
+    lengths = 2.0 * np.sqrt(5.0 * variance)  # (3,), of the equivalent ellipsoid [m]
+    k = int(np.argmax(lengths / sides))
+    if lengths[k] > _LONGEST * sides[k]:
+        message = (
+            f"link {body!r}: its equivalent ellipsoid is {lengths[k]:.3g} m long in {'xyz'[k]}, "
+            f"the box of its geometry {sides[k]:.3g} m; wanted: at most {_LONGEST * sides[k]:.3g} "
+            "m, with all mass on two sides of the box; check its inertia and its geometry"
+        )
+        evidence = {"length": float(lengths[k]), "side": float(sides[k])}
+        yield Finding("ellipsoid", "note", at, message, evidence)
 
 
 def _templates(model: RobotModel) -> Iterator[Finding]:

@@ -176,7 +176,26 @@ class OutputError(Estimator[Simulator]):
             DataError: If there are fewer samples than parameters.
             NotConvergedError: If the simulation with the initial values fails.
         """
-        simulator, initial = data, data.prior if start is None else start
+        weights, theta, how = self._minimised(data, start, exact)
+        return self._estimate(data, weights, theta, how, exact=exact)
+
+    def minimise(self, data: Simulator, start: Array | None = None) -> Array:
+        """Return the parameters of ``fit`` alone, shape (c,), without their standard errors.
+
+        Args:
+            data: The simulator.
+            start: Initial values, shape (c,); the prior if None.
+
+        Raises:
+            NotConvergedError: If the simulation with the initial values fails.
+        """
+        return self._minimised(data, start, None)[1]
+
+    def _minimised(
+        self, simulator: Simulator, start: Array | None, exact: Simulator | None
+    ) -> tuple[_Weights, Array, dict[str, Any]]:
+        """Return the last weights, the parameters, and how they were found."""
+        initial = simulator.prior if start is None else start
         theta = np.maximum(np.array(initial, dtype=float), simulator.lowest)
         found = self._left(simulator, theta)
         weights, rounds, count, converged = self._weigh(found), 0, 0, False
@@ -196,7 +215,7 @@ class OutputError(Estimator[Simulator]):
         state = "converged" if converged else "not converged"
         message = f"{self.name}, {count} steps in {rounds} rounds, {state}"
         how = {"converged": converged, "n_iter": count, "message": message}
-        return self._estimate(simulator, weights, theta, how, exact=exact)
+        return weights, theta, how
 
     def weights(self, simulator: Simulator, theta: Array) -> "_Weights":
         """Return correlation and noise level of the residuals, their weights.

@@ -97,7 +97,7 @@ def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
         "condition number": (
             "infinite"
             if condition is None
-            else f"{condition:,.0f}, columns scaled by the uncertainty of the URDF's values"
+            else f"{condition:,.0f} (regressor, columns in units of the prior)"
         ),
         "computing time": how,
     }

@@ -80,7 +80,11 @@ def _loop_parameters(found: LoopIdentification) -> list[dict[str, Any]]:
         return []
     loops, estimate = found.fit.loops, found.fit.estimate
     errors = {
-        (unknown.what, j): (float(error), float(quantile))
+        (unknown.what, j): (
+            float(error),
+            float(quantile),
+            "bound" if unknown.name in estimate.details["at_bound"] else "data",
+        )
         for unknown, error, quantile in zip(
             found.fit.simulator.free_parameters, estimate.std_error, estimate.quantile, strict=True
         )
@@ -96,11 +100,11 @@ def _loop_parameters(found: LoopIdentification) -> list[dict[str, Any]]:
         for what, unit in units.items():
             value = float(getattr(loops, what)[j])
             if math.isfinite(value):
-                error, quantile = errors.get((what, j), (None, None))
+                error, quantile, source = errors.get((what, j), (None, None, "stated"))
                 entries.append(
                     {"name": f"{joint.name}.{what}", "value": value, "std_error": error,
                      "quantile": quantile,
-                     "unit": unit, "source": "stated" if error is None else "data"}
+                     "unit": unit, "source": source}
                 )  # fmt: skip
     return entries
 

@@ -27,6 +27,7 @@ from robotid.findings import listed
 from robotid.fitting.bands import FrictionCurve
 from robotid.judgement.parameter_table import parameter_table
 from robotid.judgement.scale_check import ScaleCheck
+from robotid.judgement.stated_mass import StatedMass
 from robotid.judgement.verdict import VerdictWarning
 from robotid.logs.data import Log, suggestion
 from robotid.regressor.friction_projection import (
@@ -72,6 +73,12 @@ _SHAPE = {
         **{key: [NUMBER] for key in ("unexplained", "masses")},
         "scale": MAYBE,
         "factor": NUMBER,
+        "stated?": {
+            "names": [TEXT],
+            "ratio": MAYBE,
+            "half_width": NUMBER,
+            "absorbed_by": [TEXT],
+        },
         "is_stated": FLAG,
     },
     "consistency": {
@@ -343,7 +350,11 @@ def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:
     for name, size in (("unexplained", 2), ("masses", 3)):
         if len(stated[name]) != size:
             raise DataError(f"scale_check.{name} has {len(stated[name])} numbers, wanted {size}")
-    return ScaleCheck(**{each.name: stated[each.name] for each in dataclasses.fields(ScaleCheck)})
+    own = {x.name: stated[x.name] for x in dataclasses.fields(ScaleCheck) if x.name in stated}
+    if stated["is_stated"]:  # an earlier version did not test whether torque determines it
+        mass = stated.get("stated")
+        own["stated"] = StatedMass(()) if mass is None else StatedMass.from_dict(mass)
+    return ScaleCheck(**own)
 
 
 def stated_urdf_with_drives(result: Mapping[str, Any], model: RobotModel) -> Array | None:

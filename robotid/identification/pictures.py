@@ -226,11 +226,11 @@ def friction_chart(
 
 
 def parameter_charts(found: "Identification", terms: Sequence[str]) -> tuple[Chart, ...]:
-    """Return charts of each term of all bodies or drives, with the value before the fit.
+    """Return charts of each term of all drives, with the value before the fit.
 
     Args:
         found: The identification.
-        terms: Terms, as "m" or "viscous"; there is one chart per unit.
+        terms: Terms, as "viscous"; there is one chart per unit.
     """
     layout = found.model.layout
     owners, ends = zip(*(name.rsplit(".", 1) for name in layout.names), strict=True)
@@ -240,18 +240,18 @@ def parameter_charts(found: "Identification", terms: Sequence[str]) -> tuple[Cha
         chosen = [i for i, end in enumerate(ends) if end == term]
         for unit in dict.fromkeys(layout.units[i] for i in chosen):
             part = np.array([i for i in chosen if layout.units[i] == unit])
-            before = "URDF" if part[0] < layout.n_inertial else "before the fit"
             series = [
                 Series(
                     "identified ± 2 s.e.", found.standard[part], "predicted", "bars", error[part]
                 )
             ]
             if found.prior[part].any():
-                series.insert(0, Series(before, found.prior[part], "urdf", "bars", is_weak=True))
+                series.insert(
+                    0, Series("before the fit", found.prior[part], "urdf", "bars", is_weak=True)
+                )
             charts.append(
                 Chart(
-                    f"{term} of each {'body' if before == 'URDF' else 'drive'}, {before} and "
-                    "identified with two standard errors",
+                    f"{term} of each drive, before the fit and identified with two standard errors",
                     np.arange(len(part), dtype=float),
                     tuple(series),
                     "",

@@ -31,7 +31,7 @@ from robotid.fitting.result import Fit, Solution
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.result import Asked, Identification
-from robotid.judgement.findings import fit_findings, log_findings, unwritten
+from robotid.judgement.findings import fit_findings, log_findings, not_written
 from robotid.judgement.verdict import blocking, check_ignored, rejected, warnings_of
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
@@ -190,7 +190,7 @@ def conclude(
     log_errors = blocking(merged, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.validation)]
     findings = [*log_findings(heads), *impossible_inertials(model), *merged]
-    findings += unwritten(fit, log_errors)
+    findings += not_written(log_errors, "" if fit.is_consistent else fit.estimator.name)
     counted = not_ignored(findings, ignore)
     names = [Path(e.recording.log.path).name for e in fit.validation if not e.is_refitted]
     return replace(

@@ -181,6 +181,13 @@ class Identification(Fit):
         """Scale check: identified gravity and masses against the URDF's."""
         return check_scale(self)
 
+    @property
+    def _uncertain_drives(self) -> list[str]:
+        """The drive parameters that the prior determines, without those of undetermined sums."""
+        drives = list(zip(self.model.layout.names, self.sources, strict=True))
+        drives = drives[self.model.layout.n_inertial :]
+        return [n for n, source in drives if source == "prior" and n not in self.undetermined]
+
     @cached_property
     def verdict(self) -> Verdict:
         """Verdict on the result, with reasons."""
@@ -197,6 +204,7 @@ class Identification(Fit):
             self.is_consistent,
             self.is_poorly_excited,
             self.model.is_static,
+            self._uncertain_drives,
         )
         return judge(
             predictions,

@@ -118,9 +118,9 @@ def friction_lines(friction: Mapping[str, Any]) -> list[str]:
 
 
 def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
-    """Return a verdict as lines of text: status and reasons, then the verdict on each joint.
+    """Return a verdict as lines of text: status, reasons, and the verdict on the other joints.
 
-    A reason that is shown at a joint is not repeated.
+    The order is that of the reasons. A reason of a joint is the line of that joint.
 
     Args:
         verdict: Status, reasons and joints, as in result.json.
@@ -128,15 +128,20 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
     by_cell: dict[str, list[str]] = {}
     for name, joint in verdict["per_joint"].items():
         by_cell.setdefault(verdict_cell(name, joint), []).append(name)
-    at_joints = {joint["reasons"][0] for joint in verdict["per_joint"].values() if joint["reasons"]}
-    reasons = [f"  - {reason}" for reason in verdict["reasons"] if reason not in at_joints]
     if list(by_cell) == ["good"]:
         by_cell = {"good": ["every joint"]}
-    return [
-        f"verdict: {verdict['status']}",
-        *reasons,
-        *(f"  {', '.join(names)}: {words}" for words, names in by_cell.items()),
+    cells = {words: f"  {', '.join(names)}: {words}" for words, names in by_cell.items()}
+    of_joints = {
+        joint["reasons"][0]: verdict_cell(name, joint)
+        for name, joint in verdict["per_joint"].items()
+        if joint["reasons"]
+    }
+    lines = [
+        cells.get(of_joints[reason], "") if reason in of_joints else f"  - {reason}"
+        for reason in verdict["reasons"]
     ]
+    in_order = dict.fromkeys([*filter(None, lines), *cells.values()])
+    return [f"verdict: {verdict['status']}", *in_order]
 
 
 def verdict_cell(joint: str, verdict: Mapping[str, Any]) -> str:

@@ -150,12 +150,15 @@ class Determined:
         is_consistent: Whether the parameters are physically consistent.
         is_poorly_excited: Whether a richer motion would determine them; else noise is the limit.
         is_static: Whether the model is static.
+        uncertain_drives: Other drive parameters whose standard error is not smaller than 0.9 of
+            their prior standard deviation.
     """
 
     undetermined: Sequence[str] = ()
     is_consistent: bool = True
     is_poorly_excited: bool = True
     is_static: bool = False
+    uncertain_drives: Sequence[str] = ()
 
     def warnings(self) -> list[str]:
         """Return the reasons why the result is at best usable."""
@@ -174,13 +177,19 @@ class Determined:
 
     def notes(self) -> list[str]:
         """Return notes that do not change the verdict: parameters hidden by the noise."""
+        alone = [
+            f"{listed(self.uncertain_drives, _NAMED)}: the standard error is as large as that of "
+            "the prior: only a sum with other terms is identifiable; use the friction curve"
+        ]
+        alone = alone if self.uncertain_drives else []
         if not self.undetermined or self.is_poorly_excited:
-            return []
+            return alone
         return [
             f"{len(self.undetermined)} base parameters are not identifiable above the noise of a "
             "rich motion, or only in sums with others. What is not determined keeps the URDF's "
             "values: "
-            f"{listed(self.undetermined, _NAMED)}"
+            f"{listed(self.undetermined, _NAMED)}",
+            *alone,
         ]
 
 

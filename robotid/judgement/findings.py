@@ -30,7 +30,7 @@ __all__ = [
     "fit_findings",
     "locked_findings",
     "log_findings",
-    "unwritten",
+    "not_written",
 ]
 
 _SAME_TORQUE = 1e-3  # two solvers that differ by more, relative to the torque, disagree
@@ -68,8 +68,8 @@ def fit_findings(
     if determined.groups:
         message = (
             f"the data determine {determined.rank} of {len(determined.names)} base parameters: "
-            f"{determined.described()}. What is not determined keeps the URDF's values; record a "
-            "richer motion"
+            f"{determined.described()}. What is not determined keeps the URDF's values, because "
+            "the data reduce its prior uncertainty by less than 10 %; record a richer motion"
         )
         severity = "warning" if fit.is_poorly_excited else "note"
         findings.append(Finding("undetermined", severity, "base_parameters", message))
@@ -218,12 +218,12 @@ def _grown(found: Fit, reported: Collection[str]) -> list[Finding]:
     return findings
 
 
-def unwritten(fit: Fit, log_errors: Sequence[Finding]) -> list[Finding]:
-    """Return a warning that the URDF is not written, with the reason.
+def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> list[Finding]:
+    """Return a warning that the URDF is not written, with the reason; nothing if it is written.
 
     Args:
-        fit: The fit.
-        log_errors: Faults of the logs that make it wrong.
+        log_errors: Faults of the logs that make the result wrong.
+        inconsistent: The estimator of a result that is not physically consistent.
     """
     if log_errors:
         codes = listed(dict.fromkeys(finding.code for finding in log_errors))
@@ -231,9 +231,9 @@ def unwritten(fit: Fit, log_errors: Sequence[Finding]) -> list[Finding]:
             f"URDF not written: {codes} failed. Correct the cause; if a finding is wrong, add "
             "its code to ignore in [doctor]"
         )
-    elif not fit.is_consistent:
+    elif inconsistent:
         message = (
-            f"URDF not written: the {fit.estimator.name} estimate is not physically consistent; "
+            f"URDF not written: the {inconsistent} estimate is not physically consistent; "
             "use the 'consistent' estimator"
         )
     else:

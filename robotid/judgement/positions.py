@@ -46,8 +46,11 @@ def judge_positions(
     found = {
         joint: _judge_joint(joint, metrics.per_joint.get(joint), is_validation) for joint in joints
     }
+    worst_first = sorted(
+        found, key=lambda j: -error_of(metrics.per_joint[j]) if j in metrics.per_joint else 0.0
+    )
     reasons = {
-        status: [why for own in found.values() if own.status == status for why in own.reasons]
+        status: [why for j in worst_first if found[j].status == status for why in found[j].reasons]
         for status in ("poor", "not evaluated", "usable")
     }
     warnings = list(cautions)

@@ -11,6 +11,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.findings import listed
 from robotid.fitting.result import Fit
+from robotid.judgement.stated_mass import AGREES, StatedMass, determines_total_mass, stated_mass
 from robotid.regressor.constraints import loop_basis, without_forces
 from robotid.regressor.prediction import predict
 from robotid.regressor.torque import joint_torque_regressor
@@ -20,9 +21,8 @@ __all__ = ["ScaleCheck", "check_scale"]
 _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
 _KNOWN = 0.1  # standard error of a ratio below which it is used
-_AGREES = 0.05  # farther from 1 than this, gravity and total mass do not confirm the scale
 _HELD_BACK = 1.5  # residual over that of WLS beyond which the prior determines the result
-_ANOTHER = 0.35  # ... and farther than this, they contradict it
+_ANOTHER = 0.35  # difference of gravity and total mass from which on they contradict the scale
 _OFF = 0.1  # a common factor of all torques is reported if it is at least so far from 1,
 _CLEARLY = 4.0  # ... if that distance is so many times the unexplained share of gravity
 _BETTER = 0.5  # ... and that share is less than this times the one with a payload
@@ -40,7 +40,10 @@ class ScaleCheck:
         unexplained: Share of the identified gravity torque that remains unexplained by one factor,
             and by a payload [-].
         masses: Total mass of the URDF, identified total mass, mass of that payload [kg].
-        is_stated: Whether a mass is stated, which sets the scale by itself.
+        stated: The masses that the user states, and what torque alone determines of them; None if
+            none is stated.
+        is_total_determined: Whether torque alone determines the total mass within 5 %, so that a
+            measured one verifies the scale.
         friction: Share of viscous and Coulomb friction in each joint's torque [-].
         follows: Whether the result fits the data about as well as WLS. A result that its prior
             determines agrees with the URDF whatever the sensors measured.
@@ -52,20 +55,24 @@ class ScaleCheck:
     factor: float = 1.0
     unexplained: tuple[float, float] = (0.0, 0.0)
     masses: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    is_stated: bool = False
+    stated: StatedMass | None = None
+    is_total_determined: bool = False
     friction: Mapping[str, float] = field(default_factory=dict)
     follows: bool = True
 
     @property
     def agrees(self) -> bool:
-        """Whether gravity and total mass confirm the scale, or a mass is stated."""
-        is_near = self.scale is not None and self._off <= _AGREES
-        return self.is_stated or (is_near and self.follows)
+        """Whether a stated mass, or else gravity and total mass of the URDF, confirm the scale."""
+        if self.stated is not None and (self.stated.verifies or self.stated.contradicts):
+            return self.stated.verifies
+        return self.scale is not None and self._off <= AGREES and self.follows
 
     @property
     def contradicts(self) -> bool:
-        """Whether gravity and total mass contradict the scale."""
-        return not self.is_stated and (self._off > _ANOTHER or self.has_one_factor)
+        """Whether a stated mass, or else gravity and total mass of the URDF, contradict it."""
+        if self.stated is not None and (self.stated.verifies or self.stated.contradicts):
+            return self.stated.contradicts
+        return (bool(self._ratios_whole) and self._off > _ANOTHER) or self.has_one_factor
 
     @property
     def has_one_factor(self) -> bool:
@@ -86,32 +93,81 @@ class ScaleCheck:
 
     @property
     def message(self) -> str:
-        """What was verified, or what could not be verified and the remedy."""
-        if self.is_stated:
-            return f"absolute scale set by the stated mass: {self.figures}"
+        """What was verified, or the figure that exceeds its limit, its cause and the remedy."""
+        stated = self.stated
+        if stated is not None and stated.verifies:
+            return f"absolute scale verified by a stated mass: {stated.message}"
+        if stated is not None and stated.contradicts:
+            return f"absolute scale contradicted by a stated mass: {stated.message}"
+        beside = "" if stated is None else f". {stated.message[0].upper()}{stated.message[1:]}"
         if self.agrees:
-            agrees = "absolute scale: gravity and total mass agree with the URDF's within 5 %"
-            if self._off_whole <= _AGREES:
-                return f"{agrees}: {self.figures}"
-            before, after, payload = self.masses
-            return (
-                f"{agrees} only if a load of {payload:+.3g} kg is added to the last link, "
-                "which the URDF does not have. Without the load: gravity torque "
-                f"{self.scale:.2f} x the URDF's, total mass {after - payload:.4g} kg against the "
-                f"URDF's {before:.4g} kg. With it: {self.figures}. If no such load was mounted, "
-                "check the gains of the torques"
-            )
-        hint = ""
+            return f"{self._agreement}{beside}"
+        remedy = (
+            "State the measured mass of the moving links (total_mass)"
+            if self.is_total_determined
+            else "Verify it with a payload of known mass (robotid payload)"
+        )
+        return f"absolute scale not verified: {self.figures}{self._excess}{beside}. {remedy}"
+
+    @property
+    def _agreement(self) -> str:
+        """How gravity and total mass confirm the scale."""
+        agrees = "absolute scale: gravity and total mass agree with the URDF's within 5 %"
+        if self._is_total_open:
+            agrees = "absolute scale: gravity agrees with the URDF's within 5 %"
+        if self._off_whole <= AGREES:
+            return f"{agrees}: {self.figures}"
+        before, after, payload = self.masses
+        return (
+            f"{agrees} only if a load of {payload:+.3g} kg is added to the last link, "
+            "which the URDF does not have. Without the load: gravity torque "
+            f"{self.scale:.2f} x the URDF's, total mass {after - payload:.4g} kg against the "
+            f"URDF's {before:.4g} kg. With it: {self.figures}. If no such load was mounted, "
+            "check the gains of the torques"
+        )
+
+    @property
+    def _excess(self) -> str:
+        """Which figures exceed which limit, and the probable cause."""
+        limit = _ANOTHER if self._off > _ANOTHER else AGREES
+        ratios = self._ratios_whole
+        beyond = [what for what, ratio in ratios.items() if abs(ratio - 1.0) > limit]
+        excess = "; the residual of a joint is above 1.5 x that of WLS" if not self.follows else ""
+        if beyond:
+            verb = "differs" if len(beyond) == 1 else "differ"
+            excess = f"; {' and '.join(beyond)} {verb} by more than {100 * limit:.0f} %{excess}"
+        by_factor, by_payload = self.unexplained
+        single = [f"{j} {x:.2f}" for j, x in self.gravity.items() if abs(x - 1.0) > _ANOTHER]
         if self.has_one_factor:
-            hint = (
-                f" The same factor {self.factor:.2f} fits all joints: check the gains of the "
-                "torques."
-            )
-        elif outside := [
-            f"{j} {x:.2f}" for j, x in self.gravity.items() if abs(x - 1.0) > _ANOTHER
-        ]:
-            hint = f" Gravity torque over the URDF's, by joint: {listed(outside)}."
-        return f"absolute scale not verified: {self.figures}.{hint} State a known mass (total_mass)"
+            same = f"The same factor {self.factor:.2f} fits all joints"
+            return f"{excess}. {same}: probable cause: the gains of the torques"
+        is_urdf = self.scale is not None and abs(self.scale - 1.0) <= AGREES
+        if is_urdf and self.masses[2] > 0 and by_payload < _BETTER * by_factor:
+            load = f"a load of {self.masses[2]:+.3g} kg on the last link that the URDF lacks"
+            return f"{excess}. Probable cause: {load}"
+        if single:
+            by_joint = f"Gravity torque over the URDF's, by joint: {listed(single)}"
+            return f"{excess}. {by_joint}: probable cause: masses of the URDF, or single gains"
+        if not self.follows:
+            return f"{excess}. Probable cause: a prior or constraint that the data contradict"
+        if beyond:
+            return f"{excess}. Probable cause: the URDF's masses, or the gains of the torques"
+        return excess
+
+    @property
+    def _is_total_open(self) -> bool:
+        """Whether the total mass is stated, and not by torque: it does not count as identified."""
+        stated = self.stated
+        return stated is not None and stated.ratio is None and "total_mass" in stated.names
+
+    @property
+    def _ratios_whole(self) -> dict[str, float]:
+        """Identified over URDF's gravity torque and total mass, without a payload [-]."""
+        before, after, _ = self.masses
+        mass = (
+            {} if self._is_total_open else {"total mass": after / before if before > 0 else np.inf}
+        )
+        return ({} if self.scale is None else {"gravity torque": self.factor}) | mass
 
     @property
     def _off(self) -> float:
@@ -122,21 +178,25 @@ class ScaleCheck:
         before, after, payload = self.masses
         if not (before > 0 and payload > 0):
             return self._off_whole
-        with_load = max(abs((after - payload) / before - 1.0), abs((self.scale or 1.0) - 1.0))
+        with_load = abs((self.scale or 1.0) - 1.0)
+        if not self._is_total_open:
+            with_load = max(with_load, abs((after - payload) / before - 1.0))
         return min(with_load, self._off_whole)
 
     @property
     def _off_whole(self) -> float:
         """Relative difference of gravity and total mass without a payload [-]."""
-        before, after, _ = self.masses
-        if not before > 0:
-            return np.inf
-        return max(abs(after / before - 1.0), abs(self.factor - 1.0))
+        return max((abs(ratio - 1.0) for ratio in self._ratios_whole.values()), default=np.inf)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as result.json has them."""
-        lists = {"unexplained": list(self.unexplained), "masses": list(self.masses)}
-        return asdict(self) | lists | {"agrees": self.agrees, "message": self.message}
+        figures = asdict(self) | {
+            key: list(getattr(self, key)) for key in ("unexplained", "masses")
+        }
+        del figures["stated"]
+        stated = {} if self.stated is None else {"stated": self.stated.to_dict()}
+        concluded = {"agrees": self.agrees, "message": self.message}
+        return figures | {"is_stated": self.stated is not None} | stated | concluded
 
 
 def check_scale(found: Fit) -> ScaleCheck:
@@ -150,15 +210,14 @@ def check_scale(found: Fit) -> ScaleCheck:
         found: The identification.
     """
     model, size = found.model, found.model.layout.n_inertial
-    bounds = found.estimator.bounds
-    is_stated = bounds.total is not None or any(np.ptp(m) == 0 for m in bounds.masses.values())
     before, after = (float(pi[:size:10].sum()) for pi in (found.prior, found.standard))
     friction = _friction(found)
     errors = [found.metrics(name).per_joint for name in ("estimate", "wls")]
     follows = all(errors[0][j].rmse <= _HELD_BACK * free.rmse for j, free in errors[1].items())
     plain = ScaleCheck(
-        masses=(before, after, 0.0), is_stated=is_stated, friction=friction, follows=follows
-    )
+        masses=(before, after, 0.0), stated=stated_mass(found), friction=friction, follows=follows,
+        is_total_determined=determines_total_mass(found),
+    )  # fmt: skip
     q = np.vstack([e.recording.trajectory.q for e in found.fitted])
     if model.free_flyer:  # gravity loads its base with the whole mass
         ratio = after / before if before > 0 else 1.0

@@ -202,11 +202,12 @@ def judge(
         verdict on a joint with a warning, and on all joints if a warning concerns the result.
     """
     found, hidden = predictions.on_each(), predictions.hidden
-    poor = sorted((reason for worse, _, _ in found.values() for reason in worse), key=_rank)
+    largest = sorted(found.values(), key=lambda of: -max(of[2], default=0.0))
+    poor = sorted((reason for worse, _, _ in largest for reason in worse), key=_rank)
     is_contradicted = scale_check is not None and scale_check.contradicts
     reasons = [
         *predictions.untested(),
-        *(reason for _, cautions, _ in found.values() for reason in cautions),
+        *(reason for _, cautions, _ in largest for reason in cautions),
         *predictions.better_by_urdf(),
         *_described(warnings),
         *([scale_check.message] if scale_check is not None and is_contradicted else []),

@@ -288,7 +288,8 @@ class Finder:
             )
         return DataError(
             f"{self.where}: {has} but no gain; state it in N m/A: {flags}, or in the job file "
-            f"[torque] gains = {{ {gains} }}{also}",
+            f"[torque] gains = {{ {gains} }}{also}. A payload of known mass determines unknown "
+            "gains: robotid payload URDF LOADED --reference BARE --mass KG --gains",
             code="missing_gain",
         )
 

@@ -205,9 +205,10 @@ class Trajectory:
             shape (N, c) [-], in the order of ``friction_speeds``; None: the sign of the speed.
         memory: Regressor columns of drive parameters that depend on internal states, shape (N, m),
             in the order of ``ParameterLayout.remembering``; None if there are none.
-        contacts: Which contacts touch the ground, shape (N, k), bool; None without contacts.
+        contacts: Which contacts may touch the ground, shape (N, k), bool; None without contacts.
+        switching: Samples at which a contact changes and the acceleration jumps, shape (N,), bool;
+            None without contacts.
         wrenches: Measured components of wrenches, shape (N, m) [N or N m]; None without any.
-        switching: Samples at which a contact changes, shape (N,), bool; None without contacts.
         basis: Basis of the torques of constraint forces, shape (N, n_rows, m), as of
             ``force_basis``; None without constraints.
     """

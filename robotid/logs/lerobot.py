@@ -30,9 +30,10 @@ _FEATURES: Mapping[str, Mapping[str, str]] = {
                "torque": "tauref", "tau": "tauref", "effort": "tauref"},
 }  # fmt: skip
 _NORMALISED = (
-    "the unit of positions is not in the files of LeRobot. By default they are normalised, -100 to "
-    "100 over the calibrated range of each joint (always 0 to 100 for a gripper), and are not "
-    "angles: record with use_degrees = true, or convert them with the calibration of the robot. If "
+    "the unit of positions is not in the files of LeRobot. By version and use_degrees of the "
+    "robot, they are degrees, or normalised: -100 to 100 over the calibrated range of each joint, "
+    "which is no angle (a gripper always has 0 to 100). Normalised positions: record with "
+    "use_degrees = true, or convert them with the calibration of the robot. If "
     'they are angles, state the unit: angle = "deg" or "rad" (job file table [units], CLI '
     '--angle-unit deg, Python units=LogUnits(angle="deg"))'
 )

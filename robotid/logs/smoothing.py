@@ -25,6 +25,7 @@ _SETTLED = 42.0  # [time constants] after which a filter's transient is negligib
 _LONGEST = 8.0  # [periods of the filter] longest time of stiction
 _FINEST = 1000  # largest number of points of the uniform grid per row of the log
 _ALL = slice(None)
+_SPREAD = 1.0  # [periods of the filter] by which it spreads a force
 
 
 @dataclass(frozen=True)
@@ -89,12 +90,13 @@ def process_segments(
     t, q, v, a, tau, direction, wrenches = (
         np.concatenate(x) for x in zip(nothing, *parts, strict=True)
     )
-    contacts = _contacts(log, t, settings) if log.contacts else (None, None)
+    contacts, switching = _contacts(log, t, settings) if log.contacts else (None, None)
     return Trajectory(
         t=t, q=q, v=v, a=a, tau=tau, joints=log.joints, rate=settings.rate,
         segment=np.repeat([segment.number for segment in segments], counts),
         direction=direction if len(ratios) else None,
-        contacts=contacts[0], switching=contacts[1],
+        contacts=contacts,
+        switching=switching,
         wrenches=wrenches if log.wrenches else None,
     )  # fmt: skip
 
@@ -220,18 +222,29 @@ def _base_channels(base: BaseMotion, settings: SignalSettings) -> dict[str, Arra
 
 
 def _contacts(log: Log, t: Array, settings: SignalSettings) -> tuple[Array, Array]:
-    """Return which links touch the ground at times (N, k), and where that changes, (N,), bool.
+    """Return which links may touch the ground at times (N, k), and where that changes (N,), bool.
 
-    The change is between two rows of the log, and affects half a period of the filter around it.
+    A contact begins and ends between two rows of the log. The filter of the torque spreads its
+    force over a period before and after it: there, too, the force is unknown. Without a filter the
+    acceleration jumps between the two rows.
     """
-    flags = np.column_stack(list(log.contacts.values()))
-    last = np.searchsorted(log.t, t * (1 + 1e-12), side="right") - 1
-    changes = np.flatnonzero((flags[1:] != flags[:-1]).any(axis=1))
-    reach = 0.5 / settings.cutoff if settings.cutoff else 0.0
+    reach = _SPREAD / settings.cutoff if settings.cutoff else 0.0
     reach += 1e-9 * float(log.t[-1] - log.t[0])
-    begins, ends = log.t[changes] - reach, log.t[changes + 1] + reach
-    within = np.searchsorted(begins, t, side="right") - np.searchsorted(ends, t, side="left")
-    return flags[last.clip(0)], within > 0
+    touching = np.zeros((len(t), len(log.contacts)), dtype=bool)
+    for k, flags in enumerate(log.contacts.values()):
+        edges = np.diff(flags.astype(np.int8), prepend=0, append=0)
+        first, last = np.flatnonzero(edges > 0) - 1, np.flatnonzero(edges < 0)
+        begins = log.t[first.clip(0)] - reach
+        ends = log.t[last.clip(max=len(flags) - 1)] + reach
+        begun = np.searchsorted(begins, t, side="right")
+        touching[:, k] = begun > np.searchsorted(ends, t, side="left")
+    changing = np.zeros(len(t), dtype=bool)
+    if not settings.cutoff:
+        flags = np.column_stack(list(log.contacts.values()))
+        rows = np.flatnonzero((flags[1:] != flags[:-1]).any(axis=1))
+        begun = np.searchsorted(log.t[rows] - reach, t, side="right")
+        changing = begun > np.searchsorted(log.t[rows + 1] + reach, t, side="left")
+    return touching, changing
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,12 @@ __all__ = [
 _ASSETS = Path(__file__).parent / "assets"
 _FIRST = 3  # reasons of a verdict that are visible without unfolding
 #: Scripts, and the pattern of pages that need them.
-_SCRIPTS = {"page.js": '<details|<table class="data"', "tables.js": '<table class="data"'}
+_DOCK = '<div id="replay" class="dock"'
+_SCRIPTS = {
+    "page.js": '<details|<table class="data"',
+    "tables.js": '<table class="data"',
+    "dock.js": _DOCK,
+}
 
 
 @cache
@@ -263,13 +268,15 @@ def page(title: str, header: str, sections: Mapping[str, Section | tuple[str, st
     links = "".join(f'<a href="#{key}">{x.title}</a> ' for key, x in shown.items())
     body = "".join(_section(key, section) for key, section in shown.items())
     named = [name for name, mark in _SCRIPTS.items() if re.search(mark, header + body)]
+    has_dock = _DOCK in body
     return scaffold(
         title,
-        f"<style>/*tones*/{asset('page.css')}</style>\n",
+        f"<style>/*tones*/{asset('page.css')}{asset('dock.css') if has_dock else ''}</style>\n",
         '<a class="skip" href="#content">Skip to the content</a>\n'
         f'<nav aria-label="Sections"><div><a href="#content">{escape(title)}</a> {links}'
         f'</div></nav>\n<main id="content" tabindex="-1">\n<header>\n{header}</header>\n'
         f"{body}</main>\n",
+        policy="; frame-src 'self'" if has_dock else "",
         scripts=named,
     )
 

@@ -176,8 +176,9 @@ def constrained(
         return motion, used
     N = len(motion.t)
     contacts = np.ones((N, len(model.contacts)), dtype=bool)
-    if motion.contacts is not None and motion.switching is not None:
+    if motion.contacts is not None:
         contacts[:, [not x.always for x in model.contacts]] = motion.contacts
+    if motion.switching is not None:
         used = used & ~motion.switching[:, None]
     J = constraint_jacobian(model, motion.q, contacts)
     known, tau = _measured(model), motion.tau

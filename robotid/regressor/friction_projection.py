@@ -121,6 +121,7 @@ class ProjectedDrive:
         own: Indices of the drive's m parameters in the layout of the robot.
         error: RMS error of the projection [N m or N].
         torque: RMS torque of the drive's joints [N m or N].
+        is_linear: Whether its joints are prismatic.
     """
 
     name: str
@@ -130,13 +131,15 @@ class ProjectedDrive:
     own: tuple[int, ...]
     error: float
     torque: float
+    is_linear: bool = False
 
     def __str__(self) -> str:
-        stated = ", ".join(f"{term} {value:.4g}" for term, value in self.values.items())
+        unit = {name: term.units[self.is_linear] for name, term in _SIMPLE.items()}
+        stated = ", ".join(f"{term} {x:.4g} {unit[term]}" for term, x in self.values.items())
         share = f" ({100 * self.error / self.torque:.2g} % of its torque)" if self.torque else ""
         return (
             f"{self.name}: {', '.join(self.replaced)} projected on {stated}; "
-            f"error {self.error:.3g} RMS{share}"
+            f"error {self.error:.3g} {unit['offset']} RMS{share}"
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -303,6 +306,7 @@ def _projected(
         own=tuple(k for k, _ in own),
         error=least,
         torque=moments.torque,
+        is_linear={joint for joint, _ in model.layout.drives[d].ratios} <= model.layout.prismatic,
     )
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from robotid.diagnosis.misfit_findings import setting_of, with_entries
 from robotid.export.formats import FORMATS
-from robotid.findings import Cause, grouped, listed, toml_key
+from robotid.findings import Cause, Finding, grouped, listed, toml_key
 from robotid.judgement.evidence import GOOD, is_beaten
 from robotid.robot.drives import COUNTERBALANCE, DriveTerm
 from robotid.robot.families import spring_family
@@ -24,6 +24,7 @@ __all__ = ["Origin", "Step", "loop_steps", "next_steps"]
 _MOST = 3  # steps
 _NAMED = 4  # joints that a step names
 _NEW = "NEW.csv"
+_LOADED = "LOADED.csv"
 _PLAIN = "viscous+coulomb"
 _APPENDED = ("--validate",)  # flags that add to what was stated before
 
@@ -49,10 +50,12 @@ class Origin:
         source: The arguments of ``robotid identify``: a job file, or URDF, logs and flags; empty
             if no command made the result.
         folder: Folder of the results; "" if they were not written.
+        replay: File that ``robotid replay`` writes, from the report's folder; "" if there is none.
     """
 
     source: tuple[str, ...] = ()
     folder: str = ""
+    replay: str = ""
 
     @property
     def job(self) -> str:
@@ -140,12 +143,49 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
 
 
 def loop_steps(content: Mapping[str, Any], origin: Origin) -> tuple[Step, ...]:
-    """Return the uses of a result of closed-loop identification; nothing if it was not written.
+    """Return the next steps for a result of closed-loop identification.
+
+    They are its uses, if it was written; of a poor result, what to correct, three at most.
 
     Args:
         content: Content of its result.json.
-        origin: Its folder.
+        origin: The source of the result, and its folder.
     """
+    if content["verdict"]["status"] == "poor":
+        return _loop_repairs(content, origin)[:_MOST]
+    exports = _exports(
+        content["robot"], origin, has_gains=content["simulation"]["controller"]["kind"] != "torque"
+    )
+    return (_loop_replay(content, origin), *exports) if origin.folder else ()
+
+
+def _loop_repairs(content: Mapping[str, Any], origin: Origin) -> tuple[Step, ...]:
+    """Return what to correct for a poor result: logs, causes that findings name, joints."""
+    verdict, steps = content["verdict"], []
+    again = (origin.again(),) if origin.source else ()
+    if errors := verdict["log_errors"]:
+        words = f"Correct the logs, then repeat the identification: {errors[0]}."
+        doctor = (shlex.join(["robotid", "doctor", *origin.source]),) if origin.source else ()
+        return (Step(words, (*doctor, *again)),)
+    poor = [name for name, own in verdict["per_joint"].items() if own["status"] == "poor"]
+    warnings = [
+        Finding(entry["code"], entry["severity"], entry["where"], entry["message"])
+        for entry in content["warnings"]
+        if entry["severity"] == "warning"
+    ]
+    causes = grouped(warnings, content["joints"])
+    causes = tuple(sorted(causes, key=lambda cause: not set(poor).intersection(cause.joints)))
+    steps += [Step(f"{c.messages[0][0].upper()}{c.messages[0][1:]}.") for c in causes[: _MOST - 1]]
+    words = (
+        f"Do not use the result: the simulated position of {listed(poor, _NAMED)} is wrong. Find "
+        "out in the replay when, correct gains, limits, encoder zeros or the motion, and repeat "
+        "the identification."
+    )
+    return (*steps, Step(words, (*_loop_replay(content, origin).blocks, *again)))
+
+
+def _loop_replay(content: Mapping[str, Any], origin: Origin) -> Step:
+    """Return the step that plays a result of closed-loop identification."""
     urdf, log = (
         next((x["path"] for x in content["inputs"] if x["role"] == role), "")
         for role in ("urdf", "identification")
@@ -154,9 +194,7 @@ def loop_steps(content: Mapping[str, Any], origin: Origin) -> tuple[Step, ...]:
     words = "Compare measured and predicted torque in the replay."
     if has_gains:
         words = "Compare the commanded, measured and simulated robot in the replay."
-    watched = Step(words, origin.using("replay", urdf, log, f"{origin.folder}/result.json"))
-    exports = _exports(content["robot"], origin, has_gains=has_gains)
-    return (watched, *exports) if origin.folder else ()
+    return Step(words, origin.using("replay", urdf, log, f"{origin.folder}/result.json"))
 
 
 def _exports(robot: str, origin: Origin, *, has_gains: bool = False) -> list[Step]:
@@ -219,11 +257,30 @@ def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     check = ""
     if any(cause.code in ("total_mass", "urdf_mismatch") for cause in causes):
         check = "Check the sign, the order and the unit of the torques and the URDF's masses. "
+    masses = f"{after:.4g} kg identified, {before:.4g} kg in the URDF"
+    if found.scale_check.is_total_determined:
+        words = (
+            f"{check}State the measured mass of the moving links to verify the torque scale: "
+            f"{masses}."
+        )
+        return Step(words, origin.stating("[estimator.constraints]", "total_mass = KG"))
     words = (
-        f"{check}State the measured mass of the moving links to verify the torque scale: "
-        f"{after:.4g} kg identified, {before:.4g} kg in the URDF."
+        f"{check}Verify the torque scale with a payload of known mass, because torque does not "
+        f"determine the total mass ({masses}): record a log with it and compare the identified "
+        "payload. If the torques are motor currents, the last command identifies their gains."
     )
-    return Step(words, origin.stating("[estimator.constraints]", "total_mass = KG"))
+    urdf, result = str(found.model.tree.path), f"{origin.folder}/result.json"
+    compared = origin.using("payload", urdf, _LOADED, "--reference", result)
+    return Step(words, (*compared, *_payload_gains(found)))
+
+
+def _payload_gains(found: Identification) -> tuple[str, ...]:
+    """Return the command that identifies the gains of currents; nothing without files."""
+    urdf, log = str(found.model.tree.path), str(found.fitted[0].recording.log.path)
+    if not log:
+        return ()
+    flags = ("--reference", log, "--mass", "KG", "--gains")
+    return (shlex.join(["robotid", "payload", urdf, _LOADED, *flags]),)
 
 
 def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -231,11 +288,11 @@ def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     words = (
         f"If the column is a current, state the gain of {listed(joints or ['the joints'], _NAMED)} "
         "in N m per A (N per A for a prismatic joint): the torque is consistent with the URDF only "
-        "at another scale."
+        "at another scale. A payload of known mass determines unknown gains: the last command."
     )
     line = "\n".join(f"{toml_key(joint)} = GAIN" for joint in joints or ["JOINT"])
     flags = [x for joint in joints or ["JOINT"] for x in ("--gain", f"{joint}=GAIN")]
-    return Step(words, origin.stating("[torque.gains]", line, *flags))
+    return Step(words, (*origin.stating("[torque.gains]", line, *flags), *_payload_gains(found)))
 
 
 def _delay(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -408,18 +465,22 @@ def _doctor(found: Identification, origin: Origin, causes: Sequence[Cause]) -> S
 
 
 def _uses(found: Identification, origin: Origin, asked: Sequence[Step]) -> list[Step]:
-    """Return the uses of a result, without commands that other steps have."""
+    """Return the uses of a result, without commands that other steps have.
+
+    A poor result is only examined.
+    """
     result = f"{origin.folder}/result.json"
+    is_poor = found.verdict.status == "poor"
     steps = [
-        Step(
-            "Play a recording and examine the prediction error over time.", _replay(found, origin)
-        ),
-        Step(
+        Step("Play a recording and examine the prediction error over time.", _replay(found, origin))
+    ]
+    if not is_poor:
+        validated = Step(
             "Validate the result on another motion, at the speeds of your application.",
             origin.using("validate", result, _NEW),
-        ),
-    ]
-    if found.has_urdf:
+        )
+        steps.append(validated)
+    if found.has_urdf and not is_poor:
         steps = [*_exports(found.model.name, origin), *steps]
     if not found.scale_check.agrees:
         steps.insert(0, _scale(found, origin, ()))

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from html import escape
 
-from robotid.findings import Cause, Finding, grouped
+from robotid.findings import Cause, Finding, grouped, number_of
 from robotid.pages.html import Cell, code, table
 
 __all__ = ["findings_line", "findings_section"]
@@ -17,13 +17,14 @@ def findings_line(findings: Sequence[Finding], joints: Sequence[str], worst: str
         joints: Names of the robot's joints.
         worst: The joint with the largest error; "" if there is none.
     """
-    serious = [finding for finding in findings if finding.severity != "note"]
-    notes = len(findings) - len(serious)
-    of_notes = [_count(notes, "note")] if notes else []
-    if not serious:
+    causes, notes = (
+        grouped([f for f in findings if (f.severity == "note") == is_note], joints)
+        for is_note in (False, True)
+    )
+    of_notes = [_count(number_of(notes), "note")] if notes else []
+    if not causes:
         return ", ".join(of_notes) or "none"
-    causes = grouped(serious, joints)
-    counts = f"{_count(len(serious), 'finding')}, {_count(len(causes), 'cause')}"
+    counts = f"{_count(number_of(causes), 'finding')}, {_count(len(causes), 'cause')}"
     return "; ".join([counts, *([f"worst: {escape(worst)}"] if worst else []), *of_notes])
 
 

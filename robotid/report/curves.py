@@ -11,7 +11,7 @@ __all__ = ["curves_section", "drawn"]
 
 _ROWS = 24_000  # of all charts: about half a MB
 _LONGEST = 2000  # rows of one chart
-_OPEN = 6  # joints that are open at most
+_OPEN = 2  # joints that are open at most
 _MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
 
 RunT = TypeVar("RunT")
@@ -35,6 +35,7 @@ def curves_section(
     worst: Sequence[str],
     charts: Callable[[RunT, int, str, int], str],
     note: Callable[[int], str],
+    most: int = _OPEN,
 ) -> str:
     """Return a part for each joint; the worst joint and the worst ones that are not good are open.
 
@@ -47,9 +48,10 @@ def curves_section(
         charts: Returns the charts of a recording, given the number of a joint, the name that
             links the charts, and the number of points.
         note: Returns the HTML above the charts of the joint with a number.
+        most: Number of joints that are open at most.
     """
     points = min(_LONGEST, max(200, _ROWS // (2 * len(rows) * max(1, len(runs)))))
-    parts, first = [intro], [*worst][:_OPEN]
+    parts, first = [intro], [*worst][:most]
     for row, name in enumerate(rows):
         status = verdict_cell(name, verdicts[name]) if name in verdicts else ""
         html = note(row) + "".join(charts(run, row, link, points) for link, run in runs.items())

@@ -1,6 +1,7 @@
 """The report's sections with plots, as HTML: residuals, friction, parameters, excitation."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from html import escape
 
 import numpy as np
@@ -20,16 +21,17 @@ from robotid.identification.pictures import (
 )
 from robotid.identification.result import Identification
 from robotid.pages.charts import Chart, chart_html
-from robotid.pages.html import code, figure, number, table, text
-from robotid.robot.parameters import INERTIAL_TERMS
+from robotid.pages.html import code, figure, folded, number, table, text
 
-__all__ = ["body_figures", "drive_figures", "information_section", "residual_section"]
+__all__ = ["drive_figures", "friction_section", "information_section", "residual_section"]
 
 _PAIRS = 15  # strongest correlations that are listed
 _STRONG = 0.8  # smallest correlation that is listed
 _CELL = 11  # [px] of the correlation matrix
 _STEPS = 8  # shades of each sign in it
 _STILL = 100  # points of a friction chart in print
+_LOW = 130  # [px] height of a friction chart
+_CURVES = 8  # friction charts that are not folded
 
 
 def residual_section(found: Identification) -> str:
@@ -52,8 +54,39 @@ def residual_section(found: Identification) -> str:
     )
 
 
+def friction_section(found: Identification, worst: Sequence[str]) -> str:
+    """Return friction against speed of each joint, measured and identified.
+
+    Args:
+        found: The identification.
+        worst: Joints that have errors, the worst first; of more than 8, others are folded.
+
+    Returns:
+        HTML; nothing without speeds or friction terms.
+    """
+    names, layout = found.model.row_names, found.model.layout
+    if found.model.is_static or all(term.is_inertia for _, term in layout.drive_parameters):
+        return ""
+    first = names if len(names) <= _CURVES else [n for n in names if n in worst[:_CURVES]]
+    figures = _friction_figures(found)
+    shown = "".join(figures[name] for name in first)
+    rest = "".join(figures[name] for name in names if name not in first)
+    if rest:
+        rest = f'<div class="plots small">\n{rest}</div>\n'
+        count = len(names) - len(first)
+        rest = folded("friction-more", f"{count} more joints with smaller errors", rest)
+    log = escape(shown_evaluation(found).recording.name)
+    return (
+        f"<p>Measured: torque minus inertia, gravity and armature, on {log}. Identified: friction "
+        "and offset. Line: the friction at constant speed, with the 95 % band of its parameters. "
+        "If the measured dots deviate systematically from the identified ones, the friction has "
+        "another curve; significant deviations are findings.</p>\n"
+        f'<div class="plots small">\n{shown}</div>\n{rest}'
+    )
+
+
 def drive_figures(found: Identification) -> str:
-    """Return the friction curves of the joints and bars of the drive parameters.
+    """Return the selection of friction terms and bars of the drive parameters.
 
     Args:
         found: The identification.
@@ -73,29 +106,7 @@ def drive_figures(found: Identification) -> str:
             "friction, for each joint: the error on held-out segments, and the p-value of its "
             f"decrease.</p>\n{choice}"
         )
-    curves = ""
-    is_static = found.model.is_static  # without speeds
-    log = escape(shown_evaluation(found).recording.name)
-    if not is_static and not all(term.is_inertia for _, term in layout.drive_parameters):
-        curves = (
-            f"<h3>Friction against speed</h3>\n<p>Measured: torque minus inertia, gravity and "
-            f"armature, on {log}; identified: friction and offset. "
-            "Measured dots that deviate systematically from the identified ones indicate another "
-            "friction curve; significant deviations are findings. The line is the friction at "
-            "constant speed, with the 95 % band of its parameters.</p>\n"
-            f'<div class="plots">\n{_friction_figures(found)}</div>\n'
-        )
-    return f'{curves}{choice}<h3>Values</h3>\n<div class="plots">\n{bars}</div>\n'
-
-
-def body_figures(found: Identification) -> str:
-    """Return each inertial parameter of all bodies with error bars, and the URDF's values.
-
-    Args:
-        found: The identification.
-    """
-    figures = "".join(map(_parameter_figure, parameter_charts(found, INERTIAL_TERMS)))
-    return f'<div class="plots">\n{figures}</div>\n'
+    return f'{choice}<h3>Values</h3>\n<div class="plots">\n{bars}</div>\n'
 
 
 def information_section(found: Identification) -> str:
@@ -122,11 +133,11 @@ def information_section(found: Identification) -> str:
     )
     singular = singular_chart(info.singular_values, found.wls.rank)
     return (
-        f"<p>Condition number {found.wls.condition:.3g}; singular values from "
-        f"{info.singular_values[0]:.3g} to {info.singular_values[-1]:.2g}. The data determine the "
-        f"base parameters by {shares.mean():.0f} % on average and the weakest by {shares.min()} "
-        "%, the URDF determines the rest: S²/(S² + s²) with the prior's spread S and the standard "
-        "error s of WLS.</p>\n"
+        f"<p>Condition number {found.wls.condition:.3g} (regressor, unit columns); singular values "
+        f"from {info.singular_values[0]:.3g} to {info.singular_values[-1]:.2g}. The data determine "
+        f"the base parameters by {shares.mean():.0f} % on average and the weakest by "
+        f"{shares.min()} %, the URDF determines the rest: S²/(S² + s²) with the prior's "
+        "spread S and the standard error s of WLS.</p>\n"
         f"{chart_html(singular, singular.title)}{known}" + _correlations(info, names)
     )
 
@@ -145,18 +156,19 @@ def _residual_figures(found: Identification, row: int) -> str:
     return "".join(chart_html(*each) for each in zip(charts, captions, strict=True))
 
 
-def _friction_figures(found: Identification) -> str:
+def _friction_figures(found: Identification) -> dict[str, str]:
+    """Return the friction chart of each joint."""
     split = friction_split(found.model, shown_evaluation(found), found.standard)
-    figures = []
+    figures = {}
     for joint in found.model.row_names:
         chart = friction_chart(found, joint, split=split)
         if chart is None:
             why = "no drive" if joint in found.model.passive else "no samples used"
-            figures.append(f"<p>{escape(joint)}: {why}.</p>\n")
+            figures[joint] = f"<p>{escape(joint)}: {why}.</p>\n"
         else:
             caption = f"<strong>{escape(joint)}</strong>"
-            figures.append(chart_html(chart, caption, still=_STILL))
-    return "".join(figures)
+            figures[joint] = chart_html(replace(chart, height=_LOW), caption, still=_STILL)
+    return figures
 
 
 def _parameter_figure(chart: Chart) -> str:

@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 
 from robotid._typing import Array
-from robotid.closed_loop.evaluation import DRIFTS, OpenLoop
+from robotid.closed_loop.evaluation import DRIFTS, OpenLoop, position_metrics
 from robotid.exceptions import DataError
 from robotid.export.ranges import source_of
-from robotid.findings import Finding, listed
+from robotid.findings import Finding, grouped, listed
 from robotid.pages.charts import Chart, Series, chart_html
 from robotid.pages.html import code, number, table, text
 from robotid.report.advice import Origin, loop_steps
 from robotid.report.curves import curves_section, drawn
+from robotid.report.dock import Clip, Dock
 from robotid.report.errors import POSITION, Errors, worst_errors
 from robotid.report.shown import Shown
 from robotid.report.tables import input_table, parameter_section, version_table
@@ -92,26 +93,28 @@ def shown_positions(
         for key in ("standard_parameters", "drive_parameters")
         for entry in content[key]
     ]
-    worst = list(worst_errors(validated or [whole]))
-    source = "torque-driven simulation" if is_driven else "commands"
     model, standard = changed or (None, np.zeros(0))
+    counted = _counted(model, validation or fitted, bool(validation)) or validated or [whole]
+    worst = list(worst_errors(counted))
+    source = "torque-driven simulation" if is_driven else "commands"
+    findings = [
+        Finding(entry["code"], entry["severity"], entry["where"], entry["message"])
+        for entry in content.get("warnings", [])
+    ]
     return Shown(
         title=f"{content['robot']}: drives from {source}",
         robot=content["robot"],
         rows=joints,
         verdict=content["verdict"],
-        findings=[
-            Finding(entry["code"], entry["severity"], entry["where"], entry["message"])
-            for entry in content.get("warnings", [])
-        ],
+        findings=findings,
         quantity=POSITION,
-        counted=validated or [whole],
+        counted=counted,
         recordings=[*validated, whole],
-        facts=_facts(content),
+        facts=_facts(content) | _warned(findings, joints),
         steps=loop_steps(content, origin),
         made=f"<p>{escape(_method(content, names))}</p>\n",
         errors=(_DRIVEN_ERRORS if is_driven else _ERRORS, _horizons(content)),
-        curves=("Positions", _positions(content, fitted, validation, worst, replay)),
+        curves=("Positions", _positions(content, fitted, validation, worst, origin, replay)),
         why="",
         parameters=parameter_section(
             model, standard, entries, _DRIVEN if is_driven else _PARAMETERS
@@ -127,6 +130,24 @@ def shown_positions(
             ),
         },
     )
+
+
+def _counted(
+    model: RobotModel | None, runs: Sequence[OpenLoop], is_validation: bool
+) -> list[Errors]:
+    """Return the errors that the verdict uses: of all logs that move a joint, together."""
+    if model is None or not runs:
+        return []
+    name = runs[0].name if len(runs) == 1 else f"{len(runs)} logs together"
+    joints = position_metrics(model, runs, moving=True).to_dict()["per_joint"]
+    return [Errors(name, joints, is_fitted=not is_validation)]
+
+
+def _warned(findings: Sequence[Finding], joints: Sequence[str]) -> dict[str, str]:
+    """Return links to the errors and warnings, for the figures beside the verdict."""
+    causes = grouped([f for f in findings if f.severity != "note"], joints)
+    links = [f'<a href="#cause-{escape(c.code)}">{escape(c.code)}</a>' for c in causes]
+    return {"Errors and warnings": ", ".join(links)} if links else {}
 
 
 def _is_driven(content: Mapping[str, Any]) -> bool:
@@ -248,6 +269,7 @@ def _positions(
     fitted: Sequence[OpenLoop],
     validation: Sequence[OpenLoop],
     worst: Sequence[str],
+    origin: Origin,
     replay: str,
 ) -> str:
     """Return charts of each joint in every log."""
@@ -271,6 +293,11 @@ def _positions(
         f"log {k}": (run, "not fitted" if k < count else "fitted") for k, run in enumerate(shown)
     }
 
+    urdf = next((x["path"] for x in content["inputs"] if x["role"] == "urdf"), "")
+    clips = [Clip(link, str(run.log.path), float(run.log.t[0]), float(run.log.t[-1]))
+             for link, (run, _) in runs.items()]  # fmt: skip
+    dock = Dock(replay, origin, urdf, clips)
+
     def charts(of: tuple[OpenLoop, str], row: int, link: str, points: int) -> str:
         unit = units.get(joints[row], "rad")
         return _charts(*of, row, joints[row], unit, link=link, points=points)
@@ -278,10 +305,10 @@ def _positions(
     def note(row: int) -> str:
         unit = f"{POSITION.prefix}{units.get(joints[row], 'rad')}"
         seconds = worst_second(_residuals(validation or fitted, row))
-        return worst_html(seconds, joints[row], unit, replay, POSITION.scale)
+        return worst_html(seconds, joints[row], unit, dock, POSITION.scale)
 
     verdicts = content["verdict"].get("per_joint", {})
-    return curves_section(intro, runs, joints, verdicts, worst, charts, note)
+    return curves_section(dock.html + intro, runs, joints, verdicts, worst, charts, note, most=1)
 
 
 def _residuals(runs: Sequence[OpenLoop], j: int) -> Iterator[Residual]:

@@ -42,6 +42,8 @@ class Shown:
         parameters: Content of the section of parameters.
         entries: The parameters, as in result.json.
         appendix: Title and content of the parts of the appendix, by their keys.
+        friction: Friction against speed; "" if there is none.
+        bodies: Pictures of the links, URDF and identified; "" if there are none.
     """
 
     title: str
@@ -61,6 +63,8 @@ class Shown:
     parameters: str
     entries: Sequence[Mapping[str, Any]]
     appendix: Mapping[str, tuple[str, str]]
+    friction: str = ""
+    bodies: str = ""
 
     @property
     def verdicts(self) -> Mapping[str, Mapping[str, Any]]:
@@ -114,8 +118,10 @@ def page_of(shown: Shown, files: Mapping[str, str]) -> str:
         "findings": Section(
             "Findings", findings_section(shown.findings, shown.rows, worst), line, False
         ),
+        "friction": Section("Friction against speed", shown.friction),
         "curves": Section(*shown.curves),
         "why": Section("Residual analysis", shown.why, "torque components of each joint", False),
+        "bodies": Section("Links", shown.bodies),
         "parameters": Section(
             "Parameters",
             shown.parameters,

@@ -19,6 +19,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import INERTIAL_TERMS, pseudo_inertia
 
 __all__ = [
+    "SOURCE_NAMES",
     "base_table",
     "consistency_section",
     "input_table",
@@ -29,8 +30,8 @@ __all__ = [
     "version_table",
 ]
 
-#: Names of the sources of parameters.
-_DETERMINED = {
+#: What determined a parameter, by its source.
+SOURCE_NAMES = {
     "data": "data",
     "mixed": "data and prior",
     "prior": "prior",
@@ -92,7 +93,7 @@ def _parameter_table(entries: Sequence[Mapping[str, Any]], on_misfit: Collection
             change, _ = with_error(entry["value"] - prior, error, sign="+")
             if not set("123456789") & set(change.html):
                 change = replace(change, html="0")
-        words = _DETERMINED[entry["source"]]
+        words = SOURCE_NAMES[entry["source"]]
         words += ", model misfit" if entry["name"] in on_misfit else ""
         if other := entry.get("correlated_with"):
             words += f", with {other.rpartition('.')[2]} (r = {entry['correlation']:.3f})"
@@ -161,12 +162,12 @@ def sources_fact(entries: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     Args:
         entries: The parameters, as in result.json.
     """
-    counts = {kind: sum(entry["source"] == kind for entry in entries) for kind in _DETERMINED}
+    counts = {kind: sum(entry["source"] == kind for entry in entries) for kind in SOURCE_NAMES}
     there = {kind: count for kind, count in counts.items() if count}
     shares = "".join(
-        f'<i class="{kind}" style="flex: {count}"></i>' for kind, count in there.items()
+        f'<i class="from-{kind}" style="flex: {count}"></i>' for kind, count in there.items()
     )
-    words = ", ".join(f"{count} {_DETERMINED[kind]}" for kind, count in there.items())
+    words = ", ".join(f"{count} {SOURCE_NAMES[kind]}" for kind, count in there.items())
     name = f"{len(entries)} parameters, determined by"
     return {name: f'<span class="shares">{shares}</span>{words}'}
 
@@ -261,7 +262,7 @@ def open_section(found: Identification) -> str:
     fixed = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
     return (
         f"<p>The data determine {found.determination.rank} of {len(found.base)} base parameters; "
-        f"condition number {wls.condition:.3g} (columns scaled to unit norm).</p>\n"
+        f"condition number {wls.condition:.3g} (regressor, unit columns).</p>\n"
         + _indistinguishable(found)
         + _listed("Parameters without effect on the torque", found.mapping.unidentifiable)
         + _combinations(found)

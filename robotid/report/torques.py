@@ -19,13 +19,16 @@ from robotid.logs.settings import SignalSettings
 from robotid.pages.charts import chart_html
 from robotid.pages.html import percent
 from robotid.report.advice import Origin, next_steps
+from robotid.report.bodies import parameter_picture
 from robotid.report.curves import curves_section, drawn
 from robotid.report.diagnosis import (
-    body_figures,
     drive_figures,
+    friction_section,
     information_section,
     residual_section,
 )
+from robotid.report.dock import Clip, Dock
+from robotid.report.ellipsoids import ellipsoid_pictures
 from robotid.report.errors import TORQUE, Errors, worst_errors
 from robotid.report.shown import Shown
 from robotid.report.tables import (
@@ -76,7 +79,7 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
     counted = [errors for errors, e in zip(validation, found.validation, strict=True)
                if not e.is_refitted] or [fitted]  # fmt: skip
     entries = [entry for part in parameter_entries(found) for entry in part]
-    verdict = found.verdict.to_dict()
+    verdict, worst = found.verdict.to_dict(), [*worst_errors(counted)]
     return Shown(
         title=f"{found.model.name}: identified parameters",
         robot=found.model.name,
@@ -90,16 +93,21 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
         steps=next_steps(found, origin),
         made="".join(f"<p>{escape(text)}</p>\n" for text in (_method(found), _totals(found))),
         errors=(_ERRORS, ""),
-        curves=("Torques", torques_section(found, verdict["per_joint"], [*worst_errors(counted)],
-                                           replay)),
+        curves=("Torques", torques_section(found, verdict["per_joint"], worst, origin, replay)),
+        friction=friction_section(found, worst),
+        bodies=parameter_picture(found) + ellipsoid_pictures(found),
         why=why_section(found),
-        parameters=parameter_section(found.model, found.standard if found.has_urdf else None,
-                                     entries, _PARAMETERS, found.on_misfit),
+        parameters=parameter_section(
+            found.model,
+            found.standard if found.has_urdf else None,
+            entries,
+            _PARAMETERS,
+            found.on_misfit,
+        ),
         entries=entries,
         appendix={
             "residuals": ("Residual spectra", residual_section(found)),
-            "drives": ("Friction and drives", drive_figures(found)),
-            "bodies": ("Comparison with the URDF", body_figures(found)),
+            "drives": ("Drive parameters", drive_figures(found)),
             "base": ("Base parameters", base_table(found)),
             "consistency": ("Physical consistency", consistency_section(found)),
             "information": ("Excitation and correlation", information_section(found)),
@@ -108,7 +116,7 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
             "inputs": ("Inputs", input_table(input_entries(found))),
             "versions": ("Versions", version_table(versions())),
         },
-    )  # fmt: skip
+    )
 
 
 def _joints(metrics: Metrics, wls: Metrics) -> dict[str, dict[str, Any]]:
@@ -130,7 +138,7 @@ def _facts(found: Identification) -> dict[str, str]:
         "Total mass": f"<strong>{before:.2f} → {after:.2f} kg</strong>{change}",
         "Base parameters determined": (
             f"<strong>{found.determination.rank} of {len(found.base)}</strong>, condition number "
-            f"{found.wls.condition:.3g}"
+            f"{found.wls.condition:.3g} (regressor, unit columns)"
         ),
     }
 
@@ -177,6 +185,7 @@ def torques_section(
     found: Identification,
     verdicts: Mapping[str, Mapping[str, Any]],
     worst: Sequence[str],
+    origin: Origin,
     replay: str = "",
 ) -> str:
     """Return charts of torques and residuals over time.
@@ -185,11 +194,16 @@ def torques_section(
         found: The identification.
         verdicts: The verdict on each joint, as in result.json.
         worst: Joints that have errors, the worst first.
+        origin: Folder of the results, for commands.
         replay: File of the replay in the page's folder; "" if there is none.
     """
     evaluations, rows = found.validation or found.fitted, found.model.row_names
     shown = drawn(evaluations, rows)
     runs = {f"recording {k}": (e, found.band(e)) for k, e in enumerate(shown)}
+
+    clips = [Clip(link, str(e.recording.log.path), e.recording.extent.start, e.recording.extent.end)
+             for link, (e, _) in runs.items()]  # fmt: skip
+    dock = Dock(replay, origin, str(found.model.tree.path), clips)
 
     def charts(run: tuple[Evaluation, TorqueBand], row: int, link: str, points: int) -> str:
         return _charts(found, *run, row, link=link, points=points)
@@ -197,9 +211,9 @@ def torques_section(
     def note(row: int) -> str:
         name, unit = rows[row], found.model.row_units[row]
         seconds = None if found.model.is_static else worst_second(_residuals(evaluations, row))
-        return worst_html(seconds, name, unit, replay)
+        return worst_html(seconds, name, unit, dock)
 
-    intro = _intro(found, shown, evaluations[len(shown) :])
+    intro = dock.html + _intro(found, shown, evaluations[len(shown) :])
     return curves_section(intro, runs, rows, verdicts, worst, charts, note)
 
 

@@ -4,11 +4,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from html import escape
 from typing import NamedTuple
-from urllib.parse import quote, urlencode
 
 import numpy as np
 
 from robotid._typing import Array
+from robotid.report.dock import Dock
 
 __all__ = ["Residual", "WorstSecond", "worst_html", "worst_second"]
 
@@ -86,7 +86,7 @@ def _worst(of: Residual) -> WorstSecond | None:
 
 
 def worst_html(
-    worst: WorstSecond | None, joint: str, unit: str, replay: str, scale: float = 1.0
+    worst: WorstSecond | None, joint: str, unit: str, dock: Dock, scale: float = 1.0
 ) -> str:
     """Return a paragraph on the worst second of a joint; nothing without one.
 
@@ -94,22 +94,14 @@ def worst_html(
         worst: The window.
         joint: Name of the joint.
         unit: Unit of the residual shown.
-        replay: File of the replay, as a link of the page; "" without replay.
+        dock: The replay of the page.
         scale: Unit shown, in units of the residual.
     """
     if worst is None:
         return ""
-    link = ""
-    if replay:
-        there = urlencode(
-            {"t": f"{worst.start:.3f}", "joint": joint, "log": worst.of.file}, quote_via=quote
-        )
-        link = (
-            f' <a href="{escape(quote(replay))}#{escape(there)}" target="replay">Open this second '
-            "in the replay</a>"
-        )
+    link = dock.link("Show this second in the replay", worst.start, joint, worst.of.file)
     return (
         f'<p class="worst">Largest residual within 1 s: {escape(worst.of.name)}, '
         f"{worst.start:.2f} to {worst.end:.2f} s, RMS {worst.rms / scale:.3g} {unit}, "
-        f"{worst.ratio:.2g} times the RMS of the recording.{link}</p>\n"
+        f"{worst.ratio:.2g} times the RMS of the recording. {link}</p>\n"
     )

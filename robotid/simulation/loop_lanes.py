@@ -238,13 +238,10 @@ def _newton(work, n, at, drives, terms, step, command):
     Friction is nonlinear at speed 0, so a Newton step that would cross it ends there.
     """
     u, G, H = at[2], at[6], at[7]
-    is_found = False
     for k in range(_NEWTON):
         share = 1.0 if k < _NEWTON // 4 else 0.5  # against cycles of several joints' friction
         _balance(work, n, at, drives, terms, step, command)
         factor(work, n, H)
-        if is_found:
-            return True
         solve(work, n, H, G)
         is_found = True
         for i in range(n):
@@ -256,6 +253,8 @@ def _newton(work, n, at, drives, terms, step, command):
                 if halts or not abs(after - before) <= _CLOSE * (1.0 + abs(after)):
                     is_found = False
                 put(work, u + i, lane, after)
+        if is_found:  # H changes by rounding only
+            return True
     return False
 
 

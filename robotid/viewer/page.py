@@ -13,8 +13,8 @@ __all__ = ["page"]
 
 _ASSETS = Path(__file__).parent / "assets"
 _SCRIPTS = (
-    *("data", "scene", "masses", "arcs", "strip", "plots"),
-    *("clock", "picking", "controls", "live", "start"),
+    *("data", "scene", "masses", "arcs", "strip", "choice", "plots"),
+    *("clock", "picking", "controls", "live", "embed", "start"),
 )
 
 
@@ -92,6 +92,7 @@ _BODY = f"""\
 <div id="meshcat-pane" role="img" aria-label="moving robot"></div>
 <div id="names" aria-hidden="true" hidden></div>
 <output id="picked" hidden></output>
+<fieldset id="models" class="segments" hidden><legend>Predicted torque</legend></fieldset>
 <div id="tools"><button type="button" id="view">Reset view</button>
 <button type="button" id="picture">Picture</button>
 <button type="button" id="film" aria-pressed="false">Film</button></div>

@@ -45,7 +45,8 @@ class Torques:
         t: Times on the clock of the motion, shape (N,) [s].
         measured: Measured torques, shape (N, n) [N m or N].
         predicted: Predicted torques by the name of the model, shape (N, n) each, NaN where there
-            is no prediction; arcs, links and the heat strip show the residual of the first.
+            is no prediction; arcs, links and the heat strip show the residual of the first, until
+            another is selected.
         noise: Scale of the residuals, shape (n,): the RMS residual of each joint on the fitted
             logs of the first model; the RMS torque if None. Of positions: the RMS error of the
             command.
@@ -143,6 +144,7 @@ def replay(
     bands: Bands | None = None,
     marks: Sequence[Mark] = (),
     notes: Sequence[str] = (),
+    log: str = "",
     rate: float = 30.0,
 ) -> Replay:
     """Return a page that plays a motion in real time, in three dimensions.
@@ -159,6 +161,7 @@ def replay(
         bands: Parameters over time to plot.
         marks: Events to mark.
         notes: Sentences for the head of the page.
+        log: Name of the recording's file; a report of this recording shares its clock.
         rate: Largest number of keyframes per second [Hz]; fewer for long motions, to limit the
             page's size.
 
@@ -179,6 +182,7 @@ def replay(
         require_kind(value, kinds, name, wanted)
     require_each(marks, Mark, "marks", "a list of marks")
     require_each(notes, str, "notes", "a list of sentences")
+    require_kind(log, str, "log", "the name of a file")
     for label, pi in (masses or {}).items():
         _check_masses(model, label, pi)
     _check(t, q, rate)
@@ -197,6 +201,7 @@ def replay(
         scene,
         [q, *(own for _, own in others.values())],
         start=start,
+        log=log,
         motion=_packed_motion(*moved),
         ghosts=[
             {"label": label, **_packed_motion(*_moved(model, *own, rate))}
@@ -238,6 +243,7 @@ def live_page(
             robot_scene(model),
             [q],
             start=0.0,
+            log="",
             motion=_packed_motion(np.zeros(0), empty),
             ghosts=[],
             masses=[mass_marks(model, masses, "URDF")],
@@ -350,16 +356,15 @@ def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any
     if torques.quantity == "position":
         full, unit = 0.25, "RMS command error"
     scale = {"of": np.where(noise > 0, noise, 1.0).tolist(), "full": full, "unit": unit}
-    strip = None
-    if len(series) > 1:
-        edges = np.linspace(t[0], t[-1], min(_BINS, max(len(torques.t) // 4, 1)) + 1)
-        levels = residual_levels(edges, torques.t, series[0] - series[1])
-        strip = packed(_coded(levels, np.array(scale["of"])), "<u2")
+    edges = np.linspace(t[0], t[-1], min(_BINS, max(len(torques.t) // 4, 1)) + 1)
+    switched = series[1:] if torques.quantity == "torque" else series[1:2]
+    levels = [residual_levels(edges, torques.t, series[0] - other) for other in switched]
+    strips = [packed(_coded(level, np.array(scale["of"])), "<u2") for level in levels]
     times, values = _plotted(torques.t - t[0], np.hstack(series))
     return {
         **_torque_rows(model, labels, torques.quantity),
         "scale": scale,
-        "strip": strip,
+        "strips": strips,
         "t": packed(times),
         "values": _stepped(values),
     }
@@ -397,7 +402,7 @@ def _torque_rows(
         ],
         "labels": labels,
         "scale": None,
-        "strip": None,
+        "strips": [],
         "t": None,
         "values": None,
     }

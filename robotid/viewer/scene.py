@@ -3,6 +3,7 @@
 import base64
 import itertools
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -20,7 +21,7 @@ from robotid.robot.thinning import thin
 
 __all__ = ["Ellipsoid", "Scene", "coordinates", "ellipsoids", "mass_marks", "packed", "robot_scene"]
 
-_TRIANGLES = 24_000  # of all meshes together: about 1 MB in the page
+_TRIANGLES = 20_000  # of all meshes as they are drawn: at most 0.9 MB in the page
 _LINK, _JOINT, _BASE = "#9aa7b4", "#e07b1f", "#4a5560"
 _THICKNESS = 0.035  # radius of a link over the robot's reach
 _SHORT = 1e-4  # [m] joints closer than this are one point
@@ -199,9 +200,11 @@ class _Library:
         self.boxes: list[Array] = []  # the two corners of each mesh, shape (2, 3)
         visuals = [v for v in read_shapes(model.tree.robot) if v.kind]
         # each mesh once at each scale, with the current file
+        uses = Counter((v.file, v.size) for v in visuals if v.kind == "mesh")
         files = {(v.file, v.size): _file(model, v) for v in visuals if v.kind == "mesh"}
+        thinned = _thinned(tuple(files.values()), tuple(uses[key] for key in files))
         numbers: dict[tuple[str, tuple[float, ...]], list[tuple[int, Surface]]] = {}
-        for key, surfaces in zip(files, _thinned(tuple(files.values())), strict=True):
+        for key, surfaces in zip(files, thinned, strict=True):
             if surfaces is None:
                 self.missing.append(key[0])
             shown = [surface for surface in surfaces or () if len(surface.faces)]
@@ -221,8 +224,11 @@ def _file(model: RobotModel, visual: Shape) -> _File:
 
 
 @lru_cache(maxsize=4)  # thinning needs seconds, and a robot has many pages
-def _thinned(files: tuple[_File, ...]) -> tuple[list[Surface] | None, ...]:
-    """Return the scaled surfaces of each file, thinned for a page; None: not readable."""
+def _thinned(files: tuple[_File, ...], uses: tuple[int, ...]) -> tuple[list[Surface] | None, ...]:
+    """Return the scaled surfaces of each file, drawn so often, thinned for a page.
+
+    None: not readable.
+    """
     found: list[list[Surface] | None] = []
     for path, scale, _ in files:
         try:
@@ -231,7 +237,10 @@ def _thinned(files: tuple[_File, ...]) -> tuple[list[Surface] | None, ...]:
             read = ()
         scaled = [replace(s, vertices=s.vertices * np.array(scale)) for s in read]
         found.append(scaled or None)
-    thinned = thin([surfaces or [] for surfaces in found], _TRIANGLES)
+    sizes = [sum(len(s.faces) for s in surfaces or []) for surfaces in found]
+    drawn = sum(size * count for size, count in zip(sizes, uses, strict=True))
+    most = _TRIANGLES * sum(sizes) // max(drawn, 1)  # files of four equal legs count four times
+    thinned = thin([surfaces or [] for surfaces in found], most)
     return tuple(t if f else None for t, f in zip(thinned, found, strict=True))
 
 

@@ -25,7 +25,7 @@ class Simulator:
 class Estimator:
     rounds: int
 
-    def fit(self, simulator):
+    def minimise(self, simulator):
         raise DataRange(simulator, self.rounds)
 
 

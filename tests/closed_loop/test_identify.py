@@ -7,12 +7,14 @@ from helpers.mujoco_plant import held, multisine, plant, recorded
 from helpers.single_joint import slider
 
 from robotid.closed_loop.evaluation import position_metrics, run_open_loop
+from robotid.closed_loop.findings import loop_findings
 from robotid.closed_loop.fit import fit_loops, stated_loops
 from robotid.closed_loop.gain_check import gain_scale
 from robotid.closed_loop.identify import identify_loops, with_gravity
 from robotid.closed_loop.second_order import SecondOrder
 from robotid.closed_loop.settings import LoopSettings
 from robotid.closed_loop.term_choice import _Fold, _gains
+from robotid.commands.identify import save_result
 from robotid.estimators.output_error import OutputError
 from robotid.exceptions import DataError
 from robotid.export.entries import build_result
@@ -327,6 +329,22 @@ def test_a_slow_command_does_not_contradict_the_delay_that_was_found(found):
     assert f"{1e3 * worst:.2g} ms" in settled.message
 
 
+def test_a_delay_at_its_bound_leaves_the_warning_of_a_slow_command(found):
+    evidence = {"frequency": 2.0, "shortest": 0.0, "longest": 0.09}
+    slow = Finding("slow_command", "warning", "log", "any delay explains it", evidence)
+    delay = next(name for name in found.fit.estimate.names if name.endswith("delay"))
+    details = {**found.estimate.details, "at_bound": (delay,)}
+    fitted = replace(found.fit, estimate=replace(found.estimate, details=details))
+    bound = replace(found, fit=fitted)
+    named = {finding.code: finding for finding in loop_findings(bound, [slow])}
+    assert named["slow_command"].severity == "warning"
+    assert "any delay explains it. The delay of the fit is 0" in named["slow_command"].message
+    assert "the data do not determine it" in named["no_delay"].message
+    entries = build_result(bound, {"estimator": {"name": "simulation"}})["drive_parameters"]
+    sources = {e["source"] for e in entries if e["name"].endswith(".delay")}
+    assert "bound" in sources
+
+
 def test_friction_by_position_is_found_where_it_is_and_nowhere_else(leg):
     robot, rng = leg[0], np.random.default_rng(3)
     model, n = robot.model, 3
@@ -425,3 +443,9 @@ def test_what_whitening_leaves_correlated_widens_the_scale_of_gains(found):
     np.testing.assert_allclose(twice.error, 2.0 * plain.error)
     assert twice.common_error == pytest.approx(2.0 * plain.common_error)
     np.testing.assert_allclose(less.error, plain.error)
+
+
+def test_a_replay_of_logs_in_memory_is_refused(found, tmp_path):
+    with pytest.raises(DataError, match="the logs are in memory, and a replay of position-contr"):
+        save_result(found, tmp_path / "out", report=False, replay=True)
+    assert list((tmp_path / "out").iterdir()) == []

@@ -161,3 +161,8 @@ def test_the_usual_speed_of_a_joint_is_the_root_of_its_mean_square():
     seldom = Log(t[::2], q[::2], 0 * q[::2], ("a", "b"), q_ref=q[::2], has_torque=False)
     both = [*windows, *cut_windows(seldom, 0.5, 0.0)]  # each log has a rate of its own
     np.testing.assert_allclose(_speed(both), [rms, 0.5 * rms], rtol=0.02)
+
+
+def test_a_result_of_wrong_logs_has_no_urdf(found):
+    assert found.has_urdf
+    assert not replace(found, log_errors=("the command is delayed",)).has_urdf

@@ -3,6 +3,7 @@ from contextlib import redirect_stdout
 from io import StringIO
 
 import pytest
+from helpers.replay_data import shown
 
 from robotid.cli import main
 from robotid.cli.identify import show_result
@@ -30,6 +31,9 @@ lead = 0.3
 [controller]
 kp = 20.0
 kd = 1.5
+
+[output]
+replay = true
 
 [[identification]]
 log = "{log}"
@@ -68,6 +72,9 @@ def test_a_job_of_commands_writes_what_other_jobs_write(folder, result):
     named = {*result["outputs"].values(), "result.json"}
     assert {path.name for path in folder.iterdir()} == named
     assert {"report.html", "go2.identified.urdf", "go2.identified.drive.json"} <= named
+    data = shown((folder / "replay.html").read_text(encoding="utf-8"))
+    assert (data["log"], data["torques"]["labels"][1]) == ("chirp.parquet", "simulated")
+    assert 10.0 < data["start"] < 10.02  # the validation window
     assert result["joints"] == list(LEG)
     assert {"kind": "pd", "kp": 20.0, "kd": 1.5}.items() <= result["settings"]["controller"].items()
     assert [entry["role"] for entry in result["inputs"]] == ["urdf", "identification", "validation"]
@@ -134,6 +141,9 @@ def test_what_was_found_is_printed_with_its_values(folder, result, capsys, tmp_p
             assert entry["name"] not in lines
             continue
         value, error, *unit = lines[entry["name"]]
+        if entry["source"] == "bound":
+            assert " ".join([error, *unit]) == f"at bound {entry['unit']}"
+            continue
         assert value == f"{entry['value']:.4g}"
         assert error == f"{entry['std_error']:.2g}"
         assert " ".join(unit) == entry["unit"]

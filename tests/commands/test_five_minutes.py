@@ -57,7 +57,7 @@ def test_the_readme_alone_leads_to_a_verdict_in_four_commands_without_an_error(u
     result = user.result()
     assert result["verdict"]["status"] == "good"
     assert "motor_6.coulomb" in [entry["name"] for entry in result["drive_parameters"]]
-    assert (user.folder / "replay.html").is_file()
+    assert (user.folder / "result" / "replay.html").is_file()
 
 
 def test_errors_and_findings_alone_lead_to_it_in_three_commands_with_one_error(user):

@@ -42,7 +42,7 @@ def test_every_other_flag_states_its_key_too():
         *("--time-unit", "ms", "--angle-unit", "deg", "--topic", "/arm"),
         *("--command-topic", "/wanted", "--effort", "current", "--stamp", "log"),
         *("--rename", "b=2", "--rename", "a=one=1"),
-        *("--ignore", "late", "--ignore", "clipped", "--dynamics", "--no-report"),
+        *("--ignore", "late", "--ignore", "clipped", "--dynamics", "--no-report", "--replay"),
     ]
     found = job(identify, *words)
     assert [entry.path.name for entry in found.identification] == ["run.csv", "second.csv"]
@@ -58,7 +58,7 @@ def test_every_other_flag_states_its_key_too():
         "/arm", command="/wanted", joints={"b": "2", "a": "one=1"}, effort="current", stamp="log"
     )
     assert tuple(found.ignore) == ("late", "clipped")
-    assert (found.dynamics, found.report) == (True, False)
+    assert (found.dynamics, found.report, found.replay) == (True, False, True)
     usual = job(identify)
     assert (usual.joints, usual.locked, usual.gains) == (None, {}, {})
     assert (usual.dynamics, usual.report, usual.snap_angles) == (False, True, False)

@@ -1,5 +1,8 @@
 """What commands print, figure by figure: every value of a made-up content at its place and unit."""
 
+from argparse import Namespace
+from functools import partial
+
 import pytest
 
 from robotid.cli import (
@@ -47,7 +50,8 @@ def test_excite(shown):
         "payload": {"words": ["a word", "another"]},
     }  # fmt: skip
     assert shown(excite._show, content) == [
-        "arm: a motion of 4.5 s for 2 joints, condition number 123; 3 starts in 2.3 s, converged",
+        "arm: a motion of 4.5 s for 2 joints, condition number 123 (regressor, columns in units",
+        "of the prior); 3 starts in 2.3 s, converged",
         "designed for the parameters with the widest intervals: p1, p2",
         "",
         "smallest margin to each limit",
@@ -62,8 +66,8 @@ def test_excite(shown):
     ]
     other = content | {"starts": 1, "converged": False, "condition_number": None}
     assert shown(excite._show, other)[:2] == [
-        "arm: a motion of 4.5 s for 2 joints, condition number infinite; 1 start in 2.3 s, not",
-        "converged: increase --seconds",
+        "arm: a motion of 4.5 s for 2 joints, condition number infinite (regressor, columns in",
+        "units of the prior); 1 start in 2.3 s, not converged: increase --seconds",
     ]
 
 
@@ -273,8 +277,8 @@ def test_identify(shown):
     }  # fmt: skip
     assert shown(identify.show_result, content) == [
         "",
-        "arm: 2 joints, 12 base parameters (8 inertial), condition number 45.7, total mass 11.90",
-        "-> 10.23 kg",
+        "arm: 2 joints, 12 base parameters (8 inertial), condition number 45.7 (regressor, unit",
+        "columns), total mass 11.90 -> 10.23 kg",
         "",
         "fitted: fit.csv 0.5-9.75 s",
         "  joint    error   rmse         URDF +   WLS   URDF  gravity",
@@ -303,8 +307,8 @@ def test_identify(shown):
         "1 finding, 1 cause; worst: one, torque error 150.0 %; 1 note hidden (--verbose)",
         "",
         "verdict: poor",
-        "  one: good",
         "  slide: poor: worse",
+        "  one: good",
     ]
 
 
@@ -356,8 +360,8 @@ def test_validate(shown):
         "  * worse than a constant",
         "",
         "verdict: poor",
-        "  one: good",
         "  slide: poor: worse",
+        "  one: good",
     ]
 
 
@@ -371,14 +375,16 @@ def test_inspect(shown):
             {"code": "bare", "severity": "note", "joint": "two", "message": "two: no limits"},
         ],
     }  # fmt: skip
-    assert shown(inspect._show, content, is_verbose=False, with_base=False) == [
+    options = partial(Namespace, urdf="my arm.urdf", free_flyer=True)
+    assert shown(inspect._show, content, options=options(base=False, verbose=False)) == [
         "arm: 2 joints: one, two",
         "20 standard inertial parameters, 8 base; with drives 16",
         "warning: light: hand: 1 g",
         "1 finding, 1 cause; 1 note hidden (--verbose)",
-        "list of base parameters: --base",
+        "list of base parameters:",
+        "  robotid inspect 'my arm.urdf' --free-flyer --base",
     ]
-    assert shown(inspect._show, content, is_verbose=True, with_base=True) == [
+    assert shown(inspect._show, content, options=options(base=True, verbose=True)) == [
         "arm: 2 joints: one, two",
         "20 standard inertial parameters, 8 base; with drives 16",
         "warning: light: hand: 1 g",

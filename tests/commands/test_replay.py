@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.commanded_results import drive_entries, written_result
 from helpers.mujoco_plant import plant, recorded
@@ -16,7 +17,7 @@ from helpers.synthetic import exact_log, payload_log, truth
 
 from robotid.cli import main
 from robotid.commands.job import Job, LogEntry
-from robotid.commands.replay import _base_poses, read_findings
+from robotid.commands.replay import _base_poses, read_findings, replay_identified
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.logs.formats import write_columns
@@ -59,8 +60,15 @@ def test_a_log_alone_plays_with_its_torques(folder, capsys):
 
 def test_a_result_predicts_and_shows_masses_before_and_after(folder):
     _, data = run(folder, folder / "log.csv", folder / "out")
-    assert data["torques"]["labels"] == ["measured", "identified", "URDF"]
-    measured, predicted, _ = np.split(data["torques"]["values"], 3, axis=1)
+    assert data["torques"]["labels"] == ["measured", "identified", "URDF + drives", "URDF"]
+    measured, predicted, driven, _ = np.split(data["torques"]["values"], 4, axis=1)
+    assert np.array_equal(np.isnan(driven), np.isnan(predicted))
+    stated = json.loads((folder / "out" / "result.json").read_text())["identification"]["per_joint"]
+    for j, metrics in enumerate(stated.values()):
+        used = np.isfinite(driven[:, j])
+        error = np.linalg.norm((measured - driven)[used, j]) / np.linalg.norm(measured[used, j])
+        wanted = metrics["urdf_with_drives_relative_error_pct"]
+        assert 100 * error == pytest.approx(wanted, rel=0.02)
     known = np.isfinite(predicted)
     assert known.mean() > 0.8
     # the motion is exact and the fit explains it, but for what the filter takes
@@ -72,6 +80,64 @@ def test_a_result_predicts_and_shows_masses_before_and_after(folder):
     assert (before["label"], after["label"]) == ("URDF", "identified")
     for body in after["bodies"]:
         assert body["mass"] == pytest.approx(stated[f"{body['name']}.m"])
+
+
+def test_the_page_is_beside_the_first_result_unless_stated(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    log, out = str(folder / "log.csv"), folder / "out"
+    for words, page in (([str(out / "result.json")], out), ([], tmp_path)):
+        assert main(["replay", URDF, log, *words]) == 0
+        assert capsys.readouterr().err.startswith("written: ")
+        assert (page / "replay.html").is_file()
+        (page / "replay.html").unlink()
+
+
+def test_identify_writes_the_replay_that_its_report_links_to(tmp_path, capsys):
+    urdf, out = str(ROOT / "urdf" / "planar_2r.urdf"), tmp_path / "out"
+    model, rng = RobotModel.from_urdf(urdf), np.random.default_rng(0)
+    for name in ("log", "kept"):
+        log = exact_log(model, truth(model), rng, samples=300, rate=100.0)
+        write_log(log, tmp_path / f"{name}.csv")
+    words = [urdf, str(tmp_path / "log.csv"), "--validate", str(tmp_path / "kept.csv")]
+    words = ["identify", *words, "--estimator", "wls", "--friction", "none", "--out", str(out)]
+    assert main([*words, "--replay"]) == 0
+    assert f"  {out}/replay.html\n" in capsys.readouterr().out
+    data = shown((out / "replay.html").read_text(encoding="utf-8"))
+    assert data["log"] == "kept.csv"
+    assert data["torques"]["labels"] == ["measured", "identified", "URDF + drives", "URDF"]
+    report = (out / "report.html").read_text()
+    assert '<a href="replay.html">replay</a>' in report
+    assert 'href="replay.html#t=' in report
+    assert load_result(out).content["outputs"]["replay"] == "replay.html"
+    # the replay of an earlier result would be that of another robot
+    assert main(words) == 0
+    assert "/replay.html of an earlier run" in capsys.readouterr().err
+    assert not (out / "replay.html").exists()
+    assert 'href="#replay"' in (out / "report.html").read_text()
+
+
+def test_the_urdf_with_drives_is_rnea_and_drive_terms(identified):
+    data = shown(replay_identified(identified).html)
+    torques, (evaluation, *_) = data["torques"], identified.validation
+    assert torques["labels"] == ["measured", "identified", "URDF + drives", "URDF"]
+    assert data["log"] == Path(evaluation.recording.log.path).name
+    motion, model = evaluation.recording.trajectory, identified.model
+    pi = dict(zip(model.layout.names, identified.urdf_with_drives, strict=True))
+    real = np.isfinite(torques["values"][:, 0])  # without the row of a gap
+    values = torques["values"][real]
+    rows = np.abs(torques["t"][real, None] + motion.t[0] - motion.t).argmin(axis=1)
+    robot = pin.buildModelFromUrdf(str(model.tree.path))
+    of_pin = robot.createData()
+    bodies = [pin.rnea(robot, of_pin, motion.q[k], motion.v[k], motion.a[k]) for k in rows]
+    for j, joint in ((1, model.joints[1]), (4, model.joints[4])):
+        v, a = motion.v[rows, j], motion.a[rows, j]
+        drive = pi[f"{joint}.armature"] * a + pi[f"{joint}.viscous"] * v
+        drive += pi[f"{joint}.coulomb"] * motion.direction[rows, j] + pi[f"{joint}.offset"]
+        assert np.std(drive) > 0.1
+        found, used = values[:, 12 + j], evaluation.recording.mask[rows, j]
+        np.testing.assert_array_equal(np.isfinite(found), used)
+        wanted = (np.array(bodies)[:, j] + drive)[used]
+        np.testing.assert_allclose(found[used], wanted, atol=np.ptp(wanted) / 60_000)
 
 
 def test_masses_are_shown_of_a_result_whose_drives_have_more_terms(tmp_path):
@@ -102,14 +168,15 @@ def test_residuals_are_compared_to_those_of_the_identification(folder):
     assert scale["unit"] == "RMS noise"
     assert scale["of"] == [fitted[joint]["rmse"] for joint in result["joints"]]
     # the log is that of the identification: its residual is the noise
-    strip = np.where(data["torques"]["strip"] < 65_000, data["torques"]["strip"] / 100, np.nan)
+    codes = data["torques"]["strips"][0]
+    strip = np.where(codes < 65_000, codes / 100, np.nan)
     assert np.sqrt(np.nanmean(strip**2, axis=0)) == pytest.approx(np.ones(6), abs=0.15)
 
 
 def test_two_results_are_called_by_their_folders(folder):
     out = folder / "out" / "result.json"
     _, data = run(folder, folder / "log.csv", out, folder / "out")
-    assert data["torques"]["labels"] == ["measured", "out", "out 2", "URDF"]
+    assert data["torques"]["labels"] == ["measured", "out", "out 2", "URDF + drives", "URDF"]
     assert [m["label"] for m in data["masses"]] == ["URDF", "out", "out 2"]
 
 
@@ -146,7 +213,7 @@ def test_a_joint_that_stands_still_has_no_prediction(folder):
     rest = (torques["t"] > 16.0) & (torques["t"] < 17.0)
     assert np.isfinite(torques["values"][rest, :6]).all()
     assert np.isnan(torques["values"][rest, 6:12]).all()
-    strip = torques["strip"]  # of 18 s
+    strip = torques["strips"][0]  # of 18 s
     bins = len(strip)
     assert (strip[16 * bins // 18 + 1 : 17 * bins // 18] == 65_534).all()
     assert (strip[5 * bins // 18 : 10 * bins // 18] < 65_000).mean() > 0.8

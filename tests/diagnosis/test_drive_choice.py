@@ -24,7 +24,7 @@ from robotid.commands.job import job_from_settings
 from robotid.commands.logs import survey_logs
 from robotid.diagnosis import drive_choice
 from robotid.diagnosis.drive_choice import choose_drives
-from robotid.diagnosis.sample import Normal, take_sample
+from robotid.diagnosis.sample import Normal, Sample, Trials, take_sample
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.export.urdf import load_identified, write_urdf
 from robotid.fitting.bands import friction_curve
@@ -500,3 +500,133 @@ def test_identify_chooses_unless_told_otherwise(plain, cases):
     log = cases("load")[2]
     assert chosen(identify(plain, [log], signals=EXACT, doctor=False)) == {ELBOW: ("load",)}
     assert fitted_in(plain, [log], friction="viscous+coulomb").drives == ()
+
+
+def test_derivatives_of_terms_by_each_shape_follow_their_columns(rng):
+    """Of Stribeck and tanh, whose shapes differ, in a sample of one joint."""
+    n = 60
+    v, still, weight = 0.8 * rng.standard_normal(n), np.zeros(n), rng.uniform(0.5, 2.0, (n, 1))
+    motion = DriveMotion(still, v, still, np.sign(v), still, still)
+    ranges = {"v": (0.02, 2.0), "q": (-1.0, 1.0)}
+    W = weight[:, :, None] * rng.standard_normal((n, 1, 2))
+    families, sizes = [FAMILIES["stribeck"], FAMILIES["tanh"]], np.array([0.1, 0.6])
+
+    def columns(at):
+        return np.column_stack(
+            [term.column(motion) for family, x in zip(families, at, strict=True)
+             for term in family.make(ranges, x)]
+        )  # fmt: skip
+
+    Z = columns(sizes)
+    r = weight * (Z @ [[3.0], [-2.0]] + 0.1 * rng.standard_normal((n, 1)))
+    segments = tuple(slice(k, k + 10) for k in range(0, n, 10))
+    sample = Sample(
+        joints=("a",), is_prismatic=np.array([False]), motions=(), recordings=(), at=(), taken=(),
+        weight=weight, torque=np.ones(1), segments=segments, rows=n, W=W, r=r,
+        independent=np.arange(2), U=np.eye(2), normal=Normal.of(W, r, segments, 6),
+    )  # fmt: skip
+    drive = drive_choice._Drive(False, (motion,), (np.arange(n),), ranges, 9.0, {})
+    count, trial = drive_choice._with_slopes(sample, drive, families, sizes)
+    assert count == 2
+    X = np.concatenate([x for _, x in trial.rows])
+    np.testing.assert_allclose(X[:, :2], weight * Z)
+    theta = Trials(sample, Z[:, None], 1e-10).whole.parameters([0, 1])
+    for k in (0, 1):
+        h = 1e-6 * sizes * (np.arange(2) == k)
+        slope = (columns(sizes + h) - columns(sizes - h)) @ theta / (2 * h[k])
+        np.testing.assert_allclose(X[:, 2 + k], weight[:, 0] * slope, rtol=0.01, atol=5e-3)
+    assert (np.abs(X[:, 2:4]).max(axis=0) > 0.5).all()
+
+
+def test_shapes_are_at_a_bound_at_either_end_of_their_own_range(monkeypatch):
+    bounds = np.log([[0.01, 1.0], [0.1, 10.0], [1.0, 2.0], [0.5, 5.0]])
+    monkeypatch.setattr(drive_choice, "_log_bounds", lambda drive, families: bounds)
+    span = np.log(100.0)
+    sizes = [0.01 * np.exp(0.019 * span), 10.0 * np.exp(-0.021 * span)]
+    others = [2.0 * np.exp(-0.019 * np.log(2.0)), 5.0 * np.exp(-0.019 * np.log(10.0))]
+    found = drive_choice._at_bound(None, [("a", sizes), ("b", others)])
+    assert found.tolist() == [True, False, True, True]
+
+
+def test_a_candidate_counts_if_all_of_its_parameters_are_possible():
+    theta = {0: [1.0, 2.0], 1: [-1.0], 2: [3.0, 9.0], 3: [5.0, -4.0], 4: [0.5, 1.0, -8.0]}
+    place = [[0, 1], [2], [3, 4], [5, 6], [7]]
+    given = {}
+    trials = SimpleNamespace(
+        whole=SimpleNamespace(
+            parameters_each=lambda columns: {i: np.array(theta[i]) for i in columns}
+        ),
+        held_out=SimpleNamespace(left_each=lambda possible: given.update(possible) or possible),
+    )
+    positive = np.array([True, True, True, True, True, True, False, False])
+    highest = np.array([4.0, 4.0, 4.0, 4.0, 8.0, 6.0, 4.5, 7.0])
+    every = drive_choice._Options([], place, positive, highest, trials)
+    every.left_each({0: [], 1: [], 2: [], 3: [], 4: [0]})
+    # negative friction, beyond the largest torque; an offset may be negative
+    assert given == {0: [0, 1], 3: [5, 6]}
+    theta[4][2] = -6.9
+    given.clear()
+    every.left_each({4: [0]})
+    assert given == {4: [0, 1, 7]}
+
+
+def test_each_joint_is_given_its_own_drive_and_what_is_wanted_of_it(monkeypatch, rng):
+    """The second joint has no sample that is used, the fourth is to have nothing."""
+    names, n = ("a", "b", "c", "d"), 9
+    q, v, tau = rng.standard_normal((3, n, 4)) * [1.0, 50.0, 7.0, 2.0]
+    weight = np.ones((n, 4))
+    weight[:, 1] = 0.0
+    weight[2, 2] = 0.0
+    U = rng.standard_normal((3, 3))
+    sample = SimpleNamespace(
+        joints=names, weight=weight, taken=(np.arange(n),), is_prismatic=np.array([0, 0, 1, 0]),
+        recordings=[SimpleNamespace(trajectory=None)], at=[SimpleNamespace(tau=tau)], U=U,
+        of_joint=lambda j: ("of", j),
+    )  # fmt: skip
+    motion = SimpleNamespace(of=lambda j: SimpleNamespace(q=q[:, j], v=v[:, j]))
+    monkeypatch.setattr(drive_choice, "take_sample", lambda fit, for_drives: sample)
+    monkeypatch.setattr(drive_choice, "drive_motion_along", lambda model, trajectory: motion)
+    monkeypatch.setattr(drive_choice, "_auto", lambda *given: ("auto", *given))
+    monkeypatch.setattr(drive_choice, "_fixed", lambda *given: ("fixed", *given))
+    model = SimpleNamespace(free_flyer=False, with_reference=lambda pi: None)
+    mapping = SimpleNamespace(base_names=("c.viscous", "cc.viscous", "c.offset"))
+    fit = SimpleNamespace(model=model, mapping=mapping, standard=None)
+    wanted = {"a": None, "b": None, "c": ("load", "tanh"), "d": ()}
+    first, second = choose_drives(fit, wanted, {"a": "harmonics1", "c": "spring"})
+    assert (first[:2], first[3]) == (("auto", ("of", 0)), ["harmonics1"])
+    assert (second[:2], second[3]) == (("fixed", ("of", 2)), ("load", "tanh"))
+    for (_, _, drive, _), j in ((first, 0), (second, 2)):
+        used = weight[:, j] > 0
+        assert drive.largest == np.abs(tau[:, j]).max()
+        assert drive.is_prismatic is (j == 2)
+        speed = np.abs(v[used, j])
+        assert drive.data_range == {
+            "q": (q[used, j].min(), q[used, j].max()), "v": (speed.min(), speed.max()),
+        }  # fmt: skip
+    assert first[2].plain == {}
+    assert list(second[2].plain) == ["c.viscous", "c.offset"]
+    np.testing.assert_array_equal(second[2].plain["c.offset"], U[:, 2])
+
+
+def test_stated_families_are_sized_one_after_the_other_until_they_agree(monkeypatch):
+    """Of two families with three sizes each, whose best pair is found in the second pass."""
+    own = [(FAMILIES[name], [k]) for name in ("load", "tanh") for k in range(3)]
+    cost = np.array([[5.0, 9.0, 9.0], [9.0, 6.0, 4.0], [8.0, 9.0, 3.0]])
+
+    def left(chosen):
+        if not chosen:
+            return np.array([30.0, 20.0])
+        one, two = sorted(chosen)
+        return np.array([cost[one, two - 3] - 1.0, 1.0])
+
+    every = SimpleNamespace(own=own, left=left)
+    monkeypatch.setattr(drive_choice, "_candidates", lambda *_: own)
+    monkeypatch.setattr(drive_choice, "_Options", SimpleNamespace(of=lambda *_: every))
+    monkeypatch.setattr(drive_choice, "_found", lambda *given: given[2:])
+    sample = SimpleNamespace(torque=np.array([200.0]), joints=("a",))
+    chosen, (none, both) = drive_choice._fixed(sample, None, ("load", "tanh"))
+    assert [sizes for _, sizes in chosen] == [[2], [2]]
+    assert (none.families, none.is_selected, both.is_selected) == ((), False, True)
+    assert both.families == ("load", "tanh")
+    assert none.held_out_error_pct == pytest.approx(100 * np.sqrt(50.0 / 200.0))
+    assert both.held_out_error_pct == pytest.approx(100 * np.sqrt(3.0 / 200.0))

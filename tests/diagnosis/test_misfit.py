@@ -15,7 +15,7 @@ from helpers.paths import ROOT
 from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings, read_job
 from robotid.commands.logs import survey_logs
-from robotid.diagnosis import misfit
+from robotid.diagnosis import candidates, misfit
 from robotid.diagnosis.candidates import CANDIDATES
 from robotid.diagnosis.candidates import couplings as couplings_of
 from robotid.diagnosis.misfit import find_misfits
@@ -27,6 +27,7 @@ from robotid.diagnosis.misfit_findings import (
     with_entries,
 )
 from robotid.diagnosis.sample import RIDGE, Normal, Sample, Trials, take_sample
+from robotid.diagnosis.selection import p_value
 from robotid.doctor.diagnosis import check_logs
 from robotid.findings import Finding
 from robotid.fitting.joint_motion import JointMotion
@@ -40,7 +41,7 @@ from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.drives import Harmonic
-from robotid.robot.families import AUTO
+from robotid.robot.families import AUTO, drive_line
 from robotid.robot.model import RobotModel
 
 log_with = partial(helper.log_with, rate=50.0)  # [Hz]: the effects are slower than 10 Hz
@@ -486,3 +487,154 @@ def test_a_misfit_matters_by_its_part_of_the_torque_if_nothing_denies_it():
     assert replace(usual, confirmed=None).matters
     assert not replace(usual, confirmed=0.08).matters  # less than a quarter of the share
     assert not replace(usual, term=tanh).matters
+
+
+def test_windup_drift_and_ripples_have_the_columns_that_they_are_named_by(rng):
+    q, v, a, load, way, time = rng.standard_normal((6, 40)) * [
+        [3.0],
+        [2.0],
+        [1.0],
+        [9.0],
+        [0.5],
+        [1],
+    ]
+    way = np.abs(way)
+    motion = JointMotion(q, v, a, np.sign(v), load, way, time, passes=0.9)
+
+    def rms(x):
+        return np.sqrt(np.mean(x**2))
+
+    columns = {c.name: c.columns for c in CANDIDATES}
+    bent = [np.sign(v) * np.exp(-way / (x * rms(way))) for x in (0.02, 0.1)]
+    wanted = np.column_stack([*bent, np.tanh(load / (0.05 * rms(load)))])
+    np.testing.assert_allclose(columns["windup"](motion), wanted)
+    drift = time[:, None] * np.column_stack([np.sign(v), v, np.ones(40)])
+    np.testing.assert_allclose(columns["drift"](motion), drift)
+    np.testing.assert_array_equal(columns["coulomb"](motion)[:, 0], np.sign(v))
+    passed = 1 / (1 + (7 * np.abs(v) / (2 * np.pi * 0.9)) ** 8)
+    waves = passed[:, None] * np.column_stack([np.cos(7 * q), np.sin(7 * q)])
+    np.testing.assert_allclose(candidates._ripple(motion, 7), waves)
+    # of another motion that sets the scale
+    other = replace(motion, travelled=3.0 * way, load=5.0 * load)
+    scaled = columns["windup"](replace(motion, scale=other))
+    bent = [np.sign(v) * np.exp(-way / (x * 3 * rms(way))) for x in (0.02, 0.1)]
+    wanted = np.column_stack([*bent, np.tanh(load / (0.25 * rms(load)))])
+    np.testing.assert_allclose(scaled, wanted)
+
+
+def test_ripples_that_are_tried_explain_most_over_what_the_filter_lets_through(rng):
+    n = 2000
+    q, v = np.cumsum(rng.standard_normal(n)) * 0.05, rng.standard_normal(n) * 3.0
+    still = np.zeros(n)
+    motion = JointMotion(q, v, still, still, still, still, still, passes=20.0)
+    weight, r = rng.uniform(0.5, 2.0, n) * (rng.random(n) < 0.8), rng.standard_normal(n)
+    r += sum(0.4 * np.cos(k * q + k) for k in (9, 41, 230))
+    found = [int(c.name.split()[1]) for c in candidates.ripples(motion, weight, weight * r)]
+    explained = {}
+    for k in range(5, 241):
+        size = weight / (1 + (k * np.abs(v) / (2 * np.pi * 20.0)) ** 8)
+        explained[k] = np.abs(np.sum(weight * r * size * np.exp(1j * k * q))) ** 2 / (size @ size)
+    assert found == sorted(sorted(explained, key=explained.get)[-6:])
+    assert {9, 41} < set(found)
+
+
+def test_each_term_is_reported_with_what_it_adds_to_those_before(rng, monkeypatch):
+    """Two terms in eight segments of fitted logs, and two of validation, in which one is weaker."""
+    count, fitted = 200, 160
+    weight = rng.uniform(0.5, 2.0, (count, 2))
+    x, y = rng.standard_normal((2, count, 1)), rng.standard_normal((count, 2))
+    weak = np.where(np.arange(count) < fitted, 1.0, 0.3)
+    r = 0.3 * rng.standard_normal((count, 2))
+    r[:, 1] += x[1][:, 0] + weak * (0.8 * y[:, 0] - 0.5 * y[:, 1])
+    r *= weight
+    W = weight[:, :, None] * rng.standard_normal((count, 2, 3))
+    segments = tuple(slice(k, k + 20) for k in range(0, count, 20))
+    still = np.zeros(count)
+    sample = Sample(
+        joints=("a", "b"), is_prismatic=np.array([False, True]),
+        motions=(JointMotion(*7 * [still]),) * 2, recordings=(), at=(), taken=(), weight=weight,
+        torque=np.array([900.0, 1600.0]), segments=segments, rows=fitted, W=W, r=r,
+        independent=np.arange(3), U=np.eye(3), normal=Normal.of(W, r, segments, 8),
+    )  # fmt: skip
+    one = candidates.Candidate("one", "first", lambda m: x[1], "", units=("N m", "N"))
+    two = candidates.Candidate("two", "second", lambda m: y, "")
+    turning = candidates.Candidate("turn", "third", lambda m: r[:, [1]], "", revolute_only=True)
+    monkeypatch.setattr(misfit, "CANDIDATES", (two, turning, one))
+    monkeypatch.setattr(misfit, "couplings", lambda motion: ())
+    monkeypatch.setattr(misfit, "ripples", lambda *_: ())
+    first, second = misfit._of_joint(sample, 1)
+    trials = Trials(sample.of_joint(1), np.hstack([y, x[1]])[:, None])
+    left = [trials.held_out.left(which) for which in ([], [2], [2, 0, 1])]
+    whole = [trials.whole.left(which)[8:].sum() for which in ([], [2], [2, 0, 1])]
+    assert (first.term, second.term, first.joint) == (one, two, "b")
+    squares = left[0][:8].sum()
+    for k, found in enumerate((first, second)):
+        assert found.share == pytest.approx((left[k] - left[k + 1])[:8].sum() / squares)
+        assert found.p_value == pytest.approx(p_value(left[k], left[k + 1], 8))
+        assert found.confirmed == pytest.approx((whole[k] - whole[k + 1]) / whole[0])
+        assert found.error == pytest.approx(np.sqrt(squares / 1600.0))
+    assert second.confirmed < 0.6 * second.share
+    theta, C = trials.whole.estimate([2], 8)
+    assert (first.size, first.std_error, first.unit) == (
+        pytest.approx(theta[0]), pytest.approx(np.sqrt(C[0, 0])), "N",
+    )  # fmt: skip
+    np.testing.assert_allclose(first.theta, theta)
+    np.testing.assert_allclose(first.shift, -trials.whole.T[:, 2] * theta[0])
+    theta = trials.whole.parameters([2, 0, 1])[1:]
+    np.testing.assert_allclose(second.theta, theta)
+    np.testing.assert_allclose(second.shift, -trials.whole.T[:, :2] @ theta)
+    assert second.unit == "N rms"
+
+
+def test_entries_keep_other_families_and_a_term_replaces_all_that_it_explains():
+    own = (Harmonic(order=3.0), Harmonic(order=8.0))
+    drives = [
+        SimpleNamespace(joint="a", families=("load",), terms=()),
+        SimpleNamespace(joint="b", families=("harmonics1", "load"), terms=own[:1]),
+    ]
+    layout = SimpleNamespace(own={"b": own})
+    fit = SimpleNamespace(drives=drives, model=SimpleNamespace(layout=layout))
+    assert with_entries(fit, "b", ["harmonics4"]) == drive_line("b", own[1], "load", "harmonics4")
+    assert with_entries(fit, "b", ["spring"]) == (
+        drive_line("b", own[1], "harmonics1", "load", "spring")
+    )
+    assert with_entries(fit, "c", ["spring"]) == drive_line("c", "spring")
+    before = [
+        Finding("counterbalance", "warning", "run: b", "x", {}),
+        Finding("urdf_mismatch", "warning", "run", "x", {}),
+        Finding("unexplained_torque", "warning", "run: c", "x", {}),
+    ]
+    spring = Finding("spring", "note", "b", "a spring", {"share_pct": 51.0})
+    small = replace(spring, evidence={"share_pct": 49.0})
+    other, (_, found) = settled(before, [small, spring])[:1], settled(before, [small, spring])[1:]
+    assert other == before[2:]
+    assert (found.severity, found.evidence) == ("warning", {"share_pct": 51.0, "replaces": 2.0})
+    assert found.message.endswith(
+        "It explains counterbalance, urdf_mismatch and may bias the masses"
+    )
+    load = Finding("load_friction", "note", "c", "load", {"share_pct": 60.0})
+    *rest, last = settled(before, [load])
+    assert rest == before[:2]
+    assert last.evidence["replaces"] == 1.0
+
+
+def test_a_misfit_is_reported_with_the_intervals_of_its_own_joint():
+    still = np.zeros(3)
+    (load,) = (c for c in CANDIDATES if c.name == "load")
+    found = misfit.Misfit(
+        "b", load, 0.36, 1e-9, -0.2, 0.125, 0.01, "N m per N m", 0.04, still, still,
+        JointMotion(*7 * [still]),
+    )  # fmt: skip
+    fit = SimpleNamespace()
+    names = ["a.viscous", "b.coulomb", "bb.offset", "b.viscous"]
+    (reported,) = misfit_findings(fit, [found], names)
+    assert "; the intervals of b.coulomb, b.viscous include this misfit" in reported.message
+    assert (
+        "b: " + load.meaning + ": 0.125 +- 0.01 N m per N m. It would explain 36 % of"
+        in reported.message
+    )
+    assert "(0 % on the validation logs); the residual is 4.0 % of the torque" in reported.message
+    assert reported.evidence == pytest.approx({
+        "share_pct": 36, "error_pct": 4, "size": 0.125, "std_error": 0.01, "p_value": 1e-9,
+        "validation_share_pct": -20,
+    })  # fmt: skip

@@ -5,6 +5,7 @@ without load, whether the model that is fitted knows of load friction or not.
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,9 +17,10 @@ from robotid.diagnosis.misfit import find_misfits
 from robotid.diagnosis.model_error import settled_shapes, with_model_error
 from robotid.diagnosis.sample import take_sample
 from robotid.fitting.bands import expected_band, friction_curve
+from robotid.fitting.drives import DriveChoice, FoundShape
 from robotid.fitting.open_terms import open_torques
 from robotid.regressor.torque import trajectory_regressor
-from robotid.robot.drives import LoadFriction, Stribeck
+from robotid.robot.drives import DriveMotion, LoadFriction, Stribeck, Tanh
 
 QUANTILE = 1.5
 PLAIN = "viscous+coulomb"
@@ -240,3 +242,140 @@ def test_a_clean_robot_has_the_errors_of_its_noise(plain):
     assert find_misfits(take_sample(found)) == found.misfits == ()
     np.testing.assert_allclose(found.base_error, found.wls.std_error)
     assert choose_drives(found, dict.fromkeys(found.model.joints, ())) == ()
+
+
+def two_shapes():
+    """Return a fit of two joints, the second of which has two terms with a shape each."""
+    ranges = {"v": (0.02, 2.0), "q": (-1.0, 1.0)}
+    terms = (Stribeck(data_range=ranges["v"], speed=0.2), Tanh(data_range=ranges["v"], speed=0.7))
+    shapes = tuple(FoundShape(n, x, 0.1, "", False) for n, x in (("s", 0.2), ("t", 0.7)))
+    choice = DriveChoice(
+        "b", ("stribeck", "tanh"), terms, shapes=shapes, sizes=((0.2,), (0.7,)), data_range=ranges,
+        shape_covariance=((0.04, 0.03), (0.03, 0.09)),
+    )  # fmt: skip
+    names = ("b.stribeck", "a.stribeck", "a.tanh", "b.tanh")
+    layout = SimpleNamespace(names=names)
+    standard = np.array([3.0, 70.0, 90.0, -2.0])
+    return SimpleNamespace(model=SimpleNamespace(layout=layout), standard=standard), choice, ranges
+
+
+def test_a_torque_changes_with_each_shape_as_differences_do(rng):
+    found, choice, ranges = two_shapes()
+    v = 2.0 * rng.standard_normal(30)
+    motion = DriveMotion(*[np.zeros(30)] * 1, v, np.zeros(30), np.sign(v), *[np.zeros(30)] * 2)
+    step = 1e-6
+
+    def torque(k, sign):
+        sizes = np.array([0.2, 0.7])
+        sizes[k] += sign * step
+        own = (
+            Stribeck(data_range=ranges["v"], speed=sizes[0]),
+            Tanh(data_range=ranges["v"], speed=sizes[1]),
+        )
+        return sum(x * t.column(motion) for x, t in zip((3.0, -2.0), own, strict=True))
+
+    slopes = [(torque(k, 1) - torque(k, -1)) / (2 * step) for k in (0, 1)]
+    for k in (0, 1):
+        slope = model_error.shape_slope(found, choice, k, motion)
+        np.testing.assert_allclose(slope, slopes[k], rtol=0.01, atol=1e-3)
+    change = model_error._shape_change(found, choice, np.array([0.5, -2.0]), motion, None)
+    np.testing.assert_allclose(change, 0.5 * slopes[0] - 2.0 * slopes[1], rtol=0.02, atol=3e-3)
+
+
+def test_uncertain_shapes_are_directions_of_their_covariance(rng, monkeypatch):
+    found, choice, _ = two_shapes()
+    T = rng.standard_normal((5, 3))  # the last column is of the residual
+    monkeypatch.setattr(model_error, "_shape_trial", lambda *_: SimpleNamespace(T=T))
+    found.drives = (DriveChoice("a", (), ()), choice)
+    moves = list(model_error._of_shapes(found, None, []))
+    assert [move.joint for move in moves] == ["b", "b"]
+    X = np.array([move.shift for move in moves])
+    C = T[:, :2] @ np.array(choice.shape_covariance) @ T[:, :2].T
+    np.testing.assert_allclose(X.T @ X, C, atol=1e-12)
+    axes = np.array([move.torque.args[2] for move in moves])
+    np.testing.assert_allclose(axes.T @ axes, choice.shape_covariance, atol=1e-12)
+    np.testing.assert_allclose(X, -(axes @ T[:, :2].T))
+
+
+def test_terms_that_were_nearly_selected_move_parameters_together(rng, monkeypatch):
+    undecided = (Stribeck(speed=0.3), Tanh(speed=0.4))
+    choices = (DriveChoice("a", (), ()), DriveChoice("b", (), (), undecided=undecided))
+    v = rng.standard_normal((2, 12))
+    still = np.zeros(12)
+
+    def of(speed):
+        return DriveMotion(still, speed, still, np.sign(speed), still, still)
+
+    motions = [SimpleNamespace(of=lambda j, x=x: of(x) if j == 1 else None) for x in v]
+    taken = (np.array([0, 5, 7]), np.array([2, 11]))
+    sample = SimpleNamespace(joints=("a", "b"), taken=taken, of_joint=lambda j: ("of", j))
+    T, theta, given = rng.standard_normal((4, 3)), np.array([1.5, -0.25]), []
+
+    def trials(*arguments):
+        given.append(arguments)
+        return SimpleNamespace(whole=SimpleNamespace(T=T, parameters=lambda which: theta[which]))
+
+    monkeypatch.setattr(model_error, "Trials", trials)
+    (move,) = model_error._of_undecided(SimpleNamespace(drives=choices), sample, motions)
+    ((own, Z),) = given
+    assert own == ("of", 1)
+    speed = np.concatenate([x[k] for x, k in zip(v, taken, strict=True)])
+    columns = np.column_stack([term.column(of(speed)) for term in undecided])
+    np.testing.assert_allclose(Z[:, 0], columns)
+    assert move.joint == "b"
+    np.testing.assert_allclose(move.shift, -T[:, :2] @ theta)
+    wanted = 1.5 * undecided[0].column(of(v[0])) - 0.25 * undecided[1].column(of(v[0]))
+    np.testing.assert_allclose(move.torque(of(v[0]), None), wanted)
+
+
+@pytest.mark.parametrize(("shares", "is_settled"), [((0.3, 0.1), False), ((0.19, 0.1), True)])
+def test_shapes_of_every_joint_must_settle(monkeypatch, shares, is_settled):
+    _, choice, _ = two_shapes()
+    choices = [replace(choice, joint="a"), DriveChoice("c", (), ()), choice]
+    steps = {"a": shares[0], "b": shares[1]}
+    error = 0.01
+
+    def trial(found, choice, *_):
+        step = error * np.array([steps[choice.joint], -0.05])
+        return SimpleNamespace(estimate=lambda which, fitted: (step, error**2 * np.eye(2)))
+
+    monkeypatch.setattr(model_error, "take_sample", lambda *_, **__: SimpleNamespace(fitted=6))
+    monkeypatch.setattr(model_error, "_motions", lambda *_: [])
+    monkeypatch.setattr(model_error, "_shape_trial", trial)
+    moved = settled_shapes(SimpleNamespace(drives=choices))
+    assert (moved is None) is is_settled
+    if moved:
+        first, same, last = moved
+        assert same is choices[1]
+        for found, share in ((first, shares[0]), (last, shares[1])):
+            values = [shape.value for shape in found.shapes]
+            assert values == pytest.approx([0.2 + error * share, 0.7 - 0.05 * error])
+
+
+def test_drive_parameters_whose_error_grows_by_a_third_are_named(monkeypatch):
+    """Not those of bodies, nor one without an error before."""
+    before = SimpleNamespace(
+        drives=(), standard_error=np.array([1.0, 1.0, 2.0, 3.0, np.inf, 2.0]),
+        model=SimpleNamespace(layout=SimpleNamespace(n_inertial=2)),
+        mapping=SimpleNamespace(names=tuple("abcdef")),
+    )  # fmt: skip
+    after = SimpleNamespace(standard_error=np.array([9.0, 1.0, 2.5, 4.0, np.inf, 9.0]))
+    given = []
+
+    def wider(found, sample, moves):
+        given.append(list(moves))
+        return after if len(given) == 3 else before
+
+    monkeypatch.setattr(model_error, "_wider", wider)
+    monkeypatch.setattr(model_error, "_of_misfit", lambda misfit: f"move of {misfit}")
+    found, names = with_model_error(before, "sample", ["x", "y"])
+    assert given == [[], [], ["move of x", "move of y"]]
+    assert (found is after, names) == (True, ("d", "f"))
+
+
+def test_a_fixed_parameter_moves_a_millionth_of_the_smallest_spread():
+    given = []
+    mapping = SimpleNamespace(gain=lambda spread: given.append(spread) or "gain")
+    found = SimpleNamespace(prior_std=np.array([0.0, 2e-3, 5.0]), mapping=mapping)
+    assert model_error._gain(found) == "gain"
+    np.testing.assert_allclose(given, [[2e-9, 2e-3, 5.0]])

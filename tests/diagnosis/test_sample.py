@@ -13,9 +13,11 @@ from robotid.diagnosis.sample import (
     _segments,
     _spread_rows,
     _typical_size,
+    take_sample,
 )
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.torque import joint_torque_regressor
 
 N, JOINTS, BASE, FITTED, STRETCHES = 90, 2, 3, 7, 9
 
@@ -159,3 +161,67 @@ def test_the_typical_size_is_the_median_of_the_rows_used():
     r = np.array([[1.0, -5.0], [-2.0, 1.0], [9.0, 1.0], [4.0, 2.0]])
     used = np.array([[True, False], [True, False], [False, False], [True, False]])
     assert _typical_size(r, used).tolist() == [2.0, np.inf]
+
+
+def test_samples_are_weighted_by_the_residual_of_fitted_rows_joint_by_joint(identified):
+    """Against the dense regressor of all recordings."""
+    found = take_sample(identified)
+    model, mapping = identified.model, identified.mapping
+    every = [*identified.fitted, *[e for e in identified.validation if not e.is_refitted]]
+    Y, tau, used = [], [], []
+    for e, k in zip(every, found.taken, strict=True):
+        m = e.recording.trajectory.at(k)
+        Y.append(joint_torque_regressor(model, m.q, m.v, m.a, m.direction).reshape(len(k), 6, -1))
+        tau.append(m.tau)
+        used.append(e.recording.mask[k] & _is_steady(e.recording)[k])
+    fitted = sum(len(k) for k in found.taken[: len(identified.fitted)])
+    Y, tau, used = np.concatenate(Y), np.concatenate(tau), np.concatenate(used)
+    assert (found.rows, found.fitted) == (fitted, sum(s.stop <= fitted for s in found.segments))
+    r = tau - Y @ identified.standard
+    for j in range(6):
+        own = np.abs(r[:fitted, j])[used[:fitted, j]]
+        used[:, j] &= np.abs(r[:, j]) <= 12 * np.median(own)
+    independent = found.weight.max(axis=0)
+    size = np.sqrt([np.mean(r[:fitted, j][used[:fitted, j]] ** 2) for j in range(6)])
+    share = (independent * size)[0]
+    np.testing.assert_allclose(found.weight, used * share / size, rtol=1e-6)
+    shares = [
+        min(1.0, min(1.0, 2 * e.recording.signals.cutoff / e.recording.trajectory.rate)
+            * (k[1] - k[0]))
+        for e, k in zip(every, found.taken, strict=True)
+    ]  # fmt: skip
+    assert share**2 == pytest.approx(min(shares), rel=1e-6)
+    np.testing.assert_allclose(found.r, found.weight * r, atol=1e-9)
+    squares = np.sum((found.weight * tau)[:fitted] ** 2, axis=0)
+    np.testing.assert_allclose(found.torque, squares)
+    C = mapping.K @ np.diag(identified.prior_std**2) @ mapping.K.T
+    np.testing.assert_allclose(found.U.T @ found.U, C, atol=1e-9 * C.max())
+    W = found.weight[:, :, None] * (Y[:, :, mapping.independent] @ found.U.T)
+    np.testing.assert_allclose(found.W, W, atol=1e-8 * np.abs(W).max())
+    n = model.layout.n_inertial
+    load = Y[:, :, :n] @ identified.standard[:n]
+    np.testing.assert_allclose([m.load for m in found.motions], load.T, atol=1e-8)
+    alone = take_sample(identified, for_drives=True)
+    assert alone.rows == len(alone.r) == fitted
+
+
+def test_columns_beside_are_each_as_free_as_what_is_left(sample, rng):
+    Z = rng.standard_normal((N, JOINTS, 3)) * [1.0, 30.0, 0.0]
+    found = sample.with_columns(Z)
+    columns = sample.weight[:, :, None] * Z
+    for c in (0, 1):
+        free = 1e3 * np.sqrt(np.sum(sample.r**2) / np.sum(columns[:, :, c] ** 2))
+        np.testing.assert_allclose(found.W[:, :, BASE + c], free * columns[:, :, c])
+    assert not found.W[:, :, BASE + 2].any()
+    np.testing.assert_array_equal(found.W[:, :, :BASE], sample.W)
+    own, joined = found.of_joint(1), found.joined()
+    np.testing.assert_array_equal(own.W[:, 0], found.W[:, 1])
+    assert (own.joints, own.torque.tolist()) == (("b",), [1.0])
+    np.testing.assert_array_equal(own.normal.A, found.normal.A)
+    np.testing.assert_allclose(joined.normal.A, [found.normal.A[:FITTED].sum(axis=0)])
+    np.testing.assert_allclose(joined.normal.B, [found.normal.B[:FITTED].sum(axis=0)])
+    assert (joined.fitted, joined.segments) == (1, (slice(10 * FITTED),))
+    np.testing.assert_array_equal(joined.r, found.r[: 10 * FITTED])
+    twice = own.reweighted(3.0)
+    np.testing.assert_allclose(twice.torque, 9 * own.torque)
+    np.testing.assert_allclose(twice.normal.A, own.normal.A + 8 * own.own.A)

@@ -12,6 +12,8 @@ from helpers.misfits import coloured
 from helpers.synthetic import truth
 from scipy.signal import butter, sosfiltfilt
 
+from robotid.diagnosis import torque_split
+from robotid.diagnosis.dependence import even_bins, follow
 from robotid.diagnosis.torque_split import (
     JointTorque,
     Rows,
@@ -343,3 +345,103 @@ def test_what_is_forgotten_is_one_less_the_autocorrelation_of_all_recordings(rng
     *found, still = _broadband_shares(evaluations)
     np.testing.assert_allclose(found, 1.0 - shares[0, :2] / shares[1, :2])
     assert still is None
+
+
+def test_samples_of_two_recordings_are_cut_together_into_segments_of_ten(rng):
+    def evaluation(name, count, rate, cutoff, start):
+        t = start + np.arange(count) / rate
+        trajectory = SimpleNamespace(t=t, segment=(np.arange(count) > count // 3).astype(int))
+        signals = SignalSettings(cutoff=cutoff, rate=rate)
+        recording = SimpleNamespace(name=name, trajectory=trajectory, signals=signals)
+        return SimpleNamespace(recording=recording)
+
+    own = [
+        (evaluation("a", 400, 100.0, 10.0, 3.0), np.arange(0, 400, 5)),
+        (evaluation("b", 300, 50.0, 5.0, 9.0), np.arange(0, 300, 2)),
+    ]
+    found = torque_split._rows(own)
+    # a fifth of either is independent: 80 of the first and 60 of the second, ten each
+    assert found.segments.tolist() == [14 * k // 230 for k in range(230)]
+    assert found.recordings == ("a", "b")
+    assert found.recording.tolist() == [0] * 80 + [1] * 150
+    t, segment = (
+        np.concatenate([getattr(e.recording.trajectory, x)[k] for e, k in own])
+        for x in ("t", "segment")
+    )
+    np.testing.assert_array_equal(found.t, t)
+    np.testing.assert_array_equal(found.segment, segment)
+    assert torque_split._rows([(own[1][0], np.arange(55))]).segments is None
+
+
+def test_a_residual_is_examined_without_outliers_of_the_samples_used(rng):
+    v, q, load = motion(rng)
+    found = torque(0.5 * np.tanh(v) + 0.1 * rng.standard_normal(len(v)), v, q, load)
+    used = np.arange(len(v)) % 4 != 1
+    parts = {"friction": found.parts["friction"] + np.where(used, 0.0, 1e4)}
+    tau = found.tau + np.where(np.arange(len(v)) % 400 == 0, 40.0, 0.0)
+    spoilt = replace(found, used=used, parts=parts, tau=tau)
+    r = spoilt.residual
+    counted = used & (np.abs(r) <= 12 * np.median(np.abs(r[used])))
+    assert (used & ~counted).sum() == 10
+    segments = spoilt.rows.segments[counted]
+    (speed,) = (d for d in spoilt.follows if d.name == "speed")
+    wanted = follow("speed", "", v[counted], r[counted], even_bins(v[counted]), segments)
+    np.testing.assert_allclose(speed.means, wanted.means)
+    np.testing.assert_allclose(speed.centres, wanted.centres)
+    assert (speed.share, speed.p_value) == (wanted.share, wanted.p_value)
+    rms = spoilt.rms
+    assert rms["measured"] == pytest.approx(np.sqrt(np.mean(tau[used] ** 2)))
+    assert rms["residual"] == pytest.approx(np.sqrt(np.mean(r[used] ** 2)))
+    np.testing.assert_allclose(spoilt.power, tau * v)
+
+
+def test_only_what_fitted_recordings_could_have_shown_has_changed(rng):
+    found = torque(np.zeros(800), *motion(rng, 800))
+    parts = {
+        "significant": ("speed", 0.5, True), "none": ("speed", 0.0, False),
+        "short": ("speed", None, False), "other": ("position", 0.0, False),
+    }  # fmt: skip
+    changed = {}
+    for key, (name, share, is_significant) in parts.items():
+        before = SimpleNamespace(
+            follows=(SimpleNamespace(name=name, share=share, is_significant=is_significant),)
+        )
+        changed[key] = replace(found, fitted=before)._has_changed("speed")
+    assert changed == {"significant": False, "none": True, "short": False, "other": False}
+
+
+def test_samples_of_all_recordings_together_are_at_most_so_many(identified, monkeypatch):
+    """A half of them of each of two fitted logs, whose parts follow each other."""
+    monkeypatch.setattr(torque_split, "_ROWS", 90)
+    found = torque_split._torques_of(identified, identified.fitted)
+    assert [torque.joint for torque in found] == list(identified.model.joints)
+    taken = []
+    for e in identified.fitted:
+        count = len(e.recording.trajectory.t)
+        taken.append(np.linspace(0, count - 1, 45).round().astype(int))
+    for j, torque in enumerate(found):
+        for name, own in (
+            (
+                "tau",
+                [
+                    e.recording.trajectory.tau[k, j]
+                    for e, k in zip(identified.fitted, taken, strict=True)
+                ],
+            ),
+            (
+                "used",
+                [e.recording.mask[k, j] for e, k in zip(identified.fitted, taken, strict=True)],
+            ),
+        ):
+            np.testing.assert_array_equal(getattr(torque, name), np.concatenate(own))
+        whole = np.concatenate(
+            [e.torques["estimate"][k, j] for e, k in zip(identified.fitted, taken, strict=True)]
+        )
+        np.testing.assert_allclose(sum(torque.parts.values()), whole, atol=1e-8)
+        for part, terms in torque.terms.items():
+            np.testing.assert_allclose(sum(terms.values()), torque.parts[part], atol=1e-9)
+        speed = [
+            e.recording.trajectory.v[k, j] for e, k in zip(identified.fitted, taken, strict=True)
+        ]
+        assert torque.quantities["speed"][0] == "rad/s"
+        np.testing.assert_array_equal(torque.quantities["speed"][1], np.concatenate(speed))

@@ -287,7 +287,7 @@ def test_what_is_in_the_file_is_examined(ur5, tmp_path):
         assert (read.q_ref is None) == (needed == "torque")
     half = dict(list(table.items())[:9])  # two joints have a command, none a torque
     write_columns(half, tmp_path / "half.parquet")
-    with pytest.raises(DataError, match=r"no commanded positions of elbow_joint, wrist_1"):
+    with pytest.raises(DataError, match=r"no columns 'qref_elbow_joint', 'qref_wrist_1_joint'"):
         read_log(tmp_path / "half.parquet", log.joints, needs="any")
     with pytest.raises(DataError, match="has no torque"):
         check_logs(ur5, replace(log, q_ref=None))
@@ -308,7 +308,7 @@ def test_loads_of_a_servo_arm_mapped_to_torques_are_an_error():
     names = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
     path = DATA / "commands" / "so101" / "multisine.parquet"
     source = LogSource(joints=dict(zip(model.joints, names, strict=True)))
-    with pytest.raises(DataError, match=r"no column 'tau_Rotation'.* Its commands are enough"):
+    with pytest.raises(DataError, match=r"no columns 'tau_Rotation'.* Its commands are enough"):
         read_log(path, model.joints, source=source)
     loads = {
         f"tau_{joint}": f"loadsize_{name}" for joint, name in zip(model.joints, names, strict=True)

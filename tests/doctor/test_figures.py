@@ -8,7 +8,15 @@ import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.doctor import hypotheses
+from robotid.doctor import (
+    channels,
+    command_channels,
+    hypotheses,
+    loads,
+    mounted,
+    urdf_base,
+    urdf_geometry,
+)
 from robotid.doctor.channels import check_channels
 from robotid.doctor.clock import check_clock
 from robotid.doctor.command_channels import _held, _Loop
@@ -203,3 +211,227 @@ def test_what_a_motion_determines_is_the_same_of_its_halves():
     assert cut.evidence == pytest.approx(whole.evidence, rel=1e-9)
     assert cut.message == whole.message
     assert 0 < whole.evidence["weakest"] < 1
+
+
+def test_quantised_channels_are_reported_with_each_joint_s_own_steps():
+    t, rng = 3.0 + np.arange(2000) / 100, np.random.default_rng(0)
+    steps, sizes = (0.5, 0.25, 0.01, 0.005), (4.0, 3.5, 3.0, 2.0)
+    tau = np.column_stack(
+        [
+            np.round(size * np.sin(2 * t + size) / h) * h
+            for h, size in zip(steps, sizes, strict=True)
+        ]
+        + [rng.standard_normal(2000)]
+    )
+    log = SimpleNamespace(name="run.csv", joints=tuple("abcde"))
+    few, many = channels._quantisation(log, "tau", tau, "auto")
+    count = [np.ptp(x) / h for x, h in zip(tau.T, steps, strict=False)]
+    assert few.evidence == pytest.approx({"steps_a": count[0], "steps_b": count[1]})
+    assert many.evidence == pytest.approx({"steps_c": count[2], "steps_d": count[3]})
+    assert (few.severity, many.severity) == ("warning", "note")
+    assert f"tau of a, b is quantised in steps of 0.5, {count[0]:.0f} steps" in few.message
+    assert f"tau of c, d is quantised in steps of 0.01, {count[2]:.0f} steps" in many.message
+    (unused,) = channels._quantisation(log, "dq", tau[:, :2], "differentiated")
+    assert unused.severity == "note"
+
+
+@pytest.mark.parametrize("stated", [0.0, 0.004])
+def test_the_error_of_a_delay_is_of_the_joints_that_have_one(monkeypatch, stated):
+    lags = np.array([0.011, 0.0, 0.014, 0.0125])
+    monkeypatch.setattr(channels, "velocity_lags", lambda log: (0.012, lags))
+    (found,) = channels._velocity_delay(log_of(), stated)
+    error = 1.48 * 0.001 / np.sqrt(3)
+    assert found.evidence == pytest.approx({"delay": 0.012 - stated, "std_error": error})
+    reported = f"a delay of {12 - 1e3 * stated:.1f} +- {1e3 * error:.1f} ms"
+    assert reported in found.message
+    assert found.message.endswith("or set [signals] velocity_delay = 0.0120")
+
+
+def test_a_torque_is_clipped_at_either_limit_and_held_by_groups():
+    t = 3.0 + np.arange(2000) / 100
+    q = np.column_stack([np.sin(2 * t), np.cos(t), np.sin(t), np.cos(3 * t)])
+    tau = 5.0 * q
+    tau[:, 0] = np.clip(tau[:, 0], -4.0, 3.0)
+    k = np.arange(2000)
+    tau[:, 1], tau[:, 2], tau[:, 3] = tau[k // 4 * 4, 1], tau[k // 7 * 7, 2], tau[k // 4 * 4, 3]
+    log = replace(log_of(), joints=tuple("abcd"), q=q, tau=tau)
+    found = list(check_torque_channels(log))
+    clipped = [f for f in found if f.code == "clipped" and f.where == "run.csv: a"]
+    for finding, limit in zip(clipped, (3.0, -4.0), strict=True):
+        share = np.mean(tau[:-1, 0] == limit) * 1999 / 2000
+        assert finding.evidence == pytest.approx({"limit": limit, "share": share})
+        assert f"at its limit {limit:g} in {100 * share:.3g} % of the rows" in finding.message
+    repeated = {f.where: f.evidence for f in found if f.code == "repeated_torque"}
+    assert repeated == {
+        "run.csv: b, d": pytest.approx({"rows": 4.0, "delay": 0.015}),
+        "run.csv: c": pytest.approx({"rows": 7.0, "delay": 0.03}),
+    }
+
+
+def test_proportional_commands_are_alike_in_their_changes_too():
+    """Of a chain of three the least of the largest correlations; a trend alone is none."""
+    t, rng = np.arange(3000) / 100, np.random.default_rng(2)
+    base = np.sin(1.3 * t) + 0.3 * np.sin(3.7 * t)
+    slow = [0.08 * np.sin(5 * t + k) for k in range(2)]
+    commands = [base, base + slow[0], base + slow[0] + 1.2 * slow[1], t + 0.3 * rng.random(3000),
+                t + 0.3 * rng.random(3000)]  # fmt: skip
+    loops = [
+        SimpleNamespace(name=name, command=own, step=0.01)
+        for name, own in zip("abcde", commands, strict=True)
+    ]
+    (found,) = command_channels._alike(log_of(), loops)
+    x = np.column_stack(commands[:3])
+    same = np.minimum(np.abs(np.corrcoef(x.T)), np.abs(np.corrcoef((x[10:] - x[:-10]).T)))
+    assert same[0, 2] < 0.95 < same[1, 2] < same[0, 1]
+    assert found.evidence == pytest.approx({"correlation": same[1, 2], "joints": 3.0})
+    assert found.where == "run.csv: a, b, c"
+    assert f"(correlation {same[1, 2]:.3f} or more)" in found.message
+
+
+def test_slow_commands_are_reported_with_the_widest_range_and_the_fastest_frequency():
+    def loop(name, f, delays, lag=0.3, bandwidth=np.nan):
+        return SimpleNamespace(
+            name=name, response=(np.array(f), None, None), delays=delays, lag=(lag, 0.0),
+            bandwidth=bandwidth,
+        )  # fmt: skip
+
+    loops = [
+        loop("a", [0.5, 1.5], (0.011, 0.09)), loop("b", [0.5, 2.5], (0.034, 0.121)),
+        loop("c", [9.0], (0.0, 0.2), bandwidth=7.0), loop("d", [8.0], (0.01, 0.02)),
+    ]  # fmt: skip
+    log = SimpleNamespace(name="run.csv", joints=tuple("abcd"))
+    (found,) = command_channels._slow(log, loops)
+    assert found.where == "run.csv: a, b"
+    assert found.evidence == {"frequency": 2.5, "shortest": 0.011, "longest": 0.121}
+    assert "follow it up to 2.5 Hz" in found.message
+    assert "Any delay from 11 to 121 ms" in found.message
+
+
+def test_a_saturated_drive_is_reported_with_the_largest_error_of_all_movements():
+    """Four movements at 1.25 per second, whose commands jump."""
+    dt, q, command = 0.01, [0.0], [0.0]
+    rows = 0
+    for length in (0.5, 1.0, 0.75, 0.625):
+        target = q[-1] + length
+        count = round(length / 1.25 / dt)
+        rows += count
+        q += [q[-1] + 1.25 * dt * (k + 1) for k in range(count)] + [target] * 150
+        command += [target] * (count + 150)
+    q, command = np.array(q), np.array(command)
+    loop = SimpleNamespace(name="a", joint=0, q=q, command=command, step=dt)
+    log = SimpleNamespace(name="run.csv", q=np.random.default_rng(0).random((len(q), 1)))
+    ((name, found),) = command_channels._saturated(log, [loop])
+    assert (name, found.where) == ("a", "run.csv: a")
+    assert found.evidence["speed"] == pytest.approx(1.25)
+    assert found.evidence["error"] == pytest.approx(1.0, abs=0.03)
+    assert found.evidence["share"] == pytest.approx(rows / len(q), rel=0.05)
+    assert "in 4 movements" in found.message
+
+
+def test_rounded_angles_are_reported_by_what_they_change_with_the_largest_error(monkeypatch):
+    angles = {
+        "a": {"3.1416": np.pi, "1.57": np.pi / 2}, "b": {"0.785": np.pi / 4},
+        "c": {"-1.5708": -np.pi / 2},
+    }  # fmt: skip
+    monkeypatch.setattr(urdf_base, "_rounded", lambda tree: angles)
+    monkeypatch.setattr(urdf_base, "_effect", lambda model, mapping: (2, "two more"))
+    monkeypatch.setattr(urdf_base, "_carrying", lambda tree: {"a", "c", "other"})
+    model = SimpleNamespace(tree=SimpleNamespace(path="x/robot.urdf"))
+    felt, other = urdf_base.rounded_angles(model, None)
+    assert (felt.severity, felt.where) == ("warning", "file robot.urdf")
+    assert felt.evidence == pytest.approx({"largest_error": np.pi / 2 - 1.57, "felt": 1.0})
+    assert felt.message.startswith("the joints a, c have rounded angles in rpy; write ")
+    assert (other.severity, other.where) == ("note", "joint b")
+    assert other.evidence == pytest.approx({"largest_error": np.pi / 4 - 0.785, "felt": 0.0})
+
+
+def test_a_body_is_small_beside_the_mass_of_all():
+    """Of 3 x 5 kg and 7.5 g: a fault of the last is a note, of 16 g a warning."""
+    for mass, severity in ((0.0075, "note"), (0.016, "warning")):
+        pi = np.zeros(40)
+        pi[::10] = 5.0, 5.0, 5.0, mass
+        for at, inertia in ((4, 0.04), (6, 0.04), (9, 0.04)):
+            pi[at::10] = inertia * pi[::10]
+        pi[31] = 0.9 * mass  # the centre is outside by 0.4 m
+        layout = SimpleNamespace(n_inertial=40, bodies=tuple("abcd"))
+        points = {"d": np.array([[-0.5, -0.2, -0.1], [0.5, 0.2, 0.1]])}
+        found = list(urdf_geometry.audit_bodies(SimpleNamespace(layout=layout), pi, points))
+        outside = one(found, "com_outside")
+        assert outside.severity == severity
+        assert outside.evidence == {"outside": pytest.approx(0.4)}
+        assert one(found, "density").evidence == {"density": pytest.approx(mass / 0.08)}
+
+
+def test_a_spike_is_one_by_the_noise_of_its_own_channel():
+    """Both channels rest and jump by 0.4; the noise of the first is larger."""
+    values = np.zeros((400, 2))
+    values[:, 0], values[:, 1] = np.sin(np.arange(400) / 30), np.cos(np.arange(400) / 30)
+    values[[100, 250]] += 4.0
+    log = SimpleNamespace(name="run.csv", joints=("a", "b"), t=T[:400])
+    (found,) = channels._spikes(log, "tau", values, np.array([0.5, 0.01]))
+    assert found.where == "run.csv: tau_b"
+    assert found.evidence["rows"] == 2
+
+
+def test_velocities_of_another_joint_are_reported_with_both_correlations():
+    log = log_of()
+    alike = np.array([[0.31, 0.93], [0.2, 0.9]])
+    [found] = channels._velocity_order(log, alike)
+    assert found.where == "run.csv: a"
+    assert found.evidence == {"correlation": 0.93, "own_correlation": 0.31}
+    assert "dq_b is d(q)/dt of q_a (correlation 0.93; with dq_a 0.31)" in found.message
+
+
+def test_a_bandwidth_starts_at_the_largest_of_the_slow_responses():
+    loop = _Loop(log_of(q_ref=log_of().q), 0)
+    f = np.linspace(0.5, 8.0, 16)
+    size = np.array(
+        [0.6, 0.6, 1.3, 1.3, 1.3, 1.0, 1.0, 1.0, 1.0, 1.0, 0.7, 0.7, 0.7, 0.7, 0.4, 0.4]
+    )
+    loop.__dict__["response"] = (f, size * np.exp(0.3j * f), np.ones(16))
+    # the medians of five are 0.6, 0.6, 1.3, 1.3 ...: 0.92 is the limit
+    assert loop.bandwidth == f[10]
+
+
+@pytest.mark.parametrize(("needed", "named"), [((0, 3), [0, 3]), ((3,), [3]), ((1, 3), [1, 3])])
+def test_scales_are_named_of_the_joints_that_need_them(monkeypatch, needed, named):
+    scale, other = np.array([0.2, 7.0, 1.1, 30.0]), np.array([0, 1, 3])
+    model = SimpleNamespace(fit=lambda scale: (scale, scale, scale))
+    found = scale.tolist()
+
+    def fits(_model, scale, _theta):
+        return all(scale[j] == found[j] for j in needed)
+
+    monkeypatch.setattr(loads, "_is_this_robot", fits)
+    assert loads._needed(model, scale, other).tolist() == named
+    every = np.arange(4)
+    assert loads._needed(model, scale, every).tolist() == [0, 1, 2, 3]
+    assert scale.tolist() == found
+
+
+@pytest.mark.parametrize(
+    ("left", "loaded", "is_named"), [(86.0, 85.5, True), (88.0, 87.0, False), (86.0, 83.0, False)]
+)
+def test_a_part_is_not_mounted_by_its_gain_over_the_whole(monkeypatch, left, loaded, is_named):
+    model = RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
+    pi = model.standard_parameters()
+    size = model.layout.n_inertial
+    mass = 0.3 * pi[size - 10]
+    misfits = iter([91.0, 95.0, left])
+    probe = SimpleNamespace(model=model, of=lambda lighter: lighter)
+    parts = [
+        (["lid"], np.eye(10)[0] * 0.25 * pi[size - 10]),
+        (["hand", "tool"], np.eye(10)[0] * mass),
+    ]
+    stub = SimpleNamespace(fit=lambda scale: (loaded, None, None))
+    monkeypatch.setattr(mounted, "load_model", lambda probe, share: stub)
+    monkeypatch.setattr(mounted, "_misfit_without_load", lambda model: next(misfits))
+    monkeypatch.setattr(mounted, "_parts", lambda probe: parts)
+    found = list(mounted.check_unmounted_parts(probe, np.zeros(2), "run.csv"))
+    assert bool(found) == is_named
+    if is_named:
+        assert found[0].evidence == {
+            "mass": pytest.approx(mass),
+            "gain": pytest.approx(91.0 - left),
+        }
+        assert "without hand, tool, with a total mass" in found[0].message

@@ -6,8 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.corruptions import clean_log, robot
+from scipy.optimize import nnls
 
 from robotid.doctor import hypotheses
+from robotid.doctor import loads as loads_module
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.hypotheses import explanations, own_share
 from robotid.doctor.loads import _payload, load_model
@@ -147,3 +149,77 @@ def test_a_load_is_a_warning_if_it_surely_weighs_a_twelfth_of_the_arm_more_or_le
     (last,) = others[-1]
     assert f"about {heavy + 0.01:.2g} +- 0.1 kg {word}" in last.message
     assert list(last.evidence.values()) == pytest.approx([*load[:1], error, *load[1:]])
+
+
+def test_shares_under_another_gravity_are_those_of_each_joint_by_itself(ur5, ur5_log):
+    probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS), samples=120)
+    shares = hypotheses._shares_by_gravity(probe)
+    for g in (np.array([0.0, 3.0, -9.0]), np.array([5.0, 0.0, 1.0])):
+        np.testing.assert_allclose(shares(g), own_share(probe, g), rtol=1e-6, atol=1e-9)
+
+
+def test_a_share_with_any_load_is_that_of_factors_of_either_sign_for_its_moments(ur5, ur5_log):
+    probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS), samples=120)
+    last = np.array([-0.4, 0.3, 0.2])  # of first moments, beside 2 kg
+    extra = probe.last_body @ np.array([2.0, *last])
+    probe = replace(probe, tau=probe.tau + extra)
+    found, plain = own_share(probe, any_load=True), own_share(probe)
+    for j in range(6):
+        body = probe.last_body[:, j]
+        X = np.hstack([probe.loads()[:, j], body, -body[:, 1:], probe.drives[:, j]])
+        size = np.linalg.norm(X, axis=0)
+        left = nnls(X / np.where(size > 0, size, 1.0), probe.tau[:, j])[1] ** 2
+        wanted = left / np.sum((probe.tau[:, j] - probe.tau[:, j].mean()) ** 2)
+        assert found[j] == pytest.approx(wanted, rel=1e-5, abs=1e-9)
+    assert plain[1] > 1.5 * found[1]
+
+
+def test_what_a_load_model_expects_is_of_the_torques_that_it_uses(ur5, ur5_log):
+    """Of 4 s there are 12 instants; one torque is not explained, one never changes."""
+    motion = smooth_motion(ur5, ur5_log.window(1.0, 5.6), SIGNALS)
+    probe = take_probe(ur5, motion, samples=80)
+    probe.tau[:, 4] = 3.0
+    share = np.array([0.02, 0.3, 0.1, 0.04, 0.01, 0.06])
+    model = load_model(probe, share)
+    instants = 3.0 * np.ptp(motion.t[probe.rows])
+    assert instants < 15.0
+    used = [0, 2, 3, 5]
+    wanted = instants * np.sum(share[used] / (0.05**2 + share[used]))
+    assert model.expected == pytest.approx(wanted)
+    assert model.independent == pytest.approx(4 * instants)
+    assert model.R.any(axis=(1, 2)).tolist() == [j in used for j in range(6)]
+
+
+def test_what_a_counterbalance_cancels_is_its_share_of_gravity(ur5, ur5_log):
+    probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS), samples=150)
+    rest = probe.loads() - probe.loads(np.zeros(3))
+    for j, (cosine, sine) in ((1, (21.0, -4.0)), (2, (3.0, 7.0))):
+        own = cosine * np.cos(probe.q[:, j]) + sine * np.sin(probe.q[:, j])
+        theta = np.array([1.2, 0.9, 1.1, 1.0, 0.8, 1.3, 0.5, 0.1, -0.2, 0.3])
+        tau = np.hstack([probe.loads()[:, j], probe.last_body[:, j]]) @ theta
+        tau = tau + own + probe.drives[:, j, :4] @ [2.0, 5.0, 3.0, -1.0]
+        both = probe.tau.copy()
+        both[:, j] = tau
+        gravity = rest[:, j].sum(axis=1)
+        gravity = gravity - gravity.mean()
+        wanted = -(gravity @ own) / (gravity @ gravity)
+        found = loads_module._cancelled(replace(probe, tau=both), j, theta)
+        assert found == pytest.approx(wanted, rel=1e-6)
+
+
+def test_scales_of_torques_are_reported_together_if_alike_else_joint_by_joint():
+    probe = SimpleNamespace(model=SimpleNamespace(joints=tuple("abcd")))
+    scale = np.array([12.0, 1.0, 18.0, 15.0])
+    (together,) = loads_module._scaled(probe, scale, np.array([0, 2, 3]), "run.csv")
+    factor = (12 * 18 * 15) ** (1 / 3)
+    assert together.evidence == pytest.approx({"factor": factor, "joints": 3.0})
+    assert (together.where, together.severity) == ("run.csv: a, c, d", "warning")
+    scale[2] = 20.0
+    apart = list(loads_module._scaled(probe, scale, np.array([0, 2, 3]), "run.csv"))
+    assert [(f.where, f.evidence) for f in apart] == [
+        ("run.csv: a", {"factor": 12.0}), ("run.csv: c", {"factor": 20.0}),
+        ("run.csv: d", {"factor": 15.0}),
+    ]  # fmt: skip
+    for unit, severity in ((29.0, "warning"), (31.0, "error")):
+        (every,) = loads_module._scaled(probe, np.full(4, unit), np.arange(4), "run.csv")
+        assert (every.where, every.severity) == ("run.csv", severity)

@@ -1,10 +1,13 @@
 """The share of a motion that was seen before; how well motions determine parameters."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
+from robotid.doctor import motions as motions_module
 from robotid.doctor.motions import check_excitation, check_repeated_motion
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
@@ -86,5 +89,30 @@ def test_excitation_is_that_of_the_weighted_rows_of_all_motions(planar, motions)
     assert found.severity == "note"
     assert found.message.startswith(f"one, other: the motion determines {b} of {b} base parameters")
     assert (
-        f"(condition number {found.evidence['condition']:.3g}); no action needed" in found.message
+        f"(condition number {found.evidence['condition']:.3g} of the regressor, unit columns); no "
+        "action needed" in found.message
     )
+
+
+def test_of_long_motions_every_nth_row_counts_for_n_in_what_is_independent(
+    planar, motions, monkeypatch
+):
+    """A fourth of the rows, of which a tenth is independent behind the filter."""
+    monkeypatch.setattr(motions_module, "_ROWS", 250)
+    mapping, two = structural_mapping(planar), [replace(m, rate=100.0) for m in motions[1:]]
+    signals = SignalSettings(cutoff=5.0, trim=0.0, min_velocity=0.0)
+    (found,) = check_excitation(planar, mapping, two, signals, "x")
+    thin = [m.every(4) for m in two]
+    Y = np.concatenate([joint_torque_regressor(planar, m.q, m.v, m.a) for m in thin])
+    W = Y[:, mapping.independent].reshape(-1, 2, len(mapping.K))
+    tau, sigma = np.concatenate([m.tau for m in thin]), np.ones(2)
+    assert len(tau) == 250 + 150
+    for _ in range(30):
+        rows = (W / sigma[:, None]).reshape(-1, W.shape[2])
+        beta = np.linalg.lstsq(rows, (tau / sigma).ravel(), rcond=None)[0]
+        sigma = np.sqrt(np.mean((tau - W @ beta) ** 2, axis=0))
+    rows = np.sqrt(4 * 0.1) * (W / sigma[:, None]).reshape(-1, W.shape[2])
+    spread = prior_spread(planar, sum(m.squares for m in thin), sum(len(m.t) for m in thin))
+    size = np.sqrt(mapping.K**2 @ spread**2)
+    weakest = 1 / np.sqrt(1 + np.linalg.svd(rows * size, compute_uv=False)[-1] ** 2)
+    assert found.evidence["weakest"] == pytest.approx(weakest, rel=0.02)

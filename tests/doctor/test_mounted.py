@@ -134,6 +134,8 @@ def test_segments_are_of_all_motions(ur5):
     assert len(segments.reductions) == len(alone[0]) + len(alone[1])
     rows = [sum(part.samples for part in parts) for parts in (segments.reductions, *alone)]
     assert rows[0] == rows[1] + rows[2]
+    squares = sum(part.squares for part in segments.reductions)
+    np.testing.assert_allclose(squares, sum(motion.squares for motion in motions), rtol=1e-9)
 
 
 def test_rows_of_both_logs_are_independent_by_the_band_of_the_filter(ur5, monkeypatch):

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -6,7 +7,7 @@ import pytest
 from helpers.corruptions import clean_log
 
 from robotid.doctor.hypotheses import compensated, own_share
-from robotid.doctor.sample import coupled_columns, smooth_motion, take_probe
+from robotid.doctor.sample import _inner, coupled_columns, smooth_motion, take_probe
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
@@ -55,3 +56,27 @@ def test_torques_without_gravity_are_judged_by_their_own_size(probe, rng):
     wanted = np.minimum(own_share(whole) * size, 1.0)
     np.testing.assert_allclose(left, wanted, rtol=1e-6)
     assert np.abs(size - 1.0).max() > 0.3
+
+
+def test_the_sign_of_a_slow_joint_turns_within_a_twentieth_of_its_own_speed(probe):
+    v = probe.v / np.abs(probe.v).max(axis=0) * [2.0, 0.1, 0.3, 0.5, 0.0, 1.0]
+    still = [0.02, 0.005, 0.015, 0.02, 0.02, 0.02]
+    found = replace(probe, v=v).drives
+    np.testing.assert_allclose(found[:, :, 2], np.tanh(v / still), rtol=1e-12)
+    np.testing.assert_array_equal(found[:, :, 1], v)
+
+
+def test_rows_near_either_end_of_a_segment_are_not_used(rng):
+    t = np.concatenate([np.arange(60), 100 + np.arange(45), 200 + np.arange(20)]) / 100.0
+    segment = np.repeat([3, 5, 6], [60, 45, 20])
+    motion = SimpleNamespace(t=t, segment=segment)
+    wanted = [
+        min(x - t[segment == s].min(), t[segment == s].max() - x) >= 0.15 - 1e-12
+        for x, s in zip(t, segment, strict=True)
+    ]
+    found = _inner(motion)
+    edge = np.isclose([min(x - t[segment == s].min(), t[segment == s].max() - x)
+                       for x, s in zip(t, segment, strict=True)], 0.15)  # fmt: skip
+    np.testing.assert_array_equal(found[~edge], np.array(wanted)[~edge])
+    assert not found[segment == 6].any()
+    assert found[segment == 3].sum() >= 28

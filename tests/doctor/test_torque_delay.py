@@ -5,11 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.corruptions import clean_log, controlled_log, late, robot, table_of
+from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
+from scipy.interpolate import CubicSpline
 
 from robotid.doctor import torque_delay
 from robotid.doctor.torque_delay import _EXACT, _GRID, _Misfit
+from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.torque import carried_columns
 from robotid.robot.model import RobotModel
 
 SIGNALS = SignalSettings()
@@ -228,3 +232,65 @@ def test_a_delay_of_one_joint_is_beside_that_of_the_others(rng):
     assert own.explained == pytest.approx(1 - then / now, abs=2e-3)
     assert own.is_significant
     assert not misfit.own_delay(0).is_significant
+
+
+def test_an_instant_is_as_far_from_a_slow_one_as_the_nearest_on_either_side(rng):
+    slow, at = np.sort(rng.random(7)), np.sort(rng.uniform(-0.3, 1.4, 60))
+    wanted = np.abs(at[:, None] - slow).min(axis=1)
+    np.testing.assert_allclose(torque_delay._distance(at, slow), wanted, rtol=1e-12)
+    assert np.isinf(torque_delay._distance(at, slow[:0])).all()
+
+
+def test_what_a_torque_leaves_at_each_delay_is_of_least_squares_in_blocks(rng):
+    """Of two windows, the rows far from stiction only; the second joint's own columns."""
+    windows = []
+    for count in (90, 110):
+        inertial, drive = rng.standard_normal((count, 7)), rng.standard_normal((count, 2, 5))
+        inertial[:, 5] = 2.0 * inertial[:, 4] - inertial[:, 6]  # dependent
+        steady = rng.random((count, 2)) < 0.7
+        delayed = rng.standard_normal((2, 81, count)) + 4.0
+        windows.append(torque_delay._Window(inertial, drive, steady, delayed))
+    squares, used = torque_delay._squares(windows, 1, slice(3, 7))
+    at = [window.steady[:, 1] for window in windows]
+    X = np.concatenate(
+        [np.column_stack([w.inertial[k, 3:7], w.drive[k, 1], np.ones(k.sum())])
+         for w, k in zip(windows, at, strict=True)]
+    )  # fmt: skip
+    tau = np.concatenate([w.delayed[1][:, k] for w, k in zip(windows, at, strict=True)], axis=1)
+    assert used == len(X) == sum(k.sum() for k in at)
+    left = tau.T - X @ np.linalg.pinv(X, rcond=1e-8) @ tau.T
+    size = np.sum((tau - tau.mean(axis=1, keepdims=True)) ** 2, axis=1)
+    wanted = [np.sum(part**2, axis=0) / size for part in np.array_split(left, 8)]
+    np.testing.assert_allclose(squares, wanted, rtol=1e-8)
+    few = [replace(w, steady=w.steady & (np.arange(len(w.steady))[:, None] < 40)) for w in windows]
+    assert torque_delay._squares(few, 1, slice(3, 7)) is None
+
+
+def test_a_window_has_the_columns_and_delayed_torques_of_its_instants(rng):
+    """Without a filter; every second row, away from the ends and from slow instants."""
+    model = arm()
+    n, step = 161, 0.01
+    t = 2.0 + step * np.arange(n)
+    q = np.column_stack([np.sin(3 * t), 0.3 * np.cos(2 * t), 0.05 * np.sin(4 * t)])
+    v = np.column_stack([3 * np.cos(3 * t), -0.6 * np.sin(2 * t), 0.2 * np.cos(4 * t)])
+    a, tau = rng.standard_normal((2, n, 3))
+    motion = Trajectory(t, q, v, a, tau, model.joints, 1 / step, np.zeros(n, dtype=int))
+    rows, signals = np.arange(11, 151), SignalSettings(cutoff=None)
+    found = torque_delay._window(model, motion, rows, step, 2, signals, 0.08)
+    at = rows[::2]
+    at = at[(t[at] >= t[11] + 0.12 - 1e-9) & (t[at] <= t[150] - 0.12 + 1e-9)]
+    top = np.maximum(np.abs(v).max(axis=0), 0.02)
+    columns = [a, v, *[np.tanh(v / x) for x in (0.02, 0.1 * top, 0.3 * top)], v * np.abs(v)]
+    columns += [wave(k * q) for k in (1, 2, 3, 4) for wave in (np.cos, np.sin)]
+    np.testing.assert_allclose(found.drive, np.stack(columns, axis=2)[at], atol=1e-12)
+    np.testing.assert_allclose(found.inertial, carried_columns(model, q[at], v[at], a[at]))
+    turns = np.vstack([np.diff(np.sign(v[11:151]), axis=0) != 0, np.zeros((1, 3), dtype=bool)])
+    slow = turns | (np.abs(v[11:151]) < 0.05)
+    for j in range(3):
+        near = np.abs(t[at][:, None] - t[11:151][slow[:, j]]).min(axis=1, initial=np.inf)
+        np.testing.assert_array_equal(found.steady[:, j], near > 0.75 * 0.08)
+    for j in range(3):
+        spline = CubicSpline(t[11:151], tau[11:151, j])
+        wanted = spline(t[at] + _GRID[:, None])
+        inside = np.abs(t[at] - t[80]) < 0.4  # ends of splines differ
+        np.testing.assert_allclose(found.delayed[j][:, inside], wanted[:, inside], atol=1e-4)

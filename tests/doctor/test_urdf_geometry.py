@@ -78,6 +78,21 @@ def test_the_radius_of_gyration_is_that_of_the_inertia(tmp_path):
     assert found.evidence["farthest"] == pytest.approx(np.linalg.norm([0.2, 0.05, 0.05]))
 
 
+def test_an_ellipsoid_longer_than_its_box_allows_is_a_note_with_both_lengths(tmp_path):
+    (found,) = audit(tmp_path, ixx="0.04", izz="0.09")
+    assert (found.code, found.severity, found.where) == ("ellipsoid", "note", "link upper")
+    length = 2 * np.sqrt(5 * (0.04 + 0.09 - 0.0567) / 2 / 4.0)  # along y
+    assert found.evidence == pytest.approx({"length": length, "side": 0.1})
+    assert (
+        f"is {length:.3g} m long in y, the box of its geometry 0.1 m; wanted: at most 0.224 m"
+        in (found.message)
+    )
+    limit = 0.1**2 / 4  # variance of two halves on two sides
+    for factor, count in ((0.98, 0), (1.02, 1)):
+        izz = f"{0.0567 - 0.0067 + 8 * factor * limit}"
+        assert len(audit(tmp_path, izz=izz)) == count
+
+
 def test_a_copied_inertial_is_told_by_the_other_size(tmp_path):
     copy = {"com": "0.1 0 0", "mass": "2.1", "ixx": "0.004", "iyy": "0.02", "izz": "0.02"}
     (found,) = audit(tmp_path, **copy)
@@ -92,6 +107,7 @@ def test_numbers_of_templates_are_named(tmp_path):
     (found,) = audit(tmp_path, **numbers)
     assert found.code == "default_inertial"
     assert "1 kg and 0.001 kg m^2 about every axis" in found.message
+    assert found.evidence == {"mass": 1.0, "moment": 0.001}
 
 
 def test_a_mesh_that_is_not_found_is_one_note(tmp_path):

@@ -304,3 +304,30 @@ def test_a_pinned_link_is_not_listed(ur5, wrist):
     assert set(own["alone"]) & set(wrist.determination.undetermined)
     assert "wrist_3_joint.viscous" in found.determination.undetermined
     assert found.determination.undetermined == found.estimate.undetermined
+
+
+def test_one_measured_sum_of_four_makes_one_group_of_them():
+    """Three directions are open: none of the other parameters is among them."""
+    rows = 50.0 * np.array(
+        [[0.0, 1.0, 1.0, 0.0, -1.0, 1.0], [1.0, 0, 0, 0, 0, 0], [0, 0, 0, 1.0, 0, 0]]
+    )
+    spread = np.array([1.0, 2.0, 2.0, 3.0, 2.0, 2.0])
+    found = determine(tuple("abcdef"), rows, spread)
+    (group,) = found.groups
+    assert group.names == ("b", "c", "e", "f")
+    (one,) = group.combinations
+    assert (one.names, one.coefficients) == (("b", "c", "e", "f"), pytest.approx((1, 1, -1, 1)))
+    assert one.shares == pytest.approx((1, 1, -1, 1))
+    assert found.rank == 3
+    size = 50.0 * np.array([np.sqrt(4 * 2.0**2), 1.0, 3.0])
+    np.testing.assert_allclose(found.shrinkage, [*np.sort(1 / np.hypot(1, size)), 1, 1, 1])
+
+
+def test_a_sum_of_parameters_of_other_spreads_has_physical_coefficients():
+    """0.5 a - 4 b is measured: in units of the spreads 1 and -0.8."""
+    spread = np.array([2.0, 0.2])
+    found = determine(("a", "b"), 90.0 * np.array([[0.5, -4.0]]), spread)
+    (group,) = found.groups
+    (one,) = group.combinations
+    assert one.coefficients == pytest.approx((1.0, -8.0))
+    assert one.shares == pytest.approx((1.0, -0.8))

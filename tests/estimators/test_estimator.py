@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from robotid.estimators import OLS, RLS, TLS, WLS, Estimate, Kalman, NormalisedGradient
+from robotid.estimators.estimator import require_rows
+from robotid.exceptions import DataError
 
 THETA, ERROR = np.array([1.5, -20.0, 0.25]), np.array([0.1, 3.0, np.inf])
 ESTIMATE = Estimate(
@@ -69,3 +71,17 @@ def test_html_states_value_and_error_of_each_parameter():
 )
 def test_an_estimator_says_how_its_rows_weigh(estimator, weighing):
     assert estimator.weighing == weighing
+
+
+@pytest.mark.parametrize(("rows", "wanted"), [(57, 97), (41, 97)])
+def test_too_few_rows_are_reported_with_ten_samples_per_parameter_over_the_joints(rows, wanted):
+    """Of six joints: a sample has six rows."""
+    text = (
+        f"{rows} torque rows for 58 parameters: too few rows to fit; record at least {wanted} "
+        "samples, or reduce min_velocity and trim"
+    )
+    with pytest.raises(DataError, match=f"^{re.escape(text)}$"):
+        require_rows(rows, 58, 6)
+    with pytest.raises(DataError, match=r"^0 torque rows for 58 parameters: no joint moves"):
+        require_rows(0, 58, 6)
+    require_rows(58, 58, 6)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from robotid.estimators import Estimator
+from robotid.estimators import Estimator, output_error
 from robotid.estimators.output_error import OutputError, Residual, _freed, linearised
 from robotid.exceptions import DataError, NotConvergedError
 
@@ -81,6 +81,16 @@ def test_parameters_are_recovered_without_noise(rng):
     assert found.converged
     assert found.undetermined == ()
     assert found.names == ("gain", "time", "offset")
+
+
+@pytest.mark.parametrize("rounds", [1, 5])
+def test_parameters_alone_are_those_of_the_fit(rng, rounds):
+    lag, estimator = lagging(rng), OutputError(rounds=rounds)
+    found = estimator.fit(lag, START).theta
+    np.testing.assert_array_equal(estimator.minimise(lag, START), found)
+    about_start = replace(lag, prior=START, prior_std=np.full(3, 1e3))
+    np.testing.assert_allclose(estimator.minimise(about_start), found, rtol=1e-6)
+    assert (found != OutputError(rounds=6 - rounds).fit(lag, START).theta).any()
 
 
 def test_the_noise_that_is_left_is_found(rng):
@@ -427,3 +437,67 @@ def test_it_is_an_estimator_that_reads_a_simulator_and_begins_with_its_prior(rng
     found, initialised = estimator.fit(near), estimator.fit(near, near.prior)
     np.testing.assert_array_equal(found.theta, initialised.theta)
     assert not np.array_equal(found.theta, estimator.fit(near, START).theta), "to the last bit"
+
+
+def test_noise_and_correlation_of_a_joint_are_those_of_all_its_windows(rng):
+    """Of the first in two windows, of the third in one; the second has none."""
+    e = [rng.standard_normal((30, 2)).cumsum(axis=0), rng.standard_normal((11, 1)) * 5.0]
+    e[0][:, 1] = rng.standard_normal(30) + 0.2 * e[0][:, 1]
+    joints = (np.array([0, 2]), np.array([0]))
+    found = [Residual(x, None, j, np.arange(3)) for x, j in zip(e, joints, strict=True)]
+    most = np.array([0.9, 0.9, 0.05])
+    weights = OutputError(most=most, inflation=2.25)._weigh(found)
+    own = {0: [e[0][:, 0], e[1][:, 0]], 2: [e[0][:, 1]]}
+    for j, windows in own.items():
+        along = sum(x[1:] @ x[:-1] for x in windows) / sum(x[:-1] @ x[:-1] for x in windows)
+        rho = np.clip(along, 0.0, most[j])
+        squares = sum(np.sum((x[1:] - rho * x[:-1]) ** 2) for x in windows)
+        sigma = 1.5 * np.sqrt(squares / sum(len(x) - 1 for x in windows))
+        assert (weights.rho[j], weights.sigma[j]) == pytest.approx((rho, sigma))
+    assert weights.rho[2] == 0.05
+    whitened = weights.whiten(e[0], joints[0])
+    wanted = (e[0][1:] - weights.rho[[0, 2]] * e[0][:-1]) / weights.sigma[[0, 2]]
+    np.testing.assert_allclose(whitened, wanted)
+    assert OutputError(whitens=False)._weigh(found).rho.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_step_stops_at_bounds_and_the_others_go_as_far_as_is_best_then(rng):
+    """Two of five are at their bounds; their damped normal equations are solved by hand."""
+    A = rng.standard_normal((20, 5)) * [1.0, 30.0, 0.1, 4.0, 2.0]
+    H, theta = A.T @ A, np.array([1.0, 2.0, 30.0, 4.0, 5.0])
+    step = np.array([-3.0, 0.1, 5.0, -6.0, 0.7])
+    g, damping = H @ step, 0.2
+    lowest = np.array([0.5, 1.0, 0.0, 3.0, 0.0])
+    damped = H + damping * np.diag(np.diag(H))
+    free = theta + np.linalg.solve(damped, g)
+    assert (free < lowest).tolist() == [True, False, False, True, False]
+    moved = np.array([0, 3])
+    others = np.array([1, 2, 4])
+    left = g[others] - H[np.ix_(others, moved)] @ (lowest - theta)[moved]
+    wanted = lowest.copy()
+    wanted[others] = theta[others] + np.linalg.solve(damped[np.ix_(others, others)], left)
+    found = output_error._bounded_step(H, g, theta, lowest, damping)
+    np.testing.assert_allclose(found, wanted, rtol=1e-9)
+    # at its bound, a parameter that would go below it stays
+    theta[0] = 0.5
+    assert output_error._bounded_step(H, g, theta, lowest, damping)[0] == 0.5
+
+
+def test_windows_are_cut_into_segments_by_their_rows_or_each_alike(rng):
+    found = [
+        (rng.standard_normal((n, 2)), rng.standard_normal(n), np.array(columns))
+        for n, columns in ((410, [0, 2]), (95, [1, 2]))
+    ]
+    for are_windows, counts in ((False, (39, 9)), (True, (6, 6))):
+        parts = output_error._segments(found, 3, are_windows=are_windows)
+        assert len(parts) == sum(counts)
+        first = 0
+        for (A, b, columns), count in zip(found, counts, strict=True):
+            own = parts[first : first + count]
+            first += count
+            rows = np.column_stack([A, b])
+            for part, cut in zip(own, np.array_split(rows, count), strict=True):
+                np.testing.assert_array_equal(part.columns[0], columns)
+                (R,) = part.triangles
+                np.testing.assert_allclose(R.T @ R, cut.T @ cut, atol=1e-9)
+                assert part.rows.tolist() == [len(cut)]

@@ -1,9 +1,11 @@
 """Two runs that differ by what loads only one of them."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from robotid.estimators.two_runs import TwoRuns
+from robotid.estimators.two_runs import TwoRuns, payload_runs
 from robotid.regressor.factors import Factors, triangle_of
 
 BETA, CHANGE = np.array([2.0, -1.0, 0.5]), 0.3  # of the third parameter, in the loaded run
@@ -195,3 +197,54 @@ def test_errors_are_the_larger_of_what_stretches_and_what_joints_scatter(rng, by
     wider = np.maximum(own, np.sqrt(least)) / own
     np.testing.assert_allclose(found.freedom, np.maximum(freedom, 1.0), rtol=1e-6)
     np.testing.assert_allclose(found.covariance, covariance * np.outer(wider, wider), rtol=1e-6)
+
+
+def test_runs_of_payloads_have_the_prior_of_the_urdf_and_the_known_part(rng):
+    """Two bodies, drives of two terms that change and one that does not, a known parameter."""
+    terms = [SimpleNamespace(is_inertia=x) for x in (True, False, False)]
+    layout = SimpleNamespace(n_inertial=4, drive_parameters=[(0, term) for term in terms])
+    K, spread, urdf = rng.standard_normal((3, 7)), rng.uniform(0.5, 3.0, 7), rng.random(7)
+    columns, size = rng.standard_normal((3, 4)), np.array([1.0, 20.0, 0.3, 7.0])
+    known = np.array([np.nan, 2.5, np.nan, np.nan])
+    parts = [[SimpleNamespace(factors=f"{run}{k}") for k in range(2)] for run in ("one", "two")]
+    runs = payload_runs(
+        *parts, layout, K, urdf, spread, (columns, known, size), share=0.3, unknown=(1, 0)
+    )
+    assert (runs.reference, runs.loaded) == (("one0", "one1"), ("two0", "two1"))
+    np.testing.assert_array_equal(runs.D, np.column_stack([K[:, 5:], columns[:, [0, 2, 3]]]))
+    np.testing.assert_allclose(runs.known, 2.5 * columns[:, 1])
+    np.testing.assert_allclose(runs.mean, [*(K @ urdf), 0, 0, 0, 0, 0])
+    C = 100.0 * K @ np.diag(spread**2) @ K.T
+    np.testing.assert_allclose(runs.precision[:3, :3], np.linalg.inv(C), rtol=1e-9)
+    change = 10.0 * np.array([spread[5], spread[6], 1.0, 0.3, 7.0])
+    np.testing.assert_allclose(np.diag(runs.precision)[3:], change**-2.0)
+    assert not runs.precision[:3, 3:].any()
+    assert (runs.share, runs.unknown.tolist()) == (0.3, [1, 0])
+
+
+def test_runs_that_differ_by_scales_leave_more_by_a_load_than_by_scales(rng):
+    """One scale of both joints, or one of each, with one column that differs in addition."""
+    W, D = rng.standard_normal((2, 2, 80, 3)), np.array([[0.0, 1.0], [0.4, 0.0], [1.0, -1.0]])
+    for scale in ((1.3, 1.3), (1.3, 0.8)):
+        noise = NOISE[:, None] * rng.standard_normal((2, 2, 80))
+        loaded = np.array(scale)[:, None] * (W[1] @ BETA) + 0.6 * W[1] @ D[:, 0]
+        tau = np.stack([W[0] @ BETA, loaded]) + noise
+        runs = TwoRuns(
+            of_rows(W[0], tau[0], 2), of_rows(W[1], tau[1], 2), D, np.zeros(3), np.zeros(5),
+            1e-6 * np.eye(5), 1.0, np.empty(0, dtype=int),
+        )  # fmt: skip
+        own = np.array(
+            [np.linalg.lstsq(W[k, j], tau[k, j], rcond=None)[1][0] for k in (0, 1) for j in (0, 1)]
+        )
+        level = np.sqrt(own.reshape(2, 2).sum(axis=0) / (2 * 80 - 6))
+        rows = np.concatenate([W[0, j] / level[j] for j in (0, 1)])
+        beta = np.linalg.lstsq(rows, np.concatenate([tau[0, j] / level[j] for j in (0, 1)]))[0]
+        left = np.sum((tau[0] - W[0] @ beta) ** 2, axis=1)
+        for j in (0, 1):
+            A = W[1, j] @ np.column_stack([D[:, 0], beta])
+            left[j] += np.linalg.lstsq(A, tau[1, j], rcond=None)[1][0]
+        found = runs.residual_ratios_by_scales(1)
+        if scale[0] != scale[1]:
+            np.testing.assert_allclose(found, left / own.reshape(2, 2).sum(axis=0), rtol=1e-4)
+        assert (found < 1.3).all()
+        assert runs.residual_ratios(runs.compare().theta).mean() > 2.0

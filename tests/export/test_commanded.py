@@ -279,7 +279,7 @@ def test_mjcf_of_a_result_has_the_nearest_friction_and_says_so(result, tmp_path,
 
     mean = 0.3 * 1.5**2 / 12  # of x (q - q_0)^2 over a range of 1.5 rad; that of q - q_0 is 0
     assert f"{LEG[2]}: coulomb_q1, coulomb_q2 projected on viscous" in out
-    assert "offset 0.1; error" in out
+    assert "offset 0.1 N m; error" in out
     written = " ".join((tmp_path / "a.xml").read_text().split())
     assert f"{LEG[2]}: coulomb_q1, coulomb_q2 projected on viscous" in written
     assert "cannot state" not in out

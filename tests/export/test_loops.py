@@ -48,8 +48,9 @@ def test_each_joint_has_the_error_of_its_own_unknown():
     names = [("a", "revolute"), ("b", "prismatic"), ("c", "revolute")]
     free_parameters = [("kp", (1,)), ("kp", (2,)), ("delay", (0, 2)), ("zero", (1,))]
     estimate = SimpleNamespace(
-        std_error=np.array([1.0, 2.0, 3.0, 4.0]), quantile=np.array([2.1, 2.2, 2.3, 2.4])
-    )
+        std_error=np.array([1.0, 2.0, 3.0, 4.0]), quantile=np.array([2.1, 2.2, 2.3, 2.4]),
+        details={"at_bound": ("delay",)},
+    )  # fmt: skip
     values = {
         "kp": [10.0, 20.0, 30.0], "kd": [1.0, 2.0, 3.0], "delay": [0.1, 0.2, 0.3],
         "limit": [np.inf, 9.0, np.inf], "zero": [0.01, 0.02, 0.03],
@@ -59,7 +60,8 @@ def test_each_joint_has_the_error_of_its_own_unknown():
         estimate=estimate,
         simulator=SimpleNamespace(
             free_parameters=[
-                SimpleNamespace(what=what, joints=joints) for what, joints in free_parameters
+                SimpleNamespace(name=what, what=what, joints=joints)
+                for what, joints in free_parameters
             ]
         ),
     )
@@ -80,9 +82,10 @@ def test_each_joint_has_the_error_of_its_own_unknown():
                 assert name not in shown
                 continue
             error, reach = errors.get(name, (None, None))
+            source = "bound" if what == "delay" else "data"
             assert shown[name] == {
                 "name": name, "value": values[what][j], "std_error": error, "quantile": reach,
-                "unit": unit, "source": "data" if name in errors else "stated",
+                "unit": unit, "source": source if name in errors else "stated",
             }  # fmt: skip
     assert _loop_parameters(SimpleNamespace(loop=SimpleNamespace(kind="torque"))) == []
 

@@ -20,6 +20,7 @@ from robotid.fitting.open_terms import OpenTerm
 from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.drives import LoadFriction, PositionCoulomb
 from robotid.robot.examples import example_urdf
@@ -225,3 +226,33 @@ def test_a_term_that_is_open_adds_its_own_torque_to_what_it_moves(rng):
 
 def replace_in(found, **changes):
     return SimpleNamespace(**{**vars(found), **changes})
+
+
+def test_the_band_of_a_recording_has_each_open_term_with_what_it_moves(rng):
+    """diag(W C W^T) + sum (W x + z)^2, the torque z of a term at its own joint only."""
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=JOINTS)
+    q, v, a, tau = rng.standard_normal((4, 9, 3))
+    motion = Trajectory(np.arange(9) / 50, q, v, a, tau, JOINTS, 50.0, np.zeros(9, dtype=int))
+    mapping, size = structural_mapping(model), model.layout.n_inertial
+    standard = model.standard_parameters() * rng.uniform(0.5, 2.0, len(model.layout.names))
+    root, moves = rng.standard_normal((40, len(standard))), rng.standard_normal((2, len(standard)))
+    own = [
+        OpenTerm(LIFT, moves[0], lambda drive, alone: drive.v**3 + alone.a),
+        OpenTerm(WRIST, moves[1], lambda drive, alone: drive.load * alone.others[ELBOW].q),
+    ]
+    found = SimpleNamespace(
+        model=model, mapping=mapping, standard=standard, open_terms=tuple(own),
+        standard_covariance=root.T @ root + moves.T @ moves,
+        estimate=SimpleNamespace(sigma=np.array([3.0, 1.0, 0.5])),
+    )  # fmt: skip
+    recording = SimpleNamespace(trajectory=motion, signals=SignalSettings(cutoff=5.0))
+    band = expected_band(found, SimpleNamespace(recording=recording))
+    Y = joint_torque_regressor(model, q, v, a)
+    load = (Y[:, :size] @ standard[:size]).reshape(9, 3)
+    W, z = Y[:, mapping.independent] @ mapping.K, np.zeros((2, 9, 3))
+    z[0, :, 0], z[1, :, 2] = v[:, 0] ** 3 + a[:, 0], load[:, 2] * q[:, 1]
+    variance = np.sum((W @ root.T) ** 2, axis=1)
+    variance += (W @ moves[0] + z[0].ravel()) ** 2 + (W @ moves[1] + z[1].ravel()) ** 2
+    np.testing.assert_array_equal(band.samples, np.arange(9))
+    np.testing.assert_allclose(band.parameters, np.sqrt(variance).reshape(9, 3), rtol=1e-9)
+    np.testing.assert_allclose(band.total**2, band.parameters**2 + [9.0, 1.0, 0.25], rtol=1e-12)

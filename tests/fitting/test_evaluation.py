@@ -6,8 +6,10 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.fitting.evaluation import (
+    _conclude,
     _joined,
     _parts,
+    _Score,
     evaluate_logs,
     hidden_joints,
     pool,
@@ -18,6 +20,7 @@ from robotid.fitting.metrics import TorqueSums
 from robotid.fitting.survey import hold_log
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import turns_note
 from robotid.regressor.used_rows import row_mask
 from robotid.robot.parameters import Coupling
 
@@ -192,3 +195,73 @@ def test_more_than_two_percent_and_more_than_one_row_make_a_shared_log(rng, rows
     q, other = rng.standard_normal((2, rows, 2))
     other[:same] = q[:same]
     assert shares_rows(log(q), log(other)) is shared
+
+
+def test_of_a_long_log_its_start_its_middle_and_its_end_are_shown():
+    def shown(count, is_in_memory=False):
+        pieces = [SimpleNamespace(first=100 * k) for k in range(count)]
+        log = SimpleNamespace(pieces=pieces, first=0, stop=100 * count, is_in_memory=is_in_memory)
+        return [part.shown for part in _parts(log)]
+
+    start, end = slice(10_000), slice(-10_000, None)
+    assert shown(5) == [start, None, start, None, end]
+    assert shown(4) == [start, None, start, end]
+    assert shown(2) == [start, end]
+    assert shown(1, is_in_memory=True) == [slice(None)]
+
+
+def test_scores_of_pieces_join_field_by_field(rng):
+    def score(k):
+        tau = rng.standard_normal((4, 2))
+        sums = TorqueSums.of(tau, 0.5 * tau, np.ones((4, 2), dtype=bool), {"urdf": 0.1 * tau})
+        return _Score(
+            sums={"x": sums}, smooth=3 + k, used=5 * k, segments=frozenset({k, 7}),
+            turned=np.arange(3) == k, shown=((k, k, {}),), sampled=rng.standard_normal((k, 4)),
+            found=(np.arange(4) == k, np.arange(3) < k),
+        )  # fmt: skip
+
+    one, two = score(1), score(2)
+    both = one.join(two)
+    assert (both.smooth, both.used, both.segments) == (9, 15, {1, 2, 7})
+    assert both.turned.tolist() == [False, True, True]
+    assert both.shown == ((1, 1, {}), (2, 2, {}))
+    np.testing.assert_array_equal(both.sampled, np.concatenate([one.sampled, two.sampled]))
+    assert [x.tolist() for x in both.found] == [[False, True, True, False], [True, True, False]]
+    wanted = one.sums["x"].residual + two.sums["x"].residual
+    np.testing.assert_allclose(both.sums["x"].residual, wanted)
+
+
+def test_an_evaluation_of_a_window_has_its_extent_and_what_its_pieces_show(rng):
+    """Rows 3 to 8 of twelve in a file; the position of the second joint was unwrapped."""
+    stamps, values = 1.0 + 0.5 * np.arange(12), rng.standard_normal((6, 2))
+    head = Log(stamps[3:9], values, 2 * values, ("a", "b"), path="x/run.csv")
+    motions = [
+        Trajectory(stamps[k], *[rng.standard_normal((2, 2)) for _ in range(4)], ("a", "b"), 2.0,
+                   np.zeros(2, dtype=int))
+        for k in (slice(3, 5), slice(6, 8))
+    ]  # fmt: skip
+    masks, torques = rng.random((2, 2, 2)) < 0.7, rng.standard_normal((2, 2, 2))
+    tau = rng.standard_normal((9, 2))
+    sums = {"x": TorqueSums.of(tau, 0.5 * tau, np.ones((9, 2), dtype=bool), {})}
+    score = _Score(
+        sums=sums, smooth=41, used=77, segments=frozenset({2, 5, 7}),
+        turned=np.array([False, True]), sampled=None, found=(),
+        shown=tuple((m, k, {"x": t}) for m, k, t in zip(motions, masks, torques, strict=True)),
+    )  # fmt: skip
+    model = SimpleNamespace(row_names=("a", "b"), row_units=("N m", "N"))
+    log = SimpleNamespace(
+        first=3, stop=9, step=0.5, stamps=stamps, head=head, model=model, signals=EXACT
+    )
+    found = _conclude(log, score, True)
+    extent, recording = found.recording.extent, found.recording
+    assert (extent.samples, extent.rate, extent.start, extent.end) == (6, 2.0, 2.5, 5.0)
+    assert (extent.smooth, extent.rows_used, extent.segments) == (41, 77, 3)
+    assert (recording.name, recording.is_partial) == ("run.csv 2.5-5 s", True)
+    assert recording.log.notes == (*head.notes, turns_note(["b"]))
+    np.testing.assert_array_equal(recording.mask, np.concatenate(masks))
+    np.testing.assert_array_equal(found.torques["x"], np.concatenate(torques))
+    np.testing.assert_array_equal(recording.trajectory.q, np.concatenate([m.q for m in motions]))
+    assert (found.metrics["x"].per_joint["b"].unit, found.is_refitted) == ("N", True)
+    assert found.metrics["x"].per_joint["a"].rmse == pytest.approx(
+        0.5 * np.sqrt(np.mean(tau[:, 0] ** 2))
+    )

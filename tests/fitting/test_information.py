@@ -1,5 +1,7 @@
 """How much the data say, against the dense regressor."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers.fitting import fit
@@ -7,6 +9,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.fitting.information import information
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.factors import Factors
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
 
@@ -85,3 +88,29 @@ def test_what_the_data_leave_open_has_no_share_and_no_correlation(ur5, rng):
     assert (said.data_share[open_ones] == 0).all()
     assert np.isnan(said.correlation[open_ones]).all()
     assert (said.data_share[~open_ones] > 0).all()
+
+
+def test_information_is_that_of_dense_rows_of_two_joints_with_other_noise(rng):
+    sigma, W = np.array([0.3, 1.7]), rng.standard_normal((2, 9, 3)) * [1.0, 4.0, 0.2]
+    triangles = tuple(np.linalg.qr(np.column_stack([x, x[:, 0]]), mode="r") for x in W)
+    factors = Factors(triangles, (np.arange(3),) * 2, np.array([9, 9]), tuple("abc"))
+    K, prior_std = np.array([[1.0, 0.0, -2.5], [0.0, 3.0, 0.0], [0.5, 0.0, 0.2]]), [0.3, 0.7, 1.1]
+    C = np.diag([0.4, np.inf, 0.0])
+    wls = SimpleNamespace(sigma=sigma, theta=np.ones(3), covariance=C)
+    found = information(
+        SimpleNamespace(factors=factors, wls=wls, prior_std=np.array(prior_std),
+                        mapping=SimpleNamespace(K=K))
+    )  # fmt: skip
+    X = np.concatenate([W[0] / 0.3, W[1] / 1.7])
+    scaled = X / np.linalg.norm(X, axis=0)
+    np.testing.assert_allclose(found.singular_values, np.linalg.svd(scaled, compute_uv=False))
+    prior = (0.3**2 + 2.5**2 * 1.1**2, 9 * 0.7**2, 0.25 * 0.3**2 + 0.04 * 1.1**2)
+    np.testing.assert_allclose(found.data_share, [prior[0] / (prior[0] + 0.4), 0.0, 1.0])
+    B = np.linalg.inv(X.T @ X)
+    assert found.correlation[0, 0] == pytest.approx(1.0)
+    assert np.isnan(found.correlation[1:]).all()
+    wls.covariance = np.diag([0.4, 0.1, 0.2])
+    every = SimpleNamespace(factors=factors, wls=wls, prior_std=np.array(prior_std),
+                            mapping=SimpleNamespace(K=K))  # fmt: skip
+    size = np.sqrt(np.diag(B))
+    np.testing.assert_allclose(information(every).correlation, B / np.outer(size, size), atol=1e-9)

@@ -3,6 +3,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.linalg
 from helpers.fitting import fit, identify
 from helpers.paths import ROOT
 from helpers.synthetic import truth
@@ -26,7 +27,7 @@ from robotid.logs.read import lay_out, write_log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.factors import join
+from robotid.regressor.factors import Factors, join
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
 from robotid.simulation.motions import random_fourier
@@ -323,3 +324,107 @@ def test_the_share_of_the_noise_is_that_of_the_log_in_which_it_is_largest():
     wanted = np.maximum(*noise) / np.sqrt(whole.squares[2] / 20)
     assert (wanted < 1.0).all()
     np.testing.assert_allclose(regressor_noise._share(logs, steps, whole), wanted, rtol=1e-12)
+
+
+def test_shift_and_covariance_are_those_of_given_draws_of_two_logs(rng, monkeypatch):
+    """The formulas at the top of the module, with the sums of each draw given."""
+    rows, sigma, level = (11, 16), np.array([0.3, 1.7]), np.array([0.5, 0.9])
+    W = [3.0 * rng.standard_normal((count, 3)) for count in rows]
+    triangles = [np.linalg.qr(np.column_stack([x, x[:, 0]]), mode="r") for x in W]
+    factors = Factors(tuple(triangles), (np.arange(3),) * 2, np.array(rows), tuple("abc"))
+    logs = [
+        SimpleNamespace(
+            step=h, signals=SIGNALS, is_in_memory=True, whole=SimpleNamespace(trajectory=h)
+        )
+        for h in (0.01, 0.004)
+    ]
+    steps = {0.01: np.array([0.02, 1e-4]), 0.004: np.array([1e-3, 0.03])}
+    E = [0.4 * rng.standard_normal((4, 3)) for _ in range(12)]
+    pairs = [
+        [regressor_noise._Sums(60 * rng.standard_normal((5, 3)), x.T @ x, 9) for x in two]
+        for two in zip(E[::2], E[1::2], strict=True)
+    ]
+    plain = regressor_noise._Sums(rng.standard_normal((5, 3)), np.zeros((3, 3)), 9)
+    given = iter(pairs)
+    monkeypatch.setattr(regressor_noise, "_steps", lambda log: steps[log.step])
+    monkeypatch.setattr(regressor_noise, "_without_steps", lambda near, _: near)
+    monkeypatch.setattr(regressor_noise, "_sums", lambda near, motions, *_: plain)
+    monkeypatch.setattr(regressor_noise, "_pair", lambda *_: next(given))
+    model = SimpleNamespace(is_static=False, free_flyer=False)
+    recordings = SimpleNamespace(model=model, share=0.3, fitted=logs)
+    squares = np.array([[0.0] * 2, [0.0] * 2, [8e4, 2e5]])
+    whole = SimpleNamespace(factors=factors, squares=squares, samples=20)
+    found = find_regressor_noise(recordings, whole, 1e4 * np.array([9.0, -7.0, 5.0]), sigma, level)
+    H = sum(x.T @ x / s**2 for x, s in zip(W, sigma, strict=True))
+    B = np.linalg.inv(H)
+    noisy = sum(x.T @ x * (e / s**2) ** 2 for x, s, e in zip(W, sigma, level, strict=True))
+    scale = sum(rows) / 9
+    moved = np.array([plain.score - 0.5 * (one.score + two.score) for one, two in pairs])
+    D = scale * np.mean([0.5 * (one.information + two.information) for one, two in pairs], axis=0)
+    D_theta = scale * moved.mean(axis=0)
+    np.testing.assert_allclose(found.shift, -np.linalg.solve(H - D, D_theta), rtol=1e-9)
+    np.testing.assert_allclose(found.std_error, np.sqrt(np.diag(B @ noisy @ B) / 0.3), rtol=1e-9)
+    x, X = scipy.linalg.eigh(D, H)  # X X^T = H^-1
+    assert (x > 0).all()
+    assert (x < 0.8).all()
+    linear = np.array([0.5 * (one.segments - two.segments) @ X for one, two in pairs])
+    repeated = np.mean(linear.sum(axis=1) ** 2 - np.sum(linear**2, axis=1), axis=0)
+    unsure = 0.1 * x / (1 - x) ** 2 * (X.T @ D_theta)
+    meat = H @ X @ np.diag(scale * np.maximum(repeated, 0.0) + unsure**2) @ X.T @ H
+    meat += scale**2 * np.cov(moved.T) / 6
+    np.testing.assert_allclose(found.meat, meat, rtol=1e-8, atol=1e-9 * meat.max())
+    np.testing.assert_array_equal(found.steps, [0.02, 0.03])
+    np.testing.assert_array_equal(
+        found.share, regressor_noise._share(logs, list(steps.values()), whole)
+    )
+    counted = found.uncorrected(H)
+    np.testing.assert_allclose(
+        counted.meat - found.meat, H @ np.outer(found.shift, found.shift) @ H
+    )
+    assert (found.is_corrected, counted.is_corrected) == (True, False)
+
+
+@pytest.mark.parametrize(
+    ("steps", "shift", "severity", "coarsest"),
+    [
+        ((0.001, 0.9, 0.003, 0.002), -1.5, "warning", "0.003 rad (11.0 bits per revolution)"),
+        ((0.001, 0.9, 0.003, 0.04), 0.75, "note", "0.04 m"),
+        ((0.001, 0.9, 0.003, 0.04), 0.3, None, ""),
+    ],
+)
+def test_a_finding_names_the_joints_of_coarse_steps_and_the_worst_inertial_sum(
+    steps, shift, severity, coarsest
+):
+    K = np.array([[0.0, 0.0, 1.0], [1.0, 0.5, 0.0], [0.0, 2.0, 1.0]])  # the first is of a drive
+    noise = regressor_noise.RegressorNoise(
+        steps=np.array(steps), share=np.array([0.4, 0.03, 0.05, 0.2]),
+        shift=np.array([90.0, 0.2, shift]), std_error=np.array([1.0, 0.5, 0.75]), meat=np.eye(3),
+    )  # fmt: skip
+    layout = SimpleNamespace(n_inertial=2, prismatic={"d"})
+    fit = SimpleNamespace(
+        regressor_noise=noise, model=SimpleNamespace(joints=tuple("abcd"), layout=layout),
+        mapping=SimpleNamespace(K=K, base_names=("x", "y", "z")),
+    )  # fmt: skip
+    found = regressor_noise.encoder_findings(fit)
+    assert len(found) == (severity is not None)
+    if not found:
+        return
+    (finding,) = found
+    assert (finding.severity, finding.where) == (severity, "a, c, d")
+    assert finding.message.startswith(
+        f"a, c, d: the position is quantised in steps of up to {coarsest}. "
+    )
+    size = abs(shift) / 0.75
+    assert (
+        f"40 % of the RMS acceleration and shifts z by {size:.1f} standard errors"
+        in finding.message
+    )
+    assert finding.evidence == pytest.approx(
+        {
+            "step_a": steps[0],
+            "step_c": steps[2],
+            "step_d": steps[3],
+            "std_errors": size,
+            "share_pct": 40,
+        }
+    )

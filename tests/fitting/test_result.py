@@ -5,7 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from robotid.fitting import result as result_module
 from robotid.fitting.result import Fit
+from robotid.fitting.settings import EstimatorSettings
 
 
 def test_a_bound_is_the_source_of_what_it_moved_and_the_data_do_not_show(identified):
@@ -37,3 +39,48 @@ def test_the_quantile_of_a_standard_parameter_is_the_largest_of_its_base_paramet
     errors = SimpleNamespace(quantile=np.array([2.125, 2.5, 1.97]))
     found = SimpleNamespace(mapping=SimpleNamespace(K=K), errors=errors)
     assert Fit.standard_quantile.fget(found).tolist() == [2.125, 1.96, 2.5, 1.97]
+
+
+def test_a_stated_mass_is_the_prior_and_a_range_of_masses_is_not(identified):
+    names, spread = np.array(identified.model.layout.names), identified.prior_std
+    details = {**identified.estimate.details, "active": (), "pinned": (), "constraints": False}
+    stated = {"mass": {"forearm_link": 2.5, "upper_arm_link": [1.0, 30.0]}}
+    found = replace(
+        identified,
+        estimator=EstimatorSettings("consistent", constraints=stated),
+        standard=identified.prior + 0.4 * spread,
+        errors=replace(identified.errors, unbounded=0.5 * spread),
+        estimate=replace(identified.estimate, details=details),
+    )
+    assert {name for name, x in zip(names, found.sources, strict=True) if x != "mixed"} == {
+        "forearm_link.m"
+    }
+    assert found.sources[names.tolist().index("forearm_link.m")] == "prior"
+
+
+def test_intervals_are_each_value_s_own_quantile_times_its_own_error():
+    half = {"base_quantile": np.array([2.0, 3.0]), "base_error": np.array([0.5, 0.25])}
+    half |= {"standard_quantile": np.array([4.0, 1.5]), "standard_error": np.array([0.5, np.inf])}
+    found = SimpleNamespace(base=np.array([1.0, -2.0]), standard=np.array([7.0, 5.0]), **half)
+    assert Fit.base_interval.fget(found).tolist() == [[0.0, 2.0], [-2.75, -1.25]]
+    assert Fit.standard_interval.fget(found).tolist() == [[5.0, 9.0], [-np.inf, np.inf]]
+
+
+def test_predictions_are_of_logs_without_fitted_rows():
+    validation = [
+        SimpleNamespace(
+            recording=SimpleNamespace(name=name), is_refitted=is_refitted,
+            metrics={"estimate": f"{name} estimate", "wls": f"{name} wls"},
+        )
+        for name, is_refitted in (("a", True), ("b", False), ("c", False))
+    ]  # fmt: skip
+    found = SimpleNamespace(validation=validation)
+    assert Fit.predictions.fget(found) == {"b": "b estimate", "c": "c estimate"}
+    assert Fit.refitted.fget(found) == (validation[0],)
+
+
+def test_a_band_is_that_of_the_recording_or_of_the_noise_of_the_fit(monkeypatch):
+    monkeypatch.setattr(result_module, "expected_band", lambda found, e: ("expected", e))
+    a, b, c, other = (SimpleNamespace(name=name) for name in "abcd")
+    own = SimpleNamespace(fitted=(a, b), validation=(c,), _bands=(1, 2, 3))
+    assert [Fit.band(own, e) for e in (a, b, c, other)] == [1, 2, 3, ("expected", other)]

@@ -4,21 +4,28 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scipy.stats
-from helpers.driven import arm
+from helpers.driven import JOINTS, arm
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
+from robotid.estimators import WLS
 from robotid.exceptions import SettingsError
+from robotid.fitting import robust
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.robust import LOSSES, find_outliers, loss_slope, loss_weight
 from robotid.fitting.settings import EstimatorSettings
-from robotid.fitting.survey import survey_log
+from robotid.fitting.survey import hold_log, survey_log
 from robotid.identification.pipeline import conclude
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.read import lay_out, write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.factors import join
+from robotid.regressor.prediction import predict
 from robotid.regressor.used_rows import base_problem
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
 
 NOISE = np.array([6.0, 3.0, 0.9])
 OUTLIERS = {  # [N m] by joint and row
@@ -215,3 +222,75 @@ def test_logs_larger_than_memory_are_refused_by_name(model, tmp_path):
 def test_a_job_refuses_another_loss():
     with pytest.raises(SettingsError, match="robust is 'cauchy'"):
         EstimatorSettings("wls", robust="cauchy")
+
+
+def test_a_reversal_excuses_the_step_of_coulomb_friction_of_its_own_joint(model):
+    """Where |v| <= |a| / cutoff, an error is counted beyond twice the joint's friction."""
+    t, pi = np.arange(400) / 100, truth(model)
+    step = 2 * pi[[model.layout.names.index(f"{joint}.coulomb") for joint in model.joints]]
+    typical, off = 1.4826 * np.array([0.2, 0.3, 0.5]), np.zeros((400, 3))
+    slow = {(60, 0): 0.19, (120, 0): 0.21, (60, 1): 0.2, (180, 1): 0.0, (60, 2): 0.1, (240, 2): 0.3}
+    for k, (row, j) in enumerate(slow):
+        off[row, j] = step[j] + (11.0, 12.5, 13.5, 11.5, 14.5, 11.9)[k] * typical[j]
+    v, a = np.ones((400, 3)), np.zeros((400, 3))
+    for (row, j), speed in slow.items():
+        v[row, j], a[row, j] = -speed, 1.0
+    predicted = np.where(np.arange(400)[:, None] % 2, 3.0, -3.0) * np.ones(3)
+    left = typical / 1.4826 * np.where(np.arange(400)[:, None] % 4 < 2, 1, -1)
+    tau = predicted + np.where(off > 0, off, left)
+    motion = Trajectory(t, v, v, a, tau, model.joints, 100.0, np.zeros(400, dtype=int))
+    recording = SimpleNamespace(
+        trajectory=motion, mask=np.ones((400, 3), dtype=bool),
+        log=Log(t, v, tau, model.joints), signals=SignalSettings(cutoff=5.0),
+    )  # fmt: skip
+    evaluation = SimpleNamespace(recording=recording, torques={"estimate": predicted})
+    found = find_outliers(model, [evaluation], pi)
+    sizes = {(round(100 * o.t), model.joints.index(o.joint)): o.size for o in found}
+    wanted = {(60, 1): 13.5, (60, 2): 14.5}  # excused in part; in full beside a reversal
+    wanted |= {(120, 0): step[0] / typical[0] + 12.5, (240, 2): step[2] / typical[2] + 11.9}
+    assert sizes == pytest.approx(wanted)
+
+
+def test_a_coupled_drive_steps_at_each_of_its_joints_by_its_ratio():
+    lift, _, wrist = JOINTS
+    model = RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"), joints=JOINTS,
+        couplings=[Coupling("pair", ((lift, 1.0), (wrist, -2.5)))],
+    )  # fmt: skip
+    names, pi = model.layout.names, np.zeros(len(model.layout.names))
+    for name, value in (("pair.coulomb", 0.7), ("elbow_joint.coulomb", 1.1), ("pair.offset", 9.0)):
+        if name in names:
+            pi[names.index(name)] = value
+    assert robust._friction_step(model, pi) == pytest.approx([1.4, 2.2, 3.5])
+
+
+def test_weights_and_their_loss_are_those_of_the_residuals_of_all_logs_together(model):
+    """The scale of a joint is the median of both logs; of the second most rows are not used."""
+    rng, pi = np.random.default_rng(8), truth(model)
+    signals = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.3)
+    logs = [
+        exact_log(model, pi, rng, samples=n, noise=s * NOISE) for n, s in ((180, 1.0), (130, 2.0))
+    ]
+    own = Recordings(
+        model, structural_mapping(model), [hold_log(model, log, signals) for log in logs]
+    )
+    prior = model.standard_parameters()
+    weighted, understated = robust.reweigh(own, "huber", prior)
+    theta = WLS(prior=own.mapping.to_base(prior)).fit(
+        join(weighted.reduce(is_cut=False)).factors
+    ).theta  # fmt: skip
+    rows = [log.whole for log in own.fitted]
+    residuals = [
+        row.trajectory.tau
+        - predict(model, [own.mapping.to_standard(theta, prior)], row.trajectory)[0]
+        for row in rows
+    ]
+    together, used = np.concatenate(residuals), np.concatenate([row.mask for row in rows])
+    scale = [1.4826 * np.median(np.abs(together[used[:, j], j])) for j in range(3)]
+    for weight, residual in zip(weighted.weights, residuals, strict=True):
+        wanted = np.minimum(1.0, 1.345 * np.array(scale) / np.abs(residual))
+        np.testing.assert_allclose(weight, wanted, atol=5e-3)
+    scaled = np.abs(together / scale)[used]
+    mean = np.minimum(1.0, 1.345 / scaled).mean() / np.mean(scaled < 1.345)
+    assert understated == pytest.approx(mean, rel=1e-2)
+    assert mean > 1.05

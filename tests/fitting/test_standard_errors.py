@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,9 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import OLS, WLS
 from robotid.estimators.segments import quantile, scatter
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, NotConvergedError
 from robotid.fitting.standard_errors import (
+    Redraws,
     about_prior,
     measured_errors,
     standard_of,
@@ -108,6 +110,21 @@ def test_independent_rows_need_no_inflation_and_coloured_ones_do(W):
     _, coloured = estimate(W, W @ TRUTH + noise(rng, 0.9))
     assert 0.7 < white.inflation < 1.4
     assert coloured.inflation > 5  # (1 + 0.9) / (1 - 0.9) = 19 for rows that never change
+
+
+def test_an_open_parameter_has_no_error_and_leaves_that_of_others(W):
+    tau = W @ TRUTH + noise(np.random.default_rng(3), 0.5)
+    parts = segments(W, tau)
+    whole = merge(parts)
+    rough = WLS().fit(whole)
+    wanted = measured_errors(rough, parts, whole, 1.0, np.eye(4), rough.sigma)[0].covariance
+    open_one = rough.covariance.copy()
+    open_one[2, 2] = np.inf
+    given = replace(rough, covariance=open_one)
+    found = measured_errors(given, parts, whole, 1.0, np.eye(4), rough.sigma)[0].covariance
+    others = wanted.copy()
+    others[2, 2] = np.inf
+    np.testing.assert_allclose(found, others, rtol=1e-9)
 
 
 def test_one_parameter_is_the_closed_form_of_cr2(rng):
@@ -295,3 +312,69 @@ def test_standard_parameters_are_the_prior_moved_by_the_least_to_the_base_parame
     after = np.diag(K @ C @ K.T)
     assert after[1] == pytest.approx((K @ before @ K.T)[1, 1])
     assert after[0] == pytest.approx(wls.covariance[0, 0])
+
+
+@pytest.mark.parametrize("count", [40, 11])
+def test_with_active_bounds_errors_are_those_of_resampled_fits(W, rng, count):
+    share, given, distances = 0.25, [], rng.standard_normal((8, 6))
+    parts = segments(W, W @ TRUTH + noise(rng, 0.9))[:count]
+    whole, K = merge(parts), np.hstack([np.eye(4), rng.standard_normal((4, 2))])
+    wls = WLS(independent_share=share).fit(whole)
+    R = whole.weighted(wls.sigma)[:4, :4]
+    C = np.linalg.inv(share * K.T @ R.T @ R @ K + np.diag(np.arange(1.0, 7.0)))
+    theta = np.linalg.lstsq(K, wls.theta, rcond=None)[0]
+    estimate = replace(
+        wls, theta=theta, covariance=C, names=tuple("abcdef"), details={"active": ("x y",)}
+    )
+    solved = [distances, ["slow", "other"]]
+
+    def redrawn(*arguments):
+        given.append(arguments)
+        return solved
+
+    fit = SimpleNamespace(
+        rows=lambda factors, sigma: (factors, sigma), prior_weight=2.5, weight_ratio=1.5,
+        programme=SimpleNamespace(redrawn=redrawn),
+    )  # fmt: skip
+    every = (estimate, parts, whole, share, K, wls.sigma)
+    plain, without = measured_errors(*every)
+    found, errors = measured_errors(*every, redraws=Redraws(fit, 10, "noise"))
+    (rows, weight, pi, meat, ratio, draws, source), *_ = given
+    assert rows == (whole, wls.sigma)
+    assert (weight, ratio, draws, source) == (2.5, 1.5, 10, "noise")
+    np.testing.assert_array_equal(pi, theta)
+    wanted = share * R.T @ R
+    if count == 40:
+        wanted = share**2 * scatter(parts, K @ theta, wls.sigma, share * K @ C @ K.T).meat
+    np.testing.assert_allclose(meat, wanted, rtol=1e-9)
+    np.testing.assert_allclose(found.covariance, distances.T @ distances / 8, rtol=1e-12)
+    np.testing.assert_allclose(1 / errors.freedom, 1 / without.freedom + 1 / 8, rtol=1e-12)
+    np.testing.assert_array_equal(errors.unbounded, plain.std_error)
+    assert errors.method == (
+        f"{without.method}; bounds are active: 8 fits to resampled data and prior "
+        "(2 more not solved: slow)"
+    )
+    solved[:] = distances[:7], ["slow", "other", "other"]
+    with pytest.raises(NotConvergedError, match="solved 7 of 10 fits") as error:
+        measured_errors(*every, redraws=Redraws(fit, 10, "noise"))
+    assert error.value.status == "slow"
+    for off in (Redraws(fit, 0, "noise"), None):  # bounds are neglected
+        assert measured_errors(*every, redraws=off)[1].unbounded is None
+    if count == 11:
+        wide = measured_errors(*every, weight_ratio=3.0)[0]
+        L = np.diag(np.arange(1.0, 7.0))
+        np.testing.assert_allclose(
+            wide.covariance, C @ (share * K.T @ R.T @ R @ K + 3.0 * L) @ C, atol=1e-9
+        )
+
+
+def test_a_gradient_method_has_rank_and_names_of_least_squares(W):
+    wls = WLS().fit(merge(segments(W, W @ TRUTH + noise(np.random.default_rng(5), 0.0))))
+    wls = replace(wls, rank=3, condition=7.5, undetermined=("b",), sigma=np.array([1.0, 2.0]))
+    own = {"rank": 4, "condition": np.inf, "undetermined": (), "sigma": SIGMA, "n_iter": 11}
+    rough = replace(wls, **own, message="11 steps; a gradient method has no covariance")
+    found = with_wls_errors(rough, wls)
+    assert (found.rank, found.condition, found.undetermined) == (3, 7.5, ("b",))
+    assert (found.n_iter, found.message.split("; ")[0]) == (11, "11 steps")
+    assert "gradient" not in found.message
+    np.testing.assert_array_equal(found.sigma, SIGMA)

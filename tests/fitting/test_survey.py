@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -231,3 +232,48 @@ def test_pieces_travel_as_they_are(ur5, recording, tmp_path):
         np.testing.assert_array_equal(again.reduce().factors.R, piece.reduce().factors.R)
     # the model and the mapping go along once
     assert len(pickle.dumps(pieces)) < len(pickle.dumps(pieces[:1])) + 1000 * len(pieces)
+
+
+def test_positions_of_locked_joints_are_those_of_all_windows_in_radians():
+    kinds = {"a": "revolute", "b": "continuous", "s": "prismatic", "c": "revolute"}
+    joints = [SimpleNamespace(name=name, type=kind) for name, kind in kinds.items()]
+    model = SimpleNamespace(tree=SimpleNamespace(movable=joints))
+    layout = SimpleNamespace(units=LogUnits("s", "deg"))
+    windows = [
+        {
+            "x": np.array([10.0, np.nan, 30.0]),
+            "y": np.array([1.0, 2.0, 3.0]),
+            "z": np.full(3, np.nan),
+        },
+        {"x": np.array([40.0, 50.0]), "y": np.array([4.0, 5.0]), "z": np.full(2, np.nan)},
+    ]
+    names = {"a": "x", "s": "y", "c": "z"}
+    found = survey._positions(names, windows, layout, model)
+    assert found.keys() == {"a", "s"}  # nothing of the one whose column is empty
+    np.testing.assert_allclose(found["a"], np.deg2rad([10.0, 30.0, 40.0, 50.0]))
+    np.testing.assert_array_equal(found["s"], [1.0, 2.0, 3.0, 4.0, 5.0])
+    part = survey._positions(names, windows, layout, model, slice(2, 4))
+    np.testing.assert_allclose(part["a"], np.deg2rad([30.0, 40.0]))
+    layout.units = LogUnits("s", "rad")
+    plain = survey._positions({"b": "x"}, windows[1:], layout, model)
+    np.testing.assert_array_equal(plain["b"], [40.0, 50.0])
+
+
+def test_windows_of_a_long_log_are_named_by_their_own_rows(monkeypatch):
+    monkeypatch.setattr(survey, "_WINDOW", 100)
+    q = np.zeros((2, 1))
+    windows = tuple(Log(np.arange(2.0), q, q, ("a",), path="run.csv", notes=(n,)) for n in "xyz")
+    log = SimpleNamespace(windows=windows, first=7, stop=1008)
+    looks = survey.SurveyedLog.looks.fget(log)
+    assert [own.path for own in looks] == [
+        "run.csv rows 7-107", "run.csv rows 457-557", "run.csv rows 908-1008",
+    ]  # fmt: skip
+    assert {own.notes for own in looks} == {()}
+    head = survey.SurveyedLog.head.fget(log)
+    assert head.notes == (
+        "x", "the log is too long for the memory; the doctor checked rows 7-107, 457-557, "
+        "908-1008 only",
+    )  # fmt: skip
+    short = SimpleNamespace(windows=windows[:1], first=7, stop=300)
+    assert survey.SurveyedLog.looks.fget(short) == windows[:1]
+    assert survey.SurveyedLog.head.fget(short) is windows[0]

@@ -1,13 +1,18 @@
 """velocity = "auto" takes the velocities that predict torque better where none was fitted."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.corruptions import clean_log, robot
+from helpers.driven import arm
 
+from robotid.fitting import velocity_choice
 from robotid.fitting.survey import hold_log
+from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.torque import joint_torque_regressor
 
 LSB = 2 * np.pi / 4096  # [rad] of a 12-bit encoder
 
@@ -56,3 +61,70 @@ def test_a_log_too_short_to_predict_is_judged_by_its_lag(log):
     short = log.window(2.0, 2.7)
     assert chosen(short) == "measured"
     assert chosen(late(short, 0.05)) == "differentiated"
+
+
+def test_a_part_is_predicted_by_the_fit_to_the_others_joint_by_joint(rng):
+    """Every third row counts, in eight parts; the last joint has too few of them."""
+    model = arm()
+    n, p = 2400, model.support().sum(axis=1)
+    q, v, a, tau = rng.standard_normal((4, n, 3))
+    motion = Trajectory(np.arange(n) / 50, q, v, a, tau, model.joints, 50.0, np.zeros(n, dtype=int))
+    mask = rng.random((n, 3)) < 0.8
+    mask[:, 2] &= np.arange(n) % 3 == 1
+    error = velocity_choice._held_out_error(model, motion, mask, 3)
+    Y = joint_torque_regressor(model, q, v, a).reshape(n, 3, -1)
+    folds = [np.concatenate(np.array_split(np.arange(0, n, 3), 8)[k::2]) for k in (0, 1)]
+    for j in (0, 1):
+        squares = 0.0
+        for one, other in (folds, folds[::-1]):
+            one, other = one[mask[one, j]], other[mask[other, j]]
+            assert min(len(one), len(other)) >= 3 * p[j]
+            W = Y[:, j, model.support()[j]]
+            size = np.linalg.norm(W[one], axis=0)
+            W = W / np.where(size > 0, size, 1.0)
+            theta = np.linalg.pinv(W[one], rcond=1e-3) @ tau[one, j]
+            squares += np.sum((tau[other, j] - W[other] @ theta) ** 2)
+        wanted = np.sqrt(squares) + 1e-6 * np.linalg.norm(tau[::3, j])
+        assert error[j] == pytest.approx(wanted, rel=1e-6)
+    assert np.isnan(error[2])
+
+
+def test_both_velocities_are_compared_on_the_rows_that_both_have(monkeypatch):
+    masks = {"measured": np.array([[1, 1], [0, 1], [1, 1]] * 700, dtype=bool)}
+    masks["differentiated"] = np.array([[1, 0], [1, 1], [1, 1]] * 700, dtype=bool)
+    given = []
+
+    def held_out(model, motion, mask, every):
+        given.append((motion, mask, every))
+        return np.array([2.0, 3.0]) if motion == "measured" else np.array([5.0, 7.0])
+
+    model = SimpleNamespace(joints=("a", "b"), layout=None)
+    monkeypatch.setattr(velocity_choice, "friction_speeds", lambda layout: None)
+    monkeypatch.setattr(velocity_choice, "process", lambda log, chosen, speeds: chosen.velocity)
+    monkeypatch.setattr(velocity_choice, "row_mask", lambda model, motion, least: masks[motion])
+    monkeypatch.setattr(velocity_choice, "_held_out_error", held_out)
+    log = SimpleNamespace(has_torque=True)
+    found = velocity_choice._errors(model, log, SignalSettings())
+    np.testing.assert_array_equal(found, [[2.0, 5.0], [3.0, 7.0]])
+    assert [motion for motion, *_ in given] == ["measured", "differentiated"]
+    for _, mask, every in given:  # at most 1000 of 2100
+        np.testing.assert_array_equal(mask, masks["measured"] & masks["differentiated"])
+        assert every == 3
+    assert np.isnan(velocity_choice._errors(model, SimpleNamespace(has_torque=False), None)).all()
+
+
+@pytest.mark.parametrize(("last", "wanted"), [(0.84, False), (0.86, True)])
+def test_the_median_joint_of_all_logs_decides(monkeypatch, last, wanted):
+    errors = {
+        "a": np.array([[1.0, 0.9], [2.0, np.nan]]),
+        "b": np.array([[4.0, 3.2], [5.0, 5 * last]]),
+    }
+    for name in ("coarse_velocities", "unlike_velocities"):
+        monkeypatch.setattr(velocity_choice, name, lambda log: False)
+    monkeypatch.setattr(velocity_choice, "_errors", lambda model, log, settings: errors[log.name])
+    logs = [SimpleNamespace(name=name) for name in "ab"]
+    assert velocity_choice.prefers_measured(None, logs, SignalSettings()) is wanted
+    errors["a"], errors["b"] = np.full((2, 2, 2), np.nan)
+    timely = {"a": True, "b": wanted}
+    monkeypatch.setattr(velocity_choice, "is_timely", lambda log, delay: timely[log.name])
+    assert velocity_choice.prefers_measured(None, logs, SignalSettings()) is wanted

@@ -145,7 +145,7 @@ CALLS = {
     "metrics": (lambda **given: robot().found.metrics(**given), lambda c, _: {"name": "wls"}),
     "save": (
         lambda **given: robotid.save_result(robot().found, **given),
-        lambda c, f: {"folder": f / "saved", "report": False},
+        lambda c, f: {"folder": f / "saved", "report": False, "replay": False},
     ),
     "load_result": (robotid.load_result, lambda c, _: {"path": good_result()[0]}),
     "read_job": (robotid.read_job, lambda c, _: {"path": "job.toml"}),

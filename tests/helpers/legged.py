@@ -117,7 +117,7 @@ def recorded(
     phase = rng.uniform(0, 2 * np.pi, (n, len(tones)))
     size = rng.dirichlet(np.ones(len(tones)), n)
     period, settles = round(1 / (rate * step)), 1.0
-    rows = []
+    rows, touches = [], np.zeros(len(feet))
     for k in range(round((duration + settles) / step)):
         t = k * step - settles
         if k % _HOLD == 0:
@@ -128,7 +128,7 @@ def recorded(
             command = kp * (target - data.qpos[qpos]) - kd * data.qvel[qvel]
             before, data.ctrl[:] = data.ctrl.copy(), command
         if k % period == 0 and t >= 0:
-            touches, wrench = np.zeros(len(feet)), np.zeros((len(feet), 3))
+            wrench = np.zeros((len(feet), 3))
             mujoco.mj_forward(mj, data)
             for c in range(data.ncon):
                 contact, own = data.contact[c], np.zeros(6)
@@ -136,12 +136,16 @@ def recorded(
                 if foot is None or contact.efc_address < 0:
                     continue
                 mujoco.mj_contactForce(mj, data, c, own)
-                touches[foot] = 1.0
                 sign = 1.0 if contact.geom[1] == spheres[foot] else -1.0
                 wrench[foot] += sign * contact.frame.reshape(3, 3).T @ own[:3]
             half = 0.5 * (before + data.ctrl)
             rows.append(np.concatenate([[t], data.qpos, half, touches, wrench.ravel()]))
+            touches[:] = 0.0
         mujoco.mj_step(mj, data)
+        for contact in data.contact:  # at any time since the last row
+            for g in contact.geom:
+                if g in spheres and contact.efc_address >= 0:
+                    touches[spheres.index(g)] = 1.0
     rows = np.array(rows)
     t, q = rows[:, 0], rows[:, 1 + qpos]
     resolution = 2 * np.pi / 2**bits

@@ -15,6 +15,9 @@ from scipy.stats import t as t_of
 from robotid.commands.job import LogEntry, read_job
 from robotid.estimators.segments import quantile
 from robotid.exceptions import DataError, ModelError, SettingsError
+from robotid.fitting.recordings import Recordings
+from robotid.fitting.survey import hold_log
+from robotid.identification import payload_fit
 from robotid.identification.payload_fit import (
     Gain,
     Payload,
@@ -29,6 +32,7 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.drives import FAMILIES
 from robotid.robot.examples import example_urdf
+from robotid.robot.prior import payload_spread
 
 #: Friction is chosen where the test is about that.
 with_known_friction = partial(identify_payload, friction="viscous+coulomb")
@@ -457,3 +461,84 @@ def test_joints_that_disagree_widen_the_interval(ur5):
     assert low < MASS < high
     # few joints tell it: the interval reaches further than 1.96 standard errors
     assert (high - unsure.mass) / unsure.mass_std_error > 2.3
+
+
+def test_two_runs_are_compared_with_what_is_known_of_each_payload(rng, monkeypatch):
+    """The reference first, the fewest independent rows of both, one plausible size per payload."""
+    model, links = arm(), ("tool0", "forearm_link")
+    logs = [exact_log(model, truth(model), rng, samples=n) for n in (160, 130)]
+    filters = SignalSettings(cutoff=10.0), SignalSettings(cutoff=4.0)
+    mapping = structural_mapping(model)
+    loaded, reference = (
+        Recordings(model, mapping, [hold_log(model, log, own)])
+        for log, own in zip(logs, filters, strict=True)
+    )
+
+    class Stopped(Exception):
+        pass
+
+    def stop(*arguments, **named):
+        raise Stopped(arguments, named)
+
+    monkeypatch.setattr(payload_fit, "payload_runs", stop)
+    with pytest.raises(Stopped) as given:
+        payload_fit.fit_payloads(
+            loaded, reference, links=links, masses={"forearm_link": 2.5},
+            unknown_gains=[model.joints[2], model.joints[0]],
+        )  # fmt: skip
+    (first, second, _, K, urdf, _, (columns, known, size)), named = given.value.args
+    rows = [sum(part.factors.rows.sum() for part in run) for run in (first, second)]
+    assert rows == [run.fitted[0].whole.mask.sum() for run in (reference, loaded)]
+    np.testing.assert_array_equal(K, mapping.K)
+    np.testing.assert_array_equal(urdf, model.standard_parameters())
+    assert columns.shape == (len(K), 20)
+    np.testing.assert_array_equal(known, [*[np.nan] * 10, 2.5, *[np.nan] * 9])
+    np.testing.assert_array_equal(size, np.tile(payload_spread(model), 2))
+    assert named == {"share": pytest.approx(2 * 4.0 / 50.0), "unknown": [2, 0]}
+
+
+def test_payloads_load_the_gears_as_bodies_at_their_links(rng):
+    model = arm()
+    log = exact_log(model, truth(model), rng, samples=20)
+    loads = {"tool0": (1.5, COM, INERTIA), "forearm_link": (3.0, -COM, 2 * INERTIA)}
+    payloads = [
+        Payload(link, m, 0.1, np.zeros(2), c, COM, x, INERTIA, {})
+        for link, (m, c, x) in loads.items()
+    ]
+    mapping = structural_mapping(model)
+    base = mapping.to_base(truth(model))
+    found = SimpleNamespace(base=base, payloads=payloads)
+    bodies, added = payload_fit._loads(found, SimpleNamespace(model=model, mapping=mapping))
+    np.testing.assert_allclose(mapping.to_base(bodies), base, atol=1e-9)
+    Y = joint_torque_regressor(model, log.q, log.v, log.a)
+    wanted = sum(load_torque(model, log, link, *own) for link, own in loads.items())
+    np.testing.assert_allclose((Y @ added).reshape(wanted.shape), wanted, atol=1e-9)
+
+
+def test_known_and_fitted_parameters_of_payloads_are_put_in_their_places(rng):
+    """Of twelve parameters the first, the fifth and the last are known."""
+    known = np.full(12, np.nan)
+    known[[0, 4, 11]] = 2.0, 3.0, 5.0
+    free = [1, 2, 3, 5, 6, 7, 8, 9, 10]
+    theta, freedom, root = rng.random(13), rng.random(15), rng.standard_normal((15, 15))
+    found = SimpleNamespace(theta=theta, freedom=freedom, covariance=root @ root.T)
+    x, C, own = payload_fit._payload_parameters(found, known)
+    wanted = np.zeros(12)
+    wanted[[0, 4, 11]], wanted[free] = (2.0, 3.0, 5.0), theta[4:]  # four of the robot before
+    np.testing.assert_array_equal(x, wanted)
+    np.testing.assert_array_equal(own[free], freedom[4:13])
+    assert np.isinf(own[[0, 4, 11]]).all()
+    np.testing.assert_array_equal(C[np.ix_(free, free)], found.covariance[4:13, 4:13])
+    assert not C[[0, 4, 11]].any()
+    assert not C[:, [0, 4, 11]].any()
+
+
+def test_a_payload_of_no_significant_mass_has_nothing_else():
+    x = np.array([0.29, 0.0, 0.0, 0.01, 1e-3, 0.0, 1e-3, 0.0, 0.0, 1e-3])
+    C = np.diag([0.01, *[1e-8] * 9])
+    model = SimpleNamespace(length=100.0)
+    why = "the payload on tool does not differ significantly from 0 kg"
+    for mass, reasons in ((0.29, {"com": why, "inertia": why}), (0.31, {})):
+        own = _payload(model, "tool", np.append(mass, x[1:]), C, np.full(10, np.inf)).reasons
+        assert {key: own[key] for key in reasons} == reasons
+        assert (why in own.values()) is bool(reasons)

@@ -1,7 +1,9 @@
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.driven import JOINTS
 from helpers.fitting import fit, identify
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
@@ -10,12 +12,18 @@ from robotid.estimators import batch
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
 from robotid.findings import Finding
 from robotid.fitting.recordings import Recordings
+from robotid.fitting.result import Fit
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
+from robotid.identification import pipeline
+from robotid.identification import result as result_module
 from robotid.identification.pipeline import conclude
+from robotid.identification.result import Asked, Identification
+from robotid.judgement.evidence import Determined, Predictions
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.drives import Harmonic, LoadFriction
 from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import MassMatrixCheck
 from robotid.robot.model import RobotModel
@@ -260,3 +268,128 @@ def test_links_on_locked_joints_that_weigh_less_than_the_urdf_says_are_named():
     assert costs[1] == []
     assert "the URDF's inertials of the links on locked joints, 1.41 kg of the " in costs[0][0]
     assert "kg of wrist_1_link (identify their joints, too" in costs[0][0]
+
+
+@pytest.mark.parametrize("ignore", [(), ("unmounted_part",), ("unsigned_torque", "mass_matrix")])
+def test_what_is_concluded_counts_all_findings_but_the_ignored_ones(
+    identified, monkeypatch, ignore
+):
+    """Of a fit that is given: notes of all logs, errors and warnings of the doctor."""
+    fit = Fit(**{f.name: getattr(identified, f.name) for f in fields(Fit) if f.init})
+    given, springs = [], []
+    monkeypatch.setattr(pipeline, "with_drives", lambda *x, **_: (given.append(x), fit)[1])
+    monkeypatch.setattr(pipeline, "counterbalanced", lambda *x: x)
+    monkeypatch.setattr(pipeline, "with_known_springs", lambda *x: (springs.append(x), x[0])[1])
+    monkeypatch.setattr(pipeline, "take_sample", lambda fit: None)
+    monkeypatch.setattr(pipeline, "explain_residual", lambda fit, sample: ((), ()))
+    monkeypatch.setattr(pipeline, "with_model_error", lambda fit, *_: (fit, ("a.viscous",)))
+    logs = [
+        SimpleNamespace(head=SimpleNamespace(name=name, path=name, notes=(f"note {k}",)),
+                        asked=SignalSettings(cutoff=3.0 + k))
+        for k, name in enumerate(("a.csv", "b.csv", "c.csv"))
+    ]  # fmt: skip
+    recordings = SimpleNamespace(model=fit.model, fitted=logs[:2], validation=logs[2:])
+    found = [
+        Finding(
+            "unmounted_part", "warning", "a.csv: wrist_3_link", "x", {"mass": 2.0, "gain": 9.0}
+        ),
+        Finding("unsigned_torque", "error", "b.csv", "all absolute", {"joints": 6.0}),
+        Finding("excitation", "warning", "a.csv", "left out"),
+        Finding("rate", "note", "a.csv", "left out"),
+    ]
+    choice = EstimatorSettings("consistent")
+    result = pipeline.conclude(recordings, choice, found, ignore, friction="none")
+    codes = [f.code for f in result.findings]
+    assert codes.count("log_note") == 3
+    assert {f.where for f in result.findings if f.code == "log_note"} == {"a.csv", "b.csv", "c.csv"}
+    assert ("excitation" in codes, "rate" in codes) == (False, False)
+    assert "unmounted_part" in codes  # it is shown whatever is ignored
+    is_wrong = "unsigned_torque" not in ignore
+    assert result.log_errors == (("all absolute",) if is_wrong else ())
+    assert ("urdf_not_written" in codes) is is_wrong
+    assert result.has_urdf is not is_wrong
+    assert ("unmounted_part" in {w.code for w in result.warnings}) is (
+        "unmounted_part" not in ignore
+    )
+    assert result.asked == Asked(SignalSettings(cutoff=3.0), "none", ignore)
+    assert result.on_misfit == ("a.viscous",)
+    ((_, asked, wanted, balanced),) = given
+    assert (asked, set(wanted.values())) == (choice, {()})
+    assert balanced == (found, ["a.csv", "b.csv"])  # of the fitted logs
+    assert springs == [(found[:2], fit)]
+
+
+def test_a_verdict_is_given_all_that_is_known_of_a_result(monkeypatch):
+    monkeypatch.setattr(result_module, "hidden_joints", lambda model, fitted: ("hidden", fitted))
+    monkeypatch.setattr(result_module, "judge", lambda *x, **named: (*x, named))
+    refitted = [SimpleNamespace(recording=SimpleNamespace(name=name)) for name in ("a", "b")]
+    own = {
+        "metrics": lambda: "fitted", "predictions": {"c": 1}, "fitted": ("f",),
+        "model": SimpleNamespace(joints=("x", "y"), is_static=True), "refitted": refitted,
+        "determination": SimpleNamespace(undetermined=("u",)), "is_consistent": False,
+        "is_poorly_excited": "poorly", "log_errors": ("e",), "warnings": ("w",), "scale_check": "s",
+    }  # fmt: skip
+    predictions, determined, named = Identification.verdict.func(SimpleNamespace(**own))
+    assert predictions == Predictions(
+        "fitted", {"c": 1}, ("x", "y"), ["a", "b"], ("hidden", ("f",))
+    )
+    assert determined == Determined(("u",), False, "poorly", True)
+    assert named == {"log_errors": ("e",), "warnings": ("w",), "scale_check": "s"}
+
+
+def test_drive_terms_that_were_selected_join_those_of_the_model():
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=JOINTS[:2])
+    lift, elbow = JOINTS[:2]
+    first, second, third = (LoadFriction(), Harmonic(order=3.0), Harmonic(order=5.0))
+    plain = model.with_terms({lift: [first]})
+    given = []
+    recordings = SimpleNamespace(model=plain, with_model=lambda robot: given.append(robot))
+    fit = SimpleNamespace(
+        mapping=SimpleNamespace(names=plain.layout.names),
+        standard=np.arange(len(plain.layout.names)) + 1.0,
+    )
+    drives = [
+        SimpleNamespace(joint=lift, terms=(second,)),
+        SimpleNamespace(joint=elbow, terms=(third,)),
+    ]
+    pipeline._with_own(recordings, fit, drives)
+    (robot,) = given
+    assert robot.layout.own == {lift: (first, second), elbow: (third,)}
+    values = dict(zip(plain.layout.names, fit.standard, strict=True))
+    wanted = [values.get(name, 0.0) for name in robot.layout.names]
+    assert len(wanted) == len(values) + 2
+    np.testing.assert_array_equal(robot.carried_by, wanted)
+
+
+@pytest.mark.parametrize("settles", [(), (2,)])
+def test_fits_are_counted_and_end_with_the_shapes_that_settled(monkeypatch, settles):
+    """A first fit, two with shapes, a last one; shapes that do not move end it earlier."""
+    reported, solved = [], []
+    drives = [(SimpleNamespace(terms=("x",), shapes=("s",), k=k),) for k in range(4)]
+
+    def solve(recordings, choice, is_last=True):
+        solved.append((recordings, choice, is_last))
+        return SimpleNamespace(solution=Solved(len(solved)))
+
+    moved = iter([*(drives[k] for k in range(1, 3) if k not in settles), None])
+    monkeypatch.setattr(pipeline, "solve_recordings", solve)
+    monkeypatch.setattr(pipeline, "rough_choice", lambda choice: "rough")
+    monkeypatch.setattr(pipeline, "choose_drives", lambda *_: drives[0])
+    monkeypatch.setattr(pipeline, "_with_own", lambda recordings, fit, own: (fit.k, own[0].k))
+    monkeypatch.setattr(pipeline, "settled_shapes", lambda fit: next(moved))
+    monkeypatch.setattr(pipeline, "fit_recordings", lambda own, choice: Solved(own))
+    found = pipeline.with_drives("all", "exact", {}, progress=lambda *x: reported.append(x))
+    last = reported.pop()
+    assert last == ("fits", 3, 4, "fits")
+    assert reported == [("fits", 0, 1, "fits"), ("fits", 1, 4, "fits"), ("fits", 2, 4, "fits")]
+    assert solved == [("all", "exact", True), ((1, 0), "rough", False), ((2, 1), "rough", False)]
+    final = 1 if settles else 2
+    assert (found.k, found.drives) == ((3, final), drives[final])
+
+
+@dataclass(frozen=True)
+class Solved:
+    """What a fit is here: its number, or what was fitted."""
+
+    k: object
+    drives: tuple = ()

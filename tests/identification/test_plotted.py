@@ -1,6 +1,7 @@
 """The charts that Python is given of a result: of the joints named, shown and kept as a page."""
 
 import re
+from dataclasses import replace
 from html import unescape
 from types import SimpleNamespace
 
@@ -11,6 +12,8 @@ from scipy.stats import norm
 
 from robotid.diagnosis.torque_split import joint_torques
 from robotid.exceptions import DataError
+from robotid.identification import pictures
+from robotid.identification import result as result_module
 from robotid.identification.pictures import residual_charts
 from robotid.identification.why_pictures import why_charts
 from robotid.logs.data import Trajectory
@@ -135,3 +138,181 @@ def test_a_notebook_shows_the_page_that_is_written(identified, tmp_path):
     )
     with pytest.raises(DataError, match="does not exist; create it"):
         plot.write(tmp_path / "none" / "friction.html")
+
+
+@pytest.mark.parametrize("n", [301, 4001])
+def test_friction_is_drawn_at_position_and_load_of_the_samples_used(rng, monkeypatch, n):
+    """Of at most 800 samples, spread over the recording."""
+    row = 1
+    v, q = rng.standard_normal((2, n, 2))
+    mask = rng.random((n, 2)) < 0.6
+    q[~mask[:, row], row] += 50.0
+    motion = SimpleNamespace(v=v, q=q)
+    loads = rng.standard_normal((2, n)) * [[1.0], [4.0]]
+    left, friction = rng.standard_normal((2, n, 2))
+    layout = SimpleNamespace(own={"b": (SimpleNamespace(name="load"),)})
+    model = SimpleNamespace(row_names=("a", "b"), row_units=("N m", "N"), layout=layout)
+    evaluation = SimpleNamespace(recording=SimpleNamespace(trajectory=motion, mask=mask))
+    found = SimpleNamespace(model=model, validation=(evaluation,), fitted=(), standard=None)
+    given = []
+
+    def curve(found, joint, speeds, **at):
+        given.append((joint, at))
+        return SimpleNamespace(torque=speeds**3, std=0.5 + speeds**2)
+
+    monkeypatch.setattr(pictures, "friction_curve", curve)
+    along = SimpleNamespace(load=loads)
+    monkeypatch.setattr(pictures, "drive_motion_along", lambda model, motion: along)
+    chart = pictures.friction_chart(found, "b", split=(left, friction))
+    used = np.flatnonzero(mask[:, row])
+    used = used[:: -(-len(used) // 800)]
+    used = used[np.argsort(v[used, row])]
+    load = np.sqrt(np.mean(loads[row, used] ** 2))
+    assert given == [
+        ("b", {"q": pytest.approx(np.median(q[used, row])), "load": pytest.approx(load)})
+    ]
+    drawn = np.isfinite(series(chart, "measured").y)
+    speed = v[used, row]
+    np.testing.assert_array_equal(chart.x[drawn], speed)
+    np.testing.assert_array_equal(series(chart, "measured").y[drawn], left[used, row])
+    np.testing.assert_array_equal(series(chart, "identified").y[drawn], friction[used, row])
+    steady = series(chart, f"steady at a load of {load:.3g} N, 95 % band")
+    np.testing.assert_array_equal(steady.y[drawn], speed**3)
+    np.testing.assert_allclose(steady.half[drawn], 1.96 * (0.5 + speed**2))
+    assert (chart.x_label, chart.y_label) == ("speed [m/s]", "friction [N]")
+    mask[:, row] = False
+    assert pictures.friction_chart(found, "b", split=(left, friction)) is None
+
+
+def test_bodies_and_drives_are_drawn_beside_the_urdf_and_what_was_before():
+    layout = SimpleNamespace(
+        names=("a.m", "a.mx", "b.m", "j.viscous", "k.viscous"),
+        units=("kg", "kg m", "kg", "N m s/rad", "N s/m"), n_inertial=3,
+    )  # fmt: skip
+    found = SimpleNamespace(
+        model=SimpleNamespace(layout=layout), standard=np.arange(5.0) + 1,
+        standard_error=np.array([0.5, 0.1, np.inf, 0.25, 0.75]),
+        prior=np.array([3.0, 0.0, 4.0, 0.0, 7.0]),
+    )  # fmt: skip
+    mass, turn, slide = pictures.parameter_charts(found, ("m", "viscous"))
+    assert mass.title.startswith("m of each body, URDF and identified")
+    assert turn.title.startswith("viscous of each drive, before the fit and identified")
+    assert [s.label for s in mass.series] == ["URDF", "identified ± 2 s.e."]
+    assert [s.label for s in turn.series] == ["identified ± 2 s.e."]  # nothing before
+    assert [s.label for s in slide.series] == ["before the fit", "identified ± 2 s.e."]
+    assert mass.series[0].y.tolist() == [3.0, 4.0]
+    assert mass.series[1].y.tolist() == [1.0, 3.0]
+    np.testing.assert_array_equal(mass.series[1].half, [1.0, np.nan])
+    assert (slide.series[1].y.tolist(), slide.series[1].half.tolist()) == ([5.0], [1.5])
+    assert [(c.x_names, c.y_label) for c in (mass, turn, slide)] == [
+        (("a", "b"), "m [kg]"), (("j",), "viscous [N m s/rad]"), (("k",), "viscous [N s/m]"),
+    ]  # fmt: skip
+
+
+def test_a_line_hides_four_times_as_high_as_the_others_and_gaps_of_a_pixel_are_one():
+    flat = np.array([0.0, np.nan, 1.0])
+    assert not pictures._dwarfs(np.array([-1.9, 2.0]), flat, flat)
+    assert pictures._dwarfs(np.array([-1.9, np.nan, 2.2]), flat, flat)
+    t, used = np.arange(1001) / 10, np.ones(1001, dtype=bool)  # a pixel is 0.2 s
+    used[[0, 100, 102, 104, 110, 1000]] = False
+    spans = pictures.unused_spans(t, used)
+    wanted = [(0.0, 0.1), (9.9, 10.5), (10.9, 11.1), (99.9, 100.0)]
+    np.testing.assert_allclose(spans, wanted)
+
+
+def test_reasons_of_two_recordings_show_the_first_over_time(identified):
+    (j,) = (k for k, n in enumerate(identified.model.joints) if n == "wrist_2_joint")
+    torque = joint_torques(identified)[j]
+    n = len(torque.rows.t)
+    recording = (np.arange(n) >= n // 3).astype(int)
+    two = replace(torque, rows=replace(torque.rows, recordings=("a", "b"), recording=recording))
+    charts = why_charts(two, link="shared", points=7)
+    own = np.linspace(0, n // 3 - 1, 7).round().astype(int)
+    for name, label in (("split", "measured"), ("power", "torque × speed")):
+        chart = charts[name]
+        assert chart.link == "shared"
+        drawn = np.isfinite(series(chart, label).y)
+        np.testing.assert_array_equal(chart.x[drawn], torque.rows.t[own])
+    speed = torque.quantities["speed"][1]
+    heat = series(charts["power"], "into friction").y[drawn]
+    np.testing.assert_allclose(heat, (torque.parts["friction"] * speed)[own])
+    used = np.flatnonzero(torque.used)
+    for dependence in two.follows[1:]:
+        chart, name = charts[dependence.name], dependence.name
+        assert chart.link == ""  # time of two recordings is not that of one
+        x = two.rows.time if name == "time" else torque.quantities[name][1]
+        rows = used[np.argsort(x[used])]
+        rows = rows[np.linspace(0, len(rows) - 1, 7).round().astype(int)]
+        np.testing.assert_array_equal(chart.x, x[rows])
+        mean, error = dependence.at(x[rows])
+        np.testing.assert_array_equal(series(chart, "mean").y, mean)
+        np.testing.assert_allclose(series(chart, "mean").half, 1.96 * error)
+    assert why_charts(torque, link="shared")["time"].link == "shared"
+
+
+def test_each_torque_has_the_band_of_its_own_row(identified):
+    e = identified.fitted[0]
+    band, motion = identified.band(e), e.recording.trajectory
+    for j in (1, 4):
+        torque, residual = pictures.torque_charts(identified, e, j)
+        used = e.recording.mask[:, j].astype(bool)
+        half = 1.96 * np.interp(np.arange(len(used)), band.samples, band.total[:, j])
+        drawn = np.isin(torque.x, motion.t) & np.isfinite(series(torque, "measured").y)
+        for chart, label in ((torque, "identified"), (residual, "95 % band")):
+            np.testing.assert_allclose(series(chart, label).half[drawn], half)
+        for label, key in (("identified", "estimate"), ("URDF", "urdf")):
+            y = series(torque, label).y[drawn]
+            np.testing.assert_allclose(y[used], e.torques[key][used, j])
+            assert np.isnan(y[~used]).all()
+
+
+@pytest.mark.parametrize("rank", [3, 5])
+def test_singular_values_are_split_at_the_rank(rank):
+    values = np.array([9.0, 4.0, 1.0, 1e-3, 0.0])
+    chart = pictures.singular_chart(values, rank)
+    shown = np.array([9.0, 4.0, 1.0, 1e-3, 9e-17])
+    assert len(chart.series) == (2 if rank < 5 else 1)
+    for part, is_shown in zip(
+        chart.series, (np.arange(5) < rank, np.arange(5) >= rank), strict=False
+    ):
+        np.testing.assert_allclose(part.y, np.where(is_shown, shown, np.nan))
+    assert chart.x.tolist() == [1, 2, 3, 4, 5]
+
+
+def test_plots_of_torques_are_of_each_joint_in_turn(identified, monkeypatch):
+    given = []
+
+    def charts(found, evaluation, row, *, band):
+        given.append((evaluation, row, band))
+        return f"torque {row}", f"residual {row}"
+
+    monkeypatch.setattr(result_module, "torque_charts", charts)
+    e = identified.fitted[1]
+    plot = identified.plot_torques("wrist_1_joint", "shoulder_lift_joint", recording=e)
+    assert plot.charts == (
+        ("torque 3", "wrist_1_joint: torque"), ("residual 3", "wrist_1_joint: residual"),
+        ("torque 1", "shoulder_lift_joint: torque"),
+        ("residual 1", "shoulder_lift_joint: residual"),
+    )  # fmt: skip
+    assert [row for _, row, _ in given] == [3, 1]
+    assert all(shown is e and band is identified.band(e) for shown, _, band in given)
+
+
+def test_charts_of_reasons_are_named_by_what_they_show(identified):
+    (j,) = (k for k, n in enumerate(identified.model.joints) if n == "wrist_2_joint")
+    torque = joint_torques(identified)[j]
+    plot = identified.plot_why("wrist_2_joint")
+    names = [f"residual against {x}" for x in ("position", "speed", "acceleration", "load", "time")]
+    wanted = [torque.sentence, *names, "mechanical power"]
+    assert [caption for _, caption in plot.charts] == [f"wrist_2_joint: {x}" for x in wanted]
+    # a part that is 0 is not drawn
+    parts = {"gravity": 0.0 * torque.tau, **torque.parts, "ripple": 0.0 * torque.tau}
+    split = why_charts(replace(torque, parts=parts))["split"]
+    present = [name for name, x in torque.parts.items() if np.abs(x).max() > 1e-6]
+    assert [s.label for s in split.series] == [*present, "residual", "measured"]
+    for part in split.series[:-2]:
+        shown = np.isfinite(part.y)
+        np.testing.assert_allclose(part.y[shown], torque.parts[part.label])
+    assert split.title == (
+        f"Torque of wrist_2_joint over time, the sum of {', '.join(present)} and residual"
+    )

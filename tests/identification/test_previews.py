@@ -13,10 +13,13 @@ from helpers.fitting import identify
 from helpers.synthetic import truth
 
 from robotid.estimators.batch import solve_factor
+from robotid.estimators.segments import scatter
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.entries import build_preview
+from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
+from robotid.identification import previews
 from robotid.identification.assumptions import (
     TorqueNoise,
     assumed_noise,
@@ -36,7 +39,7 @@ from robotid.identification.previews import (
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.factors import compress
+from robotid.regressor.factors import Factors, compress
 from robotid.regressor.prediction import predict
 from robotid.regressor.torque import joint_torque_regressor, trajectory_regressor
 from robotid.regressor.used_rows import base_problem
@@ -418,3 +421,100 @@ def test_a_static_model_is_previewed_too(motion):
 def test_nothing_to_preview_is_refused(ur5):
     with pytest.raises(DataError, match="no motion was given"):
         preview(ur5, [])
+
+
+def test_noise_of_a_long_run_has_the_scatter_of_each_joint_s_own_scores(rng):
+    """Of 14 segments of two joints, the second of which is coloured; weights by its variance."""
+    W = rng.standard_normal((14, 2, 1, 3)) + 0.5 * rng.standard_normal((14, 2, 25, 3))
+    W *= [1.0, 3.0, 0.5]
+    pi = np.array([0.4, -1.1, 2.0])
+    e = rng.standard_normal((14, 2, 25)) * [[0.5], [2.0]]
+    e[:, 1] += 1.5 * rng.standard_normal((14, 1))
+    rows = np.concatenate([W, (W @ pi + e)[..., None]], axis=3)
+    every, names = (np.arange(3),) * 2, ("a", "b", "c")
+    segments = tuple(
+        Factors(tuple(np.linalg.qr(own, mode="r")), every, np.array([25, 25]), names)
+        for own in rows
+    )
+    run = Run(segments, pi, np.zeros((3, 2)), 350, 0.2, 0.03)
+    K = np.eye(3)
+    found = run.noise(K)
+    sigma = np.sqrt(np.mean(e**2, axis=(0, 2)))
+    X = [W[:, j].reshape(-1, 3) / sigma[j] for j in (0, 1)]
+    bread = np.linalg.inv(X[0].T @ X[0] + X[1].T @ X[1])
+    free, inflation = np.empty(2), np.empty(2)
+    for j in (0, 1):
+        alone = np.where(np.arange(2) == j, sigma, np.inf)
+        own = np.diag(bread @ X[j].T @ X[j] @ bread)
+        ratio = np.diag(scatter(segments, pi, alone, bread).covariance) / own
+        weight = own / np.diag(bread)
+        inflation[j] = np.prod(ratio ** (weight / weight.sum()))
+        free[j] = 1 - np.trace(X[j] @ bread @ X[j].T) / 350
+    assert inflation[1] > 3 * inflation[0]
+    np.testing.assert_allclose(found.std, sigma / np.sqrt(free), rtol=1e-9)
+    np.testing.assert_allclose(found.correlation, free * inflation * 0.03, rtol=1e-9)
+    level = np.array([0.7, 1.3])
+    X = [W[:, j].reshape(-1, 3) / level[j] for j in (0, 1)]
+    B = np.linalg.inv(X[0].T @ X[0] + X[1].T @ X[1])
+    np.testing.assert_allclose(run.meat(K, level), scatter(segments, pi, level, B).meat, rtol=1e-9)
+    short = replace(run, segments=segments[:11])
+    X = [W[:11, j].reshape(-1, 3) / level[j] for j in (0, 1)]
+    np.testing.assert_allclose(short.meat(K, level), (X[0].T @ X[0] + X[1].T @ X[1]) / 0.2)
+
+
+def test_a_run_of_two_logs_has_their_mean_step_and_the_weights_of_its_fit(rng):
+    model = arm()
+    logs = [moved(model, rng, rate=rate)[0].window(0.0, 2.5) for rate in (100.0, 40.0)]
+    held = [hold_log(model, log, SignalSettings(cutoff=5.0)) for log in logs]
+    recordings = Recordings(model, structural_mapping(model), held)
+    details = {"prior": {"weight": 30.0, "plausible_weight": 2.0}}
+    run = Run.of(recordings, truth(model), details)
+    assert run.step == pytest.approx((0.01 + 0.025) / 2)
+    assert run.share == pytest.approx(2 * 5.0 / 100.0)
+    assert run.samples == sum(len(log.whole.trajectory.t) for log in held)
+    assert run.weight == (30.0, 2.0)
+    np.testing.assert_allclose(run.squares, sum(log.whole.trajectory.squares for log in held))
+    assert Run.of(recordings, truth(model), {"prior": {"weight": 3.0}}).weight == (3.0, 1.0)
+    assert Run.of(recordings, truth(model), {}).weight is None
+
+
+def test_the_run_alone_is_judged_with_its_own_weight_of_the_prior(rng, monkeypatch):
+    model = arm()
+    held = hold_log(model, moved(model, rng)[0].window(0.0, 3.0), SignalSettings())
+    given, errors = [], previews._errors
+    monkeypatch.setattr(previews, "_errors", lambda *x: (given.append(x), errors(*x))[1])
+    part = compress(
+        base_problem(model, structural_mapping(model), held.whole.trajectory, held.whole.mask)
+    )
+    motion = held.whole.trajectory
+    run = Run((part,), truth(model), motion.squares, len(motion.t), 0.2, 0.01, (30.0, 2.0))
+    noise = TorqueNoise(STD[:3], np.array([0.0, 0.02, 0.5]), ("stated",) * 3)
+    choice = EstimatorSettings("consistent", draws=0)
+    found = previews.preview_logs(model, [held], choice, noise=noise, run=run)
+    (both, *_, weight), (alone, *_, other) = given
+    assert weight == other == (30.0, 2.0)
+    np.testing.assert_array_equal(both.factors.rows, 2 * part.rows)
+    np.testing.assert_array_equal(alone.factors.rows, part.rows)
+    # the density in each row over the variance behind the filter
+    ((_, level),) = both.levels
+    np.testing.assert_allclose(level, STD[:3] ** 2 * [1.0, 2.0, 50.0])
+    expected = found.expected
+    assert expected.errors.inflation == pytest.approx(np.mean(level / both.sigma**2))
+    assert np.ptp(level / both.sigma**2) > 1e-3
+    np.testing.assert_array_equal(expected.standard, truth(model))
+    np.testing.assert_array_equal(expected.prior, model.standard_parameters())
+    np.testing.assert_allclose(expected.base, expected.mapping.K @ truth(model))
+    C = expected.mapping.K @ expected.standard_covariance @ expected.mapping.K.T
+    np.testing.assert_allclose(expected.base_error, np.sqrt(np.diag(C)), rtol=1e-6)
+
+
+def test_words_of_a_preview_are_of_all_motions_each_named_once(monkeypatch):
+    monkeypatch.setattr(
+        previews, "excitation_finding", lambda *given: SimpleNamespace(message=given)
+    )
+    fitted = [
+        SimpleNamespace(recording=SimpleNamespace(log=SimpleNamespace(name=name)))
+        for name in ("a.csv", "b.csv", "a.csv")
+    ]
+    expected = SimpleNamespace(fitted=fitted, wls="wls", determination="determined")
+    assert Preview(expected, white()).words == ("wls", "determined", "a.csv, b.csv")

@@ -2,16 +2,27 @@
 
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.pages import tables
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
+from robotid.fitting.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import identify
-from robotid.identification.summary import cell, error_lines, friction_lines
+from robotid.identification.summary import (
+    _errors,
+    _tables,
+    cell,
+    error_lines,
+    friction_lines,
+    joint_reason,
+    verdict_lines,
+)
 from robotid.logs.read import write_log
 from robotid.robot.model import RobotModel
 
@@ -178,3 +189,50 @@ def test_an_estimate_lists_every_parameter(found):
         (line,) = [line for line in text.splitlines() if line.split()[0] == name]
         assert float(line.split()[1]) == pytest.approx(value, rel=1e-3)
         assert name in "".join(Words(html).words)
+
+
+def test_each_validation_log_has_errors_of_its_own_and_a_reason_loses_its_joint_only():
+    logs = [
+        SimpleNamespace(
+            recording=SimpleNamespace(name=name),
+            metrics={"estimate": f"{name} ours", "wls": f"{name} wls"},
+        )
+        for name in ("a.csv", "b.csv")
+    ]
+    found = SimpleNamespace(validation=logs, metrics=lambda name="estimate": f"fitted {name}")
+    assert _tables(found) == [
+        ("a.csv: not fitted", "a.csv ours", "a.csv wls"),
+        ("b.csv: not fitted", "b.csv ours", "b.csv wls"),
+        ("fitted rows", "fitted estimate", "fitted wls"),
+    ]
+    assert joint_reason("b", ["a, b: too slow", "b: no"]) == "too slow"
+    assert joint_reason("bb", ["a, b: too slow"]) == "a, b: too slow"
+    assert joint_reason("b", ["the whole: is wrong"]) == "the whole: is wrong"
+    assert joint_reason("b", []) == ""
+
+
+def test_a_reason_of_a_joint_is_shown_once():
+    verdict = {
+        "status": "poor",
+        "reasons": ["a: bad", "c: slow", "a: slow", "no log"],
+        "per_joint": {
+            "a": {"status": "poor", "reasons": ["a: bad", "a: slow"]},
+            "b": {"status": "good", "reasons": ["error 3 %"]},
+            "c": {"status": "usable", "reasons": ["c: slow"]},
+            "d": {"status": "good", "reasons": ["error 4 %"]},
+        },
+    }
+    assert verdict_lines(verdict) == [
+        "verdict: poor", "  - a: slow", "  - no log", "  a: poor: bad", "  b, d: good",
+        "  c: usable: slow",
+    ]  # fmt: skip
+    alone = {"status": "good", "reasons": ["fine"], "per_joint": {"b": verdict["per_joint"]["b"]}}
+    assert verdict_lines(alone) == ["verdict: good", "  - fine", "  every joint: good"]
+
+
+def test_a_notebook_shows_each_joint_s_error_before_that_of_the_urdf():
+    one = JointMetrics(0.125, "N m", 2.5, 0.9, 7, {"urdf": 41.5}, True)
+    other = JointMetrics(3.0, "N", 7.5, 0.9, 7, {"urdf": None}, True)
+    metrics = Metrics({"a": one, "b": other}, 1.0)
+    rows = tables(_errors("log.csv: not fitted", metrics))["log.csv: not fitted"].rows
+    assert rows == [["a", "2.5", "0.125", "N m", "41.5"], ["b", "7.5", "3", "N", "–"]]

@@ -7,6 +7,7 @@ import pytest
 
 from robotid.fitting.robust import Outlier
 from robotid.fitting.settings import EstimatorSettings
+from robotid.judgement import findings
 from robotid.judgement.findings import (
     _correlated,
     _drive_findings,
@@ -297,3 +298,105 @@ def test_all_links_weigh_within_a_factor_of_three_of_the_urdf_s():
         assert finding.evidence == {"urdf": 4.0, "identified": pytest.approx(4.0 * factor)}
         assert f"total mass is {4 * factor:.4g} kg, the URDF's is 4 kg" in finding.message
     assert found(3.1, total=(1.0, 20.0)) == found(3.1, urdf=0.0) == []
+
+
+def test_a_body_is_in_its_box_if_all_of_its_mass_can_be():
+    """Of the second of two: a bar of 2 kg along y, whose ends are at +- 0.3 m of its centre."""
+    centre, half = np.array([0.1, -0.2, 0.4]), np.array([0.0, 0.3, 0.0])
+    c, S = centre, np.diag(half**2) + np.outer(centre, centre)  # two points of 1 kg
+    inertia = 2.0 * (np.trace(S) * np.eye(3) - S)
+    i, j = (0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)
+    pi = np.concatenate([np.full(10, 9.0), [2.0], 2.0 * c, inertia[i, j]])
+    fit = SimpleNamespace(
+        model=SimpleNamespace(layout=SimpleNamespace(bodies=("a", "b"))), standard=pi
+    )
+    low, high = centre - half - 0.01, centre + half + 0.01
+    assert findings._is_within_box(fit, "b", np.array([low, high]))
+    for k, move in ((0, 0.02), (1, 0.02), (2, 0.02)):
+        for corner, sign in ((0, 1.0), (1, -1.0)):
+            box = np.array([low, high])
+            box[corner, k] += sign * move
+            assert not findings._is_within_box(fit, "b", box), (k, corner)
+
+
+def test_links_on_locked_joints_are_named_if_they_leave_their_body_hardly_possible(monkeypatch):
+    """Of four bodies: barely possible and mostly locked; locked in part; possible; not locked."""
+    ball = np.array([1.0, 0, 0, 0, 0.4, 0, 0.4, 0, 0, 0.4])
+    held = np.concatenate([0.5 * ball, 0.15 * ball, 0.5 * ball, 0 * ball])
+    rest = np.concatenate([0.05 * ball, 0.05 * ball, 0.2 * ball, 0.05 * ball])
+    urdf = held + np.tile(ball, 4)
+    found = held + rest
+    monkeypatch.setattr(findings, "held_parameters", lambda model: held)
+    layout = SimpleNamespace(n_inertial=40, bodies=tuple("abcd"))
+    model = SimpleNamespace(layout=layout, standard_parameters=lambda: np.append(urdf, 7.0))
+    fit = SimpleNamespace(model=model, standard=np.append(found, 9.0))
+    assert findings._locked_links(fit) == (
+        "the URDF's inertials of the links on locked joints, 0.5 kg of the 0.55 kg of a (identify "
+        "their joints, too, if they are wrong), the URDF's inertials of the links on locked "
+        "joints, 0.15 kg of the 0.2 kg of b (identify their joints, too, if they are wrong), "
+    )
+    held[10:20] = 0.19 * found[10:20]
+    assert findings._locked_links(fit).count("the URDF's inertials") == 1
+
+
+def test_what_the_user_asks_of_the_fit_is_named():
+    asked = EstimatorSettings(
+        "consistent", margin=0.02, constraints={"mass": {"a": 2.0}, "total_mass": 9.0}
+    )
+    words = findings._asked(SimpleNamespace(estimator=asked))
+    assert words.startswith("the constraints in [estimator] (")
+    assert words.endswith(", margin = 0.02), ")
+    assert "mass" in words
+    assert "pinned" not in words
+    plain = EstimatorSettings("consistent", margin=0.009)
+    assert "margin" not in findings._asked(SimpleNamespace(estimator=plain))
+    assert findings._asked(SimpleNamespace(estimator=EstimatorSettings("wls"))) == ""
+
+
+@pytest.mark.parametrize("rank", [7, 9])
+def test_a_fit_is_reported_by_its_determination_its_refitted_logs_and_costly_joints(
+    monkeypatch, rank
+):
+    for name in ("_static_findings", "consistency_findings", "_bound_findings", "_total_mass",
+                 "_impossible_shapes", "_dense_bodies", "_outlier_findings", "_drive_findings",
+                 "_correlated", "encoder_findings"):  # fmt: skip
+        monkeypatch.setattr(findings, name, lambda fit: [])
+    monkeypatch.setattr(findings, "misfit_findings", lambda *_: ["misfit"])
+    monkeypatch.setattr(findings, "_locked_links", lambda fit: "")
+    monkeypatch.setattr(findings, "_asked", lambda fit: "")
+
+    def log(path):
+        return SimpleNamespace(path=path)
+
+    def measured(rmse, error):
+        return SimpleNamespace(rmse=rmse, unit="N m", relative_error_pct=error)
+
+    own = {"a": measured(1.19, 11.0), "b": measured(2.5, None), "c": measured(0.61, 9.0)}
+    wls = {"a": measured(1.0, 10.0), "b": measured(2.0, 8.0), "c": measured(0.5, 7.0)}
+    fit = SimpleNamespace(
+        determination=SimpleNamespace(
+            groups=() if rank == 9 else ("x",), rank=rank, names=range(9), described=lambda: "x is"
+        ),
+        is_poorly_excited=True,
+        refitted=[
+            SimpleNamespace(recording=SimpleNamespace(name=f"{k} 0-1 s", log=log(k)))
+            for k in ("k.csv", "l.csv")
+        ],
+        metrics=lambda name="estimate": SimpleNamespace(per_joint=wls if name == "wls" else own),
+    )  # fmt: skip
+    found = findings.fit_findings(fit, (), (), ["other"])
+    if rank == 7:
+        first = found.pop(0)
+        assert (first.code, first.severity) == ("undetermined", "warning")
+        assert first.message.startswith("the data determine 7 of 9 base parameters: x is. ")
+    assert found[:2] == ["misfit", "other"]
+    refitted, costs = found[2:4], found[4:]
+    assert [f.where for f in refitted] == ["k.csv", "l.csv"]
+    assert "the validation log l.csv 0-1 s contains" in refitted[1].message
+    assert [(f.code, f.where, f.evidence) for f in costs] == [
+        ("constraint_costs", "b", {"error_pct": 0.0, "wls_error_pct": 8.0}),
+        ("constraint_costs", "c", {"error_pct": 9.0, "wls_error_pct": 7.0}),
+    ]
+    assert costs[1].message.startswith(
+        "c: the residual is 0.61 N m, that of unconstrained WLS 0.5: physics and data disagree"
+    )

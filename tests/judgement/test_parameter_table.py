@@ -147,3 +147,11 @@ def test_names_with_dots_keep_them_and_drives_have_no_value_of_the_urdf(monkeypa
     for row, values in zip(rows, wanted, strict=True):
         assert list(row) == list(parameter_table.HEADERS)
         assert [str(x) for x in row.values()] == [str(x) for x in values]
+
+
+def test_columns_of_numbers_are_numbers_though_all_of_them_are_missing():
+    drive = {"name": "a.offset", "value": 2, "unit": "N m"}
+    frame = parameter_table.parameter_table([], [drive, drive | {"name": "b.offset"}])
+    numbers = parameter_table.HEADERS[2:7]
+    assert {name: frame[name].dtype for name in numbers} == dict.fromkeys(numbers, float)
+    assert frame["value"].tolist() == [2.0, 2.0]

@@ -1,6 +1,7 @@
 """Verdicts on simulated positions: by thresholds, plainer models, and what else is known."""
 
 from robotid.fitting.metrics import JointMetrics, Metrics
+from robotid.identification.summary import verdict_lines
 from robotid.judgement.positions import judge_positions
 
 
@@ -71,3 +72,11 @@ def test_faults_and_cautions_come_first_and_the_scale_last():
     assert wrong.status == "poor"
     assert wrong.log_errors == ("the clock jumps",)
     assert [reason[:5] for reason in wrong.reasons] == ["the c", "at it", "b: si"]
+
+
+def test_the_largest_error_is_the_first_reason():
+    errors = {"a": 8.0, "b": 45.0, "c": 70.0, "d": 12.0}
+    found = judged(errors, joints=tuple(errors))
+    assert [reason[0] for reason in found.reasons] == ["c", "b", "d", "a"]
+    lines = verdict_lines(found.to_dict())
+    assert [line.split()[0] for line in lines] == ["verdict:", "c:", "b:", "d:", "a:"]

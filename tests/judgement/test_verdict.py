@@ -13,6 +13,7 @@ from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
 from robotid.judgement.evidence import Determined, Predictions, is_beaten
 from robotid.judgement.scale_check import ScaleCheck
+from robotid.judgement.stated_mass import StatedMass
 from robotid.judgement.verdict import (
     VerdictWarning,
     blocking,
@@ -87,6 +88,14 @@ def test_alarms_come_before_everything_and_constants_before_the_rest():
     assert found.reasons[0] == "torque of c swapped"
     assert found.reasons[1].startswith("b: worse than a constant")
     assert found.reasons[2].startswith("a: error 60.0 %")
+
+
+def test_the_largest_error_is_the_first_reason():
+    found = verdict({"a": joint(16.2), "b": joint(4.0), "c": joint(17.4)})
+    assert [reason[:16] for reason in found.reasons] == ["c: error 17.4 % ", "a: error 16.2 % "]
+    assert list(found.joints) == ["a", "b", "c"]
+    found = verdict({"a": joint(60.0), "c": joint(70.0)})
+    assert [reason[:16] for reason in found.reasons] == ["c: error 70.0 % ", "a: error 60.0 % "]
 
 
 def test_worse_than_the_urdf_is_poor():
@@ -522,6 +531,18 @@ def test_the_worst_of_several_recordings_refutes_no_hypothesis(errors):
     assert note.message.endswith("rejected: torque error on validation logs at most 4.5 %")
 
 
+def test_drive_parameters_that_the_prior_determines_are_named_and_change_no_verdict():
+    for undetermined in ((), ("a.m",)):
+        more = Determined(undetermined, is_poorly_excited=False, uncertain_drives=["a.coulomb"])
+        assert more.warnings() == []
+        assert "a.coulomb: the standard error is as large as that of the prior" in more.notes()[-1]
+        plain = Determined(undetermined, is_poorly_excited=False).notes()
+        assert more.notes()[:-1] == plain
+
+
+MASS = ("total_mass",)
+
+
 @pytest.mark.parametrize(
     ("scale_check", "status", "said"),
     [
@@ -544,9 +565,23 @@ def test_the_worst_of_several_recordings_refutes_no_hypothesis(errors):
         (ScaleCheck(scale=1.0, factor=1.0, masses=(10.0, 15.0, 0.0)), "usable", "15 kg against"),
         (ScaleCheck(scale=1.0, factor=1.4, masses=(10.0, 15.0, 5.0)), "good", "within 5 %"),
         (
-            ScaleCheck(scale=0.6, factor=0.6, masses=(10.0, 9.0, 0.0), is_stated=True),
+            ScaleCheck(
+                scale=0.6, factor=0.6, masses=(10.0, 9.0, 0.0), stated=StatedMass(MASS, 1.02, 0.02)
+            ),
             "good",
-            "stated",
+            "absolute scale verified by a stated mass",
+        ),
+        (
+            ScaleCheck(
+                scale=1.0, factor=1.0, masses=(10.0, 9.9, 0.0), stated=StatedMass(MASS, 0.9, 0.02)
+            ),
+            "usable",
+            "absolute scale contradicted by a stated mass",
+        ),
+        (
+            ScaleCheck(scale=1.2, factor=1.2, masses=(10.0, 30.0, 0.0), stated=StatedMass(MASS)),
+            "good",
+            "The stated total_mass does not verify the scale",
         ),
     ],
 )
@@ -558,3 +593,21 @@ def test_good_needs_a_witness_or_says_that_there_is_none(scale_check, status, sa
     )
     assert found.status == status
     assert said in found.reasons[-1]
+
+
+def test_joints_better_by_the_urdf_are_those_of_all_logs():
+    better, worse = {"urdf_with_drives": 3.0}, {"urdf_with_drives": 9.0}
+    logs = {
+        "one": {"a": joint(4.0, **worse), "b": joint(4.0, **better), "c": joint(4.0, **worse)},
+        "two": {"a": joint(4.0, **better), "b": joint(4.0, **better)},
+    }
+    fit = Metrics({name: joint(4.0) for name in "abcd"}, 1.0)
+    found = Predictions(fit, {name: Metrics(own, 1.0) for name, own in logs.items()}, "abcde")
+    (reason,) = found.better_by_urdf()
+    assert reason.startswith("the URDF with fitted drives predicts b, a better than")
+    assert found.at_rest() == [
+        "the joints e do not move in any recording: not evaluated",
+        "the joints d do not move in any validation log: not evaluated",
+    ]
+    errors = {name: own for name, (_, _, own) in found.on_each().items()}
+    assert errors == {"a": [4.0, 4.0], "b": [4.0, 4.0], "c": [4.0], "d": [], "e": []}

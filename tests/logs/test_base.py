@@ -156,24 +156,27 @@ def test_a_log_without_torque_is_read_with_wrenches(log, tmp_path):
     (tmp_path / "log.csv").write_text(text)
     again = read_log(tmp_path / "log.csv", log.joints, base=WANTED)
     assert not again.has_torque
-    with pytest.raises(DataError, match="has no column 'tau_one'"):
+    with pytest.raises(DataError, match="has no columns 'tau_one', 'tau_two'"):
         read_log(tmp_path / "log.csv", log.joints, base=BaseColumns(True))
 
 
-def test_changes_of_a_contact_are_marked_with_the_reach_of_the_filter(log):
-    flags = np.arange(101) >= 50  # changes between 2.49 and 2.50 s
+def test_a_contact_is_extended_by_the_reach_of_the_filter(log):
+    flags = (np.arange(101) >= 50) & (np.arange(101) < 53)  # 2.50 to 2.52 s
     other = np.arange(101) >= 80
     log = Log(
         log.t, log.q, log.tau, log.joints, base=log.base,
-        contacts={"a": flags, "b": other}, wrenches={"fz a": np.sin(log.t)},
+        contacts={"a": flags, "b": other, "c": ~other}, wrenches={"fz a": np.sin(log.t)},
     )  # fmt: skip
     raw = process(log, SignalSettings(cutoff=None, trim=0.0, velocity="differentiated"))
-    assert np.flatnonzero(raw.switching).tolist() == [49, 50, 79, 80]
-    np.testing.assert_array_equal(raw.contacts, np.column_stack([flags, other]))
-    smooth = process(log, SignalSettings(cutoff=20.0, trim=0.1, velocity="differentiated"))
-    marked = smooth.t[smooth.switching]
-    wanted = [2.47, 2.48, 2.49, 2.5, 2.51, 2.52, 2.77, 2.78, 2.79, 2.8, 2.81, 2.82]
-    np.testing.assert_allclose(marked, wanted)
+    touching = [np.flatnonzero(own).tolist() for own in raw.contacts.T]
+    assert touching == [[49, 50, 51, 52, 53], list(range(79, 101)), list(range(81))]
+    assert np.flatnonzero(raw.switching).tolist() == [49, 50, 52, 53, 79, 80]
+    smooth = process(log, SignalSettings(cutoff=40.0, trim=0.1, velocity="differentiated"))
+    a, b, c = (smooth.t[own] for own in smooth.contacts.T)
+    np.testing.assert_allclose(a, np.arange(2.47, 2.555, 0.01))
+    np.testing.assert_allclose([b[0], b[-1]], [2.77, smooth.t[-1]])
+    np.testing.assert_allclose([c[0], c[-1]], [smooth.t[0], 2.82])
+    assert not smooth.switching.any()
     np.testing.assert_allclose(smooth.wrenches[:, 0], np.sin(smooth.t), atol=2e-3)
     assert smooth.q.shape == (79, 9)
     assert smooth.v.shape == smooth.a.shape == smooth.tau.shape == (79, 8)

@@ -30,6 +30,12 @@ STATE = "sensor_msgs/msg/JointState"
 HOW = "(job file table [log], CLI --topic, Python source=LogSource(topic=...))"
 
 
+CURE = (
+    ". A payload of known mass determines unknown gains: robotid payload URDF LOADED --reference "
+    "BARE --mass KG --gains"
+)
+
+
 def refused(text, kind=DataError):
     return pytest.raises(kind, match="^" + re.escape(text) + "$")
 
@@ -280,7 +286,7 @@ def test_effort_is_a_current_if_stated(tmp_path):
     with refused(
         "run.mcap: joints shoulder, elbow have currents but no gain; state it in N m/A: "
         "--gain shoulder=... --gain elbow=..., or in the job file [torque] gains = "
-        "{ shoulder = ..., elbow = ... }"
+        "{ shoulder = ..., elbow = ... }" + CURE
     ):
         read_log(path, JOINTS, source=current)
 

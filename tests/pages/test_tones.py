@@ -1,5 +1,6 @@
-"""Colours of the pages: friction and residual differ for readers with protanopia, too."""
+"""Colours of the pages that differ for readers with protanopia, too."""
 
+import itertools
 import re
 
 import numpy as np
@@ -62,3 +63,12 @@ def test_friction_and_residual_differ_as_areas_of_one_chart(identified, part, se
         for name in ("friction", "residual")
     )
     assert np.linalg.norm(a - b) > LEAST
+
+
+@pytest.mark.parametrize("part", ["light", "dark"])
+@pytest.mark.parametrize("seen", SEEN)
+def test_colours_of_sources_differ(part, seen):
+    colours = {name: x for name, x in tones(part).items() if name.startswith("from-")}
+    assert len(colours) == 5
+    for a, b in itertools.combinations(colours.values(), 2):
+        assert np.linalg.norm(lab(a, seen) - lab(b, seen)) > LEAST

@@ -1,10 +1,12 @@
 """The paper's figures: what each line holds."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from robotid.paper.errata import energy_drift
-from robotid.paper.plots import paper_figures
+from robotid.paper.errata import EnergyDrift, energy_drift
+from robotid.paper.plots import _energy_figure, _trajectories_figure, paper_figures
 from robotid.paper.study import MODELS, PaperSettings, paper_arm, random_runs, study_model
 from robotid.simulation.motions import ProgramMotion
 
@@ -71,3 +73,29 @@ def test_disturbed_errors_are_those_of_their_case(studies, figures):
     for axes, study in zip(figures["disturbance"].axes, studies, strict=True):
         for line, case in zip(axes.lines, cases, strict=True):
             np.testing.assert_array_equal(line.get_ydata(), study.errors(case))
+
+
+def test_iterations_are_counted_and_energies_are_in_percent():
+    runs = {
+        "one": SimpleNamespace(
+            errors=np.ones((61, 7)), guess=np.ones((7, 5)), iterations=[3, 4, 59]
+        ),
+        "other": SimpleNamespace(errors=np.ones((91, 5)), guess=np.ones((5, 5)), iterations=[7, 8]),
+    }
+    t = np.linspace(0.0, 1.3, 5)
+    drift = EnergyDrift(t, {"one": 0.03 * t, "other": -0.2 * t**2})
+    counts = {1: 1, 2: 1, 29: 1}, {2: 2}
+    titles = ("one: 3 of 7 converged", "other: 2 of 5 converged")
+    for axes, most, title, count in zip(
+        _trajectories_figure(runs).axes, (60, 90), titles, counts, strict=True
+    ):
+        bars = axes.patches
+        edges = [bar.get_x() for bar in bars] + [bars[-1].get_x() + bars[-1].get_width()]
+        np.testing.assert_allclose(edges, np.linspace(0, most, 31), atol=1e-9)
+        heights = {k: bar.get_height() for k, bar in enumerate(bars) if bar.get_height()}
+        assert heights == count
+        assert axes.get_title() == title
+    (axes,) = _energy_figure(drift).axes
+    for line, gained in zip(axes.lines, (3.0 * t, -20.0 * t**2), strict=True):
+        np.testing.assert_allclose(line.get_xydata(), np.column_stack([t, gained]))
+    assert [line.get_label() for line in axes.lines] == ["one", "other"]

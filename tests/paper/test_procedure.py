@@ -172,6 +172,12 @@ def test_one_shot_finds_the_parameters_after_one_run():
     np.testing.assert_allclose(history.estimates[-1], [P4], rtol=1e-11)
 
 
+def test_one_shot_takes_each_run_from_its_own_guess():
+    guess = P4 * np.array([[0.5], [0.8], [1.3]])
+    history = run(guess, settings=short(1, method="one_shot", updates=40), offset=DEGREE)
+    np.testing.assert_allclose(history.estimates[-1], np.tile(P4, (3, 1)), rtol=1e-10)
+
+
 def test_one_shot_says_what_the_motion_leaves_open():
     still, settings = ProgramMotion(np.zeros(2), 2.0), short(1, method="one_shot")
     with pytest.raises(RankDeficientError, match=r"^the data excite 0 of 4 base parameters"):
@@ -373,6 +379,88 @@ def test_a_setting_out_of_range_is_named(settings, message):
         LoopSettings(**settings)
 
 
-def test_noise_without_a_source_is_refused():
+@pytest.mark.parametrize("channel", ["q", "v", "a"])
+def test_noise_without_a_source_is_refused(channel):
     with pytest.raises(SettingsError, match=r"^sensor noise is stated, but rng is None"):
-        Influences(q=1e-3)
+        Influences(**{channel: np.array([0.0, 1e-3])})
+
+
+class Given:
+    """A random generator that returns stated arrays, one after the other."""
+
+    def __init__(self, *arrays):
+        self.arrays = iter(arrays)
+
+    def standard_normal(self, shape):
+        found = next(self.arrays)
+        assert found.shape == shape
+        return found
+
+
+def test_an_iteration_is_its_equations_update_by_update(rng):
+    """Two runs of their own duration; each sensor has noise of its own, a bound is met."""
+    motion = ProgramMotion(np.array([[1.0, 1.5], [0.7, -1.1]]), np.array([2.0, 1.5]))
+    alpha, beta = np.array([20.0, 11.0]), np.array([100.0, 40.0])
+    bounds = Bounds(np.full(4, -30.0), np.array([13.0, 30.0, 30.0, 30.0]))
+    levels = 0.01 * np.array([1.0, 2.0]), np.full(2, 0.05), np.array([0.7, 0.2])
+    drawn = rng.standard_normal((40, 3, 2, 2))
+    influences = Influences(
+        lambda t, u: 0.1 * u + t[:, None], *levels, rng=Given(*drawn.reshape(120, 2, 2))
+    )
+    guesses, offset = np.array([P4 / 2, P4 * 0.8]), np.array([[0.05, -0.4], [0.0, 0.1]])
+    settings = short(1, updates=40, alpha=alpha, beta=beta, bounds=bounds)
+    loop = _Loop(ARM, PLANT, motion, settings, influences, guesses, offset)
+    loop.iterate(1, keep_torques=True)
+    P, dt = np.clip(guesses, bounds.lower, bounds.upper), np.array([0.05, 0.0375])
+    start = P.copy()
+    q, v = motion.evaluate(np.zeros(2))[0] + offset, np.zeros((2, 2))
+    largest, distance, torques, met = np.zeros(2), np.zeros(2), [], 0
+    for k, noisy in enumerate(drawn):
+        q_pr, v_pr, a_pr = motion.evaluate(k * dt)
+        distance = np.maximum(distance, np.abs(q - q_pr).max(axis=1))
+        q_seen, v_seen = q + levels[0] * noisy[0], v + levels[1] * noisy[1]
+        q_star = a_pr - alpha[:, None] * (v_seen - v_pr) - beta[:, None] * (q_seen - q_pr)
+        Psi = ARM.regressor(q_seen, v_seen, q_star)
+        u = np.array([X @ p for X, p in zip(Psi, P, strict=True)])
+        applied = 1.1 * u + (k * dt)[:, None]
+        a = PLANT.acceleration(q, v, applied)
+        a_seen = a + levels[2] * noisy[2]
+        G = ARM.regressor(q_seen, v_seen, a_seen)
+        prx = [np.abs(X.T @ (X @ p - w)).max() for X, p, w in zip(G, P, u, strict=True)]
+        largest = np.maximum(largest, prx)
+        for r, (X, D) in enumerate(zip(Psi, mass_matrix(ARM, q_seen, P), strict=True)):
+            sigma = max(np.linalg.eigvalsh(D)[0], 0.0)
+            P[r] -= sigma / np.sum(X**2) * X.T @ (a_seen - q_star)[r]
+        met += np.sum(bounds.upper < P)
+        P = np.clip(P, bounds.lower, bounds.upper)
+        torques.append(u)
+        q, v = loop._advance(q, v, a, applied)
+    history = loop.history()
+    np.testing.assert_allclose(history.estimates, [start, P], rtol=1e-9)
+    assert met > 0
+    np.testing.assert_allclose(history.prx, [largest], rtol=1e-9)
+    np.testing.assert_allclose(history.tracking, [distance], rtol=1e-9)
+    assert history.tracking[0, 0] > 0.39  # of the second joint
+    np.testing.assert_allclose(history.torques, [torques], rtol=1e-9)
+    assert (largest > prx).any()  # of an update before the last
+    np.testing.assert_array_equal([history.NA, history.diverged], np.zeros((2, 2)))
+
+
+def test_runs_diverge_by_position_or_speed_in_their_own_iteration(rng):
+    motion = ProgramMotion(np.tile([1.0, 1.5], (4, 1)), np.full(4, 2.0))
+    loop = _Loop(ARM, PLANT, motion, short(1), Influences(), np.tile(P4, (4, 1)), 0.0)
+    program = motion.evaluate(np.full(4, 0.7))
+    q, v = program[0].copy(), program[1].copy()
+    q[1, 1] += 1.1e3
+    found = loop._reset_diverged(3, q, v, program)
+    np.testing.assert_array_equal(found, program[:2])
+    v[2, 0] -= 1.1e3
+    q[3, 0] = np.nan
+    found = loop._reset_diverged(5, q, v, program)  # the second is still away
+    np.testing.assert_array_equal(found, program[:2])
+    np.testing.assert_array_equal(loop.diverged, [0, 3, 5, 5])
+    np.testing.assert_array_equal(loop.active, [True, False, False, False])
+    q, v = program[0] + 0.5, program[1] + 0.25  # those that diverged stay on the program
+    for moved, part in zip(loop._reset_diverged(6, q, v, program), program, strict=False):
+        np.testing.assert_array_equal(moved[1:], part[1:])
+    np.testing.assert_array_equal(loop._reset_diverged(6, q, v, program)[0][0], q[0])

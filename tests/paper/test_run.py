@@ -16,7 +16,7 @@ from robotid.paper import page
 from robotid.paper import run as paper
 from robotid.paper.errata import EnergyDrift, energy_drift
 from robotid.paper.run import run_paper
-from robotid.paper.study import CASES, MODELS, PaperSettings
+from robotid.paper.study import CASES, MODELS, PROGRAM, PaperSettings, paper_arm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import INERTIAL_TERMS
 
@@ -316,6 +316,42 @@ def test_errata_energy_and_settings(shown, content):
     assert dict(shown["Settings"].rows) == {k: str(v) for k, v in content["settings"].items()}
 
 
+def test_settings_are_written_each_under_its_name():
+    drift = EnergyDrift(np.array([0.0, 1.0]), {"a": np.array([0.0, 0.1])})
+    settings = PaperSettings(iterations=19, longest=31, runs=4, patience=2, seed=23)
+    found = paper._content(settings, [], {}, {}, drift)["settings"]
+    assert found == {
+        "iterations": 19, "updates_per_iteration": 100, "amplitude_rad": [1.0, 1.5],
+        "duration_s": 2.0, "alpha": 20.0, "beta": 100.0, "first_guess": "P / 2",
+        "start_beside_program_rad": [np.pi / 180, 0.0], "most_iterations_until_PRX_is_zero": 31,
+        "random_motions": 4, "seed": 23,
+    }  # fmt: skip
+
+
+def test_random_motions_differ_by_model_and_by_start(monkeypatch):
+    made_of, reported = [], []
+
+    def runs(dynamics, P, count, most, rng, *, largest_offset, progress):
+        made_of.append((dynamics.form, len(P), count, most, largest_offset, rng.uniform()))
+        progress(7)
+        return len(made_of)
+
+    monkeypatch.setattr(paper, "random_runs", runs)
+    settings = PaperSettings(runs=4, seed=5)
+    for where, largest in (("beside", 0.05), ("on", 0.0)):
+        made = paper._trajectories(
+            settings, where, largest, 31, lambda *parts: reported.append(parts)
+        )
+        assert list(made) == list(MODELS)
+    assert len({first for *_, first in made_of}) == 6
+    for k, (*given, first) in enumerate(made_of):
+        wanted = paper_arm(list(MODELS)[k % 3])
+        assert given == [wanted[0].form, len(wanted[1]), 4, 31, 0.05 if k < 3 else 0.0]
+        assert first == np.random.default_rng([5, k % 3, int(k < 3)]).uniform()
+        what = f"{list(MODELS)[k % 3]}, 4 motions from {('beside', 'on')[k // 3]} the program"
+        assert reported[k] == (what, 7, 31, "iterations")
+
+
 def test_the_verdict_is_that_of_the_last_iteration(html, content):
     box = html.split('<div class="verdict ')[1].split("</div>")[0]
     last = [content["models"][name]["relative_error"][-1] for name in MODELS]
@@ -345,3 +381,43 @@ def test_the_summary_says_what_the_start_beside_the_program_does(html, content):
     gains = [content["on_program"][n]["relative_error"][-1] / last[n] for n in MODELS]
     assert f"iterations is {min(gains):.2g} to {max(gains):.2g} times as large" in html
     assert "start, 1 degree off the program" in html
+
+
+def test_a_model_is_written_from_its_clean_case_and_judged_at_its_end(rng):
+    estimates, prx = rng.standard_normal((3, 5, 2)), rng.random((2, 5))
+    study = SimpleNamespace(
+        dynamics=SimpleNamespace(names=("p", "q")), P=np.array([3.0, -4.0]), NA=31,
+        history=SimpleNamespace(estimates=estimates, prx=prx),
+        errors=lambda: np.array([0.5, 9e-5, 2e-4]),
+    )  # fmt: skip
+    assert paper._model(study) == {
+        "names": ["p", "q"], "P_true": [3.0, -4.0], "P_hat": estimates[:, 0].tolist(),
+        "relative_error": [0.5, 9e-5, 2e-4], "prx_norm": prx[:, 0].tolist(), "NA": 31,
+        "converged": False,
+    }  # fmt: skip
+    study.errors = lambda: np.array([0.5, 2e-4, 1e-4])
+    assert paper._model(study)["converged"]
+
+
+def test_the_replay_has_the_torques_of_first_and_last_estimate(monkeypatch, rng):
+    given = {}
+
+    def replay(arm, t, q, *, torques, notes):
+        given.update(t=t, q=q, torques=torques)
+        return SimpleNamespace(write=lambda target: given.update(target=target))
+
+    monkeypatch.setattr(paper, "replay", replay)
+    dynamics, P = paper_arm("physical")
+    estimates = P * rng.uniform(0.5, 2.0, (7, 2, 4))
+    study = SimpleNamespace(P=P, history=SimpleNamespace(estimates=estimates))
+    paper._write_replay(None, study, "there")
+    t = np.linspace(0.0, 2.0, 241)
+    q, v, a = PROGRAM.evaluate(t)
+    np.testing.assert_array_equal(given["q"], q)
+    measured, predicted = given["torques"].measured, given["torques"].predicted
+    G = dynamics.regressor(q, v, a)
+    np.testing.assert_allclose(measured, G @ P, atol=1e-9)
+    assert list(predicted) == ["initial values", "after 6 iterations"]
+    for found, k in zip(predicted.values(), (0, 6), strict=True):
+        np.testing.assert_allclose(found, G @ estimates[k, 0], atol=1e-9)
+    assert given["target"] == "there"

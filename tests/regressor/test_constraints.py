@@ -103,7 +103,7 @@ def test_without_torque_only_rows_of_the_base_are_used(quadruped, rng):
     motion = Trajectory(
         t=np.arange(2.0), q=q, v=v, a=a, tau=0 * v, joints=quadruped.joints, rate=None,
         segment=np.zeros(2, dtype=int), contacts=np.zeros((2, 3), dtype=bool),
-        wrenches=np.zeros((2, 2)), switching=np.zeros(2, dtype=bool),
+        wrenches=np.zeros((2, 2)),
     )  # fmt: skip
     found, used = constrained(quadruped, motion, np.ones((2, 18), dtype=bool), has_torque=False)
     assert used.tolist() == [[True] * 6 + [False] * 12] * 2

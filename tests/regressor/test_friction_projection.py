@@ -152,8 +152,8 @@ def test_the_moments_are_read_back_and_the_sentence_states_the_figures(case):
     np.testing.assert_array_equal(first.pi, second.pi)
     drive = first.drives[1]
     assert str(drive) == (
-        f"elbow_joint: stribeck, asymmetric projected on viscous {drive.values['viscous']:.4g}, "
-        f"coulomb {drive.values['coulomb']:.4g}; error {drive.error:.3g} RMS "
+        f"elbow_joint: stribeck, asymmetric projected on viscous {drive.values['viscous']:.4g} "
+        f"N m s/rad, coulomb {drive.values['coulomb']:.4g} N m; error {drive.error:.3g} N m RMS "
         f"({100 * drive.error / drive.torque:.2g} % of its torque)"
     )
     assert drive.to_dict()["error"] == drive.error

@@ -16,7 +16,7 @@ from robotid.diagnosis.misfit_findings import misfit_findings, setting_of
 from robotid.findings import Finding
 from robotid.fitting.joint_motion import JointMotion
 from robotid.judgement.verdict import WARNING_CODES
-from robotid.report.advice import Origin, next_steps
+from robotid.report.advice import Origin, loop_steps, next_steps
 from robotid.robot.examples import example_urdf
 
 JOB = Origin(("my job.toml",), "out")
@@ -239,12 +239,13 @@ def test_an_error_comes_before_a_warning_and_three_steps_are_enough(identified):
 )
 def test_a_setting_is_a_line_of_the_job_file_or_a_flag(identified, code, evidence, table, flags):
     found = told(identified, warning(code, **evidence))
-    assert next_steps(found, FLAGS)[0].blocks == (
-        f"robotid identify arm.urdf first.csv --cutoff 8 {flags} --out out",
-    )
+    block, *of_payload = next_steps(found, FLAGS)[0].blocks
+    assert block == f"robotid identify arm.urdf first.csv --cutoff 8 {flags} --out out"
+    assert len(of_payload) == (code == "current_for_torque")
     assert next_steps(found, JOB)[0].blocks == (
         table,
         "robotid identify 'my job.toml' --out out",
+        *of_payload,
     )
 
 
@@ -262,7 +263,9 @@ def test_whatever_leaves_a_result_in_doubt_has_a_step(identified, code):
 def test_what_two_steps_ask_to_be_typed_is_typed_last(identified):
     found = told(identified, warning("current_for_torque"), warning("torque_delay", delay=0.01))
     first, second, *_ = next_steps(found, JOB)
-    assert first.blocks == ("[torque.gains]\nelbow_joint = GAIN",)
+    table, command = first.blocks
+    assert table == "[torque.gains]\nelbow_joint = GAIN"
+    assert command.endswith("--mass KG --gains")
     assert second.blocks[-1] == "robotid identify 'my job.toml' --out out"
 
 
@@ -319,7 +322,13 @@ def test_figures_in_steps_are_those_of_all_findings_and_of_the_result(identified
     assert step.words.endswith("; of elbow_joint by -0.0123; of wrist_1_joint by 0.5.")
     before, after = (pi[:60:10].sum() for pi in (identified.prior, identified.standard))
     step = next_steps(told(identified, warning("total_mass", "robot")), JOB)[0]
-    assert f"{after:.4g} kg identified, {before:.4g} kg in the URDF." in step.words
+    assert f"({after:.4g} kg identified, {before:.4g} kg in the URDF)" in step.words
+    weighed = replace(identified.scale_check, is_total_determined=True)
+    found = told(identified, warning("total_mass", "robot"))
+    found.__dict__["scale_check"] = weighed
+    step = next_steps(found, JOB)[0]
+    assert "State the measured mass of the moving links" in step.words
+    assert step.blocks[0] == "[estimator.constraints]\ntotal_mass = KG"
     assert f"{after:.4g}" != f"{before:.4g}"
     assert step.blocks[0] == "[estimator.constraints]\ntotal_mass = KG"
 
@@ -345,3 +354,56 @@ def test_joints_that_any_recording_misses_are_looked_at_and_the_first_is_played(
     assert f"the residual of {names[0]}, {names[4]} in" in look.words
     (played,) = [b for step in steps for b in step.blocks if b.startswith("robotid replay")]
     assert " x.csv out" in played
+
+
+# --- results from commands and positions ----------------------------------------------------------
+
+
+def loop_content(status, *, log_errors=(), warnings=()):
+    inputs = [{"role": "urdf", "path": "arm.urdf"}, {"role": "identification", "path": "a.csv"}]
+    per_joint = {joint: {"status": "good", "reasons": []} for joint in ("one", "two", "three")}
+    per_joint["two"] = {"status": status, "reasons": []}
+    return {
+        "robot": "arm", "joints": list(per_joint), "inputs": inputs,
+        "simulation": {"controller": {"kind": "pd"}}, "warnings": list(warnings),
+        "verdict": {"status": status, "log_errors": list(log_errors), "per_joint": per_joint},
+    }  # fmt: skip
+
+
+def loop_warning(code, where):
+    message = f"{where} has {code}; do something"
+    return {"code": code, "severity": "warning", "where": where, "message": message}
+
+
+def test_a_usable_result_of_commands_is_exported():
+    steps = loop_steps(loop_content("usable"), JOB)
+    assert [step.blocks[0].split()[1] for step in steps] == ["replay", "export", "export", "export"]
+    assert loop_steps(loop_content("usable"), Origin()) == ()
+
+
+def test_a_poor_result_of_commands_is_repaired_and_not_used():
+    warnings = [loop_warning("alike", "one"), loop_warning("small", "a.csv: two")]
+    steps = loop_steps(loop_content("poor", warnings=warnings), JOB)
+    assert [step.words.partition(":")[0] for step in steps] == [
+        "A.csv",  # of the poor joint
+        "One has alike; do something.",
+        "Do not use the result",
+    ]
+    assert "position of two is wrong" in steps[-1].words
+    assert [block.split()[1] for step in steps for block in step.blocks] == ["replay", "identify"]
+
+
+def test_errors_of_a_log_of_commands_are_corrected_first():
+    content = loop_content("poor", log_errors=["a.csv: two moves before its command"])
+    (step,) = loop_steps(content, JOB)
+    assert "Correct the logs, then repeat the identification: a.csv: two moves" in step.words
+    assert [block.split()[1] for block in step.blocks] == ["doctor", "identify"]
+
+
+def test_a_poor_result_of_torques_is_not_exported(identified):
+    wrong = told(identified)
+    vars(wrong)["verdict"] = replace(identified.verdict, status="poor")
+    blocks = [block for step in next_steps(wrong, JOB) for block in step.blocks]
+    assert wrong.has_urdf
+    assert blocks
+    assert not any(block.split()[1] in ("export", "validate") for block in blocks)

@@ -27,10 +27,10 @@ MANY = [
     [
         ([], "two", "none"),
         (MANY[3:4], "two", "1 note"),
-        (MANY[3:], "two", "3 notes"),
-        (MANY, "t<o", "3 findings, 2 causes; worst: t&lt;o; 3 notes"),
+        (MANY[3:], "two", "2 notes"),
+        (MANY, "t<o", "2 findings, 2 causes; worst: t&lt;o; 2 notes"),
         (MANY[2:4], "", "1 finding, 1 cause; 1 note"),
-        (MANY[:2], "one", "2 findings, 1 cause; worst: one"),
+        (MANY[:2], "one", "1 finding, 1 cause; worst: one"),
     ],
 )
 def test_the_line_counts_what_is_grave_its_causes_and_notes(findings, worst, line):

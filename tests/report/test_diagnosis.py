@@ -10,7 +10,13 @@ from helpers.pages import charts, tables
 from robotid.fitting.information import information
 from robotid.identification.pictures import residual_charts
 from robotid.pages.charts import Chart, Series
-from robotid.report.diagnosis import _choice, _correlations, _residual_figures, information_section
+from robotid.report.diagnosis import (
+    _choice,
+    _correlations,
+    _residual_figures,
+    friction_section,
+    information_section,
+)
 from robotid.report.errors import _notes
 from robotid.report.torques import _totals
 
@@ -23,6 +29,16 @@ def test_shares_of_the_data_are_those_of_all_and_of_the_weakest(identified):
         f"{round(100 * share.min())} %,"
     ) in said
     assert share.min() < 0.9 * share.mean()
+
+
+def test_friction_of_more_joints_than_fit_is_folded_but_for_the_worst(identified, monkeypatch):
+    joints = identified.model.row_names
+    assert "<details" not in friction_section(identified, joints)
+    monkeypatch.setattr("robotid.report.diagnosis._CURVES", 2)
+    shown, folded = friction_section(identified, [joints[4], joints[1], *joints]).split("<details")
+    titles = [[what["title"].split()[2] for what in charts(html)] for html in (shown, folded)]
+    assert titles == [[joints[1], joints[4]], [joints[0], *joints[2:4], joints[5]]]
+    assert "4 more joints with smaller errors" in folded
 
 
 @pytest.mark.parametrize("row", [0, 3, 5])

@@ -260,7 +260,7 @@ def test_the_correlation_map_has_every_name_and_a_cell_per_pair(html, found):
 
 def test_excitation_names_the_condition_and_the_strongest_correlation(html, found):
     text = Reader(html).text
-    assert f"Condition number {found.wls.condition:.3g}; singular values from" in text
+    assert f"Condition number {found.wls.condition:.3g} (regressor, unit columns); singular" in text
     assert "Correlation of errors" in text
 
 

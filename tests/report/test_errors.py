@@ -110,7 +110,7 @@ def test_masses_and_sources_are_those_of_the_result(screen, identified):
     before, after = (pi[:60:10].sum() for pi in (identified.prior, identified.standard))
     assert f"{before:.2f} → {after:.2f} kg" in screen
     assert f"{identified.determination.rank} of {len(identified.base)}" in screen
-    flex = {k: int(n) for k, n in re.findall(r'<i class="(\w+)" style="flex: (\d+)"', screen)}
+    flex = {k: int(n) for k, n in re.findall(r'<i class="from-(\w+)" style="flex: (\d+)"', screen)}
     assert flex == {kind: identified.sources.count(kind) for kind in set(identified.sources)}
     assert '<a href="arm identified.urdf">URDF</a>' in screen
 

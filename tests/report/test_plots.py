@@ -16,8 +16,8 @@ from robotid.diagnosis.residuals import autocorrelation, spectrum
 from robotid.fitting.information import information
 from robotid.identification.pictures import QUANTILE, torque_charts
 from robotid.report import torques as torques_module
+from robotid.report.advice import Origin
 from robotid.report.torques import torques_section
-from robotid.robot.parameters import INERTIAL_TERMS
 
 JOINTS = range(6)
 
@@ -149,19 +149,6 @@ def test_drives_show_their_values_with_two_standard_errors(report, identified, t
     close(ours["half"], np.where(np.isinf(error), np.nan, 2 * error))  # at its bound: no bar
 
 
-@pytest.mark.parametrize("k", range(10))
-def test_bodies_show_the_urdf_beside_what_was_identified(report, identified, k):
-    term, part = INERTIAL_TERMS[k], slice(k, 60, 10)
-    what = chart(report, f"{term} of each body")
-    assert what["x_names"] == list(identified.model.layout.bodies)
-    *before, ours = what["series"]
-    close(ours["y"], identified.standard[part])
-    close(ours["half"], 2 * identified.standard_error[part])
-    assert bool(before) == bool(identified.prior[part].any())
-    for series in before:
-        close(series["y"], identified.prior[part])
-
-
 def test_singular_values_are_those_of_the_regressor(report, identified):
     values = information(identified).singular_values
     what = chart(report, "Singular values")
@@ -238,7 +225,7 @@ def test_each_recording_has_its_own_band_error_and_share_of_the_points(identifie
     monkeypatch.setattr(torques_module, "chart_html", noted)
     monkeypatch.setattr("robotid.report.curves._ROWS", 9600)
     verdicts = identified.verdict.to_dict()["per_joint"]
-    torques_section(replace(identified, validation=()), verdicts, identified.model.joints)
+    torques_section(replace(identified, validation=()), verdicts, identified.model.joints, Origin())
     fitted, joints = identified.fitted, identified.model.joints
     assert {points for *_, points in drawn} == {9600 // (2 * 6 * 2)}
     above, below = drawn[::2], drawn[1::2]

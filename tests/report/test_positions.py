@@ -281,3 +281,16 @@ def test_the_lines_of_the_urdf_that_change_are_shown(content, followed):
     )
     assert "all other bytes are unchanged" in page
     assert "no longer at its path" in page_with(content, [], [followed])
+
+
+def test_the_worst_joint_of_the_verdict_is_open(content, followed):
+    model = plant("leg", np.random.default_rng(0)).model
+    rest = replace(followed.log, q_ref=followed.log.q_ref * [1, 1, 0])  # its noise is no motion
+    rmse, spread = np.array([1e-3, 5e-3, 2e-3]), np.full(3, 0.1)
+    moved = replace(followed, rmse=rmse, spread=spread)
+    still = replace(moved, log=rest, rmse=rmse, spread=np.array([0.1, 0.1, 1e-4]))
+    page = page_with(content, [], [moved, still], (model, model.standard_parameters()))
+    opened = re.findall(r'<details[^>]*id="joint-(\d)"[^>]* open', page)
+    assert opened == ["1"]
+    assert next(iter(bars(page))) == LEG[1]
+    assert '<a href="#cause-saturation">saturation</a>' in page.split('id="worst"')[0]

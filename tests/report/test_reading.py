@@ -140,10 +140,21 @@ def test_a_link_opens_what_it_leads_to(seen):
     assert page.locator("nav").bounding_box()["y"] == 0
 
 
-def test_six_joints_open_on_few_screens(seen):
+def test_the_worst_joints_open_on_few_screens(seen):
     screens = "document.documentElement.scrollHeight / innerHeight"
     assert seen.page.evaluate(screens) <= 6.0
     assert seen.page.locator(".next").bounding_box()["y"] < 800
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_is_wider_than_a_phone(browser, path, scheme):
+    with visit(browser, path, size=(390, 844), color_scheme=scheme) as seen:
+        width = "document.querySelector('{}').scrollWidth"
+        assert [seen.page.evaluate(width.format(x)) for x in ("html", "nav")] == [390, 390]
+        until(seen, "document.querySelectorAll('#friction ~ .plots canvas').length >= 6")
+        place = seen.page.locator("#friction ~ .plots .place").first.bounding_box()
+        assert place["width"] > 340
+        assert seen.errors == []
 
 
 def test_printing_opens_everything(seen):

@@ -7,6 +7,8 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 import pytest
 
+from robotid.report.advice import Origin
+from robotid.report.dock import Dock
 from robotid.report.torques import torques_section
 from robotid.report.worst_second import Residual, worst_html, worst_second
 
@@ -62,24 +64,24 @@ def test_a_short_recording_is_one_window_and_an_unused_one_none():
     assert (worst.start, worst.end, worst.ratio) == (100.0, pytest.approx(100.49), 1.0)
     assert worst_second([residual(np.full(1000, np.nan))]) is None
     assert worst_second([]) is None
-    assert worst_html(None, "j", "N m", "replay.html") == ""
+    assert worst_html(None, "j", "N m", Dock("replay.html")) == ""
 
 
 def test_figures_have_their_unit_and_names_are_escaped():
     worst = worst_second([residual(burst(103.5, 0.002, noise=1e-5), name='a "&<b>.csv')])
-    html = worst_html(worst, "odd & <j>", "mrad", 'my "replay".html', 1e-3)
+    html = worst_html(worst, "odd & <j>", "mrad", Dock('my "replay".html'), 1e-3)
     assert "103.50 to 104.50 s, RMS 2 mrad, " in html
     assert not re.search("<[bj]>", html)
     link = urlsplit(unescape(re.search(r'href="([^"]*)" target="replay"', html)[1]))
     assert link.path == "my%20%22replay%22.html"
     fragment = {key: value[0] for key, value in parse_qs(link.fragment).items()}
     assert fragment == {"t": "103.500", "joint": "odd & <j>", "log": 'a "&<b>.csv'}
-    assert "href" not in worst_html(worst, "j", "N m", "")
+    assert "href" not in worst_html(worst, "j", "N m", Dock())
 
 
 def test_each_joint_of_a_report_has_its_own_worst_second(identified):
     (kept,) = identified.validation
-    html = torques_section(identified, {}, ["elbow_joint"], "replay.html")
+    html = torques_section(identified, {}, ["elbow_joint"], Origin(), "replay.html")
     motion = kept.recording.trajectory
     parts = html.split('<details id="joint-')[1:]
     assert len(parts) == 6

@@ -151,6 +151,14 @@ def test_a_mesh_is_thinned_once_until_its_file_is_another(package, monkeypatch):
     assert len(runs) == 2
 
 
+def test_the_limit_of_triangles_is_of_what_is_drawn(package, monkeypatch):
+    """A ball that two visuals share counts twice."""
+    trimesh.creation.icosphere(subdivisions=3).export(package / "meshes" / "cube.stl")
+    monkeypatch.setattr(scene, "_TRIANGLES", 1000)
+    (ball,) = robot_scene(RobotModel.from_urdf(package / "urdf" / "r.urdf")).content["meshes"]
+    assert 400 < ball["faces"]["shape"][0] <= 500
+
+
 def test_parts_sit_where_pinocchio_puts_the_visuals(package):
     """Pinocchio's own reading of the visuals is the oracle."""
     path = package / "urdf" / "r.urdf"

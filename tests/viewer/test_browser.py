@@ -64,6 +64,7 @@ def page(ur5, tmp_path_factory):
         ghosts={"designed </script>": (T, q + 0.3)},
         bands=Bands(T, ["elbow.m", "wrist.m"], ["kg", "kg"], theta, 0.1 + 0 * theta),
         marks=[Mark(T[0] + 3.0, "payload <b>2 kg</b>", "payload", ur5.joints[2])],
+        log="own.csv",
     )  # fmt: skip
     return shown.write(tmp_path_factory.mktemp("page") / "replay.html")
 
@@ -162,7 +163,7 @@ def test_playback_moves_the_robot_at_true_time_and_stops(playing):
     seen = playing
     watch = "[replay.clock.time, replay.clock.at / 1000 * 0.25]"  # at: of the last frame
     seen.page.select_option("#speed", "0.25")  # or screenshots take longer than the motion
-    seen.page.wait_for_timeout(100)
+    until(seen, "replay.clock.time > 7")
     before, pose, first = seen.page.evaluate(watch), poses(seen), pixels(seen)
     seen.page.wait_for_timeout(900)
     after, second = seen.page.evaluate(watch), pixels(seen)
@@ -176,6 +177,97 @@ def test_playback_moves_the_robot_at_true_time_and_stops(playing):
     seen.page.wait_for_timeout(200)
     assert seen.page.evaluate("replay.clock.time") == stopped
     seen.page.select_option("#speed", "1")
+
+
+def test_a_paused_page_draws_no_frame_until_something_changes(still):
+    seen, frames = still, "replay.clock.frames"
+    seen.page.wait_for_timeout(200)
+    before = seen.page.evaluate(frames)
+    seen.page.wait_for_timeout(400)
+    assert seen.page.evaluate(frames) == before
+    seen.page.evaluate("replay.seek(8.5); replay.seek(9)")
+    seen.page.wait_for_timeout(200)
+    assert seen.page.evaluate(frames) == before + 1
+    # the time of a pause is not part of the motion
+    seen.page.evaluate("replay.play()")
+    until(seen, f"{frames} > {before + 4}")
+    assert seen.page.evaluate("replay.clock.time") < 10.5
+
+
+def test_the_motion_fills_the_view_and_the_shadow_is_below_the_lowest_points(still):
+    """In a wide and in a narrow window no point of the motion is outside, one is at the rim."""
+    for width in (1280, 390):
+        with sized(still, width, 800) as seen:
+            seen.page.click("#view")
+            rims = seen.page.evaluate("""() => {
+              const { THREE } = MeshCat, { camera } = replay.viewer;
+              camera.updateMatrixWorld(true);
+              const { points } = JSON.parse(document.getElementById('data').textContent).view;
+              const at = points.map(([x, y, z]) => new THREE.Vector3(x, z, -y).project(camera));
+              const range = v => [Math.min(...v), Math.max(...v)];
+              return ['x', 'y'].map(k => range(at.map(p => p[k])));
+            }""")
+            assert np.abs(rims).max() == pytest.approx(0.9, abs=1e-3)
+            np.testing.assert_allclose(np.sum(rims, axis=1), 0.0, atol=0.05)  # in the middle
+    places, opacities = seen.page.evaluate("""() => {
+      const { position, color } = replay.shadow.geometry.attributes;
+      return [[...position.array], [...color.array].filter((_, i) => i % 16 === 3)];
+    }""")
+    corners = np.array(places).reshape(-1, 4, 3)
+    # the base stands on the ground, or above that of a motion that goes below it
+    assert np.ptp(corners[:, :, 2]) == 0.0
+    np.testing.assert_allclose(corners[0].mean(axis=0)[:2], 0.0, atol=0.02)
+    assert 0.0 < min(opacities) < max(opacities) <= 0.5
+
+
+def test_a_ghost_at_the_place_of_the_robot_is_not_seen(still):
+    seen = still
+    seen.page.evaluate("replay.ghosts[0].root.visible = false; replay.viewer.set_dirty()")
+    alone = pixels(seen)
+    seen.page.evaluate("replay.ghosts[0].pose(replay.motion.at(7))")
+    seen.page.evaluate("replay.ghosts[0].root.visible = true; replay.viewer.set_dirty()")
+    assert (np.abs(alone - pixels(seen)).max(axis=2) > 10).mean() < 2e-4
+    seen.page.evaluate("replay.seek(7.5)")
+    apart = pixels(seen)
+    seen.page.evaluate("replay.ghosts[0].root.visible = false; replay.viewer.set_dirty()")
+    assert (np.abs(apart - pixels(seen)).max(axis=2) > 10).mean() > 0.005
+    seen.page.evaluate("replay.ghosts[0].root.visible = true")
+
+
+def test_a_small_residual_has_its_own_axis(still):
+    """The charts of joint 2: torques of 10 N m, and a residual of about 0.1 N m below them."""
+    seen = still
+    seen.page.locator(".plot").nth(1).scroll_into_view_if_needed()
+    until(seen, "document.querySelectorAll('.plot')[1].querySelectorAll('.u-over').length === 2")
+    torque, residual = seen.page.evaluate(
+        "[replay.torqueCharts[1].chart, replay.torqueCharts[1].below].map(c => c.extent())"
+    )
+    shown = motion(6)[1][:, 1] - FIT[:, 1]
+    room = 0.04 * np.ptp(shown)
+    assert residual == pytest.approx([shown.min() - room, shown.max() + room], abs=2e-3)
+    assert np.diff(torque) > 10 * np.diff(residual)
+
+
+def test_names_of_joints_do_not_overlap(still):
+    for width, height in ((820, 480), (390, 844)):
+        with sized(still, width, height) as seen:
+            seen.page.get_by_label("names").check()
+            seen.page.wait_for_timeout(200)
+            boxes = np.array(seen.page.evaluate(
+                "[...document.querySelectorAll('#names span')].map(e => e.getBoundingClientRect())"
+                ".map(b => [b.left, b.top, b.right, b.bottom])"
+            ))  # fmt: skip
+            for k, (left, top, right, bottom) in enumerate(boxes):
+                for other in boxes[:k]:
+                    is_beside = other[0] >= right - 0.2 or other[2] <= left + 0.2
+                    assert is_beside or other[1] >= bottom - 0.2 or other[3] <= top + 0.2
+            # the heat strip has names in a narrow window too, in their rows
+            strip = seen.page.locator("#sheet").bounding_box()
+            name = seen.page.locator("#joints span").nth(2)
+            assert "elbow" in name.inner_text()
+            middle = name.bounding_box()["y"] + name.bounding_box()["height"] / 2
+            assert middle == pytest.approx(strip["y"] + 2.5 / 6 * strip["height"], abs=2)
+            seen.page.get_by_label("names").uncheck()
 
 
 def test_speed_and_loop(still):
@@ -196,7 +288,9 @@ def test_a_click_in_a_chart_moves_robot_slider_and_every_cursor(still):
     before = poses(seen)
     seen.page.locator(".plot").nth(1).scroll_into_view_if_needed()
     until(seen, "document.querySelectorAll('.plot')[1].querySelector('.u-over') !== null")
-    chart = seen.page.locator(".plot .u-over").nth(1)
+    chart = seen.page.locator(".plot").nth(1).locator(".u-over").first
+    chart.scroll_into_view_if_needed()
+    seen.page.wait_for_timeout(150)  # charts that come into sight are drawn
     box = chart.bounding_box()
     seen.page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 20)
     seen.page.wait_for_timeout(200)

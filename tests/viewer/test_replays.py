@@ -231,7 +231,7 @@ def test_the_strip_is_of_the_first_prediction_over_what_it_is_compared_to(arm, m
         ("position", noise, noise, 0.25),
     ):
         data = shown(replay(arm, t, q, torques=Torques(t, q, ours, stated, quantity)).html)
-        scale, strip = data["torques"]["scale"], data["torques"]["strip"]
+        scale, strip = data["torques"]["scale"], data["torques"]["strips"][0]
         np.testing.assert_allclose(scale["of"], of)
         assert scale["full"] == full
         edges = np.linspace(t[0], t[-1], len(strip) + 1)
@@ -243,6 +243,13 @@ def test_the_strip_is_of_the_first_prediction_over_what_it_is_compared_to(arm, m
                 known = left[np.isfinite(left[:, j]), j]
                 wanted = 100 * np.sqrt(np.mean(known**2)) if len(known) else 65_534
                 assert strip[b, j] == pytest.approx(wanted, abs=0.51)
+        others = data["torques"]["strips"][1:]  # a switch shows them, of torques
+        assert len(others) == (quantity == "torque")
+        for strip in others:
+            mean = np.sqrt(np.mean((strip / 100.0) ** 2, axis=0))
+            np.testing.assert_allclose(
+                mean, np.sqrt(np.mean((q - other) ** 2, axis=0)) / of, rtol=0.05
+            )
 
 
 def test_the_camera_sees_the_outermost_points_about_the_base_and_the_ground(tmp_path):

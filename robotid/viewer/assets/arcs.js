@@ -6,11 +6,11 @@ const FULL = 1.5 * Math.PI; // [rad] arc of the largest torque of a joint
 class Arc { // around a joint's axis, or a bar along it; grows with the torque from a tick at zero
   constructor(joint, radius, thickness, colour, hasHead) {
     const skin = (color) => new THREE.MeshBasicMaterial(
-      { color, side: THREE.DoubleSide, depthTest: false, transparent: true });
+      { color, depthTest: false, transparent: true });
     this.material = skin(colour);
     this.isPrismatic = joint.kind === "prismatic";
-    this.around = 6;
-    this.along = 72;
+    this.around = 5;
+    this.along = 45;
     this.radius = radius;
     const shape = this.isPrismatic
       ? new THREE.CylinderGeometry(thickness, thickness, 1, 12).translate(0, 0.5, 0).rotateX(Math.PI / 2)
@@ -28,7 +28,7 @@ class Arc { // around a joint's axis, or a bar along it; grows with the torque f
       if (!this.isPrismatic) tick.position.x = radius;
       this.holder.add(this.head, tick);
     }
-    this.holder.children.forEach((mesh) => { mesh.renderOrder = 2; });
+    this.holder.children.forEach((mesh) => { mesh.renderOrder = 3; });
     joint.object.add(this.holder);
   }
   ring(radius, thickness) {
@@ -91,7 +91,7 @@ function showArcs(row) {
     if (!arcs.length) return;
     const { measured, predicted } = arcs[j];
     measured.show(row[j] / (largest[j] || 1));
-    if (predicted) predicted.show(row[count + j] / (largest[j] || 1));
+    if (predicted) predicted.show(predictedOf(row, j) / (largest[j] || 1));
     measured.material.color.set(colour);
   });
 }

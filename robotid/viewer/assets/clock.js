@@ -2,6 +2,7 @@
 // ---- the clock: the log's own time -----------------------------------------------------------
 
 const SLOW = 0.045; // [s] a frame
+const READINGS = onProcessor ? 250 : 100; // [ms] between two changes of the page about the view
 const COARSEST = 0.5; // share of the pixels' width that a slow processor draws at least
 const clock = { time: data.start, playing: !matchMedia("(prefers-reduced-motion: reduce)").matches,
   speed: 1, loop: true, follow: Boolean(data.live), start: data.start, end: 0, frames: 0, at: 0 };
@@ -10,11 +11,11 @@ const slider = byId("time"), clockText = byId("clock"), playButton = byId("play"
 let shown = null, readings = null, announced = -Infinity;
 const digits = (time) => time.toFixed(2);
 
-function show() { // the robot in every frame, the page about it ten times a second
+function show() { // the robot in every frame, the page about it less often
   if (shown !== clock.time) showRobot(clock.time);
   shown = clock.time;
   const now = performance.now();
-  if (readings && (readings.time === clock.time || (clock.playing && now - readings.at < 100))) return;
+  if (readings && (readings.time === clock.time || (clock.playing && now - readings.at < READINGS))) return;
   readings = { time: clock.time, at: now };
   showReadings(clock.time);
 }
@@ -24,6 +25,7 @@ function showRobot(time) {
   const row = motion.at(time);
   robot.pose(row);
   follow(row);
+  castShadow();
   ghosts.forEach((ghost, k) => {
     const own = ghostMotions[k].at(time); // how far it is from the robot may be shown larger
     ghost.pose(boost === 1 ? own : own.map((x, i) => row[i] + boost * (x - row[i])));
@@ -35,6 +37,7 @@ function showRobot(time) {
 function showReadings(time) {
   const from = clock.end - clock.start || 1;
   moveCursor(time);
+  tellReport(time);
   byId("now").style.left = `${(100 * (time - clock.start)) / from}%`;
   slider.value = time;
   clockText.textContent = `${digits(time)} of ${digits(clock.end)} s`;
@@ -67,6 +70,7 @@ function toggle() { if (clock.playing) pause(); else play(); }
 function buttons() {
   playButton.textContent = clock.playing ? "Pause" : "Play";
   byId("live").setAttribute("aria-pressed", clock.follow);
+  wake();
 }
 
 const pace = { mean: 0, frames: 0, pixels: 1 }; // of the last frames [s]; share of the pixels' width
@@ -83,7 +87,12 @@ function draw(pixels) {
 }
 function sharpen() { if (viewer && pace.pixels < 1) draw(1); } // full resolution of a still picture
 
-let last = null;
+const EVERY = 22; // [ms] to the next frame of a playing page, which is the second one of 60 Hz
+let last = null, isAsked = false, next = 0;
+function wake() { // asks for one frame; nothing is drawn while nothing changes
+  if (!isAsked) requestAnimationFrame(tick);
+  isAsked = true;
+}
 function tick(now) {
   const passed = last === null ? 0 : (now - last) / 1000;
   last = now;
@@ -104,7 +113,10 @@ function tick(now) {
     viewer.render();
     placeNames();
   }
-  requestAnimationFrame(tick);
+  isAsked = false; // only now: what was changed above is drawn
+  clearTimeout(next);
+  if (clock.playing || clock.follow) next = setTimeout(wake, EVERY);
+  else last = null;
 }
 
 // ---- the address stores time, joint and camera -------------------------------------------------
@@ -115,6 +127,7 @@ let isRestored = false;
 function keep() {
   if (!isRestored || !hasAddress || data.live) return;
   const state = { t: clock.time.toFixed(3) };
+  if (chosen) state.model = models[chosen];
   if (picked) state.joint = data.scene.nodes[picked].name;
   if (isTurned) {
     const { position } = viewer.camera, { target } = viewer.controls;
@@ -125,7 +138,7 @@ function keep() {
 
 function restore() { // at the start, and when a link of another page changes the address
   const stored = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
-  const isOther = stored.log && !data.notes.some((note) => note.includes(stored.log));
+  const isOther = stored.log && data.log && stored.log !== data.log;
   byId("state").textContent = isOther ? `The link is to ${stored.log}; this replay shows another recording.` : "";
   if (stored.t !== undefined && Number.isFinite(Number(stored.t))) { pause(); seek(Number(stored.t)); }
   const place = (stored.camera || "").split(" ").map(Number);
@@ -136,6 +149,8 @@ function restore() { // at the start, and when a link of another page changes th
     viewer.controls.update();
     isTurned = true;
   }
+  const wanted = models.indexOf(stored.model);
+  if (wanted >= 0 && wanted !== chosen) choose(wanted);
   if (stored.joint) pick(nodeOf(stored.joint));
   isRestored = true;
 }

@@ -15,7 +15,7 @@ document.addEventListener("keydown", (event) => {
   const step = event.shiftKey ? 1 / 30 : 1;
   const acts = { " ": toggle, ArrowLeft: () => seek(clock.time - step),
     ArrowRight: () => seek(clock.time + step), Home: () => seek(clock.start), End: () => seek(clock.end) };
-  if (!(event.key in acts) || (own && (event.key === " " || at.matches("select")))) return;
+  if (!(event.key in acts) || (own && (event.key === " " || at.matches("select, [type=radio]")))) return;
   event.preventDefault();
   acts[event.key]();
 });
@@ -53,7 +53,7 @@ function drawSwitches() {
   const place = byId("switches");
   const add = (label, checked, act) => place.append(box(label, checked, act).label);
   if (viewer) {
-    add("transparent robot", false, (on) => { seeThrough = on; showMasses(); });
+    add("transparent robot", false, (on) => robot.fade(on ? 0.35 : 1));
     if (isTorque) add("torque arcs", true, (on) => { showsArcs = on; chooseArcs(); });
     if (predictions) add("links coloured by residual", false, tint);
     ghosts.forEach((ghost, k) => {

@@ -63,6 +63,8 @@ const torqueTable = torques ? new Table(torques.t, torques.values) : null;
 const count = torques ? torques.joints.length : 0;
 const isTorque = torques && torques.quantity === "torque"; // else positions, which have no arcs
 const predictions = torques ? torques.labels.length - 1 : 0;
+let chosen = 0; // the prediction that arcs, links, heat strip and residuals show
+const predictedOf = (row, j) => row[(1 + chosen) * count + j];
 const bands = data.bands;
 const bandTable = bands ? new Table(bands.t, bands.values) : null; // values, then standard errors
 
@@ -98,4 +100,4 @@ function measureTorques() {
   squares.forEach((sum, j) => { scale.of[j] = Math.sqrt(sum / rows) || 1; });
 }
 const residualShare = (row, j) => // 1 is full red; NaN without a prediction
-  predictions ? Math.abs(row[j] - row[count + j]) / scale.of[j] / scale.full : NaN;
+  predictions ? Math.abs(row[j] - predictedOf(row, j)) / scale.of[j] / scale.full : NaN;

@@ -51,7 +51,7 @@ function showFrames(on) {
     for (const { object } of robot.joints) {
       const axes = new THREE.AxesHelper(0.09 * data.scene.reach);
       axes.material.depthTest = false;
-      axes.renderOrder = 4;
+      axes.renderOrder = 5;
       frames.push(axes);
       object.add(axes);
     }
@@ -73,10 +73,18 @@ function showNames(on) {
 }
 function placeNames() { // after a frame was drawn
   if (!showsNames) return;
-  const spot = new THREE.Vector3();
-  for (const { object, label } of names) {
-    spot.setFromMatrixPosition(object.matrixWorld).project(viewer.camera);
-    const x = ((spot.x + 1) / 2) * pane.clientWidth, y = ((1 - spot.y) / 2) * pane.clientHeight;
-    label.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
+  const spot = new THREE.Vector3(), placed = [];
+  for (const name of names) {
+    spot.setFromMatrixPosition(name.object.matrixWorld).project(viewer.camera);
+    name.width ||= name.label.offsetWidth;
+    name.height ||= name.label.offsetHeight;
+    name.x = ((spot.x + 1) / 2) * pane.clientWidth;
+    name.y = ((1 - spot.y) / 2) * pane.clientHeight;
+  }
+  for (const name of [...names].sort((a, b) => a.y - b.y)) { // below each other rather than over
+    for (const { x, y, width, height } of placed)
+      if (name.x < x + width && x < name.x + name.width && name.y < y + height) name.y = y + height;
+    placed.push(name);
+    name.label.style.transform = `translate(${name.x.toFixed(1)}px, ${name.y.toFixed(1)}px)`;
   }
 }

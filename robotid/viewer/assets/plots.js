@@ -31,16 +31,15 @@ function resting(j) { // segments in which a joint is not used, from the columns
   return found;
 }
 
-function torqueRows(j) { // measured, predicted, and residual of the first prediction
+function torqueRows(j) { // measured and predictions, and the residual of the shown prediction
   const { rows } = torqueTable;
   const ys = torques.labels.map((_, k) => rows.map((row) => row[k * count + j]));
-  if (predictions) ys.push(ys[0].map((y, k) => y - ys[1][k]));
-  return ys;
+  return [ys, predictions ? ys[0].map((y, k) => y - ys[1 + chosen][k]) : null];
 }
 
 function drawTorques() {
   const tones = torques.labels.map((label, k) => ["text", "predicted"][k]
-    || (label === "commanded" ? "tone-5" : `tone-${k + 1}`));
+    || { commanded: "tone-5", URDF: "urdf" }[label] || `tone-${k + 1}`);
   const marks = data.marks.map(({ t }) => t);
   const section = element("section", {}, element("h2", {}, isTorque ? "Torque" : "Position"));
   byId("plots").append(section);
@@ -50,13 +49,19 @@ function drawTorques() {
     const place = element("section", { class: "plot" }, element("h3", {}, heading));
     place.dataset.node = node;
     section.append(place);
-    const ys = torqueRows(j), series = torques.labels.map((label, k) =>
-      ({ label, tone: tones[k], kind: "line", y: ys[k], half: null, faint: k > 1 }));
-    if (predictions) series.push(
-      { label: "residual", tone: "residual", kind: "line", y: ys[ys.length - 1], half: null });
-    torqueCharts.push(new charts.Chart(place, { title: `${torques.quantity} of ${name} over time`, link: "time",
-      x: torqueTable.t, series, x_label: "time [s]", y_label: `${torques.quantity} [${unit}]`,
-      spans: levels ? resting(j) : [], marks, logarithmic: "", height: 100 }));
+    const [ys, residual] = torqueRows(j);
+    const add = (title, y_label, series, height) => new charts.Chart(place, { title, link: "time",
+      x: torqueTable.t, series, x_label: "time [s]", y_label,
+      spans: levels ? resting(j) : [], marks, logarithmic: "", height });
+    const chart = add(`${torques.quantity} of ${name} over time`, `${torques.quantity} [${unit}]`,
+      torques.labels.map((label, k) =>
+        ({ label, tone: tones[k], kind: "line", y: ys[k], half: null, faint: k > 1,
+          hidden: models.length > 0 && k > 0 && k - 1 !== chosen })), 100);
+    // on an axis of its own, where a small one is visible
+    const label = `measured − ${models.length ? "shown" : torques.labels[1]}`;
+    const below = predictions ? add(`residual of ${name} over time`, `residual [${unit}]`,
+      [{ label, tone: "residual", kind: "line", y: residual, half: null }], 84) : null;
+    torqueCharts.push({ chart, below });
   });
 }
 
@@ -89,8 +94,11 @@ function drawBands() {
 
 function refreshCharts() { // of a live page, those in sight
   timeLine.whole = span();
-  torqueCharts.forEach((chart, j) => {
-    if (timeLine.seen.has(chart)) chart.setData(torqueTable.t, torqueRows(j));
+  torqueCharts.forEach(({ chart, below }, j) => {
+    if (![chart, below].some((one) => timeLine.seen.has(one))) return;
+    const [ys, residual] = torqueRows(j);
+    chart.setData(torqueTable.t, ys);
+    if (below) below.setData(torqueTable.t, [residual]);
   });
   for (const { i, chart } of bandCharts)
     if (timeLine.seen.has(chart)) chart.setData(bandTable.t, bandRows(i), bandHalves(i));

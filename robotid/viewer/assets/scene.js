@@ -2,7 +2,7 @@
 // ---- the scene -------------------------------------------------------------------------------
 
 const { THREE } = MeshCat;
-const onProcessor = (() => { // without a graphics card antialiasing halves the frame rate
+const onProcessor = (() => { // without a graphics card neither antialiasing nor a graded sky
   const context = document.createElement("canvas").getContext("webgl");
   const info = context && context.getExtension("WEBGL_debug_renderer_info");
   const name = info ? context.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
@@ -12,7 +12,7 @@ const onProcessor = (() => { // without a graphics card antialiasing halves the 
 const pane = byId("meshcat-pane");
 let viewer = null, fullRatio = 1; // pixels of the view per pixel of the page
 try {
-  const renderer = new THREE.WebGLRenderer({ antialias: !onProcessor, alpha: true });
+  const renderer = new THREE.WebGLRenderer({ antialias: !onProcessor, alpha: false });
   pane.append(renderer.domElement);
   viewer = new MeshCat.Viewer(pane, false, renderer); // this page's clock draws the frames
   fullRatio = onProcessor ? 1 : window.devicePixelRatio;
@@ -21,13 +21,15 @@ try {
   pane.append(element("p", { class: "fault" }, `This browser shows no 3-D view: ${error.message}`));
 }
 
+// ---- the bodies: one mesh per joint, with the colours of its parts at its corners --------------
+
 const meshes = data.scene.meshes.map(({ low, step, vertices, faces, closed }) => {
   const made = new THREE.BufferGeometry();
   const places = Float32Array.from(unpack(vertices), (x, i) => low[i % 3] + step[i % 3] * x);
   made.setAttribute("position", new THREE.BufferAttribute(places, 3));
   made.setIndex(new THREE.BufferAttribute(unpack(faces), 1));
   made.computeVertexNormals();
-  made.userData.side = closed ? THREE.FrontSide : THREE.DoubleSide;
+  made.userData.isOpen = !closed;
   return made;
 });
 
@@ -44,8 +46,83 @@ function visible(colour) { // almost black shapes look like holes in the picture
   return hsl.l < 0.27 ? made.setHSL(hsl.h, hsl.s, 0.27) : made;
 }
 
+function merged(parts) { // one geometry in the frame of the node
+  const shapes = parts.map((part) => {
+    const shape = geometry(part).clone().applyMatrix4(new THREE.Matrix4().fromArray(part.matrix));
+    const { count } = shape.attributes.position, { r, g, b } = visible(part.colour);
+    const colours = new Float32Array(3 * count).map((_, i) => [r, g, b][i % 3]);
+    return { shape, count, colours };
+  });
+  const made = new THREE.BufferGeometry(), index = [];
+  let start = 0;
+  for (const { shape, count } of shapes) {
+    for (const corner of shape.index.array) index.push(start + corner);
+    start += count;
+  }
+  const joined = (arrays) => {
+    const all = new Float32Array(3 * start);
+    arrays.reduce((from, array) => { all.set(array, from); return from + array.length; }, 0);
+    return new THREE.BufferAttribute(all, 3);
+  };
+  made.setIndex(index);
+  made.setAttribute("position", joined(shapes.map(({ shape }) => shape.attributes.position.array)));
+  made.setAttribute("normal", joined(shapes.map(({ shape }) => shape.attributes.normal.array)));
+  made.setAttribute("color", joined(shapes.map(({ colours }) => colours)));
+  made.computeBoundingBox();
+  return made;
+}
+
+const bodies = []; // of all robots: { node, shape, side }
+data.scene.nodes.forEach((_, node) => {
+  const own = data.scene.parts.filter((part) => part.node === node);
+  const isOpen = (part) => part.shape === "mesh" && meshes[part.size[0]].userData.isOpen;
+  for (const [parts, side] of [[own.filter((part) => !isOpen(part)), THREE.FrontSide],
+    [own.filter(isOpen), THREE.DoubleSide]])
+    if (parts.length) bodies.push({ node, side, shape: merged(parts) });
+});
+
+// The sky's light and that of two lamps beside the camera, at the corners of triangles: a
+// processor draws it in half the time of three's own materials. A ghost is behind what is as near.
+const LIGHT = `
+  #ifdef FLAT
+  vColor = vec3(1.0);
+  #ifdef DOUBLE_SIDED
+  vBack = vColor;
+  #endif
+  #else
+  vec3 normalSeen = normalize(normalMatrix * normal);
+  float sky = 0.5 + 0.5 * dot(normalSeen, (viewMatrix * vec4(0.0, 1.0, 0.0, 0.0)).xyz);
+  float key = dot(normalSeen, vec3(-0.54, 0.65, 0.54)), fill = dot(normalSeen, vec3(0.92, 0.07, 0.39));
+  vec3 soil = vec3(0.37, 0.34, 0.32), own = mix(vec3(1.0), vColor, ownColour);
+  vColor = own * (mix(soil, vec3(0.68), sky) + 0.58 * max(key, 0.0) + 0.28 * max(fill, 0.0)) + glow;
+  #ifdef DOUBLE_SIDED
+  vBack = own * (mix(vec3(0.68), soil, sky) + 0.58 * max(-key, 0.0) + 0.28 * max(-fill, 0.0)) + glow;
+  #endif
+  #endif
+  mvPosition.xyz *= 1.0 + behind;
+  gl_Position = projectionMatrix * mvPosition;`;
+const HEAD = "uniform vec3 glow;\nuniform float ownColour, behind;\nvarying vec3 vBack;\n";
+
+function skin(side, { behind = 0, ...settings } = {}) {
+  const made = new THREE.MeshBasicMaterial({ side, vertexColors: true, ...settings });
+  made.userData = { ownColour: { value: 1 }, behind: { value: behind },
+    glow: { value: new THREE.Color("#000") } };
+  made.onBeforeCompile = (shader) => {
+    Object.assign(shader.uniforms, made.userData);
+    shader.vertexShader = HEAD + shader.vertexShader.replace("#include <project_vertex>",
+      `#include <project_vertex>${LIGHT}`);
+    shader.fragmentShader = `varying vec3 vBack;\n${shader.fragmentShader}`.replace(
+      "#include <color_fragment>", `#ifdef DOUBLE_SIDED
+      diffuseColor.rgb *= gl_FrontFacing ? vColor : vBack;
+      #else
+      diffuseColor.rgb *= vColor;
+      #endif`);
+  };
+  return made;
+}
+
 class Robot { // the nodes of one robot in the viewer's tree, posed by a row of a motion
-  constructor(root, material) {
+  constructor(root, meshOf) { // meshOf: makes the mesh of a body
     this.root = viewer.scene_tree.find([root]).object;
     const paths = [];
     this.joints = data.scene.nodes.map((node, i) => {
@@ -61,18 +138,11 @@ class Robot { // the nodes of one robot in the viewer's tree, posed by a row of 
       const axis = new THREE.Vector3(...node.axis);
       return { ...node, object, rest, axis, skins: new Map() };
     });
-    this.solids = data.scene.parts.map((part, k) => {
-      const shape = geometry(part), { skins } = this.joints[part.node];
-      const side = shape.userData.side ?? THREE.FrontSide, key = `${part.colour} ${side}`;
-      if (!skins.has(key)) {
-        const skin = material(visible(part.colour), side);
-        skin.userData.colour = skin.color.clone();
-        skins.set(key, skin);
-      }
-      const mesh = new THREE.Mesh(shape, skins.get(key));
-      mesh.userData.node = part.node;
-      new THREE.Matrix4().fromArray(part.matrix).decompose(mesh.position, mesh.quaternion, mesh.scale);
-      viewer.set_object([...paths[part.node], `part ${k}`], mesh);
+    this.solids = bodies.map((body) => {
+      const mesh = meshOf(body), { skins, object } = this.joints[body.node];
+      skins.set(body.side, mesh.material);
+      mesh.userData.node = body.node;
+      object.add(mesh);
       return mesh;
     });
   }
@@ -91,34 +161,51 @@ class Robot { // the nodes of one robot in the viewer's tree, posed by a row of 
       }
     }
   }
-  fade(node, opacity) {
-    for (const skin of this.joints[node].skins.values()) {
-      if (skin.opacity === opacity) continue;
-      skin.transparent = opacity < 1;
-      skin.opacity = opacity;
-      skin.depthWrite = opacity === 1;
-      skin.needsUpdate = true;
+  dress(node, act) { this.joints[node].skins.forEach(act); }
+  fade(opacity) {
+    for (const { skins } of this.joints) {
+      for (const own of skins.values()) {
+        own.transparent = opacity < 1;
+        own.opacity = opacity;
+        own.depthWrite = opacity === 1;
+        own.needsUpdate = true;
+      }
     }
   }
   tint(node, colour) { // null: its own
-    for (const skin of this.joints[node].skins.values())
-      if (colour) skin.color.set(colour); else skin.color.copy(skin.userData.colour);
+    this.dress(node, (own) => {
+      own.color.set(colour || "#fff");
+      own.userData.ownColour.value = colour ? 0 : 1;
+    });
   }
   glow(node, on) {
-    for (const skin of this.joints[node].skins.values()) skin.emissive.set(on ? "#5a2c00" : "#000");
+    this.dress(node, (own) => own.userData.glow.value.set(on ? "#5a2c00" : "#000"));
   }
 }
 
-const robot = viewer && new Robot("robot", (color, side) => new THREE.MeshLambertMaterial({ color, side }));
 const GHOSTS = ["#3b82f6", "#d9820f", "#3a9d5d"];
 const BOOST = 10;
+const BEHIND = 0.008; // of the distance of the camera: a ghost this near to the robot is hidden by it
 let boost = 1; // factor on the distance of a ghost from the robot
-const ghosts = !viewer ? [] : ghostMotions.map((_, k) => new Robot(`ghost ${k}`,
-  () => new THREE.MeshPhongMaterial({ color: GHOSTS[k % GHOSTS.length], transparent: true,
-    opacity: 0.3, depthWrite: false })));
+const robot = viewer && new Robot("robot", ({ shape, side }) => new THREE.Mesh(shape, skin(side)));
+
+function ghostly(k) { // one even colour, drawn once at each pixel: no parts show through
+  const color = GHOSTS[k % GHOSTS.length];
+  return ({ shape, side }) => {
+    const made = skin(side, { color, behind: BEHIND, opacity: 0.4, depthWrite: false,
+      blending: THREE.CustomBlending, // sides of transparent materials would be drawn one by one
+      stencilWrite: true, stencilRef: k + 1, stencilFunc: THREE.NotEqualStencilFunc,
+      stencilZPass: THREE.ReplaceStencilOp });
+    made.defines = { FLAT: "" };
+    const mesh = new THREE.Mesh(shape, made);
+    mesh.renderOrder = 2 + k / 100;
+    return mesh;
+  };
+}
+const ghosts = !viewer ? [] : ghostMotions.map((_, k) => new Robot(`ghost ${k}`, ghostly(k)));
 const floats = data.scene.nodes.some((node) => node.kind === "free");
 
-// ---- light and ground ------------------------------------------------------------------------
+// ---- sky and ground --------------------------------------------------------------------------
 
 const SKIES = { light: { top: [0.93, 0.95, 0.97], low: [0.72, 0.77, 0.82], line: "#8d98a3" },
   dark: { top: [0.22, 0.25, 0.29], low: [0.11, 0.12, 0.14], line: "#46515c" } };
@@ -126,25 +213,11 @@ const darkness = matchMedia("(prefers-color-scheme: dark)");
 const cell = data.view.cell;
 let ground = null;
 
-function light() {
-  for (const name of ["PointLightNegativeX", "PointLightPositiveX", "AmbientLight", "FillLight"])
-    viewer.set_property(["Lights", name], "visible", false);
-  const sky = new THREE.HemisphereLight("#ffffff", "#8a8078", 0.68);
-  sky.position.set(0, 0, 1);
-  viewer.set_object(["Lights", "Sky"], sky);
-  for (const [name, power, ...place] of [["key", 0.58, -1, 1.2, 1], ["fill", 0.28, 1.4, 0.1, 0.6]]) {
-    const lamp = new THREE.DirectionalLight("#ffffff", power); // beside the camera, wherever it is
-    lamp.name = name;
-    lamp.position.set(...place);
-    lamp.target.position.set(0, 0, 0);
-    viewer.camera.add(lamp, lamp.target);
-  }
-}
-
 function paint() { // the colours of the page's scheme, also when it changes
   const sky = SKIES[darkness.matches ? "dark" : "light"];
   viewer.set_property(["Background"], "top_color", sky.top);
   viewer.set_property(["Background"], "bottom_color", sky.low);
+  if (onProcessor) viewer.scene.background = new THREE.Color(...sky.top.map((x, k) => (x + sky.low[k]) / 2));
   const shown = ground ? ground.visible : true;
   ground = new THREE.GridHelper(40 * cell, 40, sky.line, sky.line);
   ground.rotateX(Math.PI / 2);
@@ -159,6 +232,64 @@ function placeGround() { // under the robot, in whole cells
   ground.position.set(x, y, data.view.ground);
 }
 
+// ---- contact shadow of the ellipsoid in the box of each body -----------------------------------
+
+const DARKEST = 0.5, SPREAD = 1.6; // opacity at the ground; size with its soft edge
+let shadow = null;
+
+function softDisc() {
+  const sheet = document.createElement("canvas"), size = sheet.width = sheet.height = 64;
+  const pen = sheet.getContext("2d"), half = size / 2;
+  const tones = pen.createRadialGradient(half, half, 0, half, half, half);
+  [1, 0.9, 0.5, 0.15, 0].forEach((share, k) => tones.addColorStop(k / 4, `rgba(255, 255, 255, ${share})`));
+  pen.fillStyle = tones;
+  pen.fillRect(0, 0, size, size);
+  return new THREE.CanvasTexture(sheet);
+}
+
+function makeShadow() {
+  const shape = new THREE.BufferGeometry();
+  const add = (name, size) => shape.setAttribute(name,
+    new THREE.BufferAttribute(new Float32Array(4 * size * bodies.length), size));
+  add("position", 3);
+  add("color", 4);
+  add("uv", 2);
+  bodies.forEach((_, k) => shape.attributes.uv.array.set([0, 0, 1, 0, 1, 1, 0, 1], 8 * k));
+  shape.setIndex(bodies.flatMap((_, k) => [0, 1, 2, 0, 2, 3].map((corner) => 4 * k + corner)));
+  shadow = new THREE.Mesh(shape, new THREE.MeshBasicMaterial(
+    { map: softDisc(), vertexColors: true, transparent: true, depthWrite: false }));
+  shadow.frustumCulled = false;
+  viewer.scene.add(shadow);
+}
+
+function castShadow() { // below the lowest point of each ellipsoid, darker the nearer it is
+  const { position, color } = shadow.geometry.attributes, centre = new THREE.Vector3();
+  const half = new THREE.Vector3(), axis = new THREE.Vector3();
+  const upright = viewer.scene.matrixWorld.clone().invert(); // the axes of the robot, z upwards
+  robot.root.updateMatrixWorld(true);
+  bodies.forEach(({ node, shape }, k) => {
+    const pose = upright.clone().multiply(robot.joints[node].object.matrixWorld);
+    shape.boundingBox.getCenter(centre).applyMatrix4(pose);
+    shape.boundingBox.getSize(half).multiplyScalar(0.5);
+    let [xx, xy, yy, xz, yz, zz] = [1e-9, 0, 1e-9, 0, 0, 1e-9]; // sums of products of the half axes
+    for (let i = 0; i < 3; i++) {
+      const { x, y, z } = axis.setFromMatrixColumn(pose, i).multiplyScalar(half.getComponent(i));
+      [xx, xy, yy, xz, yz, zz] = [xx + x * x, xy + x * y, yy + y * y, xz + x * z, yz + y * z, zz + z * z];
+    }
+    const low = Math.sqrt(zz), x = centre.x - xz / low, y = centre.y - yz / low;
+    // half axes of its cross-section about the lowest point, (a, b) and (0, c), by Cholesky's factor
+    const a = Math.sqrt(xx - xz * xz / zz), b = (xy - xz * yz / zz) / a;
+    const c = Math.sqrt(Math.max(yy - yz * yz / zz - b * b, 1e-9));
+    const high = Math.max(0, centre.z - low - data.view.ground) / (0.15 * data.scene.reach);
+    [[-1, -1], [1, -1], [1, 1], [-1, 1]].forEach(([u, v], corner) => {
+      position.setXYZ(4 * k + corner, x + SPREAD * a * u, y + SPREAD * (b * u + c * v),
+        data.view.ground + 1e-3 * data.view.radius);
+      color.setXYZW(4 * k + corner, 0, 0, 0, DARKEST / (1 + high * high));
+    });
+  });
+  position.needsUpdate = color.needsUpdate = true;
+}
+
 // ---- camera ----------------------------------------------------------------------------------
 
 const base = [0, 0, 0]; // where a floating base is, 0 if it is fixed
@@ -170,23 +301,37 @@ let follows = floats, isTurned = false; // by hand: the view then remains when t
 // the viewer's camera has y upwards: (x, y, z) of the robot is (x, z, -y) there
 const upward = ([x, y, z]) => new THREE.Vector3(x, z, -y);
 
-function aim() { // from the front and above, the whole motion in sight
-  const { camera } = viewer;
-  const away = new THREE.Vector3(0.76, 0.36, 0.54).normalize(), up = new THREE.Vector3(0, 1, 0);
+const TALL = Math.tan((20 * Math.PI) / 180); // of half the view's angle
+const FILLED = 0.9; // share of the view
+const AZIMUTHS = [35, 60, -35, -60]; // [degrees] from the front; the first, unless another is closer
+
+function framed(azimuth) { // the nearest camera of a direction with all points in sight
+  const turn = (azimuth * Math.PI) / 180, up = new THREE.Vector3(0, 1, 0);
+  const away = new THREE.Vector3(Math.cos(turn), 0.39, Math.sin(turn)).normalize();
   const right = up.clone().cross(away).normalize();
   up.copy(away).cross(right);
-  const tall = Math.tan((20 * Math.PI) / 180);
-  const wide = tall * (pane.clientWidth / Math.max(pane.clientHeight, 1));
-  let far = 1e-3;
-  for (const point of data.view.points) { // each needs a distance
-    const place = upward(point.map((x, k) => x - middle[k]));
-    const needs = Math.max(Math.abs(place.dot(right)) / wide, Math.abs(place.dot(up)) / tall);
-    far = Math.max(far, place.dot(away) + 1.15 * needs);
-  }
+  const [x, y, z] = [right, up, away].map((axis) =>
+    data.view.points.map((point) => upward(point.map((value, k) => value + base[k])).dot(axis)));
+  const depth = Math.max(...z) / 2 + Math.min(...z) / 2;
+  const fit = (across, share) => { // of the planes at both sides of the view
+    const side = (sign) => Math.max(...across.map((value, k) => sign * value + share * (z[k] - depth)));
+    return { far: (side(1) + side(-1)) / (2 * share), centre: (side(1) - side(-1)) / 2 };
+  };
+  const shape = pane.clientWidth / Math.max(pane.clientHeight, 1);
+  const wide = fit(x, FILLED * TALL * shape), tall = fit(y, FILLED * TALL);
+  const target = new THREE.Vector3().addScaledVector(right, wide.centre)
+    .addScaledVector(up, tall.centre).addScaledVector(away, depth);
+  return { away, target, far: Math.max(wide.far, tall.far, 1e-3) };
+}
+
+function aim() { // from the front and above, the whole motion as large as it fits
+  const { camera } = viewer;
+  const views = AZIMUTHS.map(framed), nearest = Math.min(...views.map(({ far }) => far));
+  const { away, target, far } = views[0].far < 1.1 * nearest ? views[0]
+    : views.find((view) => view.far === nearest);
   camera.fov = 40;
   camera.near = far / 100;
   camera.far = 100 * Math.max(far, data.view.radius);
-  const target = upward(middle.map((x, k) => x + base[k]));
   viewer.controls.target.copy(target);
   camera.position.copy(target).addScaledVector(away, far);
   viewer.controls.update();
@@ -213,8 +358,8 @@ if (viewer) {
   viewer.renderer.domElement.setAttribute("aria-hidden", "true"); // the pane has the label
   const size = viewer.set_3d_pane_size.bind(viewer);
   viewer.set_3d_pane_size = () => size(pane.clientWidth, pane.clientHeight);
-  viewer.set_property(["Axes"], "visible", false);
-  light();
+  for (const name of ["Axes", "Lights"]) viewer.set_property([name], "visible", false);
+  makeShadow();
   paint();
   darkness.addEventListener("change", paint);
   new ResizeObserver(() => {

@@ -8,6 +8,7 @@ if (torques) { measureTorques(); drawTorques(); }
 if (bands) drawBands();
 byId("side").hidden = false;
 drawSwitches();
+drawModels();
 data.marks.forEach(addMark);
 if (data.live) listen();
 restore();
@@ -15,12 +16,14 @@ showMasses();
 chooseArcs();
 buttons();
 show();
-requestAnimationFrame(tick);
+greetReport();
+if (viewer) viewer.set_dirty = () => { viewer.needs_render = true; wake(); };
+wake();
 
 // for scripts and notebooks: the clock, and the world pose of every node as 16 numbers by columns
-window.replay = { clock, seek, play, pause, pick, draw, pace, viewer, motion, arcs, masses,
+window.replay = { clock, seek, choose, play, pause, pick, draw, pace, viewer, motion, arcs, masses,
   level, bins, torqueCharts, bandCharts,
-  ghosts, robot, get picked() { return picked && data.scene.nodes[picked].name; },
+  ghosts, robot, shadow, get picked() { return picked && data.scene.nodes[picked].name; },
   poses: (which = robot) => {
     which.root.updateMatrixWorld(true);
     const inverse = viewer.scene.matrixWorld.clone().invert();

@@ -2,8 +2,8 @@
 // ---- the heat strip: residual of each joint along the time line -------------------------------
 
 const UNUSED = 65534, GAP = 65535; // codes of a joint at rest, and of a time without samples
-const levels = torques && torques.strip ? unpack(torques.strip) : null; // [bin * count + joint]
-const bins = levels ? torques.strip.shape[0] : 0;
+let levels = torques && torques.strips.length ? unpack(torques.strips[chosen]) : null; // [bin * count + joint]
+const bins = levels ? torques.strips[0].shape[0] : 0;
 const strip = byId("strip"), sheet = byId("sheet");
 
 function level(bin, j) { // residual over its scale; NaN if there is none

@@ -8,13 +8,14 @@ from helpers.estimation import EXACT, NOISE, Case, consistent
 from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
+from robotid.estimators import Consistent
 from robotid.estimators.consistent.constraints import Constraints, slabs
 from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.fitting.estimators import make_constraints
 from robotid.fitting.settings import ConstraintSettings, EstimatorSettings
 from robotid.regressor.factors import compress
 from robotid.robot.geometry import body_boxes
-from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.parameters import ParameterLayout, pseudo_inertia
 
 
 @pytest.fixture
@@ -248,3 +249,77 @@ def test_what_is_stated_of_a_centre_of_mass_widens_the_extent_of_its_body(ur5):
     made = make_constraints(bounds, {}, {"forearm_link": extent}).extent["forearm_link"]
     np.testing.assert_array_equal(made[0], np.minimum(extent[0], [1.0, -0.1, 0.0]))
     np.testing.assert_array_equal(made[1], np.maximum(extent[1], [1.2, 0.0, 0.1]))
+
+
+@pytest.fixture(scope="module")
+def two_bodies():
+    """Two bodies of 3 and 5 kg; the first has 1 kg on locked joints."""
+    layout = ParameterLayout(("one", "two"), (), ())
+    ball = np.array([1.0, 0.1, 0.2, -0.3, 0.4, 0, 0.4, 0, 0, 0.4])
+    return layout, np.concatenate([3 * ball, 5 * ball]), np.concatenate([ball, 0 * ball])
+
+
+@pytest.mark.parametrize(
+    ("bounds", "text"),
+    [
+        ({"mass": {"two": (2.0, 4.0)}, "total_mass": (9.0, 12.0), "pinned": ("one",)},
+         r"allow \[5, 7\] kg"),
+        ({"mass": {"one": (2.0, 4.0), "two": (1.5, 2.5)}, "total_mass": (1.0, 3.4)},
+         r"allow \[3.5, 6.5\] kg"),
+        ({"mass": {"one": (0.1, 0.9)}}, "joints alone have 1 kg"),
+        ({"mass": {"two": (0.1, 4.0)}, "pinned": ("two",)}, r"the URDF's 5 kg, outside its bounds"),
+        ({"pinned": ("two",),
+          "com": {"two": (np.vstack([np.eye(3), -np.eye(3)]), np.array([9, 0.15, 9, 9, 9, 9.0]))}},
+         r"\[0.1, 0.2, -0.3\] m is 50.0 mm outside"),
+    ],
+)  # fmt: skip
+def test_bounds_are_checked_with_the_figures_of_each_body(two_bodies, bounds, text):
+    layout, prior, held = two_bodies
+    with pytest.raises(SettingsError, match=text):
+        Constraints(**bounds).check(layout, prior, held)
+
+
+def test_bounds_that_meet_are_no_contradiction(two_bodies):
+    layout, prior, held = two_bodies
+    for low, high in ((3.5, 3.5), (6.5, 9.0), (1.0, 3.5)):
+        masses = {"one": (2.0, 4.0), "two": (1.5, 2.5)}
+        Constraints(mass=masses, total_mass=(low, high)).check(layout, prior, held)
+    Constraints(mass={"one": (1.0, 1.1), "two": (0.1, 0.2)}).check(layout, prior, held)
+
+
+def test_rows_of_bounds_are_those_of_their_body_and_sign(two_bodies):
+    layout, prior, _ = two_bodies
+    normal = np.array([[0.6, 0.0, 0.8], [0.0, -1.0, 0.0]])
+    bounds = Constraints(
+        mass={"two": (2.0, 9.0), "one": (-np.inf, 7.0)}, total_mass=(4.0, 8.5),
+        com={"two": (normal, np.array([0.3, 0.7]))},
+        extent={"one": np.array([[-0.5, -0.4, -0.9], [0.6, 0.7, 0.2]])},
+    )  # fmt: skip
+    C, c, labels = bounds._bounds(layout)
+    mx = prior[11:14]
+    J = pseudo_inertia(prior[:10])[0]
+    wanted = [5 - 2.0, 9.0 - 5, 7.0 - 3, 8 - 4.0, 8.5 - 8]
+    wanted += [5 * b - n @ mx for n, b in zip(normal, (0.3, 0.7), strict=True)]
+    for k, (low, high) in enumerate(((-0.5, 0.6), (-0.4, 0.7), (-0.9, 0.2))):
+        wanted.append(-J[k, k] + (low + high) * J[k, 3] - low * high * J[3, 3])
+    np.testing.assert_allclose(C @ prior + c, wanted)
+    assert labels == [
+        "mass two", "mass two", "mass one", "total_mass all", "total_mass all",
+        "centre_of_mass two", "centre_of_mass two", *["extent one"] * 3,
+    ]  # fmt: skip
+    fixed = Constraints(mass={"one": (2.5, 2.5)}, total_mass=(7.5, 7.5), pinned=("two",))
+    E, e = fixed.equalities(layout, prior)
+    np.testing.assert_array_equal(E @ prior, [*prior[10:], 3.0, 8.0])
+    np.testing.assert_array_equal(e, [*prior[10:], 2.5, 7.5])
+    assert fixed._bounds(layout)[2] == []
+
+
+def test_the_spread_before_the_data_is_that_of_the_plausible_weight(two_bodies):
+    layout, prior, held = two_bodies
+    std = np.linspace(0.5, 2.4, 20)
+    for weight, plausible, factor in ((6.0, 1.5, 1.5), (1.0, 1.5, 1.0), (0.25, 0.5, 0.25)):
+        fit = Consistent(
+            layout, np.eye(20), prior, std, held, prior_weight=weight, plausible_weight=plausible
+        )
+        np.testing.assert_allclose(fit.spread_before, std / np.sqrt(factor), rtol=1e-9)
+        assert fit.weight_ratio == max(weight / plausible, 1.0)

@@ -11,6 +11,7 @@ from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import Consistent
+from robotid.estimators.consistent import weighting
 from robotid.estimators.consistent.weighting import (
     Segments,
     _is_as_good,
@@ -346,3 +347,14 @@ def test_extents_that_the_data_contradict_are_named_and_no_others(rng):
     m, mx = found[2.0].standard[: z1.layout.n_inertial].reshape(-1, 10)[-2:, :2].sum(axis=0)
     true_m, true_mx = pi[: z1.layout.n_inertial].reshape(-1, 10)[-2:, :2].sum(axis=0)
     assert mx / m == pytest.approx(true_mx / true_m, rel=0.3)
+
+
+@pytest.mark.parametrize(("loss", "accepted"), [(0.055, False), (0.045, True)])
+def test_the_loss_of_a_segment_is_the_mean_of_the_joints_that_have_rows_in_it(loss, accepted):
+    """Six segments in which one of three joints moves a little, six in which all move."""
+    best, parts = np.zeros((2, 12, 3))
+    best[:6, 0], best[6:] = 1e-3, 1.0
+    parts[:6, 0], parts[6:] = 1e-3 * np.exp(2 * loss), np.exp(-2 * 0.012)
+    excess = np.repeat([loss, -0.012], 6)
+    assert (excess.mean() <= 2 * excess.std(ddof=1) / np.sqrt(12)) is np.bool_(accepted)
+    assert weighting._is_accepted(parts, best) is accepted

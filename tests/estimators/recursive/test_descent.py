@@ -1,6 +1,7 @@
 """The gradient methods: PRX as the paper has it, and the normalised gradient."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -148,3 +149,62 @@ def test_prx_stops_when_the_gradient_is_zero(states):
     assert fit.n_iter < 30_000
     short = PRX(np.ones(6), average=False, passes=1, rng=_rng()).fit(problem)
     assert not short.converged
+
+
+def test_a_state_averages_what_rows_of_their_own_weight_leave(rng):
+    """Of three samples of three joints; a row of weight 0 changes nothing of its joint."""
+    sigma, scale = np.array([0.5, 2.0, 1.5]), np.array([1.0, 4.0])
+    prior = np.array([0.3, -0.2])
+    estimator = NormalisedGradient(sigma, prior=prior, scale=scale, step_size=0.7)
+    state, x = estimator.init(2), prior * scale
+    mean, squares, prx, square = x.copy(), np.zeros(3), np.zeros(2), 0.0
+    for k, weight in enumerate(([1.0, 4.0, 0.25], [2.0, 0.0, 1.0], [1.0, 1.0, 9.0]), start=1):
+        weight = np.array(weight)
+        Y, tau = rng.standard_normal((3, 2)), rng.standard_normal(3)
+        state = estimator.update(state, Sample(Y, tau, weight))
+        used = np.flatnonzero(weight)
+        rows = (np.sqrt(weight) / sigma)[used]
+        Psi, u = rows[:, None] * Y[used] / scale, rows * tau[used]
+        gradient = (Psi @ mean - u) @ Psi
+        left = (Y[used] / scale @ mean - tau[used]) ** 2
+        x = x - 0.7 / (1e-9 + np.sum(Psi**2)) * (Psi @ x - u) @ Psi
+        squares[used] += (left - squares[used]) / k
+        prx, square = prx + (gradient - prx) / k, square + (gradient @ gradient - square) / k
+        mean = mean + 3.0 / (k + 2) * (x - mean)
+        np.testing.assert_allclose(state.x, x, rtol=1e-9)
+        np.testing.assert_allclose(state.mean, mean, rtol=1e-9)
+        np.testing.assert_allclose(state.squares, squares, rtol=1e-9)
+        np.testing.assert_allclose(state.prx, prx, rtol=1e-9)
+        assert state.prx_square == pytest.approx(square)
+    assert (state.steps, state.rows, state.skipped) == (3, 8, 0)
+    found = estimator.estimate(state, ("a", "b"))
+    np.testing.assert_allclose(found.theta, mean / scale)
+    np.testing.assert_allclose(found.sigma, np.sqrt(squares))
+    silent = estimator.update(state, Sample(np.zeros((3, 2)), np.ones(3), np.ones(3)))
+    assert (silent.steps, silent.rows, silent.skipped) == (4, 8, 1)
+
+
+def test_omega_is_a_ball_about_the_scaled_prior():
+    scale, prior = np.array([1.0, 4.0]), np.array([3.0, -2.0])
+    estimator = PRX(np.ones(2), prior=prior, scale=scale, bounds=2.0)
+    centre = np.array([3.0, -8.0])
+    inside, outside = np.add(centre, [1.2, -1.5]), np.add(centre, [3.0, -4.0])
+    np.testing.assert_array_equal(estimator._bounded(inside, 2.0), inside)
+    np.testing.assert_allclose(estimator._bounded(outside, 2.0), np.add(centre, [1.2, -1.6]))
+
+
+def test_columns_are_scaled_by_the_rows_of_every_block_with_their_weights(rng):
+    sigma = np.array([0.5, 2.0])
+    blocks = []
+    for n in (3, 5):
+        W, weight = rng.standard_normal((2 * n, 3)), rng.uniform(0.5, 2.0, 2 * n)
+        weight[1] = 0.0
+        W[1] = np.nan  # of a row that is not used
+        W[:, 2] = 0.0
+        blocks.append((W, rng.standard_normal(2 * n), weight))
+    problem = SimpleNamespace(n_joints=2, names=("a", "b", "c"), blocks=lambda: iter(blocks))
+    squares = sum(
+        np.nansum((weight / np.tile(sigma, len(W) // 2) ** 2)[:, None] * W**2, axis=0)
+        for W, _, weight in blocks
+    )
+    np.testing.assert_allclose(column_scale(problem, sigma), [*np.sqrt(squares[:2] / 8), 1.0])

@@ -6,6 +6,8 @@ import scipy.stats
 from helpers.estimation import NOISE, Case
 
 from robotid.estimators import OLS, RLS, WLS, Kalman, fold
+from robotid.estimators.recursive import filters
+from robotid.estimators.recursive.filters import KalmanState
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.regressor.problem import Problem, Sample
 from robotid.regressor.torque import build_problem, joint_torque_regressor
@@ -287,3 +289,26 @@ def test_after_fifty_rows_turned_away_the_next_is_believed():
     state = sure.update(state, far)
     assert (state.gated[0], state.rows[0], state.in_a_row[0]) == (50, 1, 0)
     assert state.theta[0] == pytest.approx(100.0 * 1e-6 / (1 + 1e-6))
+
+
+def test_rows_are_counted_joint_by_joint_used_or_rejected():
+    """Of five joints the second has no row; the last is used after some were rejected."""
+    state = KalmanState(
+        None, None, None, rows=np.array([7, 5, 3, 2, 9]), gated=np.array([1, 2, 0, 4, 6]),
+        in_a_row=np.array([0, 3, 0, 1, 2]), steps=9,
+    )  # fmt: skip
+    used, passed = np.array([0, 2, 3, 4]), np.array([True, False, False, True])
+    rows, gated, in_a_row = filters._count(state, used, passed)
+    assert rows.tolist() == [8, 5, 3, 2, 10]
+    assert gated.tolist() == [1, 2, 1, 5, 6]
+    assert in_a_row.tolist() == [0, 3, 1, 2, 0]
+    assert state.rows.tolist() == [7, 5, 3, 2, 9]
+
+
+def test_a_walk_is_in_units_of_each_parameter_s_own_spread():
+    P = np.array([[2.0, 0.5], [0.5, 3.0]])
+    for spread in (np.array([0.3, 7.0]), np.array([[0.09, 0.2], [0.2, 49.0]])):
+        kalman = Kalman(np.ones(2), np.zeros(2), spread, walk=0.1)
+        walked = kalman._walked(P)
+        np.testing.assert_allclose(walked, P + np.diag([0.0009, 0.49]))
+    np.testing.assert_array_equal(P, [[2.0, 0.5], [0.5, 3.0]])

@@ -1,0 +1,102 @@
+"""The picture of the parameters of all links: figures, places, sources."""
+
+import re
+from html import unescape
+
+import numpy as np
+import pytest
+
+from robotid.judgement.central import CENTRAL_TERMS, central_parameters
+from robotid.report.bodies import parameter_picture
+from robotid.robot.bodies import central_inertial
+
+UNITS = dict(zip(CENTRAL_TERMS, ["kg", *["m"] * 3, *["kg m²"] * 6], strict=True))
+
+
+@pytest.fixture(scope="module")
+def central(identified):
+    return central_parameters(identified)
+
+
+@pytest.fixture(scope="module")
+def picture(identified):
+    return parameter_picture(identified)
+
+
+def test_values_are_those_about_the_centre_of_mass(identified, central):
+    for i in (1, 4):
+        for pi, row in ((identified.prior, central.urdf), (identified.standard, central.values)):
+            m, c, _, (xx, xy, xz, yy, yz, zz) = (lambda x: (x.mass, x.com, x.rpy, x.inertia))(
+                central_inertial(pi[10 * i : 10 * i + 10])
+            )
+            np.testing.assert_allclose(row[i], [m, *c, xx, yy, zz, xy, xz, yz], atol=1e-12)
+
+
+@pytest.mark.parametrize("i", [1, 5])
+def test_intervals_contain_those_of_sampled_parameters(identified, central, i):
+    own = slice(10 * i, 10 * i + 10)
+    pi, C = identified.standard[own], 1e-8 * identified.standard_covariance[own, own]
+    rng = np.random.default_rng(0)
+    drawn = rng.multivariate_normal(pi, C, 4000, method="eigh")
+    m, c = drawn[:, 0], drawn[:, 1:4] / drawn[:, :1]
+    yy = drawn[:, 6] - m * (c[:, 0] ** 2 + c[:, 2] ** 2)
+    xz = drawn[:, 7] + m * c[:, 0] * c[:, 2]
+    quantile = identified.standard_quantile[own].max()
+    wanted = quantile * np.column_stack([m, c, yy, xz]).std(axis=0) * 1e4
+    np.testing.assert_allclose(central.half[i][[0, 1, 2, 3, 5, 8]], wanted, rtol=0.05)
+
+
+def test_sources_are_those_of_the_parameters(identified, central):
+    named = np.array(identified.sources[: central.sources.size]).reshape(central.sources.shape)
+    assert central.sources[:, 0].tolist() == named[:, 0].tolist()
+    is_kept = (named == "prior").all(axis=1)
+    assert set(central.sources[is_kept].ravel()) <= {"prior"}
+    assert {"data", "mixed", "prior"} == set(central.sources.ravel())
+
+
+def test_sources_follow_from_the_errors_over_the_priors_spreads(identified, central):
+    pi, spread, quantile = (
+        x[:60].reshape(6, 10)
+        for x in (identified.standard, identified.prior_std, identified.standard_quantile)
+    )
+    m, c = pi[:, 0], pi[:, 2] / pi[:, 0]
+    prior = np.hypot(spread[:, 2], c * spread[:, 0]) / m  # of cy = mcy / m
+    share = central.half[:, 2] / quantile.max(axis=1) / prior
+    stayed = np.abs(c - central.urdf[:, 2]) <= 0.3 * prior
+    wanted = np.where(share < 0.3, "data", np.where((share > 0.9) & stayed, "prior", "mixed"))
+    assert len(set(wanted)) > 1
+    assert central.sources[:, 2].tolist() == wanted.tolist()
+
+
+@pytest.mark.parametrize("body", ["forearm_link", "wrist_2_link"])
+@pytest.mark.parametrize("term", ["m", "cy", "Ixx", "Ixz"])
+def test_the_figures_of_each_mark_are_those_of_the_result(identified, central, picture, body, term):
+    i, k = identified.model.layout.bodies.index(body), CENTRAL_TERMS.index(term)
+    words, unit, source = re.search(
+        rf"<title>{body} {term}: (.*?) (k?g? ?m?²?), (.*?)</title>", unescape(picture)
+    ).groups()
+    found = [float(x.replace("−", "-")) for x in re.split(" → | ± ", words)]
+    wanted = [central.urdf[i, k], central.values[i, k], central.half[i, k]]
+    np.testing.assert_allclose(found, wanted, rtol=0.0, atol=0.051 * wanted[2])  # two digits
+    assert unit == UNITS[term]
+    assert (
+        source
+        == {"data": "data", "mixed": "data and prior", "prior": "prior"}[central.sources[i, k]]
+    )
+
+
+def test_marks_lie_on_one_axis_per_group(central, picture):
+    column = re.search(r'aria-label="m of each link">(.*?)</svg>', picture)[1]
+    places = [float(x) for x in re.findall(r'<circle cx="([\d.]+)%"', column)]
+    slope, zero = np.polyfit(central.values[:, 0], places, 1)
+    np.testing.assert_allclose(places, slope * central.values[:, 0] + zero, atol=0.1)
+    assert f'class="tick" x1="{zero:.1f}%"' in column
+    column = re.search(r'aria-label="Iyy of each link">(.*?)</svg>', picture)[1]
+    places = [float(x) for x in re.findall(r'<circle cx="([\d.]+)%"', column)]
+    slope, zero = np.polyfit(np.sqrt(central.values[:, 5]), places, 1)
+    np.testing.assert_allclose(places, slope * np.sqrt(central.values[:, 5]) + zero, atol=0.1)
+
+
+def test_many_links_are_folded(identified, monkeypatch):
+    monkeypatch.setattr("robotid.report.bodies._LINKS", 5)
+    assert '<details id="inertials"><summary>Parameters of 6 links' in parameter_picture(identified)
