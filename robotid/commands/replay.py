@@ -18,8 +18,8 @@ from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.export.result import Result, load_result, stated_model, stated_urdf_with_drives
 from robotid.export.shape import FILE, NUMBER, TABLE, TEXT, check_shape
 from robotid.findings import listed
-from robotid.fitting.evaluation import predict
 from robotid.fitting.closed_log import closed_log
+from robotid.fitting.evaluation import predict
 from robotid.fitting.survey import hold_log
 from robotid.identification.pictures import shown_evaluation
 from robotid.identification.result import Identification
