@@ -23,7 +23,6 @@ from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
 from robotid.robot.bodies import link_transfer
-from robotid.robot.closure import require_tree
 from robotid.robot.drives import DriveTerm
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
@@ -255,6 +254,7 @@ def identify_payload(
         require_each(value, str, name, wanted)
     require_kind(masses, (Mapping, type(None)), "masses", "a table of masses [kg] by link")
     model = robot_of(model, logs)
+    model.require_fixed("the identification of a payload")
     settings, mapping = signals or SignalSettings(), structural_mapping(model)
     wanted_families(friction, model.joints)
     read = [
@@ -329,7 +329,7 @@ def fit_payloads(
     Raises:
         DataError, ModelError, SettingsError, NotConvergedError: As of ``identify_payload``.
     """
-    require_tree(loaded.model, "payload identification")
+    loaded.model.require_fixed("the identification of a payload")
     if not loaded.model.layout.remembering:
         return _fit(loaded, reference, links, masses, unknown_gains)
     # the unknown bodies load the gears

@@ -7,7 +7,6 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.regressor.compiled import Tree, flatten, own_motion, row_lanes, why_not
-from robotid.robot.closure import require_tree
 from robotid.robot.model import RobotModel
 
 __all__ = ["MotionRegressor", "Placements", "fixed_tree"]
@@ -21,12 +20,11 @@ def fixed_tree(model: RobotModel) -> Tree:
 
     Raises:
         DataError: If the base floats.
-        ModelError: If the robot has closed chains.
         SettingsError: If the compiled code does not support a joint.
     """
     if model.free_flyer:
         raise DataError("the base floats; motion design requires a robot with a fixed base")
-    require_tree(model, "motion design")
+    model.require_fixed("motion design")
     if (why := why_not(model)) is not None:
         raise SettingsError(f"{model.name}: no motion can be designed: {why}")
     return flatten(model)

@@ -15,7 +15,7 @@ from robotid.regressor.columns import drive_values, friction_directions, instant
 from robotid.regressor.constraints import ProjectedRows, loop_basis, without_forces
 from robotid.regressor.problem import Block, Problem, RowSource
 from robotid.regressor.rows import BLOCK, kept_rows, trajectory_rows
-from robotid.robot.closure import Chains, require_tree
+from robotid.robot.closure import Chains
 from robotid.robot.drives import TERMS, DriveMotion
 from robotid.robot.model import RobotModel
 
@@ -170,13 +170,12 @@ class InstantRegressor:
 
     Raises:
         DataError: If the base floats.
-        ModelError: If the robot has closed chains.
     """
 
     def __init__(self, model: RobotModel, columns: Array) -> None:
         if model.free_flyer:
             raise DataError("the base floats, wanted a robot with a fixed base")
-        require_tree(model, "recursive identification")
+        model.require_fixed("recursive identification")
         self._model, self._data = model, model.pin_model.createData()
         self._columns = np.asarray(columns)
         G = model.velocity_map

@@ -9,7 +9,7 @@ from robotid.findings import listed
 from robotid.robot.constraints import frame_id
 from robotid.robot.model import RobotModel
 
-__all__ = ["Chains", "require_tree"]
+__all__ = ["Chains"]
 
 _CLOSED = 1e-6  # largest error of a closed loop, relative to the length of the robot
 _MOST = 30  # iterations of Newton's method
@@ -185,23 +185,6 @@ class Chains:
         pose = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0] if self._model.free_flyer else []
         (configuration,) = self._model.configurations(np.append(pose, x)[None])
         return np.ascontiguousarray(configuration)
-
-
-def require_tree(model: RobotModel, what: str) -> None:
-    """Refuse a robot with closed chains.
-
-    Args:
-        model: The robot.
-        what: What needs a robot without them.
-
-    Raises:
-        ModelError: If the robot has loops.
-    """
-    if model.loops:
-        raise ModelError(
-            f"{what} needs a robot without closed chains, but the loop {model.loops[0].name} is "
-            "stated; remove the loops, and lock or leave out the joints in them"
-        )
 
 
 def _least(J: Array, error: Array) -> Array:

@@ -375,6 +375,19 @@ class RobotModel:
                 configuration[:, joint.idx_q] = angle
         return configuration
 
+    def require_fixed(self, what: str) -> None:
+        """Refuse a robot whose base floats, or that has contacts or loops.
+
+        Args:
+            what: What needs a fixed base, as "motion design".
+
+        Raises:
+            DataError: If it is such a robot.
+        """
+        if self.free_flyer or self.constraints:
+            found = "the base floats" if self.free_flyer else "the robot has contacts or loops"
+            raise DataError(f"{self.name}: {found}; {what} needs a robot with a fixed base")
+
     def support(self) -> Array:
         """Return which parameters can affect which row, shape (n_rows, p), bool.
 

@@ -22,7 +22,6 @@ from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.findings import listed
 from robotid.logs.data import Log
 from robotid.regressor.compiled import Tree, flatten, why_not
-from robotid.robot.closure import require_tree
 from robotid.robot.drive_term import BRISTLES
 from robotid.robot.drives import Bristles, DriveTerm, MemorylessTerm
 from robotid.robot.mass_matrix import rigid_mass_matrices
@@ -246,7 +245,7 @@ class ClosedLoopRobot:
                 "mimic joints cannot be simulated. Fix the base, leave out [[coupling]], and set "
                 "mimic = 'independent'"
             )
-        require_tree(model, "simulation")
+        model.require_fixed("simulation")
         if (why := why_not(model)) is not None:
             raise SettingsError(f"{model.name} cannot be simulated: {why}")
         self.model, self.step, self.corrects = model, step, corrects

@@ -8,7 +8,6 @@ import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, NotConvergedError
-from robotid.robot.closure import require_tree
 from robotid.robot.drives import Bristles, Coulomb, DriveTerm, MemorylessTerm, Offset, Viscous
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
@@ -67,7 +66,7 @@ class RobotPlant:
     def __init__(self, model: RobotModel, pi: Array) -> None:
         if model.free_flyer:
             raise DataError("a robot with a floating base cannot be simulated without contacts")
-        require_tree(model, "simulation")
+        model.require_fixed("simulation")
         if pi.shape != (len(model.layout.names),):
             raise DataError(f"pi has shape {pi.shape}, wanted ({len(model.layout.names)},)")
         self.model, self.pi = model, pi

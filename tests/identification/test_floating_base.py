@@ -14,7 +14,7 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
-POSTURE = {"hip": (0.0, 0.08), "thigh": (0.8, 0.15), "calf": (-1.6, 0.2)}  # middle, reach [rad]
+POSTURE = {"hip": (0.0, 0.12), "thigh": (0.8, 0.25), "calf": (-1.6, 0.3)}  # middle, reach [rad]
 ARMATURE, DAMPING, TORQUE = 0.01, 0.2, 0.05
 
 
@@ -32,14 +32,14 @@ def found(go1):
     rng = np.random.default_rng(3)
     middle, reach = np.array([POSTURE[joint.split("_")[1]] for joint in go1.joints]).T
     log = recorded(
-        go1, FEET, middle, reach, rng, duration=12.0, step=2e-4, kp=100.0, kd=2.0,
+        go1, FEET, middle, reach, rng, duration=12.0, step=2e-4, kp=100.0, kd=2.0, highest=1.5,
         armature=ARMATURE, damping=DAMPING, torque=TORQUE,
     )  # fmt: skip
     other = with_other_bodies(go1, rng)
     result = robotid.identify(
         other, log.window(end=9.0), validation=log.window(9.0), doctor=False, friction="none",
         signals=robotid.SignalSettings(cutoff=25.0, velocity="differentiated"),
-        estimator=ConsistentSettings(prior_weight=1.0, draws=0),
+        estimator="wls",
     )  # fmt: skip
     truth = go1.standard_parameters()
     names = go1.layout.names
@@ -50,7 +50,9 @@ def found(go1):
 def test_the_bodies_of_another_simulator_are_found(found):
     result, truth, before = found
     K = result.mapping.K
-    z = (result.base - K @ truth) / result.base_error
+    is_drive = [x.endswith((".armature", ".viscous")) for x in result.mapping.base_names]
+    z = ((result.base - K @ truth) / result.base_error)[~np.array(is_drive)]
+    assert len(z) == 94
     assert np.mean(np.abs(z) < 2.0) > 0.85  # one run, correlated parameters
     assert np.abs(z).max() < 6.0
     masses = slice(0, result.model.layout.n_inertial, 10)
@@ -84,13 +86,15 @@ def test_the_residual_at_the_truth_is_the_noise(found):
     (torque,) = predict(result.model, [truth], motion)
     level = np.sqrt(np.mean((motion.tau - torque)[used] ** 2))
     assert level < 0.6 * TORQUE  # the filter leaves 2 * 25 / 500 of the noise's power
-    assert 0.5 < used.mean() < 1.0
+    assert used.all()  # forces of changing contacts are eliminated, no sample is lost
+    share = motion.contacts.mean(axis=0)
+    assert ((share > 0.6) & (share < 1.0)).any()
 
 
 def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_path):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
     job = read_job(JOBS / "solo12.toml")
-    result, _ = run_job(replace_estimator(job), tmp_path)
+    result, _ = run_job(rough(job), tmp_path)
     (validation,) = result.validation
     tau, used = validation.recording.trajectory.tau, validation.recording.mask
     errors = {
@@ -106,7 +110,7 @@ def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_p
     assert result.verdict.status == "good"
 
 
-def replace_estimator(job):
+def rough(job):
     from dataclasses import replace
 
     return replace(job, estimator=ConsistentSettings(prior_weight=1.0, draws=0), report=False)
@@ -114,10 +118,10 @@ def replace_estimator(job):
 
 def test_a_humanoid_is_weighed_by_its_feet(recordings, monkeypatch, tmp_path):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    result, content = run_job(replace_estimator(read_job(JOBS / "icub.toml")), tmp_path)
+    result, content = run_job(rough(read_job(JOBS / "icub.toml")), tmp_path)
     (recording,) = (e.recording for e in result.fitted)
     force = sum(recording.log.wrenches.values()).mean() / 9.81
     assert content["consistency"]["total_mass"] == pytest.approx(force, rel=0.01)
-    assert recording.mask[:, :6].all()
+    assert recording.mask[:, :6].mean() > 0.9  # in some poses a row is all force
     assert not recording.mask[:, 6:].any()
-    assert set(result.verdict.joints) <= {"base.fx", "base.fy", "base.fz", "base.mx", "base.my"}
+    assert set(result.verdict.joints) == set(result.model.row_names[:6])

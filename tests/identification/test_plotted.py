@@ -184,20 +184,20 @@ def test_friction_is_drawn_at_position_and_load_of_the_samples_used(rng, monkeyp
     assert pictures.friction_chart(found, "b", split=(left, friction)) is None
 
 
-def test_bodies_and_drives_are_drawn_beside_the_urdf_and_what_was_before():
+def test_drives_are_drawn_beside_what_was_before():
     layout = SimpleNamespace(
-        names=("a.m", "a.mx", "b.m", "j.viscous", "k.viscous"),
-        units=("kg", "kg m", "kg", "N m s/rad", "N s/m"), n_inertial=3,
+        names=("a.armature", "a.mx", "b.armature", "j.viscous", "k.viscous"),
+        units=("kg m^2", "kg m", "kg m^2", "N m s/rad", "N s/m"), n_inertial=3,
     )  # fmt: skip
     found = SimpleNamespace(
         model=SimpleNamespace(layout=layout), standard=np.arange(5.0) + 1,
         standard_error=np.array([0.5, 0.1, np.inf, 0.25, 0.75]),
         prior=np.array([3.0, 0.0, 4.0, 0.0, 7.0]),
     )  # fmt: skip
-    mass, turn, slide = pictures.parameter_charts(found, ("m", "viscous"))
-    assert mass.title.startswith("m of each body, URDF and identified")
+    mass, turn, slide = pictures.parameter_charts(found, ("armature", "viscous"))
+    assert mass.title.startswith("armature of each drive, before the fit and identified")
     assert turn.title.startswith("viscous of each drive, before the fit and identified")
-    assert [s.label for s in mass.series] == ["URDF", "identified ± 2 s.e."]
+    assert [s.label for s in mass.series] == ["before the fit", "identified ± 2 s.e."]
     assert [s.label for s in turn.series] == ["identified ± 2 s.e."]  # nothing before
     assert [s.label for s in slide.series] == ["before the fit", "identified ± 2 s.e."]
     assert mass.series[0].y.tolist() == [3.0, 4.0]
@@ -205,7 +205,7 @@ def test_bodies_and_drives_are_drawn_beside_the_urdf_and_what_was_before():
     np.testing.assert_array_equal(mass.series[1].half, [1.0, np.nan])
     assert (slide.series[1].y.tolist(), slide.series[1].half.tolist()) == ([5.0], [1.5])
     assert [(c.x_names, c.y_label) for c in (mass, turn, slide)] == [
-        (("a", "b"), "m [kg]"), (("j",), "viscous [N m s/rad]"), (("k",), "viscous [N s/m]"),
+        (("a", "b"), "armature [kg m^2]"), (("j",), "viscous [N m s/rad]"), (("k",), "viscous [N s/m]"),
     ]  # fmt: skip
 
 

@@ -223,8 +223,8 @@ def test_a_reason_of_a_joint_is_shown_once():
         },
     }
     assert verdict_lines(verdict) == [
-        "verdict: poor", "  - a: slow", "  - no log", "  a: poor: bad", "  b, d: good",
-        "  c: usable: slow",
+        "verdict: poor", "  a: poor: bad", "  c: usable: slow", "  - a: slow", "  - no log",
+        "  b, d: good",
     ]  # fmt: skip
     alone = {"status": "good", "reasons": ["fine"], "per_joint": {"b": verdict["per_joint"]["b"]}}
     assert verdict_lines(alone) == ["verdict: good", "  - fine", "  every joint: good"]

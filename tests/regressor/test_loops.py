@@ -215,7 +215,7 @@ def test_passive_joints_have_only_stated_terms(tmp_path):
 
 
 def test_online_identification_refuses_loops(bars):
-    with pytest.raises(ModelError, match="recursive identification needs a robot without closed"):
+    with pytest.raises(DataError, match="loops; recursive identification needs a robot with a fix"):
         InstantRegressor(bars, np.arange(3))
 
 
