@@ -26,7 +26,7 @@ from robotid.logs.settings import BaseSource, LogSource, LogUnits, SignalSetting
 from robotid.logs.table import Table
 from robotid.logs.transmission import Transmission, check_transmissions
 from robotid.regressor.constraints import logged_base
-from robotid.robot.constraints import Contact
+from robotid.robot.constraints import Contact, Loop
 from robotid.robot.drives import DRIVE_TERMS, FAMILIES, TERMS, DriveTerm
 from robotid.robot.families import AUTO, term_from_dict
 from robotid.robot.parameters import DYNAMICS, Coupling
@@ -115,6 +115,14 @@ def _load_contacts(tables: Sequence[Mapping[str, Any]]) -> tuple[Contact, ...]:
     return tuple(
         Contact(**{**table, "measured": tuple(table.get("measured", ()))}) for table in tables
     )
+
+
+def _load_loops(tables: Sequence[Mapping[str, Any]]) -> tuple[Loop, ...]:
+    tuples: list[dict[str, Any]] = [
+        {key: tuple(x) if isinstance(x, list) else x for key, x in {"frames": (), **table}.items()}
+        for table in tables
+    ]
+    return tuple(Loop(**table) for table in tuples)
 
 
 def _motors(gear: Transmission) -> list[Coupling]:
@@ -220,6 +228,28 @@ class Job(Settings):
         load=_load_contacts,
         dump=lambda contacts: [asdict(x) | {"measured": list(x.measured)} for x in contacts],
     )
+    loops: tuple[Loop, ...] = setting(
+        (),
+        "connections that close kinematic chains: frames, the two links, whose origins coincide; "
+        "kind, hinge (default), point or rigid; axis of the hinge, the same in both frames",
+        at="loop",
+        reads=[
+            {
+                "frames": Entries(list, (str,)),
+                "kind": (str,),
+                "axis": Entries(list, (int, float)),
+            }
+        ],
+        load=_load_loops,
+        dump=lambda loops: [
+            {"frames": list(x.frames), "kind": x.kind, "axis": list(x.axis)} for x in loops
+        ],
+    )
+    passive: tuple[str, ...] = setting(
+        (),
+        "joints without a drive: their torque is 0 and needs no column; positions that logs lack "
+        "are computed from the loops; no friction except that in [drives]",
+    )
     estimator: EstimatorSettings = setting(ConsistentSettings(), "estimator and its settings")
     controller: LoopSettings = setting(
         LoopSettings(),
@@ -305,7 +335,8 @@ class Job(Settings):
             },
             dynamics=self.model_dynamics,
             snap_angles=self.snap_angles,
-            constraints=self.contacts,
+            constraints=(*self.contacts, *self.loops),
+            passive=self.passive,
         )
 
     def placed(self, model: "RobotModel") -> tuple[str, ...]:
@@ -367,6 +398,7 @@ class Job(Settings):
             "prismatic": tuple(model.layout.prismatic),
             "source": self.source,
             "base": logged_base(model, self.base.twist),
+            "passive": model.passive,
             "transmissions": [gear.stated(model.tree.reductions) for gear in self.transmissions],
         }
 

@@ -18,6 +18,7 @@ from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.export.result import Result, load_result, stated_model, stated_urdf_with_drives
 from robotid.export.shape import FILE, NUMBER, TABLE, TEXT, check_shape
 from robotid.findings import listed
+from robotid.fitting.closed_log import closed_log
 from robotid.fitting.evaluation import predict
 from robotid.fitting.survey import hold_log
 from robotid.identification.pictures import shown_evaluation
@@ -141,12 +142,12 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     if findings.commanded:
         return _replay_commanded(job, findings.commanded, ghost)
     is_motion = not job.lay_out(entry, model, needs="motion")[0].has_torque
-    motion = job.read(entry, model, needs="motion" if is_motion else "torque")
+    motion = closed_log(model, job.read(entry, model, needs="motion" if is_motion else "torque"))
     robots = {label: stated_model(r, model) for label, r in findings.results.items()}
     bodies = {label: robot.carried_by for label, robot in robots.items()}
     ghosts = {}
     if ghost is not None:
-        shadow = job.read(LogEntry(Path(ghost)), model, needs="motion")
+        shadow = closed_log(model, job.read(LogEntry(Path(ghost)), model, needs="motion"))
         ghosts[Path(ghost).name] = (shadow.t, shadow.q)
     torques, marks, notes = None, _payloads(findings.track), [f"Motion: {entry.path.name}."]
     if is_motion:

@@ -213,7 +213,7 @@ def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
             those near reversals, where the filter smears stiction.
     """
     model, mapping = fit.model, fit.mapping
-    if model.is_static or model.free_flyer or model.constraints:
+    if model.is_static or model.free_flyer or model.constraints or model.passive:
         return None
     validation = [e for e in fit.validation if not e.is_refitted]
     rows, independent = _spread_rows(model, fit.fitted, validation)

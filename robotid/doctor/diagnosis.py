@@ -72,6 +72,7 @@ def check_logs(
             prismatic=model.layout.prismatic,
             needs="any",
             base=logged_base(model),
+            passive=model.passive,
         )
         for some in (logs, validation)
     )
@@ -141,10 +142,13 @@ def _examine_log(
     if not model.is_static:  # rows of static poses may have gaps between them
         findings += [*check_clock(log), *check_channels(log, signals)]
     findings += check_commands(log)
-    sizes = list(check_torque_channels(log)) if log.has_torque else []
+    driven = [joint for joint in log.joints if joint not in model.passive]
+    has_torque = log.has_torque and bool(driven)
+    sizes = list(check_torque_channels(log.select(driven))) if has_torque else []
     findings += sizes
-    if model.free_flyer or model.constraints:
-        message = "torques of a robot with a floating base or with contacts are not checked"
+    if model.free_flyer or model.constraints or model.passive:
+        message = "torques of a robot with a floating base, contacts, loops or passive joints are "
+        message += "not checked"
         findings.append(log_finding(name, "floating_base", "note", message))
         findings += check_base(model, log, signals)
         return None, None

@@ -17,6 +17,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
+from robotid.fitting.closed_log import closed_log
 from robotid.fitting.velocity_choice import prefers_measured
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.formats import open_table
@@ -68,7 +69,8 @@ class _Header:
             return self.source
         layout = self.source
         reader = _reader(open_table(Path(layout.path), layout.source), layout.wanted)
-        return _log_of(layout, reader.read(layout.wanted, first, stop, near), first)
+        log = _log_of(layout, reader.read(layout.wanted, first, stop, near), first)
+        return closed_log(self.model, log)
 
     @property
     def is_compiled(self) -> bool | None:
@@ -372,12 +374,13 @@ def hold_log(
 
     Args:
         model: The robot.
-        log: The log, with the model's joints in its order.
+        log: The log, with the model's joints in its order; passive ones may be missing.
         signals: Settings of the processing to a trajectory.
         locked: Positions of locked joints, if the log has them, by name [rad or m].
     """
     count = len(log.t)
     _check_base(model, log)
+    log = closed_log(model, log)
     if model.is_static:  # means of segments replace filters
         signals = replace(
             signals, cutoff=None, rate=None, velocity="differentiated",
@@ -434,6 +437,7 @@ def survey_log(
     positions = _positions(locked, found, layout, model)
     if table.rows is None:
         length = max(stop - first, 1)
+    windows = tuple(closed_log(model, log) for log in windows)
     return SurveyedLog(
         model, layout, signals, stamps, first, stop, windows, positions, length, places
     )

@@ -95,7 +95,13 @@ def identify(
     report_stage(progress, "reading logs")
     model = robot_of(model, logs)
     first, second = (
-        read_logs(some, model.joints, prismatic=model.layout.prismatic, base=logged_base(model))
+        read_logs(
+            some,
+            model.joints,
+            prismatic=model.layout.prismatic,
+            base=logged_base(model),
+            passive=model.passive,
+        )
         for some in (logs, validation)
     )
     if not first:

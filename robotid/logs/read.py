@@ -59,6 +59,7 @@ def read_log(
     transmissions: Sequence[Transmission] = (),
     needs: Needs = "torque",
     base: BaseColumns = _BASE,
+    passive: Collection[str] = (),
 ) -> Log:
     """Return the log in a file or a DataFrame, in SI units; its notes list ignored columns.
 
@@ -78,6 +79,8 @@ def read_log(
         transmissions: The motors and gears, if the file has columns of motors.
         needs: Quantities that are required besides positions, as of ``lay_out``.
         base: Columns of a floating base and of contacts; none if not stated.
+        passive: Joints without a drive, which need no torque; without a position, they are not
+            joints of the log.
 
     Raises:
         DataError: If a required column is missing, or the values look like other units.
@@ -86,7 +89,7 @@ def read_log(
     """
     layout, table = lay_out(
         path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
-        source=source, transmissions=transmissions, needs=needs, base=base,
+        source=source, transmissions=transmissions, needs=needs, base=base, passive=passive,
     )  # fmt: skip
     log = layout.to_log(table.read(layout.wanted))
     check_units(log, units, prismatic)
@@ -100,6 +103,7 @@ def read_logs(
     prismatic: Collection[str] = (),
     needs: Needs = "torque",
     base: BaseColumns = _BASE,
+    passive: Collection[str] = (),
 ) -> tuple[Log, ...]:
     """Return the logs of a user, one or several; files and DataFrames are read.
 
@@ -109,6 +113,7 @@ def read_logs(
         prismatic: Names of prismatic joints; the others are revolute.
         needs: Quantities that are required besides positions, as of ``lay_out``.
         base: As of ``read_log``.
+        passive: As of ``read_log``.
 
     Raises:
         DataError: If it is no log, or a required quantity is missing.
@@ -121,15 +126,16 @@ def read_logs(
     else:
         raise _no_log(given)
     return tuple(
-        _of_joints(log, joints, "motion" if log.wrenches else needs)
+        _of_joints(log, joints, "motion" if log.wrenches else needs, passive)
         if isinstance(log, Log)
-        else read_log(log, joints, prismatic=prismatic, needs=needs, base=base)
+        else read_log(log, joints, prismatic=prismatic, needs=needs, base=base, passive=passive)
         for log in logs
     )
 
 
-def _of_joints(log: Log, joints: Sequence[str], needs: Needs) -> Log:
+def _of_joints(log: Log, joints: Sequence[str], needs: Needs, passive: Collection[str] = ()) -> Log:
     """Return a log with its columns in the order of some joints, with all required quantities."""
+    joints = [joint for joint in joints if joint in log.joints or joint not in passive]
     if not log.has_torque and (needs == "torque" or (needs == "any" and log.q_ref is None)):
         raise DataError(f"{log.name} has no torque. {without_torque(log.q_ref is not None)}")
     if needs == "commands" and log.q_ref is None:
@@ -184,7 +190,7 @@ class LogLayout:
     @property
     def wanted(self) -> list[str]:
         """Names of all columns to read."""
-        return [name for names in self.columns.values() for name in names]
+        return [name for names in self.columns.values() for name in names if name]
 
     def stamps(self, values: Array) -> Array:
         """Return time stamps in seconds, same shape.
@@ -204,8 +210,9 @@ class LogLayout:
         Raises:
             DataError: If a value is not finite, or time does not increase.
         """
+        nothing = np.zeros(len(table[self.columns["time"][0]]))  # torque of a passive joint
         values = {
-            kind: np.stack([table[name] for name in names], axis=1)
+            kind: np.stack([table[name] if name else nothing for name in names], axis=1)
             for kind, names in self.columns.items()
         }
         is_prismatic = np.isin(self.joints, self.prismatic)
@@ -267,6 +274,7 @@ def lay_out(
     transmissions: Sequence[Transmission] = (),
     needs: Needs = "torque",
     base: BaseColumns = _BASE,
+    passive: Collection[str] = (),
 ) -> tuple[LogLayout, Table]:
     """Return the layout of a log in a file, before its columns are read, and its open table.
 
@@ -284,6 +292,7 @@ def lay_out(
             commands if every joint has them; "any", torques or commands, and both if every joint
             has them. Other quantities are ignored; torques that are not read are 0.
         base: As of ``read_log``.
+        passive: As of ``read_log``.
 
     Raises:
         DataError: If a required column is missing.
@@ -324,8 +333,10 @@ def lay_out(
     of_joints = {x: y for x, y in stated.items() if y not in chain.from_iterable(of_base.values())}
     finder = Finder(
         where, opened.names, of_joints, tuple(joints), gains or {}, source, gears, needs,
-        [*opened.notes],
+        [*opened.notes], passive=passive,
     )  # fmt: skip
+    joints = [joint for joint in joints if joint not in passive or finder.has_position(joint)]
+    finder = replace(finder, joints=tuple(joints))
     finder.seen.update(chain.from_iterable(of_base.values()))
     if base.wrenches and needs in ("torque", "any") and not any(map(finder.has_torque, joints)):
         finder = replace(finder, needs="motion")

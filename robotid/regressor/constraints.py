@@ -26,6 +26,7 @@ __all__ = [
     "constraint_jacobian",
     "force_basis",
     "logged_base",
+    "loop_basis",
     "without_forces",
 ]
 
@@ -78,6 +79,17 @@ def force_basis(J: Array, used: Array) -> Array:
         is_independent = s > _RANK * s.max(axis=1, keepdims=True, initial=1e-300)
         parts.append(U * is_independent[:, None])
     return np.concatenate(parts) if parts else A
+
+
+def loop_basis(model: RobotModel, q: Array) -> Array:
+    """Return bases of the torques that the forces of loops can cause, as of ``force_basis``.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+    """
+    J = constraint_jacobian(replace(model, constraints=model.loops), q, np.ones((len(q), 0)))
+    return force_basis(J, np.ones((len(q), model.n_rows), dtype=bool))
 
 
 def without_forces(basis: Array, rows: Array) -> Array:

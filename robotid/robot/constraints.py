@@ -62,11 +62,12 @@ class Contact:
         """Name for messages."""
         return self.frame
 
-    def rows(self, jacobians: Sequence[Array], _rotation: Array) -> Array:
+    def rows(self, jacobians: Sequence[Array], rotation: Array) -> Array:
         """Return the velocity that the contact prevents, per speed of the robot, shape (m, nv).
 
         Args:
             jacobians: Jacobian of the frame with the axes of the world, shape (6, nv).
+            rotation: Not used.
         """
         return jacobians[0][: self.sizes[self.kind]]
 
@@ -78,7 +79,8 @@ class Loop:
     Attributes:
         frames: The two links, whose frames have their origins at the connection.
         kind: "point", a ball joint; "hinge", a revolute joint; or "rigid", no relative motion.
-        axis: Axis of the hinge in the frame of the first link, shape (3,).
+        axis: Axis of the hinge, the same in the frames of both links, shape (3,). The frames of a
+            rigid connection coincide.
     """
 
     frames: tuple[str, str]
@@ -88,11 +90,13 @@ class Loop:
     sizes: ClassVar[dict[str, int]] = {"point": 3, "hinge": 5, "rigid": 6}
 
     def __post_init__(self) -> None:
+        require_each(self.frames, str, "frames of a loop", "two names of links")
         _check_kind(self, f"loop {listed(self.frames)}")
         if len(self.frames) != 2 or self.frames[0] == self.frames[1]:
-            raise SettingsError(f"loop has the frames {listed(self.frames)}, wanted two links")
-        size = np.linalg.norm(np.asarray(self.axis, dtype=float))
-        if np.shape(self.axis) != (3,) or not 1e-6 < size < np.inf:
+            found = listed(self.frames) or "none"
+            raise SettingsError(f"loop has the frames {found}, wanted two links")
+        axis = require_each(self.axis, (int, float), "axis of a loop", "x, y, z")
+        if len(axis) != 3 or not 1e-6 < np.linalg.norm(np.array(axis, dtype=float)) < np.inf:
             raise SettingsError(
                 f"axis of loop {listed(self.frames)} is {self.axis}, wanted x, y, z"
             )
@@ -112,9 +116,46 @@ class Loop:
         relative = jacobians[0] - jacobians[1]
         if self.kind != "hinge":
             return relative[: self.sizes[self.kind]]
-        axis = rotation @ np.asarray(self.axis, dtype=float)
-        across = np.linalg.svd(axis[None])[2][1:]  # (2, 3), perpendicular to the axis
-        return np.vstack([relative[:3], across @ relative[3:]])
+        return np.vstack([relative[:3], self._across(rotation) @ relative[3:]])
+
+    def error(self, placements: Sequence[pin.SE3]) -> Array:
+        """Return the displacement that the loop prevents, shape (m,) [m, rad]; 0 if it is closed.
+
+        Its rate is the prevented velocity, if it is small.
+
+        Args:
+            placements: Placements of the two frames in the world.
+        """
+        first, second = placements
+        found = np.zeros(self.sizes[self.kind])
+        found[:3] = first.translation - second.translation
+        if self.kind == "hinge":
+            axis = np.asarray(self.axis, dtype=float) / np.linalg.norm(self.axis)
+            turned = np.cross(second.rotation @ axis, first.rotation @ axis)
+            found[3:] = self._across(first.rotation) @ turned
+        elif self.kind == "rigid":
+            found[3:] = pin.log3(first.rotation @ second.rotation.T)
+        return found
+
+    def drift(self, accelerations: Sequence[Array], speeds: Sequence[Array], R: Array) -> Array:
+        """Return the prevented acceleration dJ/dt v without accelerations of joints, shape (m,).
+
+        Args:
+            accelerations: Accelerations of the two frames with the axes of the world, each (6,).
+            speeds: Angular velocities of the two frames with the axes of the world, each (3,).
+            R: Axes of the first frame in the world, shape (3, 3).
+        """
+        relative = accelerations[0] - accelerations[1]
+        if self.kind != "hinge":
+            return relative[: self.sizes[self.kind]]
+        across = self._across(R)
+        turning = np.cross(speeds[0], across) @ (speeds[0] - speeds[1])
+        return np.append(relative[:3], across @ relative[3:] + turning)
+
+    def _across(self, rotation: Array) -> Array:
+        """Return two directions perpendicular to the axis, fixed in the first link, (2, 3)."""
+        across: Array = np.linalg.svd(np.asarray(self.axis, dtype=float)[None])[2][1:]
+        return across @ rotation.T
 
 
 Constraint = Contact | Loop

@@ -16,7 +16,7 @@ from robotid._settings import require_each, require_flag, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.findings import listed
-from robotid.robot.constraints import Constraint, Contact, check_constraints
+from robotid.robot.constraints import Constraint, Contact, Loop, check_constraints
 from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveMotion, DriveTerm
 from robotid.robot.native_messages import caught_messages
 from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
@@ -90,6 +90,7 @@ class RobotModel:
         dynamics: str = "full",
         snap_angles: bool = False,
         constraints: Sequence[Constraint] = (),
+        passive: Sequence[str] = (),
     ) -> "RobotModel":
         """Read a robot from a URDF. Meshes are not needed.
 
@@ -111,6 +112,8 @@ class RobotModel:
                 multiple of pi/12; see ``exact_angle``.
             constraints: Contacts with the ground, and loops that close kinematic chains; their
                 forces are unknown.
+            passive: Joints without a drive: their torque is 0, and they have no drive terms except
+                those in ``own_terms``.
 
         Returns:
             The model.
@@ -131,6 +134,7 @@ class RobotModel:
         for name in (*(joints or ()), *(locked or ())):
             require_kind(name, str, "one of joints or locked", "the name of a joint")
         require_each(terms, str, "terms", f"a list of some of {listed(DRIVE_TERMS)}")
+        require_each(passive, str, "passive", "a list of names of joints")
         require_each(couplings, Coupling, "couplings", "a list of robotid.Coupling")
         for name, own in own_terms.items():
             require_each(own, DriveTerm, f"own_terms of {name!r}", "a list of drive terms")
@@ -145,11 +149,7 @@ class RobotModel:
             raise ModelError(f"dynamics is {dynamics!r}, wanted one of {listed(DYNAMICS)}")
         if dynamics == "static":
             _check_gravity(gravity)
-            terms = [x for x in terms if x not in TERMS or _acts_at_rest(TERMS[x])]
-            own_terms = {
-                name: [term for term in own if _acts_at_rest(term)]
-                for name, own in own_terms.items()
-            }
+            terms, own_terms = _terms_at_rest(terms, own_terms)
         if not (tree.movable or free_flyer):
             raise ModelError(
                 f"{Path(tree.path).name}: robot {tree.name!r} has no movable joint, so there is "
@@ -175,6 +175,7 @@ class RobotModel:
             prismatic=frozenset(joint.name for joint in prismatic),
             strokes={j.name: j.upper - j.lower for j in prismatic if j.has_limits},
             own={name: tuple(terms) for name, terms in own_terms.items() if terms},
+            passive=frozenset(passive),
         )
         fixed = MappingProxyType(positions)
         return cls(
@@ -203,7 +204,7 @@ class RobotModel:
             "own_terms": {
                 name: [term.to_dict() for term in terms] for name, terms in self.layout.own.items()
             },
-        }
+        } | ({"passive": list(self.passive)} if self.passive else {})
 
     @property
     def is_static(self) -> bool:
@@ -214,6 +215,16 @@ class RobotModel:
     def contacts(self) -> tuple[Contact, ...]:
         """The contacts with the ground, in the order of the constraints."""
         return tuple(x for x in self.constraints if isinstance(x, Contact))
+
+    @property
+    def loops(self) -> tuple[Loop, ...]:
+        """The loops that close kinematic chains, in the order of the constraints."""
+        return tuple(x for x in self.constraints if isinstance(x, Loop))
+
+    @property
+    def passive(self) -> tuple[str, ...]:
+        """Names of the joints without a drive, in the order of q."""
+        return tuple(joint for joint in self.joints if joint in self.layout.passive)
 
     @property
     def name(self) -> str:
@@ -398,6 +409,15 @@ class RobotModel:
         support = np.hstack([inertial, drive])
         support.flags.writeable = False
         return support
+
+
+def _terms_at_rest(
+    terms: Sequence[str], own_terms: Mapping[str, Sequence[DriveTerm]]
+) -> tuple[list[str], dict[str, list[DriveTerm]]]:
+    """Return the drive terms that act at rest."""
+    common = [x for x in terms if x not in TERMS or _acts_at_rest(TERMS[x])]
+    own = {name: [term for term in own if _acts_at_rest(term)] for name, own in own_terms.items()}
+    return common, own
 
 
 def _acts_at_rest(term: DriveTerm) -> bool:
