@@ -88,7 +88,7 @@ def _check_axes(log: Log) -> Iterator[Finding]:
 def _check_flags(
     link: str, log: Log, flags: Array, motion: Trajectory, squares: Array
 ) -> Iterator[Finding]:
-    """Yield findings on one contact: its flags are late or early, or the link moves in contact.
+    """Yield findings on one contact: its flags have a delay, or the link moves in contact.
 
     Args:
         link: The link.
@@ -100,7 +100,7 @@ def _check_flags(
     step = float(np.median(np.diff(motion.t)))
 
     def mean_square(delay: float) -> float:
-        """Return the mean square speed in contact if the flags are late by a delay [s]."""
+        """Return the mean square speed in contact if the flags have a delay [s]."""
         k = np.searchsorted(log.t, motion.t + delay + 1e-9, side="right") - 1
         touching = flags[k.clip(0, len(flags) - 1)]
         return float(squares[touching].mean()) if touching.any() else np.inf
@@ -113,9 +113,8 @@ def _check_flags(
         found = np.array([mean_square(delay) for delay in delays])
         best = float(delays[np.argmin(found)])
         if found.min() < _DELAYED * now and abs(best) > 1.5 * step:
-            late = "late" if best > 0 else "early"
             message = (
-                f"the flags of the contact {link} are {late} by {abs(best):.3f} s: with this shift "
+                f"the flags of the contact {link} are delayed by {best:+.3f} s: with this shift "
                 f"its speed in contact is {np.sqrt(found.min()):.2g} m/s instead of "
                 f"{np.sqrt(now):.2g} m/s (RMS). Correct the column contact_{link}"
             )

@@ -45,7 +45,7 @@ _REASONS = {
     "active_bound": "the data, or the masses that result from it, contradict a stated bound",
     "com_outside": "its centre of mass is {outside:.2g} m outside its geometry: not possible",
     "clipped": "the torque is clipped at a limit",
-    "contact_delay": "contact flags are late or early by {delay:+.3f} s (negative: early): contact "
+    "contact_delay": "contact flags are delayed by {delay:+.3f} s (negative: early): contact "
     "forces remain in the rows",
     "constant_torque": "the torque is constant: the channel does not work",
     "constraint_costs": "torque error {error_pct:.1f} % on the fitted recordings, "

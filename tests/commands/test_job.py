@@ -142,7 +142,6 @@ WRONG = {
     "gain": ("a = 14.87", 'a = "14.87"', "gains.a is '14.87', wanted a number"),
     "one bracket": ("[[validation]]", "[validation]", "wanted tables written as [[validation]]"),
     "no log": ('log = "val.parquet"', "end = 2.0", "a [[validation]] has no key 'log'"),
-    "floating base": ("[signals]", "free_flyer = true\n[signals]", "free_flyer is true, but no"),
     "loop's kind": ('"point"', '"ball"', "loop hand, rod is 'ball', wanted one of point, hinge"),
     "loop's frames": ('["hand", "rod"]', '["hand"]', "loop has the frames hand, wanted two links"),
     "no frames": ('frames = ["hand", "rod"]', "", "loop has the frames none, wanted two links"),
