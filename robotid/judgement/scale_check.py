@@ -221,7 +221,7 @@ def check_scale(found: Fit) -> ScaleCheck:
     q = np.vstack([e.recording.trajectory.q for e in found.fitted])
     if model.free_flyer:  # gravity loads its base with the whole mass
         ratio = after / before if before > 0 else 1.0
-        return replace(plain, scale=ratio, factor=ratio)
+        return replace(plain, scale=ratio, factor=ratio, is_total_determined=True)
     q = q[:: -(-len(q) // _POSES)]
     still = np.zeros_like(q)
     G = joint_torque_regressor(model, q, still, still).reshape(len(q), model.n_rows, -1)
