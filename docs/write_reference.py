@@ -10,7 +10,7 @@ from pathlib import Path
 from robotid.closed_loop.settings import LoopSettings
 from robotid.commands.job import Job, LogEntry
 from robotid.fitting.settings import ESTIMATORS, ConstraintSettings
-from robotid.logs.settings import LogSource, LogUnits, SignalSettings
+from robotid.logs.settings import BaseSource, LogSource, LogUnits, SignalSettings
 from robotid.logs.transmission import Transmission
 from robotid.robot.drives import TERMS
 from robotid.robot.families import AUTO
@@ -81,6 +81,7 @@ TABLES = {
     "signals": SignalSettings,
     "log": LogSource,
     "units": LogUnits,
+    "base": BaseSource,
     "controller": LoopSettings,
     "estimator.constraints": ConstraintSettings,
     "[transmission]": Transmission,

@@ -19,23 +19,29 @@ if TYPE_CHECKING:
     from robotid.identification.payload_fit import identify_payload
     from robotid.identification.previews import preview
     from robotid.identification.result import Identification
+    from robotid.logs.base import BaseColumns, BaseMotion
     from robotid.logs.data import Log, Trajectory
     from robotid.logs.read import read_log, write_log
     from robotid.logs.settings import LogSource, LogUnits, SignalSettings
     from robotid.online.identifier import OnlineIdentifier
     from robotid.report.document import write_report
+    from robotid.robot.constraints import Contact, Loop
     from robotid.robot.model import RobotModel
     from robotid.robot.parameters import Coupling
     from robotid.versions import __version__
     from robotid.viewer.replays import replay
 
 __all__ = [
+    "BaseColumns",
+    "BaseMotion",
+    "Contact",
     "Coupling",
     "EstimatorSettings",
     "Identification",
     "Log",
     "LogSource",
     "LogUnits",
+    "Loop",
     "OnlineIdentifier",
     "RobotIdError",
     "RobotModel",
@@ -77,11 +83,13 @@ _MODULES = {
     "identification.payload_fit": ["identify_payload"],
     "identification.previews": ["preview"],
     "identification.result": ["Identification"],
+    "logs.base": ["BaseColumns", "BaseMotion"],
     "logs.data": ["Log", "Trajectory"],
     "logs.read": ["read_log", "write_log"],
     "logs.settings": ["LogSource", "LogUnits", "SignalSettings"],
     "online.identifier": ["OnlineIdentifier"],
     "report.document": ["write_report"],
+    "robot.constraints": ["Contact", "Loop"],
     "robot.model": ["RobotModel"],
     "robot.parameters": ["Coupling"],
     "versions": ["__version__"],

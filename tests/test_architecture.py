@@ -162,7 +162,8 @@ def test_the_package_shows_its_public_api_and_nothing_else():
     import robotid.logs.data  # a room that was loaded stays out of sight
 
     assert dir(robotid) == [
-        "Coupling", "EstimatorSettings", "Identification", "Log", "LogSource", "LogUnits",
+        "BaseColumns", "BaseMotion", "Contact", "Coupling", "EstimatorSettings", "Identification",
+        "Log", "LogSource", "LogUnits", "Loop",
         "OnlineIdentifier", "RobotIdError", "RobotModel", "SignalSettings", "Trajectory",
         "__version__", "check_logs", "identify", "identify_payload", "inspect_urdf", "load_result",
         "preview", "read_job", "read_log", "replay", "run_job", "save_result",

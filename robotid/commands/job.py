@@ -4,7 +4,7 @@ import os
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,9 +22,11 @@ from robotid.fitting.settings import (
 from robotid.logs.columns import Needs
 from robotid.logs.data import Log
 from robotid.logs.read import LogLayout, lay_out, read_log
-from robotid.logs.settings import LogSource, LogUnits, SignalSettings
+from robotid.logs.settings import BaseSource, LogSource, LogUnits, SignalSettings
 from robotid.logs.table import Table
 from robotid.logs.transmission import Transmission, check_transmissions
+from robotid.regressor.constraints import logged_base
+from robotid.robot.constraints import Contact, Loop
 from robotid.robot.drives import DRIVE_TERMS, FAMILIES, TERMS, DriveTerm
 from robotid.robot.families import AUTO, term_from_dict
 from robotid.robot.parameters import DYNAMICS, Coupling
@@ -109,6 +111,20 @@ def _dump_couplings(couplings: Sequence[Coupling]) -> list[dict[str, Any]]:
     ]
 
 
+def _load_contacts(tables: Sequence[Mapping[str, Any]]) -> tuple[Contact, ...]:
+    return tuple(
+        Contact(**{**table, "measured": tuple(table.get("measured", ()))}) for table in tables
+    )
+
+
+def _load_loops(tables: Sequence[Mapping[str, Any]]) -> tuple[Loop, ...]:
+    tuples: list[dict[str, Any]] = [
+        {key: tuple(x) if isinstance(x, list) else x for key, x in {"frames": (), **table}.items()}
+        for table in tables
+    ]
+    return tuple(Loop(**table) for table in tuples)
+
+
 def _motors(gear: Transmission) -> list[Coupling]:
     """Return the drives of a transmission's motors that move several joints."""
     return [Coupling(joint, ratios, replaces=True) for joint, ratios in gear.shared.items()]
@@ -138,7 +154,7 @@ class Job(Settings):
         (0.0, 0.0, -9.81), "gravity in the root link's frame [m/s^2]"
     )
     free_flyer: bool = setting(
-        False, "whether the base floats; no log format has the motion of a base yet"
+        False, "whether the base floats; logs have its pose, base_x to base_qw"
     )
     mimic: str = setting(
         "independent", "independent, or coupled: a mimic joint moves with its leader"
@@ -193,6 +209,47 @@ class Job(Settings):
     )
     source: LogSource = setting(LogSource(), "location of the signals in the log files", at="log")
     units: LogUnits = setting(LogUnits(), "units of the logs, if not SI")
+    base: BaseSource = setting(BaseSource(), "motion of a floating base in the logs")
+    contacts: tuple[Contact, ...] = setting(
+        (),
+        "links that may touch the ground: frame, the link; kind, point or surface; measured, "
+        "components of the wrench that logs have as wrench_fz_<link>, of fx to mz, the others are "
+        "unknown; always, whether it always touches the ground, else logs have contact_<link>, 1 "
+        "or 0",
+        at="contact",
+        reads=[
+            {
+                "frame": (str,),
+                "kind": (str,),
+                "measured": Entries(list, (str,)),
+                "always": (bool,),
+            }
+        ],
+        load=_load_contacts,
+        dump=lambda contacts: [asdict(x) | {"measured": list(x.measured)} for x in contacts],
+    )
+    loops: tuple[Loop, ...] = setting(
+        (),
+        "connections that close kinematic chains: frames, the two links, whose origins coincide; "
+        "kind, hinge (default), point or rigid; axis of the hinge, the same in both frames",
+        at="loop",
+        reads=[
+            {
+                "frames": Entries(list, (str,)),
+                "kind": (str,),
+                "axis": Entries(list, (int, float)),
+            }
+        ],
+        load=_load_loops,
+        dump=lambda loops: [
+            {"frames": list(x.frames), "kind": x.kind, "axis": list(x.axis)} for x in loops
+        ],
+    )
+    passive: tuple[str, ...] = setting(
+        (),
+        "joints without a drive: their torque is 0 and needs no column; positions that logs lack "
+        "are computed from the loops; no friction except that in [drives]",
+    )
     estimator: EstimatorSettings = setting(ConsistentSettings(), "estimator and its settings")
     controller: LoopSettings = setting(
         LoopSettings(),
@@ -252,12 +309,6 @@ class Job(Settings):
                 f"[controller] is stated, but the estimator is {self.estimator.name!r}, wanted "
                 "'simulation'; set [estimator] name = 'simulation', or remove [controller]"
             )
-        if self.free_flyer:
-            raise SettingsError(
-                "free_flyer is true, but no log format that robotid reads has the pose and motion "
-                "of a floating base. Set free_flyer = false, or compute the regressor in Python, "
-                "joint_torque_regressor(RobotModel.from_urdf(..., free_flyer=True), q, v, a)"
-            )
 
     def model(self) -> "RobotModel":
         """Return the robot, with the job's joints, gravity and drive terms.
@@ -284,6 +335,8 @@ class Job(Settings):
             },
             dynamics=self.model_dynamics,
             snap_angles=self.snap_angles,
+            constraints=(*self.contacts, *self.loops),
+            passive=self.passive,
         )
 
     def placed(self, model: "RobotModel") -> tuple[str, ...]:
@@ -344,6 +397,8 @@ class Job(Settings):
             "units": self.units,
             "prismatic": tuple(model.layout.prismatic),
             "source": self.source,
+            "base": logged_base(model, self.base.twist),
+            "passive": model.passive,
             "transmissions": [gear.stated(model.tree.reductions) for gear in self.transmissions],
         }
 

@@ -18,6 +18,7 @@ from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.export.result import Result, load_result, stated_model, stated_urdf_with_drives
 from robotid.export.shape import FILE, NUMBER, TABLE, TEXT, check_shape
 from robotid.findings import listed
+from robotid.fitting.closed_log import closed_log
 from robotid.fitting.evaluation import predict
 from robotid.fitting.survey import hold_log
 from robotid.identification.pictures import shown_evaluation
@@ -37,6 +38,7 @@ __all__ = ["Findings", "read_findings", "replay_files", "replay_identified", "st
 _BASE = ("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw")
 
 #: Label of the torque of the URDF's bodies with identified drives.
+_PROJECTED = "Torques: the part that contact forces cannot cause."
 _DRIVEN = "URDF + drives"
 
 #: The entries of a track.json that are read.
@@ -140,12 +142,12 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     if findings.commanded:
         return _replay_commanded(job, findings.commanded, ghost)
     is_motion = not job.lay_out(entry, model, needs="motion")[0].has_torque
-    motion = job.read(entry, model, needs="motion" if is_motion else "torque")
+    motion = closed_log(model, job.read(entry, model, needs="motion" if is_motion else "torque"))
     robots = {label: stated_model(r, model) for label, r in findings.results.items()}
     bodies = {label: robot.carried_by for label, robot in robots.items()}
     ghosts = {}
     if ghost is not None:
-        shadow = job.read(LogEntry(Path(ghost)), model, needs="motion")
+        shadow = closed_log(model, job.read(LogEntry(Path(ghost)), model, needs="motion"))
         ghosts[Path(ghost).name] = (shadow.t, shadow.q)
     torques, marks, notes = None, _payloads(findings.track), [f"Motion: {entry.path.name}."]
     if is_motion:
@@ -155,11 +157,14 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         torques = _torques(job, motion, model, robots, findings.results)
         torques = replace(torques, noise=_noise(findings, model))
         marks += _contacts(torques, model)
+        notes += [_PROJECTED] if model.constraints else []
     n = model.layout.n_inertial  # drives of the result may have further terms
     masses = {"URDF": model.standard_parameters(), **bodies} if bodies else {}
     masses = {label: pi[:n] for label, pi in masses.items()}
     shown, q = model, motion.q
-    base = None if ghosts else _base_poses(job, entry, motion)
+    if motion.base is not None:
+        q = np.hstack([motion.base.pose, q])
+    base = None if ghosts or model.free_flyer else _base_poses(job, entry, motion)
     if base is not None:  # the same robot with the trunk as first body
         shown, q = _floating(job, model), np.hstack([base, q])
         trunk = shown.standard_parameters()[:10]
@@ -194,7 +199,8 @@ def replay_identified(identification: Identification) -> Replay:
         del wanted[_DRIVEN]
     predicted = {label: _of_moving(shown.torques[key], mask) for label, key in wanted.items()}
     predicted["URDF"] = shown.torques["urdf"]
-    torques = Torques(motion.t, motion.tau, predicted, identification.estimate.sigma)
+    sigma = identification.estimate.sigma[model.n_rows - len(model.joints) :]
+    torques = _of_joints(Torques(motion.t, motion.tau, predicted, sigma), model)
     return replay(
         model,
         motion.t,
@@ -202,7 +208,7 @@ def replay_identified(identification: Identification) -> Replay:
         torques=torques,
         masses={"URDF": identification.prior, "identified": identification.standard},
         marks=_contacts(torques, model),
-        notes=[f"Motion: {shown.recording.name}."],
+        notes=[f"Motion: {shown.recording.name}.", *([_PROJECTED] if model.constraints else [])],
         log=Path(shown.recording.log.path).name,
     )
 
@@ -328,7 +334,14 @@ def _torques(
     if motion is None:
         return Torques(log.t, log.tau)
     alone = {"URDF": predict(model, [model.standard_parameters()], motion)[0]}
-    return Torques(motion.t, motion.tau, shown | driven | alone)
+    return _of_joints(Torques(motion.t, motion.tau, shown | driven | alone), model)
+
+
+def _of_joints(torques: Torques, model: RobotModel) -> Torques:
+    """Return torques without the rows of a floating base."""
+    first = model.n_rows - len(model.joints)
+    predicted = {label: torque[:, first:] for label, torque in torques.predicted.items()}
+    return replace(torques, measured=torques.measured[:, first:], predicted=predicted)
 
 
 def _of_moving(torque: Array, mask: Array) -> Array:
@@ -398,10 +411,10 @@ def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], 
 
 def _contacts(torques: Torques, model: RobotModel) -> list[Mark]:
     """Return marks at large torque residuals of the first result."""
-    if not torques.predicted:
+    if not torques.predicted or model.constraints:
         return []
     predicted = next(iter(torques.predicted.values()))
-    units = dict(zip(model.joints, model.row_units, strict=True))
+    units = dict(zip(model.row_names, model.row_units, strict=True))
     marks = []
     for found in find_unexplained(torques.t, torques.measured, predicted, model.joints):
         size = f"mean {found.residual:.2g} {units[found.joint]}"

@@ -1,6 +1,7 @@
 """Validation of a written result on other logs, with a verdict."""
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,7 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     source = stated_model(result, job.model())
     if loaded.has_urdf:
         model, pi = loaded.identified
+        model = replace(model, constraints=source.constraints)  # the URDF does not state them
     else:
         model, pi = source, stated_parameters(result, source)
     prior = source.standard_parameters()

@@ -213,7 +213,7 @@ def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
             those near reversals, where the filter smears stiction.
     """
     model, mapping = fit.model, fit.mapping
-    if model.is_static:
+    if model.is_static or model.free_flyer or model.constraints or model.passive:
         return None
     validation = [e for e in fit.validation if not e.is_refitted]
     rows, independent = _spread_rows(model, fit.fitted, validation)
@@ -224,7 +224,7 @@ def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
     own = sum(map(len, rows[: len(fit.fitted)]))
     segments = _segments(own, sum(map(len, rows)) - own, independent)
     number = sum(part.stop <= own for part in segments)
-    if model.free_flyer or number < _FEWEST:
+    if number < _FEWEST:
         return None
     motion = [e.recording.trajectory.at(k) for e, k in parts]
     Y = np.concatenate([_regressor(model, e.recording.trajectory, k) for e, k in parts])

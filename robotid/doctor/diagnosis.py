@@ -12,6 +12,7 @@ from robotid._settings import require_kind
 from robotid.doctor.channels import check_channels
 from robotid.doctor.clock import check_clock, check_rest
 from robotid.doctor.command_channels import check_commands
+from robotid.doctor.contacts import check_base
 from robotid.doctor.motions import check_excitation, check_repeated_motion
 from robotid.doctor.mounted import Segments, check_payload_change
 from robotid.doctor.sample import Probe, smooth_motion, take_probe
@@ -25,13 +26,14 @@ from robotid.logs.data import Log, Trajectory
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.constraints import logged_base
 from robotid.robot.model import RobotModel
 
 __all__ = ["CODES", "check_logs", "diagnose", "findings_to_dict"]
 
 #: Codes of the doctor's errors, which can be ignored.
 CODES = (
-    "gravity", "gravity_compensated", "joint_axis", "joint_order", "delayed_command",
+    "base_twist", "gravity", "gravity_compensated", "joint_axis", "joint_order", "delayed_command",
     "locked_position", "position_offset", "position_order", "position_sign", "spikes",
     "torque_order", "torque_sign", "velocity_mismatch", "unsigned_torque", "velocity_order",
     "velocity_scale",
@@ -64,7 +66,14 @@ def check_logs(
     require_kind(model, RobotModel, "model", "a robotid.RobotModel")
     require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
     first, second = (
-        read_logs(some, model.joints, prismatic=model.layout.prismatic, needs="any")
+        read_logs(
+            some,
+            model.joints,
+            prismatic=model.layout.prismatic,
+            needs="any",
+            base=logged_base(model),
+            passive=model.passive,
+        )
         for some in (logs, validation)
     )
     return diagnose(model, first, second, signals or SignalSettings())
@@ -133,11 +142,15 @@ def _examine_log(
     if not model.is_static:  # rows of static poses may have gaps between them
         findings += [*check_clock(log), *check_channels(log, signals)]
     findings += check_commands(log)
-    sizes = list(check_torque_channels(log)) if log.has_torque else []
+    driven = [joint for joint in log.joints if joint not in model.passive]
+    has_torque = log.has_torque and bool(driven)
+    sizes = list(check_torque_channels(log.select(driven))) if has_torque else []
     findings += sizes
-    if model.free_flyer:
-        message = "the torques of a robot with a floating base are not checked"
+    if model.free_flyer or model.constraints or model.passive:
+        message = "torques of a robot with a floating base, contacts, loops or passive joints are "
+        message += "not checked"
         findings.append(log_finding(name, "floating_base", "note", message))
+        findings += check_base(model, log, signals)
         return None, None
     if model.is_static:
         return None, None  # the other checks need accelerations

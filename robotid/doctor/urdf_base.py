@@ -108,7 +108,9 @@ def _rounded(tree: Tree) -> dict[str, dict[str, float]]:
 
 def _effect(model: RobotModel, mapping: BaseMapping) -> tuple[int, str]:
     """Return how many base parameters the rounding adds, and a sentence on it, "" if none."""
-    options = {**model.options, "couplings": model.layout.couplings}
+    options = {
+        **model.options, "couplings": model.layout.couplings, "constraints": model.constraints
+    }  # fmt: skip
     meant = structural_mapping(RobotModel.from_urdf(model.tree, **options, snap_angles=True))
     more = len(mapping.K) - len(meant.K)
     seeming = _between(mapping) - _between(meant)

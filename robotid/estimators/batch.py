@@ -266,8 +266,7 @@ def _noise(factors: Factors, theta: Array, used: Array) -> Array:
 
     The degrees of freedom are the rows minus ``used``, the trace of their leverage.
     """
-    freedom = np.maximum(factors.rows - used, 1.0)
-    sigma = np.sqrt(factors.residual_squares(theta) / freedom)
+    sigma = factors.noise_levels(theta, np.maximum(factors.rows - used, 1.0))
     torque = np.sqrt(factors.torque_squares() / np.maximum(factors.rows, 1))
     floor = _FLOOR * np.where(torque > 0, torque, 1.0)
     noise: Array = np.maximum(sigma, floor)

@@ -4,6 +4,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 
+import numpy as np
+
 from robotid._typing import Array
 from robotid.fitting.survey import ReducedPiece, SurveyedLog
 from robotid.logs.data import Trajectory
@@ -137,12 +139,16 @@ class Recordings:
             for problem in problems():
                 yield from problem.mass_stream() if problem.mass_stream is not None else ()
 
+        support, is_projected = self.model.support(), bool(self.model.constraints)
+        if is_projected:  # every row has the columns of all
+            support = np.broadcast_to(support.any(axis=0), support.shape)
         return Problem(
             stream,
             self.mapping.base_names,
             self.model.n_rows,
-            self.model.support()[:, self.mapping.independent],
+            support[:, self.mapping.independent],
             mass_stream if with_mass else None,
+            is_projected=is_projected,
         )
 
     def segments(self, k: int, motion: Trajectory, joined: int = 1) -> tuple[Factors, ...]:

@@ -16,6 +16,8 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.findings import listed
+from robotid.fitting.closed_log import closed_log
 from robotid.fitting.velocity_choice import prefers_measured
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.formats import open_table
@@ -28,6 +30,7 @@ from robotid.logs.time_stamps import blocks_of, map_stamps, median_step
 from robotid.logs.units import check_reach, check_units
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import friction_speeds
+from robotid.regressor.constraints import constrained, logged_base
 from robotid.regressor.factors import Reduction
 from robotid.regressor.memory import is_loaded, remember
 from robotid.regressor.rows import COMPILED, choose_engine
@@ -66,7 +69,8 @@ class _Header:
             return self.source
         layout = self.source
         reader = _reader(open_table(Path(layout.path), layout.source), layout.wanted)
-        return _log_of(layout, reader.read(layout.wanted, first, stop, near), first)
+        log = _log_of(layout, reader.read(layout.wanted, first, stop, near), first)
+        return closed_log(self.model, log)
 
     @property
     def is_compiled(self) -> bool | None:
@@ -126,7 +130,8 @@ class LogPiece:
         model, motion, mask = self.header.model, rows.trajectory, rows.mask
         if model.layout != before.layout or is_loaded(model):
             motion = remember(model, motion.with_states(None))
-        if not model.is_static:  # static rows were chosen by their speeds already
+        # static rows were chosen by their speeds already, constrained ones with their forces
+        if not (model.is_static or model.constraints):
             mask = row_mask(model, motion, self.header.signals.min_velocity)
         vars(self)["_cached"] = replace(rows, trajectory=motion, mask=mask)
 
@@ -151,6 +156,9 @@ class LogPiece:
                 speeds=friction_speeds(header.model.layout),
             )
             mask = row_mask(header.model, trajectory, header.signals.min_velocity)
+            trajectory, mask = constrained(
+                header.model, trajectory, mask, has_torque=log.has_torque
+            )
         trajectory = remember(header.model, trajectory)
         return Rows(raw.q[rows], raw.tau[rows], trajectory, mask, (log.q != raw.q).any(axis=0))
 
@@ -342,6 +350,23 @@ class SurveyedLog:
         return tuple(found)
 
 
+def _check_base(model: RobotModel, log: Log) -> None:
+    """Refuse a log without the motion of a floating base, or without a contact of the model."""
+    wanted = logged_base(model)
+    if wanted.floats and log.base is None:
+        raise DataError(
+            f"{log.name} has no pose of the floating base; read it with "
+            "base=BaseColumns(floats=True), or pass Log(..., base=BaseMotion(pose))"
+        )
+    for kind in ("contacts", "wrenches"):
+        found, names = tuple(getattr(log, kind)), getattr(wanted, kind)
+        if found != names:
+            raise DataError(
+                f"{log.name} has the {kind} {listed(found)}, wanted those of the model, "
+                f"{listed(names)}, in this order; pass Log(..., {kind}={{...}})"
+            )
+
+
 def hold_log(
     model: RobotModel, log: Log, signals: SignalSettings, locked: Mapping[str, Array] | None = None
 ) -> SurveyedLog:
@@ -349,11 +374,13 @@ def hold_log(
 
     Args:
         model: The robot.
-        log: The log, with the model's joints in its order.
+        log: The log, with the model's joints in its order; passive ones may be missing.
         signals: Settings of the processing to a trajectory.
         locked: Positions of locked joints, if the log has them, by name [rad or m].
     """
     count = len(log.t)
+    _check_base(model, log)
+    log = closed_log(model, log)
     if model.is_static:  # means of segments replace filters
         signals = replace(
             signals, cutoff=None, rate=None, velocity="differentiated",
@@ -410,6 +437,7 @@ def survey_log(
     positions = _positions(locked, found, layout, model)
     if table.rows is None:
         length = max(stop - first, 1)
+    windows = tuple(closed_log(model, log) for log in windows)
     return SurveyedLog(
         model, layout, signals, stamps, first, stop, windows, positions, length, places
     )

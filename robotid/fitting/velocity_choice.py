@@ -65,7 +65,7 @@ def _errors(model: RobotModel, log: Log, settings: SignalSettings) -> Array:
     NaN for a joint with too little motion or without torque.
     """
     found = np.full((2, len(model.joints)), np.nan)
-    if not log.has_torque:
+    if not log.has_torque or model.free_flyer or model.constraints:
         return found.T
     motions = []
     for velocity in ("measured", "differentiated"):

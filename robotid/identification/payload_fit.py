@@ -254,6 +254,7 @@ def identify_payload(
         require_each(value, str, name, wanted)
     require_kind(masses, (Mapping, type(None)), "masses", "a table of masses [kg] by link")
     model = robot_of(model, logs)
+    model.require_fixed("the identification of a payload")
     settings, mapping = signals or SignalSettings(), structural_mapping(model)
     wanted_families(friction, model.joints)
     read = [
@@ -328,6 +329,7 @@ def fit_payloads(
     Raises:
         DataError, ModelError, SettingsError, NotConvergedError: As of ``identify_payload``.
     """
+    loaded.model.require_fixed("the identification of a payload")
     if not loaded.model.layout.remembering:
         return _fit(loaded, reference, links, masses, unknown_gains)
     # the unknown bodies load the gears

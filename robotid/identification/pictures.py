@@ -190,14 +190,15 @@ def friction_chart(
             ``shown_evaluation``; computed if None.
 
     Returns:
-        The chart; None if no sample of the joint was used.
+        The chart; None if no sample of the joint was used, or it is passive without friction.
     """
     evaluation, model = shown_evaluation(found), found.model
     motion, row = evaluation.recording.trajectory, model.row_names.index(joint)
     left, friction = split or friction_split(model, evaluation, found.standard)
     rows = np.flatnonzero(evaluation.recording.mask[:, row])
     rows = rows[:: max(1, -(-len(rows) // _DOTS))]
-    if not len(rows):
+    is_bare = joint in model.passive and joint not in model.layout.own
+    if is_bare or not len(rows):
         return None
     rows = rows[np.argsort(motion.v[rows, row], kind="stable")]
     load = 0.0

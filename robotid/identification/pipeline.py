@@ -36,6 +36,7 @@ from robotid.judgement.verdict import blocking, check_ignored, rejected, warning
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.constraints import logged_base
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 
@@ -94,7 +95,13 @@ def identify(
     report_stage(progress, "reading logs")
     model = robot_of(model, logs)
     first, second = (
-        read_logs(some, model.joints, prismatic=model.layout.prismatic)
+        read_logs(
+            some,
+            model.joints,
+            prismatic=model.layout.prismatic,
+            base=logged_base(model),
+            passive=model.passive,
+        )
         for some in (logs, validation)
     )
     if not first:

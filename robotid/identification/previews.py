@@ -237,7 +237,8 @@ def preview(
         given: An earlier identification, whose information is added.
 
     Raises:
-        DataError: If a motion cannot be read, does not fit the model or is too short.
+        DataError: If a motion cannot be read, does not fit the model or is too short, or the base
+            floats.
         SettingsError: If a setting is out of range, or a joint is unknown.
     """
     require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
@@ -289,6 +290,7 @@ def preview_logs(
     """
     if not motions:
         raise DataError("no motion was given; at least one is needed to preview anything")
+    model.require_fixed("a preview")
     mapping = structural_mapping(model)
     peak, fastest = _largest(model, motions)
     size = largest_torques(model, peak)

@@ -191,10 +191,11 @@ class Identification(Fit):
     @cached_property
     def verdict(self) -> Verdict:
         """Verdict on the result, with reasons."""
+        logs = [e.recording.log for e in (*self.fitted, *self.validation)]
         predictions = Predictions(
             self.metrics(),
             self.predictions,
-            self.model.joints,
+            self.model.joints if any(log.has_torque for log in logs) else (),
             refitted=[e.recording.name for e in self.refitted],
             hidden=hidden_joints(self.model, self.fitted),
         )

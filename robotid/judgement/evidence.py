@@ -20,6 +20,7 @@ BEATEN = 1.05
 
 _TIE = 0.3  # [%] ... and, for the URDF with fitted drives, by this share of the torque
 _OPTIMISM = 2.0  # validation error over fitted error beyond which the fit is over-fitted
+_BASE = "base."  # of the rows of a floating base
 _NAMED = 8  # parameters that a reason names
 
 
@@ -52,7 +53,24 @@ class Predictions:
         return {log: self._evaluated(metrics) for log, metrics in self.validation.items()}
 
     def _evaluated(self, metrics: Metrics) -> dict[str, JointMetrics]:
-        return {joint: m for joint, m in metrics.per_joint.items() if joint not in self.hidden}
+        """Return the metrics of joints; those of a floating base if no joint has any."""
+        found = {joint: m for joint, m in metrics.per_joint.items() if joint not in self.hidden}
+        joints = {name: m for name, m in found.items() if not name.startswith(_BASE)}
+        return joints or found
+
+    def of_base(self) -> list[str]:
+        """Return the prediction errors of the wrench on a floating base, beside its joints'."""
+        notes = []
+        for log, metrics in self.validation.items():
+            own = {x: m for x, m in metrics.per_joint.items() if x.startswith(_BASE)}
+            if not own or own.keys() & self.tested[log].keys():
+                continue
+            errors = [f"{x.removeprefix(_BASE)} {error_of(m):.0f} %" for x, m in own.items()]
+            notes.append(
+                f"wrench on the base that contact forces cannot cause, error on {log}: "
+                f"{listed(errors)}. The verdict is on the torque of the joints"
+            )
+        return notes
 
     def on_each(self) -> dict[str, tuple[list[str], list[str], list[float]]]:
         """Return the errors, the warnings and the prediction errors [%] by log of each joint."""
@@ -203,7 +221,7 @@ def _judge_joint(
     urdf = measured.baselines.get("urdf")
     if measured.relative_error_pct is None:
         return [f"{joint}: the torque is 0 throughout {log}: not evaluated"], []
-    if not measured.better_than_constant:
+    if not measured.better_than_constant and not joint.startswith(_BASE):  # its weight is constant
         constant = error / np.sqrt(1.0 - measured.r2)
         why = f"error {error:.1f} %; a constant would give {constant:.1f} %"
         return [f"{joint}: worse than a constant torque on {log}: {why}"], []

@@ -12,6 +12,7 @@ from robotid._typing import Array
 from robotid.findings import listed
 from robotid.fitting.result import Fit
 from robotid.judgement.stated_mass import AGREES, StatedMass, determines_total_mass, stated_mass
+from robotid.regressor.constraints import loop_basis, without_forces
 from robotid.regressor.prediction import predict
 from robotid.regressor.torque import joint_torque_regressor
 
@@ -218,11 +219,14 @@ def check_scale(found: Fit) -> ScaleCheck:
         is_total_determined=determines_total_mass(found),
     )  # fmt: skip
     q = np.vstack([e.recording.trajectory.q for e in found.fitted])
-    if model.free_flyer:
-        return plain
+    if model.free_flyer:  # gravity loads its base with the whole mass
+        ratio = after / before if before > 0 else 1.0
+        return replace(plain, scale=ratio, factor=ratio, is_total_determined=True)
     q = q[:: -(-len(q) // _POSES)]
     still = np.zeros_like(q)
     G = joint_torque_regressor(model, q, still, still).reshape(len(q), model.n_rows, -1)
+    if model.loops:
+        G = without_forces(loop_basis(model, q), G)
     last = G[:, :, size - 10 : size - 6]  # m, mcx, mcy, mcz of the last body
     G = G[:, :, found.mapping.independent]
     at_rest = np.arange(len(found.prior)) < size

@@ -45,6 +45,8 @@ _REASONS = {
     "active_bound": "the data, or the masses that result from it, contradict a stated bound",
     "com_outside": "its centre of mass is {outside:.2g} m outside its geometry: not possible",
     "clipped": "the torque is clipped at a limit",
+    "contact_delay": "contact flags are delayed by {delay:+.3f} s (negative: early): contact "
+    "forces remain in the rows",
     "constant_torque": "the torque is constant: the channel does not work",
     "constraint_costs": "torque error {error_pct:.1f} % on the fitted recordings, "
     "{wls_error_pct:.1f} % without constraints: physics and data disagree",
@@ -64,6 +66,7 @@ _REASONS = {
     "joint_torque_delay": "the torque is delayed by {delay:+.3f} s relative to the position "
     "(negative: early), the torques of other joints are not",
     "lost_motion": "there may be backlash between the joint and its encoder",
+    "moving_contact": "a link moves at {speed:.2g} m/s while it is in contact",
     "mass_matrix": "the mass matrix is not positive definite in all poses",
     "payload_change": "its last link carries {mass:+.2g} kg relative to the fitted logs",
     "position_offset": "the position may have an offset",
@@ -213,6 +216,7 @@ def judge(
     ]
     notes = [
         *determined.notes(),
+        *predictions.of_base(),
         *([scale_check.message] if scale_check is not None and not is_contradicted else []),
         *([f"{listed(hidden)}: {_HIDDEN}: not evaluated"] if hidden else []),
         *([_STATIC] if determined.is_static else []),

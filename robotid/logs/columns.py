@@ -54,6 +54,7 @@ class Finder:
         needs: Quantities that are read besides the positions.
         notes: Notes for the user.
         seen: Columns that are read or named in a note.
+        passive: Joints without a drive, which need no torque.
     """
 
     where: str
@@ -66,6 +67,7 @@ class Finder:
     needs: Needs = "torque"
     notes: list[str] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)
+    passive: Collection[str] = ()
 
     def find_all(self) -> dict[str, list[str]]:
         """Return the columns to read: time, q, required quantities, complete optional ones."""
@@ -87,7 +89,7 @@ class Finder:
         extra = [name for name in self.names if name not in self.seen]
         if extra:
             self.notes.append(f"columns ignored: {listed(extra)}")
-        if twice := repeated([name for names in found.values() for name in names]):
+        if twice := repeated([name for names in found.values() for name in names if name]):
             raise SettingsError(
                 f"{self.where}: {listed(twice)} are read twice; correct columns in the job file"
             )
@@ -209,7 +211,12 @@ class Finder:
         return self.source.joints.get(joint, joint)
 
     def _find_torque(self, joint: str, is_motor: bool) -> str:
-        """Return the torque column of a joint or its motor, or its current column with a gain."""
+        """Return the torque column of a joint or its motor, or its current column with a gain.
+
+        It is empty for a passive joint.
+        """
+        if joint in self.passive:
+            return ""
         m, joint = ("m", self.motors[joint]) if is_motor else ("", joint)
         tau, current = self._find_of(f"tau{m}", joint), self._find_of(f"current{m}", joint)
         has_gain = joint in self.gains
@@ -241,7 +248,8 @@ class Finder:
         for joint, is_motor in zip(self.joints, self.of_motors("tau"), strict=True):
             m, name = ("m", self.motors[joint]) if is_motor else ("", joint)
             has_gain = name in self.gains
-            if not (self._has(f"tau{m}", name) or (has_gain and self._has(f"current{m}", name))):
+            has_torque = self._has(f"tau{m}", name) or (has_gain and self._has(f"current{m}", name))
+            if not (has_torque or joint in self.passive):
                 without.append(joint)
         if without and any(self.has_torque(joint) for joint in self.joints):
             self.notes.append(
@@ -314,6 +322,7 @@ class Finder:
             absent += [
                 (f"tau{m}", name)
                 for joint, is_motor in zip(self.joints, self.of_motors("tau"), strict=True)
+                if joint not in self.passive
                 for m, name in [("m", self.motors[joint]) if is_motor else ("", joint)]
                 if not (self._has(f"tau{m}", name) or self._has(f"current{m}", name))
             ]
@@ -359,6 +368,14 @@ class Finder:
             joint: The joint.
         """
         return self._has("tau", joint) or self._has("current", joint)
+
+    def has_position(self, joint: str) -> bool:
+        """Return whether the file has the position of a joint.
+
+        Args:
+            joint: The joint.
+        """
+        return self._has("q", joint)
 
     def _has(self, kind: str, joint: str) -> bool:
         """Return whether the file has a quantity of a joint or of its motor."""

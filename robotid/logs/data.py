@@ -7,7 +7,7 @@ import difflib
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from robotid._settings import is_number, require_each, require_flag, require_kin
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
+from robotid.logs.base import POSE, BaseMotion
 
 __all__ = ["COLUMNS", "Log", "Trajectory"]
 
@@ -35,6 +36,10 @@ COLUMNS = {
 _SHORTEST = 1e-12  # [s] smallest mean time step
 _REQUIRED = ("q", "tau")
 _NO_TORQUE = "; without torques, pass zeros and has_torque=False"
+_BY_SAMPLE = (
+    "t", "q", "v", "a", "tau", "segment", "direction", "memory", "contacts",
+    "wrenches", "switching", "basis",
+)  # fmt: skip
 _LARGEST = 1e30  # in any unit, so that squares and products are finite
 
 
@@ -55,6 +60,10 @@ class Log:
         v_ref: Commanded velocities, shape (N, n) [rad/s or m/s], or None.
         tau_ref: Commanded feed-forward torques, shape (N, n) [N m or N], or None.
         has_torque: Whether torques were recorded.
+        base: Motion of the base of a robot whose base floats, or None.
+        contacts: Whether links touch the ground, by link, each of shape (N,), bool.
+        wrenches: Measured components of the wrenches of the ground, by name as "fz l_sole", each of
+            shape (N,) [N or N m].
     """
 
     t: Array
@@ -69,6 +78,9 @@ class Log:
     v_ref: Array | None = None
     tau_ref: Array | None = None
     has_torque: bool = True
+    base: BaseMotion | None = None
+    contacts: Mapping[str, Array] = field(default_factory=dict)
+    wrenches: Mapping[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_kind(self.path, (str, Path), "path", "the path of the log's file, or ''")
@@ -84,6 +96,22 @@ class Log:
         if len(self.t) < 2:
             raise DataError(f"{where} has {len(self.t)} rows, wanted at least 2; record longer")
         require_increasing(self.t, where)
+        require_kind(self.base, (BaseMotion, type(None)), "base", "a robotid.BaseMotion")
+        if self.base is not None and len(self.base.pose) != len(self.t):
+            raise DataError(
+                f"{where}: the pose of the base has {len(self.base.pose)} rows, wanted "
+                f"{len(self.t)}, one for each time stamp"
+            )
+        for kind, dtype in (("contacts", np.bool_), ("wrenches", np.float64)):
+            own = {name: _frozen(x, dtype) for name, x in getattr(self, kind).items()}
+            for name, values in own.items():
+                if values.shape != self.t.shape:
+                    raise DataError(
+                        f"{where}: {name!r} of {kind} has shape {values.shape}, wanted "
+                        f"{self.t.shape}"
+                    )
+                require_finite(values[:, None], self.t, [f"{kind} {name}"], where)
+            object.__setattr__(self, kind, own)
 
     @property
     def name(self) -> str:
@@ -116,7 +144,14 @@ class Log:
                 f"the log spans {self.t[0]:g} s to {self.t[-1]:g} s. Choose start and end inside it"
             )
         within = slice(rows[0], rows[-1] + 1)
-        return replace(self, t=self.t[within], **{k: x[within] for k, x in self._arrays().items()})
+        return replace(
+            self,
+            t=self.t[within],
+            base=None if self.base is None else self.base.at(within),
+            contacts={link: flags[within] for link, flags in self.contacts.items()},
+            wrenches={name: values[within] for name, values in self.wrenches.items()},
+            **{k: x[within] for k, x in self._arrays().items()},
+        )
 
     def select(self, joints: Sequence[str]) -> "Log":
         """Return the log of some joints.
@@ -157,10 +192,12 @@ class Trajectory:
 
     Attributes:
         t: Time stamps, shape (N,) [s].
-        q: Joint positions, shape (N, n) [rad or m].
-        v: Velocities, shape (N, n) [rad/s or m/s].
-        a: Accelerations, shape (N, n) [rad/s^2 or m/s^2].
-        tau: Torques, shape (N, n) [N m or N].
+        q: Joint positions, shape (N, n) [rad or m]; of a floating base the pose before them,
+            (N, 7 + n).
+        v: Velocities, shape (N, n) [rad/s or m/s]; with the twist of the base, (N, 6 + n).
+        a: Accelerations, likewise [rad/s^2 or m/s^2].
+        tau: Torques, shape (N, n) [N m or N]; with the wrench of the base, 0, (N, 6 + n). With a
+            basis, the torques without those of constraint forces.
         joints: Names of the n joints, in the order of the columns.
         rate: Rate of the uniform grid [Hz]; None if the rows are those of the log.
         segment: Number of the segment without gaps of each row, shape (N,), int.
@@ -168,6 +205,12 @@ class Trajectory:
             shape (N, c) [-], in the order of ``friction_speeds``; None: the sign of the speed.
         memory: Regressor columns of drive parameters that depend on internal states, shape (N, m),
             in the order of ``ParameterLayout.remembering``; None if there are none.
+        contacts: Which contacts may touch the ground, shape (N, k), bool; None without contacts.
+        switching: Samples at which a contact changes and the acceleration jumps, shape (N,), bool;
+            None without contacts.
+        wrenches: Measured components of wrenches, shape (N, m) [N or N m]; None without any.
+        basis: Basis of the torques of constraint forces, shape (N, n_rows, m), as of
+            ``force_basis``; None without constraints.
     """
 
     t: Array
@@ -180,6 +223,10 @@ class Trajectory:
     segment: Array
     direction: Array | None = None
     memory: Array | None = None
+    contacts: Array | None = None
+    wrenches: Array | None = None
+    switching: Array | None = None
+    basis: Array | None = None
 
     def __post_init__(self) -> None:
         _settle(self, "trajectory", {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau})
@@ -225,6 +272,15 @@ class Trajectory:
         vars(same).update(memory=memory, derived=self.derived)
         return same
 
+    def projected(self, basis: Array, tau: Array) -> "Trajectory":
+        """Return the same motion without the torques of constraint forces.
+
+        Args:
+            basis: As of ``force_basis``, shape (N, n_rows, m).
+            tau: The remaining torques, shape (N, n_rows) [N m, N].
+        """
+        return replace(self, basis=basis, tau=tau)
+
     @property
     def squares(self) -> Array:
         """Sums of tau^2, v^2 and a^2 over the samples, shape (3, n)."""
@@ -259,7 +315,7 @@ class Trajectory:
         """
         some = copy(self)
         vars(some).pop("derived", None)
-        for name in ("t", "q", "v", "a", "tau", "segment", "direction", "memory"):
+        for name in _BY_SAMPLE:
             values = getattr(self, name)
             if values is not None:
                 vars(some)[name] = own = values[rows]
@@ -301,16 +357,26 @@ def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]
         if values is None and name not in _REQUIRED:
             continue
         array = real_numbers(values, f"{where}: {name}", hint=_NO_TORQUE if name == "tau" else "")
-        if array.shape != (len(t), len(joints)):
+        base = _base_width(owner, name)
+        if array.shape != (len(t), base + len(joints)):
             raise DataError(
                 f"{where}: {name} has shape {array.shape}, wanted {(len(t), len(joints))}: a row "
                 f"for each time stamp, a column for each of the joints {listed(joints)}"
             )
-        require_finite(array, t, [f"{name}_{joint}" for joint in joints], where)
+        names = [f"{name}_{x}" for x in (*(f"base {k}" for k in range(base)), *joints)]
+        require_finite(array, t, names, where)
         settled[COLUMNS.get(name, name)] = array
     for name, array in settled.items():
         object.__setattr__(owner, name, array)
     object.__setattr__(owner, "joints", joints)
+
+
+def _base_width(owner: Log | Trajectory, name: str) -> int:
+    """Return the columns of an array before those of the joints: 7 or 6 of a floating base."""
+    floats = isinstance(owner, Trajectory) and np.ndim(owner.q) == 2
+    if not floats or np.shape(owner.q)[1] != len(tuple(owner.joints)) + len(POSE):
+        return 0
+    return len(POSE) if name == "q" else 6
 
 
 def _names(joints: object, where: str) -> tuple[str, ...]:

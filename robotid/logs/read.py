@@ -7,7 +7,8 @@ columns of the motors are read instead, as `qm_<motor>` and `taum_<motor>` [N m]
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,6 +19,7 @@ from robotid._settings import require_each, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
+from robotid.logs.base import BaseColumns, base_columns, base_of, contacts_of, table_of_base
 from robotid.logs.columns import NOUNS, TORQUES, Finder, Needs, without_torque
 from robotid.logs.data import (
     COLUMNS,
@@ -40,6 +42,7 @@ Readable = Log | str | Path | Frame
 
 _SI = LogUnits()
 _WHOLE = LogSource()
+_BASE = BaseColumns()
 
 
 def read_log(
@@ -55,6 +58,8 @@ def read_log(
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
     needs: Needs = "torque",
+    base: BaseColumns = _BASE,
+    passive: Collection[str] = (),
 ) -> Log:
     """Return the log in a file or a DataFrame, in SI units; its notes list ignored columns.
 
@@ -73,6 +78,9 @@ def read_log(
         source: The topic of a bag or group of a file, names of joints in it, quantity of effort.
         transmissions: The motors and gears, if the file has columns of motors.
         needs: Quantities that are required besides positions, as of ``lay_out``.
+        base: Columns of a floating base and of contacts; none if not stated.
+        passive: Joints without a drive, which need no torque; without a position, they are not
+            joints of the log.
 
     Raises:
         DataError: If a required column is missing, or the values look like other units.
@@ -81,7 +89,7 @@ def read_log(
     """
     layout, table = lay_out(
         path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
-        source=source, transmissions=transmissions, needs=needs,
+        source=source, transmissions=transmissions, needs=needs, base=base, passive=passive,
     )  # fmt: skip
     log = layout.to_log(table.read(layout.wanted))
     check_units(log, units, prismatic)
@@ -94,6 +102,8 @@ def read_logs(
     *,
     prismatic: Collection[str] = (),
     needs: Needs = "torque",
+    base: BaseColumns = _BASE,
+    passive: Collection[str] = (),
 ) -> tuple[Log, ...]:
     """Return the logs of a user, one or several; files and DataFrames are read.
 
@@ -102,6 +112,8 @@ def read_logs(
         joints: Names of the required joints, in the required order.
         prismatic: Names of prismatic joints; the others are revolute.
         needs: Quantities that are required besides positions, as of ``lay_out``.
+        base: As of ``read_log``.
+        passive: As of ``read_log``.
 
     Raises:
         DataError: If it is no log, or a required quantity is missing.
@@ -114,15 +126,16 @@ def read_logs(
     else:
         raise _no_log(given)
     return tuple(
-        _of_joints(log, joints, needs)
+        _of_joints(log, joints, "motion" if log.wrenches else needs, passive)
         if isinstance(log, Log)
-        else read_log(log, joints, prismatic=prismatic, needs=needs)
+        else read_log(log, joints, prismatic=prismatic, needs=needs, base=base, passive=passive)
         for log in logs
     )
 
 
-def _of_joints(log: Log, joints: Sequence[str], needs: Needs) -> Log:
+def _of_joints(log: Log, joints: Sequence[str], needs: Needs, passive: Collection[str] = ()) -> Log:
     """Return a log with its columns in the order of some joints, with all required quantities."""
+    joints = [joint for joint in joints if joint in log.joints or joint not in passive]
     if not log.has_torque and (needs == "torque" or (needs == "any" and log.q_ref is None)):
         raise DataError(f"{log.name} has no torque. {without_torque(log.q_ref is not None)}")
     if needs == "commands" and log.q_ref is None:
@@ -172,11 +185,12 @@ class LogLayout:
     motors: Mapping[str, tuple[bool, ...]]  # by kind: which columns are of motors
     gears: tuple[Transmission, ...]  # of the motors
     has_torque: bool  # whether the file has a torque or a current of any of the joints
+    base: BaseColumns = _BASE  # of a floating base and of contacts
 
     @property
     def wanted(self) -> list[str]:
         """Names of all columns to read."""
-        return [name for names in self.columns.values() for name in names]
+        return [name for names in self.columns.values() for name in names if name]
 
     def stamps(self, values: Array) -> Array:
         """Return time stamps in seconds, same shape.
@@ -196,8 +210,9 @@ class LogLayout:
         Raises:
             DataError: If a value is not finite, or time does not increase.
         """
+        nothing = np.zeros(len(table[self.columns["time"][0]]))  # torque of a passive joint
         values = {
-            kind: np.stack([table[name] for name in names], axis=1)
+            kind: np.stack([table[name] if name else nothing for name in names], axis=1)
             for kind, names in self.columns.items()
         }
         is_prismatic = np.isin(self.joints, self.prismatic)
@@ -211,6 +226,11 @@ class LogLayout:
                 values[kind] = values[kind] * np.where(is_length, 1.0, np.pi / 180)
             values[kind] = self._of_joints(kind, values[kind])
         t, where = self.stamps(values["time"][:, 0]), Path(self.path).name or "log"
+        base, flags = base_of(values, self.base.twist), values.pop("contact", None)
+        contacts = {} if flags is None else contacts_of(flags, self.base.contacts, where)
+        forces = values.pop("wrench", np.empty((0, 0)))
+        wrenches = dict(zip(self.base.wrenches, forces.T, strict=True))
+        values = {kind: array for kind, array in values.items() if not kind.startswith("base ")}
         for kind, array in values.items():
             names = ["time"] if kind == "time" else [f"{kind}_{joint}" for joint in self.joints]
             require_finite(array, t, names, where, first)
@@ -222,7 +242,7 @@ class LogLayout:
         arrays = {name: values[kind] for kind, name in COLUMNS.items() if kind in values}
         return Log(
             t=t, joints=self.joints, path=self.path, notes=self.notes, has_torque=has_torque,
-            **arrays,
+            base=base, contacts=contacts, wrenches=wrenches, **arrays,
         )  # fmt: skip
 
     def _of_joints(self, kind: str, values: Array) -> Array:
@@ -253,6 +273,8 @@ def lay_out(
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
     needs: Needs = "torque",
+    base: BaseColumns = _BASE,
+    passive: Collection[str] = (),
 ) -> tuple[LogLayout, Table]:
     """Return the layout of a log in a file, before its columns are read, and its open table.
 
@@ -269,6 +291,8 @@ def lay_out(
             "motion", none; "commands", a commanded position of every joint, and torques and other
             commands if every joint has them; "any", torques or commands, and both if every joint
             has them. Other quantities are ignored; torques that are not read are 0.
+        base: As of ``read_log``.
+        passive: As of ``read_log``.
 
     Raises:
         DataError: If a required column is missing.
@@ -305,11 +329,18 @@ def lay_out(
     check_transmissions(transmissions, joints)
     gears = tuple(transmissions)
     stated = {key: opened.renamed.get(name, name) for key, name in (columns or {}).items()}
+    of_base = base_columns(where, opened.names, base, stated)
+    of_joints = {x: y for x, y in stated.items() if y not in chain.from_iterable(of_base.values())}
     finder = Finder(
-        where, opened.names, stated, tuple(joints), gains or {}, source, gears, needs,
-        [*opened.notes],
+        where, opened.names, of_joints, tuple(joints), gains or {}, source, gears, needs,
+        [*opened.notes], passive=passive,
     )  # fmt: skip
-    found = finder.find_all()  # names of columns by kind
+    joints = [joint for joint in joints if joint not in passive or finder.has_position(joint)]
+    finder = replace(finder, joints=tuple(joints))
+    finder.seen.update(chain.from_iterable(of_base.values()))
+    if base.wrenches and needs in ("torque", "any") and not any(map(finder.has_torque, joints)):
+        finder = replace(finder, needs="motion")
+    found = finder.find_all() | of_base  # names of columns by kind
     layout = LogLayout(
         path=str(Path(path)) if isinstance(path, str | Path) else "",
         joints=tuple(joints),
@@ -322,6 +353,7 @@ def lay_out(
         motors={kind: finder.of_motors(kind) for kind in NOUNS},
         gears=gears,
         has_torque=any(finder.has_torque(joint) for joint in joints),
+        base=base,
     )
     return layout, opened
 
@@ -347,4 +379,5 @@ def write_log(log: Log, path: str | Path) -> None:
         values = getattr(log, name)
         if values is not None and (kind != "tau" or log.has_torque):
             table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
+    table |= table_of_base(log.base, log.contacts, log.wrenches)
     write_columns(table, Path(path))

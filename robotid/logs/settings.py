@@ -7,7 +7,7 @@ from typing import ClassVar
 from robotid._settings import NOT_NEGATIVE, POSITIVE, Range, Settings, require_kind, setting
 from robotid.exceptions import SettingsError
 
-__all__ = ["PER_SECOND", "LogSource", "LogUnits", "SignalSettings"]
+__all__ = ["PER_SECOND", "BaseSource", "LogSource", "LogUnits", "SignalSettings"]
 
 #: Number of each time unit in a second.
 PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
@@ -141,3 +141,16 @@ class LogSource(Settings):
         for joint, name in self.joints.items():
             if not isinstance(name, str):
                 raise SettingsError(f"log: joints.{joint} is {name!r}, wanted a name")
+
+
+@dataclass(frozen=True)
+class BaseSource(Settings):
+    """The motion of a floating base in a log file."""
+
+    _table: ClassVar[str] = "base"
+
+    twist: str = setting(
+        "base",
+        "axes of the velocities base_vx to base_wz: base, those of the base link, or world",
+        among=("base", "world"),
+    )

@@ -10,6 +10,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
+from robotid.logs.base import BaseMotion, base_state
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.filters import butterworth_poles, zero_phase
 from robotid.logs.friction_direction import acting_directions
@@ -24,6 +25,7 @@ _SETTLED = 42.0  # [time constants] after which a filter's transient is negligib
 _LONGEST = 8.0  # [periods of the filter] longest time of stiction
 _FINEST = 1000  # largest number of points of the uniform grid per row of the log
 _ALL = slice(None)
+_SPREAD = 1.0  # [periods of the filter] by which it spreads a force
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ def process_segments(
         segments. Its directions are those of Coulomb friction after the filter of the torque; None
         without speeds, and if they are the signs of the speeds.
     """
-    n = len(log.joints)
+    n, base = len(log.joints), 0 if log.base is None else 6
     is_sharp = settings.cutoff is None and settings.friction_band == 0
     ratios = np.empty((0, n)) if speeds is None or is_sharp else speeds
     parts, counts = [], []
@@ -79,12 +81,23 @@ def process_segments(
         part = _process_part(log, rows, segment, settings, first, own, ratios)
         counts.append(0 if part is None else len(part[0]))
         parts += [] if part is None else [part]
-    nothing = (np.empty(0), *[np.empty((0, n))] * 4, np.empty((0, len(ratios))))
-    t, q, v, a, tau, direction = (np.concatenate(x) for x in zip(nothing, *parts, strict=True))
+    empty = np.empty((0, base + n))
+    q0 = np.empty((0, n + (base and 7)))
+    nothing = (
+        np.empty(0), q0, empty, empty, empty, np.empty((0, len(ratios))),
+        np.empty((0, len(log.wrenches))),
+    )  # fmt: skip
+    t, q, v, a, tau, direction, wrenches = (
+        np.concatenate(x) for x in zip(nothing, *parts, strict=True)
+    )
+    contacts, switching = _contacts(log, t, settings) if log.contacts else (None, None)
     return Trajectory(
         t=t, q=q, v=v, a=a, tau=tau, joints=log.joints, rate=settings.rate,
         segment=np.repeat([segment.number for segment in segments], counts),
         direction=direction if len(ratios) else None,
+        contacts=contacts,
+        switching=switching,
+        wrenches=wrenches if log.wrenches else None,
     )  # fmt: skip
 
 
@@ -148,8 +161,8 @@ def _process_part(
     first: int,
     own: slice,
     speeds: Array,
-) -> tuple[Array, Array, Array, Array, Array, Array] | None:
-    """Return t, q, v, a, tau and direction of the own rows, None if there are none."""
+) -> tuple[Array, Array, Array, Array, Array, Array, Array] | None:
+    """Return t, q, v, a, tau, direction and wrenches of the own rows, None if there are none."""
     t = log.t[rows]
     if segment.rows < 5 or segment.end - segment.start <= 2 * settings.trim:
         return None
@@ -164,6 +177,10 @@ def _process_part(
         channels["v"] = log.v
     if settings.acceleration == "measured" and log.a is not None:
         channels["a"] = log.a
+    if log.base is not None:
+        channels |= _base_channels(log.base, settings)
+    if log.wrenches:
+        channels["wrenches"] = np.column_stack([*log.wrenches.values()])
     delay = {"tau": settings.torque_delay, "v": settings.velocity_delay}
     smooth = {
         name: low_pass(_resample(t - delay.get(name, 0.0), x[rows], times), grid.rate, settings)
@@ -183,8 +200,51 @@ def _process_part(
     chosen = np.flatnonzero(inside)
     if len(chosen) == 0:
         return None
-    q, tau = smooth["q"][chosen], smooth["tau"][chosen]
-    return times[chosen], q, v[chosen], a[chosen], tau, direction[chosen]
+    q, tau = smooth["q"], smooth["tau"]
+    if log.base is not None:
+        measured = smooth.get("twist"), smooth.get("base acceleration")
+        state = base_state(times, smooth["pose"], *measured)
+        q, v, a = (np.hstack(pair) for pair in zip(state, (q, v, a), strict=True))
+        tau = np.hstack([np.zeros((len(tau), 6)), tau])  # no torque acts on the base
+    wrenches = smooth.get("wrenches", np.empty((len(times), 0)))
+    arrays = times, q, v, a, tau, direction, wrenches
+    return tuple(x[chosen] for x in arrays)  # type: ignore[return-value]
+
+
+def _base_channels(base: BaseMotion, settings: SignalSettings) -> dict[str, Array]:
+    """Return the channels of a floating base by name, measured ones where the joints' are."""
+    channels = {"pose": base.pose}
+    if settings.velocity == "measured" and base.twist is not None:
+        channels["twist"] = base.twist
+    if settings.acceleration == "measured" and base.acceleration is not None:
+        channels["base acceleration"] = base.acceleration
+    return channels
+
+
+def _contacts(log: Log, t: Array, settings: SignalSettings) -> tuple[Array, Array]:
+    """Return which links may touch the ground at times (N, k), and where that changes (N,), bool.
+
+    A contact begins and ends between two rows of the log. The filter of the torque spreads its
+    force over a period before and after it: there, too, the force is unknown. Without a filter the
+    acceleration jumps between the two rows.
+    """
+    reach = _SPREAD / settings.cutoff if settings.cutoff else 0.0
+    reach += 1e-9 * float(log.t[-1] - log.t[0])
+    touching = np.zeros((len(t), len(log.contacts)), dtype=bool)
+    for k, flags in enumerate(log.contacts.values()):
+        edges = np.diff(flags.astype(np.int8), prepend=0, append=0)
+        first, last = np.flatnonzero(edges > 0) - 1, np.flatnonzero(edges < 0)
+        begins = log.t[first.clip(0)] - reach
+        ends = log.t[last.clip(max=len(flags) - 1)] + reach
+        begun = np.searchsorted(begins, t, side="right")
+        touching[:, k] = begun > np.searchsorted(ends, t, side="left")
+    changing = np.zeros(len(t), dtype=bool)
+    if not settings.cutoff:
+        flags = np.column_stack(list(log.contacts.values()))
+        rows = np.flatnonzero((flags[1:] != flags[:-1]).any(axis=1))
+        begun = np.searchsorted(log.t[rows] - reach, t, side="right")
+        changing = begun > np.searchsorted(log.t[rows + 1] + reach, t, side="left")
+    return touching, changing
 
 
 @dataclass(frozen=True)

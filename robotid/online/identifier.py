@@ -63,6 +63,7 @@ class OnlineIdentifier:
     def __init__(self, model: RobotModel, settings: OnlineSettings | None = None) -> None:
         require_kind(model, RobotModel, "model", "a robotid.RobotModel")
         require_kind(settings, (OnlineSettings, type(None)), "settings", "an OnlineSettings")
+        model.require_fixed("an online identification")
         if model.is_static:
             raise DataError("the model is static. An online identification needs dynamics = 'full'")
         self.model, self.settings = model, settings or OnlineSettings()

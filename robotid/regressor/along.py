@@ -24,6 +24,7 @@ def fixed_tree(model: RobotModel) -> Tree:
     """
     if model.free_flyer:
         raise DataError("the base floats; motion design requires a robot with a fixed base")
+    model.require_fixed("motion design")
     if (why := why_not(model)) is not None:
         raise SettingsError(f"{model.name}: no motion can be designed: {why}")
     return flatten(model)

@@ -29,6 +29,7 @@ __all__ = [
 #: Pivots below this share of the largest count as 0. Over example-robot-data, every pivot is above
 #: 1e-3 or below 1e-12, except with rounded angles in a URDF (3.1416): 1e-5 to 1e-6.
 RANK_TOLERANCE = 1e-4
+_CLOSED_RANK = 1e-9  # the same for closed chains, whose small motions have pivots down to 1e-6
 _TIE = 1e-6  # share by which each column is shortened relative to the one before it
 _FAINTEST = 1e-12  # norm of a column that is 0 at every state
 _PANEL = 24  # columns eliminated at a time
@@ -341,6 +342,7 @@ def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> Bas
         model.layout.names[:columns],
         scales=model.layout.scales(model.length)[:columns],
         preference=model.layout.preference()[:columns],
+        rtol=_CLOSED_RANK if model.loops else RANK_TOLERANCE,
         n_rows=model.n_rows,
     )
 

@@ -50,12 +50,15 @@ class Factors:
         columns: The columns of joint j, n arrays of shape (c_j,), ascending.
         rows: Number of rows folded in per joint, shape (n,), int.
         names: Names of the c columns.
+        is_projected: Whether constraint forces were eliminated from the rows: the rows of all
+            joints are mixed, and have one noise level.
     """
 
     triangles: tuple[Array, ...]
     columns: tuple[Array, ...]
     rows: Array
     names: tuple[str, ...]
+    is_projected: bool = False
 
     @property
     def R(self) -> Array:
@@ -80,7 +83,9 @@ class Factors:
             places = np.append(np.searchsorted(own, columns[remaining[-1]]), len(own))
             triangles.append(triangle_of(triangle[:, places]))
         names = tuple(self.names[i] for i in columns)
-        return Factors(tuple(triangles), tuple(remaining), self.rows, names)
+        return Factors(
+            tuple(triangles), tuple(remaining), self.rows, names, is_projected=self.is_projected
+        )
 
     def weighted(self, sigma: Array) -> Array:
         """Return one factor, shape (c + 1, c + 1), of all joints' rows [W_j tau_j] / sigma_j.
@@ -140,6 +145,19 @@ class Factors:
             left[:, -1] -= R[:, :-1] @ theta[own]
             triangles.append(left)
         return replace(self, triangles=tuple(triangles))
+
+    def noise_levels(self, theta: Array, freedom: Array) -> Array:
+        """Return the standard deviation of each joint's residual, shape (n,) [N m or N].
+
+        Args:
+            theta: Parameters, shape (c,).
+            freedom: Degrees of freedom of each joint's residual, shape (n,), positive.
+        """
+        squares = self.residual_squares(theta)
+        if self.is_projected:
+            squares, freedom = (np.full(len(x), x.sum()) for x in (squares, freedom))
+        levels: Array = np.sqrt(squares / freedom)
+        return levels
 
     def torque_squares(self) -> Array:
         """Return the sum of squared torques |tau_j|^2, shape (n,) [(N m)^2 or N^2]."""
@@ -221,6 +239,7 @@ class Reduction:
             "names": np.array(self.factors.names),
             "squares": self.squares,
             "samples": np.array(self.samples),
+            "is_projected": np.array(self.factors.is_projected),
         }
 
     @classmethod
@@ -236,6 +255,7 @@ class Reduction:
             tuple(arrays[f"columns_{j}"] for j in joints),
             rows,
             tuple(arrays["names"].tolist()),
+            is_projected=bool(arrays["is_projected"]),
         )
         return cls(factors, arrays["squares"], int(arrays["samples"]))
 
@@ -266,7 +286,7 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
         rows = _fold_blocks(triangles, columns, problem)
     found = tuple(triangle.R for triangle in triangles)
     _require_finite(found)
-    return Factors(found, tuple(columns), rows, problem.names)
+    return Factors(found, tuple(columns), rows, problem.names, is_projected=problem.is_projected)
 
 
 def compress_segments(
@@ -297,7 +317,9 @@ def compress_segments(
             rows = source.rows(start, min(start + length, source.samples))
             placed = zip(triangles, places, columns, strict=True)
             own = tuple(_placed(R, place, len(wanted) + 1) for R, place, wanted in placed)
-            found.append(Factors(own, columns, rows, problem.names))
+            found.append(
+                Factors(own, columns, rows, problem.names, is_projected=problem.is_projected)
+            )
     return tuple(found)
 
 
@@ -329,7 +351,7 @@ def merge(factors: Sequence[Factors]) -> Factors:
         triangles.append(total.R)
         columns.append(own)
     rows = np.sum([f.rows for f in factors], axis=0)
-    return Factors(tuple(triangles), tuple(columns), rows, first.names)
+    return replace(first, triangles=tuple(triangles), columns=tuple(columns), rows=rows)
 
 
 def gather(segments: Sequence[Factors], count: int) -> tuple[Factors, ...]:

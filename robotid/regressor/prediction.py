@@ -12,6 +12,7 @@ from robotid.findings import listed
 from robotid.logs.data import Trajectory, real_numbers
 from robotid.regressor.columns import friction_directions, trajectory_values
 from robotid.regressor.compiled import work_per_sample
+from robotid.regressor.constraints import without_forces
 from robotid.regressor.rows import BLOCK, COMPILED, InertialRows, TrajectoryRows, trajectory_rows
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
@@ -38,6 +39,8 @@ def predict(
 ) -> list[Array]:
     """Return the torque W theta, shape (N, n_rows) [N m, N], of each of several vectors.
 
+    Along a motion with constraints it is the torque that constraint forces cannot cause, P W theta.
+
     It is computed by the rows of the regressor for all vectors together, or, if the rows are not
     compiled and the vectors are few, by inverse dynamics, once per vector.
 
@@ -53,6 +56,16 @@ def predict(
     References:
         Luh, Walker, Paul (1980), On-Line Computational Scheme for Mechanical Manipulators.
     """
+    if trajectory.basis is None:
+        return _unconstrained(model, parameters, trajectory, compiled)
+    torques = _unconstrained(model, parameters, trajectory, compiled)
+    return [without_forces(trajectory.basis, torque) for torque in torques]
+
+
+def _unconstrained(
+    model: RobotModel, parameters: Sequence[Array], trajectory: Trajectory, compiled: bool | None
+) -> list[Array]:
+    """Return the torques with those that constraint forces cause; see ``predict``."""
     source = trajectory_rows(model, trajectory, None, compiled)
     if source.inertial is not None:
         return _from_kept(source, source.inertial, np.column_stack(list(parameters)))

@@ -98,6 +98,7 @@ class Problem:
         mass_stream: Starts a new pass over the regressors of the mass matrix of each block's
             samples, shape (k, n, n, c), or None if the problem has none.
         sources: The same rows joint by joint, in order; empty if there are only blocks.
+        is_projected: Whether constraint forces were eliminated from the rows, as of ``Factors``.
     """
 
     stream: Callable[[], Iterator[Block]]
@@ -106,6 +107,7 @@ class Problem:
     support: Array
     mass_stream: Callable[[], Iterator[Array]] | None = None
     sources: tuple[RowSource, ...] = ()
+    is_projected: bool = False
 
     def __post_init__(self) -> None:
         wanted = (self.n_joints, len(self.names))

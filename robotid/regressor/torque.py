@@ -12,8 +12,10 @@ from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import drive_values, friction_directions, instant_state
-from robotid.regressor.problem import Block, Problem
+from robotid.regressor.constraints import ProjectedRows, loop_basis, without_forces
+from robotid.regressor.problem import Block, Problem, RowSource
 from robotid.regressor.rows import BLOCK, kept_rows, trajectory_rows
+from robotid.robot.closure import Chains
 from robotid.robot.drives import TERMS, DriveMotion
 from robotid.robot.model import RobotModel
 
@@ -173,6 +175,7 @@ class InstantRegressor:
     def __init__(self, model: RobotModel, columns: Array) -> None:
         if model.free_flyer:
             raise DataError("the base floats, wanted a robot with a fixed base")
+        model.require_fixed("recursive identification")
         self._model, self._data = model, model.pin_model.createData()
         self._columns = np.asarray(columns)
         G = model.velocity_map
@@ -187,7 +190,7 @@ class InstantRegressor:
             (TERMS[name], layout.n_inertial + joints * count + k)
             for k, name in enumerate(layout.terms)
         ]
-        self._is_uniform = not (layout.couplings or layout.own)
+        self._is_uniform = not (layout.couplings or layout.own or layout.passive)
 
     def __call__(self, q: Array, v: Array, a: Array) -> Array:
         """Return the regressor of one sample, shape (n, c), as of ``joint_torque_regressor``.
@@ -252,8 +255,14 @@ def build_problem(
     Raises:
         DataError: If joints or shapes are not those of the model.
     """
-    source = trajectory_rows(model, trajectory, weight, compiled)
-    shape, weights = source.weights.shape, source.weights
+    own = trajectory_rows(model, trajectory, weight, compiled)
+    source: RowSource = own
+    weights, support = own.weights, own.support
+    if trajectory.basis is not None:
+        own = trajectory_rows(model, trajectory, None, compiled)
+        source = ProjectedRows(own, trajectory.basis, weights)
+        support = np.broadcast_to(support.any(axis=0), support.shape)
+    shape = weights.shape
     length = max(1, min(BLOCK, _BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
 
     def stream() -> Iterator[Block]:
@@ -262,6 +271,9 @@ def build_problem(
             m = trajectory
             direction, memory = (None if x is None else x[part] for x in (m.direction, m.memory))
             W = joint_torque_regressor(model, m.q[part], m.v[part], m.a[part], direction, memory)
+            if m.basis is not None:
+                Y = W.reshape(-1, model.n_rows, W.shape[1])
+                W = without_forces(m.basis[part], Y).reshape(W.shape)
             yield W, trajectory.tau[part].reshape(-1), weights[part].reshape(-1)
 
     def mass_stream() -> Iterator[Array]:
@@ -269,7 +281,10 @@ def build_problem(
             yield mass_regressor(model, trajectory.q[start : start + length])
 
     masses = mass_stream if with_mass else None
-    return Problem(stream, model.layout.names, model.n_rows, source.support, masses, (source,))
+    return Problem(
+        stream, model.layout.names, model.n_rows, support, masses, (source,),
+        is_projected=trajectory.basis is not None,
+    )  # fmt: skip
 
 
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
@@ -278,7 +293,8 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
     For a static model, the speeds of the states affect only the direction of friction.
 
     The states are scaled to the robot: speeds sqrt(g / length), accelerations g / length, so that
-    the ratio of gravity to inertia is the same for a finger and a crane.
+    the ratio of gravity to inertia is the same for a finger and a crane. The loops of the robot are
+    closed in them, and their forces eliminated from the rows.
 
     Args:
         model: The robot.
@@ -294,6 +310,11 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
     if model.layout.own:  # terms that only slow motion excites
         v *= 10.0 ** rng.uniform(-_DECADES, 0.0, v.shape)
     a = rng.uniform(-1, 1, (samples, n)) * unit * rate**2
+    if model.loops:
+        chains = Chains(model)
+        q, Z = chains.random_states(samples, rng)
+        v, a = (np.einsum("kij,kj->ki", Z, x) for x in (v, a))
+        a += chains.accelerations(q, v)
     if model.free_flyer:
         linear = np.array([model.length] * 3 + [1.0] * 3)
         quaternions = rng.standard_normal((samples, 4))
@@ -307,7 +328,12 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
     signs = friction_directions(model.layout, v, None)
     if model.is_static:
         v, a = 0.0 * v, 0.0 * a
-    return joint_torque_regressor(model, q, v, a, signs, memory)
+    W = joint_torque_regressor(model, q, v, a, signs, memory)
+    if not model.loops:
+        return W
+    return without_forces(loop_basis(model, q), W.reshape(samples, model.n_rows, -1)).reshape(
+        W.shape
+    )
 
 
 def _check_motion(model: RobotModel, q: Array, v: Array, a: Array) -> None:

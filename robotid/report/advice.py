@@ -257,7 +257,8 @@ def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     check = ""
     if any(cause.code in ("total_mass", "urdf_mismatch") for cause in causes):
         check = "Check the sign, the order and the unit of the torques and the URDF's masses. "
-    masses = f"{after:.4g} kg identified, {before:.4g} kg in the URDF"
+    source = "identified" if found.estimator.bounds.total_mass is None else "stated"
+    masses = f"{after:.4g} kg {source}, {before:.4g} kg in the URDF"
     if found.scale_check.is_total_determined:
         words = (
             f"{check}State the measured mass of the moving links to verify the torque scale: "
@@ -509,6 +510,7 @@ _AS_FOUND = (
     "active_bound",
     "com_outside",
     "constant_torque",
+    "contact_delay",
     "density",
     "drift",
     "gravity",
@@ -521,6 +523,7 @@ _AS_FOUND = (
     "joint_torque_delay",
     "lost_motion",
     "mass_matrix",
+    "moving_contact",
     "payload",
     "position_order",
     "position_sign",

@@ -163,7 +163,8 @@ def _friction_figures(found: Identification) -> dict[str, str]:
     for joint in found.model.row_names:
         chart = friction_chart(found, joint, split=split)
         if chart is None:
-            figures[joint] = f"<p>{escape(joint)}: no samples used.</p>\n"
+            why = "no drive" if joint in found.model.passive else "no samples used"
+            figures[joint] = f"<p>{escape(joint)}: {why}.</p>\n"
         else:
             caption = f"<strong>{escape(joint)}</strong>"
             figures[joint] = chart_html(replace(chart, height=_LOW), caption, still=_STILL)

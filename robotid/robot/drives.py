@@ -481,12 +481,12 @@ TERMS: dict[str, DriveTerm] = {
 DRIVE_TERMS = tuple(TERMS)
 
 
-#: The terms with shape parameters, and those that are in a model only if stated, by class.
+#: The terms with shape parameters, and those that a single joint may have, by class.
 TERM_CLASSES: dict[str, type[DriveTerm]] = {
     kind.__name__: kind
     for kind in (
-        Asymmetric, LoadFriction, Cubic, Stribeck, Tanh, Power, Ramp, Harmonic, PositionCoulomb,
-        Presliding, LuGre, Spring, Hat, Counterbalance, Lag,
+        Viscous, Coulomb, Asymmetric, LoadFriction, Cubic, Stribeck, Tanh, Power, Ramp, Harmonic,
+        PositionCoulomb, Presliding, LuGre, Spring, Hat, Counterbalance, Lag,
     )
 }  # fmt: skip
 

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
+from robotid.robot.closure import Chains
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import ParameterLayout
 
@@ -19,6 +20,7 @@ __all__ = [
 ]
 
 POSES = 10_000
+_CLOSED_POSES = 200
 _BLOCK = 200  # poses whose mass matrices are in memory together
 
 
@@ -45,10 +47,18 @@ def check_mass_matrix(
         model: The robot.
         pi: Standard parameters, shape (p,).
         poses: Number of poses, uniform within the joints' limits; a joint without limits has the
-            range +-pi rad or +-1 m.
+            range +-pi rad or +-1 m. With closed chains, fewer poses at which they close, and the
+            mass matrix of the permitted motion.
         seed: Seed of the poses.
     """
     rng = np.random.default_rng(seed)
+    if model.loops and not model.free_flyer:
+        q, Z = Chains(model).random_states(min(poses, _CLOSED_POSES), rng)
+        M = joint_mass_matrices(model, pi, q)
+        size = np.trace(M, axis1=1, axis2=2)[:, None, None]
+        M = Z @ M @ Z + np.abs(size) * (np.eye(M.shape[-1]) - Z)
+        least = np.linalg.eigvalsh(M)[:, 0]
+        return MassMatrixCheck(len(q), float(least.min()), float((least > 0).mean()))
     free = [1.0 if joint.type == "prismatic" else np.pi for joint in model.limits]
     lower = [j.lower if j.has_limits else -x for j, x in zip(model.limits, free, strict=True)]
     upper = [j.upper if j.has_limits else x for j, x in zip(model.limits, free, strict=True)]

@@ -16,6 +16,7 @@ from robotid._settings import require_each, require_flag, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.findings import listed
+from robotid.robot.constraints import Constraint, Contact, Loop, check_constraints
 from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveMotion, DriveTerm
 from robotid.robot.native_messages import caught_messages
 from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
@@ -52,6 +53,7 @@ class RobotModel:
             torque, shape (p,); None: those of the URDF.
         dynamics: "full", or "static" for logs of poses and slow motion: velocities and
             accelerations are used for the sign of friction only.
+        constraints: Contacts with the ground, and loops that close kinematic chains.
     """
 
     tree: Tree
@@ -64,6 +66,7 @@ class RobotModel:
     mimic: str
     reference: Array | None = None
     dynamics: str = "full"
+    constraints: tuple[Constraint, ...] = ()
 
     def __repr__(self) -> str:
         return (
@@ -86,6 +89,8 @@ class RobotModel:
         own_terms: Mapping[str, Sequence[DriveTerm]] = MappingProxyType({}),
         dynamics: str = "full",
         snap_angles: bool = False,
+        constraints: Sequence[Constraint] = (),
+        passive: Sequence[str] = (),
     ) -> "RobotModel":
         """Read a robot from a URDF. Meshes are not needed.
 
@@ -105,6 +110,10 @@ class RobotModel:
             dynamics: "full"; or "static" for gravity, with drive terms that act at zero speed.
             snap_angles: Whether rounded angles of joint origins, 3.1416, are replaced by the exact
                 multiple of pi/12; see ``exact_angle``.
+            constraints: Contacts with the ground, and loops that close kinematic chains; their
+                forces are unknown.
+            passive: Joints without a drive: their torque is 0, and they have no drive terms except
+                those in ``own_terms``.
 
         Returns:
             The model.
@@ -125,6 +134,7 @@ class RobotModel:
         for name in (*(joints or ()), *(locked or ())):
             require_kind(name, str, "one of joints or locked", "the name of a joint")
         require_each(terms, str, "terms", f"a list of some of {listed(DRIVE_TERMS)}")
+        require_each(passive, str, "passive", "a list of names of joints")
         require_each(couplings, Coupling, "couplings", "a list of robotid.Coupling")
         for name, own in own_terms.items():
             require_each(own, DriveTerm, f"own_terms of {name!r}", "a list of drive terms")
@@ -132,17 +142,14 @@ class RobotModel:
             require_flag(flag, name)
         tree = path if isinstance(path, Tree) else read_tree(path)
         tree = tree.snapped() if snap_angles else tree
+        check_constraints(constraints, tree.links, Path(tree.path).name)
         if mimic not in ("independent", "coupled"):
             raise ModelError(f"mimic is {mimic!r}, wanted 'independent' or 'coupled'")
         if dynamics not in DYNAMICS:
             raise ModelError(f"dynamics is {dynamics!r}, wanted one of {listed(DYNAMICS)}")
         if dynamics == "static":
             _check_gravity(gravity)
-            terms = [x for x in terms if x not in TERMS or _acts_at_rest(TERMS[x])]
-            own_terms = {
-                name: [term for term in own if _acts_at_rest(term)]
-                for name, own in own_terms.items()
-            }
+            terms, own_terms = _terms_at_rest(terms, own_terms)
         if not (tree.movable or free_flyer):
             raise ModelError(
                 f"{Path(tree.path).name}: robot {tree.name!r} has no movable joint, so there is "
@@ -168,9 +175,13 @@ class RobotModel:
             prismatic=frozenset(joint.name for joint in prismatic),
             strokes={j.name: j.upper - j.lower for j in prismatic if j.has_limits},
             own={name: tuple(terms) for name, terms in own_terms.items() if terms},
+            passive=frozenset(passive),
         )
         fixed = MappingProxyType(positions)
-        return cls(tree, reduced, layout, G, shift, free_flyer, fixed, mimic, dynamics=dynamics)
+        return cls(
+            tree, reduced, layout, G, shift, free_flyer, fixed, mimic,
+            dynamics=dynamics, constraints=tuple(constraints),
+        )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "locked": dict(self.locked)}
@@ -193,12 +204,27 @@ class RobotModel:
             "own_terms": {
                 name: [term.to_dict() for term in terms] for name, terms in self.layout.own.items()
             },
-        }
+        } | ({"passive": list(self.passive)} if self.passive else {})
 
     @property
     def is_static(self) -> bool:
         """Whether only poses at rest and slow motion are used."""
         return self.dynamics == "static"
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """The contacts with the ground, in the order of the constraints."""
+        return tuple(x for x in self.constraints if isinstance(x, Contact))
+
+    @property
+    def loops(self) -> tuple[Loop, ...]:
+        """The loops that close kinematic chains, in the order of the constraints."""
+        return tuple(x for x in self.constraints if isinstance(x, Loop))
+
+    @property
+    def passive(self) -> tuple[str, ...]:
+        """Names of the joints without a drive, in the order of q."""
+        return tuple(joint for joint in self.joints if joint in self.layout.passive)
 
     @property
     def name(self) -> str:
@@ -349,6 +375,19 @@ class RobotModel:
                 configuration[:, joint.idx_q] = angle
         return configuration
 
+    def require_fixed(self, what: str) -> None:
+        """Refuse a robot whose base floats, or that has contacts or loops.
+
+        Args:
+            what: What needs a fixed base, as "motion design".
+
+        Raises:
+            DataError: If it is such a robot.
+        """
+        if self.free_flyer or self.constraints:
+            found = "the base floats" if self.free_flyer else "the robot has contacts or loops"
+            raise DataError(f"{self.name}: {found}; {what} needs a robot with a fixed base")
+
     def support(self) -> Array:
         """Return which parameters can affect which row, shape (n_rows, p), bool.
 
@@ -370,6 +409,15 @@ class RobotModel:
         support = np.hstack([inertial, drive])
         support.flags.writeable = False
         return support
+
+
+def _terms_at_rest(
+    terms: Sequence[str], own_terms: Mapping[str, Sequence[DriveTerm]]
+) -> tuple[list[str], dict[str, list[DriveTerm]]]:
+    """Return the drive terms that act at rest."""
+    common = [x for x in terms if x not in TERMS or _acts_at_rest(TERMS[x])]
+    own = {name: [term for term in own if _acts_at_rest(term)] for name, own in own_terms.items()}
+    return common, own
 
 
 def _acts_at_rest(term: DriveTerm) -> bool:

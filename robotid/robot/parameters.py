@@ -71,12 +71,13 @@ class ParameterLayout:
 
     Attributes:
         bodies: Names of the bodies, one per movable joint (and one for a floating base).
-        joints: Names of the driven joints.
+        joints: Names of the joints that move.
         terms: The drive terms that are identified, names in ``TERMS`` in its order.
         couplings: Drives that move several joints.
         prismatic: Names of the prismatic joints.
         strokes: Ranges of the prismatic joints with limits, by name [m].
         own: Further terms of single drives, by the drive's name; they follow the others.
+        passive: Names of the joints without a drive, which have no terms but those in ``own``.
     """
 
     bodies: tuple[str, ...]
@@ -86,6 +87,7 @@ class ParameterLayout:
     prismatic: frozenset[str] = frozenset()
     strokes: Mapping[str, float] = field(default_factory=dict)
     own: Mapping[str, tuple[DriveTerm, ...]] = field(default_factory=dict)
+    passive: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         unknown = [term for term in self.terms if term not in TERMS]
@@ -117,12 +119,24 @@ class ParameterLayout:
                     f"coupling {coupling.name!r} has the name of a joint or of another drive, "
                     "wanted a unique name"
                 )
+        strange = sorted(self.passive - set(self.joints))
+        strange += [c.name for c in self.couplings if c.replaces and c.name in self.passive]
+        if strange:
+            raise SettingsError(
+                f"passive has {listed(strange)}, wanted joints that are identified and have no "
+                f"drive: some of {listed(self.joints)}"
+            )
         unknown = [name for name in self.own if name not in {d.name for d in self.drives}]
         if unknown:
             raise SettingsError(
                 f"terms are stated for {listed(unknown)}, wanted drives: "
                 f"{listed(drive.name for drive in self.drives)}"
             )
+
+        names = self.drive_names
+        if len(set(names)) < len(names):
+            twice = sorted({name for name in names if names.count(name) > 1})
+            raise SettingsError(f"{listed(twice)} is stated twice for one drive; remove one")
 
     @property
     def n_inertial(self) -> int:
@@ -174,7 +188,8 @@ class ParameterLayout:
     def drive_parameters(self) -> tuple[tuple[int, DriveTerm], ...]:
         """Index in ``drives`` of each drive parameter, and its term."""
         beside = len(self.drives) - len(self.joints)
-        shared = [self.terms] * len(self.joints) + [self.coupling_terms] * beside
+        shared = [() if joint in self.passive else self.terms for joint in self.joints]
+        shared += [self.coupling_terms] * beside
         return tuple(
             (d, term)
             for d, (drive, names) in enumerate(zip(self.drives, shared, strict=True))

@@ -245,6 +245,7 @@ class ClosedLoopRobot:
                 "mimic joints cannot be simulated. Fix the base, leave out [[coupling]], and set "
                 "mimic = 'independent'"
             )
+        model.require_fixed("simulation")
         if (why := why_not(model)) is not None:
             raise SettingsError(f"{model.name} cannot be simulated: {why}")
         self.model, self.step, self.corrects = model, step, corrects

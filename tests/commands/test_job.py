@@ -1,19 +1,25 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from robotid.commands.job import Job, job_from_settings, read_job
 from robotid.exceptions import SettingsError
+from robotid.logs.data import Log
+from robotid.logs.read import write_log
 from robotid.logs.settings import LogSource
+from robotid.robot.constraints import Loop
 from robotid.robot.drives import DRIVE_TERMS
 from robotid.robot.families import AUTO
 from robotid.robot.model import GRAVITY
 from robotid.robot.parameters import Coupling
+from tests.helpers.closed_chains import FOUR_BAR, FOUR_BAR_LOOP
 
 FULL = """
 urdf = "robot.urdf"
 joints = ["a", "b"]
 locked = { c = 0.8 }
+passive = ["b"]
 gravity = [0.0, -9.81, 0.0]
 
 [signals]
@@ -53,6 +59,10 @@ motors = ["m", "n"]
 matrix = [[32, 0], [45, 45]]
 efficiency = [0.9, 1.0]
 
+[[loop]]
+frames = ["hand", "rod"]
+kind = "point"
+
 [estimator]
 name = "wls"
 
@@ -87,6 +97,8 @@ def test_every_key_of_a_job_arrives(tmp_path):
     assert job.units.time == "ms"
     assert job.source == LogSource("/arm", joints={"a": "M1"}, effort="current", stamp="log")
     assert job.couplings == (Coupling("motor", (("a", 1.0), ("b", -1.0))),)
+    assert job.loops == (Loop(("hand", "rod"), "point"),)
+    assert job.passive == ("b",)
     (gear,) = job.transmissions
     assert (gear.motors, gear.efficiency) == (("m", "n"), (0.9, 1.0))
     assert gear.T.tolist() == [[32.0, 0.0], [45.0, 45.0]]
@@ -130,7 +142,12 @@ WRONG = {
     "gain": ("a = 14.87", 'a = "14.87"', "gains.a is '14.87', wanted a number"),
     "one bracket": ("[[validation]]", "[validation]", "wanted tables written as [[validation]]"),
     "no log": ('log = "val.parquet"', "end = 2.0", "a [[validation]] has no key 'log'"),
-    "floating base": ("[signals]", "free_flyer = true\n[signals]", "free_flyer is true, but no"),
+    "loop's kind": ('"point"', '"ball"', "loop hand, rod is 'ball', wanted one of point, hinge"),
+    "loop's frames": ('["hand", "rod"]', '["hand"]', "loop has the frames hand, wanted two links"),
+    "no frames": ('frames = ["hand", "rod"]', "", "loop has the frames none, wanted two links"),
+    "loop's axis": ('"point"', '"hinge"\naxis = [0, 1]', "is (0, 1), wanted x, y, z"),
+    "axis as text": ('"point"', '"hinge"\naxis = "z"', "axis is 'z', wanted a list"),
+    "passive": ('passive = ["b"]', 'passive = "b"', "passive is 'b', wanted a list"),
     "no urdf": ('urdf = "robot.urdf"', "", "has no key 'urdf'"),
     "joints text": ('joints = ["a", "b"]', 'joints = "a"', "joints is 'a', wanted a list"),
     "unit": ('time = "ms"', 'time = "sec"', "time is 'sec', wanted one of"),
@@ -216,3 +233,23 @@ def test_a_controller_that_the_estimator_does_not_read_is_refused(tmp_path):
         job_from_settings(table, "job.toml", tmp_path)
     table["estimator"] = {"name": "simulation"}
     assert job_from_settings(table, "job.toml", tmp_path).controller.kp == 20.0
+
+
+def test_a_job_of_a_closed_chain_reads_the_log_of_its_driven_joint(tmp_path):
+    (tmp_path / "bars.urdf").write_text(FOUR_BAR)
+    t = np.linspace(0.0, 1.0, 20)
+    write_log(Log(t, t[:, None], t[:, None], ("drive",)), tmp_path / "log.csv")
+    table = {
+        "urdf": "bars.urdf",
+        "passive": ["elbow", "pivot"],
+        "loop": [{"frames": ["coupler_end", "rocker_end"]}],
+        "drives": {"pivot": [{"term": "Viscous"}]},
+        "identification": [{"log": "log.csv"}],
+    }
+    job = job_from_settings(table, "job.toml", tmp_path)
+    model = job.model()
+    assert model.loops == (FOUR_BAR_LOOP,)
+    assert model.passive == ("elbow", "pivot")
+    assert model.layout.drive_names[-1] == "pivot.viscous"
+    assert job.read(job.identification[0], model).joints == ("drive",)
+    assert job_from_settings(job.to_dict(), "result.json", Path()) == job

@@ -60,7 +60,7 @@ def motion(model, rng, samples, reach=3.0, direction=None):
     values |= {"direction": direction, "memory": None}
     if model.free_flyer:  # logs of a floating base are not read yet
         pose = np.array([pin.SE3ToXYZQUAT(pin.SE3.Random()) for _ in range(samples)])
-        return SimpleNamespace(q=np.hstack([pose, q]), derived={}, **values)
+        return SimpleNamespace(q=np.hstack([pose, q]), derived={}, basis=None, **values)
     return Trajectory(q=q, rate=100.0, segment=np.zeros(samples, dtype=int), **values)
 
 

@@ -327,7 +327,8 @@ def test_a_verdict_is_given_all_that_is_known_of_a_result(monkeypatch):
         "metrics": lambda: "fitted", "predictions": {"c": 1}, "fitted": ("f",),
         "model": SimpleNamespace(joints=("x", "y"), is_static=True), "refitted": refitted,
         "determination": SimpleNamespace(undetermined=("u",)), "is_consistent": False,
-        "_uncertain_drives": ["d"], "is_poorly_excited": "poorly", "log_errors": ("e",), "warnings": ("w",), "scale_check": "s",
+        "_uncertain_drives": ["d"], "is_poorly_excited": "poorly", "log_errors": ("e",),
+        "warnings": ("w",), "scale_check": "s",
     }  # fmt: skip
     predictions, determined, named = Identification.verdict.func(SimpleNamespace(**own))
     assert predictions == Predictions(

@@ -205,7 +205,8 @@ def test_drives_are_drawn_beside_what_was_before():
     np.testing.assert_array_equal(mass.series[1].half, [1.0, np.nan])
     assert (slide.series[1].y.tolist(), slide.series[1].half.tolist()) == ([5.0], [1.5])
     assert [(c.x_names, c.y_label) for c in (mass, turn, slide)] == [
-        (("a", "b"), "armature [kg m^2]"), (("j",), "viscous [N m s/rad]"), (("k",), "viscous [N s/m]"),
+        (("a", "b"), "armature [kg m^2]"), (("j",), "viscous [N m s/rad]"),
+        (("k",), "viscous [N s/m]"),
     ]  # fmt: skip
 
 

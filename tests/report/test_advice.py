@@ -15,6 +15,7 @@ from robotid.diagnosis.misfit import Misfit
 from robotid.diagnosis.misfit_findings import misfit_findings, setting_of
 from robotid.findings import Finding
 from robotid.fitting.joint_motion import JointMotion
+from robotid.fitting.settings import ConsistentSettings
 from robotid.judgement.verdict import WARNING_CODES
 from robotid.report.advice import Origin, loop_steps, next_steps
 from robotid.robot.examples import example_urdf
@@ -323,6 +324,9 @@ def test_figures_in_steps_are_those_of_all_findings_and_of_the_result(identified
     before, after = (pi[:60:10].sum() for pi in (identified.prior, identified.standard))
     step = next_steps(told(identified, warning("total_mass", "robot")), JOB)[0]
     assert f"({after:.4g} kg identified, {before:.4g} kg in the URDF)" in step.words
+    found = told(identified, warning("total_mass", "robot"))
+    found = replace(found, estimator=ConsistentSettings(constraints={"total_mass": 31.5}))
+    assert f"({after:.4g} kg stated, {before:.4g} kg" in next_steps(found, JOB)[0].words
     weighed = replace(identified.scale_check, is_total_determined=True)
     found = told(identified, warning("total_mass", "robot"))
     found.__dict__["scale_check"] = weighed

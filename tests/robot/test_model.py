@@ -2,8 +2,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.exceptions import ModelError
+from robotid.exceptions import DataError, ModelError
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf, example_urdfs
 from robotid.robot.model import RobotModel
 
@@ -208,3 +209,16 @@ def test_an_example_robot_is_found_by_name():
     assert example_urdf("panda.urdf").is_file()
     with pytest.raises(ModelError, match=r"example-robot-data has no 'panda7.urdf'"):
         example_urdf("panda7.urdf")
+
+
+def test_what_needs_a_fixed_base_is_refused_for_other_robots(tmp_path):
+    urdf = example_urdf("solo12.urdf")
+    RobotModel.from_urdf(urdf).require_fixed("a preview")
+    for options, found in (
+        ({"free_flyer": True}, "the base floats"),
+        ({"constraints": [Contact("FL_FOOT")]}, "the robot has contacts or loops"),
+    ):
+        model = RobotModel.from_urdf(urdf, **options)
+        message = f"solo: {found}; a preview needs a robot with a fixed base"
+        with pytest.raises(DataError, match=message.replace("solo", model.name)):
+            model.require_fixed("a preview")

@@ -250,7 +250,7 @@ class Programme:
             x = scipy.linalg.cho_solve(factor, U.T @ left.score(np.zeros(len(U)), weights))
             used = weights * left.leverages(U @ scipy.linalg.cho_solve(factor, U.T))
             freedom = np.maximum(rows - used / share, _LEAST_FREEDOM * rows)
-            updated = np.maximum(np.sqrt(left.residual_squares(U @ x) / freedom), least)
+            updated = np.maximum(left.noise_levels(U @ x, freedom), least)
             change = float(np.max(np.abs(updated / sigma - 1.0)))
             sigma = updated
             if change < _NOISE_SETTLED:

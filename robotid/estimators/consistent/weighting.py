@@ -110,7 +110,7 @@ def choose_weight(fit: Consistent, segments: Segments, how: str) -> WeightChoice
         except NotConvergedError:
             if starts is None:
                 raise
-            return float("inf"), np.full((len(segments.folds), len(segments.sigma)), np.inf)
+            return float("inf"), np.full((len(segments.folds), 1), np.inf)
         return float(np.exp(0.5 * np.log(_by_joint(errors)).mean())), errors
 
     return replace(_search(score, how, smallest), plausible=by_evidence.plausible)
@@ -169,7 +169,8 @@ def held_out_errors(
     Returns:
         Sums of squared prediction errors by segment and joint, over the square of the joint's noise
         level and its number of rows in all segments, shape (segments, n) [-]: the sum over segments
-        is the mean square of each joint. And the fits, as initial values of other fits.
+        is the mean square of each joint. Rows that are projected together count as one joint. And
+        the fits, as initial values of other fits.
 
     Raises:
         DataError: If there are fewer than two segments.
@@ -182,9 +183,12 @@ def held_out_errors(
         )
     fits = fit.programme.minimise_each(segments.others, weight, is_exact=False, starts=starts)
     pairs = zip(segments.folds, fits, strict=True)
-    squares = [fold.residual_squares(fit.K @ x.x) / segments.sigma**2 for fold, x in pairs]
+    squares = np.array([fold.residual_squares(fit.K @ x.x) for fold, x in pairs])
+    squares /= segments.sigma**2
     rows = np.sum([fold.rows for fold in segments.folds], axis=0)  # (n,)
-    return np.array(squares) / np.maximum(rows, 1), fits
+    if segments.folds[0].is_projected:
+        squares, rows = squares.sum(axis=1, keepdims=True), rows.sum(keepdims=True)
+    return squares / np.maximum(rows, 1), fits
 
 
 def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:

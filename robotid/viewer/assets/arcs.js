@@ -72,6 +72,7 @@ class Arc { // around a joint's axis, or a bar along it; grows with the torque f
 
 const arcs = [];
 let showsArcs = true, tints = false;
+const inkOfArcs = () => (darkness.matches ? "#e9edf2" : "#1c2126");
 if (isTorque && viewer) {
   const crowd = Math.min(1, 3 / Math.sqrt(count)); // many joints have small arcs
   const radius = crowd * Math.max(0.06 * data.scene.reach, 0.05 * data.view.radius);
@@ -79,8 +80,12 @@ if (isTorque && viewer) {
     const joint = robot.joints[node];
     arcs.push({
       measured: new Arc(joint, radius, 0.12 * radius, UNSURE, true),
-      predicted: predictions ? new Arc(joint, 0.72 * radius, 0.06 * radius, "#1c2126", false) : null,
+      predicted: predictions ? new Arc(joint, 0.72 * radius, 0.06 * radius, inkOfArcs(), false) : null,
     });
+  });
+  darkness.addEventListener("change", () => {
+    arcs.forEach(({ predicted }) => predicted && predicted.material.color.set(inkOfArcs()));
+    viewer.set_dirty();
   });
 }
 

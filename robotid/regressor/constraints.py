@@ -1,0 +1,214 @@
+"""Elimination of unknown constraint forces: contacts with the ground and closed chains.
+
+With the Jacobian J of the constraints, W pi = tau + J^T f with the forces f. The rows are
+projected orthogonally to the columns of J^T of unknown forces, P W pi = P tau with P = I - B B^T
+and B an orthonormal basis of these columns. The forces disappear, and as many equations as they
+have components. A force of 1 N counts as much as a torque of 1 N m.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._typing import Array
+from robotid.logs.base import BaseColumns
+from robotid.logs.data import Trajectory
+from robotid.regressor.problem import RowSource
+from robotid.robot.constraints import Contact, frame_id
+from robotid.robot.model import RobotModel
+
+__all__ = [
+    "ProjectedRows",
+    "constrained",
+    "constraint_jacobian",
+    "force_basis",
+    "logged_base",
+    "loop_basis",
+    "without_forces",
+]
+
+_RANK = 1e-8  # singular values below this share of the largest are of dependent constraints
+_BLOCK = 1024  # samples whose Jacobians are in memory together
+
+
+def constraint_jacobian(model: RobotModel, q: Array, contacts: Array) -> Array:
+    """Return the Jacobian of a robot's constraints at each sample, shape (N, m, n_rows).
+
+    Args:
+        model: The robot; its contacts have the axes of the world, its loops likewise.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+        contacts: Which contacts touch the ground, shape (N, k), bool; the rows of others are 0.
+
+    Raises:
+        DataError: If the shape of q is not that of the model.
+    """
+    pin_model, G = model.pin_model, model.velocity_map
+    data, axes = pin_model.createData(), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    frames = [[frame_id(pin_model, link) for link in x.frames] for x in model.constraints]
+    edges = np.cumsum([0, *(x.sizes[x.kind] for x in model.constraints)])
+    place = {x: k for k, x in enumerate(c for c in model.constraints if isinstance(c, Contact))}
+    J = np.zeros((len(q), edges[-1], model.n_rows))
+    for k, q_k in enumerate(np.ascontiguousarray(model.configurations(q))):
+        pin.computeJointJacobians(pin_model, data, q_k)
+        for x, ids, first, stop in zip(model.constraints, frames, edges, edges[1:], strict=False):
+            if x in place and not contacts[k, place[x]]:
+                continue
+            own = [pin.getFrameJacobian(pin_model, data, i, axes) for i in ids]
+            rotation = pin.updateFramePlacement(pin_model, data, ids[0]).rotation
+            J[k, first:stop] = x.rows(own, rotation) @ G
+    return J
+
+
+def force_basis(J: Array, used: Array) -> Array:
+    """Return orthonormal bases of the torques that unknown constraint forces can cause.
+
+    Args:
+        J: Jacobians of the constraints, shape (N, m, n_rows).
+        used: Rows used, shape (N, n_rows), bool: the torques are those in these rows.
+
+    Returns:
+        B with columns of length 1 or 0, shape (N, n_rows, k), k the smaller of m and n_rows.
+    """
+    A = J.swapaxes(1, 2) * used[:, :, None]
+    parts = []
+    for start in range(0, len(A), _BLOCK):
+        U, s, _ = np.linalg.svd(A[start : start + _BLOCK], full_matrices=False)
+        is_independent = s > _RANK * s.max(axis=1, keepdims=True, initial=1e-300)
+        parts.append(U * is_independent[:, None])
+    return np.concatenate(parts) if parts else A
+
+
+def loop_basis(model: RobotModel, q: Array) -> Array:
+    """Return bases of the torques that the forces of loops can cause, as of ``force_basis``.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+    """
+    J = constraint_jacobian(replace(model, constraints=model.loops), q, np.ones((len(q), 0)))
+    return force_basis(J, np.ones((len(q), model.n_rows), dtype=bool))
+
+
+def without_forces(basis: Array, rows: Array) -> Array:
+    """Return rows orthogonal to the torques of constraint forces, same shape.
+
+    Args:
+        basis: As of ``force_basis``, shape (N, n_rows, m).
+        rows: Torques, shape (N, n_rows), or regressors, shape (N, n_rows, c).
+    """
+    if rows.ndim == 2:
+        return without_forces(basis, rows[..., None])[..., 0]
+    projected: Array = rows - basis @ (basis.swapaxes(1, 2) @ rows)
+    return projected
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedRows(RowSource):
+    """Rows of a trajectory without the torques of its constraint forces; see ``RowSource``.
+
+    Every row has the columns of all rows. The count of rows is that of independent equations, the
+    sum of the diagonal of P.
+
+    Attributes:
+        own: The rows before the projection, not weighted.
+        basis: As of ``force_basis``.
+        weights: Weight of each row, shape (N, n_rows).
+    """
+
+    own: RowSource
+    basis: Array
+    weights: Array
+
+    @property
+    def samples(self) -> int:
+        return self.own.samples
+
+    @property
+    def is_parallel(self) -> bool:
+        return self.own.is_parallel
+
+    @cached_property
+    def columns(self) -> tuple[Array, ...]:
+        every: Array = np.unique(np.concatenate(self.own.columns))
+        return tuple([every] * self.weights.shape[1])
+
+    def rows(self, start: int, stop: int) -> Array:
+        k = slice(start, stop)
+        left = 1.0 - np.sum(self.basis[k] ** 2, axis=2)  # (k, n_rows), diagonal of P
+        count: Array = np.rint(np.sum(left, axis=0, where=self.weights[k] > 0)).astype(int)
+        return count
+
+    def select(self, columns: Array) -> "ProjectedRows":
+        return replace(self, own=self.own.select(columns))
+
+    def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
+        every, n = self.columns[0], self.weights.shape[1]
+        places = [np.append(np.searchsorted(every, own), len(every)) for own in self.own.columns]
+        for block in self.own.blocks(start, stop, segment):
+            k = slice(start, start := start + len(block[0]))
+            X = np.zeros((len(block[0]), n, len(every) + 1))
+            for j, (place, rows) in enumerate(zip(places, block, strict=True)):
+                X[:, j, place] = rows
+            X = without_forces(self.basis[k], X) * np.sqrt(self.weights[k])[..., None]
+            yield [np.asfortranarray(X[:, j]) for j in range(n)]
+
+
+def constrained(
+    model: RobotModel, motion: Trajectory, used: Array, *, has_torque: bool = True
+) -> tuple[Trajectory, Array]:
+    """Return a motion with torques without those of constraint forces, and the rows used.
+
+    Torques of measured forces are subtracted, those of unknown forces are eliminated. Rows in which
+    nothing remains, and samples at which a contact changes, are not used.
+
+    Args:
+        model: The robot.
+        motion: Its motion, with contacts and wrenches.
+        used: Rows used for other reasons, shape (N, n_rows), bool.
+        has_torque: Whether torques of the joints were measured; else their rows are not used.
+    """
+    if not has_torque:
+        used = used & (np.arange(model.n_rows) < model.n_rows - len(model.joints))
+    if not model.constraints:
+        return motion, used
+    N = len(motion.t)
+    contacts = np.ones((N, len(model.contacts)), dtype=bool)
+    if motion.contacts is not None:
+        contacts[:, [not x.always for x in model.contacts]] = motion.contacts
+    if motion.switching is not None:
+        used = used & ~motion.switching[:, None]
+    J = constraint_jacobian(model, motion.q, contacts)
+    known, tau = _measured(model), motion.tau
+    if motion.wrenches is not None:
+        tau = tau + np.einsum("kmj,km->kj", J[:, known], motion.wrenches)
+    basis = force_basis(np.delete(J, known, axis=1), used)
+    used = used & (np.sum(basis**2, axis=2) < 1.0 - _RANK)
+    return motion.projected(basis, without_forces(basis, tau)), used
+
+
+def logged_base(model: RobotModel, twist: str = "base") -> BaseColumns:
+    """Return the columns of a floating base and of contacts that logs of a robot have.
+
+    Args:
+        model: The robot.
+        twist: Axes of the velocities of the base: "base" or "world".
+    """
+    return BaseColumns(
+        model.free_flyer,
+        tuple(x.frame for x in model.contacts if not x.always),
+        tuple(f"{part} {x.frame}" for x in model.contacts for part in x.measured),
+        twist,
+    )
+
+
+def _measured(model: RobotModel) -> list[int]:
+    """Return the rows of the Jacobian whose forces are measured."""
+    rows, first = [], 0
+    for x in model.constraints:
+        if isinstance(x, Contact):
+            rows += [first + k for k in x.rows_measured]
+        first += x.sizes[x.kind]
+    return rows

@@ -1,0 +1,201 @@
+"""Closed kinematic chains: positions at which loops close, and random states of a closed tree."""
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._typing import Array
+from robotid.exceptions import ModelError
+from robotid.findings import listed
+from robotid.robot.constraints import frame_id
+from robotid.robot.model import RobotModel
+
+__all__ = ["Chains"]
+
+_CLOSED = 1e-6  # largest error of a closed loop, relative to the length of the robot
+_MOST = 30  # iterations of Newton's method
+_SETTLED = 1e-8  # [rad, m] step with which it ends: the error is about its square
+_FAR = 1e3  # [rad, m] step with which it fails
+_RANK = 1e-8  # singular values below this share of the largest are of dependent loops
+_PATH = 25  # steps from the zero position to the first one
+_STEP = 0.25  # [rad, or robot lengths] standard deviation of a step of the random walk
+_APART = 4  # steps of the walk between two states
+
+
+class Chains:
+    """The loops of a robot as equations of its n joint coordinates; the base has no effect.
+
+    Args:
+        model: The robot, with at least one loop.
+    """
+
+    def __init__(self, model: RobotModel) -> None:
+        self._model, self._data = model, model.pin_model.createData()
+        self._first = model.n_rows - len(model.joints)
+        self._ids = [[frame_id(model.pin_model, x) for x in loop.frames] for loop in model.loops]
+        sizes = [loop.sizes[loop.kind] for loop in model.loops]
+        self._loop = np.repeat(np.arange(len(sizes)), sizes)
+        is_angle = np.concatenate([np.arange(size) >= 3 for size in sizes])
+        self._unit = np.where(is_angle, model.length, 1.0)  # from rad to m
+        self._is_long = np.isin(model.joints, list(model.layout.prismatic))
+
+    def gaps(self, q: Array) -> Array:
+        """Return the error of each loop at each sample, shape (N, loops) [m].
+
+        Angles are multiplied by the length of the robot.
+
+        Args:
+            q: Joint coordinates, shape (N, n) [rad, m].
+        """
+        loops = range(len(self._ids))
+        errors = np.array([self._equations(x)[0] for x in q]).reshape(len(q), -1)
+        found: Array = np.stack(
+            [np.linalg.norm(errors[:, self._loop == k], axis=1) for k in loops], axis=1
+        )
+        return found
+
+    def closed(self, q: Array, unknown: Array) -> Array:
+        """Return coordinates at which the loops close, shape (N, n).
+
+        The first ones are found on a path from the closed position nearest to 0, which states how
+        the chains are assembled; each of the others from the one before it. From the first sample
+        at which the loops do not close, the coordinates are constant; see ``gaps``.
+
+        Args:
+            q: Joint coordinates, shape (N, n) [rad, m]; those of unknown joints are not used.
+            unknown: Which joints are computed, shape (n,), bool; the others remain.
+
+        Raises:
+            ModelError: If the loops do not close near the zero position, or do not determine the
+                unknown joints.
+        """
+        x, found = self._assembled(), q.copy()
+        singular = np.linalg.svd(self._equations(x)[1][:, unknown], compute_uv=False)
+        if np.sum(singular > _RANK) < unknown.sum():
+            names = [self._model.joints[j] for j in np.flatnonzero(unknown)]
+            raise ModelError(
+                f"the loops do not determine the positions of {listed(names)}; log them"
+            )
+        begin = x[~unknown]
+        for part in np.linspace(0.0, 1.0, _PATH + 1)[1:]:
+            x[~unknown] = begin + part * (q[0, ~unknown] - begin)
+            x = self._newton(x, unknown)
+        for k, own in enumerate(q):
+            x[~unknown] = own[~unknown]
+            found[k] = x = self._newton(x, unknown)
+            if not self.is_closed(x):
+                found[k:] = x
+                break
+        return found
+
+    def is_closed(self, x: Array) -> bool:
+        """Return whether the loops close at coordinates to the accuracy of the computation.
+
+        Args:
+            x: Joint coordinates, shape (n,) [rad, m].
+        """
+        return bool(self.gaps(x[None]).max() <= _CLOSED * self._model.length)
+
+    def random_states(self, samples: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Return random states: coordinates (N, n) at which the loops close, and Z (N, n, n).
+
+        A random walk keeps the chains assembled as in the zero position. Z v are speeds that the
+        loops permit, Z is an orthogonal projector.
+
+        Args:
+            samples: Number N of states.
+            rng: Random generator.
+        """
+        n = len(self._model.joints)
+        every, size = np.ones(n, dtype=bool), np.where(self._is_long, self._model.length, 1.0)
+        q, Z = np.empty((samples, n)), np.empty((samples, n, n))
+        x = self._assembled()
+        for k in range(samples):
+            for _ in range(_APART):
+                step = _permitted(self._equations(x)[1]) @ (rng.standard_normal(n) * _STEP)
+                x = self._newton(x + size * step, every)
+            q[k], Z[k] = x, _permitted(self._equations(x)[1])
+        return q, Z
+
+    def accelerations(self, q: Array, v: Array) -> Array:
+        """Return accelerations that keep closed loops closed, the smallest ones, shape (N, n).
+
+        Args:
+            q: Joint coordinates at which the loops close, shape (N, n) [rad, m].
+            v: Speeds that the loops permit, shape (N, n) [rad/s, m/s].
+        """
+        a = np.empty_like(v)
+        for k, (q_k, v_k) in enumerate(zip(q, v, strict=True)):
+            a[k] = _least(self._equations(q_k)[1], self._drift(q_k, v_k))
+        return a
+
+    def _assembled(self) -> Array:
+        """Return the closed position that is nearest to 0, shape (n,)."""
+        n = len(self._model.joints)
+        x = self._newton(np.zeros(n), np.ones(n, dtype=bool))
+        if not self.is_closed(x):
+            gaps = self.gaps(x[None])[0]
+            worst = self._model.loops[gaps.argmax()]
+            raise ModelError(
+                f"loop {worst.name} ({worst.kind}) does not close near the zero position: "
+                f"{gaps.max():.3g} m remain; correct its frames, its kind or its axis"
+            )
+        return x
+
+    def _newton(self, x: Array, unknown: Array) -> Array:
+        x = x.copy()
+        for _ in range(_MOST):
+            error, J = self._equations(x)
+            step = _least(J[:, unknown], error)
+            x[unknown] += step
+            if not _SETTLED * (1.0 + np.linalg.norm(x)) < np.linalg.norm(step) < _FAR:
+                break
+        return x
+
+    def _equations(self, x: Array) -> tuple[Array, Array]:
+        """Return the errors of the loops, shape (m,) [m], and their Jacobian, shape (m, n)."""
+        pin_model, data, axes = self._model.pin_model, self._data, pin.LOCAL_WORLD_ALIGNED
+        pin.computeJointJacobians(pin_model, data, self._configuration(x))
+        pin.updateFramePlacements(pin_model, data)
+        errors, rows = [], []
+        for loop, ids in zip(self._model.loops, self._ids, strict=True):
+            own = [pin.getFrameJacobian(pin_model, data, i, axes) for i in ids]
+            places = [data.oMf[i] for i in ids]
+            errors.append(loop.error(places))
+            rows.append(loop.rows(own, places[0].rotation))
+        J = np.vstack(rows) @ self._model.velocity_map[:, self._first :]
+        return self._unit * np.concatenate(errors), self._unit[:, None] * J
+
+    def _drift(self, x: Array, v: Array) -> Array:
+        """Return dJ/dt v, shape (m,)."""
+        pin_model, data, axes = self._model.pin_model, self._data, pin.LOCAL_WORLD_ALIGNED
+        w = self._model.velocity_map[:, self._first :] @ v
+        pin.forwardKinematics(pin_model, data, self._configuration(x), w, 0.0 * w)
+        pin.updateFramePlacements(pin_model, data)
+        found = []
+        for loop, ids in zip(self._model.loops, self._ids, strict=True):
+            of_frames = [
+                pin.getFrameClassicalAcceleration(pin_model, data, i, axes).vector for i in ids
+            ]
+            speeds = [pin.getFrameVelocity(pin_model, data, i, axes).angular for i in ids]
+            found.append(loop.drift(of_frames, speeds, data.oMf[ids[0]].rotation))
+        drift: Array = self._unit * np.concatenate(found)
+        return drift
+
+    def _configuration(self, x: Array) -> Array:
+        pose = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0] if self._model.free_flyer else []
+        (configuration,) = self._model.configurations(np.append(pose, x)[None])
+        return np.ascontiguousarray(configuration)
+
+
+def _least(J: Array, error: Array) -> Array:
+    """Return the smallest x with J x = -error."""
+    x: Array = -np.linalg.lstsq(J, error, rcond=_RANK)[0]
+    return x
+
+
+def _permitted(J: Array) -> Array:
+    """Return the projector on the speeds with J v = 0, shape (n, n)."""
+    _, s, Vt = np.linalg.svd(J)
+    rank = int(np.sum(s > _RANK * s.max(initial=1e-300)))
+    Z: Array = Vt[rank:].T @ Vt[rank:]
+    return Z

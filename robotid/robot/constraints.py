@@ -1,0 +1,208 @@
+"""Constraints between frames: contacts with the ground, and joints that close kinematic chains."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._settings import require_each, require_flag, require_kind
+from robotid._typing import Array
+from robotid.exceptions import ModelError, SettingsError
+from robotid.findings import listed
+
+__all__ = ["Constraint", "Contact", "Loop", "check_constraints", "frame_id"]
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A link that touches the ground.
+
+    Attributes:
+        frame: The link, whose frame is at the point or on the surface of contact.
+        kind: "point", which transmits a force, or "surface", which also transmits a moment.
+        measured: Components of the wrench of the ground on the link that are measured, of fx, fy,
+            fz, mx, my, mz with the axes of the world and the origin of the link. The others are
+            unknown.
+        always: Whether it touches the ground at all samples; else logs state when.
+    """
+
+    frame: str
+    kind: str = "point"
+    measured: tuple[str, ...] = ()
+    always: bool = False
+
+    sizes: ClassVar[dict[str, int]] = {"point": 3, "surface": 6}
+    components: ClassVar[tuple[str, ...]] = ("fx", "fy", "fz", "mx", "my", "mz")
+
+    def __post_init__(self) -> None:
+        _check_kind(self, f"contact {self.frame!r}")
+        known = self.components[: self.sizes[self.kind]]
+        for component in require_each(self.measured, str, "measured", f"a list of {listed(known)}"):
+            if component not in known or self.measured.count(component) > 1:
+                raise SettingsError(
+                    f"measured of the {self.kind} contact {self.frame!r} has {component!r}, wanted "
+                    f"some of {listed(known)}, each once"
+                )
+        require_flag(self.always, "always")
+
+    @property
+    def rows_measured(self) -> list[int]:
+        """Indices of the measured components."""
+        return [self.components.index(component) for component in self.measured]
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The link."""
+        return (self.frame,)
+
+    @property
+    def name(self) -> str:
+        """Name for messages."""
+        return self.frame
+
+    def rows(self, jacobians: Sequence[Array], rotation: Array) -> Array:
+        """Return the velocity that the contact prevents, per speed of the robot, shape (m, nv).
+
+        Args:
+            jacobians: Jacobian of the frame with the axes of the world, shape (6, nv).
+            rotation: Not used.
+        """
+        return jacobians[0][: self.sizes[self.kind]]
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Two links that are connected at all samples, which closes a kinematic chain.
+
+    Attributes:
+        frames: The two links, whose frames have their origins at the connection.
+        kind: "point", a ball joint; "hinge", a revolute joint; or "rigid", no relative motion.
+        axis: Axis of the hinge, the same in the frames of both links, shape (3,). The frames of a
+            rigid connection coincide.
+    """
+
+    frames: tuple[str, str]
+    kind: str = "hinge"
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    sizes: ClassVar[dict[str, int]] = {"point": 3, "hinge": 5, "rigid": 6}
+
+    def __post_init__(self) -> None:
+        require_each(self.frames, str, "frames of a loop", "two names of links")
+        _check_kind(self, f"loop {listed(self.frames)}")
+        if len(self.frames) != 2 or self.frames[0] == self.frames[1]:
+            found = listed(self.frames) or "none"
+            raise SettingsError(f"loop has the frames {found}, wanted two links")
+        axis = require_each(self.axis, (int, float), "axis of a loop", "x, y, z")
+        if len(axis) != 3 or not 1e-6 < np.linalg.norm(np.array(axis, dtype=float)) < np.inf:
+            raise SettingsError(
+                f"axis of loop {listed(self.frames)} is {self.axis}, wanted x, y, z"
+            )
+
+    @property
+    def name(self) -> str:
+        """Name for messages."""
+        return " - ".join(self.frames)
+
+    def rows(self, jacobians: Sequence[Array], rotation: Array) -> Array:
+        """Return the relative velocity that the loop prevents, per speed, shape (m, nv).
+
+        Args:
+            jacobians: Jacobians of the two frames with the axes of the world, each (6, nv).
+            rotation: Axes of the first frame in the world, shape (3, 3).
+        """
+        relative = jacobians[0] - jacobians[1]
+        if self.kind != "hinge":
+            return relative[: self.sizes[self.kind]]
+        return np.vstack([relative[:3], self._across(rotation) @ relative[3:]])
+
+    def error(self, placements: Sequence[pin.SE3]) -> Array:
+        """Return the displacement that the loop prevents, shape (m,) [m, rad]; 0 if it is closed.
+
+        Its rate is the prevented velocity, if it is small.
+
+        Args:
+            placements: Placements of the two frames in the world.
+        """
+        first, second = placements
+        found = np.zeros(self.sizes[self.kind])
+        found[:3] = first.translation - second.translation
+        if self.kind == "hinge":
+            axis = np.asarray(self.axis, dtype=float) / np.linalg.norm(self.axis)
+            turned = np.cross(second.rotation @ axis, first.rotation @ axis)
+            found[3:] = self._across(first.rotation) @ turned
+        elif self.kind == "rigid":
+            found[3:] = pin.log3(first.rotation @ second.rotation.T)
+        return found
+
+    def drift(self, accelerations: Sequence[Array], speeds: Sequence[Array], R: Array) -> Array:
+        """Return the prevented acceleration dJ/dt v without accelerations of joints, shape (m,).
+
+        Args:
+            accelerations: Accelerations of the two frames with the axes of the world, each (6,).
+            speeds: Angular velocities of the two frames with the axes of the world, each (3,).
+            R: Axes of the first frame in the world, shape (3, 3).
+        """
+        relative = accelerations[0] - accelerations[1]
+        if self.kind != "hinge":
+            return relative[: self.sizes[self.kind]]
+        across = self._across(R)
+        turning = np.cross(speeds[0], across) @ (speeds[0] - speeds[1])
+        return np.append(relative[:3], across @ relative[3:] + turning)
+
+    def _across(self, rotation: Array) -> Array:
+        """Return two directions perpendicular to the axis, fixed in the first link, (2, 3)."""
+        across: Array = np.linalg.svd(np.asarray(self.axis, dtype=float)[None])[2][1:]
+        return across @ rotation.T
+
+
+Constraint = Contact | Loop
+
+
+def _check_kind(constraint: Any, where: str) -> None:  # noqa: ANN401
+    for frame in constraint.frames:
+        require_kind(frame, str, "a frame", "the name of a link")
+    if constraint.kind not in constraint.sizes:
+        raise SettingsError(
+            f"kind of {where} is {constraint.kind!r}, wanted one of {listed(constraint.sizes)}"
+        )
+
+
+def check_constraints(constraints: Sequence[Constraint], links: Sequence[str], file: str) -> None:
+    """Refuse constraints of links that are not in the URDF, or that are stated twice.
+
+    Args:
+        constraints: The constraints.
+        links: Names of the URDF's links.
+        file: Name of the URDF.
+
+    Raises:
+        ModelError: If a link is unknown or repeated.
+    """
+    import difflib
+
+    require_each(constraints, (Contact, Loop), "constraints", "a list of Contact and Loop")
+    for constraint in constraints:
+        for frame in constraint.frames:
+            if frame not in links:
+                near = difflib.get_close_matches(frame, links, n=1)
+                hint = f". Did you mean {near[0]!r}?" if near else ""
+                raise ModelError(
+                    f"contact or loop at {frame!r}, which is not a link of {file}; links: "
+                    f"{listed(links)}{hint}"
+                )
+    stated = [constraint.frames for constraint in constraints]
+    if twice := [x for k, x in enumerate(stated) if x in stated[:k]]:
+        raise ModelError(f"the contact or loop at {listed(twice[0])} is stated twice; remove one")
+
+
+def frame_id(pin_model: pin.Model, link: str) -> int:
+    """Return the number of a link's frame.
+
+    Args:
+        pin_model: The robot.
+        link: Name of the link.
+    """
+    return int(pin_model.getFrameId(link, pin.FrameType.BODY))

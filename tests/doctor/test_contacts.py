@@ -1,0 +1,96 @@
+"""Findings on the motion of a floating base and on contacts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from robotid.doctor.contacts import check_base
+from robotid.logs.base import BaseMotion, base_state
+from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
+from robotid.robot.constraints import Contact
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+FEET = ("FL_FOOT", "HR_FOOT")
+RAW = SignalSettings(cutoff=None, trim=0.0)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, terms=(),
+        constraints=[Contact(FEET[0]), Contact(FEET[1], "surface")],
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def walk(robot):
+    """Return a log in which the trunk drifts and the feet stand or swing in turn."""
+    t = np.arange(0.0, 6.0, 0.01)
+    q = np.zeros((len(t), 12))
+    swing = np.sin(2 * np.pi * 0.9 * t)  # both stand while it is 0: half of the time
+    for foot, sign in zip(FEET, (1.0, -1.0), strict=True):
+        joint = robot.joints.index(f"{foot[:2]}_KFE")
+        q[:, joint] = np.maximum(sign * swing, 0.0)
+    still = pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 1.5), np.ones(3))
+    pose = np.tile(pin.SE3ToXYZQUAT(still), (len(t), 1))
+    contacts = {foot: q[:, robot.joints.index(f"{foot[:2]}_KFE")] == 0.0 for foot in FEET}
+    return Log(t, q, 0 * q, robot.joints, base=BaseMotion(pose), contacts=contacts)
+
+
+def test_a_clean_walk_has_no_finding(robot, walk):
+    assert not list(check_base(robot, walk, RAW))
+
+
+@pytest.mark.parametrize(("rows", "delay"), [(6, "+0.06"), (-5, "-0.05")])
+@pytest.mark.parametrize("foot", FEET)
+def test_a_shift_of_flags_is_found(robot, walk, foot, rows, delay):
+    flags = {x: np.roll(y, rows if x == foot else 0) for x, y in walk.contacts.items()}
+    (found,) = check_base(robot, replace(walk, contacts=flags), RAW)
+    assert found.code == "contact_delay"
+    assert found.severity == "warning"
+    assert found.evidence["delay"] == pytest.approx(0.01 * rows, abs=0.011)
+    assert f"the flags of the contact {foot} are delayed by {delay[0]}" in found.message
+
+
+def test_a_slipping_foot_is_found_with_its_speed(robot, walk):
+    pose = walk.base.pose.copy()
+    pose[:, 1] += 0.4 * walk.t  # [m/s] the whole robot slides
+    found = list(check_base(robot, replace(walk, base=BaseMotion(pose)), RAW))
+    assert [f.code for f in found] == ["moving_contact"] * 2
+    assert [f.evidence["speed"] for f in found] == pytest.approx([0.4, 0.4], rel=0.01)
+    assert "the link HR_FOOT moves at 0.4 m/s" in found[1].message
+
+
+@pytest.mark.parametrize("part", [slice(0, 3), slice(3, 6)])
+def test_a_twist_with_the_axes_of_the_world_is_found(robot, walk, part):
+    t = walk.t
+    pose = np.array(
+        [
+            pin.SE3ToXYZQUAT(
+                pin.SE3(pin.rpy.rpyToMatrix(0.8, -0.5, 1.5 + 0.3 * np.sin(3 * x)),
+                        np.array([np.sin(x), np.cos(2 * x), 0.0]))
+            )
+            for x in t
+        ]
+    )  # fmt: skip
+    twist = base_state(t, pose, None, None)[1]
+    right = replace(walk, base=BaseMotion(pose, twist), contacts={})
+    free = replace(robot, constraints=())
+    assert not list(check_base(free, right, RAW))
+    turned = twist.copy()
+    for k, x in enumerate(pose):
+        turned[k, part] = pin.XYZQUATToSE3(x).rotation @ twist[k, part]
+    (found,) = check_base(free, replace(right, base=BaseMotion(pose, turned)), RAW)
+    assert found.code == "base_twist"
+    assert found.severity == "error"
+    assert "State twist = 'world' in [base]" in found.message
+    assert found.evidence["off_world"] < 1e-3 * found.evidence["off"]
+    off = np.sqrt(np.mean(np.sum((turned - twist)[:, part] ** 2, axis=1)))
+    assert found.evidence["off"] == pytest.approx(off)
+    doubled = replace(right, base=BaseMotion(pose, 2.0 * twist))
+    other = next(check_base(free, doubled, RAW))
+    assert "Check the columns base_vx to base_wz, or remove them" in other.message

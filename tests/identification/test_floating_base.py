@@ -1,0 +1,127 @@
+"""Identification of robots whose base floats: simulated in MuJoCo, and recorded."""
+
+import numpy as np
+import pytest
+from helpers.legged import recorded, with_other_bodies
+from helpers.paths import JOBS
+
+import robotid
+from robotid.commands.identify import run_job
+from robotid.commands.job import read_job
+from robotid.fitting.settings import ConsistentSettings
+from robotid.robot.constraints import Contact
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
+POSTURE = {"hip": (0.0, 0.12), "thigh": (0.8, 0.25), "calf": (-1.6, 0.3)}  # middle, reach [rad]
+ARMATURE, DAMPING, TORQUE = 0.01, 0.2, 0.05
+
+
+@pytest.fixture(scope="module")
+def go1():
+    return RobotModel.from_urdf(
+        example_urdf("go1.urdf"), free_flyer=True, terms=("armature", "viscous"),
+        constraints=[Contact(foot) for foot in FEET],
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def found(go1):
+    """The Go1 of MuJoCo, identified from a URDF with other bodies; the truth, and that URDF's."""
+    rng = np.random.default_rng(3)
+    middle, reach = np.array([POSTURE[joint.split("_")[1]] for joint in go1.joints]).T
+    log = recorded(
+        go1, FEET, middle, reach, rng, duration=12.0, step=2e-4, kp=100.0, kd=2.0, highest=1.5,
+        armature=ARMATURE, damping=DAMPING, torque=TORQUE,
+    )  # fmt: skip
+    other = with_other_bodies(go1, rng)
+    result = robotid.identify(
+        other, log.window(end=9.0), validation=log.window(9.0), doctor=False, friction="none",
+        signals=robotid.SignalSettings(cutoff=25.0, velocity="differentiated"),
+        estimator="wls",
+    )  # fmt: skip
+    truth = go1.standard_parameters()
+    names = go1.layout.names
+    truth += [ARMATURE * x.endswith(".armature") + DAMPING * x.endswith(".viscous") for x in names]
+    return result, truth, other.standard_parameters()
+
+
+def test_the_bodies_of_another_simulator_are_found(found):
+    result, truth, before = found
+    K = result.mapping.K
+    is_drive = [x.endswith((".armature", ".viscous")) for x in result.mapping.base_names]
+    z = ((result.base - K @ truth) / result.base_error)[~np.array(is_drive)]
+    assert len(z) == 94
+    assert np.mean(np.abs(z) < 2.0) > 0.85  # one run, correlated parameters
+    assert np.abs(z).max() < 6.0
+    masses = slice(0, result.model.layout.n_inertial, 10)
+    assert result.standard[masses].sum() == pytest.approx(truth[masses].sum(), rel=2e-3)
+    assert abs(before[masses].sum() / truth[masses].sum() - 1.0) > 0.02
+
+
+def test_unseen_motion_is_predicted_and_judged_by_the_joints(found):
+    result, _, _ = found
+    (metrics,) = result.predictions.values()
+    joints = [metrics.per_joint[joint] for joint in result.model.joints]
+    assert all(m.relative_error_pct < 5.0 for m in joints)
+    assert all(m.relative_error_pct < m.baselines["urdf"] for m in joints)
+    assert set(result.verdict.joints) == set(result.model.joints)
+    (note,) = [x for x in result.verdict.reasons if "wrench on the base" in x]
+    errors = [
+        f"{x[5:]} {metrics.per_joint[x].relative_error_pct:.0f} %"
+        for x in result.model.row_names[:6]
+    ]
+    assert ", ".join(errors) in note
+    assert result.scale_check.factor == pytest.approx(1.0, abs=0.35)
+
+
+def test_the_residual_at_the_truth_is_the_noise(found):
+    """What contact forces cannot cause is equal in MuJoCo and in the rows."""
+    from robotid.regressor.prediction import predict
+
+    result, truth, _ = found
+    recording = result.fitted[0].recording
+    motion, used = recording.trajectory, recording.mask
+    (torque,) = predict(result.model, [truth], motion)
+    level = np.sqrt(np.mean((motion.tau - torque)[used] ** 2))
+    assert level < 0.6 * TORQUE  # the filter leaves 2 * 25 / 500 of the noise's power
+    assert used.all()  # forces of changing contacts are eliminated, no sample is lost
+    share = motion.contacts.mean(axis=0)
+    assert ((share > 0.6) & (share < 1.0)).any()
+
+
+def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_path):
+    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
+    job = read_job(JOBS / "solo12.toml")
+    result, _ = run_job(rough(job), tmp_path)
+    (validation,) = result.validation
+    tau, used = validation.recording.trajectory.tau, validation.recording.mask
+    errors = {
+        name: 100
+        * np.linalg.norm((tau - validation.torques[name])[used])
+        / np.linalg.norm(tau[used])
+        for name in ("estimate", "urdf")
+    }
+    assert errors["estimate"] < 2.2
+    assert errors["urdf"] == pytest.approx(3.3, abs=0.2)
+    masses = slice(0, result.model.layout.n_inertial, 10)
+    assert result.standard[masses].sum() == pytest.approx(2.50, rel=0.015)
+    assert result.verdict.status == "good"
+
+
+def rough(job):
+    from dataclasses import replace
+
+    return replace(job, estimator=ConsistentSettings(prior_weight=1.0, draws=0), report=False)
+
+
+def test_a_humanoid_is_weighed_by_its_feet(recordings, monkeypatch, tmp_path):
+    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
+    result, content = run_job(rough(read_job(JOBS / "icub.toml")), tmp_path)
+    (recording,) = (e.recording for e in result.fitted)
+    force = sum(recording.log.wrenches.values()).mean() / 9.81
+    assert content["consistency"]["total_mass"] == pytest.approx(force, rel=0.01)
+    assert recording.mask[:, :6].mean() > 0.9  # in some poses a row is all force
+    assert not recording.mask[:, 6:].any()
+    assert set(result.verdict.joints) == set(result.model.row_names[:6])

@@ -1,0 +1,183 @@
+"""Motion of a floating base and contacts in logs."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from robotid.exceptions import DataError
+from robotid.logs.base import BaseColumns, BaseMotion, base_state, in_base, quaternions_of_angles
+from robotid.logs.data import Log
+from robotid.logs.read import read_log, write_log
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
+
+
+def poses(t):
+    """Return a smooth pose (N, 7), and its twist and acceleration with the axes of the base."""
+    placement = [
+        pin.SE3(pin.rpy.rpyToMatrix(0.3 * np.sin(x), 0.2 * np.cos(2 * x), 1.1 * x),
+                np.array([np.sin(x), x**2, 0.3 * np.cos(3 * x)]))
+        for x in t
+    ]  # fmt: skip
+    return np.array([pin.SE3ToXYZQUAT(M) for M in placement]), placement
+
+
+def differences(t, h):
+    """Return twist and acceleration by differences of Pinocchio's logarithm."""
+    twists = []
+    for x in (t - h, t, t + h):
+        before, after = poses(x - h)[1], poses(x + h)[1]
+        twists.append(
+            np.array([pin.log6(a.actInv(b)).vector for a, b in zip(before, after, strict=True)])
+            / (2 * h)
+        )
+    return twists[1], (twists[2] - twists[0]) / (2 * h)
+
+
+def test_a_pose_is_differentiated_as_by_pinocchio():
+    t = np.linspace(0.0, 3.0, 3001)
+    pose, _ = poses(t)
+    pose[:, 3:] *= 1.0005  # as after a filter
+    normal, twist, acceleration = base_state(t, pose, None, None)
+    np.testing.assert_allclose(np.linalg.norm(normal[:, 3:], axis=1), 1.0)
+    some = slice(10, -10, 300)
+    v, a = differences(t[some], 1e-4)
+    np.testing.assert_allclose(twist[some], v, atol=2e-5)
+    np.testing.assert_allclose(acceleration[some], a, atol=2e-4)
+    measured = base_state(t, pose, twist + 1.0, None)
+    np.testing.assert_allclose(measured[1], twist + 1.0)
+    np.testing.assert_allclose(measured[2], acceleration, atol=1e-9)
+    np.testing.assert_allclose(base_state(t, pose, twist, twist * 3.0)[2], twist * 3.0)
+
+
+def test_vectors_and_angles_turn_as_by_pinocchio(rng):
+    angles = rng.uniform(-3, 3, (5, 3))
+    x = rng.standard_normal((5, 3))
+    quaternions = quaternions_of_angles(angles)
+    for k in range(5):
+        R = pin.rpy.rpyToMatrix(*angles[k])
+        np.testing.assert_allclose(pin.Quaternion(quaternions[k]).toRotationMatrix(), R, atol=1e-12)
+        np.testing.assert_allclose(in_base(quaternions, x)[k], R.T @ x[k])
+
+
+def test_quaternions_are_continuous_and_checked():
+    t = np.linspace(0.0, 9.0, 91)
+    pose, _ = poses(t)
+    pose[40:60, 3:] *= -1.0
+    pose[:, 3:] *= 1.0 + 5e-4
+    base = BaseMotion(pose)
+    assert (np.abs(np.diff(base.pose[:, 3:], axis=0)) < 0.3).all()
+    np.testing.assert_allclose(np.linalg.norm(base.pose[:, 3:], axis=1), 1.0)
+    pose[7, 3:] *= 1.01
+    with pytest.raises(
+        DataError, match=r"quaternion of the base has length 1.01.* in row 7, wanted"
+    ):
+        BaseMotion(pose)
+    with pytest.raises(DataError, match=r"twist of the base has shape \(91, 3\), wanted \(N, 6\)"):
+        BaseMotion(base.pose, twist=np.zeros((91, 3)))
+    pose[3, 1] = np.nan
+    with pytest.raises(DataError, match="pose of the base is not finite in row 3"):
+        BaseMotion(pose)
+
+
+@pytest.fixture
+def log(rng):
+    t = np.linspace(2.0, 3.0, 101)
+    pose, _ = poses(t)
+    flags = rng.random(101) < 0.5
+    return Log(
+        t, *rng.standard_normal((2, 101, 2)), ("one", "two"),
+        base=BaseMotion(pose, rng.standard_normal((101, 6)), rng.standard_normal((101, 6))),
+        contacts={"l_sole": flags, "r_sole": ~flags},
+        wrenches={"fz l_sole": 10.0 * flags, "mx r_sole": t},
+    )  # fmt: skip
+
+
+WANTED = BaseColumns(True, ("l_sole", "r_sole"), ("fz l_sole", "mx r_sole"))
+
+
+def test_a_log_is_read_as_it_was_written(log, tmp_path):
+    write_log(log, tmp_path / "log.csv")
+    again = read_log(tmp_path / "log.csv", log.joints, base=WANTED)
+    for name in ("pose", "twist", "acceleration"):
+        np.testing.assert_allclose(getattr(again.base, name), getattr(log.base, name), atol=1e-15)
+    for kind in ("contacts", "wrenches"):
+        own, other = getattr(log, kind), getattr(again, kind)
+        assert list(own) == list(other)
+        for name, values in own.items():
+            np.testing.assert_array_equal(values, other[name])
+    assert not again.notes
+    world = read_log(tmp_path / "log.csv", log.joints, base=BaseColumns(True, twist="world"))
+    turned = in_base(log.base.pose[:, 3:], log.base.twist[:, 3:])
+    np.testing.assert_allclose(world.base.twist[:, 3:], turned)
+    assert not world.contacts
+    part = again.window(2.2, 2.4)
+    np.testing.assert_array_equal(part.base.twist, again.base.twist[20:41])
+    np.testing.assert_array_equal(part.contacts["r_sole"], log.contacts["r_sole"][20:41])
+    np.testing.assert_array_equal(part.wrenches["mx r_sole"], part.t)
+
+
+@pytest.mark.parametrize(
+    ("drop", "message"),
+    [
+        (
+            "base_qz",
+            "no column base_qz of the pose of the floating base; columns of the base found",
+        ),
+        ("contact_r_sole", "no column contact_r_sole; columns of that kind found: contact_l_sole"),
+        ("wrench_fz_l_sole", "no column wrench_fz_l_sole; columns of that kind found: wrench_mx_r"),
+    ],
+)
+def test_missing_columns_are_named(log, tmp_path, drop, message):
+    write_log(log, tmp_path / "log.csv")
+    lines = [line.split(",") for line in (tmp_path / "log.csv").read_text().splitlines()]
+    k = lines[0].index(drop)
+    text = "\n".join(",".join(line[:k] + line[k + 1 :]) for line in lines)
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(DataError) as error:
+        read_log(tmp_path / "log.csv", log.joints, base=WANTED)
+    assert message in str(error.value)
+
+
+def test_a_contact_is_0_or_1(log, tmp_path):
+    write_log(log, tmp_path / "log.csv")
+    text = (tmp_path / "log.csv").read_text().replace("contact_r_sole", "c")
+    text = text.replace("contact_l_sole", "contact_r_sole").replace(
+        "wrench_mx_r_sole", "contact_l_sole"
+    )
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(DataError, match="contact_l_sole is 2 in row 0, wanted 0 or 1"):
+        read_log(tmp_path / "log.csv", log.joints, base=BaseColumns(contacts=("l_sole",)))
+
+
+def test_a_log_without_torque_is_read_with_wrenches(log, tmp_path):
+    write_log(log, tmp_path / "log.csv")
+    text = (tmp_path / "log.csv").read_text().replace("tau_", "effective_")
+    (tmp_path / "log.csv").write_text(text)
+    again = read_log(tmp_path / "log.csv", log.joints, base=WANTED)
+    assert not again.has_torque
+    with pytest.raises(DataError, match="has no columns 'tau_one', 'tau_two'"):
+        read_log(tmp_path / "log.csv", log.joints, base=BaseColumns(True))
+
+
+def test_a_contact_is_extended_by_the_reach_of_the_filter(log):
+    flags = (np.arange(101) >= 50) & (np.arange(101) < 53)  # 2.50 to 2.52 s
+    other = np.arange(101) >= 80
+    log = Log(
+        log.t, log.q, log.tau, log.joints, base=log.base,
+        contacts={"a": flags, "b": other, "c": ~other}, wrenches={"fz a": np.sin(log.t)},
+    )  # fmt: skip
+    raw = process(log, SignalSettings(cutoff=None, trim=0.0, velocity="differentiated"))
+    touching = [np.flatnonzero(own).tolist() for own in raw.contacts.T]
+    assert touching == [[49, 50, 51, 52, 53], list(range(79, 101)), list(range(81))]
+    assert np.flatnonzero(raw.switching).tolist() == [49, 50, 52, 53, 79, 80]
+    smooth = process(log, SignalSettings(cutoff=40.0, trim=0.1, velocity="differentiated"))
+    a, b, c = (smooth.t[own] for own in smooth.contacts.T)
+    np.testing.assert_allclose(a, np.arange(2.47, 2.555, 0.01))
+    np.testing.assert_allclose([b[0], b[-1]], [2.77, smooth.t[-1]])
+    np.testing.assert_allclose([c[0], c[-1]], [smooth.t[0], 2.82])
+    assert not smooth.switching.any()
+    np.testing.assert_allclose(smooth.wrenches[:, 0], np.sin(smooth.t), atol=2e-3)
+    assert smooth.q.shape == (79, 9)
+    assert smooth.v.shape == smooth.a.shape == smooth.tau.shape == (79, 8)
+    assert not smooth.tau[:, :6].any()

@@ -1,0 +1,219 @@
+"""Constraint forces eliminated from the rows, against Pinocchio's constraint dynamics."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from robotid.exceptions import ModelError, SettingsError
+from robotid.logs.base import BaseColumns
+from robotid.logs.data import Trajectory
+from robotid.regressor.constraints import (
+    constrained,
+    constraint_jacobian,
+    force_basis,
+    logged_base,
+    without_forces,
+)
+from robotid.regressor.factors import Reduction, compress, merge
+from robotid.regressor.prediction import predict
+from robotid.regressor.torque import build_problem, joint_torque_regressor
+from robotid.robot.constraints import Contact, Loop
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
+LEGS = ("FL", "FR", "HL", "HR")
+
+
+@pytest.fixture(scope="module")
+def quadruped():
+    """Return a quadruped whose joints are in another order, one foot a surface."""
+    joints = [f"{leg}_{name}" for name in ("KFE", "HAA", "HFE") for leg in LEGS]
+    contacts = [Contact(foot) for foot in FEET[:3]]
+    contacts += [Contact(FEET[3], "surface", measured=("fz", "mx"), always=True)]
+    return RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), joints=joints, free_flyer=True, constraints=contacts,
+        terms=("armature", "viscous"),
+    )  # fmt: skip
+
+
+def random_motion(model, rng, samples):
+    """Return q, v and a of a robot whose base floats."""
+    pose = rng.standard_normal((samples, 7))
+    pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    n = len(model.joints)
+    q = np.hstack([pose, rng.uniform(-1, 1, (samples, n))])
+    return q, *rng.standard_normal((2, samples, 6 + n))
+
+
+def moved(model, q, speed, step):
+    """Return coordinates after a step at a speed."""
+    x = pin.integrate(
+        model.pin_model, model.configurations(q[None])[0], model.velocity_map @ speed * step
+    )
+    data = model.pin_model.createData()
+    pin.framesForwardKinematics(model.pin_model, data, x)
+    return data
+
+
+def test_the_jacobian_is_the_velocity_of_the_feet(quadruped, rng):
+    q, v, _ = random_motion(quadruped, rng, 3)
+    flags = np.array([[1, 1, 0, 1], [0, 1, 1, 1], [1, 0, 1, 1]], dtype=bool)
+    J = constraint_jacobian(quadruped, q, flags)
+    assert J.shape == (3, 15, 18)
+    for k in range(3):
+        for i, foot in enumerate(FEET):
+            frame = quadruped.pin_model.getFrameId(foot, pin.FrameType.BODY)
+            before, after = (moved(quadruped, q[k], v[k], h).oMf[frame] for h in (-1e-6, 1e-6))
+            own = J[k, 3 * i : 3 * i + 3] @ v[k]
+            speed = (after.translation - before.translation) / 2e-6
+            np.testing.assert_allclose(own, speed * flags[k, i], atol=1e-7)
+        turned = pin.log3(after.rotation @ before.rotation.T) / 2e-6
+        np.testing.assert_allclose(J[k, 12:] @ v[k], turned, atol=1e-7)
+
+
+def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(quadruped, rng):
+    q, v, a = random_motion(quadruped, rng, 7)
+    flags = rng.random((7, 3)) < 0.7
+    pi = quadruped.standard_parameters()
+    pi[quadruped.layout.n_inertial :] = rng.uniform(0.1, 1.0, 24)
+    rigid = (joint_torque_regressor(quadruped, q, v, a) @ pi).reshape(7, 18)
+    touching = np.hstack([flags, np.ones((7, 1), dtype=bool)])
+    J, f = constraint_jacobian(quadruped, q, touching), rng.standard_normal((7, 15))
+    tau = rigid - np.einsum("kmj,km->kj", J, f)
+    measured = [11, 12]  # fz and mx of the last foot
+    motion = Trajectory(
+        t=np.arange(7.0), q=q, v=v, a=a, tau=tau, joints=quadruped.joints, rate=None,
+        segment=np.zeros(7, dtype=int), contacts=flags, wrenches=f[:, measured],
+        switching=np.arange(7) == 4,
+    )  # fmt: skip
+    found, used = constrained(quadruped, motion, np.ones((7, 18), dtype=bool))
+    (predicted,) = predict(quadruped, [pi], found)
+    rest = np.arange(7) != 4
+    np.testing.assert_allclose(found.tau[rest], predicted[rest], atol=1e-10)
+    assert np.abs(found.tau).max() > 1.0
+    assert not used[4].any()
+    assert used[rest].all()
+    unknown = np.linalg.matrix_rank(np.delete(J, measured, axis=1))
+    np.testing.assert_allclose(np.sum(found.basis**2, axis=(1, 2))[[0, 1, 6]], unknown[[0, 1, 6]])
+
+
+def test_without_torque_only_rows_of_the_base_are_used(quadruped, rng):
+    q, v, a = random_motion(quadruped, rng, 2)
+    motion = Trajectory(
+        t=np.arange(2.0), q=q, v=v, a=a, tau=0 * v, joints=quadruped.joints, rate=None,
+        segment=np.zeros(2, dtype=int), contacts=np.zeros((2, 3), dtype=bool),
+        wrenches=np.zeros((2, 2)),
+    )  # fmt: skip
+    found, used = constrained(quadruped, motion, np.ones((2, 18), dtype=bool), has_torque=False)
+    assert used.tolist() == [[True] * 6 + [False] * 12] * 2
+    assert not found.basis[:, 6:].any()  # a force on the base may not act through a joint
+    ranks = [np.linalg.matrix_rank(basis) for basis in found.basis]
+    assert ranks == [4, 4]  # fx, fy, my, mz
+
+
+def test_rows_are_projected_and_counted(quadruped, rng):
+    q, v, a = random_motion(quadruped, rng, 40)
+    weight = rng.uniform(0.5, 2.0, (40, 18)) * (rng.random((40, 18)) < 0.9)
+    motion = Trajectory(
+        t=np.arange(40.0), q=q, v=v, a=a, tau=rng.standard_normal((40, 18)),
+        joints=quadruped.joints, rate=None, segment=np.zeros(40, dtype=int),
+        contacts=rng.random((40, 3)) < 0.5, switching=np.zeros(40, dtype=bool),
+        wrenches=rng.standard_normal((40, 2)),
+    )  # fmt: skip
+    found, used = constrained(quadruped, motion, np.ones((40, 18), dtype=bool))
+    problem = build_problem(quadruped, found, used * weight)
+    Y = joint_torque_regressor(quadruped, q, v, a).reshape(40, 18, -1)
+    P = np.eye(18) - found.basis @ found.basis.swapaxes(1, 2)
+    dense = np.concatenate([P @ Y, (P @ found.tau[..., None])], axis=2)
+    dense *= np.sqrt(used * weight)[..., None]
+    factors = compress(problem, threads=1)
+    assert factors.is_projected
+    for j, R in enumerate(factors.R):
+        rows = dense[:, j]
+        np.testing.assert_allclose(R.T @ R, rows.T @ rows, atol=1e-9 * np.abs(rows).max() ** 2)
+    left = np.einsum("kjj->kj", P)
+    count = [left[(used * weight)[:, j] > 0, j].sum() for j in range(18)]
+    assert factors.rows.tolist() == np.rint(count).astype(int).tolist()
+    blocks = np.concatenate([W for W, _, _ in problem.blocks()]).reshape(40, 18, -1)
+    np.testing.assert_allclose(blocks, P @ Y, atol=1e-12)
+    again = Reduction.from_arrays(Reduction(factors, motion.squares, 40).to_arrays())
+    assert again.factors.is_projected
+    both = merge([factors, factors.select(np.arange(len(factors.names)))])
+    assert both.is_projected
+    level = both.noise_levels(np.zeros(len(both.names)), np.full(18, 2.0))
+    tau = (dense[..., -1] ** 2).sum()
+    np.testing.assert_allclose(level, np.sqrt(2 * tau / 36.0))
+
+
+def test_dependent_forces_are_counted_once(rng):
+    """A link that touches at its frame and at that of a link fixed to it: six of twelve forces."""
+    J = rng.standard_normal((2, 3, 6))
+    both = np.concatenate([J, J[:, :2] + J[:, 1:]], axis=1)
+    basis = force_basis(both, np.ones((2, 6), dtype=bool))
+    np.testing.assert_allclose(np.sum(basis**2, axis=(1, 2)), 3.0)
+    rows = rng.standard_normal((2, 6))
+    left = without_forces(basis, rows)
+    np.testing.assert_allclose(J @ left[..., None], 0.0, atol=1e-12)
+    wanted = [x - A.T @ np.linalg.pinv(A.T) @ x for A, x in zip(J, rows, strict=True)]
+    np.testing.assert_allclose(left, wanted, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("kind", "axis", "equations"),
+    [("point", (0.0, 0.0, 1.0), 3), ("hinge", (0.3, -0.8, 0.2), 5), ("rigid", (1.0, 0, 0), 6)],
+)
+def test_a_loop_prevents_the_relative_motion(kind, axis, equations, rng):
+    loop = Loop(("FL_FOOT", "HR_FOOT"), kind, axis)
+    model = RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, constraints=[loop], terms=()
+    )
+    q, _, _ = random_motion(model, rng, 1)
+    J = constraint_jacobian(model, q, np.ones((1, 0), dtype=bool))[0]
+    assert J.shape == (equations, 18)
+    assert not J[:, :6].any() or kind != "point" or np.linalg.matrix_rank(J) == 3
+    data = model.pin_model.createData()
+    pin.computeJointJacobians(model.pin_model, data, model.configurations(q)[0])
+    pin.updateFramePlacements(model.pin_model, data)
+    one, two = (model.pin_model.getFrameId(x, pin.FrameType.BODY) for x in loop.frames)
+    axes = pin.LOCAL_WORLD_ALIGNED
+    difference = [
+        pin.getFrameJacobian(model.pin_model, data, i, axes) for i in (one, two)
+    ]  # fmt: skip
+    D = difference[0] - difference[1]
+    np.testing.assert_allclose(J[:3], D[:3])
+    if kind == "hinge":
+        free = data.oMf[one].rotation @ np.array(axis) / np.linalg.norm(axis)
+        rest = D[3:] - np.outer(free, free @ D[3:])
+        np.testing.assert_allclose(J[3:].T @ J[3:], rest.T @ rest, atol=1e-12)
+
+
+def test_contacts_state_what_logs_have(quadruped):
+    wanted = BaseColumns(True, FEET[:3], ("fz HR_FOOT", "mx HR_FOOT"), "world")
+    assert logged_base(quadruped, "world") == wanted
+
+
+@pytest.mark.parametrize(
+    ("contact", "message"),
+    [
+        (lambda: Contact("a", "line"), "kind of contact 'a' is 'line', wanted one of point"),
+        (lambda: Contact("a", measured=("mx",)), "measured of the point contact 'a' has 'mx'"),
+        (lambda: Contact("a", measured=("fx", "fx")), "some of fx, fy, fz, each once"),
+        (lambda: Loop(("a", "a")), "loop has the frames a, a, wanted two links"),
+        (lambda: Loop(("a", "b"), axis=(0, 0, 0)), "is (0, 0, 0), wanted x, y, z"),
+    ],
+)
+def test_wrong_constraints_are_refused(contact, message):
+    with pytest.raises(SettingsError) as error:
+        contact()
+    assert message in str(error.value)
+
+
+def test_a_contact_of_an_unknown_link_is_refused():
+    urdf = example_urdf("solo12.urdf")
+    with pytest.raises(
+        ModelError, match=r"'FL_FOTO', which is not a link of solo12.urdf.*'FL_FOOT'"
+    ):
+        RobotModel.from_urdf(urdf, free_flyer=True, constraints=[Contact("FL_FOTO")])
+    with pytest.raises(ModelError, match="the contact or loop at FL_FOOT is stated twice"):
+        RobotModel.from_urdf(urdf, constraints=[Contact("FL_FOOT"), Contact("FL_FOOT", "surface")])
