@@ -98,7 +98,7 @@ def test_both_velocities_are_compared_on_the_rows_that_both_have(monkeypatch):
         given.append((motion, mask, every))
         return np.array([2.0, 3.0]) if motion == "measured" else np.array([5.0, 7.0])
 
-    model = SimpleNamespace(joints=("a", "b"), layout=None)
+    model = SimpleNamespace(joints=("a", "b"), layout=None, free_flyer=False, constraints=())
     monkeypatch.setattr(velocity_choice, "friction_speeds", lambda layout: None)
     monkeypatch.setattr(velocity_choice, "process", lambda log, chosen, speeds: chosen.velocity)
     monkeypatch.setattr(velocity_choice, "row_mask", lambda model, motion, least: masks[motion])

@@ -151,7 +151,7 @@ def test_friction_is_drawn_at_position_and_load_of_the_samples_used(rng, monkeyp
     loads = rng.standard_normal((2, n)) * [[1.0], [4.0]]
     left, friction = rng.standard_normal((2, n, 2))
     layout = SimpleNamespace(own={"b": (SimpleNamespace(name="load"),)})
-    model = SimpleNamespace(row_names=("a", "b"), row_units=("N m", "N"), layout=layout)
+    model = SimpleNamespace(row_names=("a", "b"), row_units=("N m", "N"), layout=layout, passive=())
     evaluation = SimpleNamespace(recording=SimpleNamespace(trajectory=motion, mask=mask))
     found = SimpleNamespace(model=model, validation=(evaluation,), fitted=(), standard=None)
     given = []
