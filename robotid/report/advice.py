@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from robotid._settings import is_number
 from robotid.diagnosis.misfit_findings import setting_of, with_entries
 from robotid.export.formats import FORMATS
 from robotid.findings import Cause, Finding, grouped, listed, toml_key
@@ -257,7 +258,7 @@ def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     check = ""
     if any(cause.code in ("total_mass", "urdf_mismatch") for cause in causes):
         check = "Check the sign, the order and the unit of the torques and the URDF's masses. "
-    source = "identified" if found.estimator.bounds.total_mass is None else "stated"
+    source = "stated" if is_number(found.estimator.bounds.total_mass) else "identified"
     masses = f"{after:.4g} kg {source}, {before:.4g} kg in the URDF"
     if found.scale_check.is_total_determined:
         words = (

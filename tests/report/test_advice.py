@@ -326,6 +326,8 @@ def test_figures_in_steps_are_those_of_all_findings_and_of_the_result(identified
     assert f"({after:.4g} kg identified, {before:.4g} kg in the URDF)" in step.words
     found = told(identified, warning("total_mass", "robot"))
     found = replace(found, estimator=ConsistentSettings(constraints={"total_mass": 31.5}))
+    bounded = replace(found, estimator=ConsistentSettings(constraints={"total_mass": [9.0, 99.0]}))
+    assert f"({after:.4g} kg identified, {before:.4g} kg" in next_steps(bounded, JOB)[0].words
     assert f"({after:.4g} kg stated, {before:.4g} kg" in next_steps(found, JOB)[0].words
     weighed = replace(identified.scale_check, is_total_determined=True)
     found = told(identified, warning("total_mass", "robot"))
