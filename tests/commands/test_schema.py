@@ -16,7 +16,7 @@ from robotid.commands.job import Job, job_from_settings
 from robotid.commands.schema import job_schema
 from robotid.exceptions import SettingsError
 
-JOBS = sorted((ROOT / "tests/jobs").glob("*.toml"))
+JOBS = sorted((ROOT / "tests/jobs").rglob("*.toml"))
 LOG = {"log": "run.csv"}
 
 

@@ -93,7 +93,7 @@ def test_the_residual_at_the_truth_is_the_noise(found):
 
 def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_path):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    job = read_job(JOBS / "solo12.toml")
+    job = read_job(JOBS / "legged" / "solo12.toml")
     result, _ = run_job(rough(job), tmp_path)
     (validation,) = result.validation
     tau, used = validation.recording.trajectory.tau, validation.recording.mask
@@ -118,7 +118,7 @@ def rough(job):
 
 def test_a_humanoid_is_weighed_by_its_feet(recordings, monkeypatch, tmp_path):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    result, content = run_job(rough(read_job(JOBS / "icub.toml")), tmp_path)
+    result, content = run_job(rough(read_job(JOBS / "legged" / "icub.toml")), tmp_path)
     (recording,) = (e.recording for e in result.fitted)
     force = sum(recording.log.wrenches.values()).mean() / 9.81
     assert content["consistency"]["total_mass"] == pytest.approx(force, rel=0.01)
