@@ -249,7 +249,7 @@ def in_base(quaternion: Array, vector: Array) -> Array:
 
     Args:
         quaternion: Orientation of the base, qx qy qz qw, shape (N, 4).
-        vector: Vectors with the axes of the world, shape (N, 3).
+        vector: Vectors with the axes of the world, shape (N, 3), or one, shape (3,).
     """
     u = np.cross(vector, quaternion[:, :3])
     turned: Array = vector + 2.0 * (quaternion[:, 3:] * u + np.cross(u, quaternion[:, :3]))

@@ -236,14 +236,14 @@ def _contacts(log: Log, t: Array, settings: SignalSettings) -> tuple[Array, Arra
         first, last = np.flatnonzero(edges > 0) - 1, np.flatnonzero(edges < 0)
         begins = log.t[first.clip(0)] - reach
         ends = log.t[last.clip(max=len(flags) - 1)] + reach
-        begun = np.searchsorted(begins, t, side="right")
-        touching[:, k] = begun > np.searchsorted(ends, t, side="left")
+        started = np.searchsorted(begins, t, side="right")
+        touching[:, k] = started > np.searchsorted(ends, t, side="left")
     changing = np.zeros(len(t), dtype=bool)
     if not settings.cutoff:
         flags = np.column_stack(list(log.contacts.values()))
         rows = np.flatnonzero((flags[1:] != flags[:-1]).any(axis=1))
-        begun = np.searchsorted(log.t[rows] - reach, t, side="right")
-        changing = begun > np.searchsorted(log.t[rows + 1] + reach, t, side="left")
+        started = np.searchsorted(log.t[rows] - reach, t, side="right")
+        changing = started > np.searchsorted(log.t[rows + 1] + reach, t, side="left")
     return touching, changing
 
 

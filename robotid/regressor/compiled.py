@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
+from robotid.logs.base import in_base
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import RowPlan
 
@@ -273,9 +274,7 @@ def _is_simple(axis: Array) -> bool:
 def _base_state(model: "RobotModel", q: Array, v: Array, a: Array) -> Array:
     """Return v, w, a - g, dw of the floating base in its own frame, shape (12, k)."""
     g = model.pin_model.gravity.linear
-    # R^T g with the rotation matrix of the quaternion, computed as in Pinocchio
-    u = np.cross(g, q[:, 3:6])
-    gravity = g + 2 * (q[:, 6:7] * u + np.cross(u, q[:, 3:6]))
+    gravity = in_base(q[:, 3:7], g)
     return np.vstack([v[:, :6].T, (a[:, :3] - gravity).T, a[:, 3:6].T])
 
 

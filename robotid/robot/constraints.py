@@ -1,5 +1,6 @@
 """Constraints between frames: contacts with the ground, and joints that close kinematic chains."""
 
+import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -181,8 +182,6 @@ def check_constraints(constraints: Sequence[Constraint], links: Sequence[str], f
     Raises:
         ModelError: If a link is unknown or repeated.
     """
-    import difflib
-
     require_each(constraints, (Contact, Loop), "constraints", "a list of Contact and Loop")
     for constraint in constraints:
         for frame in constraint.frames:

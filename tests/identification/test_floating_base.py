@@ -1,5 +1,7 @@
 """Identification of robots whose base floats: simulated in MuJoCo, and recorded."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.legged import recorded, with_other_bodies
@@ -9,6 +11,8 @@ import robotid
 from robotid.commands.identify import run_job
 from robotid.commands.job import read_job
 from robotid.fitting.settings import ConsistentSettings
+from robotid.logs.base import in_base
+from robotid.logs.settings import BaseSource
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -111,8 +115,6 @@ def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_p
 
 
 def rough(job):
-    from dataclasses import replace
-
     return replace(job, estimator=ConsistentSettings(prior_weight=1.0, draws=0), report=False)
 
 
@@ -125,3 +127,15 @@ def test_a_humanoid_is_weighed_by_its_feet(recordings, monkeypatch, tmp_path):
     assert recording.mask[:, :6].mean() > 0.9  # in some poses a row is all force
     assert not recording.mask[:, 6:].any()
     assert set(result.verdict.joints) == set(result.model.row_names[:6])
+
+
+def test_a_job_states_the_axes_of_the_velocities(recordings, monkeypatch):
+    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
+    job = read_job(JOBS / "legged" / "solo12.toml")
+    world = replace(job, base=BaseSource(twist="world"))
+    entry = replace(job.identification[0], end=2.0)
+    one, other = (own.read(entry, own.model()).base for own in (job, world))
+    for part in (slice(0, 3), slice(3, 6)):
+        turned = in_base(one.pose[:, 3:], one.twist[:, part])
+        np.testing.assert_allclose(other.twist[:, part], turned)
+    assert not np.allclose(other.twist, one.twist)

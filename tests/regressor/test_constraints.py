@@ -141,6 +141,7 @@ def test_rows_are_projected_and_counted(quadruped, rng):
     assert again.factors.is_projected
     both = merge([factors, factors.select(np.arange(len(factors.names)))])
     assert both.is_projected
+    assert factors.select(np.arange(3)).is_projected
     level = both.noise_levels(np.zeros(len(both.names)), np.full(18, 2.0))
     tau = (dense[..., -1] ** 2).sum()
     np.testing.assert_allclose(level, np.sqrt(2 * tau / 36.0))
@@ -171,7 +172,6 @@ def test_a_loop_prevents_the_relative_motion(kind, axis, equations, rng):
     q, _, _ = random_motion(model, rng, 1)
     J = constraint_jacobian(model, q, np.ones((1, 0), dtype=bool))[0]
     assert J.shape == (equations, 18)
-    assert not J[:, :6].any() or kind != "point" or np.linalg.matrix_rank(J) == 3
     data = model.pin_model.createData()
     pin.computeJointJacobians(model.pin_model, data, model.configurations(q)[0])
     pin.updateFramePlacements(model.pin_model, data)
