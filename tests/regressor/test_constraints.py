@@ -1,9 +1,12 @@
 """Constraint forces eliminated from the rows, against Pinocchio's constraint dynamics."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from robotid.estimators.consistent.weighting import held_out_errors
 from robotid.exceptions import ModelError, SettingsError
 from robotid.logs.base import BaseColumns
 from robotid.logs.data import Trajectory
@@ -14,7 +17,7 @@ from robotid.regressor.constraints import (
     logged_base,
     without_forces,
 )
-from robotid.regressor.factors import Reduction, compress, merge
+from robotid.regressor.factors import Factors, Reduction, compress, merge
 from robotid.regressor.prediction import predict
 from robotid.regressor.torque import build_problem, joint_torque_regressor
 from robotid.robot.constraints import Contact, Loop
@@ -217,3 +220,24 @@ def test_a_contact_of_an_unknown_link_is_refused():
         RobotModel.from_urdf(urdf, free_flyer=True, constraints=[Contact("FL_FOTO")])
     with pytest.raises(ModelError, match="the contact or loop at FL_FOOT is stated twice"):
         RobotModel.from_urdf(urdf, constraints=[Contact("FL_FOOT"), Contact("FL_FOOT", "surface")])
+
+
+def test_rows_that_are_projected_together_are_held_out_together(rng):
+    """The mean square of one joint: all squares over all rows."""
+    rows = [np.array([4, 2]), np.array([3, 5])]
+    R = rng.standard_normal((2, 2, 3, 3))
+    folds = tuple(
+        Factors(tuple(own), (np.arange(2),) * 2, count, ("a", "b"), is_projected=True)
+        for own, count in zip(R, rows, strict=True)
+    )
+    found = [SimpleNamespace(x=x) for x in rng.standard_normal((2, 2))]
+    programme = SimpleNamespace(minimise_each=lambda *_, **__: found)
+    fit = SimpleNamespace(programme=programme, K=np.eye(2))
+    segments = SimpleNamespace(folds=folds, sigma=np.array([2.0, 2.0]), others=None)
+    errors, _ = held_out_errors(fit, segments, 1.0)
+    squares = [
+        sum(np.sum((own[:, 2] - own[:, :2] @ x.x) ** 2) for own in fold)
+        for fold, x in zip(R, found, strict=True)
+    ]
+    np.testing.assert_allclose(errors[:, 0], np.array(squares) / 4.0 / 14.0)
+    assert errors.shape == (2, 1)
