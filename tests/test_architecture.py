@@ -22,7 +22,7 @@ LINES = [
     "_settings pages",
     "robot logs",
     "regressor",
-    "estimators simulation workers",
+    "estimators simulation variation workers",
     "doctor",
     "fitting",
     "diagnosis",

@@ -128,10 +128,10 @@ def _found(result: Mapping[str, Any]) -> str:
 
 def _drive_lines(result: Mapping[str, Any]) -> list[str]:
     """Return the friction terms, or all parameters of drives and controllers of a simulation."""
-    from robotid.identification.summary import friction_lines
+    from robotid.identification.summary import friction_lines, variation_lines
 
     if "simulation" not in result:
-        return friction_lines(result["friction"])
+        return friction_lines(result["friction"]) + variation_lines(result.get("variation"))
     rows = [
         (
             entry["name"],

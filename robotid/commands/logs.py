@@ -79,13 +79,15 @@ def survey_logs(
 
     def survey(entries: Sequence[LogEntry]) -> tuple[SurveyedLog, ...]:
         logs = []
+        _check_units(entries)
         for entry in entries:
             try:
                 found = opened[entry.path]
                 if isinstance(found, DataError):
                     raise found
                 window = entry.start, entry.end
-                logs.append(survey_log(*found, model, job.signals, window, length=length))
+                log = survey_log(*found, model, job.signals, window, length=length)
+                logs.append(replace(log, unit=entry.unit))
             except DataError as error:
                 if refuse is None:
                     raise
@@ -93,6 +95,17 @@ def survey_logs(
         return tuple(logs)
 
     return tuple(survey(entries) for entries in groups)
+
+
+def _check_units(entries: Sequence[LogEntry]) -> None:
+    """Refuse logs of which only some state their robot."""
+    unnamed = [entry for entry in entries if not entry.unit]
+    if 0 < len(unnamed) < len(entries):
+        named = next(entry for entry in entries if entry.unit)
+        raise SettingsError(
+            f"{unnamed[0].path.name} has no unit, but {named.path.name} has unit = "
+            f"{named.unit!r}; state the unit (name of the robot) of each log, or of none"
+        )
 
 
 def examine(

@@ -113,6 +113,7 @@ def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[
             "validation": [recording_metrics(e, "wls") for e in found.validation],
         },
         "scale_check": found.scale_check.to_dict(),
+        **({} if found.variation is None else {"variation": found.variation.to_dict()}),
     }
 
 

@@ -55,6 +55,7 @@ Ranges for domain randomisation of {robot}, by robotid {version}. kg, m, kg m^2,
 nominal is the identified value, low to high its 95 % interval, limited to possible values. The low
 end of a positive parameter is computed from its logarithm. source is the source of the interval:
   data   the motion;
+  logs   the spread between logs, drives only: the 95 % prediction interval of the next log;
   prior  the plausible error of the URDF: the motion does not determine the parameter;
   mixed  both, or the motion determines only sums with other parameters;
   bound  the value is at a physical bound; a drive at 0 has no interval: no low, no high;
@@ -112,13 +113,20 @@ def parameter_ranges(found: Identified) -> dict[str, Any]:
     layout, sources = found.model.layout, found.sources
     errors, covariance = found.standard_error, found.standard_covariance
     quantile = found.standard_quantile
+    variation = getattr(found, "variation", None)
+    between = {} if variation is None else {each.name: each for each in variation.parameters}
     drives: dict[str, dict[str, Any]] = {drive.name: {} for drive in layout.drives}
     for k, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
         name, least = layout.drives[d].name, 0.0 if term.is_nonnegative else -math.inf
         source = "bound" if found.at_bound[k] else sources[k]
-        drives[name][layout.names[k].removeprefix(f"{name}.")] = _range(
+        found_range = _range(
             found.standard[k], errors[k], source, least=least, quantile=float(quantile[k])
-        ) | {"unit": layout.units[k]}
+        )
+        if layout.names[k] in between and source != "bound":
+            low, high = between[layout.names[k]].prediction.ends
+            found_range |= {"low": max(float(low), least), "high": float(high), "source": "logs"}
+        term_name = layout.names[k].removeprefix(f"{name}.")
+        drives[name][term_name] = found_range | {"unit": layout.units[k]}
     return {
         "robot": found.model.name,
         "confidence": 0.95,

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from robotid.fitting.standard_errors import (
 from robotid.regressor.factors import Factors, Reduction, join
 from robotid.regressor.memory import is_loaded
 from robotid.robot.prior import prior_spread
+from robotid.variation.groups import FEWEST_RUNS, RunsOf, runs_of
 
 __all__ = ["Solved", "fit_recordings", "rough_choice", "solve_recordings"]
 
@@ -162,9 +164,19 @@ class Solved:
             factors=ground.factors,
             determination=ground.determination,
             regressor_noise=ground.noise,
+            runs=self._runs(),
         )
         hidden = (mapping.K[:, ~found.at_bound] == 0).all(axis=1)  # sums of terms at bounds only
         return replace(found, base_error=np.where(hidden, np.inf, base_error))
+
+    def _runs(self) -> tuple[RunsOf, ...]:
+        """Return the information of each log on parameters that may vary between logs."""
+        logs, ground = self.ground.logs, self.ground
+        if len(logs) < FEWEST_RUNS:
+            return ()
+        own, sigma = self.recordings, ground.rough.sigma
+        _, unit = np.unique([log.unit for log in own.fitted], return_inverse=True)
+        return runs_of(own.model, own.mapping, logs, self.standard, sigma, unit)
 
     def _measured(self) -> tuple[Estimate, Estimate, StandardErrors]:
         """Return the estimate and that of WLS with standard errors, and how these were found."""
@@ -243,7 +255,7 @@ class _Ground:
     recordings: Recordings  # rows weighted if the loss is robust
     whole: Reduction  # reduction of all fitted rows, base parameters
     before: Known  # the prior
-    segments: tuple[Factors, ...]  # factors of segments of the logs; none in intermediate fits
+    logs: tuple[tuple[Factors, ...], ...]  # segments of each log; none in intermediate fits
     rough: Estimate  # weighted least squares
     pinned: Array  # (p,), bool: fixed standard parameters
     grown: float  # factor of the covariance for a robust loss [-]
@@ -253,6 +265,11 @@ class _Ground:
     def factors(self) -> Factors:
         """The factors of all fitted rows."""
         return self.whole.factors
+
+    @property
+    def segments(self) -> tuple[Factors, ...]:
+        """The factors of the segments of all logs."""
+        return tuple(chain.from_iterable(self.logs))
 
     @cached_property
     def determination(self) -> Determination:
@@ -268,17 +285,19 @@ def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool)
     prior, understated = model.standard_parameters(), 1.0
     if choice.is_robust:
         recordings, understated = reweigh(recordings, choice.loss, prior)
-    reductions = recordings.reduce(is_cut=is_last)
-    reduction = join(reductions)
-    parts = reductions if is_last else ()
-    segments = tuple(part.factors for part in parts if part.factors.rows.any())
+    reductions = recordings.reduce_logs(is_cut=is_last)
+    reduction = join(tuple(chain.from_iterable(reductions)))
+    logs = tuple(
+        tuple(part.factors for part in parts if part.factors.rows.any())
+        for parts in (reductions if is_last else ())
+    )
     factors, share = reduction.factors, recordings.share
     spread = prior_spread(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
-    held_out = segments or (factors,)
+    held_out = tuple(chain.from_iterable(logs)) or (factors,)
     before = Known(model, mapping, prior, spread, share, rough.sigma, held_out)
     pinned = model.layout.owned_by(choice.bounds.pinned)
-    return _Ground(recordings, reduction, before, segments, rough, pinned, understated**2)
+    return _Ground(recordings, reduction, before, logs, rough, pinned, understated**2)
 
 
 def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Ground:
@@ -298,12 +317,12 @@ def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Gro
     if isinstance(choice, RecursiveSettings):
         noise = noise.uncorrected(ground.factors.information(1.0 / sigma**2))
         return replace(ground, noise=noise)
-    segments = tuple(part.without(noise.shift) for part in ground.segments)
+    logs = tuple(tuple(part.without(noise.shift) for part in log) for log in ground.logs)
     return replace(
         ground,
         whole=replace(ground.whole, factors=ground.factors.without(noise.shift)),
-        before=replace(ground.before, held_out=segments),
-        segments=segments,
+        before=replace(ground.before, held_out=tuple(chain.from_iterable(logs))),
+        logs=logs,
         rough=replace(ground.rough, theta=theta - noise.shift),
         noise=noise,
     )

@@ -81,13 +81,21 @@ class Recordings:
         )
 
     def reduce(self, *, is_cut: bool = True) -> tuple[Reduction, ...]:
+        """Return the reductions of all logs to fit, in one sequence.
+
+        Args:
+            is_cut: As of ``reduce_logs``.
+        """
+        return tuple(chain.from_iterable(self.reduce_logs(is_cut=is_cut)))
+
+    def reduce_logs(self, *, is_cut: bool = True) -> tuple[tuple[Reduction, ...], ...]:
         """Reduce the logs to fit.
 
         Args:
             is_cut: Whether logs in memory are cut into segments, which standard errors need.
 
         Returns:
-            One reduction per segment of a log, in order of time. A segment of a log in memory is
+            Per log one reduction per segment, in order of time. A segment of a log in memory is
             longer than the correlation time of filtered noise; a segment of a log in a file
             consists of neighbouring pieces.
 
@@ -98,7 +106,7 @@ class Recordings:
             for log in (*self.fitted, *self.validation):  # raises errors before any fit
                 keep_inertial_rows(self.model, log.whole.trajectory)
             reduced = self._segments if is_cut else self._whole
-            return tuple(chain.from_iterable(map(reduced, range(len(self.fitted)))))
+            return tuple(tuple(reduced(k)) for k in range(len(self.fitted)))
         plan = self.plan or WorkPlan()
         found = iter(plan.reduce(self.pieces, checkpoint=self.checkpoint))
         reductions = []
@@ -109,7 +117,7 @@ class Recordings:
             own = join_segments(islice(found, count), count, most)
             if not any(reduction.samples for reduction in own):
                 raise log.too_short()
-            reductions += own
+            reductions.append(tuple(own))
         return tuple(reductions)
 
     def problem(self, *, with_mass: bool = False) -> Problem:

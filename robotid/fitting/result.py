@@ -36,6 +36,7 @@ from robotid.robot.bodies import held_parameters
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
+from robotid.variation.groups import RunsOf
 
 __all__ = ["Fit", "Solution"]
 
@@ -84,6 +85,7 @@ class Fit(Identified, Solution):
         determination: Which base parameters the fitted rows determine.
         open_terms: Uncertainties of the drive models; ``standard_covariance`` includes them.
         regressor_noise: Effect of position quantisation on least squares; None: negligible.
+        runs: Information of each of three or more fitted logs on parameters that may vary.
     """
 
     estimator: EstimatorSettings
@@ -95,6 +97,7 @@ class Fit(Identified, Solution):
     determination: Determination
     open_terms: tuple[OpenTerm, ...] = ()
     regressor_noise: RegressorNoise | None = None
+    runs: tuple[RunsOf, ...] = ()
     _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
 
     def friction(

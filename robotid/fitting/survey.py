@@ -206,6 +206,7 @@ class SurveyedLog:
         locked: Positions of locked joints in the windows, if the file has them, by name [rad or m].
         length: Rows per piece.
         places: Positions in the file at which blocks of rows start.
+        unit: Name of the robot, if there are several of one kind.
     """
 
     model: RobotModel
@@ -218,6 +219,7 @@ class SurveyedLog:
     locked: Mapping[str, Array] = field(default_factory=dict)
     length: int = PIECE
     places: Sequence[Place] = (Place(),)
+    unit: str = ""
 
     @property
     def path(self) -> str:

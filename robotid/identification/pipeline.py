@@ -32,6 +32,7 @@ from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.result import Asked, Identification
 from robotid.judgement.findings import fit_findings, log_findings, not_written
+from robotid.judgement.unlike_runs import unlike_findings
 from robotid.judgement.verdict import blocking, check_ignored, rejected, warnings_of
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
@@ -39,6 +40,7 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import logged_base
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
+from robotid.variation.variation import vary
 
 __all__ = ["conclude", "identify", "robot_of", "with_drives"]
 
@@ -179,12 +181,16 @@ def conclude(
     sample = take_sample(fit)
     misfits, discrepancies = explain_residual(fit, sample)
     fit, on_misfit = with_model_error(fit, sample, misfits)
+    variation = vary([Path(e.recording.log.path).name for e in fit.fitted], fit.runs)
     own = {field.name: getattr(fit, field.name) for field in fields(fit)}
     asked = Asked(recordings.fitted[0].asked, friction, tuple(ignore))
-    result = Identification(**own, misfits=misfits, on_misfit=on_misfit, asked=asked)
+    result = Identification(
+        **own, misfits=misfits, on_misfit=on_misfit, variation=variation, asked=asked
+    )
     # the fit reports the excitation over all samples, see finding "undetermined"
     before = [f for f in found if f.severity != "note" and f.code != "excitation"]
     of_fit = fit_findings(fit, misfits, on_misfit, discrepancies)
+    of_fit += unlike_findings(variation)
     merged = settled(with_known_springs(before, fit), of_fit)
     merged = rejected(merged, result.predictions, result.scale_check)
     log_errors = blocking(merged, ignore, is_robust=is_robust)

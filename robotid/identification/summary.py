@@ -21,6 +21,7 @@ __all__ = [
     "identification_line",
     "identification_text",
     "joint_reason",
+    "variation_lines",
     "verdict_cell",
     "verdict_lines",
 ]
@@ -64,6 +65,7 @@ def identification_text(found: Identification) -> str:
     for caption, ours, wls in _tables(found):
         lines += [caption, *error_lines(ours.to_dict(), wls.to_dict())]
     lines += friction_lines({drive.joint: drive.to_dict() for drive in found.drives})
+    lines += variation_lines(None if found.variation is None else found.variation.to_dict())
     if found.report:
         lines.append(f"report: {found.report}")
     return "\n".join(lines)
@@ -115,6 +117,25 @@ def friction_lines(friction: Mapping[str, Any]) -> list[str]:
             gain = f"held-out error {before:.1f} -> {after:.1f} %"
             lines.append(f"  {joint}: {' + '.join(found['families'])} ({gain})")
     return ["friction besides viscous and Coulomb:", *lines] if lines else []
+
+
+def variation_lines(variation: Mapping[str, Any] | None) -> list[str]:
+    """Return the spread of friction between logs as text, no line for fewer than three logs.
+
+    Args:
+        variation: As in result.json; None for fewer than three logs.
+    """
+    if variation is None:
+        return []
+    shares: dict[str, list[float]] = {}
+    for name, found in variation["parameters"].items():
+        term = name.rpartition(".")[2]
+        if term in ("coulomb", "viscous") and abs(found["mean"]) > found["std_error"]:
+            shares.setdefault(term, []).append(100 * found["spread"] / abs(found["mean"]))
+    if not shares:
+        return []
+    words = [f"{term} {min(x):.2g} to {max(x):.2g} %" for term, x in sorted(shares.items())]
+    return [f"spread between {len(variation['logs'])} logs, by joint: {', '.join(words)}"]
 
 
 def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:

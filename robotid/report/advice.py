@@ -532,6 +532,7 @@ _AS_FOUND = (
     "time_scale",
     "torque_order",
     "torque_sign",
+    "unlike_run",
     "unmounted_part",
     "unsigned_torque",
 )

@@ -44,6 +44,7 @@ class Shown:
         appendix: Title and content of the parts of the appendix, by their keys.
         friction: Friction against speed; "" if there is none.
         bodies: Pictures of the links, URDF and identified; "" if there are none.
+        variation: Variation of drive parameters between logs; "" for fewer than three logs.
     """
 
     title: str
@@ -65,6 +66,7 @@ class Shown:
     appendix: Mapping[str, tuple[str, str]]
     friction: str = ""
     bodies: str = ""
+    variation: str = ""
 
     @property
     def verdicts(self) -> Mapping[str, Mapping[str, Any]]:
@@ -121,6 +123,7 @@ def page_of(shown: Shown, files: Mapping[str, str]) -> str:
         "friction": Section("Friction against speed", shown.friction),
         "curves": Section(*shown.curves),
         "why": Section("Residual analysis", shown.why, "torque components of each joint", False),
+        "variation": Section("Variation between logs", shown.variation, "", False),
         "bodies": Section("Links", shown.bodies),
         "parameters": Section(
             "Parameters",

@@ -40,6 +40,7 @@ from robotid.report.tables import (
     settings_tables,
     version_table,
 )
+from robotid.report.variation import variation_section
 from robotid.report.why import why_section
 from robotid.report.worst_second import Residual, worst_html, worst_second
 from robotid.versions import versions
@@ -97,6 +98,7 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
         friction=friction_section(found, worst),
         bodies=parameter_picture(found) + ellipsoid_pictures(found),
         why=why_section(found),
+        variation=variation_section(found),
         parameters=parameter_section(
             found.model,
             found.standard if found.has_urdf else None,

@@ -1,0 +1,3 @@
+"""Variation of parameters between recordings and between robots of one kind."""
+
+__all__: list[str] = []

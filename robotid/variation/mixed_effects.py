@@ -1,0 +1,257 @@
+"""Mixed-effects model of parameters that vary between runs, and between units (robots).
+
+    x_run = mu + u_unit + u_run + e_run,    u_unit ~ N(0, D_unit),  u_run ~ N(0, D_run),
+
+with diagonal D. A run gives the information H about its own x and the product h = H x_hat, so runs
+in which a parameter had no effect (singular H) need no special case. Deviations are integrated out
+level by level. The restricted likelihood of the standard deviations in D is weighted by a wide
+prior about a plausible size. The standard deviation that a prediction depends on is integrated
+numerically: with few runs, its uncertainty is the largest part of the prediction interval.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.optimize
+import scipy.special
+
+from robotid._typing import Array
+
+__all__ = ["UNKNOWN", "MixedEffects", "Prediction", "Runs"]
+
+#: Standard deviation of a parameter before the data, in plausible sizes.
+UNKNOWN = 100.0
+
+_FREEDOM = 4.0  # degrees of freedom of the half Student prior of a standard deviation
+_LEAST, _MOST = -6.0, 5.0  # logarithm of the standard deviations over their plausible size
+_GRID = np.linspace(_LEAST, _MOST, 45)
+_FIRST = -1.0  # the same at the start of the search
+_STEP = 1e-5  # of the numerical gradient
+_TAIL = 0.025  # probability beyond each end of an interval
+_WIDEST = 40.0  # standard deviations that contain every end
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """Information of k runs about q parameters that may vary.
+
+    Attributes:
+        H: Information (inverse covariance) of each run, shape (k, q, q), symmetric; singular if
+            the run does not determine all.
+        h: H times the estimate of each run, shape (k, q).
+        unit: Index of the unit (robot) of each run, shape (k,), int, from 0.
+        scale: Plausible standard deviation of each parameter, shape (q,), positive.
+    """
+
+    H: Array
+    h: Array
+    unit: Array
+    scale: Array
+
+    def without(self, run: int) -> "Runs":
+        """Return the runs except one.
+
+        Args:
+            run: Index of the run.
+        """
+        left = np.arange(len(self.h)) != run
+        _, unit = np.unique(self.unit[left], return_inverse=True)
+        return replace(self, H=self.H[left], h=self.h[left], unit=unit)
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Mean, standard deviation and prediction interval of one parameter.
+
+    Attributes:
+        mean: Mean over runs and units.
+        std_error: Its standard error.
+        spread: Standard deviation between runs or units, median.
+        spread_ends: Ends of its 95 % interval, shape (2,).
+        ends: Ends of the 95 % prediction interval of a new run or unit, shape (2,).
+        probability: Two-sided probability of a deviation as large as that of a given value; 1 if
+            none was given.
+    """
+
+    mean: float
+    std_error: float
+    spread: float
+    spread_ends: Array
+    ends: Array
+    probability: float = 1.0
+
+    def shifted(self, centre: float) -> "Prediction":
+        """Return the prediction of the parameter plus a constant.
+
+        Args:
+            centre: The constant.
+        """
+        return replace(self, mean=self.mean + centre, ends=self.ends + centre)
+
+
+@dataclass(frozen=True, eq=False)
+class MixedEffects:
+    """The mixed-effects model of runs: of one unit, or of several.
+
+    Attributes:
+        runs: The runs.
+
+    References:
+        Patterson, Thompson (1971), Recovery of inter-block information when block sizes are
+        unequal (restricted likelihood). Gelman (2006), Prior distributions for variance parameters
+        in hierarchical models, section 2.2 (half Student prior).
+    """
+
+    runs: Runs
+
+    @property
+    def n_levels(self) -> int:
+        """2 if there are several units, 1 otherwise."""
+        return 2 if self.runs.unit.max() > 0 else 1
+
+    @cached_property
+    def deviation(self) -> Array:
+        """Most probable standard deviations, shape (levels, q): between runs, between units."""
+        size = self.n_levels * len(self.runs.scale)
+
+        def objective(z: Array) -> tuple[float, Array]:
+            tried = np.concatenate([z[None], z + _STEP * np.eye(size)])
+            values = _log_prior(tried).sum(axis=1) + self._likelihood(self._deviation(tried))[0]
+            return -values[0], -(values[1:] - values[0]) / _STEP
+
+        first, bounds = np.full(size, _FIRST), [(_LEAST, _MOST)] * size
+        found = scipy.optimize.minimize(
+            objective, first, jac=True, method="L-BFGS-B", bounds=bounds
+        )
+        return self._deviation(found.x)
+
+    @cached_property
+    def values(self) -> tuple[Array, Array]:
+        """Parameters in each run and their standard errors, shapes (k, q).
+
+        They are means of the run's own estimate and those of its unit and of all units, weighted by
+        their information (best linear unbiased prediction).
+        """
+        runs, deviation = self.runs, self.deviation
+        _, mean, covariance = self._likelihood(deviation)
+        centre = np.tile(mean, (len(runs.h), 1))
+        W, w, U, _ = _integrated(runs.H, runs.h, deviation[0])
+        if self.n_levels == 2:
+            W, w = self._by_unit(W, w)
+            between = _integrated(W, w, deviation[1])[2]
+            shift = np.einsum("upi,ui->up", between, w - W @ mean)
+            centre = centre + shift[runs.unit]
+        missing = runs.h - np.einsum("kpi,ki->kp", runs.H, centre)
+        values = centre + np.einsum("kpi,ki->kp", U, missing)
+        variance = np.einsum("kpp->kp", U) + np.diag(covariance) / len(runs.h)
+        return values, np.sqrt(variance)
+
+    def predict(
+        self, own: Array | None = None, value: Array | None = None
+    ) -> tuple[Prediction, ...]:
+        """Return the prediction of each parameter in a new run of a new unit, q items.
+
+        With one unit it is that of a new run. The standard deviation of the highest level is
+        integrated, parameter by parameter; all others have their most probable values.
+
+        Args:
+            own: Variance of the estimates of the new run, shape (q,); 0 if None.
+            value: Estimates of the new run, whose probability is computed, shape (q,); or None.
+        """
+        q = len(self.runs.scale)
+        own = np.zeros(q) if own is None else own
+        found = []
+        for p in range(q):
+            tried = np.repeat(self.deviation[None], len(_GRID), axis=0)
+            tried[:, -1, p] = self.runs.scale[p] * np.exp(_GRID)
+            log_likelihood, means, covariances = self._likelihood(tried)
+            log_density = log_likelihood + _log_prior(_GRID)
+            weight = np.exp(log_density - log_density.max())
+            weight /= weight.sum()
+            centres, variance = means[:, p], covariances[:, p, p]
+            mean = float(weight @ centres)
+            error = float(np.sqrt(weight @ (variance + (centres - mean) ** 2)))
+            std = np.sqrt(variance + (tried[:, :, p] ** 2).sum(axis=1) + own[p])
+            probability = 1.0
+            if value is not None:
+                below = _mixture(value[p], weight, centres, std)
+                probability = 2.0 * min(below, _mixture(-value[p], weight, -centres, std))
+            wanted = (_TAIL, 0.5, 1.0 - _TAIL)
+            low, median, high = self.runs.scale[p] * np.exp(
+                np.interp(wanted, weight.cumsum() - 0.5 * weight, _GRID)
+            )
+            ends = _mixture_ends(weight, centres, std)
+            spread_ends = np.array([low, high])
+            found.append(Prediction(mean, error, median, spread_ends, ends, min(probability, 1.0)))
+        return tuple(found)
+
+    def _deviation(self, z: Array) -> Array:
+        """Return standard deviations, shape (..., levels, q), from logarithms over the scale."""
+        deviation: Array = self.runs.scale * np.exp(z.reshape(*z.shape[:-1], self.n_levels, -1))
+        return deviation
+
+    def _likelihood(self, deviation: Array) -> tuple[Array, Array, Array]:
+        """Return the log restricted likelihood (...,), mean (..., q) and its covariance."""
+        W, w, _, total = _integrated(self.runs.H, self.runs.h, deviation[..., 0, :])
+        if self.n_levels == 2:
+            W, w = self._by_unit(W, w)
+            W, w, _, more = _integrated(W, w, deviation[..., 1, :])
+            total = total + more
+        information = W.sum(axis=-3) + np.diag((UNKNOWN * self.runs.scale) ** -2.0)
+        score, covariance = w.sum(axis=-2), np.linalg.inv(information)
+        mean = np.einsum("...pi,...i->...p", covariance, score)
+        quadratic = np.einsum("...p,...p->...", score, mean)
+        return total + 0.5 * (quadratic - np.linalg.slogdet(information)[1]), mean, covariance
+
+    def _by_unit(self, W: Array, w: Array) -> tuple[Array, Array]:
+        """Return the sums of the information W and W x over the runs of each unit."""
+        unit = self.runs.unit
+        member = 1.0 * (np.arange(unit.max() + 1)[:, None] == unit)
+        return np.einsum("uk,...kij->...uij", member, W), np.einsum("uk,...ki->...ui", member, w)
+
+
+def _integrated(H: Array, h: Array, deviation: Array) -> tuple[Array, Array, Array, Array]:
+    """Integrate the deviations of one level out of its members' information.
+
+    W = (H^-1 + D)^-1 = H - H U H with U = S (I + S H S)^-1 S and D = S^2.
+
+    Args:
+        H: Information of the members, shape (..., k, q, q).
+        h: Information times estimate, shape (..., k, q).
+        deviation: Standard deviations S, shape (..., q).
+
+    Returns:
+        W (..., k, q, q), W x (..., k, q), U (..., k, q, q) with the deviation U (h - H mu), and the
+        logarithm of the likelihood, shape (...,), without the part that depends on the mean.
+    """
+    S = deviation[..., None, :]
+    G = np.eye(S.shape[-1]) + S[..., :, None] * H * S[..., None, :]
+    U = S[..., :, None] * np.linalg.inv(G) * S[..., None, :]
+    HU = H @ U
+    quadratic = np.einsum("...ki,...kij,...kj->...", h, U, h, optimize=True)
+    log_det = np.linalg.slogdet(G)[1].sum(axis=-1)
+    return H - HU @ H, h - np.einsum("...pi,...i->...p", HU, h), U, 0.5 * (quadratic - log_det)
+
+
+def _log_prior(z: Array) -> Array:
+    """Return the log density of z = log(deviation / scale), half Student's distribution."""
+    log_density: Array = z - 0.5 * (_FREEDOM + 1.0) * np.log1p(np.exp(2.0 * z) / _FREEDOM)
+    return log_density
+
+
+def _mixture(x: float, weight: Array, means: Array, std: Array) -> float:
+    """Return the probability of values below x in a mixture of normal distributions."""
+    return float(weight @ scipy.special.ndtr((x - means) / std))
+
+
+def _mixture_ends(weight: Array, means: Array, std: Array) -> Array:
+    """Return the ends of the 95 % interval of a mixture of normal distributions, shape (2,)."""
+    middle, widest = float(weight @ means), _WIDEST * float(std.max())
+    ends = [
+        scipy.optimize.brentq(
+            lambda x, p=p: _mixture(x, weight, means, std) - p, middle - widest, middle + widest
+        )
+        for p in (_TAIL, 1.0 - _TAIL)
+    ]
+    return np.array(ends)

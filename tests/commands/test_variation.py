@@ -1,0 +1,117 @@
+"""A job with four logs: spread and next log in result.json, ranges, report and terminal."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from helpers.driven import JOINTS, arm, driven_log
+from helpers.synthetic import truth
+
+from robotid.cli.identify import show_result
+from robotid.commands.identify import run_job
+from robotid.commands.job import job_from_settings
+from robotid.exceptions import SettingsError
+from robotid.export.ranges import stated_ranges
+from robotid.identification.summary import variation_lines
+from robotid.logs.read import write_log
+from robotid.robot.examples import example_urdf
+
+COULOMB = "shoulder_lift_joint.coulomb"
+
+
+def settings(folder, units=()):
+    names = [f"run_{k}.csv" for k in range(4)]
+    logs = [{"log": str(folder / name)} for name in names]
+    for log, unit in zip(logs, units, strict=False):
+        log["unit"] = unit
+    return {
+        "urdf": str(example_urdf("ur5_robot.urdf")), "joints": list(JOINTS),
+        "locked": {"*": 0.0}, "identification": logs, "model": {"friction": "viscous+coulomb"},
+        "estimator": {"draws": 0},
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    model, rng, where = arm(), np.random.default_rng(0), tmp_path_factory.mktemp("runs")
+    k = model.layout.names.index(COULOMB)
+    for run in range(4):
+        pi = truth(model)
+        pi[k] *= 1 + 0.1 * rng.normal()
+        write_log(driven_log(model, pi, run, duration=6.0), where / f"run_{run}.csv")
+    return where
+
+
+@pytest.fixture(scope="module")
+def result(folder):
+    job = job_from_settings(settings(folder), "job.toml", folder)
+    found, content = run_job(job, folder / "out")
+    return found, json.loads(json.dumps(content))
+
+
+def test_result_has_the_variation_of_each_drive_parameter(result, folder):
+    found, content = result
+    variation = content["variation"]
+    assert variation["logs"] == [f"run_{k}.csv" for k in range(4)]
+    assert variation["units"] == 1
+    entry, own = variation["parameters"][COULOMB], found.variation.parameters
+    each = next(x for x in own if x.name == COULOMB)
+    assert entry["next_interval"] == each.prediction.ends.tolist()
+    assert entry["spread_interval"] == each.prediction.spread_ends.tolist()
+    assert (entry["mean"], entry["std_error"], entry["spread"]) == (
+        each.prediction.mean, each.prediction.std_error, each.prediction.spread
+    )  # fmt: skip
+    assert entry["std_error_by_log"] == each.std_errors.tolist()
+    assert entry["unit"] == "N m"
+    assert "spread_within_units" not in entry
+
+
+def test_ranges_of_drives_are_those_of_the_next_log(result):
+    _, content = result
+    drive = stated_ranges(content)["drives"]["shoulder_lift_joint"]["coulomb"]
+    low, high = content["variation"]["parameters"][COULOMB]["next_interval"]
+    assert drive["source"] == "logs"
+    assert (drive["low"], drive["high"]) == (max(low, 0.0), high)
+
+
+def test_report_shows_values_in_each_log_over_the_next_interval(result, folder):
+    _, content = result
+    page = (folder / "out" / "report.html").read_text()
+    section = page[page.index('<section aria-labelledby="variation">') :]
+    section = section[: section.index("</section>")].replace("<wbr>", "")
+    assert "Drive parameters in 4 logs; low to high: 95 % of the next log of this robot" in section
+    row = section[section.index(COULOMB) :]
+    marks = [float(x) for x in re.findall(r'circle cx="([\d.]+)%"', row)[:4]]
+    values = content["variation"]["parameters"][COULOMB]["by_log"]
+    assert np.argsort(marks).tolist() == np.argsort(values).tolist()
+    assert np.corrcoef(marks, values)[0, 1] > 0.999
+
+
+def test_terminal_prints_the_spread(result, capsys):
+    _, content = result
+    show_result(content)
+    printed = capsys.readouterr().out
+    assert "spread between 4 logs, by joint: coulomb" in printed
+    entry = {"logs": ["a", "b", "c"], "parameters": {
+        "x.coulomb": {"mean": -2.0, "std_error": 0.1, "spread": 0.5},
+        "y.coulomb": {"mean": 4.0, "std_error": 0.1, "spread": 0.1},
+        "y.viscous": {"mean": 1.0, "std_error": 2.0, "spread": 0.1},  # not known
+        "y.offset": {"mean": 1.0, "std_error": 0.1, "spread": 0.1},
+    }}  # fmt: skip
+    assert variation_lines(entry) == ["spread between 3 logs, by joint: coulomb 2.5 to 25 %"]
+    assert variation_lines(None) == []
+    assert variation_lines({"logs": ["a"], "parameters": {}}) == []
+
+
+def test_robots_are_stated_by_unit(folder):
+    job = job_from_settings(settings(folder, ("a", "a", "b", "b")), "job.toml", folder)
+    _, content = run_job(job, folder / "units")
+    assert content["variation"]["units"] == 2
+    assert content["variation"]["parameters"][COULOMB]["spread_within_units"] > 0
+    assert [x["unit"] for x in content["settings"]["identification"]] == ["a", "a", "b", "b"]
+    page = (folder / "units" / "report.html").read_text()
+    assert "95 % of the next robot (after 2)" in page
+    part = job_from_settings(settings(folder, ("a", "a", "b")), "job.toml", folder)
+    with pytest.raises(SettingsError, match=r"run_3.csv has no unit, but run_0.csv has unit = 'a'"):
+        run_job(part, folder / "part")

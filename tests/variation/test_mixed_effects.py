@@ -1,0 +1,152 @@
+"""The mixed-effects model against dense matrices, brute-force integration, and coverage."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.stats
+
+from robotid.variation.mixed_effects import MixedEffects, Prediction, Runs
+
+SCALE = np.array([0.2, 0.5])
+BETWEEN = np.array([[0.13, 0.4], [0.31, 0.2]])  # runs, units
+
+
+def drawn(rng, unit, *, mean=(2.0, -1.0), between=BETWEEN, rows=5):
+    """Return runs with few rows each: x = mean + u_unit + u_run + e, and the rows A, y."""
+    unit, blocks = np.asarray(unit), []
+    u_unit = between[1] * rng.normal(size=(unit.max() + 1, 2))
+    for k in unit:
+        A = rng.normal(size=(rows, 2)) @ np.array([[1.0, 0.7], [0.0, 0.6]])
+        x = np.asarray(mean) + u_unit[k] + between[0] * rng.normal(size=2)
+        blocks.append((A, A @ x + rng.normal(size=rows)))
+    return information(blocks, unit), blocks
+
+
+def information(blocks, unit):
+    H = np.array([A.T @ A for A, _ in blocks])
+    h = np.array([A.T @ y for A, y in blocks])
+    return Runs(H, h, np.asarray(unit), SCALE)
+
+
+def dense(blocks, unit, deviation):
+    """Return the restricted log likelihood, mean and covariance from the covariance of all rows."""
+    A = scipy.linalg.block_diag(*[A for A, _ in blocks])
+    X, y = np.concatenate([A for A, _ in blocks]), np.concatenate([y for _, y in blocks])
+    same = np.eye(len(unit))
+    V = A @ np.kron(same, np.diag(deviation[0] ** 2)) @ A.T + np.eye(len(y))
+    if len(deviation) == 2:
+        shared = np.equal.outer(unit, unit).astype(float)
+        V += A @ np.kron(shared, np.diag(deviation[1] ** 2)) @ A.T
+    W = np.linalg.inv(V)
+    P = X.T @ W @ X + np.diag((100.0 * SCALE) ** -2.0)
+    C = np.linalg.inv(P)
+    mean = C @ X.T @ W @ y
+    size = np.linalg.slogdet(V)[1] + np.linalg.slogdet(P)[1] + y @ W @ y - y @ W @ X @ mean
+    return -0.5 * size, mean, C, (A, X, y, W)
+
+
+@pytest.mark.parametrize("unit", [(0, 0, 0, 0), (0, 0, 1, 1, 1, 2)])
+def test_restricted_likelihood_and_mean_are_those_of_the_covariance_of_all_rows(unit):
+    runs, blocks = drawn(np.random.default_rng(1), unit)
+    model, levels = MixedEffects(runs), 2 if max(unit) else 1
+    tried = np.array([[[0.1, 0.2], [0.3, 0.1]], [[0.5, 0.01], [0.02, 0.7]]])[:, :levels]
+    found = model._likelihood(tried)
+    wanted = [dense(blocks, np.array(unit), each) for each in tried]
+    assert found[0][1] - found[0][0] == pytest.approx(wanted[1][0] - wanted[0][0], rel=1e-9)
+    for k in range(2):
+        assert found[1][k] == pytest.approx(wanted[k][1], rel=1e-9)
+        assert found[2][k] == pytest.approx(wanted[k][2], rel=1e-9)
+
+
+def test_values_in_each_run_are_the_best_linear_unbiased_prediction():
+    unit = np.array([0, 0, 1, 1, 1, 2])
+    runs, blocks = drawn(np.random.default_rng(2), unit)
+    model = MixedEffects(runs)
+    deviation = model.deviation
+    _, mean, _, (A, X, y, W) = dense(blocks, unit, deviation)
+    own = np.kron(np.eye(6), np.diag(deviation[0] ** 2))
+    shared = np.kron(np.equal.outer(unit, unit).astype(float), np.diag(deviation[1] ** 2))
+    wanted = mean + ((own + shared) @ A.T @ W @ (y - X @ mean)).reshape(6, 2)
+    values, errors = model.values
+    assert values == pytest.approx(wanted, rel=1e-8)
+    assert errors.shape == (6, 2)
+    assert (errors > 0).all()
+
+
+def test_most_probable_deviations_maximise_the_density():
+    unit = np.array([0, 0, 1, 1, 1, 2])
+    runs, blocks = drawn(np.random.default_rng(3), unit)
+    best = MixedEffects(runs).deviation
+
+    def density(deviation):
+        z = np.log(deviation / SCALE)
+        prior = np.log(np.exp(z) * scipy.stats.t(4).pdf(np.exp(z))).sum()
+        return dense(blocks, unit, deviation)[0] + prior
+
+    top = density(best)
+    inside = np.abs(np.log(best / SCALE)) < 4.9
+    assert inside.any()
+    for level, p in zip(*np.nonzero(inside), strict=True):
+        for factor in (0.9, 1.1):
+            tried = best.copy()
+            tried[level, p] *= factor
+            assert density(tried) < top
+
+
+def test_prediction_of_one_parameter_is_the_brute_force_integral():
+    rng = np.random.default_rng(4)
+    x, error = np.array([1.3, 2.1, 1.7, 2.6]), np.array([0.2, 0.5, 0.3, 0.2])
+    runs = Runs((error**-2.0)[:, None, None], (x / error**2)[:, None], np.zeros(4, int),
+                np.array([0.3]))  # fmt: skip
+    (found,) = MixedEffects(runs).predict(np.array([0.04]), np.array([4.5]))
+    s = 0.3 * np.exp(rng.uniform(-6, 5, 200_000))  # density of log s is uniform here
+    weight = 1 / (error**2 + s[:, None] ** 2)
+    total = weight.sum(axis=1)
+    mean = weight @ x / total
+    log = 0.5 * np.log(weight).sum(axis=1) - 0.5 * np.log(total)
+    log -= 0.5 * (weight * (x - mean[:, None]) ** 2).sum(axis=1)
+    density = np.exp(log) * s / 0.3 * scipy.stats.t(4).pdf(s / 0.3)
+    density /= density.sum()
+    draws = rng.choice(len(s), 200_000, p=density)
+    new = mean[draws] + np.sqrt(1 / total[draws] + s[draws] ** 2 + 0.04) * rng.normal(size=200_000)
+    assert found.mean == pytest.approx(density @ mean, abs=0.01)
+    assert found.ends == pytest.approx(np.quantile(new, [0.025, 0.975]), abs=0.04)
+    assert found.spread == pytest.approx(np.quantile(s[draws], 0.5), rel=0.05)
+    assert found.spread_ends == pytest.approx(np.quantile(s[draws], [0.025, 0.975]), rel=0.1)
+    assert found.probability == pytest.approx(2 * np.mean(new > 4.5), rel=0.15)
+    error = np.sqrt(density @ (1 / total + mean**2) - (density @ mean) ** 2)
+    assert found.std_error == pytest.approx(error, rel=0.02)
+
+
+def test_a_run_that_tells_nothing_of_a_parameter_changes_nothing():
+    unit = [0, 0, 0, 0]
+    runs, _ = drawn(np.random.default_rng(5), unit)
+    more = Runs(np.concatenate([runs.H, np.zeros((1, 2, 2))]),
+                np.concatenate([runs.h, np.zeros((1, 2))]), np.zeros(5, int), SCALE)  # fmt: skip
+    ours, theirs = MixedEffects(runs).predict(), MixedEffects(more).predict()
+    assert [x.ends for x in ours] == [pytest.approx(x.ends, rel=1e-4) for x in theirs]
+    assert MixedEffects(more.without(4)).predict()[1].mean == pytest.approx(ours[1].mean)
+
+
+def test_prediction_intervals_of_the_next_robot_and_of_spreads_cover():
+    rng, inside, spreads, count = np.random.default_rng(6), 0, 0, 40
+    for _ in range(count):
+        unit = np.repeat(np.arange(7), 3)
+        runs, blocks = drawn(rng, unit, rows=12)
+        known = unit < 6
+        model = MixedEffects(Runs(runs.H[known], runs.h[known], unit[known], SCALE))
+        A, y = blocks[-1]
+        x, C = np.linalg.solve(A.T @ A, A.T @ y), np.linalg.inv(A.T @ A)
+        for p, found in enumerate(model.predict(np.diag(C))):
+            inside += found.ends[0] < x[p] < found.ends[1]
+            spreads += found.spread_ends[0] < BETWEEN[1, p] < found.spread_ends[1]
+    assert 0.9 <= inside / (2 * count) <= 1.0
+    assert 0.9 <= spreads / (2 * count) <= 1.0
+
+
+def test_prediction_is_shifted_by_a_constant():
+    found = Prediction(1.0, 0.5, 0.2, np.array([0.1, 0.4]), np.array([0.0, 2.5]), 0.3)
+    moved = found.shifted(10.0)
+    assert (moved.mean, moved.std_error, moved.spread, moved.probability) == (11.0, 0.5, 0.2, 0.3)
+    assert moved.ends.tolist() == [10.0, 12.5]
+    assert moved.spread_ends.tolist() == [0.1, 0.4]
