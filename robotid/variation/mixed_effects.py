@@ -135,17 +135,15 @@ class MixedEffects:
         """
         runs, deviation = self.runs, self.deviation
         _, mean, covariance = self._likelihood(deviation)
-        centre = np.tile(mean, (len(runs.h), 1))
         W, w, U, _ = _integrated(runs.H, runs.h, deviation[0])
+        centre, around = np.tile(mean, (len(runs.h), 1)), covariance
         if self.n_levels == 2:
             W, w = self._by_unit(W, w)
             between = _integrated(W, w, deviation[1])[2]
-            shift = np.einsum("upi,ui->up", between, w - W @ mean)
-            centre = centre + shift[runs.unit]
-        missing = runs.h - np.einsum("kpi,ki->kp", runs.H, centre)
-        values = centre + np.einsum("kpi,ki->kp", U, missing)
-        variance = np.einsum("kpp->kp", U) + np.diag(covariance) / len(runs.h)
-        return values, np.sqrt(variance)
+            means, around = _predicted(between, W, w, centre[: len(w)], covariance)
+            centre, around = means[runs.unit], around[runs.unit]
+        values, errors = _predicted(U, runs.H, runs.h, centre, around)
+        return values, np.sqrt(np.einsum("kpp->kp", errors))
 
     def predict(
         self, own: Array | None = None, value: Array | None = None
@@ -232,6 +230,23 @@ def _integrated(H: Array, h: Array, deviation: Array) -> tuple[Array, Array, Arr
     quadratic = np.einsum("...ki,...kij,...kj->...", h, U, h, optimize=True)
     log_det = np.linalg.slogdet(G)[1].sum(axis=-1)
     return H - HU @ H, h - np.einsum("...pi,...i->...p", HU, h), U, 0.5 * (quadratic - log_det)
+
+
+def _predicted(
+    U: Array, H: Array, h: Array, centre: Array, covariance: Array
+) -> tuple[Array, Array]:
+    """Return the values of the members of a level, shape (k, q), and their errors' covariance.
+
+    Args:
+        U: As of ``_integrated``, shape (k, q, q).
+        H: Information of the members, shape (k, q, q).
+        h: Information times estimate, shape (k, q).
+        centre: Mean of each member before its own information, shape (k, q).
+        covariance: Its covariance, shape (k, q, q) or (q, q).
+    """
+    left = np.eye(h.shape[1]) - U @ H
+    values = centre + np.einsum("kpi,ki->kp", U, h - np.einsum("kpi,ki->kp", H, centre))
+    return values, U + left @ covariance @ np.swapaxes(left, 1, 2)
 
 
 def _log_prior(z: Array) -> Array:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from robotid.cli.identify import show_result
 from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings
 from robotid.exceptions import SettingsError
-from robotid.export.ranges import stated_ranges
+from robotid.export.ranges import parameter_ranges, stated_ranges
 from robotid.identification.summary import variation_lines
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
@@ -73,6 +74,22 @@ def test_ranges_of_drives_are_those_of_the_next_log(result):
     low, high = content["variation"]["parameters"][COULOMB]["next_interval"]
     assert drive["source"] == "logs"
     assert (drive["low"], drive["high"]) == (max(low, 0.0), high)
+
+
+def test_ranges_stay_possible_and_have_no_ends_at_a_bound(result):
+    found, _ = result
+    ends = np.array([-1.0, 5.0])
+    each = [replace(x, prediction=replace(x.prediction, ends=ends))
+            for x in found.variation.parameters]  # fmt: skip
+    wide = replace(found, variation=replace(found.variation, parameters=tuple(each)))
+    drives = parameter_ranges(wide)["drives"]["elbow_joint"]
+    assert (drives["coulomb"]["low"], drives["coulomb"]["high"]) == (0.0, 5.0)
+    assert (drives["offset"]["low"], drives["offset"]["high"]) == (-1.0, 5.0)
+    standard = found.standard.copy()
+    standard[found.model.layout.names.index("elbow_joint.coulomb")] = 0.0
+    drives = parameter_ranges(replace(wide, standard=standard))["drives"]["elbow_joint"]
+    assert drives["coulomb"] == {"nominal": 0.0, "source": "bound", "unit": "N m"}
+    assert drives["viscous"]["source"] == "logs"
 
 
 def test_report_shows_values_in_each_log_over_the_next_interval(result, folder):

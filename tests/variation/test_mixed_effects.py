@@ -63,14 +63,25 @@ def test_values_in_each_run_are_the_best_linear_unbiased_prediction():
     runs, blocks = drawn(np.random.default_rng(2), unit)
     model = MixedEffects(runs)
     deviation = model.deviation
-    _, mean, _, (A, X, y, W) = dense(blocks, unit, deviation)
+    _, mean, C, (A, X, y, W) = dense(blocks, unit, deviation)
     own = np.kron(np.eye(6), np.diag(deviation[0] ** 2))
     shared = np.kron(np.equal.outer(unit, unit).astype(float), np.diag(deviation[1] ** 2))
     wanted = mean + ((own + shared) @ A.T @ W @ (y - X @ mean)).reshape(6, 2)
     values, errors = model.values
     assert values == pytest.approx(wanted, rel=1e-8)
-    assert errors.shape == (6, 2)
-    assert (errors > 0).all()
+    G, same = own + shared, np.tile(np.eye(2), (6, 1))
+    P = W - W @ X @ C @ X.T @ W
+    cross = -same @ C @ X.T @ W @ A @ G
+    total = same @ C @ same.T + G - G @ A.T @ P @ A @ G + cross + cross.T
+    assert errors.ravel() == pytest.approx(np.sqrt(np.diag(total)), rel=1e-3)
+
+
+def test_runs_left_over_have_their_units_numbered_anew():
+    runs, _ = drawn(np.random.default_rng(8), [0, 1, 1, 2])
+    left = runs.without(0)
+    assert left.unit.tolist() == [0, 0, 1]
+    assert left.H.tolist() == runs.H[1:].tolist()
+    assert left.h.tolist() == runs.h[1:].tolist()
 
 
 def test_most_probable_deviations_maximise_the_density():

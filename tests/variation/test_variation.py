@@ -10,7 +10,7 @@ from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import hold_log
 from robotid.judgement.unlike_runs import unlike_findings
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.variation.groups import runs_of
+from robotid.variation.groups import _inflation, runs_of
 from robotid.variation.variation import UnlikeRun, Variation, vary
 
 NAMES = [f"run_{k}.csv" for k in range(6)]
@@ -116,6 +116,33 @@ def test_information_counts_the_noise_of_the_segments(model):
     assert 0.6 < np.std(z) < 1.6  # errors as large as stated
 
 
+def test_inflation_is_1_for_independent_rows():
+    rng, found = np.random.default_rng(0), []
+    for _ in range(150):
+        runs = []
+        for rows in (6, 9, 20):
+            A = rng.normal(size=(4, rows, 3))
+            e = 1.5 * rng.normal(size=(4, rows))
+            runs.append((np.einsum("sri,srj->sij", A, A), np.einsum("sri,sr->si", A, e)))
+        found.append(_inflation(runs))
+    assert np.mean(found) == pytest.approx(1.5**2, rel=0.06)
+
+
+def test_rows_are_divided_by_the_noise_of_their_joint(model):
+    logs, base = segments_of(model, noise=0.02, spread=0.0, seed=3)
+    own = recordings(model, logs)
+    segments = [own.segments(k, log.whole.trajectory) for k, log in enumerate(own.fitted)]
+    found = [
+        runs_of(model, own.mapping, segments, base, np.array(sigma), np.zeros(6, int))
+        for sigma in ([1.0, 1.0, 1.0], [1.0, 2.0, 5.0])
+    ]
+    for one, other in zip(*found, strict=True):
+        if one.group.kind == "gain":
+            factor = {"shoulder_lift_joint": 1.0, "elbow_joint": 4.0, "wrist_1_joint": 25.0}
+            H, less = (x.runs.H * x.inflation for x in (one, other))
+            assert less * factor[one.group.name] == pytest.approx(H)
+
+
 @pytest.mark.parametrize(("kind", "where", "name", "value"), [
     ("drive", LIFT, f"{LIFT}.coulomb", 7.0),
     ("gain", ELBOW, f"{ELBOW}.gain", 1.12),
@@ -160,6 +187,11 @@ def test_parameters_have_their_mean_spread_and_next_interval(model):
     assert coulomb.prediction.ends[0] < true < coulomb.prediction.ends[1]
     assert coulomb.values.std() == pytest.approx(0.1 * true, rel=0.7)
     assert coulomb.within is None
+    rng, own = np.random.default_rng(2), []
+    names = [n for n in model.layout.names if n.endswith(("coulomb", "viscous"))]
+    for _ in NAMES:
+        own.append(true * (1 + 0.1 * rng.normal(size=len(names))[names.index(name)]))
+    assert (np.abs(coulomb.values - own) < 5 * coulomb.std_errors).all()
     assert coulomb.to_dict()["by_log"] == coulomb.values.tolist()
 
 
