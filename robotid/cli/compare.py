@@ -68,6 +68,13 @@ def _show(content: dict[str, Any], *, is_verbose: bool = False) -> None:
         rows = [[e["joint"], *map(cell, e["relative_error_pct"])] for e in per_joint]
         echo(f"\n{title}", "  ")
         print("\n".join(columns(["joint", *labels], rows)))
+    for each in content["changes"]:
+        low, high = (f"{x:.3g}" for x in each["predicted"])
+        value, error = f"{each['value']:.4g}", f"{each['std_error']:.2g}"
+        echo(
+            f"change: {each['result']}: {each['name']} is {value} +- {error} {each['unit']}; the "
+            f"results before it predict {low} to {high}", "  ",
+        )  # fmt: skip
     _print_base_parameters(content, labels, None if is_verbose else _SHOWN)
     for key in ("settings", "versions"):
         for row in content[key]:

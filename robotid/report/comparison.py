@@ -15,6 +15,7 @@ from robotid.export.urdf import terms_from_facts
 from robotid.findings import listed
 from robotid.report.comparison_page import comparison_page
 from robotid.robot.drives import TERMS, DriveMotion
+from robotid.variation.variation import changes
 
 __all__ = ["compare_results", "write_comparison"]
 
@@ -33,8 +34,9 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
         unique part of the path), "validation" and "fitted" (errors by joint, one column per
         result), "fitted_alike" and "notes" (what is not comparable, and the reason),
         "friction" (curves by joint), "base_parameters" (values, standard errors, and the difference
-        to the first result over the combined standard error), "settings", "inputs" and "versions"
-        that differ. The largest difference comes first.
+        to the first result over the combined standard error), "changes" (parameters of the fourth
+        and later results that the results before them do not predict), "settings", "inputs" and
+        "versions" that differ. The largest difference comes first.
 
     Raises:
         DataError: If there are fewer than two results, one is not readable, or their base
@@ -47,7 +49,7 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
         _require_same_mapping(str(paths[0]), results[0], str(path), result)
     logs = _short_names([entry["log"] for result in results for entry in result["validation"]])
     common, notes = _common_recordings(results, logs)
-    names = _short_names(paths)
+    names, parameters = _short_names(paths), _base_parameters(results)
     return {
         "results": [
             {
@@ -74,7 +76,8 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
         "fitted_alike": len({_recordings(result, "identification") for result in results}) == 1,
         "notes": notes,
         "friction": _friction_curves(results),
-        "base_parameters": _base_parameters(results),
+        "base_parameters": parameters,
+        "changes": _changes(parameters),
         "settings": _differences([_flat(_chosen(result)) for result in results]),
         "inputs": _inputs(results),
         "versions": _differences([r.get("versions", {"robotid": r["robotid"]}) for r in results]),
@@ -299,6 +302,26 @@ def _base_parameters(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any
             }
         )
     return sorted(rows, key=lambda row: -_farthest(row["differences"]))
+
+
+def _changes(parameters: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the parameters of later results that the earlier results do not predict."""
+    known = [each for each in parameters if all(each["std_errors"])]
+    if not known:
+        return []
+    values, errors = (np.array([each[key] for each in known]).T for key in ("values", "std_errors"))
+    return [
+        {
+            "result": _label(k),
+            "name": known[p]["name"],
+            "unit": known[p]["unit"],
+            "value": values[k, p],
+            "std_error": errors[k, p],
+            "predicted": expected.ends.tolist(),
+            "probability": expected.probability,
+        }
+        for k, p, expected in changes(values, errors)
+    ]
 
 
 def _farthest(differences: Sequence[float | None]) -> float:

@@ -529,3 +529,34 @@ def test_friction_differs_by_a_share_of_the_most_in_either_direction():
     np.testing.assert_allclose(found["torques"][1], 2.0 * v - 0.8 * np.abs(v), atol=1e-12)
     # at 4 rad/s: 6 N m and 4.8 N m; at -4 rad/s: -10 N m and -11.2 N m
     assert found["difference"] == pytest.approx(1.2 / 11.2)
+
+
+def test_a_parameter_that_earlier_results_do_not_predict_is_a_change(folder, tmp_path, capsys):
+    rng, paths = np.random.default_rng(3), []
+    for k in range(5):
+        result = copy.deepcopy(read_result(folder / "a.json"))
+        for entry in result["base_parameters"]:
+            entry["value"] *= 1 + 0.01 * rng.normal()
+            if k == 4 and entry["name"] == "joint_2.coulomb":
+                entry["value"] *= 4
+        paths.append(tmp_path / f"{k}.json")
+        write_json(result, paths[-1])
+    assert compare_results(paths[:4])["changes"] == []
+    content = write_comparison(paths, tmp_path / "page.html")
+    (found,) = content["changes"]
+    before = [read_result(path)["base_parameters"] for path in paths]
+    index = [entry["name"] for entry in before[0]].index("joint_2.coulomb")
+    own = [each[index]["value"] for each in before]
+    assert (found["result"], found["name"], found["unit"]) == ("E", "joint_2.coulomb", "N m")
+    assert (found["value"], found["std_error"]) == (own[-1], before[-1][index]["std_error"])
+    low, high = found["predicted"]
+    assert low < min(own[:4])
+    assert max(own[:4]) < high < own[-1]
+    assert found["probability"] < 0.02 / (2 * len(before[0]))
+    page = (tmp_path / "page.html").read_text()
+    (shown,) = (table for caption, table in tables(page).items() if "low to high" in caption)
+    assert shown.rows[0][:2] == ["E", "joint_2.coulomb"]
+    assert main(["compare", *map(str, paths)]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert f"change: E: joint_2.coulomb is {own[-1]:.4g} +- " in printed
+    assert f"the results before it predict {low:.3g} to {high:.3g}" in printed
