@@ -1,12 +1,10 @@
 """A stated mass verifies the torque scale only where torque determines that mass."""
 
 import json
-
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import scipy.linalg
 from helpers.crane import CRANE
 from helpers.driven import arm
 from helpers.fitting import fit
