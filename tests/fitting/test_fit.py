@@ -14,6 +14,7 @@ from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
 
 
 @pytest.mark.parametrize(("weight", "rough"), [("auto", 1.0), ("evidence", 1.0), (2.5, 2.5)])
@@ -48,3 +49,23 @@ def test_what_is_known_of_base_parameters_follows_from_the_standard_ones(rng):
     known = Known(None, mapping, pi, spread, 0.3, np.ones(2))
     np.testing.assert_allclose(known.beta, K @ pi)
     np.testing.assert_allclose(known.covariance, K @ np.diag(spread**2) @ K.T)
+
+
+def test_the_prior_of_a_fit_has_the_scale_of_the_samples_of_all_logs(rng):
+    model = RobotModel.from_urdf(example_urdf("double_pendulum_simple.urdf"))
+    logs = [exact_log(model, truth(model), rng, samples=n, noise=0.3) for n in (130, 70)]
+    logs[1] = replace(logs[1], tau=9.0 * logs[1].tau)
+    found = fit(model, logs, signals=SignalSettings(cutoff=None, trim=0.0), estimator="wls")
+    motions = [e.recording.trajectory for e in found.fitted]
+    squares = sum(np.array([np.sum(x**2, axis=0) for x in (m.tau, m.v, m.a)]) for m in motions)
+    samples = sum(len(m.t) for m in motions)
+    np.testing.assert_allclose(found.prior_std, prior_spread(model, squares, samples))
+    np.testing.assert_array_equal(found.prior, model.standard_parameters())
+    K = found.mapping.K
+    C = np.diag(found.prior_std**2)  # the nearest to the prior in units of its spread
+    gain = C @ K.T @ np.linalg.inv(K @ C @ K.T)
+    wanted = found.prior + gain @ (found.estimate.theta - K @ found.prior)
+    np.testing.assert_allclose(found.standard, wanted, atol=1e-9)
+    np.testing.assert_allclose(found.base, found.estimate.theta, atol=1e-9)
+    np.testing.assert_allclose(found.base_error, found.estimate.std_error)
+    np.testing.assert_allclose(found.wls.theta, found.estimate.theta, rtol=1e-6)
