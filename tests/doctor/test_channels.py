@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 
 from robotid.commands.job import LogEntry, read_job
-from robotid.doctor.channels import (
-    _noise,
-    _quantisation,
-    _spikes,
-    _velocity_scale,
-    check_channels,
-)
+from robotid.doctor.channels import _noise, _velocity_scale, check_channels
 from robotid.doctor.torque_channels import check_torque_channels
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -141,17 +135,11 @@ def test_the_scale_of_a_velocity_is_the_ratio_of_sizes_with_noise_in_both(rng):
     assert ratio == pytest.approx(np.sqrt(5.0), rel=0.05)
 
 
-def plain_log(**channels):
-    (values,) = channels.values()
-    t = 5.0 + np.arange(len(values)) / 100.0
-    joints = tuple("abcd"[: values.shape[1]])
-    return Log(t, np.cumsum(values, axis=0), channels.get("tau", values), joints, path="run.csv")
-
-
 def test_the_noise_of_each_torque_is_compared_with_its_own_signal(rng):
     tau = rng.standard_normal((300, 3)) * [2.0, 7.0, 0.5]
     noise = np.array([0.31, 0.29, 0.6]) * tau.std(axis=0)
-    every, *noisy = _noise(plain_log(tau=tau), "tau", tau, noise)
+    log = SimpleNamespace(name="run.csv", joints=tuple("abc"))
+    every, *noisy = _noise(log, "tau", tau, noise)
     assert every.evidence == pytest.approx(dict(zip("abc", noise, strict=True)))
     assert f"of tau: {', '.join(f'{x:.2g}' for x in noise)} (" in every.message
     assert [f.where for f in noisy] == ["run.csv: a", "run.csv: c"]
@@ -159,36 +147,3 @@ def test_the_noise_of_each_torque_is_compared_with_its_own_signal(rng):
     assert [f.message.split(" % of the torque signal of ")[0] for f in noisy] == [
         "run.csv: noise is 31", "run.csv: noise is 60"
     ]  # fmt: skip
-
-
-def test_quantised_channels_are_named_by_the_number_of_their_steps(rng):
-    u = rng.uniform(size=(400, 4))
-    u[:2] = [[0.0] * 4, [1.0] * 4]  # the whole range
-    steps, sizes = np.array([1e-3, 7, 12, 200]), np.array([3.0, 14.0, 6.0, 50.0])
-    tau = sizes * np.where(np.arange(4) == 0, u, np.round(u * steps) / steps)
-    few, fine = _quantisation(plain_log(tau=tau), "tau", tau, "auto")
-    assert (few.severity, few.where, fine.severity) == ("warning", "run.csv: tau", "note")
-    assert few.evidence == pytest.approx({"steps_b": 7, "steps_c": 12})
-    assert fine.evidence == pytest.approx({"steps_d": 200})
-    assert "tau of b, c is quantised in steps of 2, 7 steps over its range" in few.message
-    assert "tau of d is quantised in steps of 0.25, 200 steps over its range" in fine.message
-
-
-def test_each_spike_is_counted_and_weighed_in_its_own_channel(rng):
-    tau = 0.01 * rng.standard_normal((500, 2)) + np.sin(np.arange(500) / 9.0)[:, None] * [2.0, 40.0]
-    smooth = tau.copy()
-    tau[[120, 300], 0] += [-30.0, 25.0]
-    tau[410, 1] += 900.0
-    noise = np.array([0.01, 0.01])
-    found = {f.where: f for f in _spikes(plain_log(tau=tau), "tau", tau, noise)}
-    assert list(found) == ["run.csv: tau_a", "run.csv: tau_b"]
-    for f, x, rows, sizes in zip(
-        found.values(), tau.T, ([120, 300], [410]), ([30.0, 25.0], [900.0]), strict=True
-    ):
-        share = np.sum(np.square(sizes)) / np.sum((x - np.median(x)) ** 2)
-        wanted = {"rows": len(rows), "largest": max(sizes), "first": 5.0 + rows[0] / 100.0}
-        wanted["energy_share"] = share
-        assert f.evidence == pytest.approx(wanted, rel=0.1)
-        assert f"in {len(rows)} rows, the first at t = {wanted['first']:.6g} s" in f.message
-        assert f.severity == "error"
-    assert not list(_spikes(plain_log(tau=smooth), "tau", smooth, noise))
