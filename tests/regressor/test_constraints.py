@@ -11,6 +11,7 @@ from robotid.exceptions import ModelError, SettingsError
 from robotid.logs.base import BaseColumns
 from robotid.logs.data import Trajectory
 from robotid.regressor.constraints import (
+    _measured,
     constrained,
     constraint_jacobian,
     force_basis,
@@ -189,6 +190,14 @@ def test_a_loop_prevents_the_relative_motion(kind, axis, equations, rng):
         free = data.oMf[one].rotation @ np.array(axis) / np.linalg.norm(axis)
         rest = D[3:] - np.outer(free, free @ D[3:])
         np.testing.assert_allclose(J[3:].T @ J[3:], rest.T @ rest, atol=1e-12)
+
+
+def test_measured_components_are_counted_over_loops_and_contacts_of_any_size():
+    every = (
+        Loop(("a", "b")), Contact("c", "surface", measured=("mx", "fz")), Contact("d"),
+        Loop(("e", "f"), "point"), Contact("g", measured=("fy",)),
+    )  # fmt: skip
+    assert _measured(SimpleNamespace(constraints=every)) == [5 + 3, 5 + 2, 5 + 6 + 3 + 3 + 1]
 
 
 def test_contacts_state_what_logs_have(quadruped):
