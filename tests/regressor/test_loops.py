@@ -146,6 +146,12 @@ def test_positions_out_of_reach_are_refused(tmp_path):
     )
     assert float(left) >= np.sqrt(0.15**2 + 0.6**2 - 2 * 0.15 * 0.6 * np.cos(x)) - 0.68
     assert wanted.startswith("6e-06 m")
+    q = np.column_stack([t, 5.0 * t, -t])
+    chains = Chains(robot)
+    found, first = chains.closed(q, np.array([False, True, True])), int(np.argmax(t == x))
+    assert chains.gaps(found[:first]).max() < 1e-9
+    np.testing.assert_array_equal(found[first:], np.tile(found[first], (60 - first, 1)))
+    np.testing.assert_array_equal(found[: first + 1, 0], t[: first + 1])
 
 
 def test_a_log_in_another_order_keeps_each_joint_and_names_the_loop_that_is_open(tmp_path, rng):
