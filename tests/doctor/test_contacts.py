@@ -124,6 +124,11 @@ def test_a_twist_with_the_axes_of_the_world_is_found(robot, walk, part):
     assert found.evidence["off_world"] < 1e-3 * found.evidence["off"]
     off = np.sqrt(np.mean(np.sum((turned - twist)[:, part] ** 2, axis=1)))
     assert found.evidence["off"] == pytest.approx(off)
+    size = np.sqrt(np.mean(np.sum(twist[:, part] ** 2, axis=1)))
+    assert found.evidence["size"] == pytest.approx(size)
+    unit, what = ("m/s", "linear") if part.start == 0 else ("rad/s", "angular")
+    words = f"{what} velocity of the base differs by {off:.2g} {unit} from that of its pose, "
+    assert f"{words}{size:.2g} {unit} (RMS)" in found.message
     doubled = replace(right, base=BaseMotion(pose, 2.0 * twist))
     other = next(check_base(free, doubled, RAW))
     assert "Check the columns base_vx to base_wz, or remove them" in other.message

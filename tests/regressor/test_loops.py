@@ -22,7 +22,16 @@ from robotid.robot.constraints import Loop
 from robotid.robot.drives import TERMS
 from robotid.robot.mass_matrix import check_mass_matrix
 from robotid.robot.model import RobotModel
-from tests.helpers.closed_chains import FOUR_BAR, FOUR_BAR_LOOP, Oracle, ankle, four_bar
+from tests.helpers.closed_chains import (
+    ANKLE,
+    ANKLE_LOOPS,
+    ANKLE_PASSIVE,
+    FOUR_BAR,
+    FOUR_BAR_LOOP,
+    Oracle,
+    ankle,
+    four_bar,
+)
 
 
 @pytest.fixture(params=[four_bar, ankle])
@@ -223,6 +232,19 @@ def test_a_loop_that_never_closes_is_refused(tmp_path):
     robot = four_bar(tmp_path, constraints=[replace(FOUR_BAR_LOOP, kind="rigid")])
     with pytest.raises(ModelError, match=r"\(rigid\) does not close near the zero position: "):
         structural_mapping(robot)
+
+
+def test_of_two_loops_the_one_that_stays_open_is_named_with_its_error(tmp_path):
+    right = ANKLE.index("right_tip")  # its rod is too long
+    text = ANKLE[:right] + ANKLE[right:].replace('xyz="0 0 -0.21"', 'xyz="0 0 -0.9"', 1)
+    path = tmp_path / "ankle.urdf"
+    path.write_text(text)
+    robot = RobotModel.from_urdf(path, constraints=ANKLE_LOOPS, passive=ANKLE_PASSIVE)
+    with pytest.raises(ModelError) as error:
+        Chains(robot).random_states(1, np.random.default_rng(0))
+    name, left = str(error.value).split(" does not close near the zero position: ")
+    assert name == "loop right_rod_end - right_heel (point)"
+    assert float(left.split(" m remain")[0]) > 0.2
 
 
 @pytest.mark.parametrize("kind", ["point", "hinge", "rigid"])
