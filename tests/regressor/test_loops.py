@@ -189,6 +189,7 @@ def test_a_log_in_another_order_keeps_each_joint_and_names_the_loop_that_is_open
     assert f"at t = {t[13]:g} s: {gaps[13, 1]:.3g} m remain, wanted at most" in str(error.value)
     assert f"at most {0.02 * robot.length:.2g} m" in str(error.value)
     assert gaps[13:, 0].max() < 1e-9
+    assert [Chains(robot).is_closed(x) for x in moved[[12, 13]]] == [True, False]
 
 
 def test_the_error_of_a_rigid_loop_is_of_its_distance_and_its_angle(tmp_path, rng):
