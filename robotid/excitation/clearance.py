@@ -14,8 +14,8 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
+from robotid.excitation.along import Placements, fixed_tree
 from robotid.findings import listed
-from robotid.regressor.along import Placements, fixed_tree
 from robotid.robot.geometry import link_clouds
 from robotid.robot.model import RobotModel
 from robotid.simulation.motions import Motion

@@ -8,7 +8,7 @@ import scipy.linalg
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
-from robotid.regressor.along import MotionRegressor
+from robotid.excitation.along import MotionRegressor
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import drive_motion
 from robotid.robot.drives import DriveMotion, DriveTerm

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robotid.commands.job import LogEntry, read_job
-from robotid.doctor.channels import _velocity_scale, check_channels
+from robotid.doctor.channels import _noise, _velocity_scale, check_channels
 from robotid.doctor.torque_channels import check_torque_channels
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -133,3 +133,17 @@ def test_the_scale_of_a_velocity_is_the_ratio_of_sizes_with_noise_in_both(rng):
     ratio = v[:, 0].std() / slope[:, 0].std()
     assert f"dq_one is {ratio:.3g} times d(q)/dt of q_one" in found.message
     assert ratio == pytest.approx(np.sqrt(5.0), rel=0.05)
+
+
+def test_the_noise_of_each_torque_is_compared_with_its_own_signal(rng):
+    tau = rng.standard_normal((300, 3)) * [2.0, 7.0, 0.5]
+    noise = np.array([0.31, 0.29, 0.6]) * tau.std(axis=0)
+    log = SimpleNamespace(name="run.csv", joints=tuple("abc"))
+    every, *noisy = _noise(log, "tau", tau, noise)
+    assert every.evidence == pytest.approx(dict(zip("abc", noise, strict=True)))
+    assert f"of tau: {', '.join(f'{x:.2g}' for x in noise)} (" in every.message
+    assert [f.where for f in noisy] == ["run.csv: a", "run.csv: c"]
+    assert [f.evidence["share"] for f in noisy] == pytest.approx([0.31, 0.6])
+    assert [f.message.split(" % of the torque signal of ")[0] for f in noisy] == [
+        "run.csv: noise is 31", "run.csv: noise is 60"
+    ]  # fmt: skip

@@ -65,6 +65,39 @@ def test_a_slipping_foot_is_found_with_its_speed(robot, walk):
     assert "the link HR_FOOT moves at 0.4 m/s" in found[1].message
 
 
+def test_each_contact_has_its_own_speed_whatever_is_before_it(robot, walk):
+    """A surface before a point; both feet stand always, and the trunk slides and turns."""
+    contacts = [Contact(FEET[1], "surface", always=True), Contact(FEET[0], always=True)]
+    other = replace(robot, constraints=tuple(contacts))
+    t, pose = walk.t, walk.base.pose.copy()
+    pose[:, 0] += 0.3 * np.sin(2 * t)
+    log = replace(walk, q=0 * walk.q, base=BaseMotion(pose), contacts={})
+    found = list(check_base(other, log, RAW))
+    assert [f.code for f in found] == ["moving_contact"] * 2
+    speed = np.sqrt(np.mean(np.gradient(pose[:, 0], t) ** 2))
+    assert [f.evidence["speed"] for f in found] == pytest.approx([speed] * 2, rel=1e-3)
+    for foot, f in zip(FEET[::-1], found, strict=True):
+        assert f"the link {foot} moves at {speed:.2g} m/s (RMS) while it is in contact" in f.message
+
+
+def test_a_shift_of_flags_is_stated_with_the_speeds_before_and_after_it(robot, walk):
+    flags = {x: np.roll(y, 8 * (x == FEET[0])) for x, y in walk.contacts.items()}
+    pose = walk.base.pose.copy()
+    pose[:, 1] += 0.09 * walk.t  # [m/s] less than a slip that is reported
+    log = replace(walk, base=BaseMotion(pose), contacts=flags)
+    (found,) = check_base(robot, log, RAW)
+    frame = robot.pin_model.getFrameId(FEET[0], pin.FrameType.BODY)
+    data, places = robot.pin_model.createData(), []
+    for q in robot.configurations(np.hstack([pose, walk.q])):
+        pin.framesForwardKinematics(robot.pin_model, data, q)
+        places.append(data.oMf[frame].translation.copy())
+    squares = np.sum(np.gradient(np.array(places), walk.t, axis=0) ** 2, axis=1)
+    now, then = (np.sqrt(squares[x[FEET[0]]].mean()) for x in (flags, walk.contacts))
+    words = found.message.split("its speed in contact is ")[1].split(" m/s")
+    assert float(words[0]) == pytest.approx(then, abs=0.03)
+    assert float(words[1].removeprefix(" instead of ")) == pytest.approx(now, rel=0.06)
+
+
 @pytest.mark.parametrize("part", [slice(0, 3), slice(3, 6)])
 def test_a_twist_with_the_axes_of_the_world_is_found(robot, walk, part):
     t = walk.t
@@ -91,6 +124,11 @@ def test_a_twist_with_the_axes_of_the_world_is_found(robot, walk, part):
     assert found.evidence["off_world"] < 1e-3 * found.evidence["off"]
     off = np.sqrt(np.mean(np.sum((turned - twist)[:, part] ** 2, axis=1)))
     assert found.evidence["off"] == pytest.approx(off)
+    size = np.sqrt(np.mean(np.sum(twist[:, part] ** 2, axis=1)))
+    assert found.evidence["size"] == pytest.approx(size)
+    unit, what = ("m/s", "linear") if part.start == 0 else ("rad/s", "angular")
+    words = f"{what} velocity of the base differs by {off:.2g} {unit} from that of its pose, "
+    assert f"{words}{size:.2g} {unit} (RMS)" in found.message
     doubled = replace(right, base=BaseMotion(pose, 2.0 * twist))
     other = next(check_base(free, doubled, RAW))
     assert "Check the columns base_vx to base_wz, or remove them" in other.message

@@ -12,7 +12,7 @@ from robotid.doctor import hypotheses
 from robotid.doctor import loads as loads_module
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.hypotheses import explanations, own_share
-from robotid.doctor.loads import _payload, load_model
+from robotid.doctor.loads import LoadModel, _payload, load_model
 from robotid.doctor.sample import smooth_motion, take_probe
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
@@ -223,3 +223,27 @@ def test_scales_of_torques_are_reported_together_if_alike_else_joint_by_joint():
     for unit, severity in ((29.0, "warning"), (31.0, "error")):
         (every,) = loads_module._scaled(probe, np.full(4, unit), np.arange(4), "run.csv")
         assert (every.where, every.severity) == ("run.csv", severity)
+
+
+@pytest.mark.parametrize(
+    ("decades", "used"),
+    [
+        ([0.0, 0.0, 0.0], [1, 1, 1]),  # as logged
+        ([-1.3, -1.3, -1.3], [1, 1, 1]),  # one gain of all
+        ([0.0, -0.8, 0.0], [1, 1, 1]),
+        ([0.5, 0.0, 2.1], [1, 1, 1]),
+        ([0.0, 0.0, -0.6], [1, 0, 1]),  # a torque that is ignored has no scale
+    ],
+)
+def test_the_scales_of_torques_are_those_that_they_were_divided_by(rng, decades, used):
+    """Two links of 1.1 and 0.9 times their masses, torques accurate to a thousandth."""
+    theta, R = np.array([1.1, 0.9, 0.3, 0.0, 0.1, 0.0]), np.zeros((3, 7, 7))
+    for j in np.flatnonzero(used):
+        X = rng.standard_normal((40, 6)) * [5, 3, 1, 1, 1, 1]
+        tau = X @ theta + 1e-3 * rng.standard_normal(40)
+        R[j] = np.linalg.qr(np.column_stack([X, tau / 10.0 ** decades[j]]), mode="r")
+        R[j] /= 0.01 * tau.std() / 10.0 ** decades[j]
+    model = LoadModel(R, np.array([1, 1, 0, 0, 0, 0.0]), np.array([0.3] * 2 + [20, 10, 10, 10]),
+                      0.0, 120.0)  # fmt: skip
+    found = loads_module._torque_scales(model)
+    np.testing.assert_allclose(np.log10(found), decades, atol=1e-9)

@@ -10,6 +10,7 @@ from robotid.doctor.urdf import inspect_urdf
 from robotid.doctor.urdf_base import rounded_robot
 from robotid.exceptions import ModelError
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.torque import random_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.urdf_text import read_with_yourdfpy
@@ -337,15 +338,20 @@ def test_what_yourdfpy_cannot_read_is_a_finding(tmp_path):
         read_with_yourdfpy(tmp_path / "two.urdf")
 
 
-def test_the_condition_number_is_that_of_unit_columns(tmp_path):
-    from robotid.regressor.torque import random_regressor
-
-    structure = inspected(tmp_path).structure
-    model = RobotModel.from_urdf(tmp_path / "two.urdf")
-    W = random_regressor(model, 2000, np.random.default_rng(5))
-    W = W[:, structural_mapping(model).independent]
-    unit = np.linalg.cond(W / np.linalg.norm(W, axis=0))
-    assert structure.condition == pytest.approx(unit, rel=0.5)  # other states, same size
+def test_arms_on_one_base_have_the_condition_number_of_the_whole_regressor(tmp_path):
+    """A light lift beside the arm: the extreme singular values belong to different chains."""
+    lift = """<link name="cart"><inertial><mass value="0.3"/><inertia ixx="1" iyy="1" izz="1"
+      ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="lift" type="prismatic"><axis
+      xyz="0 0 1"/><parent link="base"/><child link="cart"/><limit lower="0" upper="1" effort="9"
+      velocity="2"/></joint></robot>"""
+    path = tmp_path / "both.urdf"
+    path.write_text(CLEAN.replace("</robot>", lift))
+    model = RobotModel.from_urdf(path)
+    mapping = structural_mapping(model)
+    samples = 2 * len(mapping.names) // 3 + 20
+    W = random_regressor(model, samples, np.random.default_rng(0))[:, mapping.independent]
+    sizes = np.linalg.svd(W / np.linalg.norm(W, axis=0), compute_uv=False)
+    assert inspect_urdf(path).structure.condition == pytest.approx(sizes[0] / sizes[-1], rel=1e-6)
 
 
 def test_a_chain_whose_last_joints_are_hardly_felt_is_named(tmp_path):

@@ -15,6 +15,7 @@ from robotid.exceptions import DataError
 from robotid.fitting import survey
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import ReducedPiece, hold_log, survey_log
+from robotid.logs.base import BaseMotion
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table, write_columns
 from robotid.logs.read import lay_out, read_log, write_log
@@ -22,6 +23,8 @@ from robotid.logs.settings import LogUnits, SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.constraints import Contact
+from robotid.robot.drives import Cubic
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.motions import random_fourier
@@ -277,3 +280,30 @@ def test_windows_of_a_long_log_are_named_by_their_own_rows(monkeypatch):
     short = SimpleNamespace(windows=windows[:1], first=7, stop=300)
     assert survey.SurveyedLog.looks.fget(short) == windows[:1]
     assert survey.SurveyedLog.head.fget(short) is windows[0]
+
+
+def test_other_drive_terms_keep_the_rows_and_torques_without_contact_forces(rng):
+    """A quadruped on two feet; of a log without them, or in another order, nothing is read."""
+    feet = ("HR_FOOT", "FL_FOOT")
+    model = RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, terms=("viscous",),
+        constraints=[Contact(foot) for foot in feet],
+    )  # fmt: skip
+    t = np.arange(60) / 50.0
+    pose = np.column_stack([np.sin(t), t, 0 * t, 0 * t, 0 * t, np.sin(t / 2), np.cos(t / 2)])
+    flags = {foot: (t > 0.5) == (foot == feet[0]) for foot in feet}
+    q, tau = np.sin(np.outer(t, rng.uniform(1, 3, 12))), rng.standard_normal((60, 12))
+    log = Log(t, q, tau, model.joints, base=BaseMotion(pose), contacts=flags)
+    settings = SignalSettings(cutoff=None, trim=0.0, velocity="differentiated")
+    held = hold_log(model, log, settings)
+    first = held.whole
+    assert np.flatnonzero(~first.mask.all(axis=1)).tolist() == [25, 26]  # the feet change
+    other = held.with_model(model.with_terms({"FL_KFE": (Cubic(),)})).whole
+    np.testing.assert_array_equal(other.mask, first.mask)
+    np.testing.assert_array_equal(other.trajectory.basis, first.trajectory.basis)
+    np.testing.assert_array_equal(other.trajectory.tau, first.trajectory.tau)
+    turned = replace(log, contacts=dict(reversed(flags.items())))
+    with pytest.raises(DataError, match="has the contacts FL_FOOT, HR_FOOT, wanted those of the"):
+        hold_log(model, turned, settings)
+    with pytest.raises(DataError, match="log has no pose of the floating base"):
+        hold_log(model, replace(log, base=None), settings)

@@ -5,13 +5,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from robotid.findings import Finding
 from robotid.fitting.robust import Outlier
 from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement import findings
 from robotid.judgement.findings import (
+    _bound_findings,
     _correlated,
+    _dense_bodies,
     _drive_findings,
     _grown,
+    _impossible_shapes,
     _outlier_findings,
     _static_findings,
     _total_mass,
@@ -20,6 +24,7 @@ from robotid.judgement.findings import (
 )
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+from robotid.robot.parameters import inertial_from_pseudo_inertia
 
 
 @pytest.mark.parametrize(
@@ -400,3 +405,92 @@ def test_a_fit_is_reported_by_its_determination_its_refitted_logs_and_costly_joi
     assert costs[1].message.startswith(
         "c: the residual is 0.61 N m, that of unconstrained WLS 0.5: physics and data disagree"
     )
+
+
+def ellipsoid(density, axes, centre):
+    """Return the ten parameters of a homogeneous ellipsoid of three semi-axes."""
+    axes, centre = np.array(axes), np.array(centre)
+    mass = density * 4 / 3 * np.pi * max(np.prod(axes), 1e-6)
+    moments = mass * (np.diag(axes**2) / 5 + np.outer(centre, centre))
+    J = np.block([[moments, mass * centre[:, None]], [mass * centre[None], np.full((1, 1), mass)]])
+    return inertial_from_pseudo_inertia(J[None])[0]
+
+
+def test_bodies_denser_than_any_material_and_than_the_urdf_are_named_with_their_figures():
+    sizes = [(0.1, 0.05, 0.2), (0.03, 0.04, 0.05), (0.1, 0.2, 0.0), (0.06, 0.02, 0.05)]
+    centres = [(0.1, -0.3, 0.2), (0, 0, 0), (0, 0, 0), (-0.2, 0, 0)]
+    before, after = (
+        np.concatenate([ellipsoid(*own) for own in zip(densities, sizes, centres, strict=True)])
+        for densities in ((2e3, 18e3, 1e3, 12.5e3), (20e3, 17e3, 1e3, 11.9e3))
+    )
+    layout = SimpleNamespace(n_inertial=40, bodies=tuple("abcd"))
+    before[20:30] = ellipsoid(1e3, (0.1, 0.2, 0.3), centres[2])  # not flat
+    found = _dense_bodies(
+        SimpleNamespace(model=SimpleNamespace(layout=layout), prior=before, standard=after)
+    )
+    assert [(f.code, f.severity, f.where) for f in found] == [
+        ("dense_body", "warning", "link a"), ("dense_body", "warning", "link c")
+    ]  # fmt: skip
+    assert found[0].evidence == pytest.approx({"mass": after[0], "density": 20e3})
+    assert f"its mass is {after[0]:.3g} kg and its inertia needs a density of at least 2e+04" in (
+        found[0].message
+    )
+    assert found[1].evidence == {"mass": after[20], "density": np.inf}
+    assert "kg and its inertia is that of a body without volume" in found[1].message
+
+
+@pytest.mark.parametrize("of_urdf", [True, False])
+def test_impossible_shapes_are_notes_if_the_urdf_or_the_box_of_the_fit_excuses_them(
+    monkeypatch, of_urdf
+):
+    boxes = {"a": "box a", "b": "box b"}
+    model = SimpleNamespace(name="robot")
+    fit = SimpleNamespace(model=model, prior="before", standard="after")
+    of = {
+        "before": [("density", "b")] if of_urdf else [("density", "a"), ("gyration", "b")],
+        "after": [("com_outside", "a"), ("density", "b")],
+    }
+
+    def audit(one, pi, points):
+        assert (one, points) == (model, "points")
+        return [
+            Finding(c, "warning", f"link {x}", f"{c} of {x} in {pi}; advice") for c, x in of[pi]
+        ]
+
+    monkeypatch.setattr(findings, "audit_bodies", audit)
+    monkeypatch.setattr(findings, "body_points", lambda one: "points")
+    monkeypatch.setattr(findings, "body_boxes", lambda one: boxes)
+    asked = []
+    monkeypatch.setattr(findings, "_is_within_box", lambda *own: asked.append(own) or own[1] == "a")
+    one, two = _impossible_shapes(fit)
+    assert (one.code, one.severity, one.where) == ("com_outside", "note", "link a")
+    assert one.message == (
+        "as identified, com_outside of a in after; it is within the margin of the fit"
+    )
+    assert two.severity == ("note" if of_urdf else "warning")
+    assert two.message == (
+        "density of b in after; the URDF has the same fault"
+        if of_urdf
+        else "as identified, density of b in after; record more motion of it, or pin it to the URDF"
+    )
+    wanted = [(fit, "a", "box a"), *([] if of_urdf else [(fit, "b", "box b")])]
+    assert asked == wanted
+
+
+def test_terms_at_their_bound_and_bodies_out_of_their_box_are_named_each():
+    names = tuple(f"{joint}.{term}" for joint in "abc" for term in ("viscous", "coulomb"))
+    fit = SimpleNamespace(
+        model=SimpleNamespace(layout=SimpleNamespace(names=names)),
+        at_bound=np.array([0, 1, 1, 1, 1, 1], dtype=bool),
+        estimate=SimpleNamespace(details={"relaxed": ("hand", "arm")}),
+    )
+    terms, hand, arm = _bound_findings(fit)
+    assert (terms.code, terms.severity) == ("at_bound", "note")
+    assert terms.where == ", ".join(names[1:])
+    assert terms.message.startswith(
+        "a.coulomb, b.viscous, b.coulomb, c.viscous, c.coulomb: 0, at the bound, without"
+    )
+    for finding, link in ((hand, "hand"), (arm, "arm")):
+        assert (finding.code, finding.severity) == ("extent_contradicted", "warning")
+        assert finding.where == f"link {link}"
+        assert finding.message.startswith(f"{link}: the data contradict the box of its geometry")

@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -9,6 +10,7 @@ from helpers.fitting import fit, identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.fitting.settings import EstimatorSettings
+from robotid.judgement import scale_check
 from robotid.judgement.findings import fit_findings
 from robotid.judgement.scale_check import ScaleCheck, check_scale
 from robotid.logs.settings import SignalSettings
@@ -221,3 +223,28 @@ def test_its_figures_are_those_of_pinocchios_gravity_over_the_poses_of_all_logs(
     torque = found.standard[k[0]] * v + found.standard[k[1]] * np.sign(v)
     share = np.linalg.norm(torque, axis=0) / np.linalg.norm(tau, axis=0)
     np.testing.assert_allclose(list(scale_check.friction.values()), share, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("masses", "ratio"), [([2.0, 3.0, 7.0], 1.2), ([0.0, 0.0, 0.0], 1.0)])
+def test_a_floating_base_is_loaded_with_the_whole_mass(monkeypatch, masses, ratio):
+    before, after = np.zeros((2, 35))
+    before[:30:10], after[:30:10] = masses, [2.4, 4.0, 8.0]
+    before[30:] = 9.0  # drives
+    rmse = {"base.fz": SimpleNamespace(rmse=1.0), "a": SimpleNamespace(rmse=0.2)}
+    free = rmse | {"a": SimpleNamespace(rmse=0.1)}
+    layout = SimpleNamespace(n_inertial=30)
+    recording = SimpleNamespace(trajectory=SimpleNamespace(q=np.ones((4, 9))))
+    found = SimpleNamespace(
+        model=SimpleNamespace(layout=layout, free_flyer=True), prior=before, standard=after,
+        metrics=lambda name: SimpleNamespace(per_joint={"estimate": rmse, "wls": free}[name]),
+        fitted=[SimpleNamespace(recording=recording)],
+    )  # fmt: skip
+    monkeypatch.setattr(scale_check, "stated_mass", lambda fit: None)
+    monkeypatch.setattr(scale_check, "determines_total_mass", lambda fit: False)
+    monkeypatch.setattr(scale_check, "_friction", lambda fit: {"a": 0.3})
+    check = check_scale(found)
+    assert (check.scale, check.factor) == pytest.approx((ratio, ratio))
+    assert check.masses == pytest.approx((sum(masses), 14.4, 0.0))
+    assert check.is_total_determined
+    assert not check.follows  # the residual of a is twice that of WLS
+    assert (dict(check.friction), dict(check.gravity)) == ({"a": 0.3}, {})

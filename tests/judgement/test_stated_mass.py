@@ -1,6 +1,7 @@
 """A stated mass verifies the torque scale only where torque determines that mass."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from helpers.synthetic import exact_log, truth
 from robotid.export.result import stated_scale_check
 from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement.scale_check import ScaleCheck, check_scale
-from robotid.judgement.stated_mass import StatedMass
+from robotid.judgement.stated_mass import StatedMass, stated_mass
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0, velocity="measured")
@@ -57,6 +59,27 @@ def test_any_total_mass_of_a_fixed_arm_fits_and_none_verifies(lifted, times):
     assert model.layout.bodies[0] in found.stated.absorbed_by
     assert "The stated total_mass does not verify the scale: torque does not" in found.message
     assert "Verify it with a payload of known mass (robotid payload)" in found.message
+
+
+def test_the_named_links_take_up_most_of_the_likeliest_change_that_no_torque_shows():
+    model = arm()
+    layout, K = model.layout, structural_mapping(model).K
+    spread = np.full(len(layout.names), 0.2)
+    spread[: layout.n_inertial : 10] = 0.9, 0.35, 1.5  # [kg]
+    known = SimpleNamespace(theta=np.zeros(len(K)), covariance=np.eye(len(K)))
+    bounds = SimpleNamespace(masses={}, total=(5.0, 5.0), pinned=())
+    found = SimpleNamespace(
+        model=model, wls=known, prior_std=spread, prior=np.zeros(len(spread)),
+        mapping=SimpleNamespace(K=K), estimator=SimpleNamespace(bounds=bounds),
+    )  # fmt: skip
+    # the change x of least |x / spread| with K x = 0 that adds 1 kg to the total mass
+    own = np.array([name.endswith(".m") for name in layout.names], dtype=float)
+    rows = np.vstack([K, own]) * spread
+    x = spread * (np.linalg.pinv(rows) @ np.append(np.zeros(len(K)), 1.0))
+    masses = np.abs(x[: layout.n_inertial : 10])
+    wanted = tuple(np.array(layout.bodies)[masses > 0.1 * masses.sum()].tolist())
+    assert np.linalg.norm(K @ x) < 1e-9
+    assert stated_mass(found) == StatedMass(("total_mass",), absorbed_by=wanted)
 
 
 def test_a_stated_mass_of_the_last_link_of_a_fixed_arm_verifies_nothing(lifted):

@@ -1,11 +1,20 @@
 """Motion of a floating base and contacts in logs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from robotid.exceptions import DataError
-from robotid.logs.base import BaseColumns, BaseMotion, base_state, in_base, quaternions_of_angles
+from robotid.logs.base import (
+    BaseColumns,
+    BaseMotion,
+    base_state,
+    contacts_of,
+    in_base,
+    quaternions_of_angles,
+)
 from robotid.logs.data import Log
 from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import SignalSettings
@@ -48,6 +57,25 @@ def test_a_pose_is_differentiated_as_by_pinocchio():
     np.testing.assert_allclose(measured[1], twist + 1.0)
     np.testing.assert_allclose(measured[2], acceleration, atol=1e-9)
     np.testing.assert_allclose(base_state(t, pose, twist, twist * 3.0)[2], twist * 3.0)
+
+
+def test_a_base_is_differentiated_by_its_own_time_stamps(rng):
+    """Steps of 3 to 14 ms; differences of second order are exact for polynomials of degree 2."""
+    t = 7.0 + np.cumsum(rng.uniform(0.003, 0.014, 60))
+    C = rng.standard_normal((3, 6))
+    quaternion = np.array([0.1, -0.7, 0.4, 0.5]) / np.linalg.norm([0.1, -0.7, 0.4, 0.5])
+    x, twist = (np.vander(t, 3) @ c for c in (C[:, :3], C))
+    pose = np.hstack([x, np.tile(quaternion, (60, 1))])
+    _, found, acceleration = base_state(t, pose, None, None)
+    R = pin.Quaternion(quaternion).toRotationMatrix()
+    slope = np.column_stack([2 * t, np.ones(60)])
+    np.testing.assert_allclose(found[1:-1, :3], (slope @ C[:2, :3] @ R)[1:-1], rtol=1e-7)
+    np.testing.assert_allclose(found[:, 3:], 0.0, atol=1e-9)
+    np.testing.assert_allclose(
+        acceleration[2:-2, :3], np.tile(2 * C[0, :3] @ R, (56, 1)), rtol=1e-6
+    )
+    acceleration = base_state(t, pose, twist, None)[2]
+    np.testing.assert_allclose(acceleration[1:-1], (slope @ C[:2])[1:-1], rtol=1e-7)
 
 
 def test_vectors_and_angles_turn_as_by_pinocchio(rng):
@@ -108,8 +136,9 @@ def test_a_log_is_read_as_it_was_written(log, tmp_path):
             np.testing.assert_array_equal(values, other[name])
     assert not again.notes
     world = read_log(tmp_path / "log.csv", log.joints, base=BaseColumns(True, twist="world"))
-    turned = in_base(log.base.pose[:, 3:], log.base.twist[:, 3:])
-    np.testing.assert_allclose(world.base.twist[:, 3:], turned)
+    for part in (slice(0, 3), slice(3, 6)):
+        turned = in_base(log.base.pose[:, 3:], log.base.twist[:, part])
+        np.testing.assert_allclose(world.base.twist[:, part], turned)
     assert not world.contacts
     part = again.window(2.2, 2.4)
     np.testing.assert_array_equal(part.base.twist, again.base.twist[20:41])
@@ -148,6 +177,49 @@ def test_a_contact_is_0_or_1(log, tmp_path):
     (tmp_path / "log.csv").write_text(text)
     with pytest.raises(DataError, match="contact_l_sole is 2 in row 0, wanted 0 or 1"):
         read_log(tmp_path / "log.csv", log.joints, base=BaseColumns(contacts=("l_sole",)))
+    values = np.array([[0, 1], [1, 0], [0, 0.25], [7, 1.0]])
+    with pytest.raises(DataError, match=r"run: contact_a is 7 in row 3, wanted 0 or 1"):
+        contacts_of(values, ("a", "b"), "run")
+    with pytest.raises(DataError, match=r"run: contact_b is 0.25 in row 2, wanted 0 or 1"):
+        contacts_of(values[:3], ("a", "b"), "run")
+
+
+def test_columns_of_a_base_may_have_other_names(log, tmp_path):
+    write_log(log, tmp_path / "log.csv")
+    names = {"base_qy": "q2", "base_wz": "yaw_rate", "base_alx": "d", "contact_r_sole": "right"}
+    names["wrench_fz_l_sole"] = "F"
+    text = (tmp_path / "log.csv").read_text()
+    for standard, own in names.items():
+        assert text.count(standard) == 1
+        text = text.replace(standard, own)
+    (tmp_path / "log.csv").write_text(text)
+    again = read_log(tmp_path / "log.csv", log.joints, base=WANTED, columns=names)
+    for name in ("pose", "twist", "acceleration"):
+        np.testing.assert_allclose(getattr(again.base, name), getattr(log.base, name), atol=1e-15)
+    np.testing.assert_array_equal(again.contacts["r_sole"], log.contacts["r_sole"])
+    np.testing.assert_array_equal(again.wrenches["fz l_sole"], log.wrenches["fz l_sole"])
+
+
+@pytest.mark.parametrize("velocity", ["measured", "differentiated"])
+@pytest.mark.parametrize("acceleration", ["measured", "differentiated"])
+def test_velocities_and_accelerations_of_a_base_are_measured_where_those_of_joints_are(
+    log, velocity, acceleration
+):
+    t = log.t
+    log = replace(log, v=log.q + 1.0, a=log.q - 3.0, contacts={}, wrenches={})
+    how = {"velocity": velocity, "acceleration": acceleration}
+    found = process(log, SignalSettings(cutoff=None, trim=0.0, **how))
+    _, twist, _ = base_state(t, log.base.pose, None, None)
+    v = np.hstack([twist, np.gradient(log.q, t, axis=0)])
+    if velocity == "measured":
+        v = np.hstack([log.base.twist, log.v])
+    a = np.gradient(v, t, axis=0)
+    if acceleration == "measured":
+        a = np.hstack([log.base.acceleration, log.a])
+    np.testing.assert_allclose(found.v, v, atol=1e-9)
+    np.testing.assert_allclose(found.a, a, atol=1e-9)
+    np.testing.assert_allclose(found.q, np.hstack([log.base.pose, log.q]), atol=1e-12)
+    np.testing.assert_array_equal(found.tau, np.hstack([np.zeros((len(t), 6)), log.tau]))
 
 
 def test_a_log_without_torque_is_read_with_wrenches(log, tmp_path):

@@ -11,6 +11,7 @@ from robotid.exceptions import ModelError, SettingsError
 from robotid.logs.base import BaseColumns
 from robotid.logs.data import Trajectory
 from robotid.regressor.constraints import (
+    _measured,
     constrained,
     constraint_jacobian,
     force_basis,
@@ -101,6 +102,30 @@ def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(quadrupe
     np.testing.assert_allclose(np.sum(found.basis**2, axis=(1, 2))[[0, 1, 6]], unknown[[0, 1, 6]])
 
 
+def test_flags_belong_to_the_contacts_that_do_not_always_touch(rng):
+    """An always touching foot between two others: projectors against the touching feet alone."""
+    contacts = [Contact(foot, always=foot == FEET[1]) for foot in FEET[:3]]
+    model = RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, constraints=contacts, terms=()
+    )
+    q, v, a = random_motion(model, rng, 4)
+    flags = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=bool)
+    motion = Trajectory(
+        t=np.arange(4.0), q=q, v=v, a=a, tau=rng.standard_normal(v.shape), joints=model.joints,
+        rate=None, segment=np.zeros(4, dtype=int), contacts=flags,
+    )  # fmt: skip
+    found, _ = constrained(model, motion, np.ones((4, 18), dtype=bool))
+    for k, (first, last) in enumerate(flags.tolist()):
+        touching = [on for on, is_on in zip(contacts, (first, True, last), strict=True) if is_on]
+        alone = RobotModel.from_urdf(
+            example_urdf("solo12.urdf"), free_flyer=True, constraints=touching, terms=()
+        )
+        J = constraint_jacobian(alone, q[k : k + 1], np.ones((1, len(touching)), dtype=bool))[0]
+        B = found.basis[k]
+        np.testing.assert_allclose(B @ B.T, J.T @ np.linalg.pinv(J.T), atol=1e-10)
+        np.testing.assert_allclose(found.tau[k], motion.tau[k] - B @ B.T @ motion.tau[k])
+
+
 def test_without_torque_only_rows_of_the_base_are_used(quadruped, rng):
     q, v, a = random_motion(quadruped, rng, 2)
     motion = Trajectory(
@@ -189,6 +214,14 @@ def test_a_loop_prevents_the_relative_motion(kind, axis, equations, rng):
         free = data.oMf[one].rotation @ np.array(axis) / np.linalg.norm(axis)
         rest = D[3:] - np.outer(free, free @ D[3:])
         np.testing.assert_allclose(J[3:].T @ J[3:], rest.T @ rest, atol=1e-12)
+
+
+def test_measured_components_are_counted_over_loops_and_contacts_of_any_size():
+    every = (
+        Loop(("a", "b")), Contact("c", "surface", measured=("mx", "fz")), Contact("d"),
+        Loop(("e", "f"), "point"), Contact("g", measured=("fy",)),
+    )  # fmt: skip
+    assert _measured(SimpleNamespace(constraints=every)) == [5 + 3, 5 + 2, 5 + 6 + 3 + 3 + 1]
 
 
 def test_contacts_state_what_logs_have(quadruped):

@@ -22,7 +22,16 @@ from robotid.robot.constraints import Loop
 from robotid.robot.drives import TERMS
 from robotid.robot.mass_matrix import check_mass_matrix
 from robotid.robot.model import RobotModel
-from tests.helpers.closed_chains import FOUR_BAR, FOUR_BAR_LOOP, Oracle, ankle, four_bar
+from tests.helpers.closed_chains import (
+    ANKLE,
+    ANKLE_LOOPS,
+    ANKLE_PASSIVE,
+    FOUR_BAR,
+    FOUR_BAR_LOOP,
+    Oracle,
+    ankle,
+    four_bar,
+)
 
 
 @pytest.fixture(params=[four_bar, ankle])
@@ -137,8 +146,78 @@ def test_positions_out_of_reach_are_refused(tmp_path):
     path.write_text(text)
     robot = RobotModel.from_urdf(path, constraints=[FOUR_BAR_LOOP], passive=("elbow", "pivot"))
     t = np.linspace(0.0, 3.0, 60)
-    with pytest.raises(DataError, match=r"no position of elbow, pivot closes .* at t = 2\.\d+ s: "):
+    # the crank's end is 0.68 m from the pivot at 2.031 rad
+    x = t[np.argmax(t > np.arccos((0.15**2 + 0.6**2 - 0.68**2) / (2 * 0.15 * 0.6)))]
+    with pytest.raises(DataError, match="no position of elbow, pivot closes") as error:
         closed_log(robot, Log(t, t[:, None], t[:, None], ("drive",)))
+    left, wanted = (
+        str(error.value).split(f" at t = {x:g} s: ")[1].split(" m remain, wanted at most ")
+    )
+    assert float(left) >= np.sqrt(0.15**2 + 0.6**2 - 2 * 0.15 * 0.6 * np.cos(x)) - 0.68
+    assert wanted.startswith("6e-06 m")
+    q = np.column_stack([t, 5.0 * t, -t])
+    chains = Chains(robot)
+    found, first = chains.closed(q, np.array([False, True, True])), int(np.argmax(t == x))
+    assert chains.gaps(found[:first]).max() < 1e-9
+    np.testing.assert_array_equal(found[first:], np.tile(found[first], (60 - first, 1)))
+    np.testing.assert_array_equal(found[: first + 1, 0], t[: first + 1])
+
+
+def test_a_log_in_another_order_keeps_each_joint_and_names_the_loop_that_is_open(tmp_path, rng):
+    robot = ankle(tmp_path)
+    t = np.linspace(0.0, 1.0, 20)
+    motors = ("right_motor", "left_motor")
+    q, tau = 0.2 * np.sin(np.outer(t, [3.0, 2.0])), rng.standard_normal((20, 2))
+    whole = closed_log(robot, Log(t, q, tau, motors, a=q, q_ref=q))
+    assert "; accelerations, commands are not used" in whole.notes[0]
+    for j, joint in enumerate(robot.joints):
+        wanted = tau[:, motors.index(joint)] if joint in motors else np.zeros(20)
+        np.testing.assert_array_equal(whole.tau[:, j], wanted)
+    own = [robot.joints.index(joint) for joint in motors]
+    np.testing.assert_array_equal(whole.q[:, own], q)
+    # complete logs: joints in the order of the log, torques of passive joints are not used
+    order = rng.permutation(8)
+    names = tuple(robot.joints[k] for k in order)
+    moved = whole.q.copy()
+    moved[13:, robot.joints.index("right_w")] += 0.5
+    log = Log(t, moved[:, order], rng.standard_normal((20, 8)), names)
+    with pytest.raises(
+        DataError, match=r"do not close the loop right_rod_end - right_heel"
+    ) as error:
+        closed_log(robot, log)
+    gaps = Chains(robot).gaps(moved)
+    assert f"at t = {t[13]:g} s: {gaps[13, 1]:.3g} m remain, wanted at most" in str(error.value)
+    assert f"at most {0.02 * robot.length:.2g} m" in str(error.value)
+    assert gaps[13:, 0].max() < 1e-9
+    assert [Chains(robot).is_closed(x) for x in moved[[12, 13]]] == [True, False]
+
+
+def test_the_error_of_a_rigid_loop_is_of_its_distance_and_its_angle(tmp_path, rng):
+    robot = four_bar(tmp_path, constraints=[replace(FOUR_BAR_LOOP, kind="rigid")])
+    q = rng.uniform(-1, 1, (3, 3))
+    wanted = []
+    for x in q:
+        data = robot.pin_model.createData()
+        pin.framesForwardKinematics(robot.pin_model, data, x)
+        one, two = (data.oMf[robot.pin_model.getFrameId(f)] for f in FOUR_BAR_LOOP.frames)
+        away = np.linalg.norm(one.translation - two.translation)
+        angle = np.linalg.norm(pin.log3(one.rotation.T @ two.rotation))
+        wanted.append([np.hypot(away, 0.35 * angle)])  # the longest link of the tree: 0.35 m
+    np.testing.assert_allclose(Chains(robot).gaps(q), wanted)
+
+
+def test_accelerations_that_keep_a_hinge_are_the_smallest_that_pinocchios_rows_permit(
+    tmp_path, rng
+):
+    robot = ankle(tmp_path, constraints=[Loop(("left_rod_end", "left_heel"), "hinge", (1, 2, -1))])
+    (q, v), flags = rng.uniform(-0.5, 0.5, (2, 4, 8)), np.ones((4, 0))
+    J, after, before = (
+        constraint_jacobian(robot, x, flags) for x in (q, q + 1e-6 * v, q - 1e-6 * v)
+    )
+    drift = ((after - before) / 2e-6 @ v[..., None])[..., 0]
+    wanted = [-np.linalg.pinv(A) @ x for A, x in zip(J, drift, strict=True)]
+    assert np.linalg.matrix_rank(J[0]) == 5
+    np.testing.assert_allclose(Chains(robot).accelerations(q, v), wanted, rtol=1e-5, atol=1e-7)
 
 
 def test_undetermined_positions_are_refused(bars):
@@ -154,6 +233,19 @@ def test_a_loop_that_never_closes_is_refused(tmp_path):
     robot = four_bar(tmp_path, constraints=[replace(FOUR_BAR_LOOP, kind="rigid")])
     with pytest.raises(ModelError, match=r"\(rigid\) does not close near the zero position: "):
         structural_mapping(robot)
+
+
+def test_of_two_loops_the_one_that_stays_open_is_named_with_its_error(tmp_path):
+    right = ANKLE.index("right_tip")  # its rod is too long
+    text = ANKLE[:right] + ANKLE[right:].replace('xyz="0 0 -0.21"', 'xyz="0 0 -0.9"', 1)
+    path = tmp_path / "ankle.urdf"
+    path.write_text(text)
+    robot = RobotModel.from_urdf(path, constraints=ANKLE_LOOPS, passive=ANKLE_PASSIVE)
+    with pytest.raises(ModelError) as error:
+        Chains(robot).random_states(1, np.random.default_rng(0))
+    name, left = str(error.value).split(" does not close near the zero position: ")
+    assert name == "loop right_rod_end - right_heel (point)"
+    assert float(left.split(" m remain")[0]) > 0.2
 
 
 @pytest.mark.parametrize("kind", ["point", "hinge", "rigid"])

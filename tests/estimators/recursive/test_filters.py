@@ -312,3 +312,35 @@ def test_a_walk_is_in_units_of_each_parameter_s_own_spread():
         walked = kalman._walked(P)
         np.testing.assert_allclose(walked, P + np.diag([0.0009, 0.49]))
     np.testing.assert_array_equal(P, [[2.0, 0.5], [0.5, 3.0]])
+
+
+def test_two_steps_of_weighted_rows_are_bayes_rule_with_the_noise_of_each_joint(rng):
+    """All that a state and its estimate state, against the update in information form."""
+    sigma, share, std = np.array([0.5, 3.0]), 0.4, np.array([2.0, 0.3, 7.0])
+    kalman = Kalman(sigma, np.array([1.0, -2.0, 0.5]), std, 0.1, None, share)
+    state, theta, P = kalman.init(3), kalman.prior, np.diag(std**2)
+    products, rows = np.zeros(2), np.zeros(2, dtype=int)
+    for weight in np.array([[0.25, 1.7], [3.0, 0.0]]):
+        Y, tau = rng.standard_normal((2, 3)), 5.0 * rng.standard_normal(2)
+        state = kalman.update(state, Sample(Y, tau, weight))
+        used = weight > 0
+        precision = (weight * share / sigma**2)[used]
+        P = P + np.diag((0.1 * std) ** 2)
+        e, A = tau[used] - Y[used] @ theta, Y[used]
+        P = np.linalg.inv(np.linalg.inv(P) + A.T @ (precision[:, None] * A))
+        theta = theta + P @ A.T @ (precision * e)
+        products[used] += e * (tau[used] - A @ theta)
+        rows += used
+    np.testing.assert_allclose(state.theta, theta, rtol=1e-9)
+    np.testing.assert_allclose(state.P, P, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(state.products, products, rtol=1e-9)
+    np.testing.assert_array_equal([state.rows, state.gated], [rows, [0, 0]])
+    found = kalman.estimate(state, NAMES)
+    np.testing.assert_allclose(found.sigma, np.sqrt(np.maximum(products, 0.0) / rows))
+    ratio = np.linalg.svd(np.linalg.cholesky(P / np.outer(std, std)), compute_uv=False)
+    assert found.condition == pytest.approx(ratio[0] / ratio[-1])
+    assert found.rank == np.sum(ratio < 0.9)
+    after = np.sqrt(np.diag(P)) / std
+    assert found.undetermined == tuple(np.array(NAMES)[after > 0.9].tolist())
+    assert found.n_iter == 2
+    assert found.message == f"2 samples, 0 rows rejected by the gate, {rows.sum()} used"

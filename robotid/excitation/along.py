@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid._typing import Array
-from robotid.exceptions import DataError, SettingsError
+from robotid.exceptions import SettingsError
 from robotid.regressor.compiled import Tree, flatten, own_motion, row_lanes, why_not
 from robotid.robot.model import RobotModel
 
@@ -19,11 +19,9 @@ def fixed_tree(model: RobotModel) -> Tree:
         model: The robot.
 
     Raises:
-        DataError: If the base floats.
+        DataError: If the base floats, or the robot has contacts or loops.
         SettingsError: If the compiled code does not support a joint.
     """
-    if model.free_flyer:
-        raise DataError("the base floats; motion design requires a robot with a fixed base")
     model.require_fixed("motion design")
     if (why := why_not(model)) is not None:
         raise SettingsError(f"{model.name}: no motion can be designed: {why}")
@@ -38,7 +36,7 @@ class MotionRegressor:
         columns: Indices of the b standard parameters, shape (b,); columns of drives are 0 here.
 
     Raises:
-        DataError: If the base floats.
+        DataError: If the base floats, or the robot has contacts or loops.
         SettingsError: If the compiled code does not support a joint.
     """
 

@@ -5,8 +5,8 @@ from helpers.paths import URDF
 from helpers.robots import ROBOTS, mimicking
 
 from robotid.exceptions import DataError, SettingsError
+from robotid.excitation.along import MotionRegressor, Placements, fixed_tree
 from robotid.regressor import compiled
-from robotid.regressor.along import MotionRegressor, Placements, fixed_tree
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
