@@ -9,7 +9,7 @@ from robotid.findings import listed, quoted, toml_key
 from robotid.logs.settings import LogSource
 from robotid.logs.table import prefixes, quantity_of
 
-__all__ = ["NOUNS", "Missing"]
+__all__ = ["NOUNS", "SIZES", "Missing"]
 
 #: Nouns for the columns of each kind.
 NOUNS = {
@@ -21,6 +21,8 @@ NOUNS = {
     "dqref": "commanded velocity",
     "tauref": "commanded torque",
 }
+#: Prefixes of absolute values of loads, as bus servos report them.
+SIZES = ("loadsize_", "load_size_")
 _SHOWN = 12  # names in a list
 
 
@@ -97,7 +99,8 @@ class Missing:
         kinds = dict.fromkeys(kind.removesuffix("m") for kind, _ in self.absent)
         of_kinds = {x for kind, _ in self.absent for x in (kind, kind.replace("tau", "current"))}
         commanded, found, others = list[str](), list[str](), list[str]()
-        for name in self.names:
+        sizes = [name for name in self.names if name.startswith(SIZES)]
+        for name in (x for x in self.names if x not in sizes):
             kind, place = self._of(name)
             if kind in of_kinds and (kind.startswith("qref") or not is_commanded(name)):
                 found.append(name)
@@ -113,6 +116,8 @@ class Missing:
         others = [name for name in others if name not in ("time", "t")]
         if commanded:
             text += f" Commanded, not measured: {listed(commanded, _SHOWN)}."
+        if sizes:
+            text += f" Loads without sign, which are no torques: {listed(sizes, _SHOWN)}."
         if others:
             text += f" Other columns: {listed(others, _SHOWN)}."
         stated = {f"{kind}_{place}": column for (kind, place), column in near.items()}
@@ -122,10 +127,13 @@ class Missing:
                 f"{text} Similar names are in the log. Rename these columns, or check them and "
                 "state them in the job file:\n[columns]\n" + "\n".join(lines)
             )
+        read = self._read_names()
+        if not stated and not others and all(self._of(name)[1] in read for name in found):
+            return f"{text} {remedy}"  # every column has its meaning: there is none to rename
         hint = "".join(f"Did you mean {column!r}? " for column in stated.values())
         ((key, column),) = stated.items() or [("_".join(self.absent[0]), "NAME")]
         inside = f"{{ {toml_key(key)} = {quoted(column)} }}"
-        end = "" if stated else remedy
+        end = "" if stated else f". {remedy}"
         return f"{text} {hint}Rename {it}, or state {it} in the job file: columns = {inside}{end}"
 
     def _named(self, place: str) -> str:

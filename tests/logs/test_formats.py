@@ -258,11 +258,8 @@ def test_a_bag_without_efforts_is_refused_as_any_log(tmp_path):
     path = write_mcap(tmp_path / "run.mcap", messages)
     with refused(
         "run.mcap has no columns 'tau_shoulder', 'tau_elbow'; torque or current columns found: "
-        "none. Rename them, or state them in the job file: "
-        'columns = { tau_shoulder = "NAME" }. '
-        "Commanded positions, qref_<joint>, would be enough "
-        'for [estimator] name = "simulation" with a [controller] table; all other estimators need '
-        "tau_<joint> or current_<joint>"
+        "none. Record tau_<joint> or current_<joint>. Commanded positions, qref_<joint>, are "
+        'enough for the estimator "simulation"'
     ):
         read_log(path, JOINTS)
 
@@ -421,11 +418,8 @@ def test_one_joint_needs_no_second_axis(tmp_path):
         (
             {"tau": np.array([None] * 60)},
             "run.npz has no columns 'tau_shoulder', 'tau_elbow'; torque or current columns found: "
-            "none. Rename them, or state them in the job file: "
-            'columns = { tau_shoulder = "NAME" }. '
-            "Commanded positions, qref_<joint>, would be "
-            'enough for [estimator] name = "simulation" with a [controller] table; all other '
-            "estimators need tau_<joint> or current_<joint>",
+            "none. Record tau_<joint> or current_<joint>. Commanded positions, qref_<joint>, are "
+            'enough for the estimator "simulation"',
         ),
     ],
 )

@@ -87,10 +87,8 @@ def test_commanded_columns_are_no_torques(kind):
     listing = ", ".join(of(kind))
     assert found == (
         f"log has no columns {SOUGHT}; torque or current columns found: none. Commanded, not "
-        f"measured: {listing}. Rename them, or state them in the job file: columns = {{ tau_pan = "
-        '"NAME" }. Commanded positions, qref_<joint>, would be enough for [estimator] name = '
-        '"simulation" with a [controller] table; all other estimators need tau_<joint> or '
-        "current_<joint>"
+        f"measured: {listing}. Record tau_<joint> or current_<joint>. Commanded positions, "
+        'qref_<joint>, are enough for the estimator "simulation"'
     )
 
 
