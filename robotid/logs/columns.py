@@ -179,6 +179,7 @@ class Finder:
                 raise SettingsError(f"gain of {joint!r} is {gain}, wanted a number other than 0")
         for joint in self.source.joints:
             self._require_read(joint, "log.joints renames")
+        self._check_names()
         names = dict.fromkeys([*self.joints, *self.motors.values()])
         known = ["time", *(f"{kind}_{name}" for kind in prefixes() for name in names)]
         for standard, name in self.columns.items():
@@ -192,6 +193,21 @@ class Finder:
                     f"{self.where} has no column {name!r}, which is stated for {standard!r} in "
                     f"columns; columns found: {listed(self.names)}{suggestion(name, self.names)}"
                 )
+
+    def _check_names(self) -> None:
+        """Reject repeated joints, and two joints, or two motors, with one name in the file."""
+        if twice := repeated(self.joints):
+            raise SettingsError(f"joints has {listed(twice)} more than once; name each joint once")
+        for places in (self.joints, tuple(dict.fromkeys(self.motors.values()))):
+            own: dict[str, str] = {}
+            for place in places:
+                other = own.setdefault(self._named(place), place)
+                if other != place:
+                    raise SettingsError(
+                        f"{self.where}: joints {other} and {place} have the same name "
+                        f"{self._named(place)!r} in the log; state another one in [log.joints], "
+                        f"or by --rename {place}=NAME"
+                    )
 
     def _require_read(self, joint: str, what: str) -> None:
         if joint not in (*self.joints, *self.motors.values()):

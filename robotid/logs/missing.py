@@ -63,15 +63,25 @@ class Missing:
 
     def _of_joints(self) -> str:
         """Return the message on joints that have other names in the log, "" if none has."""
-        logged = {self._of(name)[1] for name in self.names}
+        logged = dict.fromkeys(self._of(name)[1] for name in self.names)
         absent = dict.fromkeys(x for _, x in self.absent if self._named(x) not in logged)
         others = self._other_joints()
-        pairs, by_order = similar_joints(list(absent), others)
+        sought = {self._named(joint): joint for joint in absent}
+        found, ordered = similar_joints(list(sought), others)
+        pairs = {sought[name]: other for name, other in found.items()}
+        by_order = {sought[name] for name in ordered}
         if any(x not in (*absent, *self.source.joints) for x in self.places):
             # others may be of joints that are not read, as locked ones
             pairs = {joint: name for joint, name in pairs.items() if joint not in by_order}
-        if not pairs:
+        stated = [joint for joint in absent if joint in self.source.joints]
+        if not (pairs or stated):
             return ""
+        head = f"{self.where} has no columns of joints {listed(absent)} under the names of the URDF"
+        if stated:
+            named = ", ".join(f"{x} = {quoted(self._named(x))}" for x in stated)
+            head = f"{self.where} has no columns under the names that [log.joints] states: {named}"
+        if not pairs:
+            return f"{head}; names in the log: {listed(filter(None, logged))}"
         width = max(len(f"{toml_key(joint)} = {quoted(name)}") for joint, name in pairs.items())
         lines = [
             f"{f'{toml_key(joint)} = {quoted(name)}':{width}}"
@@ -84,10 +94,9 @@ class Missing:
         rest += f"\nOther names in the log: {listed(left, _SHOWN)}." if left else ""
         joint, name = next(iter(pairs.items()))
         return (
-            f"{self.where} has no columns of joints {listed(absent)} under the names of the URDF; "
-            f"names in the log: {listed(others)}. State the name of each joint in the job file, or "
-            f"with one flag per joint, as --rename {joint}={name}. This table is a guess: check "
-            "each line, an exchange of joints gives wrong parameters.\n[log.joints]\n"
+            f"{head}; names in the log: {listed(others)}. State the name of each joint in the job "
+            f"file, or with one flag per joint, as --rename {joint}={name}. This table is a guess: "
+            "check each line, an exchange of joints gives wrong parameters.\n[log.joints]\n"
             + "\n".join(lines)
             + rest
         )

@@ -185,8 +185,8 @@ def test_a_half_command_names_the_joints():
         read_log(frame(qref_elbow=None), JOINTS, needs="commands")
     assert str(error.value) == (
         "log has no column 'qref_elbow'; commanded position columns found: qref_shoulder. If "
-        "elbow was at rest, lock it at its position, as --lock elbow=0, or locked = { elbow = 0 } in the "
-        "job file"
+        "elbow was at rest, lock it at its position, as --lock elbow=0, or locked = { elbow = 0 } "
+        "in the job file"
     )
     with pytest.raises(DataError) as error:
         read_log(frame(qref_elbow=None, qref_shoulder=None), JOINTS, needs="commands")
