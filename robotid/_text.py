@@ -12,6 +12,8 @@ from typing import Any, TextIO
 __all__ = [
     "columns",
     "in_digits_of",
+    "period",
+    "seconds",
     "terminal_width",
     "tinted",
     "wrapped",
@@ -131,6 +133,30 @@ def in_digits_of(value: float, error: float | None) -> tuple[str, str]:
     if _PLAIN[0] <= top < _PLAIN[1]:
         return f"{value:.{max(-last, 0)}f}", f"{error:.{max(-last, 0)}f}"
     return tuple(f"{x / 10**top:.{top - last}f}e{top:+03d}" for x in (value, error))  # type: ignore[return-value]
+
+
+def period(start: float, end: float) -> str:
+    """Return a range of time with its unit, in four digits and three of its length: "0-11.99 s".
+
+    Args:
+        start: Start [s].
+        end: End [s].
+    """
+    sizes = ((3, max(abs(start), abs(end))), (2, end - start))  # digits after the first one [s]
+    digits = max(
+        (n - max(math.floor(math.log10(x)), 0) for n, x in sizes if 0 < x < math.inf), default=0
+    )
+    return f"{seconds(start, digits)}-{seconds(end, digits)} s"
+
+
+def seconds(t: float, digits: int = 3) -> str:
+    """Return a time without exponent: of 0.0000050167 "0", of 1.7e9 + 0.25 "1700000000.25".
+
+    Args:
+        t: Time [s].
+        digits: Decimals.
+    """
+    return f"{round(float(t), max(digits, 0)) + 0.0:.15g}"
 
 
 def yaml_name(text: str) -> str:

@@ -4,7 +4,7 @@ import io
 
 import pytest
 
-from robotid._text import columns, in_digits_of, tinted, wrapped
+from robotid._text import columns, in_digits_of, period, tinted, wrapped
 
 
 def test_lines_fit_and_keep_their_indentation():
@@ -53,6 +53,21 @@ def test_columns_stand_apart_and_those_that_do_not_fit_are_named():
 )
 def test_the_last_digit_of_a_value_is_the_second_of_its_error(value, error, shown):
     assert in_digits_of(value, error) == shown
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "shown"),
+    [
+        (5.0167e-6, 49.99, "0-49.99 s"),
+        (5.0, 7.4, "5-7.4 s"),
+        (0.2, 5.998, "0.2-5.998 s"),
+        (1.7e9 + 0.126, 1.7e9 + 12.5, "1700000000.1-1700000012.5 s"),
+        (-1e-9, 1234.56, "0-1235 s"),
+        (3.0, 3.0, "3-3 s"),
+    ],
+)
+def test_a_range_of_time_has_no_exponent(start, end, shown):
+    assert period(start, end) == shown
 
 
 class Terminal(io.StringIO):

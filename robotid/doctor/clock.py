@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from robotid._text import seconds
 from robotid._typing import Array
 from robotid.findings import Finding, log_finding
 from robotid.logs.data import Log, Trajectory
@@ -136,9 +137,9 @@ def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
     longest, start = float(step[at]), float(log.t[at])
     severity = "warning" if longest > max(_LONG, _GAP * median) else "note"
     message = (
-        f"{len(gaps)} gaps, the longest of {longest:.3g} s at t = {start:.6g} s. A long gap ends "
-        "a segment: the log is not filtered or differentiated across it, and the rows beside it "
-        "are not used; record without interruption if possible"
+        f"{len(gaps)} gaps, the longest of {longest:.3g} s at t = {seconds(start)} s. A long gap "
+        "ends a segment: the log is not filtered or differentiated across it, and the rows beside "
+        "it are not used; record without interruption if possible"
     )
     yield log_finding(log.name, "gap", severity, message, gaps=len(gaps), longest=longest, at=start)
 
@@ -185,6 +186,6 @@ def _standstill(log: Log, moving: Array) -> Iterator[Finding]:
     message = (
         f"the robot is at rest for the first {before:.3g} s and the last {after:.3g} s. Rows of "
         "joints at rest are not used to identify friction; cut them with start = "
-        f"{moving[0]:.4g} and end = {moving[-1]:.4g}"
+        f"{seconds(moving[0])} and end = {seconds(moving[-1])}"
     )
     yield log_finding(log.name, "standstill", "note", message, before=before, after=after)

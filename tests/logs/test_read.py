@@ -244,7 +244,9 @@ def test_joints_must_be_a_list_of_names(run, joints):
 
 
 def test_a_joint_named_twice_is_refused(run):
-    with pytest.raises(SettingsError, match=r"joints has elbow more than once; name each joint once"):
+    with pytest.raises(
+        SettingsError, match=r"joints has elbow more than once; name each joint once"
+    ):
         read_log(run(make_table()), ["elbow", "elbow"])
 
 
