@@ -10,7 +10,9 @@ from collections.abc import Sequence
 from typing import Any, TextIO
 
 __all__ = [
+    "arguments",
     "columns",
+    "command_lines",
     "in_digits_of",
     "period",
     "seconds",
@@ -21,6 +23,7 @@ __all__ = [
     "yaml_plain",
 ]
 
+_ARGUMENT = re.compile(r"(?:'[^'\n]*'|[^\s'])+")  # of a command, with its quotes
 _PATH = re.compile(r"'[^' ]*/[^'\n]*'")  # a quoted path, which may have blanks
 _UNIT = re.compile(r"(?<=\d) (?=%|(?:m?s|kg|N|m|Hz|rad)\b)")  # between a number and its unit
 _PLAIN = (-3, 6)  # powers of ten that are written without an exponent
@@ -74,6 +77,33 @@ def wrapped(text: str, width: int | None, indent: str = "") -> str:
             break_on_hyphens=False,
         ) or [""]
     return "\n".join(lines).replace("\0", " ")
+
+
+def arguments(command: str) -> list[str]:
+    """Return the arguments of a command line as they are typed, quotes included.
+
+    Args:
+        command: The command, in a single line.
+    """
+    return _ARGUMENT.findall(command)
+
+
+def command_lines(command: str, width: int) -> list[str]:
+    """Return a command in lines of at most a width, to paste into a shell.
+
+    Each argument is in one line, however long; a line that continues ends with a backslash.
+
+    Args:
+        command: The command, in a single line.
+        width: Characters per line.
+    """
+    lines = [""]
+    for argument in arguments(command):
+        if lines[-1].strip() and len(lines[-1]) + len(argument) + 3 > width:
+            lines[-1] += " \\"
+            lines.append("   ")
+        lines[-1] += f" {argument}" if lines[-1] else argument
+    return lines
 
 
 def columns(

@@ -259,7 +259,7 @@ def test_the_page_of_result_files_lists_every_key_of_them():
         assert f"| `{path}` | `{former}` |" in page
     sides = {key for run in stored for key in run.get("sidecar", {})} - {"schema_version", "robot"}
     assert sides
-    assert sides <= listed["Keys of the sidecar"] | {"robotid"}
+    assert sides <= listed["Keys of the drive parameters file"] | {"robotid"}
 
 
 def test_the_drives_of_the_page_on_friction_are_accepted(tmp_path):

@@ -1,10 +1,11 @@
 """Text for people: lines, columns, digits."""
 
 import io
+import shlex
 
 import pytest
 
-from robotid._text import columns, in_digits_of, period, tinted, wrapped
+from robotid._text import columns, command_lines, in_digits_of, period, tinted, wrapped
 
 
 def test_lines_fit_and_keep_their_indentation():
@@ -68,6 +69,21 @@ def test_the_last_digit_of_a_value_is_the_second_of_its_error(value, error, show
 )
 def test_a_range_of_time_has_no_exponent(start, end, shown):
     assert period(start, end) == shown
+
+
+def test_lines_of_a_command_break_between_arguments_and_paste_as_one():
+    command = "robotid identify 'my robot.urdf' first-log.csv --lock gripper=0 --out result"
+    lines = command_lines(command, 34)
+    assert lines == [
+        "robotid identify 'my robot.urdf' \\",
+        "    first-log.csv --lock \\",
+        "    gripper=0 --out result",
+    ]
+    assert shlex.split(" ".join(lines).replace("\\ ", "")) == shlex.split(command)
+    assert command_lines(command, 100) == [command]
+    assert command_lines("a --flag=a-very-long-value b", 10) == [
+        "a \\", "    --flag=a-very-long-value \\", "    b"
+    ]  # fmt: skip
 
 
 class Terminal(io.StringIO):

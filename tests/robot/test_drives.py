@@ -233,6 +233,11 @@ def test_identification_recovers_it_and_the_table_shows_it(model, term, rng):
 
 
 @pytest.mark.parametrize("term", TERMS.values(), ids=lambda term: term.name)
+def test_friction_by_position_has_the_unit_of_its_power_of_the_position():
+    units = [PositionCoulomb(order=k).units for k in range(3)]
+    assert units == [("N m", "N"), ("N m/rad", "N/m"), ("N m/rad^2", "N/m^2")]
+
+
 def test_its_prior_spread_would_alone_explain_the_torque(model, term, rng):
     motion = process(exact_log(model, truth(model), rng), EXACT)
     spread = prior_spread(model, motion.squares, len(motion.t))[drive_part(model)]
