@@ -10,8 +10,12 @@ from collections.abc import Sequence
 from typing import Any, TextIO
 
 __all__ = [
+    "arguments",
     "columns",
+    "command_lines",
     "in_digits_of",
+    "period",
+    "seconds",
     "terminal_width",
     "tinted",
     "wrapped",
@@ -19,6 +23,7 @@ __all__ = [
     "yaml_plain",
 ]
 
+_ARGUMENT = re.compile(r"(?:'[^'\n]*'|[^\s'])+")  # of a command, with its quotes
 _PATH = re.compile(r"'[^' ]*/[^'\n]*'")  # a quoted path, which may have blanks
 _UNIT = re.compile(r"(?<=\d) (?=%|(?:m?s|kg|N|m|Hz|rad)\b)")  # between a number and its unit
 _PLAIN = (-3, 6)  # powers of ten that are written without an exponent
@@ -72,6 +77,33 @@ def wrapped(text: str, width: int | None, indent: str = "") -> str:
             break_on_hyphens=False,
         ) or [""]
     return "\n".join(lines).replace("\0", " ")
+
+
+def arguments(command: str) -> list[str]:
+    """Return the arguments of a command line as they are typed, quotes included.
+
+    Args:
+        command: The command, in a single line.
+    """
+    return _ARGUMENT.findall(command)
+
+
+def command_lines(command: str, width: int) -> list[str]:
+    """Return a command in lines of at most a width, to paste into a shell.
+
+    Each argument is in one line, however long; a line that continues ends with a backslash.
+
+    Args:
+        command: The command, in a single line.
+        width: Characters per line.
+    """
+    lines = [""]
+    for argument in arguments(command):
+        if lines[-1].strip() and len(lines[-1]) + len(argument) + 3 > width:
+            lines[-1] += " \\"
+            lines.append("   ")
+        lines[-1] += f" {argument}" if lines[-1] else argument
+    return lines
 
 
 def columns(
@@ -131,6 +163,30 @@ def in_digits_of(value: float, error: float | None) -> tuple[str, str]:
     if _PLAIN[0] <= top < _PLAIN[1]:
         return f"{value:.{max(-last, 0)}f}", f"{error:.{max(-last, 0)}f}"
     return tuple(f"{x / 10**top:.{top - last}f}e{top:+03d}" for x in (value, error))  # type: ignore[return-value]
+
+
+def period(start: float, end: float) -> str:
+    """Return a range of time with its unit, in four digits and three of its length: "0-11.99 s".
+
+    Args:
+        start: Start [s].
+        end: End [s].
+    """
+    sizes = ((3, max(abs(start), abs(end))), (2, end - start))  # digits after the first one [s]
+    digits = max(
+        (n - max(math.floor(math.log10(x)), 0) for n, x in sizes if 0 < x < math.inf), default=0
+    )
+    return f"{seconds(start, digits)}-{seconds(end, digits)} s"
+
+
+def seconds(t: float, digits: int = 3) -> str:
+    """Return a time without exponent: of 0.0000050167 "0", of 1.7e9 + 0.25 "1700000000.25".
+
+    Args:
+        t: Time [s].
+        digits: Decimals.
+    """
+    return f"{round(float(t), max(digits, 0)) + 0.0:.15g}"
 
 
 def yaml_name(text: str) -> str:

@@ -1,10 +1,11 @@
 """Text for people: lines, columns, digits."""
 
 import io
+import shlex
 
 import pytest
 
-from robotid._text import columns, in_digits_of, tinted, wrapped
+from robotid._text import columns, command_lines, in_digits_of, period, tinted, wrapped
 
 
 def test_lines_fit_and_keep_their_indentation():
@@ -53,6 +54,36 @@ def test_columns_stand_apart_and_those_that_do_not_fit_are_named():
 )
 def test_the_last_digit_of_a_value_is_the_second_of_its_error(value, error, shown):
     assert in_digits_of(value, error) == shown
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "shown"),
+    [
+        (5.0167e-6, 49.99, "0-49.99 s"),
+        (5.0, 7.4, "5-7.4 s"),
+        (0.2, 5.998, "0.2-5.998 s"),
+        (1.7e9 + 0.126, 1.7e9 + 12.5, "1700000000.1-1700000012.5 s"),
+        (-1e-9, 1234.56, "0-1235 s"),
+        (3.0, 3.0, "3-3 s"),
+    ],
+)
+def test_a_range_of_time_has_no_exponent(start, end, shown):
+    assert period(start, end) == shown
+
+
+def test_lines_of_a_command_break_between_arguments_and_paste_as_one():
+    command = "robotid identify 'my robot.urdf' first-log.csv --lock gripper=0 --out result"
+    lines = command_lines(command, 34)
+    assert lines == [
+        "robotid identify 'my robot.urdf' \\",
+        "    first-log.csv --lock \\",
+        "    gripper=0 --out result",
+    ]
+    assert shlex.split(" ".join(lines).replace("\\ ", "")) == shlex.split(command)
+    assert command_lines(command, 100) == [command]
+    assert command_lines("a --flag=a-very-long-value b", 10) == [
+        "a \\", "    --flag=a-very-long-value \\", "    b"
+    ]  # fmt: skip
 
 
 class Terminal(io.StringIO):

@@ -45,21 +45,33 @@ def pairs(words: Sequence[str], flag: str) -> dict[str, float]:
         words: Words like JOINT=NUMBER.
         flag: The flag, for errors.
     """
-    pairs = {}
-    for word in words:
-        name, _, number = word.partition("=")
+    found = {}
+    for name, number in _once(words, flag).items():
         try:
-            pairs[name] = float(number)
+            found[name] = float(number)
         except ValueError as error:
-            raise SettingsError(f"{flag} {word!r}: wanted JOINT=NUMBER") from error
-    return pairs
+            shown = f"{name}={number}" if number else name
+            raise SettingsError(f"{flag} {shown!r}: wanted JOINT=NUMBER") from error
+    return found
+
+
+def _once(words: Sequence[str], flag: str) -> dict[str, str]:
+    """Return the texts of words like JOINT=TEXT by joint; refuse two of one joint."""
+    found: dict[str, str] = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        if found.setdefault(name, value) != value:
+            raise SettingsError(
+                f"{flag} states {name} twice, as {found[name]} and as {value}; state it once"
+            )
+    return found
 
 
 def _names(words: Sequence[str], flag: str) -> dict[str, str]:
     """Return names by joint."""
     if wrong := [word for word in words if not all(word.partition("=")[::2])]:
         raise SettingsError(f"{flag} {wrong[0]!r}: wanted JOINT=NAME")
-    return dict(word.split("=", 1) for word in words)
+    return _once(words, flag)
 
 
 def _of_all_or_pairs(words: Sequence[str], flag: str) -> float | dict[str, float]:
@@ -326,7 +338,8 @@ def add_job(
     parser.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
     add_json(parser, json_)
     flags = parser.add_argument_group("instead of a job file, with URDF LOG [LOG ...]")
-    flags.add_argument("--validate", nargs="+", metavar="LOG", help="validation logs")
+    words = "validation logs; repeatable"
+    flags.add_argument("--validate", nargs="+", action="extend", metavar="LOG", help=words)
     JOB.add(flags, (*FIT, *LOG, *output))
     add_verbose(parser)
 

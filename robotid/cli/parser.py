@@ -11,6 +11,8 @@ __all__ = ["CommandParser"]
 class CommandParser(argparse.ArgumentParser):
     """A parser that suggests the nearest choice, and whose help may show its main flags only.
 
+    A flag with one value is refused if it occurs twice.
+
     Attributes:
         main_flags: Flags of the short help; all flags are shown if it is empty.
         examples: Command lines at the end of the short help.
@@ -18,6 +20,11 @@ class CommandParser(argparse.ArgumentParser):
 
     main_flags: Sequence[str] = ()
     examples: Sequence[str] = ()
+
+    def __init__(self, *words: Any, **settings: Any) -> None:  # noqa: ANN401
+        super().__init__(*words, **settings)
+        for name in (None, "store"):
+            self.register("action", name, _StoreOnce)
 
     def shorten_help(self, main_flags: Sequence[str], examples: Sequence[str]) -> None:
         """Show only the main flags and examples by ``--help``, and all flags by ``--help-all``.
@@ -98,6 +105,24 @@ class CommandParser(argparse.ArgumentParser):
         hint = f"; did you mean {near[0]!r}?" if near else "."
         wanted = ", ".join(known)
         raise argparse.ArgumentError(action, f"{value!r} is unknown{hint} Known: {wanted}")
+
+
+class _StoreOnce(argparse._StoreAction):
+    """Store the value of a flag; refuse a second value."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,  # noqa: ANN401
+        option_string: str | None = None,
+    ) -> None:
+        stored = getattr(namespace, self.dest, None)
+        if self.option_strings and stored is not None and stored is not self.default:
+            raise argparse.ArgumentError(
+                self, f"stated twice, as {stored} and as {values}; state it once"
+            )
+        super().__call__(parser, namespace, values, option_string)
 
 
 class _HelpAll(argparse.Action):

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotid._text import terminal_width, tinted, wrapped
+from robotid._text import command_lines, period, terminal_width, tinted, wrapped
 from robotid.findings import Finding, grouped, number_of
 
 if TYPE_CHECKING:
@@ -59,7 +59,10 @@ def print_steps(steps: "Sequence[Step]") -> None:
     for number, step in enumerate(steps, start=1):
         echo(f"  {number}. {step.words}", "   ")
         for block in step.blocks:
-            print("\n".join(f"       {line}" for line in block.split("\n")))
+            lines = block.split("\n")
+            if sys.stdout.isatty() and len(lines) == 1 and block.startswith("robotid "):
+                lines = command_lines(block, terminal_width() - 7)
+            print("\n".join(f"       {line}" for line in lines))
 
 
 def print_block(*lines: str) -> None:
@@ -143,7 +146,7 @@ def window_name(name: str, entry: Mapping[str, Any]) -> str:
         name: The name.
         entry: Its start and end [s].
     """
-    return f"{name} {entry['start']:.4g}-{entry['end']:.4g} s"
+    return f"{name} {period(entry['start'], entry['end'])}"
 
 
 def print_verdict(verdict: Mapping[str, Any]) -> None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from robotid.closed_loop.result import STATED_SCALE, LoopIdentification
+from robotid.closed_loop.settings import LoopSettings
 from robotid.closed_loop.term_choice import Tried
 from robotid.closed_loop.zeros import CLEAR, parallel_axes
 from robotid.findings import Finding, by_severity, listed
@@ -56,7 +57,7 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
         yield Finding("scale", "note", "controller", STATED_SCALE)
     yield from _gains_contradicted(found)
     yield from _coarse_steps(estimate.details)
-    yield from _at_bound(estimate.details["at_bound"])
+    yield from _at_bound(estimate.details["at_bound"], found.loop)
     for together in found.correlated:
         names = listed(together, _NAMED)
         message = (
@@ -152,17 +153,26 @@ def _gains_contradicted(found: LoopIdentification) -> Iterator[Finding]:
     )
 
 
-def _at_bound(names: Sequence[str]) -> Iterator[Finding]:
-    """Yield which parameters are estimated as 0."""
+def _at_bound(names: Sequence[str], loop: LoopSettings) -> Iterator[Finding]:
+    """Yield which parameters are estimated as 0, with remedies for what the user stated."""
     at_zero = [name for name in names if name.rpartition(".")[2] not in ("kp", "limit")]
+    gains = [name for name in ("kp", "kd") if getattr(loop, name) is not None]
     if at_zero:
+        subject = listed(at_zero, _NAMED)
+        stated = [*gains, *(["delay"] if loop.delay is not None else [])]
+        wrong = f", or {' or '.join(stated)} in [controller] is wrong" if stated else ""
+        remedies = [f"command a motion that depends more on {subject}"]
+        if loop.delay is not None:
+            remedies.insert(0, "leave the delay out of [controller], so that it is fitted")
+        if gains:
+            remedies.insert(0, f"compare {' and '.join(gains)} with the gains of the drive")
+        todo = "; ".join(remedies)
         yield Finding(
             "at_bound",
             "warning",
-            listed(at_zero, _NAMED),
-            f"{listed(at_zero, _NAMED)}: the estimate is 0, the lower bound. The motion does not "
-            "excite it, or a stated gain or delay is wrong. Leave the delay out of [controller], "
-            "so that it is fitted, and compare the stated gains with those of the drive",
+            subject,
+            f"{subject}: the estimate is 0, the lower bound. The motion does not excite "
+            f"{'them' if len(at_zero) > 1 else 'it'}{wrong}. {todo[0].upper()}{todo[1:]}",
         )
     if any(name.endswith("delay") for name in at_zero):
         yield Finding(

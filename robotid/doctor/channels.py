@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from robotid._text import seconds
 from robotid._typing import Array
 from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Log
@@ -106,7 +107,7 @@ def _spikes(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Findin
         energy = np.sum(height**2) / np.sum((x - np.median(x)) ** 2)
         message = (
             f"{kind} of {joint} has spikes of up to {largest:.4g} in {len(rows)} rows, the first "
-            f"at t = {first:.6g} s; remove these rows from the recording"
+            f"at t = {seconds(first)} s; remove these rows from the recording"
         )
         severity = "error" if largest > _ABSURD * amplitude and energy > _HARM else "note"
         evidence = {"rows": len(rows), "largest": largest, "energy_share": energy, "first": first}

@@ -4,9 +4,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from robotid._text import seconds
 from robotid._typing import Array
 from robotid.findings import Finding, log_finding
 from robotid.logs.data import Log, Trajectory
+from robotid.logs.measured_velocity import quantum
 from robotid.robot.parameters import ParameterLayout
 
 __all__ = ["check_clock", "check_rest", "runs_of"]
@@ -16,6 +18,8 @@ _GAP = 2.5  # [median steps] a longer step is a gap
 _LONG = 0.05  # [s] ... a longer gap is a warning
 _SET = 1.0  # [s] in a longer gap, a position that moves as in one step shows that the clock was set
 _STALE = 0.05  # share of stale rows from which they are a warning
+_CONTINUES = 0.15  # motion after repeated rows, over that in as many rows before and after it,
+_AROUND = 10  # ... estimated from at most this many rows
 _STILL = 0.02  # [rad/s, or m/s of a prismatic joint] slower: at rest
 _REST = 1.0  # [s] a longer rest at an end is reported
 _STATIC = 1e-3  # [rad or m] smaller range: the joint does not move
@@ -136,9 +140,9 @@ def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
     longest, start = float(step[at]), float(log.t[at])
     severity = "warning" if longest > max(_LONG, _GAP * median) else "note"
     message = (
-        f"{len(gaps)} gaps, the longest of {longest:.3g} s at t = {start:.6g} s. A long gap ends "
-        "a segment: the log is not filtered or differentiated across it, and the rows beside it "
-        "are not used; record without interruption if possible"
+        f"{len(gaps)} gaps, the longest of {longest:.3g} s at t = {seconds(start)} s. A long gap "
+        "ends a segment: the log is not filtered or differentiated across it, and the rows beside "
+        "it are not used; record without interruption if possible"
     )
     yield log_finding(log.name, "gap", severity, message, gaps=len(gaps), longest=longest, at=start)
 
@@ -155,11 +159,7 @@ def _goes_on(q: Array, k: int) -> bool:
 def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
     channels = np.hstack([x for x in (log.q, log.v, log.tau) if x is not None])
     same = (np.diff(channels, axis=0) == 0).all(axis=1)
-    # rows of a robot at rest repeat on a coarse grid: a stale row must lie within a motion
-    speed = np.abs(np.diff(log.q, axis=0)).max(axis=1) / step
-    is_moving = np.zeros(len(same), dtype=bool)
-    is_moving[1:-1] = (speed[:-2] > _STILL) | (speed[2:] > _STILL)
-    runs = [(a, b) for a, b in runs_of(same) if is_moving[a] or is_moving[b - 1]]
+    runs = _in_motion(log, runs_of(same))
     stale = sum(stop - start for start, stop in runs)
     if stale == 0:
         return
@@ -175,6 +175,32 @@ def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
     )
 
 
+def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the runs of repeated rows within a motion, which continues or catches up after them.
+
+    A robot that holds a position starts again from rest, and without further channels, a single
+    step of the encoder is that of a slow motion.
+
+    Args:
+        log: The log.
+        runs: First and last row of each run.
+    """
+    t, q, last_row = log.t, log.q, len(log.t) - 1
+    first, last = np.array([run for run in runs if run[1] < last_row], dtype=int).reshape(-1, 2).T
+    n = last - first + 1
+    change = q[last + 1] - q[last]
+    m = np.minimum(n, _AROUND)
+    around = np.linalg.norm(q[first] - q[np.maximum(first - m, 0)], axis=1)
+    around += np.linalg.norm(q[np.minimum(last + 1 + m, last_row)] - q[last + 1], axis=1)
+    moves = np.abs(change).max(axis=1, initial=0.0) > _STILL * (t[last + 1] - t[first])
+    if not log.has_torque:
+        steps = np.array([quantum(x) for x in q.T])
+        moves &= (np.abs(change) > 1.5 * steps).any(axis=1)
+    continues = np.linalg.norm(change, axis=1) >= _CONTINUES * around * n / m
+    rows = np.flatnonzero(moves & continues)
+    return list(zip(first[rows].tolist(), last[rows].tolist(), strict=True))
+
+
 def _standstill(log: Log, moving: Array) -> Iterator[Finding]:
     """Yield the rests at the ends of a log, from the times at which the robot moves."""
     if len(moving) == 0:
@@ -185,6 +211,6 @@ def _standstill(log: Log, moving: Array) -> Iterator[Finding]:
     message = (
         f"the robot is at rest for the first {before:.3g} s and the last {after:.3g} s. Rows of "
         "joints at rest are not used to identify friction; cut them with start = "
-        f"{moving[0]:.4g} and end = {moving[-1]:.4g}"
+        f"{seconds(moving[0])} and end = {seconds(moving[-1])}"
     )
     yield log_finding(log.name, "standstill", "note", message, before=before, after=after)

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from robotid._text import period
 from robotid._typing import Array
 from robotid.doctor.clock import runs_of
 from robotid.doctor.command_lead import find_lead
@@ -341,7 +342,7 @@ def _early(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
             continue
         t = log.t[loop.rows]
         is_whole = found.stop - found.start == len(t)
-        part = "" if is_whole else f" from {t[found.start]:.4g} to {t[found.stop - 1]:.4g} s"
+        part = "" if is_whole else f" in {period(float(t[found.start]), float(t[found.stop - 1]))}"
         message = (
             f"{loop.name} moves {1e3 * found.lead:.3g} +- {1e3 * found.std_error:.2g} ms before "
             f"its command{part}: the logged command is not the command of the drive, or it has "

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from robotid._text import seconds
 from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.logs.data import Log
@@ -73,7 +74,7 @@ def _closed(model: RobotModel, log: Log, q: np.ndarray, missing: np.ndarray) -> 
     joints = [joint for joint, is_missing in zip(model.joints, missing, strict=True) if is_missing]
     what = f"no position of {listed(joints)} closes" if joints else "the positions do not close"
     raise DataError(
-        f"{log.name}: {what} the loop {model.loops[loop].name} at t = {log.t[k]:g} s: "
+        f"{log.name}: {what} the loop {model.loops[loop].name} at t = {seconds(log.t[k])} s: "
         f"{gaps[k, loop]:.3g} m remain, wanted at most {allowed:.2g} m. Correct the zero positions "
         "or signs of the logged joints, or the frames of the loop",
         code="open_loop",

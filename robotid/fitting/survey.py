@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from robotid._text import seconds
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
@@ -504,8 +505,9 @@ def _window(stamps: Array, where: str, start: float | None, end: float | None) -
         low, high = stamps[0], stamps[-1]
         raise DataError(
             f"{where}: {max(stop - first, 0)} rows lie between "
-            f"{low if start is None else start:g} s and {high if end is None else end:g} s; "
-            f"the log spans {low:g} s to {high:g} s. Choose start and end inside it"
+            f"{seconds(low if start is None else start)} s and "
+            f"{seconds(high if end is None else end)} s; the log spans {seconds(low)} s to "
+            f"{seconds(high)} s. Choose start and end inside it"
         )
     return first, stop
 

@@ -11,7 +11,7 @@ from robotid._settings import is_number
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed, quoted, toml_key
 from robotid.logs.data import repeated, suggestion
-from robotid.logs.missing import NOUNS, Missing
+from robotid.logs.missing import NOUNS, SIZES, Missing
 from robotid.logs.settings import LogSource
 from robotid.logs.table import prefixes
 from robotid.logs.transmission import Transmission
@@ -23,19 +23,32 @@ Needs: TypeAlias = Literal["torque", "motion", "commands", "any"]
 
 #: Kinds of columns with torques.
 TORQUES = ("tau", "tauref")
-_SIZES = ("loadsize_", "load_size_")  # absolute values of loads, as bus servos report them
+_SIMULATION = (  # from commands, on the command line and in a job file
+    "by --estimator simulation --kp N_M_PER_RAD or in the job file; without kp, the masses of the "
+    """URDF determine the scale
+[estimator]
+name = "simulation"
+
+[controller]
+kp = N_M_PER_RAD  # position gain, if you know it"""
+)
 
 
-def without_torque(is_commanded: bool) -> str:
+def without_torque(is_commanded: bool, remedy: str = _SIMULATION) -> str:
     """Return the remedy for a log without torques.
 
     Args:
         is_commanded: Whether it has commands.
+        remedy: What to state for an identification from commands.
     """
-    subject = "Its commands are" if is_commanded else "Commanded positions, qref_<joint>, would be"
+    if is_commanded:
+        return (
+            "All estimators but the simulation need tau_<joint> or current_<joint>. The log has "
+            f"commanded positions: identify the drives from them, {remedy}"
+        )
     return (
-        f'{subject} enough for [estimator] name = "simulation" with a [controller] table; all '
-        "other estimators need tau_<joint> or current_<joint>"
+        "Record tau_<joint> or current_<joint>. Commanded positions, qref_<joint>, are enough for "
+        'the estimator "simulation"'
     )
 
 
@@ -166,6 +179,7 @@ class Finder:
                 raise SettingsError(f"gain of {joint!r} is {gain}, wanted a number other than 0")
         for joint in self.source.joints:
             self._require_read(joint, "log.joints renames")
+        self._check_names()
         names = dict.fromkeys([*self.joints, *self.motors.values()])
         known = ["time", *(f"{kind}_{name}" for kind in prefixes() for name in names)]
         for standard, name in self.columns.items():
@@ -179,6 +193,21 @@ class Finder:
                     f"{self.where} has no column {name!r}, which is stated for {standard!r} in "
                     f"columns; columns found: {listed(self.names)}{suggestion(name, self.names)}"
                 )
+
+    def _check_names(self) -> None:
+        """Reject repeated joints, and two joints, or two motors, with one name in the file."""
+        if twice := repeated(self.joints):
+            raise SettingsError(f"joints has {listed(twice)} more than once; name each joint once")
+        for places in (self.joints, tuple(dict.fromkeys(self.motors.values()))):
+            own: dict[str, str] = {}
+            for place in places:
+                other = own.setdefault(self._named(place), place)
+                if other != place:
+                    raise SettingsError(
+                        f"{self.where}: joints {other} and {place} have the same name "
+                        f"{self._named(place)!r} in the log; state another one in [log.joints], "
+                        f"or by --rename {place}=NAME"
+                    )
 
     def _require_read(self, joint: str, what: str) -> None:
         if joint not in (*self.joints, *self.motors.values()):
@@ -259,7 +288,7 @@ class Finder:
 
     def _note_sizes(self) -> None:
         """Add a note on loads without sign, which are not used."""
-        sizes = [name for name in self.names if name.startswith(_SIZES) and name not in self.seen]
+        sizes = [name for name in self.names if name.startswith(SIZES) and name not in self.seen]
         self.seen.update(sizes)
         if sizes:
             self.notes.append(
@@ -337,29 +366,25 @@ class Finder:
         raise missing.error(self._remedy(absent))
 
     def _remedy(self, absent: Sequence[tuple[str, str]]) -> str:
-        """Return what to do if no column is similar to a missing one, with its separator."""
+        """Return what to do if no column is similar to a missing one."""
         if at_motors := [name for name in self.names if name.startswith(("qm_", "taum_"))]:
             return (
-                f". For columns of motors, as {at_motors[0]}, state [[transmission]] with joints "
+                f"For columns of motors, as {at_motors[0]}, state [[transmission]] with joints "
                 "and matrix"
             )
         kind, joints = absent[0][0], [joint for _, joint in absent]
         if kind == "tau" and not any(map(self.has_torque, self.joints)):
-            return f". {without_torque(all(self._has('qref', other) for other in self.joints))}"
+            return without_torque(all(self._has("qref", other) for other in self.joints))
         if kind == "qref" and not any(self._has("qref", other) for other in self.joints):
-            return "".join(
-                [". Record the commands of the controller", *(f"; {note}" for note in self.notes)]
-            )
+            return "; ".join(["Record the commands of the controller", *self.notes])
         at_rest = [joint for joint in self.joints if joint in joints]
         if len(at_rest) == len(self.joints):
-            return ""
+            return f"Record the {NOUNS[kind.removesuffix('m')]} of each joint"
         locks = " ".join(f"--lock {joint}=0" for joint in at_rest)
         locked = ", ".join(f"{toml_key(joint)} = 0" for joint in at_rest)
         one = len(at_rest) == 1
         how = "was at rest, lock it at its position" if one else "were at rest, lock them there"
-        return (
-            f". If {listed(at_rest)} {how}, as {locks}, or locked = {{ {locked} }} in the job file"
-        )
+        return f"If {listed(at_rest)} {how}, as {locks}, or locked = {{ {locked} }} in the job file"
 
     def has_torque(self, joint: str) -> bool:
         """Return whether the file has a torque or a current of a joint.

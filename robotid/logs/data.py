@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotid._settings import is_number, require_each, require_flag, require_kind
+from robotid._text import seconds
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
@@ -140,8 +141,9 @@ class Log:
         rows = np.flatnonzero((self.t >= first) & (self.t <= last))
         if len(rows) < 2:
             raise DataError(
-                f"{self.name}: {len(rows)} rows lie between {first:g} s and {last:g} s; "
-                f"the log spans {self.t[0]:g} s to {self.t[-1]:g} s. Choose start and end inside it"
+                f"{self.name}: {len(rows)} rows lie between {seconds(first)} s and {seconds(last)} "
+                f"s; the log spans {seconds(self.t[0])} s to {seconds(self.t[-1])} s. Choose start "
+                "and end inside it"
             )
         within = slice(rows[0], rows[-1] + 1)
         return replace(
@@ -447,7 +449,7 @@ def require_finite(
     value = values[row, column]
     found = "NaN" if np.isnan(value) else f"{value:g}" if np.isfinite(value) else str(value)
     what = ", which is implausibly large," if np.isfinite(value) else ""
-    at = f" (t = {t[row]:.6g} s)" if np.isfinite(t[row]) else ""
+    at = f" (t = {seconds(t[row])} s)" if np.isfinite(t[row]) else ""
     raise DataError(
         f"{where}: {names[column]} is {found}{what} at row {first + row}{at}; remove the row or "
         "correct the recording",

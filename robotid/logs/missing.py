@@ -9,7 +9,7 @@ from robotid.findings import listed, quoted, toml_key
 from robotid.logs.settings import LogSource
 from robotid.logs.table import prefixes, quantity_of
 
-__all__ = ["NOUNS", "Missing"]
+__all__ = ["NOUNS", "SIZES", "Missing"]
 
 #: Nouns for the columns of each kind.
 NOUNS = {
@@ -21,6 +21,8 @@ NOUNS = {
     "dqref": "commanded velocity",
     "tauref": "commanded torque",
 }
+#: Prefixes of absolute values of loads, as bus servos report them.
+SIZES = ("loadsize_", "load_size_")
 _SHOWN = 12  # names in a list
 
 
@@ -61,15 +63,25 @@ class Missing:
 
     def _of_joints(self) -> str:
         """Return the message on joints that have other names in the log, "" if none has."""
-        logged = {self._of(name)[1] for name in self.names}
+        logged = dict.fromkeys(self._of(name)[1] for name in self.names)
         absent = dict.fromkeys(x for _, x in self.absent if self._named(x) not in logged)
         others = self._other_joints()
-        pairs, by_order = similar_joints(list(absent), others)
+        sought = {self._named(joint): joint for joint in absent}
+        found, ordered = similar_joints(list(sought), others)
+        pairs = {sought[name]: other for name, other in found.items()}
+        by_order = {sought[name] for name in ordered}
         if any(x not in (*absent, *self.source.joints) for x in self.places):
             # others may be of joints that are not read, as locked ones
             pairs = {joint: name for joint, name in pairs.items() if joint not in by_order}
-        if not pairs:
+        stated = [joint for joint in absent if joint in self.source.joints]
+        if not (pairs or stated):
             return ""
+        head = f"{self.where} has no columns of joints {listed(absent)} under the names of the URDF"
+        if stated:
+            named = ", ".join(f"{x} = {quoted(self._named(x))}" for x in stated)
+            head = f"{self.where} has no columns under the names that [log.joints] states: {named}"
+        if not pairs:
+            return f"{head}; names in the log: {listed(filter(None, logged))}"
         width = max(len(f"{toml_key(joint)} = {quoted(name)}") for joint, name in pairs.items())
         lines = [
             f"{f'{toml_key(joint)} = {quoted(name)}':{width}}"
@@ -82,10 +94,9 @@ class Missing:
         rest += f"\nOther names in the log: {listed(left, _SHOWN)}." if left else ""
         joint, name = next(iter(pairs.items()))
         return (
-            f"{self.where} has no columns of joints {listed(absent)} under the names of the URDF; "
-            f"names in the log: {listed(others)}. State the name of each joint in the job file, or "
-            f"with one flag per joint, as --rename {joint}={name}. This table is a guess: check "
-            "each line, an exchange of joints gives wrong parameters.\n[log.joints]\n"
+            f"{head}; names in the log: {listed(others)}. State the name of each joint in the job "
+            f"file, or with one flag per joint, as --rename {joint}={name}. This table is a guess: "
+            "check each line, an exchange of joints gives wrong parameters.\n[log.joints]\n"
             + "\n".join(lines)
             + rest
         )
@@ -97,7 +108,8 @@ class Missing:
         kinds = dict.fromkeys(kind.removesuffix("m") for kind, _ in self.absent)
         of_kinds = {x for kind, _ in self.absent for x in (kind, kind.replace("tau", "current"))}
         commanded, found, others = list[str](), list[str](), list[str]()
-        for name in self.names:
+        sizes = [name for name in self.names if name.startswith(SIZES)]
+        for name in (x for x in self.names if x not in sizes):
             kind, place = self._of(name)
             if kind in of_kinds and (kind.startswith("qref") or not is_commanded(name)):
                 found.append(name)
@@ -113,6 +125,8 @@ class Missing:
         others = [name for name in others if name not in ("time", "t")]
         if commanded:
             text += f" Commanded, not measured: {listed(commanded, _SHOWN)}."
+        if sizes:
+            text += f" Loads without sign, which are no torques: {listed(sizes, _SHOWN)}."
         if others:
             text += f" Other columns: {listed(others, _SHOWN)}."
         stated = {f"{kind}_{place}": column for (kind, place), column in near.items()}
@@ -122,10 +136,13 @@ class Missing:
                 f"{text} Similar names are in the log. Rename these columns, or check them and "
                 "state them in the job file:\n[columns]\n" + "\n".join(lines)
             )
+        read = self._read_names()
+        if not stated and not others and all(self._of(name)[1] in read for name in found):
+            return f"{text} {remedy}"  # every column has its meaning: there is none to rename
         hint = "".join(f"Did you mean {column!r}? " for column in stated.values())
         ((key, column),) = stated.items() or [("_".join(self.absent[0]), "NAME")]
         inside = f"{{ {toml_key(key)} = {quoted(column)} }}"
-        end = "" if stated else remedy
+        end = "" if stated else f". {remedy}"
         return f"{text} {hint}Rename {it}, or state {it} in the job file: columns = {inside}{end}"
 
     def _named(self, place: str) -> str:

@@ -137,7 +137,8 @@ def _of_joints(log: Log, joints: Sequence[str], needs: Needs, passive: Collectio
     """Return a log with its columns in the order of some joints, with all required quantities."""
     joints = [joint for joint in joints if joint in log.joints or joint not in passive]
     if not log.has_torque and (needs == "torque" or (needs == "any" and log.q_ref is None)):
-        raise DataError(f"{log.name} has no torque. {without_torque(log.q_ref is not None)}")
+        given = 'with estimator="simulation", controller={"kp": N_M_PER_RAD}'
+        raise DataError(f"{log.name} has no torque. {without_torque(log.q_ref is not None, given)}")
     if needs == "commands" and log.q_ref is None:
         raise DataError(
             f"{log.name} has no commanded positions; pass them as Log(..., q_ref=...), an array "

@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from robotid._text import seconds
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
@@ -150,7 +151,8 @@ def unwrap(log: Log, is_free: Array) -> Log:
         k = int(np.argmax(jumps[:, j]))
         raise DataError(
             f"{log.path or 'log'}: q_{log.joints[j]} jumps by a full turn at t = "
-            f"{log.t[k + 1]:.6g} s, but the joint has limits in the URDF; correct the recording",
+            f"{seconds(log.t[k + 1])} s, but the joint has limits in the URDF; correct the "
+            "recording",
             code="full_turn",
         )
     if not has_jump.any():

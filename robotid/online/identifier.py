@@ -202,7 +202,7 @@ class OnlineIdentifier:
         if not (np.isfinite(t) and all(np.isfinite(x).all() for x in arrays)):
             raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
         if t <= self._now:
-            raise DataError(f"t must increase, but {t:.6g} s follows {self._now:.6g} s")
+            raise DataError(f"t must increase, but {t:.15g} s follows {self._now:.15g} s")
 
     def _take(self, instant: Instant, now: float) -> None:
         """Process one instant; store it before the end of the warm-up."""

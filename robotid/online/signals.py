@@ -88,7 +88,7 @@ class LiveSignals:
         last = self._last
         if last is not None:
             if t <= last[0]:
-                raise DataError(f"t must increase, but {t:.6g} s follows {last[0]:.6g} s")
+                raise DataError(f"t must increase, but {t:.15g} s follows {last[0]:.15g} s")
             jump = np.where(self._is_continuous, u[: self._n] - last[1][: self._n], 0.0)
             u[: self._n] -= 2 * np.pi * np.round(jump / (2 * np.pi))
         self._last = (t, u)

@@ -11,11 +11,14 @@ from html import escape
 from pathlib import Path
 from typing import NamedTuple
 
+from robotid._text import arguments
+
 __all__ = [
     "Cell",
     "Section",
     "asset",
     "code",
+    "command_html",
     "facts_html",
     "figure",
     "folded",
@@ -33,6 +36,7 @@ __all__ = [
 _ASSETS = Path(__file__).parent / "assets"
 _FIRST = 3  # reasons of a verdict that are visible without unfolding
 #: Scripts, and the pattern of pages that need them.
+_KINDS = {"urdf": "URDF", "sidecar": "drive parameters"}  # of files, by key of result.json
 _DOCK = '<div id="replay" class="dock"'
 _SCRIPTS = {
     "page.js": '<details|<table class="data"',
@@ -230,7 +234,7 @@ def facts_html(facts: Mapping[str, str], files: Mapping[str, str] | None = None)
         files: Files to link to, by their kind; they come last.
     """
     links = ", ".join(
-        f'<a href="{escape(path)}">{escape("URDF" if kind == "urdf" else kind)}</a>'
+        f'<a href="{escape(path)}">{escape(_KINDS.get(kind, kind))}</a>'
         for kind, path in (files or {}).items()
     )
     shown = {**facts, "Files": links} if links else facts
@@ -246,14 +250,23 @@ def steps_html(steps: Iterable[tuple[str, Sequence[str]]]) -> str:
     """
     items = "".join(
         f"<li><p>{escape(action)}</p>"
-        + "".join(
-            f'<div class="copy"><pre class="command">{escape(block)}</pre></div>'
-            for block in blocks
-        )
+        + "".join(f'<div class="copy">{command_html(block)}</div>' for block in blocks)
         + "</li>\n"
         for action, blocks in steps
     )
     return f'<h2 id="next">Do next</h2>\n<ol class="next">{items}</ol>\n' if items else ""
+
+
+def command_html(block: str) -> str:
+    """Return the HTML of a command, or of lines of a job file; lines break between arguments.
+
+    Args:
+        block: The text to copy, not escaped.
+    """
+    html = escape(block)
+    if block.startswith("robotid ") and "\n" not in block:  # an argument does not end at a hyphen
+        html = " ".join(f"<span>{escape(argument)}</span>" for argument in arguments(block))
+    return f'<pre class="command">{html}</pre>'
 
 
 def page(title: str, header: str, sections: Mapping[str, Section | tuple[str, str]]) -> str:

@@ -18,7 +18,15 @@ from robotid.exceptions import DataError
 from robotid.logs.data import Trajectory
 from robotid.regressor.memory import drive_motion_along
 from robotid.robot.as_pinocchio import pinocchio_model
-from robotid.robot.drives import TERMS, DriveMotion, DriveTerm, Lag, Spring
+from robotid.robot.drives import (
+    TERMS,
+    DriveMotion,
+    DriveTerm,
+    Lag,
+    LuGre,
+    Presliding,
+    Spring,
+)
 from robotid.robot.model import RobotModel
 
 __all__ = [
@@ -35,6 +43,8 @@ __all__ = [
 _SIMPLE: dict[str, DriveTerm] = {
     **{name: TERMS[name] for name in ("viscous", "coulomb", "offset")}, "spring": Spring()
 }  # fmt: skip
+_STATES = (Presliding.label, LuGre.label)  # terms with an internal state
+_NEGLIGIBLE = 1e-4  # error of a projection over the torque of its drive
 _ROUNDING = 1e-12  # of the largest eigenvalue of products: a smaller one counts as 0
 
 
@@ -137,10 +147,12 @@ class ProjectedDrive:
         unit = {name: term.units[self.is_linear] for name, term in _SIMPLE.items()}
         stated = ", ".join(f"{term} {x:.4g} {unit[term]}" for term, x in self.values.items())
         share = f" ({100 * self.error / self.torque:.2g} % of its torque)" if self.torque else ""
-        return (
-            f"{self.name}: {', '.join(self.replaced)} projected on {stated}; "
-            f"error {self.error:.3g} {unit['offset']} RMS{share}"
-        )
+        note = f"error {self.error:.3g} {unit['offset']} RMS{share}"
+        if self.error <= _NEGLIGIBLE * self.torque:
+            note = f"error below {100 * _NEGLIGIBLE:g} % of its torque"
+        if states := [name for name in self.replaced if name in _STATES]:
+            note += f"; {', '.join(states)} at steady value, without the transient after reversals"
+        return f"{self.name}: {', '.join(self.replaced)} projected on {stated}; {note}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for sidecars."""

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote, urlencode
 
+from robotid.pages.html import command_html
 from robotid.report.advice import Origin
 
 __all__ = ["Clip", "Dock"]
@@ -98,7 +99,7 @@ class Dock:
         if not self.replay:
             words = f"The replay {_WORDS}. This command writes it:"
             command = next(filter(None, map(self._command, self.clips)))
-            block = f'<div class="copy"><pre class="command">{escape(command)}</pre></div>'
+            block = f'<div class="copy">{command_html(command)}</div>'
         return (
             f'<div id="replay" class="dock" data-file="{escape(quote(self.file))}" '
             f'data-clips="{escape(json.dumps(clips))}">'

@@ -39,6 +39,7 @@ SOURCE_NAMES = {
     "stated": "stated",
 }
 
+_COLUMNS = 7  # drive terms that a page shows side by side
 _FIRST_TERMS = ("kp", "kd", "delay", "limit", "zero")  # of a drive, before all others
 _MILLI = {"s": "ms"}  # units in the table of drives
 _METRICS = {
@@ -119,7 +120,7 @@ def _parameter_table(entries: Sequence[Mapping[str, Any]], on_misfit: Collection
 
 
 def _drive_table(entries: Sequence[Mapping[str, Any]]) -> str:
-    """Return the drive terms, one row per joint."""
+    """Return the drive terms, one row per joint, or one per term if these are more."""
     drives: dict[str, dict[str, Mapping[str, Any]]] = {}
     for entry in entries:
         owner, _, term = entry["name"].rpartition(".")
@@ -133,10 +134,17 @@ def _drive_table(entries: Sequence[Mapping[str, Any]]) -> str:
     }  # all other terms are fixed at 0
     terms = sorted(shown, key=lambda term: (*_FIRST_TERMS, term).index(term))
     units = [_MILLI.get(shown[term]["unit"], shown[term]["unit"]) for term in terms]
-    headers = ["joint", *(f"{term} [{unit}]" for term, unit in zip(terms, units, strict=True))]
-    rows = [
-        [code(joint), *(_short(own.get(term)) for term in terms)] for joint, own in drives.items()
-    ]
+    names = [f"{term} [{unit}]" for term, unit in zip(terms, units, strict=True)]
+    cells = [[_short(own.get(term)) for term in terms] for own in drives.values()]
+    headers, rows = (
+        ["joint", *names],
+        [[code(x), *own] for x, own in zip(drives, cells, strict=True)],
+    )
+    if len(terms) > max(len(drives), _COLUMNS):  # too wide for a page
+        headers = ["term", *drives]
+        rows = [
+            [text(name), *own] for name, own in zip(names, zip(*cells, strict=True), strict=True)
+        ]
     return table("Drives, by joint", headers, rows, is_data=True) if terms else ""
 
 

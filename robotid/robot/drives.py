@@ -276,6 +276,14 @@ class PositionCoulomb(MemorylessTerm):
     def name(self) -> str:
         return f"coulomb_q{self.order}"
 
+    @property
+    def units(self) -> tuple[str, str]:  # type: ignore[override]
+        """Units for revolute and prismatic drives."""
+        if self.order == 0:
+            return "N m", "N"
+        power = "" if self.order == 1 else f"^{self.order}"
+        return f"N m/rad{power}", f"N/m{power}"
+
     @staticmethod
     def position_law(q: Array, order: float, centre: float) -> Slope:
         lower = (q - centre) ** max(order - 1.0, 0.0)

@@ -298,7 +298,7 @@ def _check(t: Array, q: Array, rate: float) -> None:
     if len(reversed_rows):
         k = int(reversed_rows[0])
         raise DataError(
-            f"t must increase, but t[{k + 1}] = {t[k + 1]:.6g} s follows t[{k}] = {t[k]:.6g} s"
+            f"t must increase, but t[{k + 1}] = {t[k + 1]:.15g} s follows t[{k}] = {t[k]:.15g} s"
         )
 
 

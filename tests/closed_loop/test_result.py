@@ -12,6 +12,7 @@ from robotid.closed_loop import result
 from robotid.closed_loop.findings import loop_findings
 from robotid.closed_loop.initial_values import _speed
 from robotid.closed_loop.result import LoopIdentification, logged_motion
+from robotid.closed_loop.settings import LoopSettings
 from robotid.closed_loop.zeros import Encoders
 from robotid.fitting.bands import QUANTILE
 from robotid.logs.data import Log
@@ -109,6 +110,26 @@ def test_friction_is_projected_where_a_joint_moves_by_its_own_largest_speed(monk
         speed = np.abs(motion.v)
         np.testing.assert_array_equal(moving, speed > 0.05 * speed.max(axis=0))
         assert moving.mean(axis=0) == pytest.approx(0.97, abs=0.01)  # |cos| > 0.05
+
+
+@pytest.mark.parametrize(
+    ("stated", "cause", "remedy"),
+    [
+        ({}, "excite it. ", "Command a motion that depends more on rail.armature"),
+        ({"delay": 0.01}, "excite it, or delay in [controller] is wrong. ",
+         "Leave the delay out of [controller], so that it is fitted; command a motion"),
+        ({"kp": 9.0, "kd": 1.0}, "excite it, or kp or kd in [controller] is wrong. ",
+         "Compare kp and kd with the gains of the drive; command a motion"),
+    ],
+)  # fmt: skip
+def test_remedies_of_a_parameter_at_its_bound_name_only_what_is_stated(
+    found, stated, cause, remedy
+):
+    loop = LoopSettings(**stated)
+    at_bound = of(found, details={**found.estimate.details, "at_bound": ("rail.armature",)})
+    [finding] = (x for x in loop_findings(replace(at_bound, loop=loop), ()) if x.code == "at_bound")
+    assert f"{cause}{remedy}" in finding.message
+    assert ("delay" in finding.message) == ("delay" in stated)
 
 
 def test_encoders_are_told_with_the_figures_of_their_own_joint(found):

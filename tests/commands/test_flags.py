@@ -6,6 +6,7 @@ import pytest
 
 from robotid.cli import doctor, identify, preview, track
 from robotid.cli.flags import job_from_flags, source_words
+from robotid.cli.parser import CommandParser
 from robotid.exceptions import SettingsError
 from robotid.fitting.settings import ESTIMATORS
 from robotid.logs.settings import LogSource, SignalSettings
@@ -131,3 +132,30 @@ def test_help_names_each_estimator_once():
     names = [name.strip() for name in names]
     assert sorted(names) == sorted(ESTIMATORS)
     assert parser.parse_args(["robot.urdf", "--no-report", "--dynamics"]).no_report is False
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--lock", "a=0", "--lock", "a=1"], "--lock states a twice, as 0 and as 1; state it once"),
+        (["--rename", "a=1", "--rename", "a=2"], "--rename states a twice, as 1 and as 2"),
+    ],
+)
+def test_two_values_of_a_joint_are_refused(words, message):
+    with pytest.raises(SettingsError, match=message):
+        job(identify, *words)
+
+
+def test_a_flag_is_stated_once_and_validation_logs_add_up(capsys):
+    parser = CommandParser(prog="robotid")
+    identify.add_flags(parser)
+    found = parser.parse_args(
+        [*("r.urdf", "a.csv", "--validate", "b.csv", "--cutoff", "5", "--validate", "c.csv")]
+    )
+    assert (found.validate, found.cutoff) == (["b.csv", "c.csv"], "5")
+    for flag, value in (("--cutoff", "5"), ("--out", "x"), ("--estimator", "ols")):
+        with pytest.raises(SystemExit):
+            parser.parse_args(
+                ["r.urdf", "a.csv", flag, "6" if value == "5" else value, flag, value]
+            )
+        assert f"argument {flag}: stated twice, as " in capsys.readouterr().err

@@ -97,6 +97,20 @@ def test_the_longest_run_of_repeated_rows_is_one_in_motion():
     assert (found.evidence["rows"], found.evidence["longest_run"]) == (3, 3)
 
 
+def test_a_position_that_is_held_between_steps_is_not_stale():
+    t = 0.005 * np.arange(1200)
+    step = np.concatenate([0.6 * (1 - np.exp(-t[:400] / 0.05)) + 0.6 * k for k in range(3)])
+    q = np.round(step / 0.0015) * 0.0015  # of an encoder
+    motion = {"joints": ("a",), "tau": 0 * q[:, None], "has_torque": False}
+    assert "stale_rows" not in said(check_clock(Log(t, q=q[:, None], **motion)))
+    slow = np.round(0.1 * t / 0.0015) * 0.0015  # an encoder step in three rows
+    assert "stale_rows" not in said(check_clock(Log(t, q=slow[:, None], **motion)))
+    stale = q[np.arange(1200) // 4 * 4]  # the robot updates its state every 4 rows
+    found = said(check_clock(Log(t, q=stale[:, None], **motion)))["stale_rows"]
+    assert 90 < found.evidence["rows"] < 300
+    assert found.evidence["longest_run"] == 3
+
+
 @pytest.fixture(scope="module")
 def slider():
     """A prismatic joint and one that turns."""

@@ -184,16 +184,15 @@ def test_a_half_command_names_the_joints():
     with pytest.raises(DataError) as error:
         read_log(frame(qref_elbow=None), JOINTS, needs="commands")
     assert str(error.value) == (
-        "log has no column 'qref_elbow'; commanded position columns found: qref_shoulder. Rename "
-        'it, or state it in the job file: columns = { qref_elbow = "NAME" }. If elbow was at rest, '
-        "lock it at its position, as --lock elbow=0, or locked = { elbow = 0 } in the job file"
+        "log has no column 'qref_elbow'; commanded position columns found: qref_shoulder. If "
+        "elbow was at rest, lock it at its position, as --lock elbow=0, or locked = { elbow = 0 } "
+        "in the job file"
     )
     with pytest.raises(DataError) as error:
         read_log(frame(qref_elbow=None, qref_shoulder=None), JOINTS, needs="commands")
     assert str(error.value) == (
         "log has no columns 'qref_shoulder', 'qref_elbow'; commanded position columns found: none. "
-        'Rename them, or state them in the job file: columns = { qref_shoulder = "NAME" }. Record '
-        "the commands of the controller"
+        "Record the commands of the controller"
     )
 
 
@@ -241,24 +240,33 @@ def test_half_of_the_rest_is_noted():
     assert (log.tau == 2.0).all()
 
 
-WITHOUT = (
-    'enough for [estimator] name = "simulation" with a [controller] table; all other estimators '
-    "need tau_<joint> or current_<joint>"
+COMMANDED = (
+    "All estimators but the simulation need tau_<joint> or current_<joint>. The log has commanded "
+    "positions: identify the drives from them, "
 )
 
 
 def test_a_log_without_torque_is_told_what_it_can_do():
     with pytest.raises(DataError) as error:
         read_log(frame(), JOINTS)
-    assert str(error.value).endswith(
-        f'columns = {{ tau_shoulder = "NAME" }}. Its commands are {WITHOUT}'
+    assert str(error.value) == (
+        "log has no columns 'tau_shoulder', 'tau_elbow'; torque or current columns found: none. "
+        f"{COMMANDED}by --estimator simulation --kp N_M_PER_RAD or in the job file; without kp, "
+        'the masses of the URDF determine the scale\n[estimator]\nname = "simulation"\n\n'
+        "[controller]\nkp = N_M_PER_RAD  # position gain, if you know it"
     )
     with pytest.raises(DataError) as error:
         read_log(frame(qref_elbow=None), JOINTS)
-    assert str(error.value).endswith(f"Commanded positions, qref_<joint>, would be {WITHOUT}")
+    assert str(error.value).endswith(
+        "none. Record tau_<joint> or current_<joint>. Commanded positions, qref_<joint>, are "
+        'enough for the estimator "simulation"'
+    )
     with pytest.raises(DataError) as error:
         read_logs(make_log(), JOINTS)
-    assert str(error.value) == f"log has no torque. Its commands are {WITHOUT}"
+    assert str(error.value) == (
+        f'log has no torque. {COMMANDED}with estimator="simulation", controller={{"kp": '
+        "N_M_PER_RAD}"
+    )
     assert read_logs(make_log(), JOINTS[::-1], needs="commands")[0].joints == JOINTS[::-1]
     with pytest.raises(DataError, match=r"log has no commanded positions; pass them as Log\("):
         read_logs(make_log(q_ref=None), JOINTS, needs="commands")
@@ -294,6 +302,10 @@ def test_a_size_without_sign_is_named_and_not_read():
         "loadsize_shoulder, loadsize_elbow ignored: the absolute value of a load does not "
         "determine the direction of the torque",
     )
+    with pytest.raises(DataError) as error:
+        read_log(frame(qref_elbow=None, **sizes), JOINTS)
+    assert "none. Loads without sign, which are no torques: loadsize_sh" in str(error.value)
+    assert "Rename" not in str(error.value)
     chosen = {f"tau_{joint}": f"loadsize_{joint}" for joint in JOINTS}
     assert read_log(frame(**sizes), JOINTS, columns=chosen).notes == (
         "columns ignored: qref_shoulder, qref_elbow",

@@ -258,11 +258,8 @@ def test_a_bag_without_efforts_is_refused_as_any_log(tmp_path):
     path = write_mcap(tmp_path / "run.mcap", messages)
     with refused(
         "run.mcap has no columns 'tau_shoulder', 'tau_elbow'; torque or current columns found: "
-        "none. Rename them, or state them in the job file: "
-        'columns = { tau_shoulder = "NAME" }. '
-        "Commanded positions, qref_<joint>, would be enough "
-        'for [estimator] name = "simulation" with a [controller] table; all other estimators need '
-        "tau_<joint> or current_<joint>"
+        "none. Record tau_<joint> or current_<joint>. Commanded positions, qref_<joint>, are "
+        'enough for the estimator "simulation"'
     ):
         read_log(path, JOINTS)
 
@@ -421,11 +418,8 @@ def test_one_joint_needs_no_second_axis(tmp_path):
         (
             {"tau": np.array([None] * 60)},
             "run.npz has no columns 'tau_shoulder', 'tau_elbow'; torque or current columns found: "
-            "none. Rename them, or state them in the job file: "
-            'columns = { tau_shoulder = "NAME" }. '
-            "Commanded positions, qref_<joint>, would be "
-            'enough for [estimator] name = "simulation" with a [controller] table; all other '
-            "estimators need tau_<joint> or current_<joint>",
+            "none. Record tau_<joint> or current_<joint>. Commanded positions, qref_<joint>, are "
+            'enough for the estimator "simulation"',
         ),
     ],
 )
@@ -459,10 +453,10 @@ def test_joints_may_have_other_names_in_the_file(tmp_path):
     swapped = LogSource(joints={"M1": "M2", "M2": "M1"})
     np.testing.assert_array_equal(read_log(path, ("M1", "M2"), source=swapped).q, log.q[:, ::-1])
     with refused(
-        "run.csv has no columns of joints elbow under the names of the URDF; names in the log: M2. "
-        "State the name of each joint in the job file, or with one flag per joint, as --rename "
-        "elbow=M2. This table is a guess: check each line, an exchange of joints gives wrong "
-        'parameters.\n[log.joints]\nelbow = "M2"  # by order'
+        'run.csv has no columns under the names that [log.joints] states: elbow = "M3"; names in '
+        "the log: M2. State the name of each joint in the job file, or with one flag per joint, as "
+        "--rename elbow=M2. This table is a guess: check each line, an exchange of joints gives "
+        'wrong parameters.\n[log.joints]\nelbow = "M2"  # by order'
     ):
         read_log(path, JOINTS, source=LogSource(joints={"shoulder": "M1", "elbow": "M3"}))
     with refused(

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, SettingsError
 from robotid.logs.read import read_log
 from robotid.logs.settings import LogSource
 
@@ -87,10 +87,8 @@ def test_commanded_columns_are_no_torques(kind):
     listing = ", ".join(of(kind))
     assert found == (
         f"log has no columns {SOUGHT}; torque or current columns found: none. Commanded, not "
-        f"measured: {listing}. Rename them, or state them in the job file: columns = {{ tau_pan = "
-        '"NAME" }. Commanded positions, qref_<joint>, would be enough for [estimator] name = '
-        '"simulation" with a [controller] table; all other estimators need tau_<joint> or '
-        "current_<joint>"
+        f"measured: {listing}. Record tau_<joint> or current_<joint>. Commanded positions, "
+        'qref_<joint>, are enough for the estimator "simulation"'
     )
 
 
@@ -159,6 +157,28 @@ def test_stated_names_are_not_guessed_again():
     columns = [*of("q", "12"), *of("tau", "12")]
     found = said(columns, ("a", "b"), source=LogSource(joints={"b": "1"}))
     assert found.endswith('[log.joints]\na = "2"  # by order')
+
+
+def test_a_misspelt_name_in_the_job_file_is_named_with_the_similar_one():
+    columns = [*of("q", ("M1", "left")), *of("tau", ("M1", "left"))]
+    found = said(columns, ("a", "b"), source=LogSource(joints={"a": "M1", "b": "lift"}))
+    assert found.startswith(
+        'log has no columns under the names that [log.joints] states: b = "lift"; names in the '
+        "log: left. State"
+    )
+    assert found.endswith('[log.joints]\nb = "left"  # similar name')
+    found = said(columns[::2], ("a", "b"), source=LogSource(joints={"a": "M1", "b": "M2"}))
+    assert found.endswith('[log.joints] states: b = "M2"; names in the log: M1')
+
+
+@pytest.mark.parametrize("stated", [{"a": "1", "b": "1"}, {"a": "b"}, {"b": "a"}])
+def test_two_joints_with_one_name_in_the_log_are_refused(stated):
+    frame = pd.DataFrame({name: np.arange(3.0) for name in ("time", *of("q", "ab1"))})
+    (name,) = set(stated.values())
+    with pytest.raises(SettingsError, match=f"log: joints a and b have the same name '{name}' in"):
+        read_log(frame, ("a", "b"), source=LogSource(joints=stated))
+    with pytest.raises(SettingsError, match="joints has a more than once; name each joint once"):
+        read_log(frame, ("a", "b", "a"))
 
 
 def test_the_name_of_a_locked_joint_is_not_given_to_another():

@@ -141,15 +141,14 @@ def test_missing_column_is_named_with_those_of_its_kind(run):
     path = run(make_table(tau_elbow=None))
     with refused(
         f"{path.name} has no column 'tau_elbow'; torque or current columns found: tau_shoulder. "
-        'Rename it, or state it in the job file: columns = { tau_elbow = "NAME" }. If elbow was at '
-        "rest, lock it at its position, as --lock elbow=0, or locked = { elbow = 0 } in the "
-        "job file"
+        "If elbow was at rest, lock it at its position, as --lock elbow=0, or locked = { elbow = 0 "
+        "} in the job file"
     ):
         read_log(path, JOINTS)
     path = run({k: v for k, v in make_table().items() if not k.startswith("q_")})
     with refused(
-        f"{path.name} has no columns 'q_shoulder', 'q_elbow'; position columns found: none. Rename "
-        'them, or state them in the job file: columns = { q_shoulder = "NAME" }'
+        f"{path.name} has no columns 'q_shoulder', 'q_elbow'; position columns found: none. Record "
+        "the position of each joint"
     ):
         read_log(path, JOINTS)
 
@@ -171,8 +170,7 @@ def test_the_column_of_another_joint_is_not_suggested(run):
     path = run({"time": np.arange(3), "q_joint_1": zeros, "q_joint_2": zeros, "tau_joint_1": zeros})
     with refused(
         f"{path.name} has no column 'tau_joint_2'; torque or current columns found: "
-        "tau_joint_1. Rename it, or state it in the job file: "
-        'columns = { tau_joint_2 = "NAME" }. If joint_2 was at rest, lock it at its position, '
+        "tau_joint_1. If joint_2 was at rest, lock it at its position, "
         "as --lock joint_2=0, or locked = { joint_2 = 0 } in the job file"
     ):
         read_log(path, ["joint_1", "joint_2"])
@@ -246,7 +244,9 @@ def test_joints_must_be_a_list_of_names(run, joints):
 
 
 def test_a_joint_named_twice_is_refused(run):
-    with pytest.raises(SettingsError, match=r"q_elbow, tau_elbow are read twice"):
+    with pytest.raises(
+        SettingsError, match=r"joints has elbow more than once; name each joint once"
+    ):
         read_log(run(make_table()), ["elbow", "elbow"])
 
 

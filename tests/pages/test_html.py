@@ -5,7 +5,7 @@ from decimal import Decimal
 import numpy as np
 import pytest
 
-from robotid.pages.html import facts_html, steps_html, verdict_html, with_error
+from robotid.pages.html import command_html, facts_html, steps_html, verdict_html, with_error
 
 
 def test_a_verdict_shows_three_reasons_and_folds_all_others():
@@ -39,6 +39,15 @@ def test_a_step_has_each_of_its_blocks_to_copy():
         "<li><p>Read.</p></li>\n</ol>\n"
     )
     assert steps_html([]) == ""
+
+
+def test_a_command_breaks_between_arguments_only():
+    assert command_html("robotid replay 'my log.csv' --lock a=0 <x>") == (
+        '<pre class="command"><span>robotid</span> <span>replay</span> '
+        "<span>&#x27;my log.csv&#x27;</span> <span>--lock</span> <span>a=0</span> "
+        "<span>&lt;x&gt;</span></pre>"
+    )
+    assert command_html("[locked]\na = 0") == '<pre class="command">[locked]\na = 0</pre>'
 
 
 def test_a_number_ends_at_the_second_digit_of_its_error(rng):

@@ -1,5 +1,7 @@
 """Friction on the terms of simulators: brute force over the rows, bounds, what is left."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.optimize
@@ -176,6 +178,15 @@ def test_a_delay_stays_by_itself_and_presliding_is_that_of_long_motion(case, ur5
     wanted = {"viscous": 1.0, "coulomb": 5.0, "offset": 0.1}
     assert drive.values == pytest.approx(wanted, abs=1e-9)
     assert drive.error == pytest.approx(0.0, abs=1e-6)
+    steady = "presliding at steady value, without the transient after reversals"
+    assert str(drive) == (
+        "elbow_joint: presliding projected on viscous 1 N m s/rad, coulomb 5 N m, offset 0.1 N m; "
+        f"error below 0.01 % of its torque; {steady}"
+    )
+    mixed = replace(drive, replaced=("stribeck", "presliding"), error=0.3, torque=10.0)
+    assert str(mixed).endswith(f"; error 0.3 N m RMS (3 % of its torque); {steady}")
+    other = replace(drive, replaced=("stribeck",), error=3e-16, torque=10.0)
+    assert str(other).endswith("; error below 0.01 % of its torque")
     left = dict(zip(found.model.layout.names, found.pi, strict=True))
     assert left[f"{ELBOW}.lag"] == 0.01
     assert f"{ELBOW}.presliding" not in left

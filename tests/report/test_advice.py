@@ -387,6 +387,13 @@ def test_a_usable_result_of_commands_is_exported():
     assert loop_steps(loop_content("usable"), Origin()) == ()
 
 
+def test_the_replay_of_commands_shows_the_first_validation_log():
+    content = loop_content("usable")
+    assert " arm.urdf a.csv " in loop_steps(content, JOB)[0].blocks[0]
+    content["inputs"] += [{"role": "validation", "path": f"{name}.csv"} for name in "bc"]
+    assert " arm.urdf b.csv " in loop_steps(content, JOB)[0].blocks[0]
+
+
 def test_a_poor_result_of_commands_is_repaired_and_not_used():
     warnings = [loop_warning("alike", "one"), loop_warning("small", "a.csv: two")]
     steps = loop_steps(loop_content("poor", warnings=warnings), JOB)

@@ -160,7 +160,7 @@ def test_without_folder_or_file_there_is_no_dock():
     ):
         assert (dock.html, dock.link("Show", 1.0, "j", "a")) == ("", "")
     html = Dock("", origin, "arm.urdf", [in_memory, clip]).html
-    assert "robotid replay arm.urdf &#x27;a b.csv&#x27; out</pre>" in html
+    assert "<span>arm.urdf</span> <span>&#x27;a b.csv&#x27;</span> <span>out</span></pre>" in html
     clips = json.loads(unescape(re.search(r'data-clips="([^"]*)"', html)[1]))
     assert [c["log"] for c in clips] == ["", "a b.csv"]
     assert "<pre" not in Dock("replay.html", Origin(), "arm.urdf", [in_memory]).html

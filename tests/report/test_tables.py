@@ -364,3 +364,8 @@ def test_drives_have_a_column_for_each_term_that_is_there_or_was_sought():
         ["one", "–", "–", "0.00 ± 0.25", "–"], ["two", "300", "12.50 ± 0.50", "–", "−1.5"],
     ]  # fmt: skip
     assert _drive_table(entries[:1]) == ""
+    many = [("two.viscous", 1.5, None, "N"), *((f"two.t{k}", 1.0, 0.5, "N") for k in range(7))]
+    found = [dict(zip(("name", "value", "std_error", "unit"), x, strict=True)) for x in many]
+    (table,) = tables(_drive_table(found)).values()
+    assert table.headers == ["term", "two"]
+    assert [row[0] for row in table.rows] == ["viscous [N]", *(f"t{k} [N]" for k in range(7))]

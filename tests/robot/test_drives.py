@@ -487,3 +487,8 @@ def test_knots_and_centres_of_families_lie_in_the_range_seen():
     np.testing.assert_allclose(list(table.values()), list(wanted.values()), atol=1e-12)
     by_position = FAMILIES["position"].make(seen)
     assert [(term.order, term.centre) for term in by_position] == [(1, 1.0), (2, 1.0)]
+
+
+def test_friction_by_position_has_the_unit_of_its_power_of_the_position():
+    units = [PositionCoulomb(order=k).units for k in range(3)]
+    assert units == [("N m", "N"), ("N m/rad", "N/m"), ("N m/rad^2", "N/m^2")]

@@ -71,7 +71,8 @@ function describe(isLate = false) {
   else if (isLate) words = `${decodeURI(file)} is missing, or another version of robotid wrote it. This command writes it; then reload.`;
   const needs = isHeard ? isOther : isLate;
   state.textContent = words;
-  command.textContent = clip.command || "";
+  const parts = (clip.command || "").split(/((?:'[^']*'|[^\s'])+)/); // arguments between blanks
+  command.replaceChildren(...parts.map((part, k) => (k % 2 ? element("span", {}, part) : part)));
   command.hidden = !needs || !clip.command;
   reload.hidden = isHeard;
   dock.classList.toggle("missing", isLate && !isHeard);
