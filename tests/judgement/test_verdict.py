@@ -194,6 +194,17 @@ def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
     ]
 
 
+@pytest.mark.parametrize("code", ["com_outside", "dense_body", "density", "ellipsoid", "gyration"])
+def test_an_impossible_body_makes_the_result_usable_and_no_joint(code):
+    found = Finding(code, "warning", "link a", "the mass of a is 40 kg: not possible")
+    warnings = warnings_of([found, replace(found, severity="note")], JOINTS)
+    assert warnings == (VerdictWarning(code, "", "the mass of a is 40 kg: not possible"),)
+    concluded = verdict({name: joint(4.0) for name in JOINTS}, warnings=warnings)
+    assert concluded.status == "usable"
+    assert concluded.reasons == (f"the mass of a is 40 kg: not possible ({code})",)
+    assert {own.status for own in concluded.joints.values()} == {"good"}
+
+
 def test_kept_recordings_that_were_fitted_are_named():
     found = judged(Metrics({"a": joint(3.0)}, 1.0), {}, refitted=["x.csv"])
     assert found.status == "usable"
