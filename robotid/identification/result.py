@@ -7,7 +7,7 @@ from typing import Any
 
 from robotid._settings import Settings, require_kind
 from robotid.diagnosis.misfit import Misfit
-from robotid.diagnosis.torque_split import joint_torques
+from robotid.diagnosis.torque_split import JointTorque, joint_torques
 from robotid.exceptions import DataError
 from robotid.findings import Finding, listed
 from robotid.fitting.evaluation import Evaluation, hidden_joints
@@ -153,7 +153,7 @@ class Identification(Fit):
         Raises:
             DataError: If there is no such joint.
         """
-        torque = joint_torques(self)[self._row(joint)]
+        torque = self.joint_torques[self._row(joint)]
         charts = why_charts(torque)
         about = {name: f"residual against {name}" for name in charts}
         about |= {"split": torque.sentence, "power": "mechanical power"}
@@ -170,6 +170,11 @@ class Identification(Fit):
                 f"{suggestion(joint, names)}"
             )
         return names.index(joint)
+
+    @cached_property
+    def joint_torques(self) -> tuple[JointTorque, ...]:
+        """Torque of each row, its parts, and what its residual depends on."""
+        return joint_torques(self)
 
     @property
     def has_urdf(self) -> bool:
@@ -212,4 +217,5 @@ class Identification(Fit):
             log_errors=self.log_errors,
             warnings=self.warnings,
             scale_check=self.scale_check,
+            cause_of=lambda joint: self.joint_torques[self._row(joint)].sentence,
         )

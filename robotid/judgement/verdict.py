@@ -2,7 +2,7 @@
 
 import difflib
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -186,6 +186,7 @@ def judge(
     log_errors: Sequence[str] = (),
     warnings: Sequence[VerdictWarning] = (),
     scale_check: ScaleCheck | None = None,
+    cause_of: Callable[[str], str] | None = None,
 ) -> Verdict:
     """Return the verdict on a result.
 
@@ -195,6 +196,8 @@ def judge(
         log_errors: Faults of the recordings that make every result of them wrong.
         warnings: Why the result may be wrong although it predicts well.
         scale_check: The scale check against the URDF's gravity and masses.
+        cause_of: Returns the cause of the residual of a joint. The good joint with the largest
+            error gets this reason, too.
 
     Returns:
         The verdict. Without a validation log, or with a warning, it is at most "usable". So is the
@@ -235,6 +238,14 @@ def judge(
         for joint, (worse, cautions, errors) in found.items()
     }
     per_joint |= {joint: JointVerdict("not evaluated", (_HIDDEN,)) for joint in hidden}
+    best = {joint: max(found[joint][2]) for joint, v in per_joint.items() if v.status == "good"}
+    if best and cause_of is not None:
+        largest_good = max(best, key=lambda joint: best[joint])
+        limit = f"largest error of the good joints: {cause_of(largest_good)}"
+        own = per_joint[largest_good]
+        per_joint[largest_good] = replace(own, reasons=(*own.reasons, limit))
+        if len(best) == len(per_joint):
+            notes.insert(0, f"{largest_good}: largest error: {cause_of(largest_good)}")
     worst = max((error for _, _, errors in found.values() for error in errors), default=0.0)
     good = (
         f"torque prediction error on validation logs: at most {worst:.1f} % at every joint, "
