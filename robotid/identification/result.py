@@ -1,7 +1,7 @@
 """An identification: a fit with findings and a verdict."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -21,6 +21,7 @@ from robotid.identification.summary import (
 from robotid.identification.why_pictures import why_charts
 from robotid.judgement.evidence import Determined, Predictions
 from robotid.judgement.parameter_table import parameter_entries, parameter_table
+from robotid.judgement.payload_check import PayloadCheck
 from robotid.judgement.scale_check import ScaleCheck, check_scale
 from robotid.judgement.verdict import Verdict, VerdictWarning, judge
 from robotid.logs.data import suggestion
@@ -60,6 +61,7 @@ class Identification(Fit):
         misfits: Terms that its drive models lack.
         on_misfit: Names of drive parameters whose errors increased for these.
         asked: Stated signals, friction and findings to ignore.
+        payload_check: Check of the torque scale with a payload of known mass; None without one.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -69,6 +71,7 @@ class Identification(Fit):
     misfits: tuple[Misfit, ...] = ()
     on_misfit: tuple[str, ...] = ()
     asked: Asked = field(default_factory=Asked)
+    payload_check: PayloadCheck | None = None
 
     def __repr__(self) -> str:
         return identification_line(self, self.estimator.name, self.verdict.status)
@@ -184,7 +187,7 @@ class Identification(Fit):
     @cached_property
     def scale_check(self) -> ScaleCheck:
         """Scale check: identified gravity and masses against the URDF's."""
-        return check_scale(self)
+        return replace(check_scale(self), payload=self.payload_check)
 
     @property
     def _uncertain_drives(self) -> list[str]:
