@@ -8,7 +8,7 @@ from dataclasses import MISSING
 from pathlib import Path
 
 from robotid.closed_loop.settings import LoopSettings
-from robotid.commands.job import Job, LogEntry
+from robotid.commands.job import Job, LogEntry, PayloadEntry
 from robotid.fitting.settings import ESTIMATORS, ConstraintSettings
 from robotid.logs.settings import BaseSource, LogSource, LogUnits, SignalSettings
 from robotid.logs.transmission import Transmission
@@ -86,6 +86,7 @@ TABLES = {
     "estimator.constraints": ConstraintSettings,
     "[transmission]": Transmission,
     "[identification]": LogEntry,
+    "[payload_check]": PayloadEntry,
 }
 
 
@@ -115,7 +116,15 @@ def job_file():
         key.at or field.name: (field, key)
         for field, key in keys(Job)
         if (key.at or field.name)
-        not in {*TABLES, "model", "estimator", "transmission", "identification", "validation"}
+        not in {
+            *TABLES,
+            "model",
+            "estimator",
+            "transmission",
+            "identification",
+            "validation",
+            "payload_check",
+        }
     }
     tables = {}
     for at, (field, key) in own.items():

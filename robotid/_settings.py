@@ -117,7 +117,7 @@ def require_flag(value: object, name: str) -> None:
 
 
 #: Keys that are required in a table of a list of tables, if its schema has them.
-REQUIRED = ("log", "name", "ratios", "joints", "matrix")
+REQUIRED = ("log", "name", "ratios", "joints", "matrix", "mass")
 POSITIVE = Range("a positive number", lambda x: x > 0)
 NOT_NEGATIVE = Range("0 or a positive number", lambda x: x >= 0)
 

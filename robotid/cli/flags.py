@@ -91,6 +91,15 @@ def _number_or_false(word: str, flag: str) -> float | bool:
         raise SettingsError(f"{flag} {word!r}: wanted a number or false") from error
 
 
+def _payload_check(word: str, flag: str) -> list[dict[str, Any]]:
+    """Return the log with a payload, and its known mass [kg]."""
+    log, _, mass = word.rpartition("=")
+    try:
+        return [{"log": log, "mass": float(mass)}]
+    except ValueError as error:
+        raise SettingsError(f"{flag} {word!r}: wanted LOG=KG") from error
+
+
 @dataclass(frozen=True)
 class Flags:
     """Flags that state settings; types, help and defaults come from the fields of the settings.
@@ -202,6 +211,7 @@ JOB = Flags(
         "--estimator": ("estimator.name", "NAME"),
         "--kp": ("controller.kp", "[JOINT=]N_M_PER_RAD"),
         "--kd": ("controller.kd", "[JOINT=]N_M_S_PER_RAD"),
+        "--payload-check": ("payload_check", "LOG=KG"),
         "--joints": ("joints", "A,B,..."),
         "--lock": ("locked", "JOINT=POSITION"),
         "--snap-angles": ("snap_angles", ""),
@@ -230,10 +240,10 @@ JOB = Flags(
         "--effort": ("log.effort", "MEANING"),
         "--stamp": ("log.stamp", "CLOCK"),
     },
-    {"--rename": _names},
+    {"--rename": _names, "--payload-check": _payload_check},
 )
 #: Flags of the estimator.
-FIT = ("--estimator", "--kp", "--kd")
+FIT = ("--estimator", "--kp", "--kd", "--payload-check")
 #: Flags of the robot and of the reading of its logs.
 LOG = tuple(
     flag for flag, (key, _) in JOB.keys.items() if flag not in FIT and not key.startswith("output.")

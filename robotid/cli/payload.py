@@ -63,8 +63,9 @@ def run(options: argparse.Namespace) -> None:
 def _show(content: dict[str, Any]) -> None:
     from robotid.identification.summary import cell
 
+    checks = {check["link"]: check for check in content["mass_checks"]}
     for found in content["payloads"]:
-        _print_one_payload(found)
+        _print_one_payload(found, checks.get(found["link"]))
     errors = [f"{joint} {cell(x)} %" for joint, x in content["relative_error_pct"].items()]
     echo(f"torque prediction error: {listed(errors)}", "  ")
     if "gains" in content:
@@ -75,12 +76,14 @@ def _show(content: dict[str, Any]) -> None:
             print(f"{joint} = {value}  # 95 % interval {low:.4g} to {high:.4g}")
 
 
-def _print_one_payload(found: Mapping[str, Any]) -> None:
+def _print_one_payload(found: Mapping[str, Any], check: Mapping[str, Any] | None) -> None:
     link, (low, high) = found["link"], found["mass_interval"]
     mass, error = in_digits_of(found["mass"], found["mass_std_error"])
     print(f"payload on {link}")
     if error == "-":
         print(f"  mass {found['mass']:g} kg, stated")
+        if check is not None:
+            echo(f"  scale of the torques: {check['message']}", "  ")
     else:
         low, high = (in_digits_of(end, found["mass_std_error"])[0] for end in (low, high))
         echo(

@@ -18,6 +18,7 @@ from robotid.commands.logs import (
     needed_of,
     survey_logs,
 )
+from robotid.commands.payload import check_payloads
 from robotid.doctor.diagnosis import diagnose
 from robotid.exceptions import DataError
 from robotid.export.entries import build_result
@@ -315,7 +316,8 @@ def identify_job(
         )
     asked = replace(concluded.asked, job=job)
     findings = (*placed.notes, *concluded.findings)
-    return replace(concluded, asked=asked, findings=findings), checkpoint
+    check = check_payloads(job, concluded.model, fitted)
+    return replace(concluded, asked=asked, findings=findings, payload_check=check), checkpoint
 
 
 def _loop_stages() -> Sequence[str]:

@@ -34,7 +34,7 @@ from robotid.robot.parameters import DYNAMICS, Coupling
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
 
-__all__ = ["Job", "LogEntry", "job_from_settings", "read_job"]
+__all__ = ["Job", "LogEntry", "PayloadEntry", "job_from_settings", "read_job"]
 
 _MODEL_KEYS: Mapping[str, tuple[type, ...]] = {
     "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
@@ -140,6 +140,22 @@ class LogEntry(Settings):
     unit: str = setting(
         "", "name of the robot, if the logs are of several robots of one kind, as 'arm-07'"
     )
+
+
+@dataclass(frozen=True)
+class PayloadEntry(Settings):
+    """A log with a payload of known mass, which checks the scale of the torques."""
+
+    path: Path = setting(MISSING, "the file, with the payload that the fitted logs lack",
+                         at="log", **_FILE)  # fmt: skip
+    mass: float = setting(
+        MISSING,
+        "known mass of the payload [kg]",
+        within=Range("more than 0 and less than 1e6", lambda x: 0 < x < 1e6),
+    )
+    link: str = setting("", "link that carries it; the last moving link if not stated")
+    start: float | None = setting(None, "start of the window in the log's own time [s]")
+    end: float | None = setting(None, "end of the window [s]")
 
 
 @dataclass(frozen=True)
@@ -276,6 +292,10 @@ class Job(Settings):
     )
     identification: tuple[LogEntry, ...] = setting((), "logs to fit")
     validation: tuple[LogEntry, ...] = setting((), "validation logs")
+    payload_checks: tuple[PayloadEntry, ...] = setting(
+        (), "logs with a payload of known mass, which check the scale of the torques",
+        at="payload_check",
+    )  # fmt: skip
     ignore: tuple[str, ...] = setting(
         (), "codes of the doctor's findings to ignore", at="doctor.ignore"
     )
@@ -450,7 +470,7 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
     if "urdf" not in table:
         raise SettingsError(f"{where} has no key 'urdf'; name the robot's URDF file")
     found = dict(table, urdf=_path(table["urdf"], where, folder))
-    for key in ("identification", "validation"):
+    for key in ("identification", "validation", "payload_check"):
         entries = table.get(key, [])
         found[key] = [dict(entry, log=_path(entry["log"], where, folder)) for entry in entries]
     try:

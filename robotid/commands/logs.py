@@ -44,7 +44,13 @@ __all__ = [
 
 _PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of its own
 _SHORTEST = 256  # rows of a piece
-_IRRELEVANT = ("validation", "estimator", "output", "doctor")  # for the reductions of the logs
+_IRRELEVANT = (
+    "validation",
+    "payload_check",
+    "estimator",
+    "output",
+    "doctor",
+)  # for the reductions of the logs
 
 
 def survey_logs(

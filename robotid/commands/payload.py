@@ -5,18 +5,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from robotid._files import file_sha256
 from robotid._typing import ProgressCallback, report_stage
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import job_of_result, survey_logs
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.fitting.recordings import Recordings
-from robotid.identification.payload_fit import fit_payloads, own_friction
+from robotid.fitting.survey import SurveyedLog
+from robotid.identification.payload_fit import fit_payloads, mass_checks, own_friction
+from robotid.judgement.payload_check import PayloadCheck
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.drives import DriveTerm
 from robotid.robot.model import RobotModel
 
-__all__ = ["is_result", "measure_payload", "stated_masses"]
+__all__ = ["check_payloads", "is_result", "measure_payload", "stated_masses"]
 
 _STAGES = ("reading logs", "fitting")
 
@@ -109,7 +112,41 @@ def measure_payload(
     if own:
         loaded, reference = (run.with_model(model.with_terms(own)) for run in (loaded, reference))
         found = fit_payloads(loaded, reference, links=links, masses=known, unknown_gains=unknown)
+    if known and not unknown:
+        found = replace(found, checks=mass_checks(loaded, reference, masses=known, links=links))
     return found.to_dict()
+
+
+def check_payloads(
+    job: Job, model: RobotModel, reference: Sequence[SurveyedLog]
+) -> PayloadCheck | None:
+    """Return the check of the torque scale with the payloads that a job states.
+
+    Args:
+        job: The job.
+        model: Its robot with the identified friction terms.
+        reference: Its fitted logs, without payloads.
+
+    Returns:
+        The check with the narrowest relative interval; None if the job states none.
+
+    Raises:
+        DataError, ModelError, SettingsError, NotConvergedError: As of ``measure_payload``.
+    """
+    checks = []
+    for entry in job.payload_checks:
+        (logs,) = survey_logs(job, model, [LogEntry(entry.path, entry.start, entry.end)])
+        runs = [Recordings(model, structural_mapping(model), run) for run in (logs, reference)]
+        link = entry.link or model.layout.bodies[-1]
+        check = mass_checks(*runs, masses={link: entry.mass})[link]
+        checks.append(replace(check, log=str(entry.path), sha256=file_sha256(entry.path)))
+    return min(checks, key=_width, default=None)
+
+
+def _width(check: PayloadCheck) -> float:
+    """Return the relative width of the interval of an identified mass; inf without one."""
+    low, high = check.interval
+    return (high - low) / check.known if check.identified is not None else float("inf")
 
 
 def _chosen_terms(

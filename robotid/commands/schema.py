@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from robotid._settings import REQUIRED, Entries, Key, Settings
-from robotid.commands.job import Job, LogEntry
+from robotid.commands.job import Job, LogEntry, PayloadEntry
 from robotid.fitting.settings import ESTIMATORS, ConstraintSettings
 from robotid.logs.transmission import Transmission
 
@@ -16,6 +16,7 @@ _NAMES |= {list: "array", dict: "object"}
 _TABLES: Mapping[str, type[Settings]] = {
     "identification": LogEntry,
     "validation": LogEntry,
+    "payload_check": PayloadEntry,
     "transmission": Transmission,
     "estimator.constraints": ConstraintSettings,
 }  # whose keys a job's own paths do not have

@@ -7,7 +7,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.findings import Finding, listed
-from robotid.robot.geometry import body_points
+from robotid.robot.geometry import body_points, kinematic_lengths
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.tree import Inertial
@@ -17,6 +17,7 @@ __all__ = ["audit_bodies", "audit_links"]
 _DENSEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: about solid tungsten, and foam
 _MARGIN = 0.1  # of the box's diagonal, by which a centre of mass may lie outside
 _LONGEST = 5.0**0.5  # ellipsoid of a body with half of its mass on each of two sides, over the box
+_SLENDER = 1.6  # ellipsoid over the length that the kinematics give; a uniform rod has 1.29
 _THIN = 0.01  # [m] least side of a box, so that thin sheets have a volume
 _SMALL = 1e-3  # share of the robot's mass below which a fault of a body is only a note
 _ROUND = tuple(10.0**k for k in range(-6, 3))  # inertias [kg m^2] and masses [kg] of templates
@@ -57,6 +58,8 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
 def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> Iterator[Finding]:
     """Yield the bodies whose parameters are impossible in the box around their geometry.
 
+    A body without geometry is compared with the length that the kinematics give it.
+
     Args:
         model: The robot.
         pi: Standard parameters, shape (p,), of the URDF or identified.
@@ -64,14 +67,26 @@ def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> I
 
     Yields:
         "com_outside", "density", "gyration"; notes for a body of negligible mass. "ellipsoid", a
-        note, without "gyration".
+        note, without "gyration"; a warning for a body without geometry that carries a joint, if it
+        would be too long even with all mass at its ends.
     """
     J = pseudo_inertia(pi[: model.layout.n_inertial])
+    lengths = kinematic_lengths(model) if set(model.layout.bodies) - points.keys() else {}
+    # the last bodies end beyond their joints
+    inner = (
+        {model.layout.bodies[i - 1] for i in model.pin_model.parents if i > 0} if lengths else ()
+    )
     for body, J_i in zip(model.layout.bodies, J, strict=True):
-        if body in points and J_i[3, 3] > 0:
-            is_small = J_i[3, 3] < _SMALL * np.abs(J[:, 3, 3]).sum()
-            for finding in _against_geometry(body, J_i, points[body]):
-                yield replace(finding, severity="note") if is_small else finding
+        if not J_i[3, 3] > 0:
+            continue
+        is_note = J_i[3, 3] < _SMALL * np.abs(J[:, 3, 3]).sum()
+        if body in points:
+            found = _against_geometry(body, J_i, points[body])
+        else:
+            found = _against_kinematics(body, J_i, lengths.get(body, np.inf), model.length)
+            is_note |= body not in inner
+        for finding in found:
+            yield replace(finding, severity="note") if is_note else finding
 
 
 def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
@@ -120,6 +135,34 @@ def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
         )
         evidence = {"length": float(lengths[k]), "side": float(sides[k])}
         yield Finding("ellipsoid", "note", at, message, evidence)
+
+
+def _against_kinematics(body: str, J: Array, length: float, longest: float) -> Iterator[Finding]:
+    """Yield the parameters of a body without geometry that are impossible for its length [m].
+
+    A body may be wide where its joints are close: warnings need more than the longest of all bodies
+    allows.
+    """
+    at, centre = f"link {body}", J[:3, 3] / J[3, 3]
+    about = f"its joints allow a length of about {length:.3g} m, housings included"
+    distance = float(np.linalg.norm(centre))
+    if distance > max(length, longest):
+        message = (
+            f"link {body!r}: its centre of mass {_metres(centre)} m is {distance:.3g} m from its "
+            f"joint, {about}; check the frame and the unit of <inertial><origin>"
+        )
+        yield Finding("com_outside", "warning", at, message, {"outside": distance - length})
+        return
+    variance = np.linalg.eigvalsh(J[:3, :3] / J[3, 3] - np.outer(centre, centre))[-1]  # [m^2]
+    ellipsoid = 2.0 * float(np.sqrt(5.0 * max(variance, 0.0)))
+    if ellipsoid > _SLENDER * length:
+        severity = "warning" if ellipsoid > _LONGEST * max(length, longest) else "note"
+        message = (
+            f"link {body!r}: its equivalent ellipsoid is {ellipsoid:.3g} m long, {about} (wanted: "
+            f"at most {_SLENDER * length:.3g} m); check its inertia"
+        )
+        evidence = {"length": ellipsoid, "side": length}
+        yield Finding("ellipsoid", severity, at, message, evidence)
 
 
 def _templates(model: RobotModel) -> Iterator[Finding]:

@@ -26,6 +26,7 @@ from robotid.export.urdf import load_identified, terms_from_facts
 from robotid.findings import listed
 from robotid.fitting.bands import FrictionCurve
 from robotid.judgement.parameter_table import parameter_table
+from robotid.judgement.payload_check import PayloadCheck
 from robotid.judgement.scale_check import ScaleCheck
 from robotid.judgement.stated_mass import StatedMass
 from robotid.judgement.verdict import VerdictWarning
@@ -78,6 +79,12 @@ _SHAPE = {
             "ratio": MAYBE,
             "half_width": NUMBER,
             "absorbed_by": [TEXT],
+        },
+        "payload?": {
+            **dict.fromkeys(("link", "log", "sha256"), TEXT),
+            **dict.fromkeys(("known", "std_error"), NUMBER),
+            "identified": MAYBE,
+            "interval": [NUMBER],
         },
         "is_stated": FLAG,
     },
@@ -347,10 +354,15 @@ def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:
     stated = result.get("scale_check")
     if stated is None:
         return None
-    for name, size in (("unexplained", 2), ("masses", 3)):
-        if len(stated[name]) != size:
-            raise DataError(f"scale_check.{name} has {len(stated[name])} numbers, wanted {size}")
+    lists = {"unexplained": (stated["unexplained"], 2), "masses": (stated["masses"], 3)}
+    if "payload" in stated:
+        lists["payload.interval"] = stated["payload"]["interval"], 2
+    for name, (numbers, size) in lists.items():
+        if len(numbers) != size:
+            raise DataError(f"scale_check.{name} has {len(numbers)} numbers, wanted {size}")
     own = {x.name: stated[x.name] for x in dataclasses.fields(ScaleCheck) if x.name in stated}
+    if "payload" in stated:
+        own["payload"] = PayloadCheck.from_dict(stated["payload"])
     if stated["is_stated"]:  # an earlier version did not test whether torque determines it
         mass = stated.get("stated")
         own["stated"] = StatedMass(()) if mass is None else StatedMass.from_dict(mass)

@@ -1,7 +1,7 @@
 """Payload identification from a run with and a run without it, and gains from a known mass."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import ConsistentSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import robot_of, with_drives
+from robotid.judgement.payload_check import PayloadCheck
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -37,6 +38,7 @@ __all__ = [
     "PayloadFit",
     "fit_payloads",
     "identify_payload",
+    "mass_checks",
     "own_friction",
 ]
 
@@ -49,6 +51,10 @@ _SAME = 1e-3  # of the largest column of a link: below, motion does not determin
 _MOST_LOADS = 20  # fits until the joint load torque is that of the identified bodies
 _CONVERGED = 1e-4  # relative change of the parameters at convergence
 _FREE = 1e-9  # weight of the prior in the fit that makes a payload consistent: none
+
+
+class UndeterminedMassError(DataError):
+    """The motion does not determine the mass of a payload."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +165,7 @@ class PayloadFit:
         base: Base parameters, shape (b,), SI units.
         base_error: Their standard errors, shape (b,), including the uncertainty of the gains.
         unexplained: Relative torque error of each joint, shape (n,) [-].
+        checks: Known masses against those that torque alone determines, by link.
     """
 
     model: RobotModel
@@ -168,9 +175,11 @@ class PayloadFit:
     base: Array
     base_error: Array
     unexplained: Array
+    checks: Mapping[str, PayloadCheck] = field(default_factory=dict)
 
     def __str__(self) -> str:
         every = [line for payload in self.payloads for line in payload.lines()]
+        every += [check.message for check in self.checks.values()]
         every += [
             f"gain of {joint}: {gain.value:.4g} +- {gain.std_error:.2g} "
             f"[{gain.interval[0]:.4g}, {gain.interval[1]:.4g}]"
@@ -192,6 +201,7 @@ class PayloadFit:
         content: dict[str, Any] = {
             "robot": self.model.name,
             "payloads": [payload.to_dict() for payload in self.payloads],
+            "mass_checks": [check.to_dict() for check in self.checks.values()],
             "relative_error_pct": dict(
                 zip(self.model.row_names, (100 * self.unexplained).tolist(), strict=True)
             ),
@@ -283,9 +293,12 @@ def identify_payload(
         torques = [replace(log, tau=gain * log.tau) for log in read[1]]
         judged = replace(without, fitted=[hold_log(model, log, settings) for log in torques])
     own = own_friction(judged, friction)
-    if not own:
-        return found
-    return fitted([run.with_model(model.with_terms(own)) for run in (loaded, without)])
+    if own:
+        loaded, without = (run.with_model(model.with_terms(own)) for run in (loaded, without))
+        found = fitted((loaded, without))
+    if masses and not unknown_gains:
+        found = replace(found, checks=mass_checks(loaded, without, masses=masses, links=links))
+    return found
 
 
 def own_friction(
@@ -307,6 +320,38 @@ def own_friction(
     # the selection of friction needs no consistent bodies, and a quadratic fit always converges
     choice = ConsistentSettings(prior="euclidean", prior_weight=1.0, draws=0)
     return with_drives(reference, choice, wanted).model.layout.own
+
+
+def mass_checks(
+    loaded: Recordings,
+    reference: Recordings,
+    *,
+    masses: Mapping[str, float],
+    links: Sequence[str] = (),
+) -> dict[str, PayloadCheck]:
+    """Return known masses of payloads against those that torque alone determines, by link.
+
+    Args:
+        loaded: Recordings with the payloads.
+        reference: Recordings without them.
+        masses: Known masses, by link [kg].
+        links: All links with payloads; those of the masses if empty.
+
+    Raises:
+        DataError, ModelError, SettingsError, NotConvergedError: As of ``identify_payload``, except
+            the error of masses that the motion does not determine.
+    """
+    _check_known(loaded.model, links or tuple(masses), masses, ())
+    try:
+        found = fit_payloads(loaded, reference, links=links or tuple(masses), masses={})
+    except UndeterminedMassError:
+        return {link: PayloadCheck(link, mass) for link, mass in masses.items()}
+    checks = {}
+    for link, mass in masses.items():
+        own = found[link]
+        low, high = own.mass_interval.tolist()
+        checks[link] = PayloadCheck(link, mass, own.mass, own.mass_std_error, (low, high))
+    return checks
 
 
 def fit_payloads(
@@ -427,7 +472,7 @@ def _payload_columns(model: RobotModel, K: Array, links: Sequence[str]) -> Array
         bodies[body] = link
         own = K[:, 10 * body : 10 * body + 10] @ transfer
         if np.abs(own[:, 0]).max(initial=0.0) < _SAME * np.abs(own).max(initial=1e-300):
-            raise DataError(
+            raise UndeterminedMassError(
                 f"no motion determines the mass of the payload on {link}: no joint lifts or "
                 "accelerates it; measure it with a scale"
             )
@@ -478,7 +523,7 @@ def _check_mass(model: RobotModel, link: str, mass: float, error: float, is_know
         return
     arm = payload_spread(model)[0]
     if error > _MASS * max(abs(mass), _SMALL * arm):
-        raise DataError(
+        raise UndeterminedMassError(
             f"the motion does not determine the mass of the payload on {link}: {mass:.3g} +- "
             f"{error:.2g} kg; record poses and motions in which its gravity loads different "
             "joints, with and without the payload"

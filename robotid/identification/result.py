@@ -1,13 +1,13 @@
 """An identification: a fit with findings and a verdict."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 from robotid._settings import Settings, require_kind
 from robotid.diagnosis.misfit import Misfit
-from robotid.diagnosis.torque_split import joint_torques
+from robotid.diagnosis.torque_split import JointTorque, joint_torques
 from robotid.exceptions import DataError
 from robotid.findings import Finding, listed
 from robotid.fitting.evaluation import Evaluation, hidden_joints
@@ -21,6 +21,7 @@ from robotid.identification.summary import (
 from robotid.identification.why_pictures import why_charts
 from robotid.judgement.evidence import Determined, Predictions
 from robotid.judgement.parameter_table import parameter_entries, parameter_table
+from robotid.judgement.payload_check import PayloadCheck
 from robotid.judgement.scale_check import ScaleCheck, check_scale
 from robotid.judgement.verdict import Verdict, VerdictWarning, judge
 from robotid.logs.data import suggestion
@@ -62,6 +63,7 @@ class Identification(Fit):
         on_misfit: Names of drive parameters whose errors increased for these.
         variation: Variation of the drives' parameters between three or more fitted logs.
         asked: Stated signals, friction and findings to ignore.
+        payload_check: Check of the torque scale with a payload of known mass; None without one.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -72,6 +74,7 @@ class Identification(Fit):
     on_misfit: tuple[str, ...] = ()
     variation: Variation | None = None
     asked: Asked = field(default_factory=Asked)
+    payload_check: PayloadCheck | None = None
 
     def __repr__(self) -> str:
         return identification_line(self, self.estimator.name, self.verdict.status)
@@ -156,7 +159,7 @@ class Identification(Fit):
         Raises:
             DataError: If there is no such joint.
         """
-        torque = joint_torques(self)[self._row(joint)]
+        torque = self.joint_torques[self._row(joint)]
         charts = why_charts(torque)
         about = {name: f"residual against {name}" for name in charts}
         about |= {"split": torque.sentence, "power": "mechanical power"}
@@ -174,6 +177,11 @@ class Identification(Fit):
             )
         return names.index(joint)
 
+    @cached_property
+    def joint_torques(self) -> tuple[JointTorque, ...]:
+        """Torque of each row, its parts, and what its residual depends on."""
+        return joint_torques(self)
+
     @property
     def has_urdf(self) -> bool:
         """Whether a URDF may be written: it is consistent, and no fault makes it wrong."""
@@ -182,7 +190,7 @@ class Identification(Fit):
     @cached_property
     def scale_check(self) -> ScaleCheck:
         """Scale check: identified gravity and masses against the URDF's."""
-        return check_scale(self)
+        return replace(check_scale(self), payload=self.payload_check)
 
     @property
     def _uncertain_drives(self) -> list[str]:
@@ -215,4 +223,5 @@ class Identification(Fit):
             log_errors=self.log_errors,
             warnings=self.warnings,
             scale_check=self.scale_check,
+            cause_of=lambda joint: self.joint_torques[self._row(joint)].sentence,
         )

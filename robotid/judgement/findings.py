@@ -46,6 +46,7 @@ _MUCH = 0.2  # ... if links on locked joints have more than this share of its ma
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
 _BEYOND = 0.02  # share of samples outside the fitted range of friction that is reported
 _DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
+_AT_BOUND = 1e-3  # relative difference of a mass from a stated bound that determines it
 _VANISHED = 0.05  # share of a link's URDF mass below which the link has practically vanished
 
 
@@ -388,16 +389,17 @@ def _impossible_shapes(fit: Fit) -> list[Finding]:
     before = {(finding.code, finding.where) for finding in audit_bodies(model, fit.prior, points)}
     findings = []
     for finding in audit_bodies(model, fit.standard, points):
+        body = finding.where.removeprefix("link ")
         if (finding.code, finding.where) in before:
             message = f"{finding.message.partition(';')[0]}; the URDF has the same fault"
             finding = replace(finding, severity="note", message=message)
-        elif _is_within_box(fit, body := finding.where.removeprefix("link "), boxes[body]):
+        elif _is_within_box(fit, body, boxes[body]):
             fault = finding.message.partition(";")[0]
             message = f"as identified, {fault}; it is within the margin of the fit"
             finding = replace(finding, severity="note", message=message)
         else:
             fault = finding.message.partition(";")[0]
-            message = f"as identified, {fault}; record more motion of it, or pin it to the URDF"
+            message = f"as identified, {fault}. {_remedy(fit, body)}"
             finding = replace(finding, message=message)
         findings.append(finding)
     return findings
@@ -406,28 +408,51 @@ def _impossible_shapes(fit: Fit) -> list[Finding]:
 def _dense_bodies(fit: Fit) -> list[Finding]:
     """Return the identified bodies whose inertia needs a density above that of any material.
 
-    Bodies that have this density in the URDF are left out.
+    Bodies that have this density in the URDF are left out, and all of a result that is not
+    physically consistent, which is a reason of its own.
     """
+    if not fit.is_consistent:
+        return []
     findings, size = [], fit.model.layout.n_inertial
     before, after = (pi[:size].reshape(-1, 10) for pi in (fit.prior, fit.standard))
     for body, was, now in zip(fit.model.layout.bodies, before, after, strict=True):
         density = least_density(now)
         if density <= max(_DENSEST, least_density(was)):
             continue
-        thinness = (
-            f"its inertia needs a density of at least {density:.3g} kg/m^3 (wanted: at most "
-            f"{_DENSEST:g})"
-            if np.isfinite(density)
-            else "its inertia is that of a body without volume"
-        )
+        # at equal inertia the density is proportional to the mass to the power of 2.5
+        excess = float(now[0]) * (1.0 - (_DENSEST / density) ** 0.4)
         message = (
-            f"{body}: as identified, its mass is {now[0]:.3g} kg and {thinness}. The predicted "
-            "torque may be right, the body is not: record motion about more axes, or pin it to "
-            "the URDF"
+            f"as identified, the mass of {body} is {now[0]:.3g} kg and its inertia needs a density "
+            f"of at least {density:.3g} kg/m^3 (wanted: at most {_DENSEST:g}, steel has 7900): "
+            f"such a body is not possible. {_remedy(fit, body, excess)}"
         )
         evidence = {"mass": float(now[0]), "density": density}
         findings.append(Finding("dense_body", "warning", f"link {body}", message, evidence))
     return findings
+
+
+def _remedy(fit: Fit, body: str, excess: float = 0.0) -> str:
+    """Return what to correct for an impossible body, and what remains valid.
+
+    Args:
+        fit: The fit.
+        body: The body.
+        excess: Mass that it has beyond the largest possible one [kg]; 0 if that is unknown.
+    """
+    bounds, layout = fit.estimator.bounds, fit.model.layout
+    masses = fit.standard[: layout.n_inertial : 10]
+    cure = "Record motion about more axes, or pin it to the URDF"
+    stated, pair, mass = "total_mass", bounds.total, float(masses.sum())
+    if body in bounds.masses:
+        stated, pair = f"mass of {body}", bounds.masses[body]
+        mass = float(masses[layout.bodies.index(body)])
+    if pair is not None and np.isclose(mass, pair, rtol=_AT_BOUND).any():
+        limit = f" (possible: up to about {mass - excess:.3g} kg)" if excess > 0 else ""
+        cure = f"Check the stated {stated} of {mass:.4g} kg{limit}: weigh it, or remove it"
+    return (
+        f"{cure}. The predicted torque may still be right; do not use mass, centre of mass and "
+        "inertia of this link"
+    )
 
 
 def _bound_findings(fit: Fit) -> list[Finding]:

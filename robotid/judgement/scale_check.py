@@ -11,6 +11,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.findings import listed
 from robotid.fitting.result import Fit
+from robotid.judgement.payload_check import PayloadCheck
 from robotid.judgement.stated_mass import AGREES, StatedMass, determines_total_mass, stated_mass
 from robotid.regressor.constraints import loop_basis, without_forces
 from robotid.regressor.prediction import predict
@@ -42,6 +43,7 @@ class ScaleCheck:
         masses: Total mass of the URDF, identified total mass, mass of that payload [kg].
         stated: The masses that the user states, and what torque alone determines of them; None if
             none is stated.
+        payload: The check with a payload of known mass; None if there is none.
         is_total_determined: Whether torque alone determines the total mass within 5 %, so that a
             measured one verifies the scale.
         friction: Share of viscous and Coulomb friction in each joint's torque [-].
@@ -56,23 +58,34 @@ class ScaleCheck:
     unexplained: tuple[float, float] = (0.0, 0.0)
     masses: tuple[float, float, float] = (0.0, 0.0, 0.0)
     stated: StatedMass | None = None
+    payload: PayloadCheck | None = None
     is_total_determined: bool = False
     friction: Mapping[str, float] = field(default_factory=dict)
     follows: bool = True
 
     @property
     def agrees(self) -> bool:
-        """Whether a stated mass, or else gravity and total mass of the URDF, confirm the scale."""
-        if self.stated is not None and (self.stated.verifies or self.stated.contradicts):
-            return self.stated.verifies
+        """Whether known masses, or else gravity and total mass of the URDF, confirm the scale."""
+        if self._decisive:
+            return all(check.verifies for check in self._decisive)
         return self.scale is not None and self._off <= AGREES and self.follows
 
     @property
     def contradicts(self) -> bool:
-        """Whether a stated mass, or else gravity and total mass of the URDF, contradict it."""
-        if self.stated is not None and (self.stated.verifies or self.stated.contradicts):
-            return self.stated.contradicts
+        """Whether a known mass, or else gravity and total mass of the URDF, contradict it."""
+        if self._decisive:
+            return any(check.contradicts for check in self._decisive)
         return (bool(self._ratios_whole) and self._off > _ANOTHER) or self.has_one_factor
+
+    @property
+    def _decisive(self) -> dict[PayloadCheck | StatedMass, str]:
+        """The known masses that verify or contradict the scale, and their names."""
+        checks = {self.payload: "payload of known mass", self.stated: "stated mass"}
+        return {
+            check: name
+            for check, name in checks.items()
+            if check is not None and (check.verifies or check.contradicts)
+        }
 
     @property
     def has_one_factor(self) -> bool:
@@ -94,12 +107,15 @@ class ScaleCheck:
     @property
     def message(self) -> str:
         """What was verified, or the figure that exceeds its limit, its cause and the remedy."""
-        stated = self.stated
-        if stated is not None and stated.verifies:
-            return f"absolute scale verified by a stated mass: {stated.message}"
-        if stated is not None and stated.contradicts:
-            return f"absolute scale contradicted by a stated mass: {stated.message}"
-        beside = "" if stated is None else f". {stated.message[0].upper()}{stated.message[1:]}"
+        sentences = [
+            f"absolute scale {'verified' if check.verifies else 'contradicted'} by a {name}: "
+            f"{check.message}"
+            for check, name in sorted(self._decisive.items(), key=lambda item: item[0].verifies)
+        ]
+        if sentences:
+            return ". ".join([sentences[0], *(f"{x[0].upper()}{x[1:]}" for x in sentences[1:])])
+        texts = [check.message for check in (self.stated, self.payload) if check is not None]
+        beside = "".join(f". {text[0].upper()}{text[1:]}" for text in texts)
         if self.agrees:
             return f"{self._agreement}{beside}"
         remedy = (
@@ -107,7 +123,8 @@ class ScaleCheck:
             if self.is_total_determined
             else "Verify it with a payload of known mass (robotid payload)"
         )
-        return f"absolute scale not verified: {self.figures}{self._excess}{beside}. {remedy}"
+        remedy = f". {remedy}" if self.payload is None else ""
+        return f"absolute scale not verified: {self.figures}{self._excess}{beside}{remedy}"
 
     @property
     def _agreement(self) -> str:
@@ -193,8 +210,10 @@ class ScaleCheck:
         figures = asdict(self) | {
             key: list(getattr(self, key)) for key in ("unexplained", "masses")
         }
-        del figures["stated"]
+        del figures["stated"], figures["payload"]
         stated = {} if self.stated is None else {"stated": self.stated.to_dict()}
+        if self.payload is not None:
+            stated["payload"] = self.payload.to_dict()
         concluded = {"agrees": self.agrees, "message": self.message}
         return figures | {"is_stated": self.stated is not None} | stated | concluded
 

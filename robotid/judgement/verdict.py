@@ -2,7 +2,7 @@
 
 import difflib
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -43,7 +43,6 @@ _SMALL = 5.0  # [%] of the torque: a missing drive term below this gives no warn
 _REASONS = {
     "angle_scale": "positions fit best when multiplied by another factor",
     "active_bound": "the data, or the masses that result from it, contradict a stated bound",
-    "com_outside": "its centre of mass is {outside:.2g} m outside its geometry: not possible",
     "clipped": "the torque is clipped at a limit",
     "contact_delay": "contact flags are delayed by {delay:+.3f} s (negative: early): contact "
     "forces remain in the rows",
@@ -54,12 +53,9 @@ _REASONS = {
     "torque: the drive model lacks it",
     "current_for_torque": "the torque fits the URDF only in another scale. If it is a current or "
     "has another unit, masses and inertias are wrong by the same factor",
-    "density": "its mass gives a density of {density:.2g} kg/m^3 in the box around its geometry",
     "gravity": "the stated direction of gravity may be wrong",
     "gravity_compensated": "the torque may be logged without gravity",
     "repeated_torque": "each torque value is repeated over {rows:.0f} samples: delayed and stepped",
-    "gyration": "its radius of gyration is {gyration:.2g} m, its geometry extends only "
-    "{farthest:.2g} m: not possible",
     "joint_origin": "the joint's origin differs from the URDF's",
     "joint_axis": "the joint axis may be reversed",
     "joint_order": "the columns may belong to another joint",
@@ -101,8 +97,11 @@ _REASONS |= {
     "of the torque): the drive model lacks it"
     for code, term in _MISFITS.items()
 }
+#: Findings of impossible bodies: their messages are the reasons. They concern masses and inertias
+#: of links, not the predicted torque of a joint.
+_OF_BODIES = ("com_outside", "dense_body", "density", "ellipsoid", "gyration")
 #: Codes of the warnings that make a result at most "usable".
-WARNING_CODES = (*_REASONS, "repeated_motion")
+WARNING_CODES = (*_REASONS, *_OF_BODIES, "repeated_motion")
 _OF_RESULTS = ("total_mass",)  # errors that only a result can have
 _HYPOTHESES = (
     "current_for_torque",
@@ -188,6 +187,7 @@ def judge(
     log_errors: Sequence[str] = (),
     warnings: Sequence[VerdictWarning] = (),
     scale_check: ScaleCheck | None = None,
+    cause_of: Callable[[str], str] | None = None,
 ) -> Verdict:
     """Return the verdict on a result.
 
@@ -197,10 +197,13 @@ def judge(
         log_errors: Faults of the recordings that make every result of them wrong.
         warnings: Why the result may be wrong although it predicts well.
         scale_check: The scale check against the URDF's gravity and masses.
+        cause_of: Returns the cause of the residual of a joint. The good joint with the largest
+            error gets this reason, too.
 
     Returns:
         The verdict. Without a validation log, or with a warning, it is at most "usable". So is the
-        verdict on a joint with a warning, and on all joints if a warning concerns the result.
+        verdict on a joint with a warning, and on all joints if a warning concerns the result. An
+        impossible body concerns the result, but not the torque of its joint.
     """
     found, hidden = predictions.on_each(), predictions.hidden
     largest = sorted(found.values(), key=lambda of: -max(of[2], default=0.0))
@@ -222,10 +225,11 @@ def judge(
         *([f"{listed(hidden)}: {_HIDDEN}: not evaluated"] if hidden else []),
         *([_STATIC] if determined.is_static else []),
     ]
+    of_torque = [warning for warning in warnings if warning.code not in _OF_BODIES]
     per_joint = {
         joint: on_joint(
             sorted(worse, key=_rank),
-            [*cautions, *_described([w for w in warnings if w.joint in ("", joint)])],
+            [*cautions, *_described([w for w in of_torque if w.joint in ("", joint)])],
             is_tested=bool(errors),
             checked=f"error at most {max(errors):.1f} %, smaller than that of a constant and "
             "that of the URDF"
@@ -235,6 +239,14 @@ def judge(
         for joint, (worse, cautions, errors) in found.items()
     }
     per_joint |= {joint: JointVerdict("not evaluated", (_HIDDEN,)) for joint in hidden}
+    best = {joint: max(found[joint][2]) for joint, v in per_joint.items() if v.status == "good"}
+    if best and cause_of is not None:
+        largest_good = max(best, key=lambda joint: best[joint])
+        limit = f"largest error of the good joints: {cause_of(largest_good)}"
+        own = per_joint[largest_good]
+        per_joint[largest_good] = replace(own, reasons=(*own.reasons, limit))
+        if len(best) == len(per_joint):
+            notes.insert(0, f"{largest_good}: largest error: {cause_of(largest_good)}")
     worst = max((error for _, _, errors in found.values() for error in errors), default=0.0)
     good = (
         f"torque prediction error on validation logs: at most {worst:.1f} % at every joint, "
@@ -400,7 +412,9 @@ def warnings_of(
     }
     found: list[VerdictWarning] = []
     for finding in findings:
-        if finding.severity != "warning" or finding.code not in _REASONS or _is_harmless(finding):
+        if finding.severity != "warning" or finding.code not in WARNING_CODES:
+            continue
+        if finding.code == "repeated_motion" or _is_harmless(finding):
             continue
         # the unexplained torque is the spikes, which a robust fit downweights
         if finding.code == "unexplained_torque" and finding.where in downweighted:
@@ -438,6 +452,9 @@ def _rank(reason: str) -> int:
 
 
 def _warnings(finding: Finding, joints: Sequence[str]) -> Iterator[VerdictWarning]:
+    if finding.code in _OF_BODIES:
+        yield VerdictWarning(finding.code, "", finding.message)
+        return
     message = _REASONS[finding.code].format(**finding.evidence)
     log, _, last = finding.where.rpartition(": ")
     named = [joint for joint in last.split(", ") if joint in joints]

@@ -19,6 +19,7 @@ from robotid.robot.families import spring_family
 
 if TYPE_CHECKING:
     from robotid.identification.result import Identification
+    from robotid.judgement.payload_check import PayloadCheck
 
 __all__ = ["Origin", "Step", "loop_steps", "next_steps"]
 
@@ -259,6 +260,11 @@ def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
         check = "Check the sign, the order and the unit of the torques and the URDF's masses. "
     source = "stated" if is_number(found.estimator.bounds.total_mass) else "identified"
     masses = f"{after:.4g} kg {source}, {before:.4g} kg in the URDF"
+    payload = found.scale_check.payload
+    if payload is not None:
+        action = "Correct" if payload.contradicts else "Verify"
+        words = f"{check}{action} the torque scale: {payload.message}."
+        return Step(words, (*_payload_gains(found, payload), origin.again()))
     if found.scale_check.is_total_determined:
         words = (
             f"{check}State the measured mass of the moving links to verify the torque scale: "
@@ -267,21 +273,26 @@ def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
         return Step(words, origin.stating("[estimator.constraints]", "total_mass = KG"))
     words = (
         f"{check}Verify the torque scale with a payload of known mass, because torque does not "
-        f"determine the total mass ({masses}): record a log with it and compare the identified "
-        "payload. If the torques are motor currents, the last command identifies their gains."
+        f"determine the total mass ({masses}): record a log with it and state it as below. Its "
+        "identified mass may differ by at most 5 %; the torques, masses and inertias are wrong by "
+        "the same factor as it. If the torques are motor currents, the last command identifies "
+        "their gains."
     )
-    urdf, result = str(found.model.tree.path), f"{origin.folder}/result.json"
-    compared = origin.using("payload", urdf, _LOADED, "--reference", result)
-    return Step(words, (*compared, *_payload_gains(found)))
+    line = f'log = "{_LOADED}"\nmass = KG'
+    stated = origin.stating("[[payload_check]]", line, "--payload-check", f"{_LOADED}=KG")
+    return Step(words, (*stated, *_payload_gains(found)))
 
 
-def _payload_gains(found: Identification) -> tuple[str, ...]:
+def _payload_gains(found: Identification, payload: PayloadCheck | None = None) -> list[str]:
     """Return the command that identifies the gains of currents; nothing without files."""
     urdf, log = str(found.model.tree.path), str(found.fitted[0].recording.log.path)
     if not log:
-        return ()
-    flags = ("--reference", log, "--mass", "KG", "--gains")
-    return (shlex.join(["robotid", "payload", urdf, _LOADED, *flags]),)
+        return []
+    loaded, mass, link = _LOADED, "KG", []
+    if payload is not None:
+        loaded, mass, link = payload.log, f"{payload.known:g}", ["--link", payload.link]
+    flags = ("--reference", log, *link, "--mass", mass, "--gains")
+    return [shlex.join(["robotid", "payload", urdf, loaded, *flags])]
 
 
 def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -483,9 +494,11 @@ def _uses(found: Identification, origin: Origin, asked: Sequence[Step]) -> list[
         steps.append(validated)
     if found.has_urdf and not is_poor:
         steps = [*_exports(found.model.name, origin), *steps]
-    if not found.scale_check.agrees:
-        steps.insert(0, _scale(found, origin, ()))
     typed = {block for step in asked for block in step.blocks}
+    if not found.scale_check.agrees:
+        check = _scale(found, origin, ())
+        blocks = tuple(b for b in check.blocks if b != origin.again() or b not in typed)
+        steps.insert(0, replace(check, blocks=blocks))
     return [step for step in steps if step.blocks and typed.isdisjoint(step.blocks)]
 
 
@@ -511,8 +524,10 @@ _AS_FOUND = (
     "com_outside",
     "constant_torque",
     "contact_delay",
+    "dense_body",
     "density",
     "drift",
+    "ellipsoid",
     "gravity",
     "gravity_compensated",
     "gyration",

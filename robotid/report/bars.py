@@ -1,10 +1,12 @@
 """Error bars of the joints, the worst first, with the errors of other predictions."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import NamedTuple
 
+from robotid.findings import Finding, grouped, listed
 from robotid.identification.summary import joint_reason
 from robotid.judgement.verdict import JointVerdict
 from robotid.pages.html import code, percent
@@ -68,7 +70,9 @@ def bars_html(
         marks: Markers of other predictions, by name.
         limits: Largest error that is good, and largest that is usable [%].
     """
-    rows = [_row(bar, marks, limits) for bar in bars]
+    common = _common(bars)
+    named = {bar.joint for own in common for bar in own}
+    rows = [_row(bar, marks, limits, is_named=bar.joint in named) for bar in bars]
     more = "".join(rows[_ROWS:])
     if more:
         words = f"{len(rows) - _ROWS} more joints with smaller errors"
@@ -76,6 +80,29 @@ def bars_html(
     return (
         f'<h2 id="worst">{title}, worst joint first <span class="note">{note}</span></h2>\n'
         f'{_legend(marks, limits)}<ol class="bars">{"".join(rows[:_ROWS])}</ol>\n{more}'
+        f"{''.join(map(_reason_of, common))}"
+    )
+
+
+def _common(bars: Sequence[Bar]) -> list[list[Bar]]:
+    """Return the joints that have one reason, apart from its numbers, if they are several."""
+    groups: dict[tuple[str, str], list[Bar]] = {}
+    for bar in bars:
+        if why := joint_reason(bar.joint, bar.verdict.reasons):
+            groups.setdefault((bar.verdict.status, re.sub(r"[\d.]+", "", why)), []).append(bar)
+    return [own for own in groups.values() if len(own) > 1]
+
+
+def _reason_of(bars: Sequence[Bar]) -> str:
+    """Return the common reason of joints, with the range of its numbers, and their names."""
+    reasons = [
+        Finding("", "note", bar.joint, joint_reason(bar.joint, bar.verdict.reasons)) for bar in bars
+    ]
+    (cause,) = grouped(reasons, [bar.joint for bar in bars])
+    status, names = bars[0].verdict.status, listed(bar.joint for bar in bars)
+    return (
+        f'<p class="common {status.replace(" ", "-")}"><strong>{status}</strong>: {escape(names)}: '
+        f"{escape('; '.join(cause.messages))}</p>\n"
     )
 
 
@@ -84,9 +111,21 @@ def _at(value: float) -> str:
     return f"{100 * (min(value, _WIDEST) / _WIDEST) ** 0.5:.2f}%"
 
 
-def _row(bar: Bar, marks: Mapping[str, Mark], limits: tuple[float, float]) -> str:
+def _row(
+    bar: Bar, marks: Mapping[str, Mark], limits: tuple[float, float], *, is_named: bool
+) -> str:
+    """Return the row of a joint with its own reason.
+
+    Args:
+        bar: The joint.
+        marks: As of ``bars_html``.
+        limits: As of ``bars_html``.
+        is_named: Whether its first reason is that of other joints, too, and stands below the bars.
+    """
     status, kind = bar.verdict.status, bar.verdict.status.replace(" ", "-")
-    why, link, picture = joint_reason(bar.joint, bar.verdict.reasons), "", ""
+    own = bar.verdict.reasons[-1:] if status == "good" else bar.verdict.reasons
+    own = bar.verdict.reasons[1:] if is_named else own
+    why, link, picture = joint_reason(bar.joint, own), "", ""
     if bar.error is not None:
         picture = _picture(bar, bar.error, marks, limits)
     if bar.why:

@@ -3,7 +3,7 @@
 from html import escape
 
 from robotid.diagnosis.decisions import DEPENDENCE_SHARE
-from robotid.diagnosis.torque_split import JointTorque, joint_torques
+from robotid.diagnosis.torque_split import JointTorque
 from robotid.identification.result import Identification
 from robotid.identification.why_pictures import why_charts
 from robotid.pages.charts import Chart, chart_html
@@ -24,7 +24,7 @@ def why_section(found: Identification) -> str:
     Args:
         found: The identification.
     """
-    torques = sorted(joint_torques(found), key=_error, reverse=True)
+    torques = sorted(found.joint_torques, key=_error, reverse=True)
     shown = ", ".join(torques[0].rows.recordings)
     kind = "Validation logs" if torques[0].fitted is not None else "Fitted logs, without validation"
     points = max(_FEWEST_POINTS, min(_POINTS, _ALL_POINTS // len(torques)))

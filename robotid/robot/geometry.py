@@ -19,6 +19,7 @@ __all__ = [
     "box_half_spaces",
     "geometry_half_spaces",
     "hull_half_spaces",
+    "kinematic_lengths",
     "link_clouds",
 ]
 
@@ -27,6 +28,7 @@ _MOST_FACES = 100  # a hull with more is replaced by an outer polytope with this
 _GROWN = 0.05  # enlargement on each side of the box of a body's geometry, over its diagonal
 _GROWN_BLIND = 0.35  # the same of the box of its frames only, which have no width ...
 _NARROWEST = 0.1  # ... and at least this share of the longest link
+_HOUSINGS = 0.1  # of the robot's length, for the parts of a body beyond its joints
 
 
 def geometry_half_spaces(model: RobotModel, shape: str) -> dict[str, tuple[Array, Array]]:
@@ -126,16 +128,7 @@ def body_boxes(model: RobotModel) -> dict[str, Array]:
     Returns:
         Lower and upper corner by name of each body, shape (2, 3) [m].
     """
-    bodies = model.layout.bodies
-    frames: dict[str, list[Array]] = {body: [np.zeros(3)] for body in bodies}
-    for frame in model.pin_model.frames:
-        if frame.parentJoint > 0:
-            frames[bodies[frame.parentJoint - 1]].append(frame.placement.translation)
-    for i, (parent, place) in enumerate(
-        zip(model.pin_model.parents, model.pin_model.jointPlacements, strict=True)
-    ):
-        if i > 0 and parent > 0:
-            frames[bodies[parent - 1]].append(place.translation)
+    bodies, frames = model.layout.bodies, _body_frames(model)
     shapes, boxes = body_points(model), {}
     J = pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial])
     for body, J_i in zip(bodies, J, strict=True):
@@ -151,6 +144,41 @@ def body_boxes(model: RobotModel) -> dict[str, Array]:
             low, high = np.minimum(low, centre - half), np.maximum(high, centre + half)
         boxes[body] = np.array([low, high])
     return boxes
+
+
+def kinematic_lengths(model: RobotModel) -> dict[str, float]:
+    """Return the length that the kinematics give each body, whether or not it has geometry.
+
+    It is the largest distance between the body's frames (of its joints, links and tools) or from
+    its joint to the one before it, and 10 % of the robot's length for housings beyond the joints.
+    The travel of prismatic joints at the body is added; next to one without limits a body has no
+    length here, and neither has a robot whose joints all coincide.
+
+    Args:
+        model: The robot.
+
+    Returns:
+        Length by name of the body [m].
+    """
+    pins, bodies, frames = model.pin_model, model.layout.bodies, _body_frames(model)
+    steps = [float(np.linalg.norm(place.translation)) for place in pins.jointPlacements]
+    reach = np.zeros(len(steps))  # from the root along the joints [m]
+    for i, parent in enumerate(pins.parents):
+        reach[i] = reach[parent] + steps[i]
+    travel = np.zeros(len(steps))
+    for limits in model.limits:
+        if limits.name in model.layout.prismatic:
+            i = pins.getJointId(limits.name)
+            stroke = limits.upper - limits.lower if limits.has_limits else np.inf
+            travel[[i, pins.parents[i]]] += stroke
+    lengths = {}
+    for i, body in enumerate(bodies, start=1):
+        points = np.array(frames[body])
+        span = float(np.linalg.norm(points[:, None] - points, axis=2).max())
+        length = max(span, steps[i]) + float(travel[i]) + _HOUSINGS * float(reach.max())
+        if 0 < length < np.inf:
+            lengths[body] = length
+    return lengths
 
 
 def box_half_spaces(points: Array) -> tuple[Array, Array]:
@@ -188,6 +216,19 @@ def hull_half_spaces(points: Array) -> tuple[Array, Array]:
     x, y = np.cos(angle) * np.sin(polar), np.sin(angle) * np.sin(polar)
     A = np.column_stack([x, y, np.cos(polar)])
     return A, (A @ points.T).max(axis=1)
+
+
+def _body_frames(model: RobotModel) -> dict[str, list[Array]]:
+    """Return the origins of the frames of each body, in the frame of its moved link [m]."""
+    pins, bodies = model.pin_model, model.layout.bodies
+    frames: dict[str, list[Array]] = {body: [np.zeros(3)] for body in bodies}
+    for frame in pins.frames:
+        if frame.parentJoint > 0:
+            frames[bodies[frame.parentJoint - 1]].append(frame.placement.translation)
+    for i, (parent, place) in enumerate(zip(pins.parents, pins.jointPlacements, strict=True)):
+        if i > 0 and parent > 0:
+            frames[bodies[parent - 1]].append(place.translation)
+    return frames
 
 
 def _shapes(model: RobotModel) -> dict[str, list[Shape]]:

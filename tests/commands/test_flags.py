@@ -1,12 +1,14 @@
 """Flags state what the keys of a job file state."""
 
 import argparse
+from pathlib import Path
 
 import pytest
 
 from robotid.cli import doctor, identify, preview, track
 from robotid.cli.flags import job_from_flags, source_words
 from robotid.cli.parser import CommandParser
+from robotid.commands.job import job_from_settings
 from robotid.exceptions import SettingsError
 from robotid.fitting.settings import ESTIMATORS
 from robotid.logs.settings import LogSource, SignalSettings
@@ -83,6 +85,18 @@ def test_a_flag_that_a_command_has_no_use_for_is_not_there(capsys):
         job(track, "--trim", "0.5")
     assert "--trim" in capsys.readouterr().err
     assert job(track, "--min-velocity", "0.1").signals.min_velocity == 0.1
+
+
+def test_a_payload_of_known_mass_is_stated_with_its_log():
+    (check,) = job(identify, "--payload-check", "a=b/loaded.csv=2.5").payload_checks
+    assert (check.path.name, check.mass, check.link) == ("loaded.csv", 2.5, "")
+    for word in ("loaded.csv", "loaded.csv=heavy"):
+        with pytest.raises(SettingsError, match=f"--payload-check '{word}': wanted LOG=KG"):
+            job(identify, "--payload-check", word)
+    with pytest.raises(SettingsError, match=r"mass is -1.0, wanted more than 0"):
+        job(identify, "--payload-check", "loaded.csv=-1")
+    with pytest.raises(SettingsError, match=r"a \[\[payload_check\]\] has no key 'mass'"):
+        job_from_settings({"urdf": "x", "payload_check": [{"log": "y"}]}, "job.toml", Path())
 
 
 def test_gains_are_stated_for_all_joints_or_by_joint():

@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
+from robotid._files import file_sha256
 from robotid.cli import main
 from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings
 from robotid.commands.payload import stated_masses
 from robotid.exceptions import SettingsError
+from robotid.export.result import load_result, stated_scale_check
 from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
+from robotid.report.advice import Origin, next_steps
 from robotid.robot.bodies import link_transfer
 from robotid.robot.drives import Tanh
 from robotid.robot.examples import example_urdf
@@ -81,7 +84,10 @@ def test_a_mass_is_said_to_be_in_the_scale_of_the_torques(files, capsys):
 def test_the_text_says_what_a_controller_asks_for(files, capsys):
     said = asked(capsys, files / "loaded.csv", "--reference", files / "bare.csv", "--link", "tool0",
                  "--mass", "2")  # fmt: skip
-    assert said.startswith("payload on tool0\n  mass 2 kg, stated\n")
+    assert said.startswith("payload on tool0\n  mass 2 kg, stated\n  scale of the torques: payload")
+    check = " ".join(said.split())
+    assert re.search(r"of 2 kg on tool0: torque alone determines [12][.\d]* kg \(95 % inter", check)
+    assert "wanted: at most 5 %" in check
     assert re.search(r"centre of mass in the frame of tool0 \[m\]\n    x +0.0", said)
     assert re.search(r"about the origin of tool0, axes of tool0 \[kg m\^2\]\n    Ixx +0.0", said)
     assert "inertia about its centre of mass, axes of tool0" in said
@@ -90,6 +96,45 @@ def test_the_text_says_what_a_controller_asks_for(files, capsys):
     assert len(figures) == 9
     assert all((len(x), power) == (len(e), same) for x, power, e, same in figures)
     assert max(map(len, said.splitlines())) <= 80
+
+
+def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
+    table = {
+        "urdf": ARM, "identification": [{"log": "bare.csv"}], "estimator": {"draws": 0},
+        "model": {"friction": "viscous+coulomb"}, "output": {"report": False},
+        "payload_check": [
+            {"log": "loaded.csv", "mass": 1.8, "link": "tool0", "end": 3.0},
+            {"log": "loaded.csv", "mass": 1.8, "link": "tool0"},
+        ],
+    }  # fmt: skip
+    found, _ = run_job(job_from_settings(table, "job.toml", files), files / "checked")
+    check = found.scale_check.payload  # that with the narrower interval: the whole log
+    assert (check.known, check.link) == (1.8, "tool0")
+    assert check.identified == pytest.approx(2.0, abs=0.06)
+    assert check.interval[0] < 2.0 < check.interval[1]
+    assert check.sha256 == file_sha256(files / "loaded.csv")
+    assert found.scale_check.contradicts  # 2 kg are not 1.8 kg
+    (reason,) = [r for r in found.verdict.reasons if "payload of known mass" in r]
+    assert check.message in reason
+    whole = load_result(files / "checked").content
+    assert stated_scale_check(whole).payload == check
+    assert job_from_settings(whole["settings"], "x", files).payload_checks == (
+        found.asked.job.payload_checks
+    )
+    (step,) = [
+        s for s in next_steps(found, Origin(("job.toml",), "out")) if "torque scale" in s.words
+    ]
+    assert step.words.startswith("Correct the torque scale: payload of 1.8 kg on tool0")
+    urdf, bare, loaded = found.model.tree.path, files / "bare.csv", files / "loaded.csv"
+    assert step.blocks[0] == (
+        f"robotid payload {urdf} {loaded} --reference {bare} --link tool0 --mass 1.8 --gains"
+    )
+    right = replace(check, known=2.0)
+    verified = replace(found, payload_check=right)
+    assert verified.scale_check.agrees == right.verifies
+    steps = next_steps(verified, Origin(("job.toml",), "out"))
+    assert right.verifies
+    assert not any("torque scale" in step.words for step in steps)
 
 
 def test_gains_come_from_a_known_mass(files, capsys, ur5):

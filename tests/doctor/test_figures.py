@@ -354,7 +354,7 @@ def test_a_body_is_small_beside_the_mass_of_all():
             pi[at::10] = inertia * pi[::10]
         pi[31] = 0.9 * mass  # the centre is outside by 0.4 m
         layout = SimpleNamespace(n_inertial=40, bodies=tuple("abcd"))
-        points = {"d": np.array([[-0.5, -0.2, -0.1], [0.5, 0.2, 0.1]])}
+        points = dict.fromkeys("abcd", np.array([[-0.5, -0.2, -0.1], [0.5, 0.2, 0.1]]))
         found = list(urdf_geometry.audit_bodies(SimpleNamespace(layout=layout), pi, points))
         outside = one(found, "com_outside")
         assert outside.severity == severity

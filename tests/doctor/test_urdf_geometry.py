@@ -1,10 +1,11 @@
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from robotid.doctor.urdf import inspect_urdf
-from robotid.doctor.urdf_geometry import audit_links
+from robotid.doctor.urdf_geometry import _against_kinematics, audit_bodies, audit_links
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -91,6 +92,50 @@ def test_an_ellipsoid_longer_than_its_box_allows_is_a_note_with_both_lengths(tmp
     for factor, count in ((0.98, 0), (1.02, 1)):
         izz = f"{0.0567 - 0.0067 + 8 * factor * limit}"
         assert len(audit(tmp_path, izz=izz)) == count
+
+
+def slender(tmp_path, length, *, com=0.2, offset=0.4):
+    """Audit the arm without geometry; the ellipsoid of its upper link has this length."""
+    path = tmp_path / "arm.urdf"
+    axis = 4.0 * (length / 2) ** 2 / 5.0
+    text = ARM.format(**(GOOD | {"com": f"{com} 0 0", "iyy": axis, "izz": axis, "ixx": "1e-3"}))
+    text = re.sub("<collision>.*?</collision>", "", text).replace("0.4 0 0", f"{offset} 0 0")
+    path.write_text(text)
+    model = RobotModel.from_urdf(path)
+    return list(audit_bodies(model, model.standard_parameters(), {}))
+
+
+def test_a_link_without_geometry_is_compared_with_the_distance_of_its_joints(tmp_path):
+    reference = 0.4 + 0.1 * (0.1 + 0.4)  # between its joints, and housings
+    for factor, severities in ((1.55, []), (1.65, ["note"]), (2.2, ["note"]), (2.3, ["warning"])):
+        found = slender(tmp_path, factor * reference)
+        assert [finding.severity for finding in found] == severities, factor
+    (finding,) = found
+    assert (finding.code, finding.where) == ("ellipsoid", "link upper")
+    # the second moment along x is half of iyy + izz - ixx
+    length = np.sqrt((2.3 * reference) ** 2 - 4 * 5 / 4.0 * 1e-3 / 2)
+    assert finding.evidence == pytest.approx({"length": length, "side": reference})
+    assert "is 1.03 m long, its joints allow a length of about 0.45 m" in finding.message
+    assert "(wanted: at most 0.72 m)" in finding.message
+    (finding,) = slender(tmp_path, 0.3, com=-0.5)
+    assert (finding.code, finding.severity) == ("com_outside", "warning")
+    assert finding.evidence == pytest.approx({"outside": 0.05})
+    assert slender(tmp_path, 0.3, com=-0.44) == []
+    # the last body ends beyond its joint: a note
+    assert [(f.where, f.severity) for f in slender(tmp_path, 0.1, com=0, offset=0)] == [
+        ("link fore", "note")
+    ]
+
+
+def test_joints_that_are_close_do_not_show_how_wide_a_body_is():
+    for axis, at, severities in (
+        (0.88, 0.0, ["note"]), (0.9, 0.0, ["warning"]), (0.1, 0.39, []), (0.1, 0.41, ["warning"]),
+    ):  # fmt: skip
+        second = np.diag([axis**2 / 20.0, 1e-3, 1e-3]) + np.diag([at**2, 0.0, 0.0])  # [m^2]
+        J = 2.0 * np.block([[second, np.array([[at], [0.0], [0.0]])], [at, 0.0, 0.0, 1.0]])
+        # its joints are 0.1 m apart, the longest distance of all is 0.4 m
+        found = list(_against_kinematics("a", J, 0.1, 0.4))
+        assert [finding.severity for finding in found] == severities
 
 
 def test_a_copied_inertial_is_told_by_the_other_size(tmp_path):

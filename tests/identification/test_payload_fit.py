@@ -128,6 +128,34 @@ def test_a_known_mass_is_kept_and_makes_the_rest_surer(ur5, rng):
     assert (np.abs(known.com - COM) < 4 * known.com_std_error).all()
 
 
+def test_a_known_mass_is_checked_by_the_torque_that_does_not_know_it(ur5, rng):
+    logs = [replace(log, tau=1.1 * log.tau) for log in recorded(ur5, rng, noise=LEVEL)]
+    asked = {"links": ["tool0"], "signals": EXACT}
+    free = with_known_friction(ur5, logs[:1], logs[1:], **asked)
+    found = with_known_friction(ur5, logs[:1], logs[1:], masses={"tool0": MASS}, **asked)
+    check = found.checks["tool0"]
+    assert free.checks == {}
+    assert (check.known, check.identified) == (MASS, pytest.approx(free["tool0"].mass))
+    assert check.ratio == pytest.approx(1.1, abs=0.03)
+    assert check.std_error == pytest.approx(free["tool0"].mass_std_error)
+    assert check.interval == pytest.approx(free["tool0"].mass_interval)
+    assert check.contradicts
+    assert check.message in str(found)
+    assert found.to_dict()["mass_checks"] == [check.to_dict()]
+    gains = with_known_friction(
+        ur5, logs[:1], logs[1:], masses={"tool0": MASS}, unknown_gains=ur5.joints, **asked
+    )
+    assert gains.checks == {}  # the mass determines the gains
+
+
+def test_a_mass_that_the_motion_does_not_determine_is_no_check(ur5, rng):
+    _, still = recorded(ur5, rng, noise=LEVEL)
+    light = {"masses": {"tool0": 0.01}, "links": ["tool0"], "signals": EXACT}
+    log = replace(still, tau=still.tau + 400 * LEVEL * rng.standard_normal(still.tau.shape))
+    found = with_known_friction(ur5, [log], [still], **light)
+    assert found.checks["tool0"].identified is None
+
+
 def test_intervals_hold_the_truth_of_payload_gains_and_robot(ur5):
     beta = structural_mapping(ur5).to_base(truth(ur5))
     outside = []

@@ -125,6 +125,24 @@ def test_each_joint_has_a_verdict_of_its_own():
     assert found["d"].reasons == ("it does not move in any validation log",)
 
 
+def test_the_good_joint_with_the_largest_error_has_the_cause_of_its_residual():
+    logs = {"val.csv": Metrics({"a": joint(4.0), "b": joint(6.0), "c": joint(20.0)}, 1.0)}
+    fit = Metrics({name: joint(5.0) for name in "abc"}, 1.0)
+    causes = {"b": "it is noise"}  # of no other joint is the cause computed
+    found = judge(Predictions(fit, logs), Determined(), cause_of=causes.__getitem__)
+    assert found.joints["b"].reasons[1:] == ("largest error of the good joints: it is noise",)
+    assert [len(found.joints[name].reasons) for name in "ac"] == [1, 1]
+    assert not any("noise" in reason for reason in found.reasons)  # another joint is worse
+    logs = {"val.csv": Metrics({"a": joint(4.0), "b": joint(6.0)}, 1.0)}
+    found = judge(Predictions(fit, logs, "ab"), Determined(), cause_of=causes.__getitem__)
+    assert found.status == "usable"  # c does not move in the validation log
+    assert not any("noise" in reason for reason in found.reasons)
+    fit = Metrics({name: joint(5.0) for name in "ab"}, 1.0)
+    found = judge(Predictions(fit, logs), Determined(), cause_of=causes.__getitem__)
+    assert found.status == "good"
+    assert found.reasons[1:] == ("b: largest error: it is noise",)
+
+
 def test_the_worst_of_several_recordings_decides_on_a_joint():
     logs = {
         "one.csv": Metrics({"a": joint(4.0)}, 1.0),
@@ -192,6 +210,17 @@ def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
     assert found.to_dict()["warnings"] == [
         {"code": "urdf_mismatch", "joint": "", "message": "run.csv: masses do not fit"}
     ]
+
+
+@pytest.mark.parametrize("code", ["com_outside", "dense_body", "density", "ellipsoid", "gyration"])
+def test_an_impossible_body_makes_the_result_usable_and_no_joint(code):
+    found = Finding(code, "warning", "link a", "the mass of a is 40 kg: not possible")
+    warnings = warnings_of([found, replace(found, severity="note")], JOINTS)
+    assert warnings == (VerdictWarning(code, "", "the mass of a is 40 kg: not possible"),)
+    concluded = verdict({name: joint(4.0) for name in JOINTS}, warnings=warnings)
+    assert concluded.status == "usable"
+    assert concluded.reasons == (f"the mass of a is 40 kg: not possible ({code})",)
+    assert {own.status for own in concluded.joints.values()} == {"good"}
 
 
 def test_kept_recordings_that_were_fitted_are_named():

@@ -14,6 +14,7 @@ from robotid.robot.geometry import (
     box_half_spaces,
     geometry_half_spaces,
     hull_half_spaces,
+    kinematic_lengths,
 )
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -158,6 +159,33 @@ def test_the_box_of_a_body_holds_its_geometry_or_its_frames_and_the_urdfs_own_bo
     reach = np.sqrt(3.0 * (J[2, 2] / J[3, 3] - centre**2))
     assert body_boxes(small)["one"][1][2] == pytest.approx(centre + reach, abs=1e-9)
     assert centre + reach > 1.01 + 0.05 * 1.5
+
+
+def test_the_kinematic_length_of_a_body_is_that_between_its_frames_or_to_the_joint_before(tmp_path):
+    assert kinematic_lengths(arm(tmp_path)) == {"one": 1.0}  # the flange; no way along the joints
+    joint = (
+        '<link name="{1}"><inertial><mass value="1"/><inertia ixx=".01" iyy=".01" izz=".01" '
+        'ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="j{1}" type="{3}"><parent '
+        'link="{0}"/><child link="{1}"/><origin xyz="0 {2} 0"/><axis xyz="0 1 0"/>'
+        '<limit lower="-1" upper="{4}" effort="1" velocity="1"/></joint>'
+    )
+    path = tmp_path / "chain.urdf"
+
+    def lengths(kind, upper):
+        steps = [("base", "a", 0.0, "revolute", 1), ("a", "b", 2.0, "revolute", 1)]
+        steps += [("b", "c", 0.5, kind, upper), ("c", "d", 0.1, "revolute", 1)]
+        joints = "".join(joint.format(*step) for step in steps)
+        path.write_text(f'<robot name="r"><link name="base"/>{joints}</robot>')
+        return kinematic_lengths(RobotModel.from_urdf(path))
+
+    housings = 0.1 * 2.6
+    expected = {"a": 2.0, "b": 2.0, "c": 0.5, "d": 0.1}
+    expected = {body: length + housings for body, length in expected.items()}
+    assert lengths("revolute", 1) == pytest.approx(expected)
+    # the travel of 3 m is beside both bodies of the prismatic joint
+    travel = expected | {body: expected[body] + 3.0 for body in "bc"}
+    assert lengths("prismatic", 2) == pytest.approx(travel)
+    assert lengths("prismatic", -1).keys() == {"a", "d"}  # without limits
 
 
 BROKEN = {
