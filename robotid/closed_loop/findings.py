@@ -56,7 +56,7 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
         yield Finding("scale", "note", "controller", STATED_SCALE)
     yield from _gains_contradicted(found)
     yield from _coarse_steps(estimate.details)
-    yield from _at_bound(estimate.details["at_bound"])
+    yield from _at_bound(found)
     for together in found.correlated:
         names = listed(together, _NAMED)
         message = (
@@ -152,9 +152,31 @@ def _gains_contradicted(found: LoopIdentification) -> Iterator[Finding]:
     )
 
 
-def _at_bound(names: Sequence[str]) -> Iterator[Finding]:
-    """Yield which parameters are estimated as 0."""
-    at_zero = [name for name in names if name.rpartition(".")[2] not in ("kp", "limit")]
+def _at_bound(found: LoopIdentification) -> Iterator[Finding]:
+    """Yield which parameters are estimated as 0, or as the largest value of a drive that moves."""
+    estimate, free_parameters = found.estimate, found.fit.simulator.free_parameters
+    largest = [
+        free
+        for free, value in zip(free_parameters, estimate.theta.tolist(), strict=True)
+        if value >= free.highest
+    ]
+    if largest:
+        names = listed([f"{free.name} = {free.highest:g}" for free in largest], _NAMED)
+        yield Finding(
+            "at_bound",
+            "warning",
+            names,
+            f"{names}: the estimate is the upper bound; with more, the gear is self-locking. The "
+            "motion hardly separates it from Coulomb friction and gravity, or another term is "
+            "missing. Record slow motion at several loads, or set friction = 'viscous+coulomb' in "
+            "[model]",
+        )
+    others = {free.name for free in largest}
+    at_zero = [
+        name
+        for name in estimate.details["at_bound"]
+        if name not in others and name.rpartition(".")[2] not in ("kp", "limit")
+    ]
     if at_zero:
         yield Finding(
             "at_bound",

@@ -83,6 +83,21 @@ def test_what_the_data_hardly_shrink_is_undetermined(found):
     assert replace(other, fit=fit).undetermined == ("rail.viscous",), "bodies have a prior"
 
 
+def test_a_parameter_at_its_upper_bound_is_told_from_one_at_0(found):
+    simulator, theta = found.fit.simulator, found.estimate.theta.copy()
+    first, second, *others = simulator.free_parameters
+    theta[:2] = 0.5, 0.0
+    wide = replace(simulator, free_parameters=(replace(first, highest=0.5), second, *others))
+    details = {**found.estimate.details, "at_bound": NAMES[:2]}
+    estimate = replace(found.estimate, theta=theta, details=details)
+    bound = replace(found, fit=replace(found.fit, simulator=wide, estimate=estimate))
+    above, below = [f for f in loop_findings(bound, ()) if f.code == "at_bound"]
+    assert above.where == f"{NAMES[0]} = 0.5"
+    assert "the estimate is the upper bound; with more, the gear is self-locking" in above.message
+    assert below.where == NAMES[1]
+    assert below.message.startswith(f"{NAMES[1]}: the estimate is 0, the lower bound")
+
+
 def test_two_sets_that_a_third_pair_joins_are_one(found):
     R = np.eye(5)
     for a, b in ((0, 3), (1, 2), (2, 3)):
