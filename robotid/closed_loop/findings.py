@@ -65,12 +65,18 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
         yield Finding("correlated_terms", "note", names, message)
     if found.undetermined:
         names = listed(found.undetermined, _NAMED)
+        has_gains = any(name.endswith((".kp", ".kd")) for name in found.undetermined)
+        known = (
+            ", or state the gains, or groups of joints with equal drives, in [controller]"
+            if has_gains
+            else ""
+        )
         yield Finding(
             "undetermined",
             "warning",
             names,
             f"the logs do not determine {names}: the prior values remain. Command a motion that "
-            "depends on these parameters",
+            f"depends on these parameters{known}",
         )
     yield from _limits_found(found)
     yield from _encoder_findings(found)

@@ -76,6 +76,11 @@ def test_what_the_data_hardly_shrink_is_undetermined(found):
     other = of(found, covariance=np.diag((share * spread) ** 2))
     np.testing.assert_allclose(other.shrunk, share)
     assert other.undetermined == ("turn.armature", "rail.viscous")
+    said = [f.message for f in loop_findings(other, ()) if f.code == "undetermined"]
+    names = ("rail.armature", "turn.kp", *NAMES[2:])
+    gain = of(found, covariance=other.estimate.covariance, names=names)
+    said += [f.message for f in loop_findings(gain, ()) if f.code == "undetermined"]
+    assert ["groups of joints with equal drives" in words for words in said] == [False, True]
     simulator = found.fit.simulator
     body = replace(simulator.free_parameters[1], what="body")
     free_parameters = (simulator.free_parameters[0], body, *simulator.free_parameters[2:])
