@@ -13,6 +13,7 @@ __all__ = [
     "columns",
     "in_digits_of",
     "terminal_width",
+    "time_range",
     "tinted",
     "wrapped",
     "yaml_name",
@@ -48,6 +49,16 @@ def tinted(text: str, word: str, tone: str, stream: TextIO) -> str:
     if tone not in _TONES or os.environ.get("NO_COLOR") or not (has_codes and stream.isatty()):
         return text
     return text.replace(word, f"\x1b[{_TONES[tone]}m{word}\x1b[0m", 1)
+
+
+def time_range(start: float, end: float) -> str:
+    """Return the range of a recording to the millisecond, as ``5-7.4 s``.
+
+    Args:
+        start: Its start [s].
+        end: Its end [s].
+    """
+    return f"{round(start, 3):.4g}-{round(end, 3):.4g} s"
 
 
 def wrapped(text: str, width: int | None, indent: str = "") -> str:

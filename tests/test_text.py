@@ -4,7 +4,7 @@ import io
 
 import pytest
 
-from robotid._text import columns, in_digits_of, tinted, wrapped
+from robotid._text import columns, in_digits_of, time_range, tinted, wrapped
 
 
 def test_lines_fit_and_keep_their_indentation():
@@ -71,3 +71,8 @@ def test_colour_is_for_terminals_and_no_color_ends_it(monkeypatch):
         with monkeypatch.context() as changed:
             changed.setenv(name, value)
             assert tinted(said, "poor", "poor", Terminal()) == said
+
+
+def test_a_range_of_time_begins_at_0_if_it_does_to_the_millisecond():
+    assert time_range(4.957e-06, 120.3399) == "0-120.3 s"
+    assert time_range(0.0204, 7.4) == "0.02-7.4 s"

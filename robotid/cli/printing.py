@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotid._text import terminal_width, tinted, wrapped
+from robotid._text import terminal_width, time_range, tinted, wrapped
 from robotid.findings import Finding, grouped, number_of
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def window_name(name: str, entry: Mapping[str, Any]) -> str:
         name: The name.
         entry: Its start and end [s].
     """
-    return f"{name} {entry['start']:.4g}-{entry['end']:.4g} s"
+    return f"{name} {time_range(entry['start'], entry['end'])}"
 
 
 def print_verdict(verdict: Mapping[str, Any]) -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from robotid._text import time_range
 from robotid._typing import Array
 from robotid.exceptions import NotConvergedError
 from robotid.fitting.metrics import JointMetrics, Metrics
@@ -52,7 +53,7 @@ class OpenLoop:
     @property
     def name(self) -> str:
         """Name of the log's file with its time range, as ``run3.parquet 5-7.4 s``."""
-        return f"{self.log.name} {self.log.t[0]:.4g}-{self.log.t[-1]:.4g} s"
+        return f"{self.log.name} {time_range(float(self.log.t[0]), float(self.log.t[-1]))}"
 
     @property
     def is_driven(self) -> bool:

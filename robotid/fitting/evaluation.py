@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from robotid._text import time_range
 from robotid._typing import Array
 from robotid.fitting.metrics import Metrics, TorqueSums
 from robotid.fitting.survey import PieceTask, SurveyedLog
@@ -80,7 +81,7 @@ class Recording:
     def name(self) -> str:
         """Name of the log's file and its time range, as ``run3.parquet 5-7.4 s``."""
         file = Path(self.log.path).name or "log"
-        return f"{file} {self.extent.start:.4g}-{self.extent.end:.4g} s"
+        return f"{file} {time_range(self.extent.start, self.extent.end)}"
 
     @property
     def is_partial(self) -> bool:

@@ -187,10 +187,8 @@ def _loop_repairs(content: Mapping[str, Any], origin: Origin) -> tuple[Step, ...
 
 def _loop_replay(content: Mapping[str, Any], origin: Origin) -> Step:
     """Return the step that plays a result of closed-loop identification."""
-    urdf, log = (
-        next((x["path"] for x in content["inputs"] if x["role"] == role), "")
-        for role in ("urdf", "identification")
-    )
+    paths = {x["role"]: x["path"] for x in reversed(content["inputs"])}  # the first of each role
+    urdf, log = paths["urdf"], paths.get("validation", paths.get("identification", ""))
     has_gains = content["simulation"]["controller"]["kind"] != "torque"
     words = "Compare measured and predicted torque in the replay."
     if has_gains:

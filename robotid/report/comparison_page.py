@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from robotid._text import time_range
 from robotid._typing import Array
 from robotid.pages.charts import Chart, Series, chart_html
 from robotid.pages.html import Cell, code, number, page, percent, table, text, with_error
@@ -86,7 +87,7 @@ def _errors_section(content: Mapping[str, Any]) -> str:
         parts.append(f"<ul>{notes}</ul>\n")
     parts += [
         _error_table(
-            f"{entry['name']} {entry['start']:.4g}-{entry['end']:.4g} s: not fitted",
+            f"{entry['name']} {time_range(entry['start'], entry['end'])}: not fitted",
             content,
             entry["per_joint"],
             alike=True,

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from robotid._text import time_range
 from robotid._typing import Array
 from robotid.closed_loop.evaluation import DRIFTS, OpenLoop, position_metrics
 from robotid.exceptions import DataError
@@ -163,7 +164,7 @@ def _entries(content: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
 
 def _name(entry: Mapping[str, Any]) -> str:
     """Return the name of a recording, as ``OpenLoop.name``."""
-    return f"{Path(entry['log']).name} {entry['start']:.4g}-{entry['end']:.4g} s"
+    return f"{Path(entry['log']).name} {time_range(entry['start'], entry['end'])}"
 
 
 def _unit(entry: Mapping[str, Any]) -> str:

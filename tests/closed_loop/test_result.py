@@ -77,8 +77,11 @@ def test_what_the_data_hardly_shrink_is_undetermined(found):
     np.testing.assert_allclose(other.shrunk, share)
     assert other.undetermined == ("turn.armature", "rail.viscous")
     said = [f.message for f in loop_findings(other, ()) if f.code == "undetermined"]
-    names = ("rail.armature", "turn.kp", *NAMES[2:])
-    gain = of(found, covariance=other.estimate.covariance, names=names)
+    first, second, *others = other.fit.simulator.free_parameters
+    gain = (first, replace(second, name="turn.kp"), *others)
+    simulator = replace(other.fit.simulator, free_parameters=gain)
+    estimate = replace(other.estimate, names=tuple(free.name for free in gain))
+    gain = replace(other, fit=replace(other.fit, simulator=simulator, estimate=estimate))
     said += [f.message for f in loop_findings(gain, ()) if f.code == "undetermined"]
     assert ["groups of joints with equal drives" in words for words in said] == [False, True]
     simulator = found.fit.simulator
