@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 from robotid.closed_loop.result import STATED_SCALE, LoopIdentification
-from robotid.closed_loop.settings import LoopSettings
 from robotid.closed_loop.term_choice import Tried
 from robotid.closed_loop.zeros import CLEAR, parallel_axes
 from robotid.findings import Finding, by_severity, listed
@@ -57,7 +56,7 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
         yield Finding("scale", "note", "controller", STATED_SCALE)
     yield from _gains_contradicted(found)
     yield from _coarse_steps(estimate.details)
-    yield from _at_bound(estimate.details["at_bound"], found.loop)
+    yield from _at_bound(found)
     for together in found.correlated:
         names = listed(together, _NAMED)
         message = (
@@ -66,12 +65,18 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
         yield Finding("correlated_terms", "note", names, message)
     if found.undetermined:
         names = listed(found.undetermined, _NAMED)
+        has_gains = any(name.endswith((".kp", ".kd")) for name in found.undetermined)
+        known = (
+            ", or state the gains, or groups of joints with equal drives, in [controller]"
+            if has_gains
+            else ""
+        )
         yield Finding(
             "undetermined",
             "warning",
             names,
             f"the logs do not determine {names}: the prior values remain. Command a motion that "
-            "depends on these parameters",
+            f"depends on these parameters{known}",
         )
     yield from _limits_found(found)
     yield from _encoder_findings(found)
@@ -153,9 +158,32 @@ def _gains_contradicted(found: LoopIdentification) -> Iterator[Finding]:
     )
 
 
-def _at_bound(names: Sequence[str], loop: LoopSettings) -> Iterator[Finding]:
-    """Yield which parameters are estimated as 0, with remedies for what the user stated."""
-    at_zero = [name for name in names if name.rpartition(".")[2] not in ("kp", "limit")]
+def _at_bound(found: LoopIdentification) -> Iterator[Finding]:
+    """Yield which parameters are estimated as 0, or as the largest value of a drive that moves."""
+    loop = found.loop
+    estimate, free_parameters = found.estimate, found.fit.simulator.free_parameters
+    largest = [
+        free
+        for free, value in zip(free_parameters, estimate.theta.tolist(), strict=True)
+        if value >= free.highest
+    ]
+    if largest:
+        names = listed([f"{free.name} = {free.highest:g}" for free in largest], _NAMED)
+        yield Finding(
+            "at_bound",
+            "warning",
+            names,
+            f"{names}: the estimate is the upper bound; with more, the gear is self-locking. The "
+            "motion hardly separates it from Coulomb friction and gravity, or another term is "
+            "missing. Record slow motion at several loads, or set friction = 'viscous+coulomb' in "
+            "[model]",
+        )
+    others = {free.name for free in largest}
+    at_zero = [
+        name
+        for name in estimate.details["at_bound"]
+        if name not in others and name.rpartition(".")[2] not in ("kp", "limit")
+    ]
     gains = [name for name in ("kp", "kd") if getattr(loop, name) is not None]
     if at_zero:
         subject = listed(at_zero, _NAMED)

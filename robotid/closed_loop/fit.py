@@ -32,7 +32,7 @@ from robotid.closed_loop.zeros import Encoders, find_encoders, same_encoders
 from robotid.doctor.command_channels import largest_speeds
 from robotid.estimators.estimator import Estimate
 from robotid.estimators.output_error import OutputError
-from robotid.exceptions import DataError, SettingsError
+from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.findings import listed
 from robotid.fitting.settings import SimulationSettings
 from robotid.identification.result import Identification
@@ -344,9 +344,9 @@ def _settled(
     """Return the estimate with the best initial states of the windows, and these windows.
 
     Fits of the initial states and joint steps of states and parameters alternate, until a step
-    changes no parameter by more than 0.2 standard errors. If such a step raises the residual, as it
-    may far from the minimum, or derivatives are not exact, the parameters are fitted from the best
-    initial states.
+    changes no parameter by more than 0.2 standard errors. If such a step raises the residual or
+    cannot be simulated, as may happen far from the minimum, or derivatives are not exact, the
+    parameters are fitted from the best initial states.
 
     Args:
         simulator: The simulator.
@@ -359,9 +359,12 @@ def _settled(
     level, first = np.inf, estimate.theta
     for _ in range(_SETTLING):
         initialised = simulator.with_better_start(estimate.theta)
-        found = estimator.settle(initialised, estimate)
-        before, level = level, float(np.mean(np.log(found.sigma)))
-        if level > before + _RAISED:
+        try:
+            found = estimator.settle(initialised, estimate)
+        except NotConvergedError:
+            found = None
+        before, level = level, np.inf if found is None else float(np.mean(np.log(found.sigma)))
+        if found is None or level > before + _RAISED:
             simulator = simulator.with_better_start(first)
             return simulator, estimator.fit(simulator, first)
         change = np.abs(found.theta - estimate.theta)

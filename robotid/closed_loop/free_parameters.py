@@ -40,6 +40,7 @@ class FreeParameter:
         prior: Prior value.
         spread: Prior standard deviation; inf without a prior.
         lowest: Lower bound.
+        highest: Upper bound.
         term: The friction term.
         coordinate: Number of a body's coordinate, 0 to 3.
     """
@@ -50,8 +51,26 @@ class FreeParameter:
     prior: float
     spread: float
     lowest: float = -np.inf
+    highest: float = np.inf
     term: DriveTerm | None = None
     coordinate: int = 0
+
+    @classmethod
+    def of_term(
+        cls, owner: str, term: DriveTerm, joints: tuple[int, ...], prior: float, spread: float
+    ) -> "FreeParameter":
+        """Return the parameter of a friction term, with the bounds of the term.
+
+        Args:
+            owner: The joint, or the group of joints that share it.
+            term: The term.
+            joints: Indices of the joints.
+            prior: Prior value.
+            spread: Prior standard deviation.
+        """
+        lowest = 0.0 if term.is_nonnegative else -np.inf
+        name = f"{owner}.{term.name}"
+        return cls(name, "term", joints, prior, spread, lowest, term.highest, term)
 
 
 def free_body_parameters(robot: ClosedLoopRobot, spread: float) -> list[FreeParameter]:
@@ -142,8 +161,9 @@ class LoopSimulator:
         return np.array([free.spread for free in self.free_parameters])
 
     @cached_property
-    def lowest(self) -> Array:
-        return np.array([free.lowest for free in self.free_parameters])
+    def bounds(self) -> Array:
+        bounds = [(free.lowest, free.highest) for free in self.free_parameters]
+        return np.array(bounds).reshape(-1, 2).T
 
     def loops(self, theta: Array) -> Loops:
         """Return bodies, drives and loops at given values of the free parameters.

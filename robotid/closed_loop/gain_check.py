@@ -9,7 +9,7 @@ import scipy.linalg
 from robotid._typing import Array
 from robotid.closed_loop.free_parameters import FreeParameter, LoopSimulator
 from robotid.estimators.estimator import Estimate
-from robotid.estimators.output_error import OutputError
+from robotid.estimators.output_error import OutputError, is_at_bound
 
 __all__ = ["GainScale", "gain_scale"]
 
@@ -70,7 +70,7 @@ def gain_scale(simulator: LoopSimulator, estimator: OutputError, estimate: Estim
     T[:c, :c] = np.eye(c)
     for k, gain in enumerate(gains, start=c):
         T[k, c + gain.joints[0]] = gain.prior
-    free = np.concatenate([estimate.theta > simulator.lowest, np.ones(n, dtype=bool)])
+    free = np.concatenate([~is_at_bound(simulator, estimate.theta), np.ones(n, dtype=bool)])
     T = T[:, free]
     inflation = max(float(estimate.details["inflation"]), 1.0)
     change, error = _last(T.T @ H @ T, T.T @ g, n)

@@ -233,10 +233,7 @@ def _term(
     initial = float(np.median([base.values[base.place(j, term)] for j in joints]))
     size = typical.torque / (typical.speed if isinstance(term, Viscous) else 1.0)
     wide = _WIDE * float(np.median(size[list(joints)]))
-    lowest = 0.0 if term.is_nonnegative else -np.inf
-    return FreeParameter(
-        f"{owner}.{term.name}", "term", tuple(joints), initial, wide, lowest, term=term
-    )
+    return FreeParameter.of_term(owner, term, tuple(joints), initial, wide)
 
 
 def free_zeros(model: RobotModel, encoders: Encoders) -> list[FreeParameter]:

@@ -115,9 +115,7 @@ def _free_parameters(
         for k, term in enumerate(_TERMS):
             value = float(start.values[len(_TERMS) * j + k])
             spread = 100 * torque[j] * (10.0 if term.name == "viscous" else 1.0)
-            lowest = 0.0 if term.is_nonnegative else -np.inf
-            name = f"{joint}.{term.name}"
-            found.append(FreeParameter(name, "term", (j,), value, spread, lowest, term=term))
+            found.append(FreeParameter.of_term(joint, term, (j,), value, spread))
         if finds_delay:
             found.append(
                 FreeParameter(f"{joint}.delay", "delay", (j,), float(start.delay[j]), 0.1, 0.0)

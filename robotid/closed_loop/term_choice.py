@@ -75,11 +75,7 @@ def candidates(simulator: LoopSimulator, torque: Array) -> list[tuple[FreeParame
             for term in terms:
                 size = half**term.order if isinstance(term, PositionCoulomb) else 1.0
                 spread = 1.0 if isinstance(term, LoadFriction) else torque[j] / size
-                lowest = 0.0 if term.is_nonnegative else -np.inf
-                name = f"{joint}.{term.name}"
-                free_parameters.append(
-                    FreeParameter(name, "term", (j,), 0.0, spread, lowest, term=term)
-                )
+                free_parameters.append(FreeParameter.of_term(joint, term, (j,), 0.0, spread))
             found.append(tuple(free_parameters))
     return found
 

@@ -12,7 +12,7 @@ from robotid._files import file_sha256
 from robotid._typing import STAGES, ProgressCallback, report_stage
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.doctor.diagnosis import diagnose
-from robotid.doctor.locked_joints import STILL, check_locked
+from robotid.doctor.locked_joints import STILL, check_locked, percent_hint
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.result import Result, load_result, stated_model, stated_parameters
 from robotid.findings import Finding, by_severity
@@ -190,6 +190,7 @@ def locked_as_logged(
         f"joints are locked at their positions in the logs: {shown}. State other positions with "
         "locked = { joint = position }"
     )
+    message += "".join(percent_hint(model, *place, job.units) for place in logged.items())
     note = Finding("locked_as_logged", "note", ", ".join(logged), message, logged)
     job = replace(job, locked={**job.locked, **logged})
     model = job.model()
@@ -214,7 +215,7 @@ def examine_logs(
     findings: list[Finding] = []
     for log in (*fitted, *validation):
         name = Path(log.path).name
-        findings += check_locked(model, log.locked, name, job.placed(model))
+        findings += check_locked(model, log.locked, name, job.placed(model), job.units)
         if len(log.windows) > 1:  # the windows have no notes of their own
             notes = log.head.notes
             findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in notes]

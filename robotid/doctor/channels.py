@@ -30,6 +30,8 @@ _NOISY = 0.3  # noise over signal from which a torque is uninformative
 _LAG = 0.002  # [s] a shorter lag is not reported
 _ALIKE = 0.8  # least correlation of a velocity with the derivative of its position
 _SCALE = 1.1  # velocity over d(q)/dt, or the inverse, from which the unit differs
+_ENCODER = 0.01  # largest difference of a step from 2 pi / 2^bits [bits]
+_BITS = range(9, 24)  # of encoders
 _DEAD = 1e-3  # velocity over d(q)/dt below which the channel is constant
 
 
@@ -82,15 +84,33 @@ def _quantisation(log: Log, kind: str, values: Array, velocity: str) -> Iterator
             continue
         names = [log.joints[j] for j in chosen]
         evidence = {f"steps_{log.joints[j]}": count[j] for j in chosen}
-        todo = "its resolution is too low: log it with more digits" if few else "log more digits"
-        if few and kind == "dq":
-            todo += ", or set velocity = 'differentiated'; 'auto' differentiates the position"
+        todo = _finer(kind, float(steps[chosen].max()), velocity, few=few)
         message = (
             f"{kind} of {listed(names)} is quantised in steps of {steps[chosen].max():.3g}, "
             f"{count[chosen].min():.0f} steps over its range; {todo}"
         )
         severity = "warning" if few and is_used else "note"
         yield log_finding(log.name, "quantised", severity, message, kind, **evidence)
+
+
+def _finer(kind: str, step: float, velocity: str, *, few: bool) -> str:
+    """Return what to do about steps of a channel."""
+    if kind == "dq" and few:
+        return (
+            "its resolution is too low. No action needed: velocity = 'auto' differentiates the "
+            "position instead"
+            if velocity == "auto"
+            else "its resolution is too low: set velocity = 'differentiated'"
+        )
+    bits = np.log2(2 * np.pi / step)
+    if kind == "q" and abs(bits - round(bits)) < _ENCODER and round(bits) in _BITS:
+        encoder = f"the step is that of an encoder of {round(bits)} bits, not of the digits"
+        return (
+            f"{encoder}: record a larger motion, of {COARSE} steps or more"
+            if few
+            else f"{encoder}, and small in the motion; no action needed"
+        )
+    return "its resolution is too low: log it with more digits" if few else "log more digits"
 
 
 def _spikes(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding]:

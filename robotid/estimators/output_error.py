@@ -20,7 +20,7 @@ from robotid.estimators.segments import FEWEST_SEGMENTS, at_least, sandwich, sca
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, triangle_of
 
-__all__ = ["OutputError", "Residual", "Simulator", "linearised"]
+__all__ = ["OutputError", "Residual", "Simulator", "is_at_bound", "linearised"]
 
 _CAUTIOUS = 1e-3  # damping of a step: parameters that are not identifiable do not move
 _NEARLY_FREE = 1e-6  # damping of the last step, near the minimum
@@ -67,7 +67,7 @@ class Simulator(Protocol):
         names: Names of the c parameters.
         prior: Prior values, shape (c,).
         prior_std: Prior standard deviations, shape (c,); infinite without prior knowledge.
-        lowest: Lower bounds, shape (c,); -inf without a bound.
+        bounds: Lower and upper bounds, shape (2, c); infinite without a bound.
     """
 
     @property
@@ -77,7 +77,7 @@ class Simulator(Protocol):
     @property
     def prior_std(self) -> Array: ...
     @property
-    def lowest(self) -> Array: ...
+    def bounds(self) -> Array: ...
 
     def residuals(
         self, theta: Array, *, with_slopes: bool, with_starts: bool = False
@@ -196,7 +196,7 @@ class OutputError(Estimator[Simulator]):
     ) -> tuple[_Weights, Array, dict[str, Any]]:
         """Return the last weights, the parameters, and how they were found."""
         initial = simulator.prior if start is None else start
-        theta = np.maximum(np.array(initial, dtype=float), simulator.lowest)
+        theta = np.clip(np.array(initial, dtype=float), *simulator.bounds)
         found = self._left(simulator, theta)
         weights, rounds, count, converged = self._weigh(found), 0, 0, False
         for rounds in range(1, self.rounds + 1):
@@ -263,12 +263,19 @@ class OutputError(Estimator[Simulator]):
     def joint_step(self, simulator: Simulator, theta: Array) -> Array:
         """Return the parameters after a step of them together with the windows' initial states.
 
+        They do not change if the simulation after the step fails.
+
         Args:
             simulator: The simulator.
             theta: Parameters of the best fit with fixed initial states, shape (c,).
         """
         H, g = self.normal(simulator, self.weights(simulator, theta), theta, frees=True)
-        return _bounded_step(H, g, theta, simulator.lowest, _CAUTIOUS)
+        moved = _bounded_step(H, g, theta, simulator.bounds, _CAUTIOUS)
+        try:
+            self._left(simulator, moved)
+        except NotConvergedError:
+            return theta
+        return moved
 
     def settle(self, simulator: Simulator, estimate: Estimate) -> Estimate:
         """Return the estimate after a step of it together with the windows' initial states.
@@ -279,11 +286,16 @@ class OutputError(Estimator[Simulator]):
         Args:
             simulator: The simulator, with initial states fitted for the estimate.
             estimate: Result of ``fit``, with exact derivatives.
+
+        Raises:
+            NotConvergedError: If the simulation after the step fails.
         """
         found = simulator.residuals(estimate.theta, with_slopes=True, with_starts=True)
         weights = self._weigh(found, frees=True)
         how = {key: getattr(estimate, key) for key in ("converged", "n_iter", "message")}
-        return self._estimate(simulator, weights, estimate.theta, how, found=found)
+        settled = self._estimate(simulator, weights, estimate.theta, how, found=found)
+        self._left(simulator, settled.theta)
+        return settled
 
     def moved(self, simulator: Simulator, other: Simulator, theta: Array) -> tuple[Array, Array]:
         """Return the first-order change of the estimate for other residuals, and standard errors.
@@ -301,7 +313,7 @@ class OutputError(Estimator[Simulator]):
         (H, g), (_, changed) = (
             self.normal(s, weights, theta, frees=True) for s in (simulator, other)
         )
-        free = theta > simulator.lowest
+        free = ~is_at_bound(simulator, theta)
         scale = 1.0 / np.sqrt(np.diag(H)[free])
         inverse = scipy.linalg.pinvh(H[np.ix_(free, free)] * np.outer(scale, scale))
         change, error = np.zeros_like(theta), np.zeros_like(theta)
@@ -348,7 +360,7 @@ class OutputError(Estimator[Simulator]):
             self.progress("fitting loops", step, self.steps, "steps")
             H, g = self.normal(simulator, weights, theta, frees=self.frees)
             while True:
-                trial = _bounded_step(H, g, theta, simulator.lowest, damping)
+                trial = _bounded_step(H, g, theta, simulator.bounds, damping)
                 left, new = found, np.inf
                 try:
                     left = self._left(simulator, trial)
@@ -396,7 +408,7 @@ class OutputError(Estimator[Simulator]):
         H, g = _summed(simulator, theta, parts)
         change = np.zeros_like(theta)
         if moves:
-            change = _bounded_step(H, g, theta, simulator.lowest, _NEARLY_FREE) - theta
+            change = _bounded_step(H, g, theta, simulator.bounds, _NEARLY_FREE) - theta
         known = 1.0 / simulator.prior_std**2
         scale = 1.0 / np.sqrt(np.diag(H))
         values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
@@ -420,7 +432,7 @@ class OutputError(Estimator[Simulator]):
             name for name, share in zip(simulator.names, gained, strict=True) if share < _LOST
         )
         theta = theta + change
-        is_low = theta <= simulator.lowest
+        at_bound = np.array(simulator.names)[is_at_bound(simulator, theta)]
         return Estimate(
             theta=theta,
             covariance=at_least(sandwich(bread, meat + np.diag(known)), independent),
@@ -435,7 +447,7 @@ class OutputError(Estimator[Simulator]):
                 "inflation": inflation * self.inflation,
                 "freedom": freedom,
                 "left": left,
-                "at_bound": tuple(np.array(simulator.names)[is_low].tolist()),
+                "at_bound": tuple(at_bound.tolist()),
             },
             **{**how, "converged": how["converged"] and left < 1.0},
         )
@@ -527,21 +539,34 @@ def _given(r: Residual) -> Array:
     return r.slopes
 
 
-def _bounded_step(H: Array, g: Array, theta: Array, lowest: Array, damping: float) -> Array:
-    """Return the parameters after a damped step, limited to their lower bounds."""
+def is_at_bound(simulator: Simulator, theta: Array) -> Array:
+    """Return which parameters are at a bound, shape (c,), bool.
+
+    Args:
+        simulator: The simulator.
+        theta: Parameters, shape (c,).
+    """
+    lowest, highest = simulator.bounds
+    at_bound: Array = (theta <= lowest) | (theta >= highest)
+    return at_bound
+
+
+def _bounded_step(H: Array, g: Array, theta: Array, bounds: Array, damping: float) -> Array:
+    """Return the parameters after a damped step, limited to their bounds."""
+    lowest, highest = bounds
     scale = 1.0 / np.sqrt(np.diag(H))
     H = H * np.outer(scale, scale) + damping * np.eye(len(H))  # its condition, not that of units
-    free = (theta > lowest) | (g > 0)
+    free = ((theta > lowest) | (g > 0)) & ((theta < highest) | (g < 0))
     trial = theta.copy()
     while free.any():
         step = scipy.linalg.solve(H[np.ix_(free, free)], (scale * g)[free], assume_a="pos")
         trial[free] = theta[free] + scale[free] * step
-        below = free & (trial < lowest)
-        if not below.any():
+        outside = free & ((trial < lowest) | (trial > highest))
+        if not outside.any():
             break
-        trial[below] = lowest[below]
-        g = g - H[:, below] @ ((lowest - theta) / scale)[below] / scale
-        free = free & ~below
+        trial[outside] = np.clip(trial, lowest, highest)[outside]
+        g = g - H[:, outside] @ ((trial - theta) / scale)[outside] / scale
+        free = free & ~outside
     return trial
 
 

@@ -544,8 +544,7 @@ def _positions(
     for joint, column in names.items():
         q = np.concatenate([columns[column] for columns in windows])[inside]
         q = q[np.isfinite(q)]
-        if joint in revolute and layout.units.angle == "deg":
-            q = np.deg2rad(q)
+        first, scale = layout.units.scale(joint, is_angle=joint in revolute)
         if len(q):
-            positions[joint] = q
+            positions[joint] = first + scale * q
     return positions

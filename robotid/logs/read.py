@@ -216,15 +216,13 @@ class LogLayout:
             kind: np.stack([table[name] if name else nothing for name in names], axis=1)
             for kind, names in self.columns.items()
         }
-        is_prismatic = np.isin(self.joints, self.prismatic)
         if "tau" in values:
             values["tau"] = values["tau"] * np.array(self.factors)
         for kind, is_motor in self.motors.items():
             if kind not in values:
                 continue
-            if self.units.angle == "deg" and kind not in TORQUES:
-                is_length = is_prismatic & ~np.array(is_motor)
-                values[kind] = values[kind] * np.where(is_length, 1.0, np.pi / 180)
+            if kind not in TORQUES:
+                values[kind] = self._to_si(kind, values[kind], is_motor)
             values[kind] = self._of_joints(kind, values[kind])
         t, where = self.stamps(values["time"][:, 0]), Path(self.path).name or "log"
         base, flags = base_of(values, self.base.twist), values.pop("contact", None)
@@ -245,6 +243,19 @@ class LogLayout:
             t=t, joints=self.joints, path=self.path, notes=self.notes, has_torque=has_torque,
             base=base, contacts=contacts, wrenches=wrenches, **arrays,
         )  # fmt: skip
+
+    def _to_si(self, kind: str, values: Array, is_motor: Sequence[bool]) -> Array:
+        """Return positions or their derivatives in rad or m and s."""
+        if self.units.angle != "deg" and not self.units.percent:
+            return values
+        is_angle = np.array(is_motor) | ~np.isin(self.joints, self.prismatic)
+        scales = [
+            self.units.scale(joint, is_angle=bool(own))
+            for joint, own in zip(self.joints, is_angle, strict=True)
+        ]
+        first, scale = np.array(scales).T
+        si: Array = first + scale * values if kind in ("q", "qref") else scale * values
+        return si
 
     def _of_joints(self, kind: str, values: Array) -> Array:
         """Return values of joints; those of motors are converted by their transmission."""

@@ -1,10 +1,20 @@
 """Settings of reading and filtering logs."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from robotid._settings import NOT_NEGATIVE, POSITIVE, Range, Settings, require_kind, setting
+from robotid._settings import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    Entries,
+    Range,
+    Settings,
+    is_number,
+    require_kind,
+    setting,
+)
 from robotid.exceptions import SettingsError
 
 __all__ = ["PER_SECOND", "BaseSource", "LogSource", "LogUnits", "SignalSettings"]
@@ -103,6 +113,34 @@ class LogUnits(Settings):
     angle: str | None = setting(
         None, "unit of q, dq and ddq of revolute joints", among=("rad", "deg")
     )
+    percent: Mapping[str, Sequence[float]] = setting(
+        {}, "joints logged from 0 to 100, such as grippers of LeRobot: the positions at 0 and at "
+        "100 by joint [rad or m], as { gripper = [-0.17, 1.75] }",
+        reads=Entries(dict, (list,)),
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_kind(self.percent, Mapping, "percent", "a table of two positions by joint")
+        for joint, ends in self.percent.items():
+            is_pair = isinstance(ends, Sequence) and len(ends) == 2 and all(map(is_number, ends))
+            if not is_pair or ends[0] == ends[1]:
+                raise SettingsError(
+                    f"units: percent of {joint} is {ends!r}, wanted two different numbers, the "
+                    "positions at 0 and at 100 [rad or m]"
+                )
+
+    def scale(self, joint: str, *, is_angle: bool) -> tuple[float, float]:
+        """Return a and b of a joint's positions a + b x [rad or m], x the number in the log.
+
+        Args:
+            joint: The joint.
+            is_angle: Whether its positions are angles.
+        """
+        if joint in self.percent:
+            first, last = self.percent[joint]
+            return float(first), (last - first) / 100
+        return 0.0, math.pi / 180 if is_angle and self.angle == "deg" else 1.0
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,7 @@ __all__ = [
     "TERM",
     "ZERO",
     "coded_term",
+    "last_step",
     "roll_out",
     "work_of",
 ]
@@ -157,6 +158,17 @@ def work_of(joints: int, columns: int, n_bristles: int) -> Work:
     return work_space(own + n_bristles * (5 + columns), _DOUBLINGS)
 
 
+def last_step(work: Work, joints: int) -> tuple[Array, Array]:
+    """Return the positions before the last step and its last correction of speeds, (n, LANES).
+
+    Args:
+        work: Work space after ``roll_out``.
+        joints: Number of joints n.
+    """
+    rows, q = work.numbers.reshape(-1, LANES), (joints + 1) * BODY
+    return rows[q : q + joints], rows[q + 6 * joints : q + 7 * joints]
+
+
 @compiled
 def _balance(work, n, at, drives, terms, step, command):
     """Write the residual G of a step's equation for the speeds u, and its derivative H.
@@ -232,8 +244,41 @@ def _presliding(work, n, at, terms, step):
 
 
 @compiled
-def _newton(work, n, at, drives, terms, step, command):
+def _solve(work, n, at, drives, terms, step, command):
     """Solve a step for its speeds u and leave the factor of H; return whether it converged.
+
+    Friction that falls with speed faster than the inertia of a step allows makes H indefinite and
+    several speeds possible. Steps without this fall then lead to the one next to the speed before.
+    """
+    if _newton(work, n, at, drives, terms, step, command, False):
+        return True
+    v, u = at[1], at[2]
+    for i in range(n):
+        for lane in range(LANES):
+            put(work, u + i, lane, get(work, v + i, lane))
+    _newton(work, n, at, drives, terms, step, command, True)
+    return _newton(work, n, at, drives, terms, step, command, False)
+
+
+@compiled
+def _add_fall(work, n, at, terms):
+    """Add to H the slopes of friction that falls with speed, so that it is positive definite."""
+    u, middle, H, loss = at[2], at[3], at[7], at[11]
+    codes, shapes, values, spans = terms
+    for i in range(n):
+        for k in range(spans[i, 0], spans[i, 1]):
+            if codes[k, 2] == LOADED:
+                continue
+            for lane in range(LANES):
+                speed, angle = get(work, u + i, lane), get(work, middle + i, lane)
+                _, y_u, _ = term(codes, shapes, k, angle, speed, direction(speed)[0], 0.0)
+                fall = max(-values[k] * y_u, 0.0) / get(work, loss + i, lane)
+                put(work, H + i * n + i, lane, get(work, H + i * n + i, lane) + fall)
+
+
+@compiled
+def _newton(work, n, at, drives, terms, step, command, is_cautious):
+    """Iterate Newton's method for ``_solve``, without falling friction in H if cautious.
 
     Friction is nonlinear at speed 0, so a Newton step that would cross it ends there.
     """
@@ -241,6 +286,8 @@ def _newton(work, n, at, drives, terms, step, command):
     for k in range(_NEWTON):
         share = 1.0 if k < _NEWTON // 4 else 0.5  # against cycles of several joints' friction
         _balance(work, n, at, drives, terms, step, command)
+        if is_cautious:
+            _add_fall(work, n, at, terms)
         factor(work, n, H)
         solve(work, n, H, G)
         is_found = True
@@ -562,11 +609,11 @@ def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, cor
         if held >= 0 and ticks[k].any():
             _hold(work, n, at, sensitivities, columns, drives, command[k], ticks[k])
         _centre(work, n, at, step, tree, bodies, zeros, v, a)
-        if not _newton(work, n, at, drives, terms, step, command[k]):
+        if not _solve(work, n, at, drives, terms, step, command[k]):
             return k
         if corrects:
             _centre(work, n, at, step, tree, bodies, zeros, u, a)
-            if not _newton(work, n, at, drives, terms, step, command[k]):
+            if not _solve(work, n, at, drives, terms, step, command[k]):
                 return k
         if bristles >= 0:
             _advance_bristles(work, n, at, terms, step)

@@ -19,13 +19,12 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import NotConvergedError, SettingsError
-from robotid.findings import listed
 from robotid.logs.data import Log
 from robotid.regressor.compiled import Tree, flatten, why_not
 from robotid.robot.drive_term import BRISTLES
 from robotid.robot.drives import Bristles, DriveTerm, MemorylessTerm
-from robotid.robot.mass_matrix import rigid_mass_matrices
 from robotid.robot.model import RobotModel
+from robotid.simulation.failures import why_no_solution
 
 if TYPE_CHECKING:
     from robotid.simulation.loop_lanes import Course
@@ -374,41 +373,21 @@ class ClosedLoopRobot:
         q, v = np.zeros((2, samples, n, lanes.LANES))
         S = np.zeros((samples, outputs * n, len(numbers), lanes.LANES))
         q[0], v[0] = course.start
+        work = lanes.work_of(n, len(numbers), int(has_state.sum()))
         failed = lanes.roll_out(
             part.tree, loops.zero[own], loops.bodies[part.bodies], drives,
             lanes.Terms(codes, shapes, loops.values[places], spans),
             lanes.Columns(columns, sums, along), course, lanes.Motion(q, v, S),
-            lanes.work_of(n, len(numbers), int(has_state.sum())), self.corrects,
+            work, self.corrects,
         )  # fmt: skip
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
-            raise NotConvergedError(
-                self._why_not(own, loops, windows[0].start[0]),
-                f"step {failed % len(course.steps) + 1} of {len(course.steps)}",
-            )
+            last = lanes.last_step(work, n) if failed >= 0 else None
+            at, lane, i, angles = _failed_at(failed // course.every, last, q, v)
+            window = windows[lane]
+            time = float(window.log.t[min(window.start_row + at, window.stop - 1)])
+            why = why_no_solution(self.model, loops, own, angles, i, self.step)
+            raise NotConvergedError(why, f"{window.log.name} at {time:.4g} s")
         return numbers, q, v, S
-
-    def _why_not(self, joints: Array, loops: Loops, q: Array) -> str:
-        """Return why a part with these joints and the initial position q has no roll-out."""
-        names = listed(self.model.joints[j] for j in joints)
-        if loops.rate is None:
-            return (
-                f"the simulation of {names} has no solution: a friction parameter is negative, or "
-                f"the gains are too high for steps of {self.step:g} s"
-            )
-        pi = self.model.standard_parameters()
-        pi[: self.model.layout.n_inertial] = loops.bodies.reshape(-1)
-        bodies = self.model.with_parameters(pi)
-        (M,) = rigid_mass_matrices(bodies, bodies.configurations((q + loops.zero)[None]))
-        M = (M + np.diag(loops.armature))[np.ix_(joints, joints)]
-        kp, kd = loops.kp[joints], loops.kd[joints]
-        least = 0.5 * np.linalg.eigvals(np.linalg.solve(M, np.diag(kd))).real.max()
-        least = max([least, *(0.5 * kp[kd > 0] / kd[kd > 0])])
-        return (
-            f"the simulation of {names} is unstable: the controller's rate of {loops.rate:g} Hz is "
-            f"too low. Gains kp {listed(f'{x:.3g}' for x in kp)} and kd "
-            f"{listed(f'{x:.3g}' for x in kd)} need about {least:.3g} Hz with these inertias. "
-            "State the sampling rate of the drives' controllers in [controller], or leave it out"
-        )
 
     def _course(self, part: _Part, windows: Sequence[Window], loops: Loops) -> "Course":
         """Return the commands of a part's joints in a block of windows."""
@@ -505,6 +484,28 @@ def _parts(tree: Tree) -> list[_Part]:
         bodies = np.flatnonzero(np.array(root) == r)
         parts.append(_Part(tree.leaders[bodies], bodies, tree.part(bodies)))
     return parts
+
+
+def _failed_at(
+    row: int, last: tuple[Array, Array] | None, q: Array, v: Array
+) -> tuple[int, int, int, Array]:
+    """Return row, lane and joint of a failed roll-out, and the positions in this lane, shape (n,).
+
+    Args:
+        row: Row of the step without a solution.
+        last: Positions before this step and the last correction of speeds; None if every step has
+            one, but speeds are too large.
+        q: Positions, shape (N, n, LANES).
+        v: Speeds, shape (N, n, LANES).
+    """
+    if last is None:
+        is_fast = ~(np.abs(v) < _FASTEST)
+        row, i, lane = (int(k) for k in np.unravel_index(np.argmax(is_fast), v.shape))
+        return row, lane, i, q[max(row - 1, 0), :, lane]
+    before, change = last
+    size = np.where(np.isfinite(change), np.abs(change), np.inf)
+    i, lane = (int(k) for k in np.unravel_index(np.argmax(size), size.shape))
+    return row, lane, i, before[:, lane]
 
 
 def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:

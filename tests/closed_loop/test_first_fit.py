@@ -8,6 +8,7 @@ import pytest
 
 from robotid.closed_loop import fit
 from robotid.closed_loop.settings import LoopSettings
+from robotid.exceptions import NotConvergedError
 
 
 class DataRange(Exception):
@@ -46,3 +47,16 @@ def test_the_first_fit_is_of_drives_alone_with_the_bodies_of_the_urdf(monkeypatc
     first, rounds = caught.value.args
     assert [unknown.name for unknown in first.free_parameters] == ["kp", "coulomb"]
     assert (first.windows, rounds) == (("first", "third"), 1)
+
+
+def test_where_a_settling_step_cannot_be_simulated_the_parameters_are_fitted():
+    class Unsteady:
+        def settle(self, simulator, estimate):
+            raise NotConvergedError("no solution", "step 1")
+
+        def fit(self, simulator, theta):
+            return "fitted", simulator, theta
+
+    simulator = SimpleNamespace(exact=None, with_better_start=lambda theta: ("from", theta))
+    found = fit._settled(simulator, Unsteady(), SimpleNamespace(theta="first"))
+    assert found == (("from", "first"), ("fitted", ("from", "first"), "first"))

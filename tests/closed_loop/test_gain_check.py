@@ -44,7 +44,7 @@ def test_scales_are_one_step_of_gains_beside_all_that_was_found(tmp_path, rng):
     found = identified_crane(tmp_path)
     simulator, c, n = found.fit.simulator, len(found.estimate.theta), 2
     theta = found.estimate.theta.copy()
-    theta[3] = simulator.lowest[3]  # at its bound, which no step moves
+    theta[3] = simulator.bounds[0, 3]  # at its bound, which no step moves
     A = rng.standard_normal((40, c + 2 * n))
     H, g = A.T @ A, rng.standard_normal(c + 2 * n)
     asked = []

@@ -77,11 +77,34 @@ def test_what_the_data_hardly_shrink_is_undetermined(found):
     other = of(found, covariance=np.diag((share * spread) ** 2))
     np.testing.assert_allclose(other.shrunk, share)
     assert other.undetermined == ("turn.armature", "rail.viscous")
+    said = [f.message for f in loop_findings(other, ()) if f.code == "undetermined"]
+    first, second, *others = other.fit.simulator.free_parameters
+    gain = (first, replace(second, name="turn.kp"), *others)
+    simulator = replace(other.fit.simulator, free_parameters=gain)
+    estimate = replace(other.estimate, names=tuple(free.name for free in gain))
+    gain = replace(other, fit=replace(other.fit, simulator=simulator, estimate=estimate))
+    said += [f.message for f in loop_findings(gain, ()) if f.code == "undetermined"]
+    assert ["groups of joints with equal drives" in words for words in said] == [False, True]
     simulator = found.fit.simulator
     body = replace(simulator.free_parameters[1], what="body")
     free_parameters = (simulator.free_parameters[0], body, *simulator.free_parameters[2:])
     fit = replace(other.fit, simulator=replace(simulator, free_parameters=free_parameters))
     assert replace(other, fit=fit).undetermined == ("rail.viscous",), "bodies have a prior"
+
+
+def test_a_parameter_at_its_upper_bound_is_told_from_one_at_0(found):
+    simulator, theta = found.fit.simulator, found.estimate.theta.copy()
+    first, second, *others = simulator.free_parameters
+    theta[:2] = 0.5, 0.0
+    wide = replace(simulator, free_parameters=(replace(first, highest=0.5), second, *others))
+    details = {**found.estimate.details, "at_bound": NAMES[:2]}
+    estimate = replace(found.estimate, theta=theta, details=details)
+    bound = replace(found, fit=replace(found.fit, simulator=wide, estimate=estimate))
+    above, below = [f for f in loop_findings(bound, ()) if f.code == "at_bound"]
+    assert above.where == f"{NAMES[0]} = 0.5"
+    assert "the estimate is the upper bound; with more, the gear is self-locking" in above.message
+    assert below.where == NAMES[1]
+    assert below.message.startswith(f"{NAMES[1]}: the estimate is 0, the lower bound")
 
 
 def test_two_sets_that_a_third_pair_joins_are_one(found):

@@ -9,6 +9,7 @@ from helpers.crane import identified_crane
 from robotid.closed_loop import term_choice
 from robotid.closed_loop.term_choice import _Fold, _folds, _gains, candidates
 from robotid.estimators.output_error import OutputError, linearised
+from robotid.robot.drives import LoadFriction
 
 
 def test_gains_are_those_of_fits_to_the_other_folds(rng):
@@ -78,5 +79,7 @@ def test_terms_are_offered_in_the_size_of_motion_and_torque():
         term = found[f"wide.coulomb_q{order}"].term
         assert (term.order, term.centre) == (order, pytest.approx(0.2, abs=1e-3))
         assert term.data_range == pytest.approx((-0.3, 0.7), abs=1e-3)
-    lowest = {name: u.lowest for name, u in found.items()}
-    assert lowest == {n: 0.0 if n.endswith("load") else -np.inf for n in found}
+    bounds = {name: (u.lowest, u.highest) for name, u in found.items()}
+    free, load = (-np.inf, np.inf), (0.0, LoadFriction.highest)
+    assert bounds == {n: load if n.endswith("load") else free for n in found}
+    assert load[1] < 1.0, "a gear that loses its whole load has no unique motion"

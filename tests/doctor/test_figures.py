@@ -235,6 +235,23 @@ def test_quantised_channels_are_reported_with_each_joint_s_own_steps():
     assert unused.severity == "note"
 
 
+def test_steps_say_what_is_to_be_done_about_them():
+    t, step = np.arange(2000) / 100, 2 * np.pi / 4096
+    log = SimpleNamespace(name="run.csv", joints=("a",))
+
+    def said(kind, size, h, velocity="auto"):
+        x = (np.round(size * np.sin(2 * t) / h) * h)[:, None]
+        (finding,) = channels._quantisation(log, kind, x, velocity)
+        return finding.message.partition("over its range; ")[2]
+
+    encoder = "the step is that of an encoder of 12 bits, not of the digits"
+    assert said("q", 0.06, step) == f"{encoder}: record a larger motion, of 100 steps or more"
+    assert said("q", 0.6, step) == f"{encoder}, and small in the motion; no action needed"
+    assert said("q", 2.0, 0.01) == "log more digits"
+    assert "No action needed: velocity = 'auto' differentiates" in said("dq", 1.0, 50 * step)
+    assert said("dq", 1.0, 50 * step, "measured").endswith("set velocity = 'differentiated'")
+
+
 @pytest.mark.parametrize("stated", [0.0, 0.004])
 def test_the_error_of_a_delay_is_of_the_joints_that_have_one(monkeypatch, stated):
     lags = np.array([0.011, 0.0, 0.014, 0.0125])

@@ -9,11 +9,13 @@ from helpers.synthetic import exact_log, truth
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import examine
+from robotid.doctor.locked_joints import percent_hint
 from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import LogUnits
 from robotid.robot.drives import DRIVE_TERMS
 from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
 
 HELD = "wrist_3_joint"
 
@@ -119,3 +121,40 @@ def test_held_joints_are_checked_in_logs_read_in_pieces_too(job, tmp_path, monke
 def test_degrees_of_the_log_are_degrees_here(job):
     (finding,) = found(job(0.7, units=LogUnits(angle="deg")))
     assert finding.evidence["median"] == pytest.approx(np.deg2rad(0.7))
+
+
+def hint(position, name="gripper", **units):
+    model = RobotModel.from_urdf(example_urdf("so101.urdf"))
+    return percent_hint(model, name, position, LogUnits(**units))
+
+
+def test_a_gripper_that_may_be_logged_in_percent_has_the_setting_and_the_position_named():
+    words = hint(np.deg2rad(35.0), angle="deg")
+    assert words.startswith(". If 35, the number in the log, is a percentage, as of LeRobot's gri")
+    assert "state percent = { gripper = [-0.1745, 1.745] } in [units]" in words
+    assert words.endswith(f"it then is at {-0.174533 + 0.35 * (1.74533 + 0.174533):.4g} rad")
+    assert hint(35.0).startswith(". If 35, the number in the log"), "in radians it is far"
+    for position, others in (
+        (0.3, {}), (np.deg2rad(105.0), {"angle": "deg"}), (-np.deg2rad(35.0), {"angle": "deg"}),
+        (np.deg2rad(35.0), {"angle": "deg", "percent": {"gripper": [0.0, 1.0]}}),
+        (np.deg2rad(35.0), {"angle": "deg", "name": "wrist_roll"}),
+    ):  # fmt: skip
+        assert hint(position, **others) == ""
+
+
+def test_a_locked_gripper_in_percent_is_named_and_read(job, tmp_path):
+    (degrees,) = found(job(0.7, units=LogUnits(angle="deg")))
+    assert "percentage" not in degrees.message, "0.7 may be degrees"
+    log = read_log(tmp_path / "run.csv", (*job(0.7).model().joints, HELD))
+    q = np.degrees(log.q)
+    q[:, -1] = 20.0
+    write_log(replace(log, q=q, v=None), tmp_path / "run.csv")
+    in_degrees = replace(job(0.7), units=LogUnits(angle="deg"))
+    write_log(replace(log, q=q, v=None), tmp_path / "run.csv")
+    (finding,) = found(in_degrees)
+    assert "If 20, the number in the log, is a percentage" in finding.message
+    stated = LogUnits(angle="deg", percent={HELD: [0.5, 1.5]})
+    assert found(replace(in_degrees, units=stated)) == [], "at 0.7 rad"
+    noted = replace(in_degrees, locked={}, estimator=EstimatorSettings("wls"))
+    [note] = [f for f in examine(noted) if f.code == "locked_as_logged"]
+    assert "If 20, the number in the log, is a percentage" in note.message

@@ -21,7 +21,7 @@ class Lagging:
     measured: np.ndarray  # likewise
     prior: np.ndarray
     prior_std: np.ndarray
-    lowest: np.ndarray
+    bounds: np.ndarray
     further: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))  # rows A theta = b
     names: tuple[str, ...] = ("gain", "time", "offset")
 
@@ -55,7 +55,7 @@ class Lagging:
 
 def lagging(rng, *, rho=RHO, sigma=SIGMA, windows=24, samples=120, **changes):
     told = np.repeat(rng.standard_normal((windows, samples // 10)), 10, axis=1)
-    exact = Lagging(told, told, np.zeros(3), np.full(3, np.inf), np.full(3, -np.inf))
+    exact = Lagging(told, told, np.zeros(3), np.full(3, np.inf), UNBOUNDED)
     white = sigma * rng.standard_normal(told.shape)
     white[:, 0] /= np.sqrt(1.0 - rho**2)
     noise = lfilter([1.0], [1.0, -rho], white, axis=1)
@@ -63,6 +63,7 @@ def lagging(rng, *, rho=RHO, sigma=SIGMA, windows=24, samples=120, **changes):
 
 
 START = np.array([1.0, 0.2, 0.0])
+UNBOUNDED = np.outer([-1.0, 1.0], np.full(3, np.inf))
 
 
 def test_the_slopes_of_the_lag_are_those_of_differences(rng):
@@ -199,12 +200,13 @@ def test_correlated_noise_does_not_make_plain_squares_sure(rng):
     assert found.details["inflation"] > 2
 
 
-def test_a_bound_holds_and_is_named(rng):
-    lag = lagging(rng, lowest=np.array([2.0, 0.0, -np.inf]))
+@pytest.mark.parametrize("bounds", [(2.0, np.inf), (-np.inf, 1.2)])
+def test_a_bound_holds_and_is_named(rng, bounds):
+    lag = lagging(rng, bounds=np.array([bounds, (0.0, np.inf), (-np.inf, np.inf)]).T)
     found = OutputError().fit(lag, START)
-    assert found.theta[0] == 2.0
+    assert found.theta[0] in bounds
     assert found.details["at_bound"] == ("gain",)
-    fixed = lag.measured - lag.simulated(np.array([2.0, found.theta[1], found.theta[2]]))
+    fixed = lag.measured - lag.simulated(found.theta)
     nearby = [lag.simulated(found.theta + np.array([0.0, d, 0.0])) for d in (-0.02, 0.02)]
     whitened = [np.sum(np.diff(lag.measured - s, axis=1) ** 2) for s in nearby]
     assert np.sum(np.diff(fixed, axis=1) ** 2) < min(whitened), "the others are at their best"
@@ -317,10 +319,21 @@ def test_a_step_of_parameters_and_starts_together_settles_what_held_starts_bind(
     near = OutputError().settle(simulator, exact)
     np.testing.assert_allclose(settled.std_error, near.std_error, rtol=0.02)
     assert (settled.n_iter, settled.message) == (held.n_iter, held.message)
-    low = replace(simulator, lowest=np.array([-np.inf, -np.inf, 0.2]))
+    low = replace(simulator, bounds=np.array([[-np.inf, -np.inf, 0.2], np.full(3, np.inf)]))
     settled = OutputError().settle(low, replace(held, theta=np.array([1.5, 0.3, 0.2001])))
     assert settled.theta[2] == 0.2
     assert settled.details["at_bound"] == ("offset",)
+
+
+def test_a_step_to_parameters_that_cannot_be_simulated_is_not_taken(rng):
+    simulator = Started(**vars(lagging(rng)))
+    near, far = np.array([1.4, 0.31, 0.1]), np.array([1.5, 1.5, 0.1])  # and then below 0 s
+    moved = OutputError().joint_step(simulator, near)
+    assert np.abs(moved - near).max() > 1e-3
+    np.testing.assert_array_equal(OutputError().joint_step(simulator, far), far)
+    held = OutputError().fit(simulator, START)
+    with pytest.raises(NotConvergedError, match="a lag needs"):
+        OutputError().settle(simulator, replace(held, theta=far))
 
 
 @pytest.mark.parametrize("spread", [np.inf, 0.01])
@@ -371,7 +384,7 @@ def test_other_residuals_move_an_estimate_by_its_normal_equations(rng):
     theta, std = np.array([1.4, 0.32, 0.1]), np.array([2.0, 0.1, 0.3])
     known = {"prior": np.array([1.3, 0.4, 0.0]), "prior_std": std}
     known["further"] = np.array([[3.0, -5.0, 1.0, 0.5]])
-    known["lowest"] = np.array([-np.inf, 0.0, 0.1])  # at which the offset is
+    known["bounds"] = np.array([[-np.inf, 0.0, 0.1], np.full(3, np.inf)])  # the offset is at one
     simulators = [Started(**{**vars(lag), **known}) for lag in (one, other)]
     change, error = OutputError(inflation=3.0).moved(*simulators, theta)
     e = [lag.measured - one.simulated(theta) for lag in (one, other)]
@@ -476,11 +489,16 @@ def test_a_step_stops_at_bounds_and_the_others_go_as_far_as_is_best_then(rng):
     left = g[others] - H[np.ix_(others, moved)] @ (lowest - theta)[moved]
     wanted = lowest.copy()
     wanted[others] = theta[others] + np.linalg.solve(damped[np.ix_(others, others)], left)
-    found = output_error._bounded_step(H, g, theta, lowest, damping)
-    np.testing.assert_allclose(found, wanted, rtol=1e-9)
-    # at its bound, a parameter that would go below it stays
+    infinite = np.full(5, np.inf)
+    below, above = np.array([lowest, infinite]), np.array([-infinite, -lowest])
+    for sign, bounds in ((1, below), (-1, above)):
+        found = output_error._bounded_step(H, sign * g, sign * theta, bounds, damping)
+        np.testing.assert_allclose(found, sign * wanted, rtol=1e-9)
+    # at its bound, a parameter that would go beyond it stays
     theta[0] = 0.5
-    assert output_error._bounded_step(H, g, theta, lowest, damping)[0] == 0.5
+    for sign, bounds in ((1, below), (-1, above)):
+        found = output_error._bounded_step(H, sign * g, sign * theta, bounds, damping)
+        assert found[0] == sign * 0.5
 
 
 def test_windows_are_cut_into_segments_by_their_rows_or_each_alike(rng):

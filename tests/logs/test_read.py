@@ -344,6 +344,23 @@ def test_stated_units_become_si(run):
         np.testing.assert_array_equal(getattr(log, name)[:, 1], getattr(truth, name)[100:201, 1])
 
 
+def test_percentages_become_positions_between_their_ends(run):
+    truth = make_log()
+    share = (truth.q[:, 1] + 0.5) / 2.5  # from -0.5 to 2 rad
+    table = {"q_elbow": 100 * share, "dq_elbow": truth.v[:, 1] / 0.025}
+    units = LogUnits(angle="deg", percent={"elbow": [-0.5, 2.0], "another": [0, 1]})
+    table |= {"q_shoulder": np.degrees(truth.q[:, 0]), "dq_shoulder": np.degrees(truth.v[:, 0])}
+    log = read_log(run(make_table(**table)), JOINTS[:2], units=units)
+    np.testing.assert_allclose(log.q, truth.q[:, :2], atol=1e-12)
+    np.testing.assert_allclose(log.v, truth.v[:, :2], atol=1e-12)
+
+
+@pytest.mark.parametrize("ends", [[0.1], [0.3, 0.3], ["a", 1.0], 5.0, [0.0, np.inf]])
+def test_a_percentage_needs_two_different_ends(ends):
+    with pytest.raises(SettingsError, match=r"percent of jaw is .* wanted two different"):
+        LogUnits(percent={"jaw": ends})
+
+
 def test_joints_that_slide_may_go_far(run):
     path = run(make_table(q_elbow=make_log().q[:, 1] * 20))
     assert np.abs(read_log(path, JOINTS, prismatic=["elbow"]).q).max() > 19

@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -36,6 +37,7 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 from robotid.simulation.course_lanes import divide_rows
+from robotid.simulation.failures import why_no_solution
 from robotid.simulation.loops import ClosedLoopRobot, Loops, Window, cut_windows
 
 RATE = 500.0  # [Hz]
@@ -526,12 +528,54 @@ def test_a_late_torque_has_no_place_and_is_told_why(planar):
         rolled(planar, loops, commanded(planar))
 
 
-def test_friction_below_0_has_no_solution(legs):
-    loops = loops_of(legs, PLAIN, (0.1, -5.0, 0.0))
-    with pytest.raises(
-        NotConvergedError, match=r"FL_hip_joint.*no solution: a friction parameter is neg"
-    ):
-        rolled(legs, loops, commanded(legs))
+@pytest.mark.parametrize(
+    ("term", "value", "words"),
+    [
+        (Coulomb(), -5.0, r"simulation of FL_hip_joint .*joint.coulomb is -5, wanted 0 or more"),
+        (LoadFriction(), 1.4, r"FL_hip_joint.load is 1.4, wanted at most 0.5. Set other friction"),
+        (
+            PositionCoulomb(order=1, centre=0.9), 3.0,
+            r"FL_hip_joint .* its Coulomb friction is -3.11 N m at -0.136 rad, wanted 0 or more",
+        ),
+    ],
+)  # fmt: skip
+def test_friction_without_a_solution_is_named_with_joint_value_and_time(legs, term, value, words):
+    loops, log = loops_of(legs, (Viscous(), term), (0.1, value)), commanded(legs)
+    with pytest.raises(NotConvergedError, match=words) as caught:
+        ClosedLoopRobot(legs).roll_out(loops, [Window(log, 40, 40, len(log.t))])
+    name, time = re.fullmatch(r"(\S+) at (\S+) s", caught.value.status).groups()
+    assert name == log.name
+    assert log.t[40] <= float(time) < log.t[50], "of the log, not of the window"
+
+
+def test_of_a_simulation_without_another_reason_gain_and_inertia_are_named(planar):
+    loops = loops_of(planar, kp=1e9)
+    words = why_no_solution(planar, loops, np.array([0, 1]), np.zeros(2), 1, 2e-3)
+    assert re.search(
+        r"of joint_2 has no solution in steps of 0.002 s: its gain kp is 1e\+09", words
+    )
+    inertia, most = (
+        float(x) for x in re.findall(r"inertia (\S+), wanted kp below (\S+)", words)[0]
+    )
+    assert most == pytest.approx(inertia / 2e-3**2, rel=1e-2)
+    assert inertia > loops.armature[1]
+
+
+def test_friction_that_falls_faster_than_inertia_allows_slips_as_in_small_steps(tmp_path):
+    """A light joint under a slow ramp sticks and slips: in one step many speeds are possible."""
+    model, t = slider(tmp_path), np.arange(200) / RATE
+    ramp = 0.05 * t[:, None]
+    log = Log(t, 0 * ramp, 0 * ramp, ("j",), q_ref=ramp, has_torque=False)
+    loops = loops_of(
+        model, (Viscous(), Coulomb(), Stribeck(speed=0.03)), (0.5, 0.05, 0.3), zero=np.zeros(1),
+        armature=np.zeros(1), kd=np.zeros(1), kp=50.0,
+    )  # fmt: skip
+    light = replace(loops, bodies=1e-3 * loops.bodies)
+    coarse, fine = (rolled(model, light, log, step=step).q[:, 0] for step in (2e-3, 1e-5))
+    slips = [int(np.argmax(np.diff(q) * RATE > 0.1)) for q in (coarse, fine)]
+    assert slips[1] > 50, "it sticks, and then slips"
+    assert abs(slips[0] - slips[1]) <= 1
+    assert np.sqrt(np.mean((coarse - fine) ** 2)) < 0.15 * np.ptp(fine)
 
 
 def test_the_longest_steps_of_a_row_are_divided_further():
