@@ -215,7 +215,7 @@ class Job(Settings):
         "links that may touch the ground: frame, the link; kind, point or surface; measured, "
         "components of the wrench that logs have as wrench_fz_<link>, of fx to mz, the others are "
         "unknown; always, whether it always touches the ground, else logs have contact_<link>, 1 "
-        "or 0",
+        "or 0; radius of a ball-shaped foot, below whose frame the ground is [m]",
         at="contact",
         reads=[
             {
@@ -223,6 +223,7 @@ class Job(Settings):
                 "kind": (str,),
                 "measured": Entries(list, (str,)),
                 "always": (bool,),
+                "radius": (int, float),
             }
         ],
         load=_load_contacts,

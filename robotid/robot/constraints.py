@@ -21,18 +21,22 @@ class Contact:
     """A link that touches the ground.
 
     Attributes:
-        frame: The link, whose frame is at the point or on the surface of contact.
+        frame: The link, whose frame is at the point or on the surface of contact; the centre of the
+            foot if it has a radius.
         kind: "point", which transmits a force, or "surface", which also transmits a moment.
         measured: Components of the wrench of the ground on the link that are measured, of fx, fy,
             fz, mx, my, mz with the axes of the world and the origin of the link. The others are
             unknown.
         always: Whether it touches the ground at all samples; else logs state when.
+        radius: Of a ball that rolls on level ground: the force of the ground acts this far below
+            the frame [m].
     """
 
     frame: str
     kind: str = "point"
     measured: tuple[str, ...] = ()
     always: bool = False
+    radius: float = 0.0
 
     sizes: ClassVar[dict[str, int]] = {"point": 3, "surface": 6}
     components: ClassVar[tuple[str, ...]] = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -47,6 +51,12 @@ class Contact:
                     f"some of {listed(known)}, each once"
                 )
         require_flag(self.always, "always")
+        require_kind(self.radius, (int, float), "radius of a contact", "a length [m]")
+        if not 0.0 <= self.radius < np.inf or (self.radius > 0.0 and self.kind != "point"):
+            raise SettingsError(
+                f"radius of the {self.kind} contact {self.frame!r} is {self.radius:g}, wanted a "
+                "positive length [m] of a point contact, or 0"
+            )
 
     @property
     def rows_measured(self) -> list[int]:
@@ -70,7 +80,10 @@ class Contact:
             jacobians: Jacobian of the frame with the axes of the world, shape (6, nv).
             rotation: Not used.
         """
-        return jacobians[0][: self.sizes[self.kind]]
+        J = jacobians[0][: self.sizes[self.kind]].copy()
+        J[0] -= self.radius * jacobians[0][4]  # v + w x (0, 0, -radius)
+        J[1] += self.radius * jacobians[0][3]
+        return J
 
 
 @dataclass(frozen=True)
