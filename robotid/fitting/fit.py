@@ -171,8 +171,9 @@ class Solved:
         ground, choice, fit, estimate = self.ground, self.choice, self.in_cone, self.estimate
         factors, rough, mapping = ground.factors, ground.rough, ground.recordings.mapping
         segments, share, K = ground.segments, ground.before.share, mapping.K
-        more = None if ground.noise is None else ground.noise.meat
-        of_wls = more if self.weighing != "alike" else None  # found with the weights of WLS
+        more = of_wls = ground.more(rough.sigma)
+        if ground.noise is not None and self.weighing == "alike":
+            of_wls = None  # found with the weights of WLS
         wls, errors = measured_errors(rough, segments, factors, share, K, rough.sigma, more=of_wls)
         if self.weighing == "by step" and fit is None:
             estimate = with_wls_errors(estimate, wls)
@@ -180,6 +181,7 @@ class Solved:
             sigma = np.ones_like(rough.sigma) if self.weighing == "alike" else rough.sigma
             if estimate.names == mapping.names:
                 sigma = estimate.sigma
+            more = ground.more(sigma)
             redraws, ratio = None, 1.0  # without bounds
             if fit is not None and isinstance(choice, BoundedSettings):
                 redraws = Redraws(fit, choice.draws, np.random.default_rng(0))
@@ -253,6 +255,13 @@ class _Ground:
     def factors(self) -> Factors:
         """The factors of all fitted rows."""
         return self.whole.factors
+
+    def more(self, sigma: Array) -> Array | None:
+        """Return the covariance of the score in addition to the scatter, (b, b); None: 0."""
+        root = self.recordings.contacts
+        if root is not None:  # rows without constraint forces have one noise level
+            return np.asarray(root @ root.T / sigma[-1] ** 4)
+        return None if self.noise is None else self.noise.meat
 
     @cached_property
     def determination(self) -> Determination:

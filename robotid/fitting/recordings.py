@@ -39,6 +39,7 @@ class Recordings:
         plan: Processes that work on the pieces of logs in files; None: this process.
         checkpoint: Storage of the reductions until the run is complete.
         weights: Weights of the rows of each log to fit, shapes (N, n_rows); 1 if None.
+        contacts: Root C of the covariance C C^T of W^T tau due to points of contact, shape (b, k).
     """
 
     model: RobotModel
@@ -48,6 +49,7 @@ class Recordings:
     plan: WorkPlan | None = None
     checkpoint: Checkpoint | None = None
     weights: tuple[Array, ...] | None = None
+    contacts: Array | None = None
 
     @property
     def is_in_memory(self) -> bool:

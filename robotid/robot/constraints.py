@@ -30,6 +30,8 @@ class Contact:
         always: Whether it touches the ground at all samples; else logs state when.
         radius: Of a ball that rolls on level ground: the force of the ground acts this far below
             the frame [m].
+        uncertainty: Standard deviation of the point of contact, along each axis [m]; None: it is
+            estimated from the logs. It is an error of the intervals.
     """
 
     frame: str
@@ -37,6 +39,7 @@ class Contact:
     measured: tuple[str, ...] = ()
     always: bool = False
     radius: float = 0.0
+    uncertainty: float | None = None
 
     sizes: ClassVar[dict[str, int]] = {"point": 3, "surface": 6}
     components: ClassVar[tuple[str, ...]] = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -56,6 +59,13 @@ class Contact:
             raise SettingsError(
                 f"radius of the {self.kind} contact {self.frame!r} is {self.radius:g}, wanted a "
                 "positive length [m] of a point contact, or 0"
+            )
+        length = 0.0 if self.uncertainty is None else self.uncertainty
+        require_kind(length, (int, float), "uncertainty of a contact", "a length [m]")
+        if not 0.0 <= length < np.inf:
+            raise SettingsError(
+                f"uncertainty of the contact {self.frame!r} is {length:g}, wanted a length [m], at "
+                "least 0"
             )
 
     @property

@@ -115,6 +115,9 @@ def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_p
     masses = result.standard[: result.model.layout.n_inertial : 10]
     assert masses.sum() == pytest.approx(2.501, rel=0.006)
     assert masses[0] == pytest.approx(1.251, rel=0.05)  # the trunk
+    truth = result.mapping.K @ result.model.standard_parameters()  # the simulator used this URDF
+    covered = np.abs(result.base - truth) < result.errors.quantile * result.base_error
+    assert covered.mean() > 0.88  # 0.4 without the errors of the points of contact
     assert result.verdict.status == "good"
 
 
