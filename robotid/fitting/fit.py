@@ -258,9 +258,9 @@ class _Ground:
 
     def more(self, sigma: Array) -> Array | None:
         """Return the covariance of the score in addition to the scatter, (b, b); None: 0."""
-        root = self.recordings.contacts
-        if root is not None:  # rows without constraint forces have one noise level
-            return np.asarray(root @ root.T / sigma[-1] ** 4)
+        if (contacts := self.recordings.contacts) is not None:
+            # rows without constraint forces have one noise level
+            return np.asarray(contacts.root @ contacts.root.T / sigma[-1] ** 4)
         return None if self.noise is None else self.noise.meat
 
     @cached_property
@@ -285,7 +285,9 @@ def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool)
     spread = prior_spread(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
     held_out = segments or (factors,)
-    before = Known(model, mapping, prior, spread, share, rough.sigma, held_out)
+    contacts = recordings.contacts
+    repeated = 0.0 if contacts is None else contacts.variance / rough.sigma[-1] ** 2
+    before = Known(model, mapping, prior, spread, share, rough.sigma, held_out, repeated)
     pinned = model.layout.owned_by(choice.bounds.pinned)
     return _Ground(recordings, reduction, before, segments, rough, pinned, understated**2)
 

@@ -22,7 +22,7 @@ import scipy.linalg
 
 from robotid._typing import Array
 from robotid.estimators import WLS
-from robotid.fitting.recordings import Recordings
+from robotid.fitting.recordings import ContactErrors, Recordings
 from robotid.fitting.survey import Rows
 from robotid.regressor.constraints import constraint_forces, contact_links, without_forces
 from robotid.regressor.factors import join, triangle_of
@@ -80,7 +80,10 @@ def with_contact_errors(recordings: Recordings) -> Recordings:
         s = estimated_uncertainty(total.R, L, mean, recordings.share, count)
         stated = [s if own is None else own for own in stated]
     cross = total.R[:b, :b].T @ total.R[:b, b:-1]  # -W^T D
-    return replace(recordings, contacts=cross * np.repeat(np.array(stated, dtype=float), 3))
+    sizes = np.repeat(np.array(stated, dtype=float), 3)
+    rest = total.R[b:-1, b:-1] * sizes  # of D, what W cannot explain
+    errors = ContactErrors(cross * sizes, float(np.sum(rest**2)) / int(whole.factors.rows.sum()))
+    return replace(recordings, contacts=errors)
 
 
 def estimated_uncertainty(R: Array, L: Array, mean: Array, share: float, rows: int) -> float:

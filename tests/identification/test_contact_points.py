@@ -96,15 +96,17 @@ def test_the_size_of_offsets_is_found(rng):
 
 
 def test_the_covariance_of_the_score_is_that_of_the_stated_uncertainty(log):
-    def root(uncertainty):
+    def errors(uncertainty):
         model = robot(uncertainty)
         found = with_contact_errors(
             Recordings(model, structural_mapping(model), (hold_log(model, log, RAW),))
         )
         return found.contacts
 
-    once, twice = root(1e-3), root(2e-3)
-    assert once.shape[1] == 6
-    np.testing.assert_allclose(twice, 2.0 * once)
-    assert root(0.0) is None
-    assert 0.0 < np.abs(root(None)).max() < np.inf
+    once, twice = errors(1e-3), errors(2e-3)
+    assert once.root.shape[1] == 6
+    np.testing.assert_allclose(twice.root, 2.0 * once.root)
+    assert twice.variance == pytest.approx(4.0 * once.variance)
+    assert once.variance > 0.0
+    assert errors(0.0) is None
+    assert 0.0 < np.abs(errors(None).root).max() < np.inf
