@@ -191,6 +191,9 @@ class Solved:
                 estimate, segments, factors, share, K, sigma,
                 is_filter=is_filter, weight_ratio=ratio, redraws=redraws, more=more,
             )  # fmt: skip
+        if (contacts := ground.recordings.contacts) is not None:
+            known = f"{errors.method}; points of contact uncertain by {contacts.uncertainty:.2g} m"
+            errors = replace(errors, method=known)
         if ground.grown != 1.0:
             estimate = replace(estimate, covariance=ground.grown * estimate.covariance)
             wls = replace(wls, covariance=ground.grown * wls.covariance)

@@ -33,6 +33,7 @@ class ContactErrors:
 
     root: Array  # (b, k), C of the covariance C C^T of W^T tau
     variance: float  # of a row's residual, on average [(N m)^2]
+    uncertainty: float  # of the points, largest standard deviation [m]
 
 
 @dataclass(frozen=True, eq=False)

@@ -82,7 +82,8 @@ def with_contact_errors(recordings: Recordings) -> Recordings:
     cross = total.R[:b, :b].T @ total.R[:b, b:-1]  # -W^T D
     sizes = np.repeat(np.array(stated, dtype=float), 3)
     rest = total.R[b:-1, b:-1] * sizes  # of D, what W cannot explain
-    errors = ContactErrors(cross * sizes, float(np.sum(rest**2)) / int(whole.factors.rows.sum()))
+    variance = float(np.sum(rest**2)) / int(whole.factors.rows.sum())
+    errors = ContactErrors(cross * sizes, variance, float(sizes.max()))
     return replace(recordings, contacts=errors)
 
 

@@ -118,6 +118,7 @@ def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_p
     assert masses[0] == pytest.approx(1.251, rel=0.05)  # the trunk
     truth = result.mapping.K @ result.model.standard_parameters()  # the simulator used this URDF
     covered = np.abs(result.base - truth) < result.errors.quantile * result.base_error
+    assert "points of contact uncertain by 0.0022 m" in result.errors.method
     assert covered.mean() > 0.88  # 0.4 without the errors of the points of contact
     assert result.verdict.status == "good"
 
