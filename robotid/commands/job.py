@@ -234,7 +234,8 @@ class Job(Settings):
         "links that may touch the ground: frame, the link; kind, point or surface; measured, "
         "components of the wrench that logs have as wrench_fz_<link>, of fx to mz, the others are "
         "unknown; always, whether it always touches the ground, else logs have contact_<link>, 1 "
-        "or 0",
+        "or 0; radius of a ball-shaped foot, below whose frame the ground is [m]; uncertainty, "
+        "standard deviation of the point of contact [m], estimated if it is not stated",
         at="contact",
         reads=[
             {
@@ -242,10 +243,19 @@ class Job(Settings):
                 "kind": (str,),
                 "measured": Entries(list, (str,)),
                 "always": (bool,),
+                "radius": (int, float),
+                "uncertainty": (int, float),
             }
         ],
         load=_load_contacts,
-        dump=lambda contacts: [asdict(x) | {"measured": list(x.measured)} for x in contacts],
+        dump=lambda contacts: [
+            {
+                k: list(y) if isinstance(y, tuple) else y
+                for k, y in asdict(x).items()
+                if y is not None
+            }
+            for x in contacts
+        ],
     )
     loops: tuple[Loop, ...] = setting(
         (),

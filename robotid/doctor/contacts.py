@@ -13,6 +13,7 @@ from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.constraints import constraint_jacobian
+from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
 
 __all__ = ["check_base"]
@@ -25,6 +26,8 @@ _DELAYED = 0.5  # ratio of squared speeds of the foot below which a delay is fou
 _SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
 _STANDS = 0.3  # ... if it is above this share of its speed without contact
 _FEWEST = 5  # changes of a contact without which a delay is not examined
+_ROLLS = 0.3  # median speed at the contact of a rolling foot, as a share of that of its frame ...
+_CREEPS = 2e-3  # [m/s] ... if the frame is faster than this
 
 
 def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator[Finding]:
@@ -45,14 +48,21 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
     except DataError:  # too short: the error is raised again when the log is read
         return
     every = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
-    J, first = constraint_jacobian(model, motion.q, every), 0
-    for contact in model.contacts:
-        v = np.einsum("kij,kj->ki", J[:, first : first + 3], motion.v)  # of the link [m/s]
-        first += contact.sizes[contact.kind]
+    surfaces = tuple(Contact(x.frame, "surface") for x in model.contacts)
+    J = constraint_jacobian(replace(model, constraints=surfaces), motion.q, every)
+    speeds = np.einsum("kij,kj->ki", J, motion.v).reshape(len(motion.t), -1, 6)
+    for contact, speed in zip(model.contacts, speeds.swapaxes(0, 1), strict=True):
         flags = np.ones(len(log.t), dtype=bool)
         if not contact.always and contact.frame in log.contacts:
             flags = log.contacts[contact.frame]
-        yield from _check_flags(contact.frame, log, flags, motion, np.sum(v**2, axis=1))
+        rolls = np.column_stack([speed[:, 4], -speed[:, 3], 0.0 * speed[:, 5]])  # v / radius
+        v = speed[:, :3] - contact.radius * rolls  # at the contact [m/s]
+        findings = list(_check_flags(contact.frame, log, flags, motion, np.sum(v**2, axis=1)))
+        if contact.kind == "point" and "contact_delay" not in [x.code for x in findings]:
+            touching = _at(log, flags, motion.t)
+            rolling = list(_check_radius(contact, log, v[touching], rolls[touching]))
+            findings = rolling or findings
+        yield from findings
 
 
 def _check_axes(log: Log) -> Iterator[Finding]:
@@ -101,8 +111,7 @@ def _check_flags(
 
     def mean_square(delay: float) -> float:
         """Return the mean square speed in contact if the flags have a delay [s]."""
-        k = np.searchsorted(log.t, motion.t + delay + 1e-9, side="right") - 1
-        touching = flags[k.clip(0, len(flags) - 1)]
+        touching = _at(log, flags, motion.t + delay)
         return float(squares[touching].mean()) if touching.any() else np.inf
 
     now = mean_square(0.0)
@@ -121,7 +130,7 @@ def _check_flags(
             yield log_finding(log.name, "contact_delay", "warning", message, delay=best)
             return
     own = np.sqrt(now)
-    swings = ~flags[(np.searchsorted(log.t, motion.t + 1e-9, side="right") - 1).clip(0)]
+    swings = ~_at(log, flags, motion.t)
     other = np.sqrt(squares[swings].mean()) if swings.any() else np.inf
     if np.isfinite(own) and own > _SLIDES and (own > _STANDS * other or not swings.any()):
         message = (
@@ -130,6 +139,46 @@ def _check_flags(
             f"it acts at the origin of {link}"
         )
         yield log_finding(log.name, "moving_contact", "warning", message, speed=own)
+
+
+def _check_radius(contact: Contact, log: Log, v: Array, rolls: Array) -> Iterator[Finding]:
+    """Yield a finding if a foot in contact rolls as a ball of another radius than stated.
+
+    Args:
+        contact: The contact.
+        log: The log.
+        v: Velocity at the contact with the stated radius, shape (N, 3) [m/s].
+        rolls: Change of the centre's velocity per radius of a ball that rolls, shape (N, 3) [1/s].
+    """
+    pace = np.linalg.norm(rolls, axis=1)
+    if not np.any(pace > 0.0):
+        return
+    # weighted median of v / roll: the smallest sum of |v - change roll|, samples that slip apart
+    u, along = rolls[:, :2].ravel(), v[:, :2].ravel()
+    ratio = along[u != 0.0] / u[u != 0.0]
+    order = np.argsort(ratio)
+    weight = np.cumsum(np.abs(u[u != 0.0])[order])
+    change = float(ratio[order][np.searchsorted(weight, 0.5 * weight[-1])])
+    before, after = (
+        float(np.median(np.linalg.norm(v[:, :2] - x * rolls[:, :2], axis=1))) for x in (0.0, change)
+    )
+    radius = contact.radius + change
+    if radius <= 0.0 or before < _CREEPS or after > _ROLLS * before:
+        return
+    message = (
+        f"the link {contact.frame} rolls on the ground as a ball of radius {radius:.4f} m: with it "
+        f"the median speed at the contact is {after:.2g} m/s, with {contact.radius:g} m it is "
+        f"{before:.2g} m/s. State radius = {radius:.4f} in [[contact]]"
+    )
+    yield log_finding(
+        log.name, "rolling_contact", "warning", message, radius=radius, before=before, after=after
+    )
+
+
+def _at(log: Log, flags: Array, t: Array) -> Array:
+    """Return the flags of a contact at times, shape (N,), bool."""
+    k = np.searchsorted(log.t, t + 1e-9, side="right") - 1
+    return np.asarray(flags[k.clip(0, len(flags) - 1)])
 
 
 def _rms(values: Array) -> float:

@@ -32,6 +32,7 @@ class Known:
     share: float  # share of the rows that count as independent [-]
     sigma: Array  # (n,), noise level of each joint [N m or N]
     held_out: tuple[Factors, ...] = ()  # segments for choosing the weight and testing extents
+    repeated: float = 0.0  # share of errors of points of contact in the squared residual [-]
 
     @property
     def beta(self) -> Array:
@@ -86,7 +87,7 @@ def consistent_fit(settings: BoundedSettings, known: Known) -> Consistent:
         fit = replace(fit, constraints=fit.constraints.without_extent(beyond))
     if not how:
         return fit
-    choice = choose_weight(fit, segments, how)
+    choice = choose_weight(fit, segments, how, known.repeated)
     return replace(
         fit, prior_weight=choice.weight, plausible_weight=choice.plausible, choice=choice
     )

@@ -183,8 +183,9 @@ class Solved:
         ground, choice, fit, estimate = self.ground, self.choice, self.in_cone, self.estimate
         factors, rough, mapping = ground.factors, ground.rough, ground.recordings.mapping
         segments, share, K = ground.segments, ground.before.share, mapping.K
-        more = None if ground.noise is None else ground.noise.meat
-        of_wls = more if self.weighing != "alike" else None  # found with the weights of WLS
+        more = of_wls = ground.more(rough.sigma)
+        if ground.noise is not None and self.weighing == "alike":
+            of_wls = None  # found with the weights of WLS
         wls, errors = measured_errors(rough, segments, factors, share, K, rough.sigma, more=of_wls)
         if self.weighing == "by step" and fit is None:
             estimate = with_wls_errors(estimate, wls)
@@ -192,6 +193,7 @@ class Solved:
             sigma = np.ones_like(rough.sigma) if self.weighing == "alike" else rough.sigma
             if estimate.names == mapping.names:
                 sigma = estimate.sigma
+            more = ground.more(sigma)
             redraws, ratio = None, 1.0  # without bounds
             if fit is not None and isinstance(choice, BoundedSettings):
                 redraws = Redraws(fit, choice.draws, np.random.default_rng(0))
@@ -201,6 +203,9 @@ class Solved:
                 estimate, segments, factors, share, K, sigma,
                 is_filter=is_filter, weight_ratio=ratio, redraws=redraws, more=more,
             )  # fmt: skip
+        if (contacts := ground.recordings.contacts) is not None:
+            known = f"{errors.method}; points of contact uncertain by {contacts.uncertainty:.2g} m"
+            errors = replace(errors, method=known)
         if ground.grown != 1.0:
             estimate = replace(estimate, covariance=ground.grown * estimate.covariance)
             wls = replace(wls, covariance=ground.grown * wls.covariance)
@@ -271,6 +276,13 @@ class _Ground:
         """The factors of the segments of all logs."""
         return tuple(chain.from_iterable(self.logs))
 
+    def more(self, sigma: Array) -> Array | None:
+        """Return the covariance of the score in addition to the scatter, (b, b); None: 0."""
+        if (contacts := self.recordings.contacts) is not None:
+            # rows without constraint forces have one noise level
+            return np.asarray(contacts.root @ contacts.root.T / sigma[-1] ** 4)
+        return None if self.noise is None else self.noise.meat
+
     @cached_property
     def determination(self) -> Determination:
         """Which base parameters the rows determine."""
@@ -295,7 +307,9 @@ def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool)
     spread = prior_spread(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
     held_out = tuple(chain.from_iterable(logs)) or (factors,)
-    before = Known(model, mapping, prior, spread, share, rough.sigma, held_out)
+    contacts = recordings.contacts
+    repeated = 0.0 if contacts is None else contacts.variance / rough.sigma[-1] ** 2
+    before = Known(model, mapping, prior, spread, share, rough.sigma, held_out, repeated)
     pinned = model.layout.owned_by(choice.bounds.pinned)
     return _Ground(recordings, reduction, before, logs, rough, pinned, understated**2)
 

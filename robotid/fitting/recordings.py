@@ -18,13 +18,22 @@ from robotid.robot.model import RobotModel
 from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.plan import WorkPlan
 
-__all__ = ["Recordings"]
+__all__ = ["ContactErrors", "Recordings"]
 
 _SEGMENTS = 48  # of all logs in memory: enough to estimate the scatter of their scores
 _CORRELATIONS = 10  # shortest segment, in correlation times of filtered noise
 _SEGMENTS_IN_FILE = 64  # largest number of segments of a log in a file
 _FACTORS = 2**26  # largest size of all their factors [bytes], with at least _FEW segments per log
 _FEW = 8
+
+
+@dataclass(frozen=True, eq=False)
+class ContactErrors:
+    """Effect of the uncertainty of points of contact on all rows."""
+
+    root: Array  # (b, k), C of the covariance C C^T of W^T tau
+    variance: float  # of a row's residual, on average [(N m)^2]
+    uncertainty: float  # of the points, largest standard deviation [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +48,7 @@ class Recordings:
         plan: Processes that work on the pieces of logs in files; None: this process.
         checkpoint: Storage of the reductions until the run is complete.
         weights: Weights of the rows of each log to fit, shapes (N, n_rows); 1 if None.
+        contacts: Effect of the points of contact; None without any.
     """
 
     model: RobotModel
@@ -48,6 +58,7 @@ class Recordings:
     plan: WorkPlan | None = None
     checkpoint: Checkpoint | None = None
     weights: tuple[Array, ...] | None = None
+    contacts: ContactErrors | None = None
 
     @property
     def is_in_memory(self) -> bool:

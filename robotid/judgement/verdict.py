@@ -62,6 +62,8 @@ _REASONS = {
     "joint_torque_delay": "the torque is delayed by {delay:+.3f} s relative to the position "
     "(negative: early), the torques of other joints are not",
     "lost_motion": "there may be backlash between the joint and its encoder",
+    "rolling_contact": "a foot rolls as a ball of radius {radius:.4f} m, which is not stated: its "
+    "force acts elsewhere",
     "moving_contact": "a link moves at {speed:.2g} m/s while it is in contact",
     "mass_matrix": "the mass matrix is not positive definite in all poses",
     "payload_change": "its last link carries {mass:+.2g} kg relative to the fitted logs",

@@ -39,7 +39,7 @@ _REQUIRED = ("q", "tau")
 _NO_TORQUE = "; without torques, pass zeros and has_torque=False"
 _BY_SAMPLE = (
     "t", "q", "v", "a", "tau", "segment", "direction", "memory", "contacts",
-    "wrenches", "switching", "basis",
+    "wrenches", "switching", "basis", "loaded",
 )  # fmt: skip
 _LARGEST = 1e30  # in any unit, so that squares and products are finite
 
@@ -213,6 +213,8 @@ class Trajectory:
         wrenches: Measured components of wrenches, shape (N, m) [N or N m]; None without any.
         basis: Basis of the torques of constraint forces, shape (N, n_rows, m), as of
             ``force_basis``; None without constraints.
+        loaded: Torques with those of unknown constraint forces, shape (N, n_rows) [N m, N]; None
+            without constraints.
     """
 
     t: Array
@@ -229,6 +231,7 @@ class Trajectory:
     wrenches: Array | None = None
     switching: Array | None = None
     basis: Array | None = None
+    loaded: Array | None = None
 
     def __post_init__(self) -> None:
         _settle(self, "trajectory", {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau})
@@ -274,14 +277,15 @@ class Trajectory:
         vars(same).update(memory=memory, derived=self.derived)
         return same
 
-    def projected(self, basis: Array, tau: Array) -> "Trajectory":
+    def projected(self, basis: Array, tau: Array, loaded: Array) -> "Trajectory":
         """Return the same motion without the torques of constraint forces.
 
         Args:
             basis: As of ``force_basis``, shape (N, n_rows, m).
             tau: The remaining torques, shape (N, n_rows) [N m, N].
+            loaded: The torques with them, shape (N, n_rows) [N m, N].
         """
-        return replace(self, basis=basis, tau=tau)
+        return replace(self, basis=basis, tau=tau, loaded=loaded)
 
     @property
     def squares(self) -> Array:

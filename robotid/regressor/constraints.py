@@ -23,10 +23,13 @@ from robotid.robot.model import RobotModel
 __all__ = [
     "ProjectedRows",
     "constrained",
+    "constraint_forces",
     "constraint_jacobian",
+    "contact_links",
     "force_basis",
     "logged_base",
     "loop_basis",
+    "touching",
     "without_forces",
 ]
 
@@ -60,6 +63,29 @@ def constraint_jacobian(model: RobotModel, q: Array, contacts: Array) -> Array:
             rotation = pin.updateFramePlacement(pin_model, data, ids[0]).rotation
             J[k, first:stop] = x.rows(own, rotation) @ G
     return J
+
+
+def contact_links(model: RobotModel, q: Array) -> tuple[Array, Array]:
+    """Return axes and Jacobians of rotation of the links of contacts, with the world's axes.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+
+    Returns:
+        Axes, shape (N, k, 3, 3), and Jacobians, shape (N, k, 3, n_rows).
+    """
+    pin_model, data = model.pin_model, model.pin_model.createData()
+    frames = [frame_id(pin_model, x.frame) for x in model.contacts]
+    rotation = np.empty((len(q), len(frames), 3, 3))
+    turning = np.empty((len(q), len(frames), 3, pin_model.nv))
+    axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    for k, q_k in enumerate(np.ascontiguousarray(model.configurations(q))):
+        pin.computeJointJacobians(pin_model, data, q_k)
+        for i, frame in enumerate(frames):
+            rotation[k, i] = pin.updateFramePlacement(pin_model, data, frame).rotation
+            turning[k, i] = pin.getFrameJacobian(pin_model, data, frame, axes)[3:]
+    return rotation, turning @ model.velocity_map
 
 
 def force_basis(J: Array, used: Array) -> Array:
@@ -174,19 +200,49 @@ def constrained(
         used = used & (np.arange(model.n_rows) < model.n_rows - len(model.joints))
     if not model.constraints:
         return motion, used
-    N = len(motion.t)
-    contacts = np.ones((N, len(model.contacts)), dtype=bool)
-    if motion.contacts is not None:
-        contacts[:, [not x.always for x in model.contacts]] = motion.contacts
     if motion.switching is not None:
         used = used & ~motion.switching[:, None]
-    J = constraint_jacobian(model, motion.q, contacts)
+    J = constraint_jacobian(model, motion.q, touching(model, motion))
     known, tau = _measured(model), motion.tau
     if motion.wrenches is not None:
         tau = tau + np.einsum("kmj,km->kj", J[:, known], motion.wrenches)
     basis = force_basis(np.delete(J, known, axis=1), used)
     used = used & (np.sum(basis**2, axis=2) < 1.0 - _RANK)
-    return motion.projected(basis, without_forces(basis, tau)), used
+    return motion.projected(basis, without_forces(basis, tau), tau), used
+
+
+def touching(model: RobotModel, motion: Trajectory) -> Array:
+    """Return which contacts of a robot may touch the ground, shape (N, k), bool.
+
+    Args:
+        model: The robot.
+        motion: Its motion.
+    """
+    contacts = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
+    if motion.contacts is not None:
+        contacts[:, [not x.always for x in model.contacts]] = motion.contacts
+    return contacts
+
+
+def constraint_forces(model: RobotModel, motion: Trajectory, torque: Array, used: Array) -> Array:
+    """Return the constraint forces for which a robot has a torque, shape (N, m) [N, N m].
+
+    They are those of least squares; measured ones are 0.
+
+    Args:
+        model: The robot.
+        motion: Its motion, as of ``constrained``.
+        torque: W pi, the torque without constraint forces, shape (N, n_rows) [N m, N].
+        used: Rows used, shape (N, n_rows), bool.
+    """
+    J = constraint_jacobian(model, motion.q, touching(model, motion))
+    known, tau = _measured(model), motion.tau if motion.loaded is None else motion.loaded
+    f = np.zeros(J.shape[:2])
+    A = np.delete(J, known, axis=1).swapaxes(1, 2) * used[:, :, None]
+    inverse = np.linalg.pinv(A, rcond=_RANK)
+    others = np.delete(np.arange(J.shape[1]), known)
+    f[:, others] = (inverse @ ((torque - tau) * used)[..., None])[..., 0]
+    return f
 
 
 def logged_base(model: RobotModel, twist: str = "base") -> BaseColumns:

@@ -542,6 +542,7 @@ _AS_FOUND = (
     "payload",
     "position_order",
     "position_sign",
+    "rolling_contact",
     "solvers_differ",
     "time_scale",
     "torque_order",

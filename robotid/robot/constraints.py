@@ -21,18 +21,25 @@ class Contact:
     """A link that touches the ground.
 
     Attributes:
-        frame: The link, whose frame is at the point or on the surface of contact.
+        frame: The link, whose frame is at the point or on the surface of contact; the centre of the
+            foot if it has a radius.
         kind: "point", which transmits a force, or "surface", which also transmits a moment.
         measured: Components of the wrench of the ground on the link that are measured, of fx, fy,
             fz, mx, my, mz with the axes of the world and the origin of the link. The others are
             unknown.
         always: Whether it touches the ground at all samples; else logs state when.
+        radius: Of a ball that rolls on level ground: the force of the ground acts this far below
+            the frame [m].
+        uncertainty: Standard deviation of the point of contact, along each axis [m]; None: it is
+            estimated from the logs. It is an error of the intervals.
     """
 
     frame: str
     kind: str = "point"
     measured: tuple[str, ...] = ()
     always: bool = False
+    radius: float = 0.0
+    uncertainty: float | None = None
 
     sizes: ClassVar[dict[str, int]] = {"point": 3, "surface": 6}
     components: ClassVar[tuple[str, ...]] = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -47,6 +54,19 @@ class Contact:
                     f"some of {listed(known)}, each once"
                 )
         require_flag(self.always, "always")
+        require_kind(self.radius, (int, float), "radius of a contact", "a length [m]")
+        if not 0.0 <= self.radius < np.inf or (self.radius > 0.0 and self.kind != "point"):
+            raise SettingsError(
+                f"radius of the {self.kind} contact {self.frame!r} is {self.radius:g}, wanted a "
+                "positive length [m] of a point contact, or 0"
+            )
+        length = 0.0 if self.uncertainty is None else self.uncertainty
+        require_kind(length, (int, float), "uncertainty of a contact", "a length [m]")
+        if not 0.0 <= length < np.inf:
+            raise SettingsError(
+                f"uncertainty of the contact {self.frame!r} is {length:g}, wanted a length [m], at "
+                "least 0"
+            )
 
     @property
     def rows_measured(self) -> list[int]:
@@ -70,7 +90,10 @@ class Contact:
             jacobians: Jacobian of the frame with the axes of the world, shape (6, nv).
             rotation: Not used.
         """
-        return jacobians[0][: self.sizes[self.kind]]
+        J = jacobians[0][: self.sizes[self.kind]].copy()
+        J[0] -= self.radius * jacobians[0][4]  # v + w x (0, 0, -radius)
+        J[1] += self.radius * jacobians[0][3]
+        return J
 
 
 @dataclass(frozen=True)

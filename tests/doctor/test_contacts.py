@@ -10,6 +10,7 @@ from robotid.doctor.contacts import check_base
 from robotid.logs.base import BaseMotion, base_state
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -96,6 +97,46 @@ def test_a_shift_of_flags_is_stated_with_the_speeds_before_and_after_it(robot, w
     words = found.message.split("its speed in contact is ")[1].split(" m/s")
     assert float(words[0]) == pytest.approx(then, abs=0.03)
     assert float(words[1].removeprefix(" instead of ")) == pytest.approx(now, rel=0.06)
+
+
+@pytest.fixture(scope="module")
+def ball(robot):
+    """Return a log of a robot that rolls on one foot, a ball of 25 mm, and lifts it at times."""
+    t = np.arange(0.0, 6.0, 0.01)
+    angle = 0.3 * np.sin(2.0 * t)
+    height = np.maximum(np.sin(5.0 * t) - 0.8, 0.0)
+    data = robot.pin_model.createData()
+    pin.framesForwardKinematics(robot.pin_model, data, pin.neutral(robot.pin_model))
+    centre = data.oMf[robot.pin_model.getFrameId(FEET[0], pin.FrameType.BODY)].translation
+    pose = []
+    for x, lift in zip(angle, height, strict=True):
+        turned = pin.rpy.rpyToMatrix(0.0, x, 0.7) @ pin.rpy.rpyToMatrix(0.5 * x, 0.0, 0.0)
+        pose.append(pin.SE3ToXYZQUAT(pin.SE3(turned, -turned @ centre + [0, 0, lift])))
+    log = Log(t, np.zeros((len(t), 12)), np.zeros((len(t), 12)), robot.joints,
+              base=BaseMotion(np.array(pose)), contacts={FEET[0]: height == 0.0})  # fmt: skip
+    motion = process(log, replace(RAW, velocity="differentiated", acceleration="differentiated"))
+    R = np.array([pin.XYZQUATToSE3(x).rotation for x in log.base.pose])
+    w = np.einsum("kij,kj->ki", R, motion.v[:, 3:6])
+    pace = 0.025 * np.cross(w, [0.0, 0.0, 1.0])
+    way = np.cumsum(0.5 * (pace[1:] + pace[:-1]), axis=0) * 0.01
+    moved = log.base.pose.copy()
+    moved[1:, :3] += way
+    return replace(log, base=BaseMotion(moved))
+
+
+def test_the_radius_of_a_rolling_foot_is_found(robot, ball):
+    def found(radius):
+        contacts = (Contact(FEET[0], radius=radius),)
+        return list(check_base(replace(robot, constraints=contacts), ball, RAW))
+
+    (finding,) = found(0.0)
+    assert finding.code == "rolling_contact"
+    assert finding.evidence["radius"] == pytest.approx(0.025, rel=0.02)
+    assert finding.evidence["after"] < 0.1 * finding.evidence["before"]
+    assert "State radius = 0.025" in finding.message
+    (finding,) = found(0.01)
+    assert finding.evidence["radius"] == pytest.approx(0.025, rel=0.02)
+    assert not found(0.025)
 
 
 @pytest.mark.parametrize("part", [slice(0, 3), slice(3, 6)])

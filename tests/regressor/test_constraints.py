@@ -76,6 +76,20 @@ def test_the_jacobian_is_the_velocity_of_the_feet(quadruped, rng):
         np.testing.assert_allclose(J[k, 12:] @ v[k], turned, atol=1e-7)
 
 
+def test_the_force_on_a_round_foot_acts_below_its_frame(rng):
+    """The velocity at the contact is that of the point of the foot which touches the ground."""
+    contact = Contact(FEET[2], radius=0.03)
+    model = RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, constraints=[contact], terms=()
+    )
+    q, v, _ = random_motion(model, rng, 1)
+    (J,) = constraint_jacobian(model, q, np.ones((1, 1), dtype=bool))
+    frame = model.pin_model.getFrameId(FEET[2], pin.FrameType.BODY)
+    before, now, after = (moved(model, q[0], v[0], h).oMf[frame] for h in (-1e-6, 0.0, 1e-6))
+    point = now.actInv(now.translation - np.array([0.0, 0.0, 0.03]))
+    np.testing.assert_allclose(J @ v[0], (after.act(point) - before.act(point)) / 2e-6, atol=1e-7)
+
+
 def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(quadruped, rng):
     q, v, a = random_motion(quadruped, rng, 7)
     flags = rng.random((7, 3)) < 0.7
@@ -235,6 +249,9 @@ def test_contacts_state_what_logs_have(quadruped):
         (lambda: Contact("a", "line"), "kind of contact 'a' is 'line', wanted one of point"),
         (lambda: Contact("a", measured=("mx",)), "measured of the point contact 'a' has 'mx'"),
         (lambda: Contact("a", measured=("fx", "fx")), "some of fx, fy, fz, each once"),
+        (lambda: Contact("a", radius=-0.1), "radius of the point contact 'a' is -0.1, wanted a"),
+        (lambda: Contact("a", "surface", radius=0.1), "radius of the surface contact 'a' is 0.1"),
+        (lambda: Contact("a", radius="2 cm"), "radius of a contact is '2 cm', a str, wanted a"),
         (lambda: Loop(("a", "a")), "loop has the frames a, a, wanted two links"),
         (lambda: Loop(("a", "b"), axis=(0, 0, 0)), "is (0, 0, 0), wanted x, y, z"),
     ],

@@ -22,6 +22,7 @@ _PATIENCE = 2  # decades without a better score after which the search ends
 _ALIKE = 2.0  # standard errors by which the mean log error of a larger weight may be above the best
 _MOST_LOSS = 1.02  # largest ratio of the held-out errors of a larger weight, mean over joints
 _MOST_JOINT_LOSS = 1.05  # ... and of any one joint
+_MOST_REPEATED = 0.5  # largest share of repeated errors in the squared residual
 _BEYOND = 4.0  # standard errors by which a body must be outside its box
 _CLEAR = 0.02  # relative increase of the mean square error at which an extent is contradicted
 _STEP = 0.5  # decades between the best weight and the refined ones
@@ -69,7 +70,9 @@ class Segments:
         return np.array([total.R for total in rest])
 
 
-def choose_weight(fit: Consistent, segments: Segments, how: str) -> WeightChoice:
+def choose_weight(
+    fit: Consistent, segments: Segments, how: str, repeated: float = 0.0
+) -> WeightChoice:
     """Return the weight of the prior, chosen from the fitted data.
 
     * "cv": the largest weight with the same prediction error on held-out segments as the best one.
@@ -77,7 +80,9 @@ def choose_weight(fit: Consistent, segments: Segments, how: str) -> WeightChoice
       over joints. A larger weight is accepted if its error is at most 2 % above the smallest one,
       at most 5 % for any joint, and the mean log ratio of the errors by segment is at most two
       standard errors above 0. This test alone is not sufficient: with six segments it has little
-      power against one or two bad segments.
+      power against one or two bad segments. An error that repeats in all segments has no scatter:
+      a smaller weight that only fits it is not better, so the mean log ratio may also be as large
+      as such an error makes it.
     * "evidence": the weight with the largest ``log_evidence``.
 
     Weights are tried from 100 down to 1e-4 (entropic: 0.1) in decades, until two weights in a row
@@ -90,6 +95,7 @@ def choose_weight(fit: Consistent, segments: Segments, how: str) -> WeightChoice
         fit: The fit; its own weight is not used.
         segments: The fitted data.
         how: "cv" or "evidence".
+        repeated: Share of errors that repeat in all segments in the squared residual [-].
 
     Raises:
         DataError: If "cv" has fewer than two segments.
@@ -97,7 +103,7 @@ def choose_weight(fit: Consistent, segments: Segments, how: str) -> WeightChoice
     """
     smallest = _SMALLEST if fit.penalty.is_quadratic else _SMALLEST_ENTROPIC
     evidence = log_evidence(fit, segments.rows)
-    by_evidence = _search(lambda w: (-evidence(w), np.zeros(0)), "evidence", smallest)
+    by_evidence = _search(lambda w: (-evidence(w), np.zeros(0)), "evidence", smallest, 0.0)
     if how == "evidence":
         return by_evidence
 
@@ -113,7 +119,9 @@ def choose_weight(fit: Consistent, segments: Segments, how: str) -> WeightChoice
             return float("inf"), np.full((len(segments.folds), 1), np.inf)
         return float(np.exp(0.5 * np.log(_by_joint(errors)).mean())), errors
 
-    return replace(_search(score, how, smallest), plausible=by_evidence.plausible)
+    # a residual without the repeated error is smaller by this log ratio
+    excess = -0.5 * np.log1p(-min(repeated, _MOST_REPEATED))
+    return replace(_search(score, how, smallest, excess), plausible=by_evidence.plausible)
 
 
 def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]:
@@ -221,7 +229,7 @@ def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
 
 
 def _search(
-    score: Callable[[float], tuple[float, Array]], how: str, smallest: float
+    score: Callable[[float], tuple[float, Array]], how: str, smallest: float, allowed: float
 ) -> WeightChoice:
     """Return the largest weight that ``_is_accepted`` in comparison with that of smallest score.
 
@@ -243,13 +251,17 @@ def _search(
         if smallest <= k <= _LARGEST and np.isfinite(tried.get(k - _STEP, 0.0)):
             attempt(k)
     best = min(tried, key=lambda k: tried[k])
-    alike = [k for k in tried if np.isfinite(tried[k]) and _is_accepted(parts[k], parts[best])]
+    finite = [k for k in tried if np.isfinite(tried[k])]
+    alike = [k for k in finite if _is_accepted(parts[k], parts[best], allowed)]
     curve = tuple((float(10.0**k), tried[k]) for k in sorted(tried) if np.isfinite(tried[k]))
     return WeightChoice(float(10.0 ** max([best, *alike])), how, curve, float(10.0**best))
 
 
-def _is_accepted(parts: Array, best: Array) -> bool:
-    """Return whether errors are about as small as the best ones, both of shape (segments, n)."""
+def _is_accepted(parts: Array, best: Array, allowed: float) -> bool:
+    """Return whether errors are about as small as the best ones, both of shape (segments, n).
+
+    The mean log ratio is at most the allowed one, or two standard errors.
+    """
     if not parts.size:
         return False
     ratio = np.sqrt(_by_joint(parts) / _by_joint(best))  # (n,)
@@ -258,7 +270,8 @@ def _is_accepted(parts: Array, best: Array) -> bool:
     both = (parts > 0) & (best > 0)  # a joint at rest has no rows in a segment
     logs = 0.5 * np.log(np.where(both, parts, 1.0) / np.where(both, best, 1.0))
     excess = logs.sum(axis=1) / np.maximum(both.sum(axis=1), 1)  # (segments,)
-    return bool(excess.mean() <= _ALIKE * excess.std(ddof=1) / np.sqrt(len(excess)))
+    error = excess.std(ddof=1) / np.sqrt(len(excess))
+    return bool(excess.mean() <= max(allowed, _ALIKE * error))
 
 
 def _by_joint(parts: Array) -> Array:

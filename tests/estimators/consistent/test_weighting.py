@@ -357,4 +357,13 @@ def test_the_loss_of_a_segment_is_the_mean_of_the_joints_that_have_rows_in_it(lo
     parts[:6, 0], parts[6:] = 1e-3 * np.exp(2 * loss), np.exp(-2 * 0.012)
     excess = np.repeat([loss, -0.012], 6)
     assert (excess.mean() <= 2 * excess.std(ddof=1) / np.sqrt(12)) is np.bool_(accepted)
-    assert weighting._is_accepted(parts, best) is accepted
+    assert weighting._is_accepted(parts, best, 0.0) is accepted
+
+
+def test_a_larger_weight_may_leave_an_error_that_repeats_in_all_segments():
+    best = np.full((6, 1), 1.0)
+    worse = best * 1.01**2  # in each segment, without scatter
+    assert not weighting._is_accepted(worse, best, 0.0)
+    assert not weighting._is_accepted(worse, best, 0.009)
+    assert weighting._is_accepted(worse, best, 0.011)
+    assert not weighting._is_accepted(best * 1.03**2, best, 0.1)

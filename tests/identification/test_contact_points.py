@@ -1,0 +1,112 @@
+"""Errors of points of contact in the intervals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from robotid.fitting.recordings import Recordings
+from robotid.fitting.survey import hold_log
+from robotid.identification.contact_points import (
+    _slopes,
+    estimated_uncertainty,
+    with_contact_errors,
+)
+from robotid.logs.base import BaseMotion
+from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.constraints import constraint_jacobian, touching
+from robotid.regressor.prediction import predict
+from robotid.robot.constraints import Contact, frame_id
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
+RAW = SignalSettings(
+    cutoff=None, trim=0.0, velocity="differentiated", acceleration="differentiated"
+)
+
+
+def robot(uncertainty):
+    contacts = [
+        Contact(FEET[1], "surface", always=True),
+        Contact(FEET[0], uncertainty=uncertainty),
+        Contact(FEET[3], uncertainty=uncertainty, always=True),
+    ]
+    return RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, terms=(), constraints=contacts
+    )
+
+
+@pytest.fixture(scope="module")
+def log():
+    """Return a log in which all joints and the base move, and one foot touches at times."""
+    rng = np.random.default_rng(1)
+    t = np.arange(0.0, 0.6, 0.01)
+    waves = np.sin(np.outer(t, rng.uniform(3, 9, 18)) + rng.uniform(0, 6, 18))
+    pose = [
+        pin.SE3ToXYZQUAT(pin.SE3(pin.rpy.rpyToMatrix(*w[3:6]), 0.1 * w[:3])) for w in 0.4 * waves
+    ]
+    tau = rng.standard_normal((len(t), 12))
+    flags = {FEET[0]: t % 0.2 < 0.1}
+    joints = robot(None).joints
+    return Log(t, waves[:, 6:], tau, joints, base=BaseMotion(np.array(pose)), contacts=flags)
+
+
+def test_a_force_beside_its_point_leaves_the_torque_of_its_slope(log, rng):
+    model = robot(None)
+    rows = hold_log(model, log, RAW).whole
+    motion, pi, x = rows.trajectory, model.standard_parameters(), 1e-5 * rng.standard_normal(6)
+    (torque,) = predict(model, [pi], replace(motion, basis=None))
+    J, f = constraint_jacobian(model, motion.q, touching(model, motion)), rng.uniform(1, 2, 12)
+    surfaces = tuple(Contact(c.frame, "surface", always=c.always) for c in model.contacts)
+    whole = replace(model, constraints=surfaces)
+    turning = constraint_jacobian(whole, motion.q, touching(whole, motion))
+    data, moved = model.pin_model.createData(), J.copy()
+    for k, q in enumerate(model.configurations(motion.q)):
+        pin.framesForwardKinematics(model.pin_model, data, q)
+        for i, first in ((1, 6), (2, 9)):
+            R = data.oMf[frame_id(model.pin_model, model.contacts[i].frame)].rotation
+            own = R @ x[3 * (i - 1) : 3 * i]
+            w = turning[k, 6 * i + 3 : 6 * i + 6]
+            moved[k, first : first + 3] += np.cross(w, own, axisa=0, axisc=0)
+    loaded = torque - np.einsum("kmj,m->kj", moved, f)
+    rows = replace(rows, trajectory=replace(motion, loaded=loaded))
+    D = _slopes(model, rows, pi, [1, 2]).reshape(*torque.shape, 6)
+    B = motion.basis
+    left = torque - loaded
+    left = left - np.einsum("kij,klj,kl->ki", B, B, left)
+    np.testing.assert_allclose((D @ x)[rows.mask], left[rows.mask], atol=1e-7)
+    assert np.abs(left).max() > 1e-5
+
+
+def test_the_size_of_offsets_is_found(rng):
+    """Offsets of 2 mm that the rows determine, beside parameters with a wide prior."""
+    W, D, x = rng.standard_normal((2000, 5)), rng.standard_normal((2000, 12)), np.zeros(12)
+    x = 2e-3 * rng.standard_normal(12)
+    tau = W @ np.ones(5) + D @ x + 1e-3 * rng.standard_normal(2000)
+    R = np.linalg.qr(np.column_stack([W, D, tau]), mode="r")
+    s = estimated_uncertainty(R, 10 * np.eye(5), np.zeros(5), 1.0, 2000)
+    assert s == pytest.approx(np.sqrt(np.mean(x**2)), rel=0.02)
+    tau = tau - D @ x
+    R = np.linalg.qr(np.column_stack([W, D, tau]), mode="r")
+    assert estimated_uncertainty(R, 10 * np.eye(5), np.zeros(5), 1.0, 2000) < 1e-4
+
+
+def test_the_covariance_of_the_score_is_that_of_the_stated_uncertainty(log):
+    def errors(uncertainty):
+        model = robot(uncertainty)
+        found = with_contact_errors(
+            Recordings(model, structural_mapping(model), (hold_log(model, log, RAW),))
+        )
+        return found.contacts
+
+    once, twice = errors(1e-3), errors(2e-3)
+    assert once.root.shape[1] == 6
+    np.testing.assert_allclose(twice.root, 2.0 * once.root)
+    assert twice.variance == pytest.approx(4.0 * once.variance)
+    assert once.variance > 0.0
+    assert errors(0.0) is None
+    assert 0.0 < np.abs(errors(None).root).max() < np.inf
