@@ -117,6 +117,11 @@ def _load_contacts(tables: Sequence[Mapping[str, Any]]) -> tuple[Contact, ...]:
     )
 
 
+def _dump_contact(contact: Contact) -> dict[str, Any]:
+    table = asdict(contact) | {"measured": list(contact.measured)}
+    return {key: x for key, x in table.items() if x is not None and (key, x) != ("axes", "world")}
+
+
 def _load_loops(tables: Sequence[Mapping[str, Any]]) -> tuple[Loop, ...]:
     tuples: list[dict[str, Any]] = [
         {key: tuple(x) if isinstance(x, list) else x for key, x in {"frames": (), **table}.items()}
@@ -214,8 +219,8 @@ class Job(Settings):
         (),
         "links that may touch the ground: frame, the link; kind, point or surface; measured, "
         "components of the wrench that logs have as wrench_fz_<link>, of fx to mz, the others are "
-        "unknown; always, whether it always touches the ground, else logs have contact_<link>, 1 "
-        "or 0",
+        "unknown; axes of these, world or link; always, whether it always touches the ground, else "
+        "logs have contact_<link>, 1 or 0; threshold, for a column that is a force instead [N]",
         at="contact",
         reads=[
             {
@@ -223,10 +228,12 @@ class Job(Settings):
                 "kind": (str,),
                 "measured": Entries(list, (str,)),
                 "always": (bool,),
+                "axes": (str,),
+                "threshold": (int, float),
             }
         ],
         load=_load_contacts,
-        dump=lambda contacts: [asdict(x) | {"measured": list(x.measured)} for x in contacts],
+        dump=lambda contacts: [_dump_contact(x) for x in contacts],
     )
     loops: tuple[Loop, ...] = setting(
         (),
@@ -397,7 +404,7 @@ class Job(Settings):
             "units": self.units,
             "prismatic": tuple(model.layout.prismatic),
             "source": self.source,
-            "base": logged_base(model, self.base.twist),
+            "base": logged_base(model, self.base),
             "passive": model.passive,
             "transmissions": [gear.stated(model.tree.reductions) for gear in self.transmissions],
         }

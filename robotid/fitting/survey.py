@@ -435,6 +435,9 @@ def survey_log(
     for log in windows:
         check_units(log, layout.units, layout.prismatic)
     positions = _positions(locked, found, layout, model)
+    base = windows[0].base
+    if base is not None and base.imu is not None:  # all pieces have the bias of its first rows
+        layout = replace(layout, base=replace(layout.base, imu=base.imu.frame))
     if table.rows is None:
         length = max(stop - first, 1)
     windows = tuple(closed_log(model, log) for log in windows)

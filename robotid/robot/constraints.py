@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pinocchio as pin
 
-from robotid._settings import require_each, require_flag, require_kind
+from robotid._settings import is_number, require_each, require_flag, require_kind
 from robotid._typing import Array
 from robotid.exceptions import ModelError, SettingsError
 from robotid.findings import listed
@@ -27,12 +27,18 @@ class Contact:
             fz, mx, my, mz with the axes of the world and the origin of the link. The others are
             unknown.
         always: Whether it touches the ground at all samples; else logs state when.
+        axes: Axes of the components: "world", or "link" for those of the link, as a sensor in it
+            measures.
+        threshold: Force above which it touches the ground [N], if the log's column of the contact
+            is a force; None for a column of 0 and 1.
     """
 
     frame: str
     kind: str = "point"
     measured: tuple[str, ...] = ()
     always: bool = False
+    axes: str = "world"
+    threshold: float | None = None
 
     sizes: ClassVar[dict[str, int]] = {"point": 3, "surface": 6}
     components: ClassVar[tuple[str, ...]] = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -47,6 +53,14 @@ class Contact:
                     f"some of {listed(known)}, each once"
                 )
         require_flag(self.always, "always")
+        if self.axes not in ("world", "link"):
+            raise SettingsError(
+                f"axes of the contact {self.frame!r} is {self.axes!r}, wanted 'world' or 'link'"
+            )
+        if not (self.threshold is None or is_number(self.threshold)):
+            raise SettingsError(
+                f"threshold of the contact {self.frame!r} is {self.threshold!r}, wanted a force [N]"
+            )
 
     @property
     def rows_measured(self) -> list[int]:
@@ -68,9 +82,13 @@ class Contact:
 
         Args:
             jacobians: Jacobian of the frame with the axes of the world, shape (6, nv).
-            rotation: Not used.
+            rotation: Axes of the link in the world, shape (3, 3).
         """
-        return jacobians[0][: self.sizes[self.kind]]
+        rows = jacobians[0][: self.sizes[self.kind]]
+        if self.axes == "world":
+            return rows
+        turned: Array = (rotation.T @ rows.reshape(-1, 3, rows.shape[1])).reshape(rows.shape)
+        return turned
 
 
 @dataclass(frozen=True)
