@@ -107,7 +107,7 @@ def recorded(
         height: Of the base at the start [m].
         highest: Highest frequency of the motion [Hz].
         force: Whether the feet's forces are logged, in the world's axes.
-        imu: Placement of an IMU in the base, whose values are logged without noise; or None.
+        imu: Placement of an IMU in the base, whose filtered values are logged; or None.
     """
     mj = spec_of(model, feet, step=step, armature=armature, damping=damping, imu=imu)
     data = mujoco.MjData(mj)
@@ -126,6 +126,7 @@ def recorded(
     size = rng.dirichlet(np.ones(len(tones)), n)
     period, settles = round(1 / (rate * step)), 1.0
     rows, touches = [], np.zeros(len(feet))
+    means, sensed = [], np.zeros(mj.nsensordata)
     for k in range(round((duration + settles) / step)):
         t = k * step - settles
         if k % _HOLD == 0:
@@ -147,11 +148,13 @@ def recorded(
                 sign = 1.0 if contact.geom[1] == spheres[foot] else -1.0
                 wrench[foot] += sign * contact.frame.reshape(3, 3).T @ own[:3]
             half = 0.5 * (before + data.ctrl)
-            rows.append(
-                np.concatenate([[t], data.qpos, half, touches, wrench.ravel(), data.sensordata])
-            )
+            rows.append(np.concatenate([[t], data.qpos, half, touches, wrench.ravel()]))
             touches[:] = 0.0
+            means.append(sensed / period)
+        if k % period == 0:
+            sensed[:] = 0.0
         mujoco.mj_step(mj, data)
+        sensed += data.sensordata
         if k % _HOLD == 0 and data.ncon:  # at any time since the last row
             acting = data.contact.geom[data.contact.efc_address >= 0]
             touches[np.isin(spheres, acting)] = 1.0
@@ -170,7 +173,8 @@ def recorded(
         still = ImuFrame(
             pin.Quaternion(imu.rotation).coeffs(), imu.translation, mj.opt.gravity, np.zeros(3)
         )
-        measured, _ = motion_of_imu(t, q, rows[:, -6:], still)
+        means = np.array([*means, sensed / period])  # of the periods before and after each row
+        measured, _ = motion_of_imu(t, q, 0.5 * (means[:-1] + means[1:]), still)
     wrenches = {}
     if force:
         parts = ("fx", "fy", "fz")
