@@ -12,6 +12,7 @@ from robotid.findings import listed
 from robotid.logs.imu import IMU, ImuFrame, ImuMotion, inertial_state, motion_of_imu
 
 __all__ = [
+    "ACCELERATION",
     "POSE",
     "TWIST",
     "BaseColumns",
@@ -30,7 +31,8 @@ POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _ANGLES = ("x", "y", "z", "roll", "pitch", "yaw")
 #: Names of the components of a twist: linear [m/s] and angular velocity [rad/s].
 TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
-_ACCELERATION = ("ax", "ay", "az", "alx", "aly", "alz")
+#: Names of the components of its time derivative [m/s^2, rad/s^2].
+ACCELERATION = ("ax", "ay", "az", "alx", "aly", "alz")
 _POSE_REMEDY = (
     "Record base_x, base_y, base_z [m] and the orientation base_qx, base_qy, base_qz, base_qw, or "
     "base_roll, base_pitch, base_yaw [rad]; or state the link of an IMU, imu in [base]"
@@ -171,7 +173,7 @@ def base_columns(
 
 def _columns_of_base(where: str, names: Sequence[str], wanted: BaseColumns) -> dict[str, list[str]]:
     """Return the columns of the motion of the base, by kind."""
-    forms = {"pose": POSE, "angles": _ANGLES, "twist": TWIST, "acceleration": _ACCELERATION}
+    forms = {"pose": POSE, "angles": _ANGLES, "twist": TWIST, "acceleration": ACCELERATION}
     whole = {kind: [f"base_{end}" for end in ends] for kind, ends in forms.items()}
     orientations = ["pose", "angles"]
     if wanted.imu is not None:
@@ -288,7 +290,7 @@ def table_of_base(
         wrenches: As of ``Log.wrenches``.
     """
     table: dict[str, Array] = {}
-    forms = {"pose": POSE, "twist": TWIST, "acceleration": _ACCELERATION}
+    forms = {"pose": POSE, "twist": TWIST, "acceleration": ACCELERATION}
     for kind, ends in forms.items():
         values = getattr(base, kind, None)
         if values is not None:
