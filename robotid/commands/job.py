@@ -220,7 +220,8 @@ class Job(Settings):
         "links that may touch the ground: frame, the link; kind, point or surface; measured, "
         "components of the wrench that logs have as wrench_fz_<link>, of fx to mz, the others are "
         "unknown; axes of these, world or link; always, whether it always touches the ground, else "
-        "logs have contact_<link>, 1 or 0; threshold, for a column that is a force instead [N]",
+        "logs have contact_<link>, 1 or 0, or it is found; threshold, for a column that is a force "
+        "instead [N]",
         at="contact",
         reads=[
             {

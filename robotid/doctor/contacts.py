@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from robotid._typing import Array
+from robotid.doctor.found_contacts import with_contacts
 from robotid.exceptions import DataError
 from robotid.findings import Finding, log_finding
 from robotid.logs.base import base_state, in_base
@@ -41,9 +42,13 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         return
     still = replace(signals, velocity="differentiated", acceleration="differentiated")
     try:
-        motion = process(log, still)
-    except DataError:  # too short: the error is raised again when the log is read
+        found = with_contacts(model, log, signals)
+        motion = process(found, still)
+    except DataError:  # too short, or no contacts: raised again when the log is read
         return
+    for note in found.notes[len(log.notes) :]:
+        yield log_finding(log.name, "log_note", "note", note)
+    log = found
     every = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
     J, first = constraint_jacobian(model, motion.q, every), 0
     for contact in model.contacts:

@@ -1,6 +1,6 @@
 """Motion of a floating base: pose, twist and acceleration of its link."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -131,6 +131,20 @@ class BaseColumns:
     local: tuple[str, ...] = ()
     imu: ImuFrame | None = None
 
+    def present(self, names: Collection[str]) -> "BaseColumns":
+        """Return the same with only those contacts that a file has; the others may be found.
+
+        Args:
+            names: Names of its columns, and standard names that are renamed.
+        """
+        kept = [k for k, link in enumerate(self.contacts) if f"contact_{link}" in names]
+        limits = self.thresholds or (None,) * len(self.contacts)
+        return replace(
+            self,
+            contacts=tuple(self.contacts[k] for k in kept),
+            thresholds=tuple(limits[k] for k in kept),
+        )
+
 
 def base_columns(
     where: str, names: Sequence[str], wanted: BaseColumns, columns: Mapping[str, str]
@@ -144,28 +158,21 @@ def base_columns(
         columns: Names in the file by standard name, if they differ.
 
     Raises:
-        DataError: If the pose of a floating base, or a contact, is missing.
+        DataError: If the pose of a floating base, or a wrench, is missing.
     """
     names = [*names, *columns]
     found = _columns_of_base(where, names, wanted) if wanted.floats else {}
-    found["contact"] = [f"contact_{link}" for link in wanted.contacts]
+    found["contact"] = [f"contact_{link}" for link in wanted.present(names).contacts]
     found["wrench"] = [f"wrench_{name.replace(' ', '_', 1)}" for name in wanted.wrenches]
-    remedies = {
-        "contact": "Record 1 while the link touches the ground, 0 otherwise; or state always = "
-        "true in [[contact]]",
-        "wrench": "Name the column in [columns], or remove the component from measured in "
-        "[[contact]]",
-    }
-    for kind, remedy in remedies.items():
-        if missing := [name for name in found[kind] if name not in names]:
-            seen = [name for name in names if name.startswith(f"{kind}_")]
-            raise DataError(
-                f"{where} has no column {listed(missing)}; columns of that kind found: "
-                f"{listed(seen)}. {remedy}",
-                code="missing_column",
-            )
+    if missing := [name for name in found["wrench"] if name not in names]:
+        seen = [name for name in names if name.startswith("wrench_")]
+        raise DataError(
+            f"{where} has no column {listed(missing)}; columns of that kind found: {listed(seen)}. "
+            "Name the column in [columns], or remove the component from measured in [[contact]]",
+            code="missing_column",
+        )
     return {
-        kind if kind in remedies else f"base {kind}": [columns.get(name, name) for name in own]
+        kind if kind in ("contact", "wrench") else f"base {kind}": [columns.get(x, x) for x in own]
         for kind, own in found.items()
         if own
     }

@@ -332,6 +332,7 @@ def lay_out(
     gears = tuple(transmissions)
     stated = {key: opened.renamed.get(name, name) for key, name in (columns or {}).items()}
     of_base = base_columns(where, opened.names, base, stated)
+    base = base.present([*opened.names, *stated])
     base = replace(base, twist=opened.axes.get("twist", base.twist))
     notes = [*opened.notes, *_notes_of_sensors(where, opened, of_base, base)]
     of_joints = {x: y for x, y in stated.items() if y not in chain.from_iterable(of_base.values())}

@@ -13,7 +13,7 @@ from robotid._typing import Array
 from robotid.exceptions import ModelError, SettingsError
 from robotid.findings import listed
 
-__all__ = ["Constraint", "Contact", "Loop", "check_constraints", "frame_id"]
+__all__ = ["Constraint", "Contact", "Loop", "check_constraints", "frame_id", "link_positions"]
 
 
 @dataclass(frozen=True)
@@ -223,3 +223,19 @@ def frame_id(pin_model: pin.Model, link: str) -> int:
         link: Name of the link.
     """
     return int(pin_model.getFrameId(link, pin.FrameType.BODY))
+
+
+def link_positions(pin_model: pin.Model, configurations: Array, links: Sequence[str]) -> Array:
+    """Return the positions of links in the world, shape (N, k, 3) [m].
+
+    Args:
+        pin_model: The robot.
+        configurations: Pinocchio's configurations, shape (N, nq).
+        links: Names of the k links.
+    """
+    data, ids = pin_model.createData(), [frame_id(pin_model, link) for link in links]
+    found = np.empty((len(configurations), len(ids), 3))
+    for k, q in enumerate(np.ascontiguousarray(configurations)):
+        pin.framesForwardKinematics(pin_model, data, q)
+        found[k] = [data.oMf[i].translation for i in ids]
+    return found

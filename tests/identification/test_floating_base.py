@@ -117,6 +117,23 @@ def test_the_residual_at_the_truth_is_the_noise(found):
     assert ((share > 0.6) & (share < 1.0)).any()
 
 
+def test_contacts_without_flags_are_found(go1, trot):
+    from robotid.regressor.prediction import predict
+
+    log = replace(trot[0], base=BaseMotion(trot[0].base.pose))
+    for base in (log.base, trot[0].base):
+        held = hold_log(go1, replace(log, base=base, contacts={}), SIGNALS)
+        motion, used = held.whole.trajectory, held.whole.mask
+        (torque,) = predict(go1, [truth_of(go1)], motion)
+        assert np.sqrt(np.mean((motion.tau - torque)[used] ** 2)) < 0.7 * TORQUE
+        found = held.windows[0]
+        assert list(found.contacts) == list(log.contacts)
+        for foot, flags in found.contacts.items():
+            assert np.mean(flags < log.contacts[foot]) < 0.001  # in contact, but found in the air
+            assert np.mean(flags > log.contacts[foot]) < 0.15
+        assert "RR_foot" in found.notes[-1]
+
+
 def test_an_imu_replaces_position_and_velocity_of_the_base(go1, trot):
     from robotid.regressor.prediction import predict
 
