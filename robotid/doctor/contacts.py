@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.doctor.found_contacts import with_contacts
+from robotid.doctor.imu import check_imu
 from robotid.exceptions import DataError
 from robotid.findings import Finding, log_finding
 from robotid.logs.base import base_state, in_base
@@ -25,6 +27,8 @@ _LONGEST = 0.15  # [s] delay of contact flags that is searched for
 _DELAYED = 0.5  # ratio of squared speeds of the foot below which a delay is found
 _SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
 _STANDS = 0.3  # ... if it is above this share of its speed without contact
+_MARGIN = 0.03  # [s] after and before a change of contact in which a slip is not examined
+_SLIPS = 0.03  # share of the time in contact with a slip that is reported
 _FEWEST = 5  # changes of a contact without which a delay is not examined
 
 
@@ -36,9 +40,10 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         log: The log.
         signals: How the log becomes a trajectory.
     """
-    if log.base is not None and log.base.twist is not None:
+    if log.base is not None and log.base.twist is not None and log.base.imu is None:
         yield from _check_axes(log)
-    if not model.contacts:
+    imu = None if log.base is None else log.base.imu
+    if not model.contacts and imu is None:
         return
     still = replace(signals, velocity="differentiated", acceleration="differentiated")
     try:
@@ -48,16 +53,104 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         return
     for note in found.notes[len(log.notes) :]:
         yield log_finding(log.name, "log_note", "note", note)
-    log = found
-    every = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
-    J, first = constraint_jacobian(model, motion.q, every), 0
-    for contact in model.contacts:
-        v = np.einsum("kij,kj->ki", J[:, first : first + 3], motion.v)  # of the link [m/s]
-        first += contact.sizes[contact.kind]
-        flags = np.ones(len(log.t), dtype=bool)
-        if not contact.always and contact.frame in log.contacts:
-            flags = log.contacts[contact.frame]
-        yield from _check_flags(contact.frame, log, flags, motion, np.sum(v**2, axis=1))
+    flags = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
+    for k, contact in enumerate(model.contacts):
+        if not contact.always and contact.frame in found.contacts:
+            flags[:, k] = _at(found.contacts[contact.frame], found, motion.t)
+    world = [
+        replace(contact, kind="point", axes="world", measured=()) for contact in model.contacts
+    ]
+    every = np.ones_like(flags)
+    J = constraint_jacobian(replace(model, constraints=tuple(world)), motion.q, every)
+    J = J.reshape(len(J), len(world), 3, model.n_rows)
+    if imu is not None:
+        wrong = list(check_imu(found, motion, _of_pairs(J, flags, motion.v)))
+        yield from wrong
+        if any(finding.code == "imu_axes" for finding in wrong):
+            return
+    if not model.contacts:
+        return
+    velocity = np.einsum("kcij,kj->kci", J, motion.v)  # (N, contacts, 3) [m/s]
+    relative = np.sum(_relative(velocity, flags) ** 2, axis=2)
+    has_ground = log.base is None or log.base.has_position
+    squares = np.sum(velocity**2, axis=2) if has_ground else relative
+    for k, contact in enumerate(model.contacts):
+        own = log.contacts.get(contact.frame)
+        if contact.always:
+            own = np.ones(len(log.t), dtype=bool)
+        if own is None:  # found from this motion
+            continue
+        named = list(_check_flags(contact.frame, log, own, motion, squares[:, k], has_ground))
+        slips = np.minimum(squares[:, k], 4.0 * relative[:, k])  # 2 feet: each moves by a half
+        yield from named or _check_slip(contact.frame, log, flags[:, k], motion, slips, signals)
+
+
+def _at(flags: Array, log: Log, t: Array) -> Array:
+    """Return flags at other times: those of the last row."""
+    rows = np.searchsorted(log.t, t + 1e-9, side="right") - 1
+    at: Array = flags[rows.clip(0, len(flags) - 1)]
+    return at
+
+
+def _relative(velocity: Array, flags: Array) -> Array:
+    """Return velocities (N, k, 3) relative to the median of the links in contact.
+
+    They are 0 where fewer than two links are in contact.
+    """
+    standing = np.where(flags[..., None], velocity, np.nan)
+    standing[flags.sum(axis=1) < 2] = 0.0
+    relative: Array = velocity - np.nanmedian(standing, axis=1)[:, None]
+    relative[flags.sum(axis=1) < 2] = 0.0
+    return relative
+
+
+def _of_pairs(J: Array, flags: Array, v: Array) -> tuple[Array, Array]:
+    """Return D and d of the relative velocities D w + d of pairs of links in contact.
+
+    Args:
+        J: Jacobians of the links, shape (N, k, 3, n_rows).
+        flags: Whether they are in contact, shape (N, k).
+        v: Velocities, shape (N, n_rows).
+    """
+    D, d = np.zeros((len(J), 0, 3)), np.zeros((len(J), 0))
+    for i, j in combinations(range(J.shape[1]), 2):
+        both = flags[:, i] & flags[:, j]
+        own = (J[:, i] - J[:, j]) * both[:, None, None]
+        D = np.concatenate([D, own[..., 3:6]], axis=1)
+        d = np.concatenate([d, np.einsum("kij,kj->ki", own[..., 6:], v[:, 6:])], axis=1)
+    return D, d
+
+
+def _check_slip(
+    link: str, log: Log, flags: Array, motion: Trajectory, squares: Array, signals: SignalSettings
+) -> Iterator[Finding]:
+    """Yield a finding if a link moves during a part of its contacts, away from their ends.
+
+    Args:
+        link: The link.
+        log: The log.
+        flags: Whether it is in contact, shape (N,).
+        motion: The smoothed motion.
+        squares: Square of the link's speed that is not that of all links in contact, shape (N,)
+            [m^2/s^2].
+        signals: Settings of the filter, which spreads the motion beyond a contact.
+    """
+    step = float(np.median(np.diff(motion.t)))
+    reach = _MARGIN + (1.0 / signals.cutoff if signals.cutoff else 0.0)
+    width = 2 * round(reach / step) + 1
+    beside = np.convolve(~flags, np.ones(width), mode="same") > 0.5
+    inside = ~beside
+    slips = inside & (squares > _SLIDES**2)
+    if np.count_nonzero(slips) < _SLIPS * np.count_nonzero(inside) or not slips.any():
+        return
+    share = np.count_nonzero(slips) / np.count_nonzero(inside)
+    speed, distance = np.sqrt(squares[slips].mean()), step * np.sqrt(squares[slips]).sum()
+    message = (
+        f"the link {link} slips in {share:.0%} of its time in contact, at {speed:.2g} m/s (RMS), "
+        f"{distance:.2g} m in total. Its force is still eliminated"
+    )
+    evidence = {"share": share, "speed": speed, "distance": distance}
+    yield log_finding(log.name, "slipping_foot", "note", message, **evidence)
 
 
 def _check_axes(log: Log) -> Iterator[Finding]:
@@ -91,7 +184,7 @@ def _check_axes(log: Log) -> Iterator[Finding]:
 
 
 def _check_flags(
-    link: str, log: Log, flags: Array, motion: Trajectory, squares: Array
+    link: str, log: Log, flags: Array, motion: Trajectory, squares: Array, has_ground: bool
 ) -> Iterator[Finding]:
     """Yield findings on one contact: its flags have a delay, or the link moves in contact.
 
@@ -101,18 +194,18 @@ def _check_flags(
         flags: Whether it touches the ground, by row of the log.
         motion: The smoothed motion.
         squares: Square of the link's speed along it, shape (N,) [m^2/s^2].
+        has_ground: Whether the speed does not depend on the flags of other links.
     """
     step = float(np.median(np.diff(motion.t)))
 
     def mean_square(delay: float) -> float:
         """Return the mean square speed in contact if the flags have a delay [s]."""
-        k = np.searchsorted(log.t, motion.t + delay + 1e-9, side="right") - 1
-        touching = flags[k.clip(0, len(flags) - 1)]
+        touching = _at(flags, log, motion.t + delay)
         return float(squares[touching].mean()) if touching.any() else np.inf
 
     now = mean_square(0.0)
     changes = int(np.count_nonzero(np.diff(flags.astype(int))))
-    if changes >= _FEWEST:
+    if changes >= _FEWEST and has_ground:
         reach = int(_LONGEST / step)
         delays = step * np.arange(-reach, reach + 1)
         found = np.array([mean_square(delay) for delay in delays])
@@ -126,7 +219,7 @@ def _check_flags(
             yield log_finding(log.name, "contact_delay", "warning", message, delay=best)
             return
     own = np.sqrt(now)
-    swings = ~flags[(np.searchsorted(log.t, motion.t + 1e-9, side="right") - 1).clip(0)]
+    swings = ~_at(flags, log, motion.t)
     other = np.sqrt(squares[swings].mean()) if swings.any() else np.inf
     if np.isfinite(own) and own > _SLIDES and (own > _STANDS * other or not swings.any()):
         message = (

@@ -25,7 +25,7 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["FoundContact", "find_contacts", "with_contacts"]
 
-_SURE = 0.99  # probability from which a sample is decided
+_SURE = 0.98  # probability from which a sample is decided
 _FEWEST = 0.5  # share of decided samples of a contact below which it is not found
 _LOAD = 0.4  # of the mean force of all feet on the ground: initial limit of a contact
 _SOME = 20  # samples without which a distribution is not estimated
