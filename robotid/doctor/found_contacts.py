@@ -235,12 +235,21 @@ def _evidence(x: Array, p: Array, narrow: float, off: float | None) -> Array:
         narrow: Smallest standard deviation.
         off: Mean value without contact; None to estimate it.
     """
-    on = float(np.average(x, weights=p))
+    on, is_fixed = float(np.average(x, weights=p)), off is not None
     off = float(np.average(x, weights=1.0 - p)) if off is None else off
-    a, b = (
-        max(float(np.sqrt(np.average((x - mean) ** 2, weights=w))), narrow)
-        for mean, w in ((on, p), (off, 1.0 - p))
-    )
+    a = max(float(np.sqrt(np.average((x - on) ** 2, weights=p))), narrow)
+    b = np.sqrt(np.average((x - off) ** 2, weights=1.0 - p))
+    if is_fixed:  # its tails are links in contact
+        b = min(b, _spread(x - off, 1.0 - p))
+    b = max(float(b), narrow)
     y = np.clip(x, min(on, off), max(on, off))  # values beyond both are no further evidence
     ratio: Array = (((y - off) / b) ** 2 - ((y - on) / a) ** 2) / 2 - np.log(a / b)
     return ratio
+
+
+def _spread(x: Array, weights: Array) -> float:
+    """Return the standard deviation of a normal distribution with the median of |x|."""
+    order = np.argsort(np.abs(x), axis=None)
+    total = np.cumsum(weights.ravel()[order])
+    middle = order[np.searchsorted(total, 0.5 * total[-1])]
+    return 1.4826 * float(np.abs(x.ravel()[middle]))
