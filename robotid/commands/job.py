@@ -117,6 +117,11 @@ def _load_contacts(tables: Sequence[Mapping[str, Any]]) -> tuple[Contact, ...]:
     )
 
 
+def _dump_contact(contact: Contact) -> dict[str, Any]:
+    table = asdict(contact) | {"measured": list(contact.measured)}
+    return {key: x for key, x in table.items() if x is not None and (key, x) != ("axes", "world")}
+
+
 def _load_loops(tables: Sequence[Mapping[str, Any]]) -> tuple[Loop, ...]:
     tuples: list[dict[str, Any]] = [
         {key: tuple(x) if isinstance(x, list) else x for key, x in {"frames": (), **table}.items()}
@@ -233,9 +238,11 @@ class Job(Settings):
         (),
         "links that may touch the ground: frame, the link; kind, point or surface; measured, "
         "components of the wrench that logs have as wrench_fz_<link>, of fx to mz, the others are "
-        "unknown; always, whether it always touches the ground, else logs have contact_<link>, 1 "
-        "or 0; radius of a ball-shaped foot, below whose frame the ground is [m]; uncertainty, "
-        "standard deviation of the point of contact [m], estimated if it is not stated",
+        "unknown; axes of these, world or link; always, whether it always touches the ground, else "
+        "logs have contact_<link>, 1 or 0, or it is found; threshold, for a column that is a force "
+        "instead [N]; radius of a ball-shaped foot, below whose frame the ground is [m]; "
+        "uncertainty, standard deviation of the point of contact [m], estimated if it is not "
+        "stated",
         at="contact",
         reads=[
             {
@@ -245,17 +252,12 @@ class Job(Settings):
                 "always": (bool,),
                 "radius": (int, float),
                 "uncertainty": (int, float),
+                "axes": (str,),
+                "threshold": (int, float),
             }
         ],
         load=_load_contacts,
-        dump=lambda contacts: [
-            {
-                k: list(y) if isinstance(y, tuple) else y
-                for k, y in asdict(x).items()
-                if y is not None
-            }
-            for x in contacts
-        ],
+        dump=lambda contacts: [_dump_contact(x) for x in contacts],
     )
     loops: tuple[Loop, ...] = setting(
         (),
@@ -430,7 +432,7 @@ class Job(Settings):
             "units": self.units,
             "prismatic": tuple(model.layout.prismatic),
             "source": self.source,
-            "base": logged_base(model, self.base.twist),
+            "base": logged_base(model, self.base),
             "passive": model.passive,
             "transmissions": [gear.stated(model.tree.reductions) for gear in self.transmissions],
         }

@@ -2,10 +2,13 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
 from robotid._typing import Array
+from robotid.doctor.found_contacts import with_contacts
+from robotid.doctor.imu import check_imu
 from robotid.exceptions import DataError
 from robotid.findings import Finding, log_finding
 from robotid.logs.base import base_state, in_base
@@ -25,6 +28,8 @@ _LONGEST = 0.15  # [s] delay of contact flags that is searched for
 _DELAYED = 0.5  # ratio of squared speeds of the foot below which a delay is found
 _SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
 _STANDS = 0.3  # ... if it is above this share of its speed without contact
+_MARGIN = 0.03  # [s] after and before a change of contact in which a slip is not examined
+_SLIPS = 0.03  # share of the time in contact with a slip that is reported
 _FEWEST = 5  # changes of a contact without which a delay is not examined
 _ROLLS = 0.3  # median speed at the contact of a rolling foot, as a share of that of its frame ...
 _CREEPS = 2e-3  # [m/s] ... if the frame is faster than this
@@ -38,31 +43,135 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         log: The log.
         signals: How the log becomes a trajectory.
     """
-    if log.base is not None and log.base.twist is not None:
+    if log.base is not None and log.base.twist is not None and log.base.imu is None:
         yield from _check_axes(log)
-    if not model.contacts:
+    imu = None if log.base is None else log.base.imu
+    if not model.contacts and imu is None:
         return
     still = replace(signals, velocity="differentiated", acceleration="differentiated")
     try:
-        motion = process(log, still)
-    except DataError:  # too short: the error is raised again when the log is read
+        found = with_contacts(model, log, signals)
+        motion = process(found, still)
+    except DataError:  # too short, or no contacts: raised again when the log is read
         return
-    every = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
-    surfaces = tuple(Contact(x.frame, "surface") for x in model.contacts)
-    J = constraint_jacobian(replace(model, constraints=surfaces), motion.q, every)
-    speeds = np.einsum("kij,kj->ki", J, motion.v).reshape(len(motion.t), -1, 6)
-    for contact, speed in zip(model.contacts, speeds.swapaxes(0, 1), strict=True):
-        flags = np.ones(len(log.t), dtype=bool)
-        if not contact.always and contact.frame in log.contacts:
-            flags = log.contacts[contact.frame]
-        rolls = np.column_stack([speed[:, 4], -speed[:, 3], 0.0 * speed[:, 5]])  # v / radius
-        v = speed[:, :3] - contact.radius * rolls  # at the contact [m/s]
-        findings = list(_check_flags(contact.frame, log, flags, motion, np.sum(v**2, axis=1)))
-        if contact.kind == "point" and "contact_delay" not in [x.code for x in findings]:
-            touching = _at(log, flags, motion.t)
-            rolling = list(_check_radius(contact, log, v[touching], rolls[touching]))
-            findings = rolling or findings
-        yield from findings
+    for note in found.notes[len(log.notes) :]:
+        yield log_finding(log.name, "log_note", "note", note)
+    flags = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
+    for k, contact in enumerate(model.contacts):
+        if not contact.always and contact.frame in found.contacts:
+            flags[:, k] = _at(found.contacts[contact.frame], found, motion.t)
+    J, turn = _contact_jacobian(model, motion.q)
+    if imu is not None:
+        wrong = list(check_imu(found, motion, _of_pairs(J, flags, motion.v)))
+        yield from wrong
+        if any(finding.code == "imu_axes" for finding in wrong):
+            return
+    if not model.contacts:
+        return
+    velocity = np.einsum("kcij,kj->kci", J, motion.v)  # (N, contacts, 3) [m/s]
+    relative = np.sum(_relative(velocity, flags) ** 2, axis=2)
+    has_ground = log.base is None or log.base.has_position
+    squares = np.sum(velocity**2, axis=2) if has_ground else relative
+    for k, contact in enumerate(model.contacts):
+        own = log.contacts.get(contact.frame)
+        if contact.always:
+            own = np.ones(len(log.t), dtype=bool)
+        if own is None:  # found from this motion
+            continue
+        named = list(_check_flags(contact.frame, log, own, motion, squares[:, k], has_ground))
+        is_delayed = "contact_delay" in [finding.code for finding in named]
+        if contact.kind == "point" and has_ground and not is_delayed:
+            w = np.einsum("kij,kj->ki", turn[:, k], motion.v)
+            rolls = np.column_stack([w[:, 1], -w[:, 0], 0.0 * w[:, 2]])  # v / radius
+            touching = _at(own, log, motion.t)
+            named = (
+                list(_check_radius(contact, log, velocity[touching, k], rolls[touching])) or named
+            )
+        slips = np.minimum(squares[:, k], 4.0 * relative[:, k])  # 2 feet: each moves by a half
+        yield from named or _check_slip(contact.frame, log, flags[:, k], motion, slips, signals)
+
+
+def _at(flags: Array, log: Log, t: Array) -> Array:
+    """Return flags at other times: those of the last row."""
+    rows = np.searchsorted(log.t, t + 1e-9, side="right") - 1
+    at: Array = flags[rows.clip(0, len(flags) - 1)]
+    return at
+
+
+def _relative(velocity: Array, flags: Array) -> Array:
+    """Return velocities (N, k, 3) relative to the median of the links in contact.
+
+    They are 0 where fewer than two links are in contact.
+    """
+    standing = np.where(flags[..., None], velocity, np.nan)
+    standing[flags.sum(axis=1) < 2] = 0.0
+    relative: Array = velocity - np.nanmedian(standing, axis=1)[:, None]
+    relative[flags.sum(axis=1) < 2] = 0.0
+    return relative
+
+
+def _of_pairs(J: Array, flags: Array, v: Array) -> tuple[Array, Array]:
+    """Return D and d of the relative velocities D w + d of pairs of links in contact.
+
+    Args:
+        J: Jacobians of the links, shape (N, k, 3, n_rows).
+        flags: Whether they are in contact, shape (N, k).
+        v: Velocities, shape (N, n_rows).
+    """
+    D, d = np.zeros((len(J), 0, 3)), np.zeros((len(J), 0))
+    for i, j in combinations(range(J.shape[1]), 2):
+        both = flags[:, i] & flags[:, j]
+        own = (J[:, i] - J[:, j]) * both[:, None, None]
+        D = np.concatenate([D, own[..., 3:6]], axis=1)
+        d = np.concatenate([d, np.einsum("kij,kj->ki", own[..., 6:], v[:, 6:])], axis=1)
+    return D, d
+
+
+def _check_slip(
+    link: str, log: Log, flags: Array, motion: Trajectory, squares: Array, signals: SignalSettings
+) -> Iterator[Finding]:
+    """Yield a finding if a link moves during a part of its contacts, away from their ends.
+
+    Args:
+        link: The link.
+        log: The log.
+        flags: Whether it is in contact, shape (N,).
+        motion: The smoothed motion.
+        squares: Square of the link's speed that is not that of all links in contact, shape (N,)
+            [m^2/s^2].
+        signals: Settings of the filter, which spreads the motion beyond a contact.
+    """
+    step = float(np.median(np.diff(motion.t)))
+    reach = _MARGIN + (1.0 / signals.cutoff if signals.cutoff else 0.0)
+    width = 2 * round(reach / step) + 1
+    beside = np.convolve(~flags, np.ones(width), mode="same") > 0.5
+    inside = ~beside
+    slips = inside & (squares > _SLIDES**2)
+    if np.count_nonzero(slips) < _SLIPS * np.count_nonzero(inside) or not slips.any():
+        return
+    share = np.count_nonzero(slips) / np.count_nonzero(inside)
+    speed, distance = np.sqrt(squares[slips].mean()), step * np.sqrt(squares[slips]).sum()
+    message = (
+        f"the link {link} slips in {share:.0%} of its time in contact, at {speed:.2g} m/s (RMS), "
+        f"{distance:.2g} m in total. Its force is still eliminated"
+    )
+    evidence = {"share": share, "speed": speed, "distance": distance}
+    yield log_finding(log.name, "slipping_foot", "note", message, **evidence)
+
+
+def _contact_jacobian(model: RobotModel, q: Array) -> tuple[Array, Array]:
+    """Return the Jacobians (N, k, 3, n_rows) of the k points of contact, and of their links' turn.
+
+    Their axes are those of the world.
+    """
+    surfaces = tuple(Contact(contact.frame, "surface") for contact in model.contacts)
+    every = np.ones((len(q), len(surfaces)), dtype=bool)
+    J = constraint_jacobian(replace(model, constraints=surfaces), q, every)
+    J = J.reshape(len(q), len(surfaces), 6, model.n_rows)
+    radius = np.array([contact.radius for contact in model.contacts])[:, None]
+    J[:, :, 0] -= radius * J[:, :, 4]  # v + w x (0, 0, -radius)
+    J[:, :, 1] += radius * J[:, :, 3]
+    return J[:, :, :3], J[:, :, 3:]
 
 
 def _check_axes(log: Log) -> Iterator[Finding]:
@@ -96,7 +205,7 @@ def _check_axes(log: Log) -> Iterator[Finding]:
 
 
 def _check_flags(
-    link: str, log: Log, flags: Array, motion: Trajectory, squares: Array
+    link: str, log: Log, flags: Array, motion: Trajectory, squares: Array, has_ground: bool
 ) -> Iterator[Finding]:
     """Yield findings on one contact: its flags have a delay, or the link moves in contact.
 
@@ -106,17 +215,18 @@ def _check_flags(
         flags: Whether it touches the ground, by row of the log.
         motion: The smoothed motion.
         squares: Square of the link's speed along it, shape (N,) [m^2/s^2].
+        has_ground: Whether the speed does not depend on the flags of other links.
     """
     step = float(np.median(np.diff(motion.t)))
 
     def mean_square(delay: float) -> float:
         """Return the mean square speed in contact if the flags have a delay [s]."""
-        touching = _at(log, flags, motion.t + delay)
+        touching = _at(flags, log, motion.t + delay)
         return float(squares[touching].mean()) if touching.any() else np.inf
 
     now = mean_square(0.0)
     changes = int(np.count_nonzero(np.diff(flags.astype(int))))
-    if changes >= _FEWEST:
+    if changes >= _FEWEST and has_ground:
         reach = int(_LONGEST / step)
         delays = step * np.arange(-reach, reach + 1)
         found = np.array([mean_square(delay) for delay in delays])
@@ -130,7 +240,7 @@ def _check_flags(
             yield log_finding(log.name, "contact_delay", "warning", message, delay=best)
             return
     own = np.sqrt(now)
-    swings = ~_at(log, flags, motion.t)
+    swings = ~_at(flags, log, motion.t)
     other = np.sqrt(squares[swings].mean()) if swings.any() else np.inf
     if np.isfinite(own) and own > _SLIDES and (own > _STANDS * other or not swings.any()):
         message = (
@@ -173,12 +283,6 @@ def _check_radius(contact: Contact, log: Log, v: Array, rolls: Array) -> Iterato
     yield log_finding(
         log.name, "rolling_contact", "warning", message, radius=radius, before=before, after=after
     )
-
-
-def _at(log: Log, flags: Array, t: Array) -> Array:
-    """Return the flags of a contact at times, shape (N,), bool."""
-    k = np.searchsorted(log.t, t + 1e-9, side="right") - 1
-    return np.asarray(flags[k.clip(0, len(flags) - 1)])
 
 
 def _rms(values: Array) -> float:

@@ -16,6 +16,7 @@ import numpy as np
 
 from robotid._text import seconds
 from robotid._typing import Array
+from robotid.doctor.found_contacts import with_contacts
 from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.fitting.closed_log import closed_log
@@ -71,7 +72,7 @@ class _Header:
         layout = self.source
         reader = _reader(open_table(Path(layout.path), layout.source), layout.wanted)
         log = _log_of(layout, reader.read(layout.wanted, first, stop, near), first)
-        return closed_log(self.model, log)
+        return with_contacts(self.model, closed_log(self.model, log), self.signals)
 
     @property
     def is_compiled(self) -> bool | None:
@@ -363,7 +364,8 @@ def _check_base(model: RobotModel, log: Log) -> None:
         )
     for kind in ("contacts", "wrenches"):
         found, names = tuple(getattr(log, kind)), getattr(wanted, kind)
-        if found != names:
+        stated = tuple(x for x in names if x in found)  # contacts without flags are found
+        if found != (stated if kind == "contacts" else names):
             raise DataError(
                 f"{log.name} has the {kind} {listed(found)}, wanted those of the model, "
                 f"{listed(names)}, in this order; pass Log(..., {kind}={{...}})"
@@ -383,7 +385,7 @@ def hold_log(
     """
     count = len(log.t)
     _check_base(model, log)
-    log = closed_log(model, log)
+    log = with_contacts(model, closed_log(model, log), signals)
     if model.is_static:  # means of segments replace filters
         signals = replace(
             signals, cutoff=None, rate=None, velocity="differentiated",
@@ -438,9 +440,12 @@ def survey_log(
     for log in windows:
         check_units(log, layout.units, layout.prismatic)
     positions = _positions(locked, found, layout, model)
+    base = windows[0].base
+    if base is not None and base.imu is not None:  # all pieces have the bias of its first rows
+        layout = replace(layout, base=replace(layout.base, imu=base.imu.frame))
     if table.rows is None:
         length = max(stop - first, 1)
-    windows = tuple(closed_log(model, log) for log in windows)
+    windows = tuple(with_contacts(model, closed_log(model, log), signals) for log in windows)
     return SurveyedLog(
         model, layout, signals, stamps, first, stop, windows, positions, length, places
     )

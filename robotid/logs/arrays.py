@@ -17,6 +17,7 @@ from robotid.exceptions import DataError, MissingDependencyError
 from robotid.findings import listed
 from robotid.logs.data import suggestion
 from robotid.logs.settings import LogSource
+from robotid.logs.simulator_arrays import with_simulator_arrays
 from robotid.logs.table import Table, WritableFormat, choose, parsing, prefixes
 
 __all__ = ["Hdf5Format", "MatFormat", "NpzFormat"]
@@ -119,7 +120,8 @@ def _table_of_arrays(path: Path, entries: Mapping[str, _Entry], source: LogSourc
         if entries[at].is_number:
             _require_plausible_size(path, name, entries[at].shape)
             columns |= _columns_of(where, name, at, entries[at].shape, joints)
-    return Table(list(columns), partial(_read, where, entries, columns))
+    table = Table(list(columns), partial(_read, where, entries, columns))
+    return with_simulator_arrays(where, table, joints)
 
 
 def _group(where: str, paths: Sequence[str], topic: str | None) -> str:

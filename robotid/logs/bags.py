@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2, including MCAP: joint states and commands as a table of columns.
+"""Bags of ROS 1 and ROS 2, including MCAP: joints, commands and sensors as a table of columns.
 
 The library rosbags reads all of them; ROS need not be installed.
 """
@@ -17,6 +17,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.findings import listed
+from robotid.logs.bag_sensors import Sensor, first_of, is_low_state, sensors_of, with_sensors
 from robotid.logs.data import repeated, suggestion
 from robotid.logs.settings import LogSource
 from robotid.logs.table import Format, Table, choose
@@ -53,11 +54,20 @@ class BagFormat(Format):
     reference (formerly "desired"), as ``qref_<joint>`` and ``dqref_<joint>``, and the effort of
     the reference as ``tauref_<joint>``. For joint states, the commands are in a second topic; a
     zero-order hold brings them to the time stamps of the states.
+
+    A LowState of Unitree contains its motors, by number: ``position_0``. Columns of sensors are of
+    further topics, as of ``with_sensors``.
     """
 
     def open(self, path: Path, source: LogSource) -> Table:
         with _open(path) as (reader, decode):
             types = {c.topic: _full_name(c.msgtype) for c in reader.connections}
+            filled = {c.topic: types[c.topic] for c in reader.connections if c.msgcount}
+
+            def first(topic: str) -> Any:  # noqa: ANN401
+                return next(_messages(path, reader, decode, topic))[1]
+
+            sensors = sensors_of(path.name, filled, first, source)
             topic = _choose_topic(path.name, reader, types, source)
             blocks = _blocks(path, reader, decode, topic, source, _MEASURED)
             others: dict[Layout, _Block] = {}
@@ -67,15 +77,52 @@ class BagFormat(Format):
         if source.command is not None:
             commands = _table(f"{path.name}, topic {source.command!r}", others)
             stamps = _stamps(blocks), _stamps(others)
-            return _with_commands(table, commands, stamps, source.command)
-        unread = sorted(x for x, kind in types.items() if kind == _CONTROLLER)
-        if unread and types[topic] != _CONTROLLER:
+            table = _with_commands(table, commands, stamps, source.command)
+        elif unread := _unread_commands(types, topic):
             note = (
                 f"commands are in topics that are not read: {listed(unread)}; topic = "
                 f'"{unread[0]}" reads them and their measured positions'
             )
-            return replace(table, notes=(note,))
-        return table
+            table = replace(table, notes=(note,))
+        return with_sensors(table, path.name, sensors, partial(_load, path, source))
+
+
+def _unread_commands(types: Mapping[str, str], topic: str) -> list[str]:
+    """Return the topics of controllers, if the joints are read from another topic."""
+    found = sorted(x for x, kind in types.items() if kind == _CONTROLLER)
+    return [] if types[topic] == _CONTROLLER else found
+
+
+def _load(path: Path, source: LogSource, sensor: Sensor) -> tuple[Array, Array]:
+    """Return stamps (N,) [s], sorted, and values (N, k) of a topic of a sensor."""
+    stamps, rows = array("q"), []
+    with _open(path) as (reader, decode):
+        for logged, message in _messages(path, reader, decode, sensor.topic):
+            stamps.append(_stamp(message, logged, source))
+            rows.append(sensor.values(message))
+    _require_stamped(path.name, sensor.topic, stamps, source)
+    t, values = np.array(stamps) / 1e9, np.array(rows, dtype=np.float64)
+    order = np.argsort(t, kind="stable")
+    return t[order], values[order]
+
+
+def _stamp(message: Any, logged: int, source: LogSource) -> int:  # noqa: ANN401
+    """Return the stamp of a message [ns]; without a header, the time of recording."""
+    if source.stamp == "log" or not hasattr(message, "header"):
+        return logged
+    clock = message.header.stamp
+    stamp: int = clock.sec * 10**9 + clock.nanosec
+    return stamp
+
+
+def _require_stamped(where: str, topic: str, stamps: Sequence[int], source: LogSource) -> None:
+    """Reject messages whose header stamps are all 0."""
+    if source.stamp == "header" and not any(stamps):
+        raise DataError(
+            f"{where}, topic {topic!r}: the header stamps of all {len(stamps)} messages are 0. To "
+            'use the time of recording, state stamp = "log" (job file table [log], CLI --stamp '
+            'log, Python source=LogSource(stamp="log"))'
+        )
 
 
 def _stamps(blocks: dict[Layout, _Block]) -> Array:
@@ -100,22 +147,16 @@ def _blocks(
 ) -> dict[Layout, _Block]:
     """Return the messages of a topic; fields are the names of position, velocity and effort."""
     blocks: dict[Layout, _Block] = {}
-    count = 0
-    for count, (logged, message) in enumerate(_messages(path, reader, decode, topic), start=1):
-        layout, values = _content(path.name, topic, count - 1, message, fields)
+    stamps = array("q")
+    for number, (logged, message) in enumerate(_messages(path, reader, decode, topic)):
+        layout, values = _content(path.name, topic, number, message, fields)
         block = blocks.setdefault(layout, _Block())
-        block.number.append(count - 1)
-        clock = message.header.stamp
-        by_header = source.stamp == "header"
-        block.stamp.append(clock.sec * 10**9 + clock.nanosec if by_header else logged)
+        block.number.append(number)
+        stamps.append(_stamp(message, logged, source))
+        block.stamp.append(stamps[-1])
         for part in values:
             block.values.frombytes(np.asarray(part, dtype=np.float64).tobytes())
-    if source.stamp == "header" and not any(any(block.stamp) for block in blocks.values()):
-        raise DataError(
-            f"{path.name}, topic {topic!r}: the header stamps of all {count} messages are 0. To "
-            'use the time of recording, state stamp = "log" (job file table [log], CLI --stamp '
-            'log, Python source=LogSource(stamp="log"))'
-        )
+    _require_stamped(path.name, topic, stamps, source)
     return blocks
 
 
@@ -175,14 +216,15 @@ def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes, str], Any]]]:
         raise _broken(path, error) from error
     with closing(reader):
         for connection in reader.connections:
-            if _full_name(connection.msgtype) == _CONTROLLER and _CONTROLLER not in types.types:
-                types.register(_definitions(path, connection.msgdef, types.types))
+            kind = _full_name(connection.msgtype)
+            if (kind == _CONTROLLER or is_low_state(kind)) and kind not in types.types:
+                types.register(_definitions(path, kind, connection.msgdef, types.types))
 
         def decode(raw: bytes, kind: str) -> Any:  # noqa: ANN401
             if kind not in types.types:
                 raise DataError(
                     f"{path.name} does not contain the definition of {kind}, as .db3 files before "
-                    "ROS 2 Iron; convert it to MCAP on a machine with control_msgs: 'ros2 bag "
+                    "ROS 2 Iron; convert it to MCAP on a machine with its package: 'ros2 bag "
                     "convert'"
                 )
             return deserialize(raw, kind)
@@ -190,14 +232,19 @@ def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes, str], Any]]]:
         yield reader, decode
 
 
-def _definitions(path: Path, definition: Any, known: Container[str]) -> dict[str, Any]:  # noqa: ANN401
-    """Return the unknown types that a bag defines for the states of its controllers."""
+def _definitions(
+    path: Path,
+    kind: str,
+    definition: Any,  # noqa: ANN401
+    known: Container[str],
+) -> dict[str, Any]:
+    """Return the unknown types that a bag defines for messages of a type."""
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
     found: dict[str, Any] = {}
     try:
         if definition.format.name == "MSG":
-            found = dict(get_types_from_msg(definition.data, _CONTROLLER))
+            found = dict(get_types_from_msg(definition.data, kind))
         elif definition.format.name == "IDL":
             for text in definition.data.split("=" * 80 + "\n"):
                 found |= get_types_from_idl(re.sub(r"^IDL: .*\n", "", text)) if text else {}
@@ -244,7 +291,11 @@ def _choose_topic(
     """
     filled = {c.topic for c in reader.connections if c.msgcount}
     listing = f"topics: {dict(sorted(types.items()))}"
-    for wanted, kinds in ((source.topic, (_STATE, _CONTROLLER)), (source.command, (_STATE,))):
+    low = [kind for kind in types.values() if is_low_state(kind)]
+    for wanted, kinds in (
+        (source.topic, (_STATE, _CONTROLLER, *low)),
+        (source.command, (_STATE,)),
+    ):
         if wanted is None:
             continue
         if wanted not in types:
@@ -265,7 +316,7 @@ def _choose_topic(
         )
     if source.topic is not None:
         return source.topic
-    for kind in (_STATE, _CONTROLLER):
+    for kind in (_STATE, _CONTROLLER, *low):
         found = sorted(x for x in filled if types[x] == kind and x != source.command)
         if found:
             return choose(where, found, f"topics of {kind}", listing)
@@ -286,8 +337,14 @@ def _content(
     fields: Sequence[str],
 ) -> tuple[Layout, list[Array]]:
     """Return the joints of a message, and its fields with values."""
+    motors = first_of(message, "motor_state", "motorState")
     if hasattr(message, "joint_names"):
         names, content = tuple(message.joint_names), _controlled(message)
+    elif motors is not None:
+        names = tuple(str(k) for k in range(len(motors)))
+        torques = [first_of(motor, "tau_est", "tauEst") for motor in motors]
+        values = [motor.q for motor in motors], [motor.dq for motor in motors], torques
+        content = dict(zip(fields, values, strict=True))
     else:
         names = tuple(message.name)
         values = (message.position, message.velocity, message.effort)

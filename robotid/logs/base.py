@@ -1,6 +1,6 @@
 """Motion of a floating base: pose, twist and acceleration of its link."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,9 +9,12 @@ from numpy.typing import ArrayLike
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
+from robotid.logs.imu import IMU, ImuFrame, ImuMotion, inertial_state, motion_of_imu
 
 __all__ = [
+    "ACCELERATION",
     "POSE",
+    "TWIST",
     "BaseColumns",
     "BaseMotion",
     "base_columns",
@@ -26,8 +29,18 @@ __all__ = [
 #: Names of the coordinates of a pose: position [m], and the orientation as a quaternion.
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _ANGLES = ("x", "y", "z", "roll", "pitch", "yaw")
-_TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
-_ACCELERATION = ("ax", "ay", "az", "alx", "aly", "alz")
+#: Names of the components of a twist: linear [m/s] and angular velocity [rad/s].
+TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
+#: Names of the components of its time derivative [m/s^2, rad/s^2].
+ACCELERATION = ("ax", "ay", "az", "alx", "aly", "alz")
+_POSE_REMEDY = (
+    "Record base_x, base_y, base_z [m] and the orientation base_qx, base_qy, base_qz, base_qw, or "
+    "base_roll, base_pitch, base_yaw [rad]; or state the link of an IMU, imu in [base]"
+)
+_IMU_REMEDY = (
+    "Record imu_wx, imu_wy, imu_wz [rad/s], imu_ax, imu_ay, imu_az [m/s^2], and the orientation "
+    "imu_qx, imu_qy, imu_qz, imu_qw, or that of the base"
+)
 _UNIT = 1e-3  # tolerance of the norm of a logged quaternion
 
 
@@ -42,6 +55,8 @@ class BaseMotion:
             (N, 6); None if it was not recorded.
         acceleration: Time derivative of the twist, shape (N, 6) [m/s^2, rad/s^2]; None if it was
             not recorded.
+        imu: Values of an IMU, which determine angular velocity and acceleration; None without one.
+            The position is 0 if it was not recorded.
 
     Raises:
         DataError: If a shape is not the expected one, or a quaternion is not of length 1.
@@ -50,6 +65,7 @@ class BaseMotion:
     pose: Array
     twist: Array | None = None
     acceleration: Array | None = None
+    imu: ImuMotion | None = None
 
     def __post_init__(self) -> None:
         for name, width in (("pose", 7), ("twist", 6), ("acceleration", 6)):
@@ -75,8 +91,15 @@ class BaseMotion:
         Args:
             rows: Their numbers.
         """
-        parts = {name: x[rows] for name, x in vars(self).items() if x is not None}
-        return replace(self, **parts)
+        imu = None if self.imu is None else self.imu.at(rows)
+        arrays = {"pose": self.pose, "twist": self.twist, "acceleration": self.acceleration}
+        some: dict[str, Array] = {name: x[rows] for name, x in arrays.items() if x is not None}
+        return replace(self, imu=imu, **some)
+
+    @property
+    def has_position(self) -> bool:
+        """Whether the position was recorded."""
+        return bool(self.pose[:, :3].any())
 
 
 @dataclass(frozen=True)
@@ -92,12 +115,35 @@ class BaseColumns:
         wrenches: Components of wrenches, as "fz l_sole" from ``wrench_fz_l_sole``. With these, a
             log need not have torques.
         twist: Axes of the velocities: "base" or "world".
+        thresholds: For each contact the force above which it counts, if its column is a force, or
+            None; empty: none is.
+        local: Links whose wrenches have the axes of the link instead of the world's.
+        imu: Place of an IMU in the base, whose ``imu_wx`` to ``imu_az`` replace velocities and
+            accelerations; orientation is that of the base, or of the IMU, ``imu_qx`` to
+            ``imu_qw``; the position may be missing. None without an IMU.
     """
 
     floats: bool = False
     contacts: tuple[str, ...] = ()
     wrenches: tuple[str, ...] = ()
     twist: str = "base"
+    thresholds: tuple[float | None, ...] = ()
+    local: tuple[str, ...] = ()
+    imu: ImuFrame | None = None
+
+    def present(self, names: Collection[str]) -> "BaseColumns":
+        """Return the same with only those contacts that a file has; the others may be found.
+
+        Args:
+            names: Names of its columns, and standard names that are renamed.
+        """
+        kept = [k for k, link in enumerate(self.contacts) if f"contact_{link}" in names]
+        limits = self.thresholds or (None,) * len(self.contacts)
+        return replace(
+            self,
+            contacts=tuple(self.contacts[k] for k in kept),
+            thresholds=tuple(limits[k] for k in kept),
+        )
 
 
 def base_columns(
@@ -112,88 +158,130 @@ def base_columns(
         columns: Names in the file by standard name, if they differ.
 
     Raises:
-        DataError: If the pose of a floating base, or a contact, is missing.
+        DataError: If the pose of a floating base, or a wrench, is missing.
     """
-    found: dict[str, list[str]] = {}
     names = [*names, *columns]
-    if wanted.floats:
-        forms = {"pose": POSE, "angles": _ANGLES, "twist": _TWIST, "acceleration": _ACCELERATION}
-        whole = {kind: [f"base_{end}" for end in ends] for kind, ends in forms.items()}
-        found = {k: own for k, own in whole.items() if set(own) <= set(names)}
-        if "pose" in found:
-            found.pop("angles", None)
-        elif "angles" not in found:
-            seen = [name for name in names if name.startswith("base_")]
-            missing = [name for name in whole["pose"] if name not in names]
-            raise DataError(
-                f"{where} has no column {listed(missing)} of the pose of the floating base; "
-                f"columns of the base found: {listed(seen)}. Record base_x, base_y, base_z [m] and "
-                "the orientation base_qx, base_qy, base_qz, base_qw, or base_roll, base_pitch, "
-                "base_yaw [rad]",
-                code="missing_column",
-            )
-    found["contact"] = [f"contact_{link}" for link in wanted.contacts]
+    found = _columns_of_base(where, names, wanted) if wanted.floats else {}
+    found["contact"] = [f"contact_{link}" for link in wanted.present(names).contacts]
     found["wrench"] = [f"wrench_{name.replace(' ', '_', 1)}" for name in wanted.wrenches]
-    remedies = {
-        "contact": "Record 1 while the link touches the ground, 0 otherwise; or state always = "
-        "true in [[contact]]",
-        "wrench": "Name the column in [columns], or remove the component from measured in "
-        "[[contact]]",
-    }
-    for kind, remedy in remedies.items():
-        if missing := [name for name in found[kind] if name not in names]:
-            seen = [name for name in names if name.startswith(f"{kind}_")]
-            raise DataError(
-                f"{where} has no column {listed(missing)}; columns of that kind found: "
-                f"{listed(seen)}. {remedy}",
-                code="missing_column",
-            )
+    if missing := [name for name in found["wrench"] if name not in names]:
+        seen = [name for name in names if name.startswith("wrench_")]
+        raise DataError(
+            f"{where} has no column {listed(missing)}; columns of that kind found: {listed(seen)}. "
+            "Name the column in [columns], or remove the component from measured in [[contact]]",
+            code="missing_column",
+        )
     return {
-        kind if kind in remedies else f"base {kind}": [columns.get(name, name) for name in own]
+        kind if kind in ("contact", "wrench") else f"base {kind}": [columns.get(x, x) for x in own]
         for kind, own in found.items()
         if own
     }
 
 
-def base_of(values: Mapping[str, Array], twist: str) -> BaseMotion | None:
-    """Return the motion of the base from its columns, None without these.
+def _columns_of_base(where: str, names: Sequence[str], wanted: BaseColumns) -> dict[str, list[str]]:
+    """Return the columns of the motion of the base, by kind."""
+    forms = {"pose": POSE, "angles": _ANGLES, "twist": TWIST, "acceleration": ACCELERATION}
+    whole = {kind: [f"base_{end}" for end in ends] for kind, ends in forms.items()}
+    orientations = ["pose", "angles"]
+    if wanted.imu is not None:
+        whole = {kind: whole[kind] for kind in orientations}
+        whole |= {
+            "imu quaternion": [f"imu_{end}" for end in IMU[:4]],
+            "quaternion": [f"base_{end}" for end in POSE[3:]],
+            "rpy": [f"base_{end}" for end in _ANGLES[3:]],
+            "imu": [f"imu_{end}" for end in IMU[4:]],
+        }
+        orientations = [kind for kind in whole if kind != "imu"]
+    found = {kind: own for kind, own in whole.items() if set(own) <= set(names)}
+    used = next((kind for kind in orientations if kind in found), "")
+    required = ["imu"] if wanted.imu is not None else []
+    missing = [x for kind in required for x in whole[kind] if x not in names]
+    if not used and not missing:
+        missing = [x for x in whole["imu quaternion" if required else "pose"] if x not in names]
+    if missing:
+        seen = [name for name in names if name.startswith(("base_", "imu_"))]
+        what = "the IMU" if required else "the pose of the floating base"
+        remedy = _IMU_REMEDY if required else _POSE_REMEDY
+        raise DataError(
+            f"{where} has no column {listed(missing)} of {what}; columns of the base found: "
+            f"{listed(seen)}. {remedy}",
+            code="missing_column",
+        )
+    return {kind: own for kind, own in found.items() if kind == used or kind not in orientations}
+
+
+def base_of(
+    t: Array, q: Array, values: Mapping[str, Array], wanted: BaseColumns
+) -> tuple[BaseMotion | None, str]:
+    """Return the motion of the base from its columns, None without these, and a note or "".
 
     Args:
+        t: Time stamps, shape (N,) [s].
+        q: Joint positions, shape (N, n) [rad or m].
         values: Columns by kind, as of ``base_columns``, each of shape (N, k).
-        twist: Axes of the velocities: "base" or "world".
+        wanted: Axes of the velocities, and place of the IMU.
 
     Raises:
         DataError: If a value is not finite, or a quaternion is not of length 1.
     """
-    pose, angles = values.get("base pose"), values.get("base angles")
-    if angles is not None:
-        pose = np.hstack([angles[:, :3], quaternions_of_angles(angles[:, 3:])])
+    pose, frame = _pose_of(values, wanted.imu), wanted.imu
     if pose is None:
-        return None
+        return None, ""
     base = BaseMotion(pose, values.get("base twist"), values.get("base acceleration"))
-    if twist == "base" or base.twist is None:
-        return base
+    if frame is not None:
+        imu, note = motion_of_imu(t, q, _checked(values["base imu"], "IMU", 6), frame)
+        return replace(base, imu=imu), note
+    if wanted.twist == "base" or base.twist is None:
+        return base, ""
     quaternion = base.pose[:, 3:]
     parts = [in_base(quaternion, part) for part in (base.twist[:, :3], base.twist[:, 3:])]
-    return replace(base, twist=np.hstack(parts))
+    return replace(base, twist=np.hstack(parts)), ""
 
 
-def contacts_of(values: Array, links: Sequence[str], where: str) -> dict[str, Array]:
+def _pose_of(values: Mapping[str, Array], frame: ImuFrame | None) -> Array | None:
+    """Return the pose (N, 7) from its columns by kind; a position that is missing is 0."""
+    if (pose := values.get("base pose")) is not None:
+        return pose
+    if (angles := values.get("base angles")) is not None:
+        return np.hstack([angles[:, :3], quaternions_of_angles(angles[:, 3:])])
+    quaternion = values.get("base quaternion")
+    if (own := values.get("base imu quaternion")) is not None and frame is not None:
+        quaternion = _of_base(own, frame.quaternion)
+    elif (angles := values.get("base rpy")) is not None:
+        quaternion = quaternions_of_angles(angles)
+    return None if quaternion is None else np.hstack([0.0 * quaternion[:, :3], quaternion])
+
+
+def _of_base(quaternion: Array, own: Array) -> Array:
+    """Return the orientation of the base (N, 4) from that of an IMU, and the IMU's in the base."""
+    x, w, back = quaternion[:, :3], quaternion[:, 3:], -own[:3]
+    vector = w * back + own[3] * x + np.cross(x, back)
+    return np.hstack([vector, w * own[3] - x @ back[:, None]])
+
+
+def contacts_of(values: Array, wanted: BaseColumns, where: str) -> dict[str, Array]:
     """Return whether links touch the ground, by link, each of shape (N,), bool.
 
     Args:
-        values: Columns of 0 and 1, shape (N, k).
-        links: The links.
+        values: Columns of 0 and 1, or of forces of contacts with a threshold, shape (N, k).
+        wanted: The links, and their thresholds.
         where: Name of the file.
 
     Raises:
-        DataError: If a value is neither 0 nor 1.
+        DataError: If a flag is neither 0 nor 1.
     """
+    links = wanted.contacts
+    limits = np.full(len(links), np.nan)
+    if wanted.thresholds:
+        limits[:] = [np.nan if x is None else x for x in wanted.thresholds]
+    is_force = ~np.isnan(limits)
+    values = np.where(is_force, values > limits, values)
     for link, flags in zip(links, values.T, strict=True):
         wrong = np.flatnonzero((flags != 0.0) & (flags != 1.0))
         if len(wrong):
             raise DataError(
-                f"{where}: contact_{link} is {flags[wrong[0]]:g} in row {wrong[0]}, wanted 0 or 1"
+                f"{where}: contact_{link} is {flags[wrong[0]]:g} in row {wrong[0]}, wanted 0 or "
+                "1; if it is a force, state threshold in [[contact]]"
             )
     return {link: flags == 1.0 for link, flags in zip(links, values.T, strict=True)}
 
@@ -209,7 +297,7 @@ def table_of_base(
         wrenches: As of ``Log.wrenches``.
     """
     table: dict[str, Array] = {}
-    forms = {"pose": POSE, "twist": _TWIST, "acceleration": _ACCELERATION}
+    forms = {"pose": POSE, "twist": TWIST, "acceleration": ACCELERATION}
     for kind, ends in forms.items():
         values = getattr(base, kind, None)
         if values is not None:
@@ -219,7 +307,11 @@ def table_of_base(
 
 
 def base_state(
-    t: Array, pose: Array, twist: Array | None, acceleration: Array | None
+    t: Array,
+    pose: Array,
+    twist: Array | None,
+    acceleration: Array | None,
+    imu: ImuMotion | None = None,
 ) -> tuple[Array, Array, Array]:
     """Return pose (N, 7), twist (N, 6) and acceleration (N, 6) of a base as of Pinocchio.
 
@@ -231,6 +323,8 @@ def base_state(
         pose: Smoothed pose, shape (N, 7) [m, -]; the quaternions need not be of length 1.
         twist: Smoothed twist, shape (N, 6); None to differentiate the pose.
         acceleration: Smoothed acceleration, shape (N, 6); None to differentiate the twist.
+        imu: Smoothed values of an IMU, which replace angular velocity and acceleration; None
+            without one.
     """
     quaternion = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
     pose = np.hstack([pose[:, :3], quaternion])
@@ -239,7 +333,10 @@ def base_state(
         vector, scalar = quaternion[:, :3], quaternion[:, 3:]
         w = 2.0 * (scalar * rate[:, 3:6] - rate[:, 6:] * vector - np.cross(vector, rate[:, 3:6]))
         twist = np.hstack([in_base(quaternion, rate[:, :3]), w])
-    if acceleration is None:
+    if imu is not None:
+        down = in_base(quaternion, imu.frame.gravity)
+        twist, acceleration = inertial_state(t, twist[:, :3], down, imu.values, imu.frame)
+    elif acceleration is None:
         acceleration = np.gradient(twist, t, axis=0)
     return pose, twist, acceleration
 

@@ -225,8 +225,9 @@ class LogLayout:
                 values[kind] = self._to_si(kind, values[kind], is_motor)
             values[kind] = self._of_joints(kind, values[kind])
         t, where = self.stamps(values["time"][:, 0]), Path(self.path).name or "log"
-        base, flags = base_of(values, self.base.twist), values.pop("contact", None)
-        contacts = {} if flags is None else contacts_of(flags, self.base.contacts, where)
+        base, note = base_of(t, values["q"], values, self.base)
+        flags = values.pop("contact", None)
+        contacts = {} if flags is None else contacts_of(flags, self.base, where)
         forces = values.pop("wrench", np.empty((0, 0)))
         wrenches = dict(zip(self.base.wrenches, forces.T, strict=True))
         values = {kind: array for kind, array in values.items() if not kind.startswith("base ")}
@@ -235,12 +236,13 @@ class LogLayout:
             require_finite(array, t, names, where, first)
             array.flags.writeable = False  # so that the log does not copy it
         require_increasing(t, where, first)
+        notes = (*self.notes, note) if note else self.notes
         has_torque = "tau" in values
         if not has_torque:
             values["tau"] = np.zeros_like(values["q"])
         arrays = {name: values[kind] for kind, name in COLUMNS.items() if kind in values}
         return Log(
-            t=t, joints=self.joints, path=self.path, notes=self.notes, has_torque=has_torque,
+            t=t, joints=self.joints, path=self.path, notes=notes, has_torque=has_torque,
             base=base, contacts=contacts, wrenches=wrenches, **arrays,
         )  # fmt: skip
 
@@ -342,14 +344,17 @@ def lay_out(
     gears = tuple(transmissions)
     stated = {key: opened.renamed.get(name, name) for key, name in (columns or {}).items()}
     of_base = base_columns(where, opened.names, base, stated)
+    base = base.present([*opened.names, *stated])
+    base = replace(base, twist=opened.axes.get("twist", base.twist))
+    notes = [*opened.notes, *_notes_of_sensors(where, opened, of_base, base)]
     of_joints = {x: y for x, y in stated.items() if y not in chain.from_iterable(of_base.values())}
     finder = Finder(
         where, opened.names, of_joints, tuple(joints), gains or {}, source, gears, needs,
-        [*opened.notes], passive=passive,
+        notes, passive=passive,
     )  # fmt: skip
     joints = [joint for joint in joints if joint not in passive or finder.has_position(joint)]
     finder = replace(finder, joints=tuple(joints))
-    finder.seen.update(chain.from_iterable(of_base.values()))
+    finder.seen.update(chain.from_iterable(of_base.values()), opened.sensors)
     if base.wrenches and needs in ("torque", "any") and not any(map(finder.has_torque, joints)):
         finder = replace(finder, needs="motion")
     found = finder.find_all() | of_base  # names of columns by kind
@@ -368,6 +373,23 @@ def lay_out(
         base=base,
     )
     return layout, opened
+
+
+def _notes_of_sensors(
+    where: str, table: Table, columns: Mapping[str, Sequence[str]], base: BaseColumns
+) -> list[str]:
+    """Return a note on the columns of other topics; reject wrenches whose axes are not stated."""
+    forces = [name for name in columns.get("wrench", ()) if name in table.sensors]
+    links = {name.partition(" ")[2] for name in base.wrenches} - {*base.local}
+    if forces and links and table.axes.get("wrench") == "link":
+        raise DataError(
+            f"{where}: {listed(forces)} have the axes of their frames, but [[contact]] of "
+            f"{listed(sorted(links))} states those of the world; state axes = 'link'"
+        )
+    used = [table.sensors[x] for own in columns.values() for x in own if x in table.sensors]
+    if not used:
+        return []
+    return [f"interpolated at the stamps of the joints: {listed(list(dict.fromkeys(used)))}"]
 
 
 def write_log(log: Log, path: str | Path) -> None:

@@ -170,6 +170,11 @@ class LogSource(Settings):
         "the time stamps of a bag: header, the stamp in the message, or log, the time of recording",
         among=("header", "log"),
     )
+    sensors: tuple[str, ...] = setting(
+        (),
+        "the topics of a bag with odometry, IMU, wrenches or foot forces; all topics of these "
+        "kinds if not stated",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -191,4 +196,10 @@ class BaseSource(Settings):
         "base",
         "axes of the velocities base_vx to base_wz: base, those of the base link, or world",
         among=("base", "world"),
+    )
+    imu: str | None = setting(
+        None,
+        "the link of an IMU, fixed to the root link; its angular velocity and specific force, "
+        "imu_wx to imu_az, are used instead of velocities and accelerations of the base, and its "
+        "orientation, imu_qx to imu_qw, if there is none of the base",
     )

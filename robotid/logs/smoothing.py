@@ -4,7 +4,7 @@ A part is resampled and filtered together with neighbouring rows, which are remo
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -203,7 +203,8 @@ def _process_part(
     q, tau = smooth["q"], smooth["tau"]
     if log.base is not None:
         measured = smooth.get("twist"), smooth.get("base acceleration")
-        state = base_state(times, smooth["pose"], *measured)
+        imu = log.base.imu and replace(log.base.imu, values=smooth["imu"])
+        state = base_state(times, smooth["pose"], *measured, imu)
         q, v, a = (np.hstack(pair) for pair in zip(state, (q, v, a), strict=True))
         tau = np.hstack([np.zeros((len(tau), 6)), tau])  # no torque acts on the base
     wrenches = smooth.get("wrenches", np.empty((len(times), 0)))
@@ -214,6 +215,8 @@ def _process_part(
 def _base_channels(base: BaseMotion, settings: SignalSettings) -> dict[str, Array]:
     """Return the channels of a floating base by name, measured ones where the joints' are."""
     channels = {"pose": base.pose}
+    if base.imu is not None:
+        return channels | {"imu": base.imu.values}
     if settings.velocity == "measured" and base.twist is not None:
         channels["twist"] = base.twist
     if settings.acceleration == "measured" and base.acceleration is not None:

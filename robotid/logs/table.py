@@ -100,6 +100,8 @@ class Table:
     rows: RowReader | None = None  # reads row by row; None if the format is read as a whole
     renamed: Mapping[str, str] = field(default_factory=dict)  # names above by name in the file
     angle_unit: str = ""  # why the unit of angles must be stated; "" if it is known
+    sensors: Mapping[str, str] = field(default_factory=dict)  # sources of interpolated columns
+    axes: Mapping[str, str] = field(default_factory=dict)  # of "twist" and "wrench", if known
 
 
 class Format(ABC):

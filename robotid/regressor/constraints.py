@@ -14,8 +14,12 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
+from robotid.exceptions import ModelError
+from robotid.findings import listed
 from robotid.logs.base import BaseColumns
-from robotid.logs.data import Trajectory
+from robotid.logs.data import Trajectory, suggestion
+from robotid.logs.imu import ImuFrame
+from robotid.logs.settings import BaseSource
 from robotid.regressor.problem import RowSource
 from robotid.robot.constraints import Contact, frame_id
 from robotid.robot.model import RobotModel
@@ -34,6 +38,7 @@ __all__ = [
 ]
 
 _RANK = 1e-8  # singular values below this share of the largest are of dependent constraints
+_AS_IS = BaseSource()
 _BLOCK = 1024  # samples whose Jacobians are in memory together
 
 
@@ -41,7 +46,7 @@ def constraint_jacobian(model: RobotModel, q: Array, contacts: Array) -> Array:
     """Return the Jacobian of a robot's constraints at each sample, shape (N, m, n_rows).
 
     Args:
-        model: The robot; its contacts have the axes of the world, its loops likewise.
+        model: The robot; its contacts have the axes that they state, its loops those of the world.
         q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
         contacts: Which contacts touch the ground, shape (N, k), bool; the rows of others are 0.
 
@@ -245,19 +250,45 @@ def constraint_forces(model: RobotModel, motion: Trajectory, torque: Array, used
     return f
 
 
-def logged_base(model: RobotModel, twist: str = "base") -> BaseColumns:
+def logged_base(model: RobotModel, source: BaseSource = _AS_IS) -> BaseColumns:
     """Return the columns of a floating base and of contacts that logs of a robot have.
 
     Args:
         model: The robot.
-        twist: Axes of the velocities of the base: "base" or "world".
+        source: Axes of the velocities of the base, and the link of its IMU.
+
+    Raises:
+        ModelError: If the link of the IMU is not fixed to the base.
     """
+    flagged = [x for x in model.contacts if not x.always]
     return BaseColumns(
         model.free_flyer,
-        tuple(x.frame for x in model.contacts if not x.always),
+        tuple(x.frame for x in flagged),
         tuple(f"{part} {x.frame}" for x in model.contacts for part in x.measured),
-        twist,
+        source.twist,
+        thresholds=tuple(x.threshold for x in flagged),
+        local=tuple(x.frame for x in model.contacts if x.axes == "link"),
+        imu=None if source.imu is None or not model.free_flyer else _imu_frame(model, source.imu),
     )
+
+
+def _imu_frame(model: RobotModel, link: str) -> ImuFrame:
+    """Return the place of an IMU in the base."""
+    if link not in model.tree.links:
+        raise ModelError(
+            f"imu in [base] is {link!r}, which is not a link of {model.name}; links: "
+            f"{listed(model.tree.links)}{suggestion(link, model.tree.links)}"
+        )
+    frame = model.pin_model.frames[frame_id(model.pin_model, link)]
+    if frame.parentJoint != 1:
+        raise ModelError(
+            f"imu in [base] is {link!r}, which moves relative to the root link "
+            f"{model.tree.root!r}; wanted a link that is fixed to it"
+        )
+    place = frame.placement
+    coefficients: Array = pin.Quaternion(place.rotation).coeffs()
+    gravity: Array = model.pin_model.gravity.linear
+    return ImuFrame(coefficients.copy(), place.translation.copy(), gravity.copy())
 
 
 def _measured(model: RobotModel) -> list[int]:

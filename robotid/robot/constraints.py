@@ -8,12 +8,12 @@ from typing import Any, ClassVar
 import numpy as np
 import pinocchio as pin
 
-from robotid._settings import require_each, require_flag, require_kind
+from robotid._settings import is_number, require_each, require_flag, require_kind
 from robotid._typing import Array
 from robotid.exceptions import ModelError, SettingsError
 from robotid.findings import listed
 
-__all__ = ["Constraint", "Contact", "Loop", "check_constraints", "frame_id"]
+__all__ = ["Constraint", "Contact", "Loop", "check_constraints", "frame_id", "link_positions"]
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,10 @@ class Contact:
             the frame [m].
         uncertainty: Standard deviation of the point of contact, along each axis [m]; None: it is
             estimated from the logs. It is an error of the intervals.
+        axes: Axes of the components: "world", or "link" for those of the link, as a sensor in it
+            measures.
+        threshold: Force above which it touches the ground [N], if the log's column of the contact
+            is a force; None for a column of 0 and 1.
     """
 
     frame: str
@@ -40,6 +44,8 @@ class Contact:
     always: bool = False
     radius: float = 0.0
     uncertainty: float | None = None
+    axes: str = "world"
+    threshold: float | None = None
 
     sizes: ClassVar[dict[str, int]] = {"point": 3, "surface": 6}
     components: ClassVar[tuple[str, ...]] = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -67,6 +73,14 @@ class Contact:
                 f"uncertainty of the contact {self.frame!r} is {length:g}, wanted a length [m], at "
                 "least 0"
             )
+        if self.axes not in ("world", "link"):
+            raise SettingsError(
+                f"axes of the contact {self.frame!r} is {self.axes!r}, wanted 'world' or 'link'"
+            )
+        if not (self.threshold is None or is_number(self.threshold)):
+            raise SettingsError(
+                f"threshold of the contact {self.frame!r} is {self.threshold!r}, wanted a force [N]"
+            )
 
     @property
     def rows_measured(self) -> list[int]:
@@ -88,12 +102,15 @@ class Contact:
 
         Args:
             jacobians: Jacobian of the frame with the axes of the world, shape (6, nv).
-            rotation: Not used.
+            rotation: Axes of the link in the world, shape (3, 3).
         """
-        J = jacobians[0][: self.sizes[self.kind]].copy()
-        J[0] -= self.radius * jacobians[0][4]  # v + w x (0, 0, -radius)
-        J[1] += self.radius * jacobians[0][3]
-        return J
+        rows = jacobians[0][: self.sizes[self.kind]].copy()
+        rows[0] -= self.radius * jacobians[0][4]  # v + w x (0, 0, -radius)
+        rows[1] += self.radius * jacobians[0][3]
+        if self.axes == "world":
+            return rows
+        turned: Array = (rotation.T @ rows.reshape(-1, 3, rows.shape[1])).reshape(rows.shape)
+        return turned
 
 
 @dataclass(frozen=True)
@@ -228,3 +245,19 @@ def frame_id(pin_model: pin.Model, link: str) -> int:
         link: Name of the link.
     """
     return int(pin_model.getFrameId(link, pin.FrameType.BODY))
+
+
+def link_positions(pin_model: pin.Model, configurations: Array, links: Sequence[str]) -> Array:
+    """Return the positions of links in the world, shape (N, k, 3) [m].
+
+    Args:
+        pin_model: The robot.
+        configurations: Pinocchio's configurations, shape (N, nq).
+        links: Names of the k links.
+    """
+    data, ids = pin_model.createData(), [frame_id(pin_model, link) for link in links]
+    found = np.empty((len(configurations), len(ids), 3))
+    for k, q in enumerate(np.ascontiguousarray(configurations)):
+        pin.framesForwardKinematics(pin_model, data, q)
+        found[k] = [data.oMf[i].translation for i in ids]
+    return found

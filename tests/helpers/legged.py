@@ -6,6 +6,7 @@ import pinocchio as pin
 
 from robotid.logs.base import BaseMotion
 from robotid.logs.data import Log
+from robotid.logs.imu import ImuFrame, motion_of_imu
 from robotid.robot.constraints import frame_id
 from robotid.robot.parameters import pseudo_inertia
 
@@ -13,7 +14,7 @@ _HOLD = 10  # steps during which a torque is held
 _RADIUS = 1e-3  # [m] of the feet: contacts are at the origin of the foot's link
 
 
-def spec_of(model, feet, *, step, armature=0.0, damping=0.0, friction=0.8):
+def spec_of(model, feet, *, step, armature=0.0, damping=0.0, friction=0.8, imu=None):
     """Return a MuJoCo model of a robot whose base floats, with small spheres as feet on a plane.
 
     Args:
@@ -23,6 +24,7 @@ def spec_of(model, feet, *, step, armature=0.0, damping=0.0, friction=0.8):
         armature: Of each joint [kg m^2].
         damping: Of each joint [N m s/rad].
         friction: Coefficient of the feet.
+        imu: Placement of an IMU in the base, or None.
     """
     pin_model, names = model.pin_model, list(model.pin_model.names)
     spec, bodies = mujoco.MjSpec(), {}
@@ -59,6 +61,10 @@ def spec_of(model, feet, *, step, armature=0.0, damping=0.0, friction=0.8):
             pos=frame.placement.translation, name=foot, condim=3, mass=0.0,
             friction=[friction, 0, 0], solref=[0.02, 1.0],
         )  # fmt: skip
+    if imu is not None:
+        site = bodies[1].add_site(name="imu", pos=imu.translation, quat=_wxyz(imu.rotation))
+        for kind in (mujoco.mjtSensor.mjSENS_GYRO, mujoco.mjtSensor.mjSENS_ACCELEROMETER):
+            spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site.name)
     for name in model.joints:
         motor = spec.add_actuator(name=name, target=name)
         motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
@@ -79,6 +85,7 @@ def _steiner(inertia):
 def recorded(
     model, feet, middle, reach, rng, *, duration=20.0, rate=500.0, step=1e-4, kp=40.0, kd=1.0,
     torque=0.02, bits=18, armature=0.0, damping=0.0, height=None, highest=1.2, force=False,
+    imu=None,
 ):  # fmt: skip
     """Return the log of a robot whose joints follow multi-sines while its feet are on the ground.
 
@@ -100,8 +107,9 @@ def recorded(
         height: Of the base at the start [m].
         highest: Highest frequency of the motion [Hz].
         force: Whether the feet's forces are logged, in the world's axes.
+        imu: Placement of an IMU in the base, whose filtered values are logged; or None.
     """
-    mj = spec_of(model, feet, step=step, armature=armature, damping=damping)
+    mj = spec_of(model, feet, step=step, armature=armature, damping=damping, imu=imu)
     data = mujoco.MjData(mj)
     joints = [mj.joint(name) for name in model.joints]
     qpos = np.array([joint.qposadr[0] for joint in joints])
@@ -118,6 +126,7 @@ def recorded(
     size = rng.dirichlet(np.ones(len(tones)), n)
     period, settles = round(1 / (rate * step)), 1.0
     rows, touches = [], np.zeros(len(feet))
+    means, sensed = [], np.zeros(mj.nsensordata)
     for k in range(round((duration + settles) / step)):
         t = k * step - settles
         if k % _HOLD == 0:
@@ -141,7 +150,11 @@ def recorded(
             half = 0.5 * (before + data.ctrl)
             rows.append(np.concatenate([[t], data.qpos, half, touches, wrench.ravel()]))
             touches[:] = 0.0
+            means.append(sensed / period)
+        if k % period == 0:
+            sensed[:] = 0.0
         mujoco.mj_step(mj, data)
+        sensed += data.sensordata
         if k % _HOLD == 0 and data.ncon:  # at any time since the last row
             acting = data.contact.geom[data.contact.efc_address >= 0]
             touches[np.isin(spheres, acting)] = 1.0
@@ -153,7 +166,15 @@ def recorded(
     first = 1 + mj.nq
     tau = rows[:, first : first + n] + torque * rng.standard_normal((len(t), n))
     flags = rows[:, first + n : first + n + len(feet)] > 0
-    forces = rows[:, first + n + len(feet) :].reshape(len(t), -1, 3)
+    count = first + n + len(feet)
+    forces = rows[:, count : count + 3 * len(feet)].reshape(len(t), -1, 3)
+    measured = None
+    if imu is not None:
+        still = ImuFrame(
+            pin.Quaternion(imu.rotation).coeffs(), imu.translation, mj.opt.gravity, np.zeros(3)
+        )
+        means = np.array([*means, sensed / period])  # of the periods before and after each row
+        measured, _ = motion_of_imu(t, q, 0.5 * (means[:-1] + means[1:]), still)
     wrenches = {}
     if force:
         parts = ("fx", "fy", "fz")
@@ -163,7 +184,7 @@ def recorded(
             for k, part in enumerate(parts)
         }
     return Log(
-        t, q, tau, model.joints, base=BaseMotion(pose),
+        t, q, tau, model.joints, base=BaseMotion(pose, imu=measured),
         contacts={foot: flags[:, i] for i, foot in enumerate(feet)}, wrenches=wrenches,
     )  # fmt: skip
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.legged import recorded, with_other_bodies
 from helpers.paths import JOBS
@@ -10,9 +11,13 @@ from helpers.paths import JOBS
 import robotid
 from robotid.commands.identify import run_job
 from robotid.commands.job import read_job
+from robotid.estimators import WLS
+from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import ConsistentSettings
-from robotid.logs.base import in_base
+from robotid.fitting.survey import hold_log
+from robotid.logs.base import BaseMotion, in_base
 from robotid.logs.settings import BaseSource
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -20,6 +25,8 @@ from robotid.robot.model import RobotModel
 FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
 POSTURE = {"hip": (0.0, 0.12), "thigh": (0.8, 0.25), "calf": (-1.6, 0.3)}  # middle, reach [rad]
 ARMATURE, DAMPING, TORQUE = 0.01, 0.2, 0.05
+IMU = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.0), np.array([0.15, -0.05, 0.1]))
+SIGNALS = robotid.SignalSettings(cutoff=25.0, velocity="differentiated")
 
 
 @pytest.fixture(scope="module")
@@ -31,24 +38,36 @@ def go1():
 
 
 @pytest.fixture(scope="module")
-def found(go1):
-    """The Go1 of MuJoCo, identified from a URDF with other bodies; the truth, and that URDF's."""
+def trot(go1):
+    """The Go1 of MuJoCo with an IMU, and the random numbers after its recording."""
     rng = np.random.default_rng(3)
     middle, reach = np.array([POSTURE[joint.split("_")[1]] for joint in go1.joints]).T
     log = recorded(
         go1, FEET, middle, reach, rng, duration=12.0, step=2e-4, kp=100.0, kd=2.0, highest=1.5,
-        armature=ARMATURE, damping=DAMPING, torque=TORQUE,
+        armature=ARMATURE, damping=DAMPING, torque=TORQUE, imu=IMU,
     )  # fmt: skip
+    return log, rng
+
+
+@pytest.fixture(scope="module")
+def found(go1, trot):
+    """The Go1 of MuJoCo, identified from a URDF with other bodies; the truth, and that URDF's."""
+    log, rng = trot
+    log = replace(log, base=BaseMotion(log.base.pose))
     other = with_other_bodies(go1, rng)
     result = robotid.identify(
         other, log.window(end=9.0), validation=log.window(9.0), doctor=False, friction="none",
-        signals=robotid.SignalSettings(cutoff=25.0, velocity="differentiated"),
-        estimator="wls",
+        signals=SIGNALS, estimator="wls",
     )  # fmt: skip
-    truth = go1.standard_parameters()
-    names = go1.layout.names
-    truth += [ARMATURE * x.endswith(".armature") + DAMPING * x.endswith(".viscous") for x in names]
-    return result, truth, other.standard_parameters()
+    return result, truth_of(go1), other.standard_parameters()
+
+
+def truth_of(model):
+    """Return the parameters of the robot in MuJoCo."""
+    drives = {".armature": ARMATURE, ".viscous": DAMPING}
+    return model.standard_parameters() + [
+        sum(x for end, x in drives.items() if name.endswith(end)) for name in model.layout.names
+    ]
 
 
 def test_the_bodies_of_another_simulator_are_found(found):
@@ -96,6 +115,51 @@ def test_the_residual_at_the_truth_is_the_noise(found):
     assert used.all()  # forces of changing contacts are eliminated, no sample is lost
     share = motion.contacts.mean(axis=0)
     assert ((share > 0.6) & (share < 1.0)).any()
+
+
+def test_contacts_without_flags_are_found(go1, trot):
+    from robotid.regressor.prediction import predict
+
+    log = replace(trot[0], base=BaseMotion(trot[0].base.pose))
+    for base in (log.base, trot[0].base):
+        held = hold_log(go1, replace(log, base=base, contacts={}), SIGNALS)
+        motion, used = held.whole.trajectory, held.whole.mask
+        (torque,) = predict(go1, [truth_of(go1)], motion)
+        assert np.sqrt(np.mean((motion.tau - torque)[used] ** 2)) < 0.7 * TORQUE
+        found = held.windows[0]
+        assert list(found.contacts) == list(log.contacts)
+        for foot, flags in found.contacts.items():
+            assert np.mean(flags < log.contacts[foot]) < 0.001  # in contact, but found in the air
+            assert np.mean(flags > log.contacts[foot]) < 0.15
+        assert "RR_foot" in found.notes[-1]
+
+
+def test_an_imu_replaces_position_and_velocity_of_the_base(go1, trot):
+    from robotid.regressor.prediction import predict
+
+    log, truth = trot[0], truth_of(go1)
+    pose = log.base.pose * np.append(np.zeros(3), np.ones(4))
+
+    def whole(imu):
+        held = hold_log(go1, replace(log, base=BaseMotion(pose, imu=imu)), SIGNALS)
+        motion, used = held.whole.trajectory, held.whole.mask
+        (torque,) = predict(go1, [truth], motion)
+        return held, np.sqrt(np.mean((motion.tau - torque)[used] ** 2))
+
+    imu = log.base.imu
+    assert whole(imu)[1] < 0.7 * TORQUE
+    elsewhere = replace(imu, frame=replace(imu.frame, lever=-imu.frame.lever))
+    assert whole(elsewhere)[1] > 2.0 * TORQUE
+    size = np.repeat([2e-3, 0.05], 3)  # [rad/s, m/s^2]
+    noise = size * np.random.default_rng(1).standard_normal(imu.values.shape)
+    held, _ = whole(replace(imu, values=imu.values + noise))
+    recordings = Recordings(go1, structural_mapping(go1), [held])
+    beta = WLS().fit(recordings.problem()).theta
+    found = recordings.mapping.to_standard(beta, truth)
+    fitted, true = predict(go1, [found, truth], held.whole.trajectory)
+    assert np.linalg.norm(fitted - true) < 0.01 * np.linalg.norm(true)
+    masses = slice(0, go1.layout.n_inertial, 10)
+    assert found[masses].sum() == pytest.approx(truth[masses].sum(), rel=0.01)
 
 
 def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_path):

@@ -153,7 +153,6 @@ def test_a_log_is_read_as_it_was_written(log, tmp_path):
             "base_qz",
             "no column base_qz of the pose of the floating base; columns of the base found",
         ),
-        ("contact_r_sole", "no column contact_r_sole; columns of that kind found: contact_l_sole"),
         ("wrench_fz_l_sole", "no column wrench_fz_l_sole; columns of that kind found: wrench_mx_r"),
     ],
 )
@@ -166,6 +165,19 @@ def test_missing_columns_are_named(log, tmp_path, drop, message):
     with pytest.raises(DataError) as error:
         read_log(tmp_path / "log.csv", log.joints, base=WANTED)
     assert message in str(error.value)
+
+
+def test_a_contact_without_column_is_not_in_the_log(log, tmp_path):
+    write_log(log, tmp_path / "log.csv")
+    text = (tmp_path / "log.csv").read_text().replace("contact_l_sole", "other")
+    (tmp_path / "log.csv").write_text(text)
+    wanted = replace(WANTED, thresholds=(0.5, None))
+    again = read_log(tmp_path / "log.csv", log.joints, base=wanted)
+    assert list(again.contacts) == ["r_sole"]
+    np.testing.assert_array_equal(again.contacts["r_sole"], log.contacts["r_sole"])
+    columns = {"contact_l_sole": "other"}
+    named = read_log(tmp_path / "log.csv", log.joints, base=wanted, columns=columns)
+    np.testing.assert_array_equal(named.contacts["l_sole"], log.contacts["l_sole"])
 
 
 def test_a_contact_is_0_or_1(log, tmp_path):

@@ -1,5 +1,6 @@
 """Constraint forces eliminated from the rows, against Pinocchio's constraint dynamics."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ from robotid.estimators.consistent.weighting import held_out_errors
 from robotid.exceptions import ModelError, SettingsError
 from robotid.logs.base import BaseColumns
 from robotid.logs.data import Trajectory
+from robotid.logs.settings import BaseSource
 from robotid.regressor.constraints import (
     _measured,
     constrained,
@@ -88,6 +90,28 @@ def test_the_force_on_a_round_foot_acts_below_its_frame(rng):
     before, now, after = (moved(model, q[0], v[0], h).oMf[frame] for h in (-1e-6, 0.0, 1e-6))
     point = now.actInv(now.translation - np.array([0.0, 0.0, 0.03]))
     np.testing.assert_allclose(J @ v[0], (after.act(point) - before.act(point)) / 2e-6, atol=1e-7)
+
+
+def test_a_wrench_with_the_axes_of_its_link(quadruped, rng):
+    q, _, _ = random_motion(quadruped, rng, 2)
+    flags = np.ones((2, 4), dtype=bool)
+    world, own = (
+        constraint_jacobian(replace(quadruped, constraints=contacts), q, flags)
+        for contacts in (
+            [replace(x, axes=axes) for x in quadruped.constraints] for axes in ("world", "link")
+        )
+    )
+    for k in range(2):
+        data = moved(quadruped, q[k], np.zeros(18), 0.0)
+        for i, foot in enumerate(FEET):
+            R = data.oMf[quadruped.pin_model.getFrameId(foot, pin.FrameType.BODY)].rotation
+            rows = slice(3 * i, 3 * i + 3)
+            np.testing.assert_allclose(own[k, rows], R.T @ world[k, rows], atol=1e-12)
+        np.testing.assert_allclose(own[k, 12:], R.T @ world[k, 12:], atol=1e-12)
+    with pytest.raises(SettingsError, match="axes of the contact 'a' is 'foot', wanted 'world' or"):
+        Contact("a", axes="foot")
+    with pytest.raises(SettingsError, match="threshold of the contact 'a' is 'x', wanted a force"):
+        Contact("a", threshold="x")
 
 
 def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(quadruped, rng):
@@ -239,8 +263,18 @@ def test_measured_components_are_counted_over_loops_and_contacts_of_any_size():
 
 
 def test_contacts_state_what_logs_have(quadruped):
-    wanted = BaseColumns(True, FEET[:3], ("fz HR_FOOT", "mx HR_FOOT"), "world")
-    assert logged_base(quadruped, "world") == wanted
+    wanted = BaseColumns(True, FEET[:3], ("fz HR_FOOT", "mx HR_FOOT"), "world", (None,) * 3)
+    assert logged_base(quadruped, BaseSource(twist="world")) == wanted
+    local = replace(quadruped, constraints=[Contact("FL_FOOT", axes="link", threshold=5.0)])
+    found = logged_base(local)
+    assert [found.local, found.thresholds] == [("FL_FOOT",), (5.0,)]
+    with pytest.raises(ModelError, match=r"imu in .base. is 'imu', which is not a link of solo"):
+        logged_base(quadruped, BaseSource(imu="imu"))
+    with pytest.raises(ModelError, match="'FL_FOOT', which moves relative to the root link 'base_"):
+        logged_base(quadruped, BaseSource(imu="FL_FOOT"))
+    frame = logged_base(quadruped, BaseSource(imu="base_link")).imu
+    np.testing.assert_allclose(frame.quaternion, [0, 0, 0, 1])
+    np.testing.assert_allclose(frame.gravity, [0, 0, -9.81])
 
 
 @pytest.mark.parametrize(

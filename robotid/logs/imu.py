@@ -1,0 +1,131 @@
+"""Motion of a floating base measured by an IMU: angular velocity and specific force."""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from robotid._typing import Array
+
+__all__ = ["IMU", "ImuFrame", "ImuMotion", "inertial_state", "motion_of_imu"]
+
+#: Names of the values of an IMU: orientation, angular velocity [rad/s], specific force [m/s^2].
+IMU = ("qx", "qy", "qz", "qw", "wx", "wy", "wz", "ax", "ay", "az")
+_WINDOW = 0.5  # [s] shortest rest in which the bias of the gyroscopes is estimated
+_STILL = 0.02  # [rad/s] largest standard deviation of a gyroscope at rest
+_UNMOVED = 5e-3  # [rad or m] largest motion of a joint at rest
+
+
+@dataclass(frozen=True, eq=False)
+class ImuFrame:
+    """Place of an IMU in the base link.
+
+    Attributes:
+        quaternion: Orientation of the IMU in the base link, qx qy qz qw, shape (4,).
+        lever: Origin of the IMU in the base link, shape (3,) [m].
+        gravity: Gravity in the world, shape (3,) [m/s^2].
+        bias: Bias of the gyroscopes with the axes of the base, shape (3,) [rad/s]; None to
+            estimate it at rest.
+    """
+
+    quaternion: Array
+    lever: Array
+    gravity: Array
+    bias: Array | None = None
+
+    @property
+    def rotation(self) -> Array:
+        """Axes of the IMU in the base link, shape (3, 3)."""
+        x, y, z, w = self.quaternion
+        S = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        rotation: Array = np.eye(3) + 2.0 * (w * S + S @ S)
+        return rotation
+
+
+@dataclass(frozen=True, eq=False)
+class ImuMotion:
+    """Recorded values of an IMU with the axes of the base link.
+
+    Attributes:
+        values: Angular velocity without bias [rad/s] and specific force, the acceleration minus
+            gravity [m/s^2], shape (N, 6).
+        frame: Place of the IMU, with the bias that was subtracted.
+    """
+
+    values: Array
+    frame: ImuFrame
+
+    def at(self, rows: slice) -> "ImuMotion":
+        """Return some samples.
+
+        Args:
+            rows: Their numbers.
+        """
+        return replace(self, values=self.values[rows])
+
+
+def motion_of_imu(t: Array, q: Array, values: Array, frame: ImuFrame) -> tuple[ImuMotion, str]:
+    """Return the motion of an IMU without the bias of its gyroscopes, and a note on the bias.
+
+    The bias is the mean angular velocity in all windows of 0.5 s in which joints and gyroscopes are
+    at rest.
+
+    Args:
+        t: Time stamps, shape (N,) [s].
+        q: Joint positions, shape (N, n) [rad or m].
+        values: Angular velocity [rad/s] and specific force [m/s^2] with the axes of the IMU, shape
+            (N, 6).
+        frame: Place of the IMU.
+    """
+    turned = np.hstack([values[:, :3] @ frame.rotation.T, values[:, 3:] @ frame.rotation.T])
+    if frame.bias is not None:
+        turned[:, :3] -= frame.bias
+        return ImuMotion(turned, frame), ""
+    number = ((t - t[0]) / _WINDOW).astype(int)
+    edges = np.searchsorted(number, np.arange(number[-1] + 1))  # the last window may be short
+    resting = [
+        slice(first, stop)
+        for first, stop in pairwise(edges)
+        if stop - first > 4
+        and np.ptp(q[first:stop], axis=0).max(initial=0.0) < _UNMOVED
+        and turned[first:stop, :3].std(axis=0).max() < _STILL
+    ]
+    bias, note = (
+        np.zeros(3),
+        (
+            "the robot is never at rest for 0.5 s: the bias of the gyroscopes is not estimated; "
+            "record 1 s at rest"
+        ),
+    )
+    if resting:
+        means = np.array([turned[rows, :3].mean(axis=0) for rows in resting])
+        bias = means.mean(axis=0)
+        shown = ", ".join(f"{1e3 * x:+.2f}" for x in bias)
+        note = (
+            f"bias of the gyroscopes, estimated in {_WINDOW * len(resting):g} s at rest and "
+            f"subtracted: {shown} mrad/s"
+        )
+    turned[:, :3] -= bias
+    return ImuMotion(turned, replace(frame, bias=bias)), note
+
+
+def inertial_state(
+    t: Array, velocity: Array, down: Array, values: Array, frame: ImuFrame
+) -> tuple[Array, Array]:
+    """Return twist (N, 6) and its time derivative (N, 6) of a base with an IMU, in base axes.
+
+    With the lever r of the IMU, its specific force f and gravity g, the specific force at the
+    origin is f - alpha x r - w x (w x r), and dv/dt = that + g - w x v.
+
+    Args:
+        t: Time stamps, shape (N,) [s].
+        velocity: Linear velocity v of the base, shape (N, 3) [m/s]; forces do not depend on it.
+        down: Gravity g, shape (N, 3) [m/s^2].
+        values: Smoothed values of the IMU, as of ``ImuMotion``.
+        frame: Place of the IMU.
+    """
+    w, f, r = values[:, :3], values[:, 3:], frame.lever
+    alpha = np.gradient(w, t, axis=0)
+    f = f - np.cross(alpha, r) - np.cross(w, np.cross(w, r))
+    rate = np.hstack([f + down - np.cross(w, velocity), alpha])
+    return np.hstack([velocity, w]), rate

@@ -1,0 +1,123 @@
+"""Contacts found from torques and motion, against stated ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.paths import JOBS
+
+from robotid.commands.job import read_job
+from robotid.doctor.found_contacts import find_contacts, with_contacts
+from robotid.exceptions import DataError
+from robotid.logs.base import BaseMotion, quaternions_of_angles
+from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.constraints import constraint_jacobian
+from robotid.regressor.prediction import predict_instants
+from robotid.robot.constraints import Contact
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
+RAW = SignalSettings(cutoff=None, trim=0.0, velocity="differentiated")
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, terms=(),
+        constraints=[Contact(foot) for foot in FEET],
+    )  # fmt: skip
+
+
+def standing(robot, loaded):
+    """Return a log at rest, the forces upwards (N, 4), and the wrench left on the base (N, 6).
+
+    Args:
+        robot: The robot.
+        loaded: Whether each foot has a load, by sample, shape (N, 4); the others are lifted.
+    """
+    N, n = len(loaded), len(robot.joints)
+    t = np.arange(N) / 100
+    pose = np.zeros((N, 7))
+    pose[:, :3] = [1.0, 2.0, 0.3]
+    pose[:, 3:] = quaternions_of_angles(np.tile([0.0, 0.05, 0.7], (N, 1)))
+    q = np.tile([0.1, 1.2, -1.6], (N, n // 3))
+    q[:, [robot.joints.index(f"{foot[:2]}_KFE") for foot in FEET]] -= 0.4 * ~loaded
+    q = np.hstack([pose, q])
+    torque = predict_instants(robot, robot.standard_parameters(), q)
+    J = constraint_jacobian(robot, q, loaded)
+    f = np.array([np.linalg.pinv(j[:, :6].T) @ x[:6] for j, x in zip(J, torque, strict=True)])
+    tau = torque - np.einsum("kmj,km->kj", J, f)
+    log = Log(t, q[:, 7:], tau[:, 6:], robot.joints, base=BaseMotion(pose))
+    return log, f[:, 2::3], tau[:, :6]
+
+
+def test_forces_at_rest_are_found(robot):
+    every = np.ones((200, 4), dtype=bool)
+    log, forces, rest = standing(robot, every)
+    assert np.abs(rest).max() < 1e-9  # the feet bear the weight
+    t, found = find_contacts(robot, log, RAW)
+    np.testing.assert_allclose(t, log.t)
+    assert [x.frame for x in found] == list(FEET)
+    for k, contact in enumerate(found):
+        np.testing.assert_allclose(contact.force, forces[:, k], atol=1e-3)
+        assert contact.shares == pytest.approx((1.0, 0.0, 0.0))
+
+
+def test_feet_without_load_are_found(robot):
+    loaded = np.ones((400, 4), dtype=bool)
+    loaded[100:200, 2] = loaded[300:, 3] = False
+    log, _, rest = standing(robot, loaded)
+    assert np.abs(rest).max() < 1e-9
+    _, found = find_contacts(robot, log, RAW)
+    for contact, own in zip(found, loaded.T, strict=True):
+        np.testing.assert_array_equal(contact.touches > 0.98, own)
+        np.testing.assert_array_equal(contact.touches < 0.02, ~own)
+        lifted = contact.force[~own]  # the acceleration jumps at two samples of either end
+        np.testing.assert_allclose(lifted[2:-2], 0.0, atol=1e-3)
+    stated = {"FR_FOOT": loaded[:, 1], "FL_FOOT": loaded[:, 0]}
+    full = with_contacts(robot, replace(log, contacts=stated), RAW)
+    assert list(full.contacts) == list(FEET)
+    for own, flags in zip(loaded.T, full.contacts.values(), strict=True):
+        np.testing.assert_array_equal(flags, own)
+    assert full.notes == (
+        "contacts found from torques and motion: HL_FOOT 75 % in contact, 25 % not, 0 % undecided; "
+        "HR_FOOT 75 % in contact, 25 % not, 0 % undecided. Undecided samples count as contact",
+    )
+    assert with_contacts(robot, full, RAW) is full
+
+
+def test_what_cannot_be_found_names_what_to_log(robot):
+    log, *_ = standing(robot, np.ones((50, 4), dtype=bool))
+    still = replace(log, tau=0 * log.tau, has_torque=False)
+    with pytest.raises(DataError) as error:
+        with_contacts(robot, still, RAW)
+    assert str(error.value).startswith(
+        "log has no column of the contact of FL_FOOT, FR_FOOT, HL_FOOT, HR_FOOT, and the contact "
+        "cannot be found from torques and motion: it has no torque or no motion of the base. "
+        "Record contact_FL_FOOT, 1 while the link touches the ground"
+    )
+    assert error.value.code == "missing_column"
+    measured = replace(robot, constraints=[Contact(FEET[0], measured=("fz",))])
+    with pytest.raises(DataError, match="no column contact_FL_FOOT, but a measured force there"):
+        with_contacts(measured, replace(log, wrenches={"fz FL_FOOT": log.t}), RAW)
+    rng = np.random.default_rng(0)
+    noisy = replace(log, tau=log.tau + 3.0 * rng.standard_normal(log.tau.shape))
+    with pytest.raises(DataError, match=r"found from torques and motion: [0-9]+ % of samples are"):
+        with_contacts(robot, noisy, RAW)
+
+
+def test_contacts_of_a_trot_agree_with_stated_ones(recordings, monkeypatch):
+    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
+    job = read_job(JOBS / "legged" / "solo12.toml")
+    model = job.model()
+    log = job.read(job.identification[0], model)
+    t, found = find_contacts(model, replace(log, contacts={}), job.signals)
+    for contact in found:
+        stated = log.contacts[contact.frame][np.searchsorted(log.t, t - 1e-9)]
+        on, off, undecided = contact.shares
+        assert undecided < 0.04
+        decided = np.abs(contact.touches - 0.5) > 0.48
+        assert np.mean((contact.touches > 0.5)[decided] == stated[decided]) > 0.975
+        assert min(on, off) > 0.2

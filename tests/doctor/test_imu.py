@@ -1,0 +1,178 @@
+"""Findings on an IMU: turned axes, units, gravity; and feet that slip."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.paths import JOBS
+
+from robotid.commands.job import read_job
+from robotid.doctor.contacts import check_base
+from robotid.logs.base import BaseMotion, base_state, in_base, quaternions_of_angles
+from robotid.logs.data import Log
+from robotid.logs.imu import ImuFrame, ImuMotion
+from robotid.logs.settings import BaseSource, SignalSettings
+from robotid.regressor.constraints import constraint_jacobian
+from robotid.robot.constraints import Contact, link_positions
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
+RAW = SignalSettings(cutoff=None, trim=0.0)
+G = np.array([0.0, 0.0, -9.81])
+TURN = pin.rpy.rpyToMatrix(0.4, 0.2, 1.0)  # axes of the IMU in the base
+ALIKE = np.eye(3)
+FRAME = ImuFrame(pin.Quaternion(TURN).coeffs(), np.zeros(3), G, np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, terms=(),
+        constraints=[Contact(foot) for foot in FEET],
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def sway(robot):
+    """Return the log of a robot whose trunk moves in all directions while its feet stand."""
+    t = np.arange(0.0, 4.0, 0.02)
+    waves = [np.sin(x * t) for x in (1.6, 2.3, 3.1)]
+    pose = np.zeros((len(t), 7))
+    pose[:, :3] = np.column_stack([0.02 * waves[2], 0.02 * waves[0], 0.25 + 0.01 * waves[1]])
+    pose[:, 3:] = quaternions_of_angles(np.column_stack([0.2 * w for w in waves]))
+    q = np.hstack([pose, np.tile([0.1, 0.8, -1.6], (len(t), 4))])
+    every = np.ones((len(t), 4), dtype=bool)
+
+    def positions(q):
+        return link_positions(robot.pin_model, robot.configurations(q), FEET).reshape(-1, 12)
+
+    target = positions(q)[:1]
+    for _ in range(6):  # Newton
+        J = constraint_jacobian(robot, q, every)[:, :, 6:]
+        q[:, 7:] += np.linalg.solve(J, (target - positions(q))[..., None])[..., 0]
+    assert np.abs(positions(q) - target).max() < 1e-9
+    _, v, a = base_state(t, pose, None, None)
+    f = a[:, :3] + np.cross(v[:, 3:], v[:, :3]) - in_base(pose[:, 3:], G)
+    imu = ImuMotion(np.hstack([v[:, 3:], f]), FRAME)
+    contacts = {foot: every[:, 0] for foot in FEET}
+    joints = q[:, 7:]
+    return Log(t, joints, 0 * joints, robot.joints, base=BaseMotion(pose, imu=imu),
+               contacts=contacts)  # fmt: skip
+
+
+def measured(log, change):
+    """Return a log whose IMU measured changed values, with the axes of the IMU."""
+    values = log.base.imu.values
+    own = change(np.hstack([values[:, :3] @ TURN, values[:, 3:] @ TURN]))
+    turned = np.hstack([own[:, :3] @ TURN.T, own[:, 3:] @ TURN.T])
+    return replace(log, base=replace(log.base, imu=ImuMotion(turned, FRAME)))
+
+
+def without_position(log, turn=ALIKE):
+    """Return a log with an IMU only; turn: axes of the base by the orientation, in the base."""
+    q = [pin.Quaternion(pin.XYZQUATToSE3(x).rotation @ turn).coeffs() for x in log.base.pose]
+    pose = np.hstack([np.zeros((len(q), 3)), np.array(q)])
+    return replace(log, base=replace(log.base, pose=pose))
+
+
+def test_a_right_imu_has_no_finding(robot, sway):
+    for log in (sway, without_position(sway)):
+        assert not list(check_base(robot, log, RAW))
+        assert not list(check_base(replace(robot, constraints=()), log, RAW))
+
+
+def scaled(angular, linear):
+    return lambda values: values * np.repeat([angular, linear], 3)
+
+
+FAULTS = {
+    "axes": (lambda x: np.hstack([x[:, [1, 0, 2]], x[:, [4, 3, 5]]]) * ([1, -1, 1] * 2),
+             {"imu_axes": "its axes x, y, z are", "imu_gravity": "deg from the vertical"}),
+    "gyroscope": (lambda x: np.hstack([x[:, [0, 2, 1]] * [-1, 1, 1], x[:, 3:]]),
+                  {"imu_axes": "its axes x, y, z are"}),
+    "degrees": (scaled(180 / np.pi, 1.0), {"imu_axes": "it is in deg/s"}),
+    "reversed": (scaled(1.0, -1.0), {"imu_gravity": "its sign is reversed"}),
+    "g": (scaled(1.0, 1 / 9.81), {"imu_gravity": "it is in units of g"}),
+    "scale": (scaled(1.0, 1.3), {"imu_gravity": "its scale is wrong"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_of_an_imu_are_named(robot, sway, fault):
+    change, wanted = FAULTS[fault]
+    found = list(check_base(robot, measured(sway, change), RAW))
+    assert {x.code for x in found} == set(wanted)
+    for finding in found:
+        assert finding.severity == "error"
+        assert wanted[finding.code] in finding.message
+
+
+def test_the_axes_of_a_turned_imu_are_named(robot, sway):
+    # the IMU's x is y of the link, its y is -x: a quarter turn about z
+    (found, *_) = check_base(
+        robot, measured(sway, lambda x: np.hstack([x[:, [1, 0, 2]] * [1, -1, 1], x[:, 3:]])), RAW
+    )
+    assert found.code == "imu_axes"
+    assert "its axes x, y, z are y, -x, z of the stated link" in found.message
+    assert found.evidence["best"] < 0.02
+    assert found.evidence["off"] > 0.5
+
+
+def test_gravity_that_was_subtracted_is_named(robot, sway):
+    def subtracted(values):
+        up = in_base(sway.base.pose[:, 3:], -G) @ TURN
+        return np.hstack([values[:, :3], values[:, 3:] - up])
+
+    (found,) = check_base(robot, measured(sway, subtracted), RAW)
+    assert found.code == "imu_gravity"
+    assert "gravity was subtracted" in found.message
+    assert found.evidence["size"] < 0.5
+
+
+def test_axes_of_imu_and_orientation_that_are_turned_alike_are_found_by_the_legs(robot, sway):
+    turn = pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2)  # orientation and values agree
+    log = without_position(sway, turn)
+    values = log.base.imu.values
+    alike = np.hstack([values[:, :3] @ turn, values[:, 3:] @ turn])
+    log = replace(log, base=replace(log.base, imu=ImuMotion(alike, FRAME)))
+    (found,) = [x for x in check_base(robot, log, RAW) if x.code.startswith("imu")]
+    assert found.code == "imu_axes"
+    assert "does not agree with that from the links in contact" in found.message
+
+
+def test_the_imu_of_a_standing_humanoid(recordings, monkeypatch):
+    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
+    job = read_job(JOBS / "legged" / "icub.toml")
+    names = {"w": "gyro", "a": "acc"}
+    own = {f"imu_{k}{x}": f"imu_{name}_{x}" for k, name in names.items() for x in "xyz"}
+    for link, codes in (("root_link_imu_frame", []), ("root_link", ["imu_gravity"])):
+        other = replace(job, columns={**job.columns, **own}, base=BaseSource(imu=link))
+        model = other.model()
+        log = other.read(other.identification[0], model)
+        assert "bias of the gyroscopes, estimated in" in log.notes[-1]
+        found = check_base(model, log, job.signals)
+        assert [x.code for x in found if x.severity != "note"] == codes
+
+
+@pytest.mark.parametrize("has_position", [True, False])
+def test_a_foot_that_slips_for_a_while_is_named(robot, sway, has_position):
+    q, foot = sway.q.copy(), "HL_FOOT"
+    joints = [robot.joints.index(f"HL_{name}") for name in ("HAA", "HFE", "KFE")]
+    slip = 0.05 * np.clip((sway.t - 1.0) / 0.2, 0.0, 1.0)  # [rad] over 0.2 s
+    q[:, joints[0]] += 2.0 * slip
+    log = replace(sway, q=q)
+    found = list(check_base(robot, log if has_position else without_position(log), RAW))
+    (own,) = [x for x in found if foot in x.message]
+    assert [own.code, own.severity] == ["slipping_foot", "note"]
+    assert own.evidence["share"] == pytest.approx(0.05, abs=0.02)
+    assert own.evidence["distance"] == pytest.approx(0.025, rel=0.3)
+    assert all(x is own for x in found)
+
+
+def test_an_error_of_the_position_is_no_slip(robot, sway):
+    pose = sway.base.pose.copy()
+    pose[:, 0] += 0.04 * np.clip((sway.t - 1.0) / 0.1, 0.0, 1.0)  # [m] of all feet within 0.1 s
+    log = replace(sway, base=replace(sway.base, pose=pose))
+    assert not list(check_base(robot, log, RAW))

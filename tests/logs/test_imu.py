@@ -1,0 +1,147 @@
+"""Motion of a base from an IMU: place and axes of the IMU, bias, logs without a position."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from robotid.exceptions import DataError
+from robotid.logs.base import BaseColumns, BaseMotion, base_state
+from robotid.logs.data import Log
+from robotid.logs.imu import ImuFrame, ImuMotion, motion_of_imu
+from robotid.logs.read import read_log, write_log
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
+
+G = np.array([0.0, 0.3, -9.8])
+TURN = pin.rpy.rpyToMatrix(0.4, -1.1, 2.9)  # axes of the IMU in the base
+FRAME = ImuFrame(pin.Quaternion(TURN).coeffs(), np.array([0.2, -0.1, 0.05]), G)
+BIAS = np.array([0.01, -0.02, 0.005])  # [rad/s] with the axes of the IMU
+JOINTS = ("hip",)
+
+
+def placement(x):
+    return pin.SE3(
+        pin.rpy.rpyToMatrix(0.3 * np.sin(x), 0.2 * np.cos(2 * x), 1.1 * x),
+        np.array([np.sin(x), x**2, 0.3 * np.cos(3 * x)]),
+    )
+
+
+def measured(t, h=1e-4):
+    """Return what an IMU measures (N, 6), and its orientation (N, 4), by differences."""
+    values, orientation = [], []
+    for x in t:
+        place = [placement(x + k * h) * pin.SE3(TURN, FRAME.lever) for k in (-1, 0, 1)]
+        before, now, after = (M.translation for M in place)
+        R = place[1].rotation
+        w = pin.log3(place[0].rotation.T @ place[2].rotation) / (2 * h)
+        values.append(np.append(w, R.T @ ((before - 2 * now + after) / h**2 - G)))
+        orientation.append(pin.Quaternion(R).coeffs())
+    return np.array(values), np.array(orientation)
+
+
+@pytest.fixture(scope="module")
+def motion():
+    """Return time, pose, its twist and acceleration, and the values of the IMU."""
+    t = np.linspace(0.0, 2.0, 1001)
+    pose = np.array([pin.SE3ToXYZQUAT(placement(x)) for x in t])
+    _, twist, acceleration = base_state(t, pose, None, None)
+    return t, pose, twist, acceleration, *measured(t)
+
+
+def specific_force(pose, twist, acceleration):
+    """Return the acceleration of the origin minus gravity, with the axes of the base."""
+    down = np.array([pin.XYZQUATToSE3(x).rotation.T @ G for x in pose])
+    return acceleration[:, :3] + np.cross(twist[:, 3:], twist[:, :3]) - down
+
+
+def test_an_imu_has_the_acceleration_of_the_base(motion):
+    t, pose, twist, acceleration, values, _ = motion
+    frame = replace(FRAME, bias=np.zeros(3))
+    imu, note = motion_of_imu(t, np.zeros((len(t), 1)), values, frame)
+    assert note == ""
+    some = slice(5, -5)
+    for position in (1.0, 0.0):  # with and without a position
+        own = pose * np.append([position] * 3, np.ones(4))
+        found = base_state(t, own, None, None, imu)
+        assert np.abs(found[1][:, :3]).max() * (1 - position) == 0.0
+        np.testing.assert_allclose(found[1][some, 3:], twist[some, 3:], atol=2e-4)
+        np.testing.assert_allclose(found[2][some, 3:], acceleration[some, 3:], atol=2e-2)
+        np.testing.assert_allclose(
+            specific_force(*found)[some], specific_force(pose, twist, acceleration)[some], atol=5e-3
+        )
+    np.testing.assert_allclose(base_state(t, pose, None, None, imu)[2][some], acceleration[some],
+                               atol=2e-2)  # fmt: skip
+
+
+def test_the_bias_is_estimated_at_rest(rng):
+    t = np.arange(0.0, 4.0, 0.01)
+    moves = t > 1.6
+    q = np.where(moves, np.sin(5 * t), 0.0)[:, None]
+    values = np.tile(np.append(BIAS, [1.0, 2.0, 9.0]), (len(t), 1))
+    values[moves, :3] += 1.0
+    values[:, :3] += 1e-3 * rng.standard_normal((len(t), 3))
+    imu, note = motion_of_imu(t, q, values, FRAME)
+    np.testing.assert_allclose(imu.frame.bias, TURN @ BIAS, atol=3e-4)
+    np.testing.assert_allclose(imu.values[~moves].mean(axis=0)[:3], 0.0, atol=3e-4)
+    np.testing.assert_allclose(imu.values[0, 3:], TURN @ [1.0, 2.0, 9.0])
+    shown = ", ".join(f"{1e3 * x:+.2f}" for x in imu.frame.bias)
+    assert note.startswith("bias of the gyroscopes, estimated in 1.5 s at rest and subtracted: ")
+    assert f"{shown} mrad/s" in note
+    imu, note = motion_of_imu(t, np.sin(5 * t)[:, None], values, FRAME)
+    assert not imu.frame.bias.any()
+    assert note.endswith("the bias of the gyroscopes is not estimated; record 1 s at rest")
+
+
+def test_an_imu_is_read_with_or_without_an_orientation_of_its_own(motion, tmp_path):
+    t, pose, _, _, values, orientation = motion
+    q = np.zeros((len(t), 1))
+    write_log(Log(t, q, q, JOINTS, base=BaseMotion(pose)), tmp_path / "log.csv")
+    lines = (tmp_path / "log.csv").read_text().splitlines()
+    columns = {
+        k: x
+        for k, x in zip(lines[0].split(","), np.loadtxt(lines[1:], delimiter=",").T, strict=True)
+    }
+    names = ("qx", "qy", "qz", "qw", "wx", "wy", "wz", "ax", "ay", "az")
+    columns |= {
+        f"imu_{x}": y for x, y in zip(names, np.hstack([orientation, values]).T, strict=True)
+    }
+    wanted = BaseColumns(True, imu=replace(FRAME, bias=np.zeros(3)))
+
+    def read(names):
+        table = np.column_stack([columns[x] for x in names])
+        path = tmp_path / "some.csv"
+        np.savetxt(path, table, delimiter=",", header=",".join(names), comments="")
+        return read_log(path, JOINTS, base=wanted)
+
+    every = list(columns)
+    both = read(every)
+    np.testing.assert_allclose(both.base.pose, BaseMotion(pose).pose, atol=1e-9)
+    assert both.base.has_position
+    own = read([x for x in every if not x.startswith("base_")])
+    alike = np.abs(np.sum(own.base.pose[:, 3:] * both.base.pose[:, 3:], axis=1))
+    np.testing.assert_allclose(alike, 1.0, atol=1e-12)
+    assert not own.base.has_position
+    other = read([x for x in every if not x.startswith(("imu_q", "base_x"))])
+    np.testing.assert_allclose(other.base.pose[:, 3:], both.base.pose[:, 3:], atol=1e-9)
+    for log in (both, own, other):
+        np.testing.assert_allclose(log.base.imu.values, np.hstack(
+            [values[:, :3] @ TURN.T, values[:, 3:] @ TURN.T]), atol=1e-9)  # fmt: skip
+    part = own.window(0.5, 1.0)
+    np.testing.assert_array_equal(part.base.imu.values, own.base.imu.values[250:501])
+    with pytest.raises(DataError, match=r"no column imu_ax of the IMU.* Record imu_wx"):
+        read([x for x in every if x != "imu_ax"])
+    with pytest.raises(DataError, match=r"no column imu_qx, imu_qy, imu_qz, imu_qw of the IMU"):
+        read([x for x in every if not x.startswith(("imu_q", "base_"))])
+
+
+def test_an_imu_is_filtered_as_the_joints(motion):
+    t, pose, twist, _, values, _ = motion
+    imu = ImuMotion(np.hstack([values[:, :3] @ TURN.T, values[:, 3:] @ TURN.T]), FRAME)
+    q = np.zeros((len(t), 1))
+    log = Log(t, q, q, JOINTS, base=BaseMotion(pose, twist=9.0 * twist, imu=imu))
+    smooth = process(log, SignalSettings(cutoff=30.0, velocity="differentiated"))
+    rows = np.searchsorted(t, smooth.t - 1e-9)
+    np.testing.assert_allclose(smooth.v[:, 3:6], twist[rows, 3:], atol=2e-3)
+    np.testing.assert_allclose(smooth.v[:, :3], twist[rows, :3], atol=2e-3)
