@@ -26,7 +26,7 @@ from helpers import cassie
 from helpers.legged import recorded, with_other_bodies
 from helpers.walkers import G1, TALOS
 
-from robotid.exceptions import RankDeficientError
+from robotid.exceptions import NotConvergedError, RankDeficientError
 from robotid.fitting.settings import ConsistentSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import identify
@@ -43,7 +43,7 @@ POSTURE = {"hip": (0.0, 0.12), "thigh": (0.8, 0.25), "calf": (-1.6, 0.3)}  # mid
 SIGNALS = SignalSettings(cutoff=25.0, velocity="differentiated")
 ARMATURE, DAMPING = 0.01, 0.2
 PRIOR = ConsistentSettings(prior_weight=1.0, draws=0)
-NO_PRIOR = ConsistentSettings(prior_weight=1e-9, draws=0)
+NO_PRIOR = ConsistentSettings(prior="euclidean", prior_weight=1e-6, draws=0)
 
 
 def robot():
@@ -113,7 +113,7 @@ def coverage(name, seeds, duration):
                 other, log, signals=SIGNALS, estimator=plant.estimator, friction="none",
                 doctor=False,
             )  # fmt: skip
-        except RankDeficientError as error:
+        except (RankDeficientError, NotConvergedError) as error:
             print(f"{seed:4} {str(error)[:60]}")
             continue
         spent = time.process_time() - start
@@ -147,7 +147,7 @@ def unseen(name, seed, duration):
                 other, fitted, validation=rest, signals=SIGNALS, estimator=settings,
                 friction="none", doctor=False,
             )  # fmt: skip
-        except RankDeficientError as error:
+        except (RankDeficientError, NotConvergedError) as error:
             print(f"  {label:14} {str(error)[:50]}")
             continue
         (own,) = found.validation

@@ -148,7 +148,7 @@ def recorded(model, feet, middle, reach, rng, *, highest=1.2, **options):
 def followed(
     model, feet, motion, rng, *, posture, duration=20.0, rate=500.0, step=1e-4, kp=40.0, kd=1.0,
     torque=0.02, bits=18, armature=0.0, damping=0.0, height=None, force=False, ground=0.02,
-    gantry=None, springs=(),
+    gantry=None, springs=(), friction=0.8,
 ):  # fmt: skip
     """Return the log of a robot on the ground whose joints follow a motion.
 
@@ -173,10 +173,17 @@ def followed(
         ground: Time constant of the ground [s].
         gantry: The wrench that holds the base at its origin, with the axes of the world, from the
             time, its pose (7,) and its speeds (6,); it is logged.
-        springs: As of ``spec_of``.
+        springs, friction: As of ``spec_of``.
     """
     mj = spec_of(
-        model, feet, step=step, armature=armature, damping=damping, ground=ground, springs=springs
+        model,
+        feet,
+        step=step,
+        armature=armature,
+        damping=damping,
+        ground=ground,
+        springs=springs,
+        friction=friction,
     )
     data, feet = mujoco.MjData(mj), _points(feet)
     joints = [mj.joint(name) for name in model.joints]
