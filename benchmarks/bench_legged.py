@@ -1,14 +1,15 @@
-"""Legged robots with unknown contact forces: intervals, masses, prediction, time.
+"""Legged robots with unknown contact forces: intervals, prediction, time.
 
-    python benchmarks/bench_legged.py [--runs 20] [--quick] [--long]
+    python benchmarks/bench_legged.py [--runs 20] [--robots go1 g1 talos cassie] [--unseen]
 
 A Go1 stands on point feet in MuJoCo at 0.1 ms with held torques, 18-bit encoders and 0.05 N m of
-torque noise; its joints follow multi-sines, its feet slip and lift at times. It is identified by
-weighted least squares. Counted is how often the 95 % interval of an inertial base parameter holds
-the truth. --long adds the consistent estimator, and motions in which the feet hardly move. With the
-recordings, a Solo12 that trots in PyBullet is identified with the defaults from the first half of
-its log: its URDF is the truth. Beside it the regressor's projected rows are timed against those of
-an arm.
+torque noise; its joints follow multi-sines, its feet slip and lift at times. G1 and TALOS step in
+place on flat feet without support. Cassie with its rods and springs hangs on a gantry whose wrench
+is measured, its feet touch the ground. They are identified by weighted least squares, Cassie with
+a prior, since not all of its links are excited. Counted is how often the 95 % interval of an
+inertial base parameter holds the truth. Beside it the regressor's projected rows are timed against
+those of an arm. With the recordings, a Solo12 that trots in PyBullet is identified from the first
+half of its log: its URDF is the truth. With --unseen: joint torque of the last 30 % of a recording, fitted on the others.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -16,20 +17,23 @@ import setting  # noqa: I001 -- pins the threads of BLAS before numpy is importe
 import argparse
 import os
 import sys
-import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
+from dataclasses import replace
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from helpers import cassie
 from helpers.legged import recorded, with_other_bodies
 from helpers.paths import JOBS
+from helpers.walkers import G1, TALOS
 
 from robotid.commands.identify import run_job
 from robotid.commands.job import read_job
-from robotid.exceptions import RankDeficientError
+from robotid.exceptions import NotConvergedError, RankDeficientError
+from robotid.fitting.settings import ConsistentSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import identify
 from robotid.logs.settings import SignalSettings
@@ -44,6 +48,8 @@ FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
 POSTURE = {"hip": (0.0, 0.12), "thigh": (0.8, 0.25), "calf": (-1.6, 0.3)}  # middle, reach [rad]
 SIGNALS = SignalSettings(cutoff=25.0, velocity="differentiated")
 ARMATURE, DAMPING = 0.01, 0.2
+PRIOR = ConsistentSettings(prior_weight=1.0, draws=0)
+NO_PRIOR = ConsistentSettings(prior="euclidean", prior_weight=1e-6, draws=0)
 
 
 def robot():
@@ -53,63 +59,94 @@ def robot():
     )  # fmt: skip
 
 
-def log_of(model, seed, duration, share=1.0):
-    middle, reach = np.array([POSTURE[joint.split("_")[1]] for joint in model.joints]).T
-    rng = np.random.default_rng(seed)
-    log = recorded(
-        model, FEET, middle, share * reach, rng, duration=duration, kp=100.0, kd=2.0, highest=1.5,
-        torque=0.05, armature=ARMATURE, damping=DAMPING,
-    )  # fmt: skip
-    return log, with_other_bodies(model, rng)
+class Go1:
+    def __init__(self, estimator="wls", share=1.0):
+        self.estimator, self.share, self.model = estimator, share, robot()
+
+    def log(self, model, rng, duration):
+        middle, reach = np.array([POSTURE[joint.split("_")[1]] for joint in model.joints]).T
+        return recorded(
+            model, FEET, middle, self.share * reach, rng, duration=duration, kp=100.0, kd=2.0,
+            highest=1.5, torque=0.05, armature=ARMATURE, damping=DAMPING,
+        )  # fmt: skip
+
+    def truth(self, model):
+        pi, names = model.standard_parameters(), model.layout.names
+        return pi + [
+            ARMATURE * x.endswith(".armature") + DAMPING * x.endswith(".viscous") for x in names
+        ]
 
 
-def coverage(model, runs, duration, estimator="wls", share=1.0):
-    """Print the coverage of runs; the amplitude of the joints is a share of the usual one."""
-    truth = model.standard_parameters()
-    names = model.layout.names
-    truth += [ARMATURE * x.endswith(".armature") + DAMPING * x.endswith(".viscous") for x in names]
-    print(f"Go1, {estimator}, {share:g} of the amplitude")
-    print(f"{'run':>4} {'covered':>8} {'of':>4} {'rms z':>6} {'total mass [kg]':>16} {'s':>6}")
+class Walker:
+    """G1 or TALOS; see ``helpers.walkers``."""
+
+    estimator = "wls"
+
+    def __init__(self, biped):
+        self.model, self.log, self.truth = biped.model, biped.log, biped.truth
+
+
+class Cassie:
+    """Cassie on a gantry with a measured wrench; many of its small links are not excited."""
+
+    estimator = PRIOR
+
+    def __init__(self):
+        with TemporaryDirectory() as folder:
+            self.model = cassie.cassie(Path(folder))
+        self.log, self.truth = cassie.log, cassie.truth
+
+
+PLANTS = {
+    "go1": Go1, "go1_consistent": lambda: Go1("consistent"),
+    "go1_still": lambda: Go1("consistent", 0.3),
+    "g1": lambda: Walker(G1), "talos": lambda: Walker(TALOS), "cassie": Cassie,
+}  # fmt: skip
+
+
+def coverage(name, seeds, duration):
+    plant = PLANTS[name]()
+    model = plant.model
+    truth, n = plant.truth(model), model.layout.n_inertial
+    print(
+        f"{name}\n{'run':>4} {'covered':>8} {'of':>4} {'rms z':>6} {'total mass [kg]':>16} {'s':>6}"
+    )
     shares = []
-    for seed in range(runs):
-        log, other = log_of(model, seed, duration, share)
-        start = time.process_time()
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        log = plant.log(model, rng, duration)
+        other, start = with_other_bodies(model, rng), time.process_time()
         try:
             found = identify(
-                other, log, signals=SIGNALS, estimator=estimator, friction="none", doctor=False
-            )
-        except RankDeficientError as error:
+                other, log, signals=SIGNALS, estimator=plant.estimator, friction="none",
+                doctor=False,
+            )  # fmt: skip
+        except (RankDeficientError, NotConvergedError) as error:
             print(f"{seed:4} {str(error)[:60]}")
             continue
         spent = time.process_time() - start
-        is_drive = [x.endswith((".armature", ".viscous")) for x in found.mapping.base_names]
-        z, wide = scores(found, truth)
-        z, wide = z[~np.array(is_drive)], wide[~np.array(is_drive)]
-        mass = found.standard[: model.layout.n_inertial : 10].sum()
-        shares.append(np.mean(np.abs(z) < wide))
+        is_body = found.mapping.independent < n
+        z = ((found.base - found.mapping.K @ truth) / found.base_error)[is_body]
+        mass = found.standard[:n:10].sum()
+        shares.append(np.mean(np.abs(z) < found.errors.quantile[is_body]))
         print(
             f"{seed:4} {100 * shares[-1]:7.0f}% {len(z):4} {np.sqrt(np.mean(z**2)):6.2f} "
-            f"{mass:16.3f} {spent:6.1f}"
+            f"{mass:16.3f} {spent:6.1f}",
+            flush=True,
         )
     if shares:
         print(f"mean {100 * np.mean(shares):7.0f}%, wanted 90 to 98 %")
-
-
-def scores(found, truth):
-    """Return errors of base parameters in standard errors, and the half-width of intervals."""
-    z = (found.base - found.mapping.K @ truth) / found.base_error
-    return z, found.errors.quantile
 
 
 def trot():
     """Print the masses of a Solo12 by the defaults, beside the truth."""
     job = replace(read_job(JOBS / "legged" / "solo12.toml"), report=False)
     start = time.process_time()
-    with tempfile.TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder:
         found, _ = run_job(job, folder)
     spent = time.process_time() - start
     truth = found.model.standard_parameters()
-    z, wide = scores(found, truth)
+    z, wide = (found.base - found.mapping.K @ truth) / found.base_error, found.errors.quantile
     (validation,) = found.validation
     used, tau = validation.recording.mask, validation.recording.trajectory.tau
     left = (tau - validation.torques["estimate"])[used]
@@ -126,8 +163,45 @@ def trot():
         )
 
 
-def speed(model, duration):
-    log, _ = log_of(model, 0, duration)
+def unseen(name, seed, duration):
+    """Print errors on unseen motion, and the trunk, of fits with and without a prior."""
+    plant = PLANTS[name]()
+    model, rng = plant.model, np.random.default_rng(seed)
+    log, n = plant.log(model, rng, duration), model.layout.n_inertial
+    other = with_other_bodies(model, rng)
+    fitted, rest = log.window(end=0.7 * duration), log.window(0.7 * duration)
+    truth = plant.truth(model)[:n]
+    print(f"{name}: joint torque of unseen motion, trunk's mass and Ixx / truth")
+    for label, settings in (
+        ("wls", "wls"), ("LMI, no prior", NO_PRIOR), ("consistent", PRIOR)
+    ):  # fmt: skip
+        try:
+            found = identify(
+                other, fitted, validation=rest, signals=SIGNALS, estimator=settings,
+                friction="none", doctor=False,
+            )  # fmt: skip
+        except (RankDeficientError, NotConvergedError) as error:
+            print(f"  {label:14} {str(error)[:50]}")
+            continue
+        (own,) = found.validation
+        first = model.n_rows - len(model.joints)
+        used, tau = own.recording.mask[:, first:], own.recording.trajectory.tau[:, first:]
+        errors = {
+            key: 100 * np.linalg.norm((tau - own.torques[key][:, first:])[used])
+            / np.linalg.norm(tau[used])
+            for key in ("urdf", "estimate")
+        }  # fmt: skip
+        trunk = found.standard[[0, 4]] / truth[[0, 4]]
+        print(
+            f"  {label:14} {errors['estimate']:6.2f} % (URDF {errors['urdf']:.1f} %) "
+            f"{trunk[0]:6.2f} {trunk[1]:6.2f}",
+            flush=True,
+        )
+
+
+def speed(duration):
+    model = robot()
+    log = Go1().log(model, np.random.default_rng(0), duration)
     rows = hold_log(model, log, SIGNALS).whole
     legged = base_problem(model, structural_mapping(model), rows.trajectory, rows.mask)
     arm = setting.robot("panda")
@@ -151,17 +225,21 @@ def main():
     )
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--long", action="store_true")
+    parser.add_argument("--first", type=int, default=0, help="number of the first run")
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of each recording")
+    parser.add_argument("--robots", nargs="+", choices=PLANTS, default=[*PLANTS])
+    parser.add_argument("--unseen", action="store_true", help="only errors on unseen motion")
     options = parser.parse_args()
-    model = robot()
-    runs, duration = (1, 8.0) if options.quick else (options.runs, 20.0)
-    coverage(model, runs, duration)
-    if options.long:
-        coverage(model, runs, duration, "consistent")
-        coverage(model, runs, duration, "consistent", 0.3)
-    if "ROBOTID_DATA" in os.environ:
-        trot()
-    speed(model, 6.0)
+    runs, seconds = (1, 4.0) if options.quick else (options.runs, options.seconds)
+    for name in options.robots:
+        if options.unseen:
+            unseen(name, options.first, seconds)
+        else:
+            coverage(name, range(options.first, options.first + runs), seconds)
+    if not options.unseen:
+        if "ROBOTID_DATA" in os.environ:
+            trot()
+        speed(6.0)
 
 
 if __name__ == "__main__":

@@ -123,11 +123,7 @@ def _dump_contact(contact: Contact) -> dict[str, Any]:
 
 
 def _load_loops(tables: Sequence[Mapping[str, Any]]) -> tuple[Loop, ...]:
-    tuples: list[dict[str, Any]] = [
-        {key: tuple(x) if isinstance(x, list) else x for key, x in {"frames": (), **table}.items()}
-        for table in tables
-    ]
-    return tuple(Loop(**table) for table in tuples)
+    return tuple(Loop.from_dict(table) for table in tables)
 
 
 def _motors(gear: Transmission) -> list[Coupling]:
@@ -272,9 +268,7 @@ class Job(Settings):
             }
         ],
         load=_load_loops,
-        dump=lambda loops: [
-            {"frames": list(x.frames), "kind": x.kind, "axis": list(x.axis)} for x in loops
-        ],
+        dump=lambda loops: [x.to_dict() for x in loops],
     )
     passive: tuple[str, ...] = setting(
         (),

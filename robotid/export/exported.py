@@ -114,14 +114,14 @@ class Written:
 def unstated_terms(
     model: RobotModel, pi: Array, name: str, terms: Collection[str], *, has_couplings: bool = False
 ) -> list[str]:
-    """Return a sentence on the drive parameters that a format cannot state, if any.
+    """Return a sentence on drive parameters and loops that a format cannot state, if any.
 
     Args:
         model: The robot.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
         name: The format.
         terms: The drive terms of the format.
-        has_couplings: Whether it states drives that move several joints.
+        has_couplings: Whether it states drives that move several joints, and loops.
     """
     layout = model.layout
     drives = zip(layout.drive_parameters, layout.drive_names, pi[layout.n_inertial :], strict=True)
@@ -131,6 +131,8 @@ def unstated_terms(
         if value != 0.0
         and not (term.name in terms and (has_couplings or layout.drives[d] not in layout.couplings))
     ]
+    if not has_couplings:
+        missing += [f"the loop {loop.name}" for loop in model.loops]
     sentence = (
         f"{name} cannot state {listed(missing)}; the drive parameters file of the URDF has them"
     )

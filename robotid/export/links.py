@@ -37,7 +37,7 @@ class XmlFormat:
     Attributes:
         name: Its name.
         terms: Drive terms of a joint that it can state.
-        has_couplings: Whether it can state them for drives that move several joints, too.
+        has_couplings: Whether it can state them for drives that move several joints, and loops.
         is_readable: Whether the simulator reads a mesh.
     """
 

@@ -47,6 +47,8 @@ _GEOMS = {
 #: below its friction. With its 0.02 s friction is below Fc for 10 ms around each reversal; the
 #: minimum is 2 steps.
 _STIFF = {"solimpfriction": "0.999 0.999 0.001 0.5 2", "solreffriction": "1e-5 1"}
+#: Softness of a closed loop, as small as MuJoCo and the time step permit.
+_CLOSED = {"solimp": "0.9999 0.9999 0.001 0.5 2", "solref": "1e-5 1"}
 _COMPILER = {
     "angle": "radian", "autolimits": "true", "inertiafromgeom": "false", "balanceinertia": "false",
     "boundmass": "0", "boundinertia": "0",
@@ -148,7 +150,8 @@ def write_mjcf(
     Armature, viscous and Coulomb friction are the joint's armature, damping and frictionloss, or
     those of a tendon over the joints that a drive moves. The torque offset is the bias of the
     joint's actuator, whose control is the drive's torque. A frictionloss is a soft constraint:
-    ``mj_inverse`` gives Fc sign(v) for a moving joint, and less near zero speed.
+    ``mj_inverse`` gives Fc sign(v) for a moving joint, and less near zero speed. Passive joints
+    have no actuator. A loop is a ``connect`` constraint, two along a hinge, or a ``weld``.
 
     The control of a joint with a position controller is its position command. Its delay is a
     history of commands, which needs MuJoCo 3.5, or a first-order filter with the same delay at low
@@ -224,6 +227,7 @@ def _mjcf(
         _add_motion(body, link, own, servos)
         _add_geoms(body, link, assets)
     _add_drives(top, model, links, values, servos)
+    _add_loops(top, model, bodies)
     return top
 
 
@@ -292,6 +296,8 @@ def _add_drives(
             at = {"joint1": link.joint.name, "joint2": leader}
             ET.SubElement(equality, "joint", at, polycoef=numbers_text([shift, ratio, 0, 0, 0]))
     for limits in model.limits:
+        if limits.name in model.passive:
+            continue
         at = {"name": limits.name, "joint": limits.name}
         if limits.name not in servos.of and 0.0 < limits.effort < np.inf:
             at["ctrlrange"] = numbers_text([-limits.effort, limits.effort])
@@ -306,6 +312,19 @@ def _add_drives(
         elif offset:
             at |= {"biastype": "affine", "biasprm": numbers_text([-offset, 0.0, 0.0])}
         ET.SubElement(actuators, "general" if "biastype" in at else "motor", at)
+
+
+def _add_loops(top: ET.Element, model: RobotModel, bodies: Mapping[str, ET.Element]) -> None:
+    """Add the loops: each point that coincides is a pair of sites, one in each of the links."""
+    equality = ET.SubElement(top, "equality")
+    for loop in model.loops:
+        axis = model.length * np.array(loop.axis) / np.linalg.norm(loop.axis)
+        tag = "weld" if loop.kind == "rigid" else "connect"
+        for k, place in enumerate([np.zeros(3), axis] if loop.kind == "hinge" else [np.zeros(3)]):
+            names = [f"{loop.name} {k} {link}" for link in loop.frames]
+            for link, name in zip(loop.frames, names, strict=True):
+                ET.SubElement(bodies[link], "site", name=name, pos=numbers_text(place))
+            ET.SubElement(equality, tag, {"site1": names[0], "site2": names[1]} | _CLOSED)
 
 
 def _drive(name: str, values: Mapping[str, float]) -> dict[str, str]:

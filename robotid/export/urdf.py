@@ -35,6 +35,7 @@ from robotid.robot.bodies import (
     inertial_parameters,
     link_places,
 )
+from robotid.robot.constraints import Loop
 from robotid.robot.drives import TERMS
 from robotid.robot.families import term_from_dict
 from robotid.robot.model import RobotModel
@@ -71,6 +72,7 @@ _SHAPE = {
     "terms": [TEXT],
     "own_terms?": {...: [TABLE]},
     "passive?": [TEXT],
+    "loops?": [{"frames": [TEXT], "kind": TEXT, "axis": [NUMBER]}],
     "drives": {...: {...: NUMBER}},
     "couplings": [{"name": TEXT, "ratios": {...: NUMBER}, "replaces?": FLAG}],
     "lumped": TABLE,
@@ -236,6 +238,7 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
         own_terms=terms_from_facts(facts.get("own_terms", {})),
         dynamics=facts.get("dynamics", "full"),
         passive=facts.get("passive", ()),
+        constraints=[Loop.from_dict(table) for table in facts.get("loops", ())],
         **{
             key: facts[key]
             for key in ("joints", "locked", "free_flyer", "mimic", "gravity", "terms")
@@ -295,6 +298,7 @@ def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[st
     own = [drive.name for drive in layout.drives if drive not in layout.couplings]
     return {
         **model.options,
+        **({"loops": [loop.to_dict() for loop in model.loops]} if model.loops else {}),
         "drives": {name: values[name] for name in own},
         "couplings": [
             {"name": c.name, "ratios": {joint: float(ratio) for joint, ratio in c.ratios}}
@@ -478,7 +482,10 @@ def _check_torque(model: RobotModel, pi: Array, urdf: Path, sidecar: Path) -> No
         )
     wanted, found = (
         (random_regressor(robot, _STATES, np.random.default_rng(0)) @ x).reshape(_STATES, -1)
-        for robot, x in ((replace(model, constraints=()), pi), (loaded, read_back))
+        for robot, x in (
+            (replace(model, constraints=()), pi),
+            (replace(loaded, constraints=()), read_back),
+        )
     )
     difference = np.linalg.norm(found - wanted, axis=0)  # (n_rows,)
     off = np.flatnonzero(difference > _SAME * np.linalg.norm(wanted, axis=0))

@@ -185,28 +185,31 @@ def friction_chart(
 
     Args:
         found: The identification.
-        joint: The joint.
+        joint: The joint, or a row of the base.
         split: Measured and identified friction, as ``friction_split`` returns them for
             ``shown_evaluation``; computed if None.
 
     Returns:
-        The chart; None if no sample of the joint was used, or it is passive without friction.
+        The chart; None if no sample of the joint was used, or it has no drive and no friction.
     """
     evaluation, model = shown_evaluation(found), found.model
     motion, row = evaluation.recording.trajectory, model.row_names.index(joint)
     left, friction = split or friction_split(model, evaluation, found.standard)
     rows = np.flatnonzero(evaluation.recording.mask[:, row])
     rows = rows[:: max(1, -(-len(rows) // _DOTS))]
-    is_bare = joint in model.passive and joint not in model.layout.own
-    if is_bare or not len(rows):
+    is_driven = joint in model.joints and joint not in model.passive
+    has_friction = is_driven or joint in model.layout.own
+    if not has_friction or not len(rows):
         return None
     rows = rows[np.argsort(motion.v[rows, row], kind="stable")]
     load = 0.0
     if any(x.name == "load" for x in model.layout.own.get(joint, ())):
-        loads = drive_motion_along(model, motion).load
-        load = float(np.sqrt(np.mean(loads[row, rows] ** 2)))
+        drive = [own.name for own in model.layout.drives].index(joint)
+        loads = drive_motion_along(model, motion).load[drive]
+        load = float(np.sqrt(np.mean(loads[rows] ** 2)))
     v, unit = motion.v[rows, row], model.row_units[row]
-    curve = friction_curve(found, joint, v, q=float(np.median(motion.q[rows, row])), load=load)
+    q = float(np.median(motion.q[rows, row - model.n_rows]))  # from the end: a pose has 7 entries
+    curve = friction_curve(found, joint, v, q=q, load=load)
     # Coulomb friction jumps where the motion reverses: no line crosses it
     v, left, friction, steady, std = broken(
         np.sign(v), v, left[rows, row], friction[rows, row], curve.torque, curve.std

@@ -163,7 +163,8 @@ def _friction_figures(found: Identification) -> dict[str, str]:
     for joint in found.model.row_names:
         chart = friction_chart(found, joint, split=split)
         if chart is None:
-            why = "no drive" if joint in found.model.passive else "no samples used"
+            is_driven = joint in found.model.joints and joint not in found.model.passive
+            why = "no samples used" if is_driven else "no drive"
             figures[joint] = f"<p>{escape(joint)}: {why}.</p>\n"
         else:
             caption = f"<strong>{escape(joint)}</strong>"

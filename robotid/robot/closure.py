@@ -2,6 +2,7 @@
 
 import numpy as np
 import pinocchio as pin
+from scipy.linalg import qr
 
 from robotid._typing import Array
 from robotid.exceptions import ModelError
@@ -16,6 +17,8 @@ _MOST = 30  # iterations of Newton's method
 _SETTLED = 1e-8  # [rad, m] step with which it ends: the error is about its square
 _FAR = 1e3  # [rad, m] step with which it fails
 _RANK = 1e-8  # singular values below this share of the largest are of dependent loops
+_REGULAR = 1e-6  # ... and of dependent columns of a loop
+_DEAD = 1e-4  # ... of positions that loops determine, relative to the length of the robot
 _PATH = 25  # steps from the zero position to the first one
 _STEP = 0.25  # [rad, or robot lengths] standard deviation of a step of the random walk
 _APART = 4  # steps of the walk between two states
@@ -70,10 +73,11 @@ class Chains:
         """
         x, found = self._assembled(), q.copy()
         singular = np.linalg.svd(self._equations(x)[1][:, unknown], compute_uv=False)
-        if np.sum(singular > _RANK) < unknown.sum():
-            names = [self._model.joints[j] for j in np.flatnonzero(unknown)]
+        if np.sum(singular > _DEAD * self._model.length) < unknown.sum():
+            names = listed([self._model.joints[j] for j in np.flatnonzero(unknown)])
             raise ModelError(
-                f"the loops do not determine the positions of {listed(names)}; log them"
+                f"the loops do not determine the positions of {names} near the zero position; log "
+                "them. If it is a dead centre, shift the zero position of a joint in the URDF"
             )
         begin = x[~unknown]
         for part in np.linspace(0.0, 1.0, _PATH + 1)[1:]:
@@ -98,8 +102,8 @@ class Chains:
     def random_states(self, samples: int, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return random states: coordinates (N, n) at which the loops close, and Z (N, n, n).
 
-        A random walk keeps the chains assembled as in the zero position. Z v are speeds that the
-        loops permit, Z is an orthogonal projector.
+        A random walk keeps the chains assembled as in the zero position: it does not cross dead
+        centres. Z v are speeds that the loops permit, Z is an orthogonal projector.
 
         Args:
             samples: Number N of states.
@@ -109,12 +113,30 @@ class Chains:
         every, size = np.ones(n, dtype=bool), np.where(self._is_long, self._model.length, 1.0)
         q, Z = np.empty((samples, n)), np.empty((samples, n, n))
         x = self._assembled()
+        J = self._equations(x)[1]
+        squares = self._squares(J)
+        sides = _sides(J, squares)
         for k in range(samples):
             for _ in range(_APART):
-                step = _permitted(self._equations(x)[1]) @ (rng.standard_normal(n) * _STEP)
-                x = self._newton(x + size * step, every)
-            q[k], Z[k] = x, _permitted(self._equations(x)[1])
+                step = _permitted(J) @ (rng.standard_normal(n) * _STEP)
+                other = self._newton(x + size * step, every)
+                J_other = self._equations(other)[1]
+                if _sides(J_other, squares) == sides:
+                    x, J = other, J_other
+            q[k], Z[k] = x, _permitted(J)
         return q, Z
+
+    def _squares(self, J: Array) -> list[tuple[Array, Array]]:
+        """Return rows and columns of square, regular parts of J: of each loop, and of all."""
+        groups = [np.flatnonzero(self._loop == k) for k in range(len(self._ids))]
+        found = []
+        for rows in [*groups, np.arange(len(J))]:
+            R, columns = qr(J[rows], mode="r", pivoting=True)
+            size = np.abs(np.diag(R))
+            columns = columns[: np.sum(size > _REGULAR * size[0])]
+            chosen = qr(J[np.ix_(rows, columns)].T, mode="r", pivoting=True)[1]
+            found.append((rows[chosen[: len(columns)]], columns))
+        return found
 
     def accelerations(self, q: Array, v: Array) -> Array:
         """Return accelerations that keep closed loops closed, the smallest ones, shape (N, n).
@@ -191,6 +213,11 @@ def _least(J: Array, error: Array) -> Array:
     """Return the smallest x with J x = -error."""
     x: Array = -np.linalg.lstsq(J, error, rcond=_RANK)[0]
     return x
+
+
+def _sides(J: Array, squares: list[tuple[Array, Array]]) -> list[float]:
+    """Return the signs of the determinants of square parts of J; they change at dead centres."""
+    return [float(np.linalg.slogdet(J[np.ix_(*own)])[0]) for own in squares]
 
 
 def _permitted(J: Array) -> Array:

@@ -1,7 +1,7 @@
 """Constraints between frames: contacts with the ground, and joints that close kinematic chains."""
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -146,6 +146,24 @@ class Loop:
     def name(self) -> str:
         """Name for messages."""
         return " - ".join(self.frames)
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> "Loop":
+        """Return a loop from plain values, as of ``to_dict``.
+
+        Args:
+            table: Its attributes by name; lists for tuples.
+
+        Raises:
+            SettingsError: If a value is not usable.
+        """
+        plain: dict[str, Any] = {"frames": (), **table}
+        lists = {key: tuple(x) for key, x in plain.items() if isinstance(x, list)}
+        return cls(**{**plain, **lists})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for a file."""
+        return {"frames": list(self.frames), "kind": self.kind, "axis": list(self.axis)}
 
     def rows(self, jacobians: Sequence[Array], rotation: Array) -> Array:
         """Return the relative velocity that the loop prevents, per speed, shape (m, nv).

@@ -6,13 +6,17 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.closed_chains import Oracle, ankle, four_bar
 from helpers.robots import possible_parameters
 from helpers.simulators import SIMULATED, simulated, states
 from scipy.spatial.distance import pdist
 
 from robotid.exceptions import ModelError
 from robotid.export.commanded import CommandedDrive
+from robotid.export.exported import unstated_terms
 from robotid.export.mjcf import write_mjcf
+from robotid.robot.closure import Chains
+from robotid.robot.constraints import Loop
 from robotid.robot.drives import Cubic, Spring
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
@@ -225,3 +229,34 @@ def test_what_no_simulator_reads_is_refused_before_anything_is_written(tmp_path)
     ):
         write_mjcf(model, pi, tmp_path / "robot.xml")
     assert not (tmp_path / "robot.xml").exists()
+
+
+@pytest.mark.parametrize("robot", [four_bar, ankle])
+def test_loops_are_closed_in_mujoco(robot, tmp_path, rng):
+    model = robot(tmp_path, terms=("viscous",))
+    pi = model.standard_parameters()
+    pi[model.layout.n_inertial :] = rng.uniform(0.02, 0.1, len(model.layout.drive_names))
+    write_mjcf(model, pi, tmp_path / "closed.xml")
+    robot, data = load(tmp_path / "closed.xml")
+    assert robot.nu == len(model.joints) - len(model.passive)
+    oracle = Oracle(model, pi)
+    q, Z = Chains(model).random_states(5, rng)
+    at = np.array([robot.joint(joint).qposadr[0] for joint in model.joints])
+    for q_k, Z_k in zip(q, Z, strict=True):
+        v = Z_k @ rng.standard_normal(len(q_k))
+        tau = rng.standard_normal(len(q_k)) * ~np.isin(model.joints, model.passive)
+        data.qpos[at], data.qvel[at] = q_k, v
+        data.ctrl[:] = [tau[model.joints.index(robot.actuator(k).name)] for k in range(robot.nu)]
+        mujoco.mj_forward(robot, data)
+        wanted = oracle.acceleration(q_k, v, tau)
+        np.testing.assert_allclose(data.qacc[at], wanted, atol=1e-2 * np.abs(wanted).max())
+
+
+def test_a_rigid_loop_is_a_weld_and_others_are_stated_elsewhere(tmp_path):
+    model = four_bar(tmp_path, constraints=[Loop(("coupler_end", "rocker_end"), "rigid")])
+    pi = model.standard_parameters()
+    write_mjcf(model, pi, tmp_path / "welded.xml")
+    robot, _ = load(tmp_path / "welded.xml")
+    assert list(robot.eq_type) == [mujoco.mjtEq.mjEQ_WELD]
+    (note,) = unstated_terms(model, pi, "SDF", ())
+    assert note.startswith("SDF cannot state the loop coupler_end - rocker_end; the drive param")

@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.closed_chains import four_bar
 from helpers.robots import motion, possible_parameters
 
 from robotid.doctor.urdf import inspect_urdf
@@ -516,3 +517,14 @@ def test_a_link_that_did_not_change_keeps_its_text_and_rounding_is_0(ur5, tmp_pa
     assert origin.split('xyz="')[1].split('"')[0].split()[2] == "0.0"
     write_urdf(ur5, pi, tmp_path / "new.urdf")
     assert "e-6" not in (tmp_path / "new.urdf").read_text()
+
+
+def test_a_sidecar_states_the_loops(tmp_path):
+    model = four_bar(tmp_path)
+    sidecar = write_urdf(model, model.standard_parameters(), tmp_path / "written.urdf")
+    loaded, _ = load_identified(tmp_path / "written.urdf", sidecar)
+    assert loaded.loops == model.loops
+    assert loaded.passive == model.passive
+    assert json.loads(sidecar.read_text())["loops"] == [
+        {"frames": ["coupler_end", "rocker_end"], "kind": "hinge", "axis": [0.0, 0.0, 1.0]}
+    ]

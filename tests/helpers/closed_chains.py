@@ -1,4 +1,4 @@
-"""Closed chains: a four-bar and a differential as URDFs, and their simulation by Pinocchio."""
+"""Closed chains: four-bar, ankle, differential as URDFs, and their simulation by Pinocchio."""
 
 import numpy as np
 import pinocchio as pin
@@ -40,6 +40,30 @@ FOUR_BAR = "<robot name='four_bar'>" + "".join(
         _joint("rocker_tip", "fixed", "rocker", "rocker_end", "0.3 0 0"),
     ]
 ) + "</robot>"  # fmt: skip
+#: A wrist that two motors in its base move by a differential: both pitch, their difference rolls.
+WRIST = "".join(
+    [
+        _link("base"), _link("yoke", _inertial(0.6, "0.01 0.02 0.05", 0.002, 0.003, 0.001)),
+        _link("hand", _inertial(0.8, "0.05 -0.01 0.02", 0.001, 0.004, 0.004)),
+        _joint("pitch", "revolute", "base", "yoke", "0 0 0.3", axis="0 1 0"),
+        _joint("roll", "revolute", "yoke", "hand", "0.1 0 0", axis="1 0 0"),
+    ]
+)  # fmt: skip
+MOTORS = "".join(
+    text
+    for name, y in (("left", 0.1), ("right", -0.1))
+    for text in (
+        _link(f"{name}_rotor", _inertial(0.1, "0 0 0", 1e-5, 3e-5, 1e-5)),
+        _joint(f"{name}", "revolute", "base", f"{name}_rotor", f"0 {y} 0", axis="0 1 0"),
+    )
+)
+PARALLELOGRAM = (  # crank and rocker at 0.5 rad
+    FOUR_BAR.replace('rpy="0 0 1.2"', 'rpy="0 0 0.5"')
+    .replace('"0 0 0" rpy="0 0 0"', '"0 0 0" rpy="0 0 0.5"', 1)
+    .replace('"0.15 0 0" rpy="0 0 0"', '"0.15 0 0" rpy="0 0 -0.5"')
+    .replace('"0.38 0 0"', '"0.35 0 0"')
+    .replace('"0.3 0 0"', '"0.15 0 0"')
+)
 FOUR_BAR_LOOP = Loop(("coupler_end", "rocker_end"))
 
 ANKLE = "<robot name='ankle'>" + "".join(
@@ -92,12 +116,19 @@ def _model(path, text, **options):
 
 
 class Oracle:
-    """Pinocchio's constraint dynamics of a robot with loops, whose joints have its order."""
+    """Pinocchio's constraint dynamics of a robot with loops of ball joints, on point feet or none.
 
-    def __init__(self, model, pi):
-        self.layout, self.pi = model.layout, dict(zip(model.layout.names, pi, strict=True))
+    Args:
+        model: The robot.
+        pi: Its parameters.
+        feet: Links whose origins do not accelerate.
+    """
+
+    def __init__(self, model, pi, feet=()):
+        self.model, self.layout = model, model.layout
+        self.pi = dict(zip(model.layout.names, pi, strict=True))
         self.robot = pin.Model(model.with_parameters(pi).pin_model)
-        self.robot.armature = self._drive("armature")
+        self.robot.armature = model.velocity_map @ self._drive("armature")
         self.data = self.robot.createData()
         self.loops = pin.StdVec_RigidConstraintModel()
         for loop in model.loops:
@@ -108,20 +139,30 @@ class Oracle:
                     two.parentJoint, two.placement, pin.ReferenceFrame.LOCAL,
                 )
             )  # fmt: skip
+        for foot in feet:
+            frame = self.robot.frames[self.robot.getFrameId(foot)]
+            self.loops.append(
+                pin.RigidConstraintModel(
+                    pin.ContactType.CONTACT_3D, self.robot, frame.parentJoint, frame.placement,
+                    pin.ReferenceFrame.LOCAL,
+                )
+            )  # fmt: skip
         self.of_loops = pin.StdVec_RigidConstraintData()
         self.of_loops.extend([loop.createData() for loop in self.loops])
         pin.initConstraintDynamics(self.robot, self.data, self.loops, self.of_loops)
         self.settings = pin.ProximalSettings(1e-13, 1e-13, 1e-8, 50)
 
     def _drive(self, term):
-        return np.array([self.pi.get(f"{joint}.{term}", 0.0) for joint in self.layout.joints])
+        return np.array([self.pi.get(f"{row}.{term}", 0.0) for row in self.model.row_names])
 
     def acceleration(self, q, v, tau):
-        """Return the accelerations under torques of the drives, at the joints."""
+        """Return the accelerations of all rows under torques of the drives, at the joints."""
         friction = self._drive("viscous") * v + self._drive("coulomb") * np.tanh(v / 5e-3)
-        return pin.constraintDynamics(
-            self.robot, self.data, q, v, tau - friction - self._drive("offset"), self.loops,
-            self.of_loops, self.settings,
+        torque = tau - friction - self._drive("offset") - self._drive("spring") * q[-len(v) :]
+        G, (configuration,) = self.model.velocity_map, self.model.configurations(q[None])
+        return G.T @ pin.constraintDynamics(
+            self.robot, self.data, configuration, G @ v, G @ torque, self.loops, self.of_loops,
+            self.settings,
         )  # fmt: skip
 
     def force(self):

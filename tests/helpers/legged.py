@@ -1,5 +1,7 @@
 """Robots on legs in MuJoCo: a plant with ground contacts that shares no code with the method."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pinocchio as pin
@@ -7,23 +9,29 @@ import pinocchio as pin
 from robotid.logs.base import BaseMotion
 from robotid.logs.data import Log
 from robotid.logs.imu import ImuFrame, motion_of_imu
-from robotid.robot.constraints import frame_id
+from robotid.robot.constraints import Contact, frame_id
 from robotid.robot.parameters import pseudo_inertia
 
 _HOLD = 10  # steps during which a torque is held
-_RADIUS = 1e-3  # [m] of the feet: contacts are at the origin of the foot's link
+_RADIUS = 1e-3  # [m] of the feet: contacts are at the origin of the foot's link, or at its corners
+SETTLES = 1.0  # [s] from the first posture to the start of the log
 
 
-def spec_of(model, feet, *, step, armature=0.0, damping=0.0, friction=0.8, imu=None):
+def spec_of(
+    model, feet, *, step, armature=0.0, damping=0.0, friction=0.8, ground=0.02, springs=(), imu=None
+):  # fmt: skip
     """Return a MuJoCo model of a robot whose base floats, with small spheres as feet on a plane.
 
     Args:
-        model: The robot; its tree is written as a URDF with a floating joint.
-        feet: Links that touch the ground.
+        model: The robot; its tree is written as a URDF with a floating joint. Its loops are
+            ``connect`` constraints.
+        feet: Links that touch the ground, or the points of each link that do, shape (k, 3) [m].
         step: Of MuJoCo [s].
-        armature: Of each joint [kg m^2].
-        damping: Of each joint [N m s/rad].
+        armature: Of each joint with a drive [kg m^2].
+        damping: Of each joint with a drive [N m s/rad].
         friction: Coefficient of the feet.
+        ground: Time constant of the ground [s].
+        springs: Stiffness [N m/rad] and damping [N m s/rad] by passive joint.
         imu: Placement of an IMU in the base, or None.
     """
     pin_model, names = model.pin_model, list(model.pin_model.names)
@@ -44,31 +52,55 @@ def spec_of(model, feet, *, step, armature=0.0, damping=0.0, friction=0.8, imu=N
         axis = pin.computeJointJacobian(
             pin_model, pin_model.createData(), pin.neutral(pin_model), i
         )
+        drive = {"armature": armature, "damping": [damping, 0, 0]}
         bodies[i].add_joint(
             name=names[i], type=mujoco.mjtJoint.mjJNT_HINGE,
-            axis=axis[3:, pin_model.joints[i].idx_v], armature=armature, damping=[damping, 0, 0],
+            axis=axis[3:, pin_model.joints[i].idx_v],
+            **(drive if names[i] not in model.passive else {}),
+            **({} if names[i] not in springs else _spring(*springs[names[i]], step)),
         )  # fmt: skip
     spec.option.timestep = step
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     spec.worldbody.add_geom(
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=[10, 10, 0.1], friction=[friction, 0, 0], condim=3,
-        solref=[0.02, 1.0],
+        solref=[ground, 1.0],
     )  # fmt: skip
-    for foot in feet:
-        frame = model.pin_model.frames[frame_id(model.pin_model, foot)]
-        bodies[frame.parentJoint].add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[_RADIUS, 0, 0],
-            pos=frame.placement.translation, name=foot, condim=3, mass=0.0,
-            friction=[friction, 0, 0], solref=[0.02, 1.0],
+    for foot, points in _points(feet).items():
+        frame = pin_model.frames[frame_id(pin_model, foot)]
+        for k, point in enumerate(points):
+            bodies[frame.parentJoint].add_geom(
+                type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[_RADIUS, 0, 0],
+                pos=frame.placement.act(np.array(point)), name=f"{foot} {k}", condim=3, mass=0.0,
+                friction=[friction, 0, 0], solref=[ground, 1.0],
+            )  # fmt: skip
+    for loop in model.loops:
+        for link in loop.frames:
+            frame = pin_model.frames[frame_id(pin_model, link)]
+            bodies[frame.parentJoint].add_site(name=link, pos=frame.placement.translation)
+        spec.add_equality(
+            type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_SITE,
+            name1=loop.frames[0], name2=loop.frames[1], solref=[2 * step, 1.0],
+            solimp=[0.9999, 0.9999, 0.001, 0.5, 2.0],
         )  # fmt: skip
     if imu is not None:
         site = bodies[1].add_site(name="imu", pos=imu.translation, quat=_wxyz(imu.rotation))
         for kind in (mujoco.mjtSensor.mjSENS_GYRO, mujoco.mjtSensor.mjSENS_ACCELEROMETER):
             spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site.name)
     for name in model.joints:
-        motor = spec.add_actuator(name=name, target=name)
-        motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
+        if name not in model.passive:
+            motor = spec.add_actuator(name=name, target=name)
+            motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
     return spec.compile()
+
+
+def _spring(stiffness, damping, step):
+    """Return a spring in a step whose force acts half a step early, as a negative damping does."""
+    return {"stiffness": [stiffness, 0, 0], "damping": [damping + 0.5 * step * stiffness, 0, 0]}
+
+
+def _points(feet):
+    """Return the points that touch the ground by link."""
+    return dict(feet) if hasattr(feet, "keys") else {foot: [(0.0, 0.0, 0.0)] for foot in feet}
 
 
 def _wxyz(rotation):
@@ -82,19 +114,59 @@ def _steiner(inertia):
     return m * np.array([y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y])
 
 
-def recorded(
-    model, feet, middle, reach, rng, *, duration=20.0, rate=500.0, step=1e-4, kp=40.0, kd=1.0,
-    torque=0.02, bits=18, armature=0.0, damping=0.0, height=None, highest=1.2, force=False,
-    imu=None,
-):  # fmt: skip
+def multisine(middle, reach, rng, highest=1.2):
+    """Return a motion of joints about a posture, positions from the time, shape (n,) [rad].
+
+    Args:
+        middle: Posture, shape (n,) [rad].
+        reach: Amplitude of the motion, shape (n,) [rad].
+        rng: Source of the motion.
+        highest: Highest frequency [Hz].
+    """
+    tones = np.arange(1, 13)
+    f = np.linspace(0.1, highest, len(tones))
+    phase = rng.uniform(0, 2 * np.pi, (len(middle), len(tones)))
+    size = rng.dirichlet(np.ones(len(tones)), len(middle))
+
+    def wanted(t):
+        wave = np.sum(size * np.sin(2 * np.pi * f * max(t, 0.0) + phase), axis=1)
+        start = np.sum(size * np.sin(phase), axis=1)
+        ramp = np.clip(1.0 + t / SETTLES, 0.0, 1.0)
+        return middle + reach * (wave if t > 0 else ramp * start), 0.0
+
+    return wanted
+
+
+def recorded(model, feet, middle, reach, rng, *, highest=1.2, **options):
     """Return the log of a robot whose joints follow multi-sines while its feet are on the ground.
 
     Args:
         model: The robot, whose bodies are those of its URDF.
-        feet: Links that touch the ground.
+        feet: As of ``spec_of``.
         middle: Posture in which it stands, shape (n,) [rad].
         reach: Amplitude of the motion, shape (n,) [rad].
         rng: Source of the motion and of noise.
+        highest: Highest frequency of the motion [Hz].
+        options: As of ``followed``.
+    """
+    motion = multisine(middle, reach, rng, highest)
+    return followed(model, feet, motion, rng, **{"posture": middle, **options})
+
+
+def followed(
+    model, feet, motion, rng, *, posture, duration=20.0, rate=500.0, step=1e-4, kp=40.0, kd=1.0,
+    torque=0.02, bits=18, armature=0.0, damping=0.0, height=None, force=False, ground=0.02,
+    gantry=None, springs=(), friction=0.8, imu=None,
+):  # fmt: skip
+    """Return the log of a robot on the ground whose joints follow a motion.
+
+    Args:
+        model: The robot, whose bodies are those of its URDF.
+        feet: As of ``spec_of``.
+        motion: Positions [rad] and torques [N m] of the joints from the time, from -1 s on; those
+            of passive joints have no effect.
+        rng: Source of noise.
+        posture: Positions at -1 s, shape (n,) [rad], or (7 + n,) with the pose of the base.
         duration: Length [s].
         rate: Rows per second [Hz].
         step: Of MuJoCo [s].
@@ -105,76 +177,109 @@ def recorded(
         armature: Of each joint [kg m^2].
         damping: Of each joint [N m s/rad].
         height: Of the base at the start [m].
-        highest: Highest frequency of the motion [Hz].
         force: Whether the feet's forces are logged, in the world's axes.
+        ground: Time constant of the ground [s].
+        gantry: The wrench that holds the base at its origin, with the axes of the world, from the
+            time, its pose (7,) and its speeds (6,); it is logged.
+        springs, friction: As of ``spec_of``.
         imu: Placement of an IMU in the base, whose filtered values are logged; or None.
     """
-    mj = spec_of(model, feet, step=step, armature=armature, damping=damping, imu=imu)
-    data = mujoco.MjData(mj)
+    mj = spec_of(
+        model,
+        feet,
+        step=step,
+        armature=armature,
+        damping=damping,
+        ground=ground,
+        springs=springs,
+        friction=friction,
+        imu=imu,
+    )
+    data, feet = mujoco.MjData(mj), _points(feet)
     joints = [mj.joint(name) for name in model.joints]
     qpos = np.array([joint.qposadr[0] for joint in joints])
     qvel = np.array([joint.dofadr[0] for joint in joints])
-    data.qpos[qpos] = middle
-    data.qpos[2] = 1.0 if height is None else height
-    mujoco.mj_forward(mj, data)
-    spheres = [mj.geom(foot).id for foot in feet]
+    driven = np.array([name not in model.passive for name in model.joints])
+    _place(mj, data, qpos, posture, 1.0 if height is None else height)
+    geoms = [mj.geom(i).name.rpartition(" ")[0] for i in range(mj.ngeom)]
+    foot_of = np.array([[*feet, ""].index(name) for name in geoms])  # the last one is the plane
     if height is None:  # the lowest foot touches the ground
-        data.qpos[2] += _RADIUS - min(data.geom_xpos[i][2] for i in spheres)
-    n, tones = len(joints), np.arange(1, 13)
-    f = np.linspace(0.1, highest, len(tones))
-    phase = rng.uniform(0, 2 * np.pi, (n, len(tones)))
-    size = rng.dirichlet(np.ones(len(tones)), n)
-    period, settles = round(1 / (rate * step)), 1.0
-    rows, touches = [], np.zeros(len(feet))
+        data.qpos[2] += _RADIUS - data.geom_xpos[foot_of < len(feet), 2].min()
+    period = round(1 / (rate * step))
+    rows, touches, ctrl = [], np.zeros(len(feet) + 1), np.zeros(len(joints) + 6)
     means, sensed = [], np.zeros(mj.nsensordata)
-    for k in range(round((duration + settles) / step)):
-        t = k * step - settles
-        if k % _HOLD == 0:
-            ramp = np.clip(1.0 + t / settles, 0.0, 1.0)
-            wave = np.sum(size * np.sin(2 * np.pi * f * max(t, 0.0) + phase), axis=1)
-            start = np.sum(size * np.sin(phase), axis=1)
-            target = middle + reach * (wave if t > 0 else ramp * start)
-            command = kp * (target - data.qpos[qpos]) - kd * data.qvel[qvel]
-            before, data.ctrl[:] = data.ctrl.copy(), command
+    for k in range(0, round((duration + SETTLES) / step), _HOLD):
+        t = k * step - SETTLES
+        wanted, ahead = motion(t)
+        command = kp * (wanted - data.qpos[qpos]) - kd * data.qvel[qvel] + ahead
+        held = np.zeros(6) if gantry is None else gantry(t, data.qpos[:7], data.qvel[:6])
+        before, ctrl = ctrl, np.append(np.where(driven, command, 0.0), held)
+        data.ctrl[:] = ctrl[:-6][driven]
+        data.xfrc_applied[1] = held
+        data.xfrc_applied[1, 3:] += np.cross(data.qpos[:3] - data.xipos[1], held[:3])
         if k % period == 0 and t >= 0:
-            wrench = np.zeros((len(feet), 3))
             mujoco.mj_forward(mj, data)
-            for c in range(data.ncon):
-                contact, own = data.contact[c], np.zeros(6)
-                foot = next((i for i, g in enumerate(spheres) if g in contact.geom), None)
-                if foot is None or contact.efc_address < 0:
-                    continue
-                mujoco.mj_contactForce(mj, data, c, own)
-                sign = 1.0 if contact.geom[1] == spheres[foot] else -1.0
-                wrench[foot] += sign * contact.frame.reshape(3, 3).T @ own[:3]
-            half = 0.5 * (before + data.ctrl)
-            rows.append(np.concatenate([[t], data.qpos, half, touches, wrench.ravel()]))
+            forces = _forces(mj, data, foot_of)
+            row = [[t], data.qpos, 0.5 * (before + ctrl), touches[:-1], forces.ravel()]
+            rows.append(np.concatenate(row))
             touches[:] = 0.0
             means.append(sensed / period)
         if k % period == 0:
             sensed[:] = 0.0
-        mujoco.mj_step(mj, data)
-        sensed += data.sensordata
-        if k % _HOLD == 0 and data.ncon:  # at any time since the last row
+        for _ in range(1 if imu is None else _HOLD):
+            mujoco.mj_step(mj, data, _HOLD if imu is None else 1)
+            sensed += data.sensordata
+        if data.ncon:  # at any time since the last row
             acting = data.contact.geom[data.contact.efc_address >= 0]
-            touches[np.isin(spheres, acting)] = 1.0
-    rows = np.array(rows)
+            touches[foot_of[acting]] = 1.0
+    log = _logged(model, list(feet), mj, qpos, np.array(rows), rng, torque, bits, force)
+    if imu is not None:
+        still = ImuFrame(
+            pin.Quaternion(imu.rotation).coeffs(), imu.translation, mj.opt.gravity, np.zeros(3)
+        )
+        means = np.array([*means, sensed / period])  # of the periods before and after each row
+        measured, _ = motion_of_imu(log.t, log.q, 0.5 * (means[:-1] + means[1:]), still)
+        log = replace(log, base=replace(log.base, imu=measured))
+    if gantry is None:
+        return log
+    wrench = np.array(rows)[:, 1 + mj.nq + len(joints) :][:, :6]
+    names = (f"{part} {model.tree.root}" for part in Contact.components)
+    return replace(log, wrenches=log.wrenches | dict(zip(names, wrench.T, strict=True)))
+
+
+def _place(mj, data, qpos, posture, height):
+    """Put a robot at a posture, its base upright at a height or at its stated pose."""
+    if len(posture) > len(qpos):
+        data.qpos[:7] = np.array(posture)[[0, 1, 2, 6, 3, 4, 5]]
+    else:
+        data.qpos[2] = height
+    data.qpos[qpos] = posture[-len(qpos) :]
+    mujoco.mj_forward(mj, data)
+
+
+def _forces(mj, data, foot_of):
+    """Return the force of the ground on each foot with the axes of the world, shape (k, 3) [N]."""
+    forces, own = np.zeros((foot_of.max() + 1, 3)), np.zeros(6)
+    for c in range(data.ncon):
+        contact = data.contact[c]
+        if contact.efc_address >= 0:
+            mujoco.mj_contactForce(mj, data, c, own)
+            force = contact.frame.reshape(3, 3).T @ own[:3]  # on the second geom
+            forces[foot_of[contact.geom]] += np.outer([-1.0, 1.0], force)
+    return forces[:-1]
+
+
+def _logged(model, feet, mj, qpos, rows, rng, torque, bits, force):
+    """Return the log of rows of t, qpos, torques, flags and forces, with noise."""
+    n = len(model.joints)
     t, q = rows[:, 0], rows[:, 1 + qpos]
     resolution = 2 * np.pi / 2**bits
     q = np.round(q / resolution) * resolution
     pose = rows[:, [1, 2, 3, 5, 6, 7, 4]]
     first = 1 + mj.nq
     tau = rows[:, first : first + n] + torque * rng.standard_normal((len(t), n))
-    flags = rows[:, first + n : first + n + len(feet)] > 0
-    count = first + n + len(feet)
-    forces = rows[:, count : count + 3 * len(feet)].reshape(len(t), -1, 3)
-    measured = None
-    if imu is not None:
-        still = ImuFrame(
-            pin.Quaternion(imu.rotation).coeffs(), imu.translation, mj.opt.gravity, np.zeros(3)
-        )
-        means = np.array([*means, sensed / period])  # of the periods before and after each row
-        measured, _ = motion_of_imu(t, q, 0.5 * (means[:-1] + means[1:]), still)
+    flags, forces = np.split(rows[:, first + n + 6 :], [len(feet)], axis=1)
+    flags, forces = flags > 0, forces.reshape(len(t), -1, 3)
     wrenches = {}
     if force:
         parts = ("fx", "fy", "fz")
@@ -184,7 +289,7 @@ def recorded(
             for k, part in enumerate(parts)
         }
     return Log(
-        t, q, tau, model.joints, base=BaseMotion(pose, imu=measured),
+        t, q, tau, model.joints, base=BaseMotion(pose),
         contacts={foot: flags[:, i] for i, foot in enumerate(feet)}, wrenches=wrenches,
     )  # fmt: skip
 

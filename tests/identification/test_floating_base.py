@@ -102,6 +102,23 @@ def test_unseen_motion_is_predicted_and_judged_by_the_joints(found):
     assert check.is_total_determined
 
 
+def test_a_report_has_the_friction_of_joints_and_none_of_the_base(found):
+    from robotid.identification.pictures import friction_chart
+    from robotid.report.diagnosis import friction_section
+
+    result, _, _ = found
+    assert friction_chart(result, "base.mz") is None
+    shown = friction_section(result, ["base.mz"])
+    assert "base.mz: no drive." in str(shown)
+    joint = result.model.joints[-1]
+    curve = friction_chart(result, joint)
+    fitted = dict(zip(result.model.layout.names, result.standard, strict=True))
+    steady = curve.series[2].y
+    line = fitted[f"{joint}.viscous"] * curve.x
+    is_shown = np.isfinite(steady)
+    np.testing.assert_allclose(steady[is_shown], line[is_shown], atol=1e-9)
+
+
 def test_the_residual_at_the_truth_is_the_noise(found):
     """What contact forces cannot cause is equal in MuJoCo and in the rows."""
     from robotid.regressor.prediction import predict

@@ -150,8 +150,12 @@ def test_friction_is_drawn_at_position_and_load_of_the_samples_used(rng, monkeyp
     motion = SimpleNamespace(v=v, q=q)
     loads = rng.standard_normal((2, n)) * [[1.0], [4.0]]
     left, friction = rng.standard_normal((2, n, 2))
-    layout = SimpleNamespace(own={"b": (SimpleNamespace(name="load"),)})
-    model = SimpleNamespace(row_names=("a", "b"), row_units=("N m", "N"), layout=layout, passive=())
+    drives = [SimpleNamespace(name=name) for name in ("a", "b")]
+    layout = SimpleNamespace(own={"b": (SimpleNamespace(name="load"),)}, drives=drives)
+    model = SimpleNamespace(
+        row_names=("a", "b"), row_units=("N m", "N"), layout=layout, passive=(), joints=("a", "b"),
+        n_rows=2,
+    )  # fmt: skip
     evaluation = SimpleNamespace(recording=SimpleNamespace(trajectory=motion, mask=mask))
     found = SimpleNamespace(model=model, validation=(evaluation,), fitted=(), standard=None)
     given = []

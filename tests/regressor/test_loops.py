@@ -15,19 +15,29 @@ from robotid.logs.data import Log
 from robotid.logs.read import lay_out, read_log, write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.constraints import constraint_jacobian, loop_basis, without_forces
+from robotid.regressor.constraints import (
+    constraint_jacobian,
+    force_basis,
+    loop_basis,
+    without_forces,
+)
 from robotid.regressor.torque import InstantRegressor, joint_torque_regressor, random_regressor
 from robotid.robot.closure import Chains
 from robotid.robot.constraints import Loop
 from robotid.robot.drives import TERMS
 from robotid.robot.mass_matrix import check_mass_matrix
 from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
+from tests.helpers.cassie import FEET, cassie, truth
 from tests.helpers.closed_chains import (
     ANKLE,
     ANKLE_LOOPS,
     ANKLE_PASSIVE,
     FOUR_BAR,
     FOUR_BAR_LOOP,
+    MOTORS,
+    PARALLELOGRAM,
+    WRIST,
     Oracle,
     ankle,
     four_bar,
@@ -70,6 +80,94 @@ def test_rows_are_those_of_pinocchios_constraint_dynamics(robot, rng):
     J = constraint_jacobian(robot, q, np.ones((10, 0)))
     kept = Chains(robot).accelerations(q, v)
     np.testing.assert_allclose(J @ (a - kept)[..., None], 0.0, atol=1e-9)
+
+
+def test_rows_of_a_biped_with_rods_are_those_of_pinocchio(tmp_path, rng):
+    """Loops and feet together, on a floating base: no force of them is in the rows."""
+    biped = cassie(tmp_path)
+    n, on_ground = len(biped.joints), FEET[:2]
+    pi = truth(biped)
+    joints, Z = Chains(biped).random_states(4, rng)
+    pose = np.array([pin.SE3ToXYZQUAT(pin.SE3.Random()) for _ in joints])
+    q = np.hstack([pose, joints])
+    contacts = np.array([[foot in on_ground for foot in FEET] + [False]] * len(q))
+    J = constraint_jacobian(biped, q, contacts)
+    v = np.hstack(
+        [
+            rng.standard_normal((len(q), 6)),
+            np.einsum("kij,kj->ki", Z, rng.standard_normal((len(q), n))),
+        ]
+    )
+    for k, own in enumerate(J):  # the feet stand, the loops remain closed
+        v[k] -= np.linalg.pinv(own, rcond=1e-6) @ own @ v[k]
+    tau = np.zeros((len(q), 6 + n))
+    tau[:, 6:] = rng.standard_normal((len(q), n)) * ~np.isin(biped.joints, biped.passive)
+    oracle = Oracle(biped, pi, on_ground)
+    a = np.array([oracle.acceleration(*x) for x in zip(q, v, tau, strict=True)])
+    basis = force_basis(J, np.ones(v.shape, dtype=bool))
+    predicted = without_forces(
+        basis, (joint_torque_regressor(biped, q, v, a) @ pi).reshape(v.shape)
+    )
+    np.testing.assert_allclose(predicted, without_forces(basis, tau), atol=1e-8)
+    assert np.sum(basis**2) == pytest.approx(
+        len(q) * (10 + 5)
+    )  # of 12 and 6, and two are redundant
+
+
+def test_a_differential_is_the_constraint_dynamics_of_its_rotors(tmp_path, rng):
+    """Motors that turn 9 (pitch + roll) and 9 (pitch - roll) are couplings of both joints."""
+    A = 9.0 * np.array([[1.0, 1.0], [1.0, -1.0]])
+    for name, text in (("wrist", WRIST), ("whole", WRIST + MOTORS)):
+        (tmp_path / f"{name}.urdf").write_text(f"<robot name='wrist'>{text}</robot>")
+    whole = pin.buildModelFromUrdf(str(tmp_path / "whole.urdf"))
+    data = whole.createData()
+    at = [whole.joints[whole.getJointId(x)].idx_v for x in ("pitch", "roll", "left", "right")]
+    wrist = RobotModel.from_urdf(
+        tmp_path / "wrist.urdf", passive=("pitch", "roll"), terms=("armature", "viscous"),
+        couplings=[
+            Coupling(motor, tuple(zip(("pitch", "roll"), ratios.tolist(), strict=True)))
+            for motor, ratios in zip(("left", "right"), A, strict=True)
+        ],
+    )  # fmt: skip
+    pi = wrist.standard_parameters()
+    drives = {"armature": 3e-5, "viscous": 2e-4}
+    names = wrist.layout.names[wrist.layout.n_inertial :]
+    pi[wrist.layout.n_inertial :] = [drives[name.rpartition(".")[2]] for name in names]
+    T = np.vstack([np.eye(2), A])  # speeds of joints and rotors from those of the joints
+    rows = []
+    for _ in range(5):
+        q, v, torque = rng.standard_normal((3, 2))
+        speed, angle, tau = np.zeros((3, 4))
+        speed[at], angle[at] = T @ v, T @ q
+        tau[at[2:]] = torque - drives["viscous"] * (A @ v)
+        M = pin.crba(whole, data, angle)
+        M = np.triu(M) + np.triu(M, 1).T
+        h = pin.nonLinearEffects(whole, data, angle, speed)
+        gear = np.zeros((2, 4))
+        gear[:, at] = np.hstack([A, -np.eye(2)])  # gear @ speed = 0
+        system = np.block([[M, gear.T], [gear, np.zeros((2, 2))]])
+        a = np.linalg.solve(system, np.append(tau - h, np.zeros(2)))[at[:2]]
+        rows.append([q, v, a, A.T @ torque])
+    q, v, a, tau = np.swapaxes(rows, 0, 1)
+    W = joint_torque_regressor(wrist, q, v, a)
+    np.testing.assert_allclose((W @ pi).reshape(q.shape), tau, atol=1e-8)
+
+
+def test_a_walk_does_not_cross_dead_centres(tmp_path, rng):
+    """Crank and rocker are parallel; at their dead centres they can cross."""
+    path = tmp_path / "parallelogram.urdf"
+    path.write_text(PARALLELOGRAM)
+    options = {"constraints": [FOUR_BAR_LOOP], "passive": ("elbow", "pivot")}
+    bars = RobotModel.from_urdf(path, **options)
+    q, _ = Chains(bars).random_states(120, rng)
+    np.testing.assert_allclose(q, q[:, :1] * [1.0, -1.0, 1.0], atol=1e-7)
+    assert np.sin(q[:, 0] + 0.5).min() > 0.0
+    assert np.ptp(q[:, 0]) > 1.0
+    flat = PARALLELOGRAM.replace("0 0 0.5", "0 0 0").replace("0 0 -0.5", "0 0 0")
+    path.write_text(flat)
+    bars = RobotModel.from_urdf(path, **options)
+    with pytest.raises(ModelError, match="the positions of elbow, pivot near the zero position"):
+        Chains(bars).closed(np.zeros((1, 3)), np.array([False, True, True]))
 
 
 def test_base_parameters_are_those_of_the_closed_chain(robot, rng):
