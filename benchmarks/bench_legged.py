@@ -9,7 +9,8 @@ is measured, its feet touch the ground. They are identified by weighted least sq
 a prior, since not all of its links are excited. Counted is how often the 95 % interval of an
 inertial base parameter holds the truth. Beside it the regressor's projected rows are timed against
 those of an arm. With the recordings, a Solo12 that trots in PyBullet is identified from the first
-half of its log: its URDF is the truth. With --unseen: joint torque of the last 30 % of a recording, fitted on the others.
+half of its log: its URDF is the truth. With --unseen: joint torque of the last 30 % of a recording,
+fitted on the others.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
