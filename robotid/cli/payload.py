@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> None:
 def _show(content: dict[str, Any]) -> None:
     from robotid.identification.summary import cell
 
-    checks = {check["link"]: check for check in content["mass_checks"]}
+    checks = {check["link"]: check for check in content.get("mass_checks", ())}
     for found in content["payloads"]:
         _print_one_payload(found, checks.get(found["link"]))
     errors = [f"{joint} {cell(x)} %" for joint, x in content["relative_error_pct"].items()]

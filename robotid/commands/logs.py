@@ -44,13 +44,8 @@ __all__ = [
 
 _PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of its own
 _SHORTEST = 256  # rows of a piece
-_IRRELEVANT = (
-    "validation",
-    "payload_check",
-    "estimator",
-    "output",
-    "doctor",
-)  # for the reductions of the logs
+# for the reductions of the logs
+_IRRELEVANT = ("validation", "estimator", "output", "doctor", "payload_check")
 
 
 def survey_logs(

@@ -423,8 +423,8 @@ def _dense_bodies(fit: Fit) -> list[Finding]:
         excess = float(now[0]) * (1.0 - (_DENSEST / density) ** 0.4)
         message = (
             f"as identified, the mass of {body} is {now[0]:.3g} kg and its inertia needs a density "
-            f"of at least {density:.3g} kg/m^3 (wanted: at most {_DENSEST:g}, steel has 7900): "
-            f"such a body is not possible. {_remedy(fit, body, excess)}"
+            f"of at least {float(f'{density:.2g}'):.0f} kg/m^3 (wanted: at most {_DENSEST:g}, "
+            f"steel has 7900): such a body is not possible. {_remedy(fit, body, excess)}"
         )
         evidence = {"mass": float(now[0]), "density": density}
         findings.append(Finding("dense_body", "warning", f"link {body}", message, evidence))

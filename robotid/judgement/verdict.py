@@ -248,7 +248,8 @@ def judge(
         own = per_joint[largest_good]
         per_joint[largest_good] = replace(own, reasons=(*own.reasons, limit))
         if len(best) == len(per_joint):
-            notes.insert(0, f"{largest_good}: largest error: {cause_of(largest_good)}")
+            cause = cause_of(largest_good).partition(". ")[0]
+            notes.insert(0, f"{largest_good}: largest error: {cause}")
     worst = max((error for _, _, errors in found.values() for error in errors), default=0.0)
     good = (
         f"torque prediction error on validation logs: at most {worst:.1f} % at every joint, "

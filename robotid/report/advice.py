@@ -264,7 +264,8 @@ def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     if payload is not None:
         action = "Correct" if payload.contradicts else "Verify"
         words = f"{check}{action} the torque scale: {payload.message}."
-        return Step(words, (*_payload_gains(found, payload), origin.again()))
+        again = (origin.again(),) if origin.source else ()
+        return Step(words, (*_payload_gains(found, payload), *again))
     if found.scale_check.is_total_determined:
         words = (
             f"{check}State the measured mass of the moving links to verify the torque scale: "

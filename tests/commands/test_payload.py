@@ -129,6 +129,8 @@ def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
     assert step.blocks[0] == (
         f"robotid payload {urdf} {loaded} --reference {bare} --link tool0 --mass 1.8 --gains"
     )
+    rewritten = next_steps(found, Origin((), "out"))  # the report of a result names no source
+    assert not any("robotid identify" in block for step in rewritten for block in step.blocks)
     right = replace(check, known=2.0)
     verified = replace(found, payload_check=right)
     assert verified.scale_check.agrees == right.verifies

@@ -154,7 +154,7 @@ def test_a_needle_denser_than_any_material_is_named_unless_the_urdf_has_it(ur5, 
     assert finding.evidence == {"mass": 7.6, "density": pytest.approx(density)}
     assert finding.message == (
         "as identified, the mass of upper_arm_link is 7.6 kg and its inertia needs a density of at "
-        "least 2.24e+05 kg/m^3 (wanted: at most 12000, steel has 7900): such a body is not "
+        "least 220000 kg/m^3 (wanted: at most 12000, steel has 7900): such a body is not "
         "possible. Record motion about more axes, or pin it to the URDF. The predicted torque may "
         "still be right; do not use mass, centre of mass and inertia of this link"
     )
