@@ -87,7 +87,7 @@ def _mass_matrix(model: RobotModel, loops: "Loops", joints: Array, q: Array) -> 
     pi = model.standard_parameters()
     pi[: model.layout.n_inertial] = loops.bodies.reshape(-1)
     bodies, every = model.with_parameters(pi), loops.zero.copy()
-    every[joints] += np.nan_to_num(q)
+    every[joints] += q
     (M,) = rigid_mass_matrices(bodies, bodies.configurations(every[None]))
     own: Array = (M + np.diag(loops.armature))[np.ix_(joints, joints)]
     return own

@@ -491,6 +491,8 @@ def _failed_at(
 ) -> tuple[int, int, int, Array]:
     """Return row, lane and joint of a failed roll-out, and the positions in this lane, shape (n,).
 
+    The positions of an unstable one are the initial ones.
+
     Args:
         row: Row of the step without a solution.
         last: Positions before this step and the last correction of speeds; None if every step has
@@ -501,11 +503,11 @@ def _failed_at(
     if last is None:
         is_fast = ~(np.abs(v) < _FASTEST)
         row, i, lane = (int(k) for k in np.unravel_index(np.argmax(is_fast), v.shape))
-        return row, lane, i, q[max(row - 1, 0), :, lane]
+        return row, lane, i, q[0, :, lane]
     before, change = last
     size = np.where(np.isfinite(change), np.abs(change), np.inf)
     i, lane = (int(k) for k in np.unravel_index(np.argmax(size), size.shape))
-    return row, lane, i, before[:, lane]
+    return row, lane, i, np.clip(np.nan_to_num(before[:, lane]), -_FASTEST, _FASTEST)
 
 
 def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:

@@ -153,7 +153,7 @@ def test_notes_of_a_long_log_are_told_once_and_its_looks_are_all_examined(hand, 
     told = []
     monkeypatch.setattr(module, "diagnose", lambda model, *logs: told.append(logs) or ("d",))
     monkeypatch.setattr(
-        module, "check_locked", lambda model, held, name, placed: [(name, held, placed)]
+        module, "check_locked", lambda model, held, name, placed, units: [(name, held, placed)]
     )
 
     def log(name, *looks):
