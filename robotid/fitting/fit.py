@@ -183,9 +183,8 @@ class Solved:
         ground, choice, fit, estimate = self.ground, self.choice, self.in_cone, self.estimate
         factors, rough, mapping = ground.factors, ground.rough, ground.recordings.mapping
         segments, share, K = ground.segments, ground.before.share, mapping.K
-        more = of_wls = ground.more(rough.sigma)
-        if ground.noise is not None and self.weighing == "alike":
-            of_wls = None  # found with the weights of WLS
+        more = ground.more(rough.sigma)
+        of_wls = None if ground.noise and self.weighing == "alike" else more  # of other weights
         wls, errors = measured_errors(rough, segments, factors, share, K, rough.sigma, more=of_wls)
         if self.weighing == "by step" and fit is None:
             estimate = with_wls_errors(estimate, wls)
@@ -204,8 +203,8 @@ class Solved:
                 is_filter=is_filter, weight_ratio=ratio, redraws=redraws, more=more,
             )  # fmt: skip
         if (contacts := ground.recordings.contacts) is not None:
-            known = f"{errors.method}; points of contact uncertain by {contacts.uncertainty:.2g} m"
-            errors = replace(errors, method=known)
+            own = f"points of contact uncertain by {contacts.uncertainty:.2g} m"
+            errors = replace(errors, method=f"{errors.method}; {own}")
         if ground.grown != 1.0:
             estimate = replace(estimate, covariance=ground.grown * estimate.covariance)
             wls = replace(wls, covariance=ground.grown * wls.covariance)
@@ -278,8 +277,7 @@ class _Ground:
 
     def more(self, sigma: Array) -> Array | None:
         """Return the covariance of the score in addition to the scatter, (b, b); None: 0."""
-        if (contacts := self.recordings.contacts) is not None:
-            # rows without constraint forces have one noise level
+        if (contacts := self.recordings.contacts) is not None:  # all rows have one noise level
             return np.asarray(contacts.root @ contacts.root.T / sigma[-1] ** 4)
         return None if self.noise is None else self.noise.meat
 
