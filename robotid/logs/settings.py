@@ -174,6 +174,7 @@ class LogSource(Settings):
         (),
         "the topics of a bag with odometry, IMU, wrenches or foot forces; all topics of these "
         "kinds if not stated",
+        dump=lambda topics: list(topics) or None,
     )
 
     def __post_init__(self) -> None:
