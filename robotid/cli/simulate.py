@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from robotid._settings import Settings
 from robotid.cli.console import terminal_progress
-from robotid.cli.flags import JOB, ROBOT, Flags, add_json
+from robotid.cli.flags import JOB, ROBOT, Flags, add_json, job_from_flags
 from robotid.cli.printing import echo, print_files
 from robotid.cli.running import show_found
 from robotid.exceptions import SettingsError
@@ -50,7 +50,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         parser: Its parser.
     """
     add = parser.add_argument
-    add("source", metavar="URDF")
+    add("source", metavar="JOB.toml | URDF")
     add("motion", metavar="MOTION", help="table of time and q_<joint>, as a log or a design")
     words = "log to write; the true parameters are written next to it"
     add("--out", required=True, metavar="LOG", help=words)
@@ -101,6 +101,11 @@ def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation
                 f"{options.plant}: drives.{joint} has {named[0]!r}, wanted a term with its shape, "
                 "as { term = 'Stribeck', speed = 0.1 }"
             )
+    if Path(options.source).suffix == ".toml":
+        if drives:
+            raise SettingsError(f"{options.plant} has drives; state them in {options.source}")
+        options.logs = []
+        return job_from_flags(options, needs_logs=False), settings
     if options.plant:  # errors of its drives then name this file
         job_from_settings({"urdf": options.source, "drives": drives}, options.plant, Path())
     table = {"urdf": options.source, "drives": drives, **JOB.stated(options, ROBOT)}

@@ -206,7 +206,8 @@ def friction_chart(
         loads = drive_motion_along(model, motion).load
         load = float(np.sqrt(np.mean(loads[row, rows] ** 2)))
     v, unit = motion.v[rows, row], model.row_units[row]
-    curve = friction_curve(found, joint, v, q=float(np.median(motion.q[rows, row])), load=load)
+    angle = motion.q[rows, row + motion.q.shape[1] - motion.v.shape[1]]  # a pose has one entry more
+    curve = friction_curve(found, joint, v, q=float(np.median(angle)), load=load)
     # Coulomb friction jumps where the motion reverses: no line crosses it
     v, left, friction, steady, std = broken(
         np.sign(v), v, left[rows, row], friction[rows, row], curve.torque, curve.std
