@@ -1,4 +1,4 @@
-"""Reference motions: Fourier series within limits, quintics from rest to rest, samples, legged robots."""
+"""Reference motions: Fourier series, quintics from rest to rest, samples, legged robots."""
 
 from dataclasses import dataclass
 from functools import cached_property
