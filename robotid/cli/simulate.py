@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from robotid._settings import Settings
 from robotid.cli.console import terminal_progress
-from robotid.cli.flags import JOB, ROBOT, Flags, add_json, job_from_flags
+from robotid.cli.flags import JOB, ROBOT, Flags, add_json
 from robotid.cli.printing import echo, print_files
 from robotid.cli.running import show_found
 from robotid.exceptions import SettingsError
+from robotid.findings import listed
 
 if TYPE_CHECKING:
     from robotid.commands.job import Job
@@ -91,7 +92,7 @@ def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation
     Raises:
         SettingsError: If the file of the plant, or a flag, is not usable.
     """
-    from robotid.commands.job import job_from_settings
+    from robotid.commands.job import job_from_settings, read_job
     from robotid.simulation.settings import read_simulation
 
     settings, drives = read_simulation(options.plant, _PLANT.stated(options))
@@ -104,8 +105,9 @@ def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation
     if Path(options.source).suffix == ".toml":
         if drives:
             raise SettingsError(f"{options.plant} has drives; state them in {options.source}")
-        options.logs = []
-        return job_from_flags(options, needs_logs=False), settings
+        if given := [flag for flag in JOB.given(options) if flag in ROBOT]:
+            raise SettingsError(f"{options.source} is a job file; state {listed(given)} in it")
+        return read_job(options.source), settings
     if options.plant:  # errors of its drives then name this file
         job_from_settings({"urdf": options.source, "drives": drives}, options.plant, Path())
     table = {"urdf": options.source, "drives": drives, **JOB.stated(options, ROBOT)}
