@@ -24,6 +24,7 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import logged_base
 from robotid.regressor.factors import join
 from robotid.robot.bodies import link_transfer, usual_links
+from robotid.robot.closure import refuse_loops
 from robotid.robot.drives import DriveTerm
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
@@ -253,6 +254,7 @@ def identify_payload(
         require_each(value, str, name, wanted)
     require_kind(masses, (Mapping, type(None)), "masses", "a table of masses [kg] by link")
     model = robot_of(model, logs)
+    refuse_loops(model, "the identification of a payload")
     _check_gains(model, unknown_gains)
     settings, mapping = signals or SignalSettings(), structural_mapping(model)
     wanted_families(friction, model.joints)
@@ -343,6 +345,7 @@ def fit_payloads(
     Raises:
         DataError, ModelError, SettingsError, NotConvergedError: As of ``identify_payload``.
     """
+    refuse_loops(loaded.model, "the identification of a payload")
     _check_gains(loaded.model, unknown_gains)
     if not loaded.model.layout.remembering:
         return _fit(loaded, reference, links, masses, unknown_gains)

@@ -54,6 +54,7 @@ from robotid.regressor.constraints import logged_base
 from robotid.regressor.factors import Factors, compress, join, merge
 from robotid.regressor.prediction import predict
 from robotid.regressor.used_rows import base_problem, independent_share
+from robotid.robot.closure import refuse_loops
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
@@ -299,6 +300,7 @@ def preview_logs(
     """
     if not motions:
         raise DataError("no motion was given; at least one is needed to preview anything")
+    refuse_loops(model, "a preview")
     if model.free_flyer and not model.contacts:
         raise DataError(
             f"{model.name}: the base floats without contacts; a preview needs [[contact]], or a "

@@ -81,9 +81,9 @@ def simulate(
     """Return the log of a simulated robot that tracks a motion.
 
     Args:
-        model: The controller's model of the robot, with a fixed base.
+        model: The controller's model of the robot; if its base floats, with contacts.
         pi: The true standard parameters, shape (p,), drive terms included.
-        motion: The motion to track.
+        motion: The motion to track; a ``FloatingMotion`` if the base floats.
         rate: Sample rate of the log [Hz].
         duration: Length of the log [s].
         rng: Source of the noise.
@@ -92,7 +92,8 @@ def simulate(
             and PD without limits, and ideal sensors.
 
     Raises:
-        DataError: If the base floats, or the simulation diverges.
+        DataError: If contacts cannot cause the motion of a floating base, the robot has a fixed
+            base and contacts or loops, or the simulation diverges.
         SettingsError: If a setting does not fit the robot.
     """
     chosen = settings or Simulation()
@@ -118,16 +119,17 @@ def follow(
     The integrator is a Rosenbrock W-method of order 3, which is stable with stiction.
 
     Args:
-        model: The controller's model of the robot, with a fixed base.
+        model: The controller's model of the robot; if its base floats, with contacts.
         pi: The true standard parameters, shape (p,), drive terms included.
-        motion: The motion to track.
+        motion: The motion to track; a ``FloatingMotion`` if the base floats.
         rate: Sample rate of the run [Hz].
         duration: Length of the run [s].
         settings: Controller, actuators and payload, and the measured side of elastic gears.
         progress: Called with the number of simulated seconds.
 
     Raises:
-        DataError: If the base floats, or the simulation diverges.
+        DataError: If contacts cannot cause the motion of a floating base, the robot has a fixed
+            base and contacts or loops, or the simulation diverges.
         SettingsError: If a setting does not fit the robot.
 
     References:
@@ -138,6 +140,8 @@ def follow(
     t = np.arange(round(duration * rate) + 1) / rate
     loaded = carried(model, pi, settings.payload)
     deflection = settings.payload.start if settings.payload.mass > 0 else math.inf
+    if not model.free_flyer:
+        model.require_fixed("simulation")
     if settings.controller.kind == "perfect":
         return _perfect(model, pi, loaded, motion, t, deflection)
     if model.free_flyer:

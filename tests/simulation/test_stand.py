@@ -121,6 +121,9 @@ def test_what_a_stand_cannot_do_is_refused(robot, motion):
         follow(robot, pi, flying, settings=PERFECT, **rng)
     with pytest.raises(SettingsError, match="kind is feedforward, wanted perfect"):
         follow(robot, pi, motion, settings=Simulation(), **rng)
+    fixed = RobotModel.from_urdf(example_urdf("solo12.urdf"), constraints=[Contact(FEET[0])])
+    with pytest.raises(DataError, match="has contacts or loops; simulation needs a robot with"):
+        follow(fixed, fixed.standard_parameters(), motion, settings=PERFECT, **rng)
     alone = RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True, terms=())
     with pytest.raises(SettingsError, match="has no contacts"):
         follow(alone, pi, motion, settings=PERFECT, **rng)
