@@ -10,6 +10,7 @@ from robotid.cli.flags import JOB, ROBOT, Flags, add_json
 from robotid.cli.printing import echo, print_files
 from robotid.cli.running import show_found
 from robotid.exceptions import SettingsError
+from robotid.findings import listed
 
 if TYPE_CHECKING:
     from robotid.commands.job import Job
@@ -50,7 +51,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         parser: Its parser.
     """
     add = parser.add_argument
-    add("source", metavar="URDF")
+    add("source", metavar="JOB.toml | URDF")
     add("motion", metavar="MOTION", help="table of time and q_<joint>, as a log or a design")
     words = "log to write; the true parameters are written next to it"
     add("--out", required=True, metavar="LOG", help=words)
@@ -91,7 +92,7 @@ def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation
     Raises:
         SettingsError: If the file of the plant, or a flag, is not usable.
     """
-    from robotid.commands.job import job_from_settings
+    from robotid.commands.job import job_from_settings, read_job
     from robotid.simulation.settings import read_simulation
 
     settings, drives = read_simulation(options.plant, _PLANT.stated(options))
@@ -101,6 +102,12 @@ def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation
                 f"{options.plant}: drives.{joint} has {named[0]!r}, wanted a term with its shape, "
                 "as { term = 'Stribeck', speed = 0.1 }"
             )
+    if Path(options.source).suffix == ".toml":
+        if drives:
+            raise SettingsError(f"{options.plant} has drives; state them in {options.source}")
+        if given := [flag for flag in JOB.given(options) if flag in ROBOT]:
+            raise SettingsError(f"{options.source} is a job file; state {listed(given)} in it")
+        return read_job(options.source), settings
     if options.plant:  # errors of its drives then name this file
         job_from_settings({"urdf": options.source, "drives": drives}, options.plant, Path())
     table = {"urdf": options.source, "drives": drives, **JOB.stated(options, ROBOT)}

@@ -16,6 +16,7 @@ from robotid.fitting.survey import SurveyedLog
 from robotid.identification.payload_fit import fit_payloads, mass_checks, own_friction
 from robotid.judgement.payload_check import PayloadCheck
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.bodies import usual_links
 from robotid.robot.drives import DriveTerm
 from robotid.robot.model import RobotModel
 
@@ -73,7 +74,7 @@ def measure_payload(
         job: The logs with the payloads, and the settings for reading logs.
         references: Logs without payloads; or one result, whose logs are read again with its
             settings.
-        links: Links that carry the payloads; the last moving link if empty.
+        links: Links that carry the payloads; if empty, the last moving link, or a floating base.
         masses: Known masses, as of ``stated_masses``.
         find_gains: Whether gains that the job does not state are estimated, too.
         progress: Called at the start of each of the two stages.
@@ -100,7 +101,7 @@ def measure_payload(
     model = job.model()
     unknown = [joint for joint in model.joints if joint not in job.gains] if find_gains else []
     job = replace(job, gains={**job.gains, **dict.fromkeys(unknown, 1.0)})
-    links = tuple(links) or model.layout.bodies[-1:]
+    links = tuple(links) or usual_links(model)
     surveyed = survey_logs(job, model, job.identification, entries)
     mapping = structural_mapping(model)
     loaded, reference = (Recordings(model, mapping, logs) for logs in surveyed)

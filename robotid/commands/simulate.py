@@ -21,7 +21,7 @@ from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.simulation.closed_loop import Run, carried, delay, follow
-from robotid.simulation.motions import SampledMotion
+from robotid.simulation.motions import FloatingMotion, SampledMotion
 from robotid.simulation.sensors import measure
 from robotid.simulation.settings import Simulation
 from robotid.simulation.truth import draw_parameters
@@ -110,8 +110,21 @@ def simulate_log(
     return content
 
 
-def _motion(job: Job, model: RobotModel, files: SimulatedFiles) -> SampledMotion:
+def _motion(job: Job, model: RobotModel, files: SimulatedFiles) -> SampledMotion | FloatingMotion:
     table = job.read(LogEntry(files.motion), model, needs="motion")
+    if table.base is not None:
+        flags = [
+            np.ones(len(table.t), dtype=bool) if x.always else table.contacts[x.frame]
+            for x in model.contacts
+        ]
+        touching = np.reshape(flags, (len(flags), len(table.t))).T
+        t, pose, q = table.t, table.base.pose, table.q
+        if files.cutoff is not None:
+            signals = SignalSettings(cutoff=files.cutoff, velocity="differentiated", trim=0.0)
+            smooth = process(table, signals)
+            t, pose, q = smooth.t, smooth.q[:, :7], smooth.q[:, 7:]
+            touching = touching[np.clip(np.searchsorted(table.t, t), 0, len(table.t) - 1)]
+        return FloatingMotion(t, pose, q, touching)
     if files.cutoff is None:
         return SampledMotion(table.t, table.q, table.v, table.a)
     smooth = process(

@@ -87,14 +87,16 @@ def explain_residual(
         sample: Samples of its recordings; None if there are too few for a test.
 
     Returns:
-        Terms that drive models lack, the largest first, and warnings "position_offset",
+        For a robot with a fixed base, without loops and passive joints, else nothing: terms that
+        drive models lack, the largest first, and warnings "position_offset",
         "lost_motion", "angle_scale", "torque_scale", "time_scale", "gravity" and "joint_origin",
         the one that explains most of the residual first.
     """
-    if sample is None:
+    model = fit.model
+    if sample is None or model.free_flyer or model.constraints or model.passive:
         return (), ()
     misfits = find_misfits(sample)
-    own = list(_alterations(fit.model, fit.standard, sample))
+    own = list(_alterations(model, fit.standard, sample))
     found = list(_found(fit, sample, own))
     if misfits and found:
         altered = np.concatenate([one.alteration.Z for one in found], axis=2)

@@ -7,9 +7,12 @@ the next one together with it, until no family improves the fit. Validation logs
 The nonlinear parameters of a family, its shape, are searched on a grid. Then all shapes of a joint
 are refined together, with the linear parameters refitted in each step (variable projection, Golub,
 Pereyra 2003).
+
+Where constraint forces were eliminated, the torque of a drive appears in the rows of other joints,
+too. The families of each joint are then selected again together with those of the others.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -37,6 +40,7 @@ _STEP = 1e-3  # relative step of a finite difference
 _STEPS = 40  # iterations of the search for all shapes of a joint together
 _SHARPEST = 1e-6  # of the squared residual: lower limit for weights, for exact data
 _NOTHING = 1e-300
+_LOADED = ("load", "lag")  # families that depend on the torque of the drive
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +48,7 @@ class _Drive:
     """A joint's drive along the samples."""
 
     is_prismatic: bool
+    has_load: bool  # whether its torque is known, with no unknown force of a contact or loop
     motions: tuple[DriveMotion, ...]  # of each recording, all its samples
     taken: tuple[Array, ...]  # indices of the samples in each recording
     data_range: DataRange
@@ -79,16 +84,64 @@ def choose_drives(
         A choice per joint; none for a joint that hardly moved, or if the logs are too short.
     """
     sample = take_sample(fit, for_drives=True)
-    if sample is None or fit.model.free_flyer:
+    if sample is None:
         return ()
+    drives, choices = _drives(fit, sample, wanted), dict[str, DriveChoice]()
+
+    def choose(j: int, together: Sample) -> None:
+        joint = sample.joints[j]
+        names, alone, drive = wanted[joint], together.of_joint(j), drives[j]
+        first = [own for own in [(balanced or {}).get(joint)] if own is not None]
+        chosen = _auto(alone, drive, first) if names is None else _fixed(alone, drive, names)
+        choices[joint] = chosen
+
+    for j in drives:
+        choose(j, sample)
+    if sample.basis is not None:
+        _choose_together(sample, drives, choices, choose)
+    return tuple(choices.values())
+
+
+def _choose_together(
+    sample: Sample,
+    drives: Mapping[int, _Drive],
+    choices: Mapping[str, DriveChoice],
+    choose: Callable[[int, Sample], None],
+) -> None:
+    """Select the terms of each joint again, together with those of all others."""
+    chosen = {j: choices[sample.joints[j]].terms for j in drives}
+    chosen = {j: terms for j, terms in chosen.items() if terms}
+    if len(chosen) < 2:
+        return
+    first, size = sample.W.shape[1] - len(sample.joints), sample.W.shape[2]
+    owner = np.repeat(list(chosen), [len(terms) for terms in chosen.values()])
+    Z = np.zeros((*sample.r.shape, len(owner)))
+    for j, terms in chosen.items():
+        Z[:, first + j, owner == j] = drives[j].columns(terms)
+    together = sample.with_columns(Z)
+    for j in chosen:
+        others = [k for k in chosen if k != j and choices[sample.joints[k]].terms]
+        which = np.append(np.arange(size), size + np.flatnonzero(np.isin(owner, others)))
+        choose(j, together.with_some_columns(which))
+
+
+def _drives(
+    fit: Solution, sample: Sample, wanted: Mapping[str, Sequence[str] | None]
+) -> dict[int, _Drive]:
+    """Return the drives whose families are stated or selected, by the index of their joint."""
     model = fit.model.with_reference(fit.standard)
     motions = [drive_motion_along(model, x.trajectory) for x in sample.recordings]
-    torques = np.concatenate([motion.tau for motion in sample.at])
-    used = sample.weight > 0
-    choices = []
+    is_free, first = sample.basis is None, sample.weight.shape[1] - len(sample.joints)
+    largest = np.concatenate(
+        [motion.tau[:, first:] for motion in sample.at]
+        if is_free
+        else [x.log.tau for x in sample.recordings]  # with torques of constraint forces
+    )
+    used = sample.weight[:, first:] > 0
+    drives = {}
     for j, joint in enumerate(sample.joints):
         names = wanted[joint]
-        if not used[:, j].any() or (names is not None and not names):
+        if not used[:, j].any() or (names is not None and not names) or joint in fit.model.passive:
             continue
         own = tuple(motion.of(j) for motion in motions)
         data_range = _range_of(own, sample.taken, used[:, j])
@@ -97,13 +150,11 @@ def choose_drives(
             for k, name in enumerate(fit.mapping.base_names)
             if name.startswith(f"{joint}.")
         }
-        largest = float(np.abs(torques[:, j]).max())
-        drive = _Drive(bool(sample.is_prismatic[j]), own, sample.taken, data_range, largest, plain)
-        first = [own for own in [(balanced or {}).get(joint)] if own is not None]
-        alone = sample.of_joint(j)
-        chosen = _auto(alone, drive, first) if names is None else _fixed(alone, drive, names)
-        choices.append(chosen)
-    return tuple(choices)
+        drives[j] = _Drive(
+            bool(sample.is_prismatic[j]), is_free, own, sample.taken, data_range,
+            float(np.abs(largest[:, j]).max()), plain,
+        )  # fmt: skip
+    return drives
 
 
 def _range_of(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Array) -> DataRange:
@@ -127,6 +178,9 @@ def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[tuple[Fam
         if not all(0.0 < low < high for low, high in bounds):  # it hardly moved
             continue
         grids = [_sizes(*pair) for pair in bounds]
+        terms = family.make(drive.data_range, *[float(sizes[0]) for sizes in grids])
+        if not drive.has_load and any(term.needs_load for term in terms):
+            continue
         yield from ((family, [float(x) for x in sizes]) for sizes in product(*grids))
 
 
@@ -354,8 +408,14 @@ def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
     missing = [name for name, group in zip(names, groups, strict=True) if not group]
     if missing:
         raise SettingsError(
-            f"friction of {sample.joints[0]} has {listed(missing)}, which needs a revolute joint "
-            "and at least half a revolution in the fitted logs; remove it, or record more motion"
+            f"friction of {sample.joints[0]} has {listed(missing)}, which needs "
+            + (
+                "a revolute joint and at least half a revolution in the fitted logs; remove it, or "
+                "record more motion"
+                if drive.has_load or missing[0] not in _LOADED
+                else "the joint load torque, which unknown forces of contacts or loops change; "
+                "remove it"
+            )
         )
     chosen = [group[len(group) // 2] for group in groups]
     for _ in range(3 if len(names) > 1 else 1):  # one after the other, repeated a few times
@@ -437,8 +497,9 @@ def _grown(
     _, before = sample.normal.whole
     grown = {}
     for name, u in drive.plain.items():
-        more = u @ T @ np.linalg.solve(S, T.T @ u)
-        grown[name] = float(np.sqrt(1.0 + max(more, 0.0) / (u @ before @ u)))
+        more = u @ T[: len(u)] @ np.linalg.solve(S, T[: len(u)].T @ u)
+        variance = u @ before[: len(u), : len(u)] @ u  # without the columns added to W
+        grown[name] = float(np.sqrt(1.0 + max(more, 0.0) / variance))
     return grown
 
 

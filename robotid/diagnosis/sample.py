@@ -7,6 +7,10 @@ with the base parameters, with one segment of the logs held out after the other:
 
 so that what base parameters can explain does not count (Frisch, Waugh 1933). C is their prior
 covariance. A term that is not in the data does not reduce the residual of held-out segments.
+
+With constraint forces eliminated, the torque z of joint j is P e_j z in all rows, along the unit
+vector u = P e_j / sqrt(P_jj). The equation of the joint alone is that along u: row j of the
+projected rows over sqrt(P_jj), where the column is sqrt(P_jj) z.
 """
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -22,6 +26,7 @@ from robotid.fitting.evaluation import Evaluation, Recording
 from robotid.fitting.joint_motion import JointMotion, joint_motions, travelled
 from robotid.fitting.result import Solution
 from robotid.logs.data import Trajectory
+from robotid.regressor.constraints import without_forces
 from robotid.regressor.torque import trajectory_regressor
 from robotid.regressor.used_rows import independent_share
 from robotid.robot.model import RobotModel
@@ -39,6 +44,7 @@ _FEWEST = 6  # segments for a test
 _NEAR = 0.5  # periods of the filter's cut-off
 _OUTLIER = 12.0  # typical residuals above which a sample is excluded
 _FREE = 1e3  # prior spread of an added column, in residuals
+_SHORTEST_UNIT = 1e-4  # rows with a smaller sqrt(P_jj) are not used
 
 OptionT = TypeVar("OptionT", bound=Hashable)
 
@@ -99,6 +105,8 @@ class Normal:
 class Sample:
     """Samples of the recordings, weighted for each joint by its RMS residual, 0 where not used.
 
+    Rows of a floating base precede those of the n joints.
+
     Attributes:
         joints: Names of the n joints.
         is_prismatic: Which of them are prismatic, shape (n,), bool.
@@ -106,16 +114,18 @@ class Sample:
         recordings: The fitted recordings, then the validation recordings, if they are used.
         at: Their motions at these samples.
         taken: Indices of these samples in each recording.
-        weight: Weights of the torques, shape (N, n) [1/(N m), 1/N].
-        torque: Weighted sum of the squared torques of fitted samples, shape (n,).
+        weight: Weights of the torques, shape (N, n_rows) [1/(N m), 1/N]; one for all rows if
+            constraint forces were eliminated.
+        torque: Weighted sum of the squared torques of fitted samples, shape (n_rows,).
         segments: Samples of each of the K segments, those of the validation logs last.
         rows: Number of samples of fitted logs.
-        W: Regressor of the base parameters over their prior spread, shape (N, n, b), and columns
-            that are refitted with them.
-        r: Residual of the estimate, shape (N, n).
+        W: Regressor of the base parameters over their prior spread, shape (N, n_rows, b), and
+            columns that are refitted with them.
+        r: Residual of the estimate, shape (N, n_rows).
         independent: Columns of the regressor that belong to base parameters, shape (b,), int.
         U: Factor of the prior covariance of base parameters, C = U^T U, shape (b, b).
         normal: Normal equations of the segments, of all joints of the robot.
+        basis: As of ``Trajectory.basis``, at these samples.
     """
 
     joints: tuple[str, ...]
@@ -133,6 +143,7 @@ class Sample:
     independent: Array
     U: Array
     normal: Normal
+    basis: Array | None = None
 
     @property
     def fitted(self) -> int:
@@ -143,13 +154,23 @@ class Sample:
         """Return the same samples with more columns that are refitted with the base parameters.
 
         Args:
-            Z: Torques of parameters of 1, shape (N, n, c) [N m or N].
+            Z: Torques of parameters of 1, shape (N, n_rows, c) [N m or N].
         """
-        columns = self.weight[:, :, None] * Z
+        left = Z if self.basis is None else without_forces(self.basis, Z)
+        columns = self.weight[:, :, None] * left
         size = np.linalg.norm(columns, axis=(0, 1))
         spread = _FREE * np.linalg.norm(self.r) / np.where(size > 0, size, np.inf)
         W = np.concatenate([self.W, columns * spread], axis=2)
         return replace(self, W=W, normal=Normal.of(W, self.r, self.segments, self.fitted))
+
+    def with_some_columns(self, which: Array) -> "Sample":
+        """Return the same samples with fewer columns.
+
+        Args:
+            which: The columns of W, shape (c,), int.
+        """
+        A, B = self.normal.A[:, which[:, None], which], self.normal.B[:, which]
+        return replace(self, W=self.W[..., which], normal=Normal(A, B, self.fitted))
 
     def of_joint(self, j: int) -> "Sample":
         """Return the samples of one joint; other joints count only in the normal equations.
@@ -157,16 +178,29 @@ class Sample:
         Args:
             j: Index of the joint.
         """
-        own = slice(j, j + 1)
-        return replace(
+        row = self.weight.shape[1] - len(self.joints) + j
+        own, joint = slice(row, row + 1), slice(j, j + 1)
+        alone = replace(
             self,
-            joints=self.joints[own],
-            is_prismatic=self.is_prismatic[own],
-            motions=self.motions[own],
+            joints=self.joints[joint],
+            is_prismatic=self.is_prismatic[joint],
+            motions=self.motions[joint],
             weight=self.weight[:, own],
             torque=self.torque[own],
             W=np.ascontiguousarray(self.W[:, own]),
             r=self.r[:, own],
+            basis=None,
+        )
+        if self.basis is None:
+            return alone
+        u = _lengths(self.basis)[:, own]
+        tau = np.concatenate([motion.tau[:, own] for motion in self.at])
+        return replace(
+            alone,
+            weight=u * alone.weight,
+            torque=np.sum((alone.weight * tau / u)[: self.rows] ** 2, axis=0),
+            W=alone.W / u[..., None],
+            r=alone.r / u,
         )
 
     @cached_property
@@ -213,7 +247,7 @@ def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
             those near reversals, where the filter smears stiction.
     """
     model, mapping = fit.model, fit.mapping
-    if model.is_static or model.free_flyer or model.constraints or model.passive:
+    if model.is_static:
         return None
     validation = [e for e in fit.validation if not e.is_refitted]
     rows, independent = _spread_rows(model, fit.fitted, validation)
@@ -229,16 +263,18 @@ def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
     motion = [e.recording.trajectory.at(k) for e, k in parts]
     Y = np.concatenate([_regressor(model, e.recording.trajectory, k) for e, k in parts])
     tau = np.concatenate([m.tau for m in motion])
+    size, first = model.layout.n_inertial, model.n_rows - len(model.joints)
+    load = Y[:, first:, :size] @ fit.standard[:size]
+    basis = None
+    if model.constraints:
+        basis = np.concatenate([m.basis for m in motion if m.basis is not None])
+        Y = without_forces(basis, Y)
     r = tau - Y @ fit.standard
     used = np.concatenate([e.recording.mask[k] for e, k in parts])
-    if not for_drives:
+    if basis is None and not for_drives:
         used &= np.concatenate([_is_steady(e.recording)[k] for e, k in parts])
-    used = used & (np.abs(r) <= _OUTLIER * _typical_size(r[:own], used[:own]))
-    squares = np.sum(r[:own] ** 2, axis=0, where=used[:own])
-    scale = np.sqrt(squares / np.maximum(used[:own].sum(axis=0), 1))
+    used, scale = _noise_level(r, used, own, basis)
     weight = used * np.sqrt(independent) / np.where(scale > 0, scale, np.inf)
-    size = model.layout.n_inertial
-    load = Y[:, :, :size] @ fit.standard[:size]
     # C = U^T U: base parameters over their prior spread are of size 1
     U = np.asarray(np.linalg.qr((mapping.K * fit.prior_std).T, mode="r"))
     W = weight[:, :, None] * (Y[:, :, mapping.independent] @ U.T)
@@ -259,6 +295,7 @@ def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
         independent=mapping.independent,
         U=U,
         normal=Normal.of(W, r, segments, number),
+        basis=basis,
     )
 
 
@@ -310,6 +347,31 @@ def _regressor(model: RobotModel, motion: Trajectory, samples: Array | None = No
     """Return the regressor of the standard parameters at some samples, shape (N, n, p)."""
     Y = trajectory_regressor(model, motion, samples)
     return Y.reshape(-1, model.n_rows, Y.shape[1])
+
+
+def _lengths(basis: Array) -> Array:
+    """Return sqrt(P_jj), the length of P e_j, of each row, shape (N, n_rows)."""
+    squares = 1.0 - np.sum(basis**2, axis=2)
+    lengths: Array = np.sqrt(np.maximum(squares, _SHORTEST_UNIT**2))
+    return lengths
+
+
+def _noise_level(r: Array, used: Array, own: int, basis: Array | None) -> tuple[Array, Array]:
+    """Return the used rows without outliers, and the RMS residual of each row, (n_rows,).
+
+    Rows that were projected together have one noise level, and an outlier excludes its sample.
+    """
+    u = np.ones(r.shape) if basis is None else _lengths(basis)
+    size = np.abs(r) / u
+    usual: Array = size <= _OUTLIER * _typical_size(size[:own], used[:own])
+    if basis is not None:
+        usual = np.all(usual | ~used, axis=1, keepdims=True)
+    used = used & usual
+    squares = np.sum(r[:own] ** 2, axis=0, where=used[:own])
+    freedom = np.sum(u[:own] ** 2, axis=0, where=used[:own])
+    if basis is not None:
+        squares, freedom = (np.full(len(x), x.sum()) for x in (squares, freedom))
+    return used, np.sqrt(squares / np.maximum(freedom, 1))
 
 
 def _typical_size(r: Array, used: Array) -> Array:

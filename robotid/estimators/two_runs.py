@@ -201,14 +201,27 @@ class TwoRuns:
         """Noise level of each joint's signal, shape (n,), above 0.
 
         If a joint moves in a few rows only, its residual is 0 whatever its noise; its RMS signal is
-        used then.
+        used then. Rows that are projected together have one noise level.
         """
+        if self._logged.is_projected:
+            return self._common_noise
         rows = np.maximum(self._logged.rows, 1)
         used = len(self._whole) * np.array([len(own) for own in self._logged.columns])
         freedom = np.maximum(rows - used / self.share, _LEAST_FREEDOM * rows)
         signal = np.sqrt(self._logged.torque_squares() / rows)
         left = np.where(self.share * rows > used, np.sqrt(self._own_squares / freedom), signal)
         noise: Array = np.maximum(left, _FLOOR * signal)
+        return np.where(noise > 0, noise, 1.0)
+
+    @cached_property
+    def _common_noise(self) -> Array:
+        """Noise level of all rows together from a separate fit of each run, shape (n,)."""
+        one, count = np.ones(len(self._logged.rows)), int(self._logged.rows.sum())
+        squares = sum(run.weighted(one)[-1, -1] ** 2 for run in self._whole)
+        used = len(self._whole) * len(self.known)
+        freedom = max(count - used / self.share, _LEAST_FREEDOM * count)
+        signal = np.sqrt(self._logged.torque_squares().sum() / max(count, 1))
+        noise: Array = max(np.sqrt(squares / max(freedom, 1.0)), _FLOOR * signal) * one
         return np.where(noise > 0, noise, 1.0)
 
     def _first_gains(self) -> Array:
@@ -256,7 +269,9 @@ class TwoRuns:
             triangles.append(triangle_of(np.column_stack([rows, torque - known])))
             columns.append(used)
         names = (*run.names, *map(str, added))
-        return Factors(tuple(triangles), tuple(columns), run.rows, names)
+        return Factors(
+            tuple(triangles), tuple(columns), run.rows, names, is_projected=run.is_projected
+        )
 
     def _minimum(self, whole: Factors, sigma: Array) -> tuple[Array, Array]:
         """Return the minimum of rows and prior, and the inverse information."""
@@ -294,7 +309,8 @@ class TwoRuns:
         covariance, freedom = self._scattered(segments, gain, solution, bread)
         whole = [self._extended(run, loaded, gain, at) for loaded, run in enumerate(self._whole)]
         joints = [_of_joint(run, j) for run in whole for j in range(len(gain))]
-        if by_joint and len(joints) >= FEWEST_SEGMENTS:
+        is_alone = not self._logged.is_projected  # else the rows of joints are mixed
+        if by_joint and is_alone and len(joints) >= FEWEST_SEGMENTS:
             other, few = self._scattered(joints, gain, solution, bread)
             freedom = np.where(np.diag(other) > np.diag(covariance), few, freedom)
             covariance = at_least(covariance, np.diag(other))

@@ -234,6 +234,7 @@ def _expected_torque(preview: "Preview") -> dict[str, dict[str, Any]]:
             "unit": model.row_units[j],
         }
         for j, row in enumerate(model.row_names)
+        if row in model.joints
     }
 
 

@@ -257,7 +257,8 @@ def typical_friction(
         side = np.linspace(speeds.min(), speeds.max(), _SPEEDS)
         v = np.append(-side[::-1], side)
     if q is None:
-        positions = [m.q[is_used] @ ratios for m, is_used in zip(motions, rows, strict=True)]
+        angles = [m.q[:, m.q.shape[1] - len(ratios) :] for m in motions]  # without the base's pose
+        positions = [x[is_used] @ ratios for x, is_used in zip(angles, rows, strict=True)]
         q = float(np.median(np.concatenate(positions))) if np.any(np.concatenate(rows)) else 0.0
     if load is None:
         load = 0.0

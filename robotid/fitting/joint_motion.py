@@ -87,7 +87,8 @@ def joint_motions(
     def joined(of: Callable[[Trajectory], Array]) -> Array:
         return np.concatenate([of(m)[k] for m, k in zip(motions, rows, strict=True)])
 
-    q, v, a = (joined(attrgetter(name)) for name in "qva")
+    n = len(model.joints)  # the pose and twist of a floating base come before them
+    q, v, a = (x[:, x.shape[1] - n :] for x in (joined(attrgetter(name)) for name in "qva"))
     signs = joined(partial(_directions, model))
     distance = joined(travelled)
     time = joined(lambda m: (m.t - m.t[0]) / (longest or 1.0))
@@ -107,7 +108,8 @@ def joint_motions(
 def _directions(model: RobotModel, motion: Trajectory) -> Array:
     """Return the direction of the friction of each joint's own drive, shape (N, n)."""
     signs = friction_directions(model.layout, motion.v, motion.direction)[:, : len(model.joints)]
-    return signs if signs.shape[1] else np.sign(motion.v)
+    v = motion.v[:, motion.v.shape[1] - len(model.joints) :]
+    return signs if signs.shape[1] else np.sign(v)
 
 
 def travelled(motion: Trajectory) -> Array:
@@ -117,7 +119,9 @@ def travelled(motion: Trajectory) -> Array:
         motion: The motion, N rows.
     """
     is_first = np.diff(motion.segment, prepend=motion.segment[0] - 1) != 0
-    reverses = (np.diff(np.sign(motion.v), axis=0, prepend=0.0) != 0) | is_first[:, None]
+    n = len(motion.joints)
+    q, v = (x[:, x.shape[1] - n :] for x in (motion.q, motion.v))
+    reverses = (np.diff(np.sign(v), axis=0, prepend=0.0) != 0) | is_first[:, None]
     last = np.maximum.accumulate(np.where(reverses, np.arange(len(reverses))[:, None], 0), axis=0)
-    distance: Array = np.abs(motion.q - np.take_along_axis(motion.q, last, axis=0))
+    distance: Array = np.abs(q - np.take_along_axis(q, last, axis=0))
     return distance

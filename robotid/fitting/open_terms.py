@@ -9,6 +9,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.joint_motion import JointMotion, joint_motions
+from robotid.regressor.constraints import without_forces
 from robotid.regressor.memory import drive_motion_along
 from robotid.robot.drives import DriveMotion
 
@@ -56,5 +57,6 @@ def open_torques(found: "Fit", evaluation: "Evaluation", rows: Array) -> list[Ar
     for term in found.open_terms:
         j, torque = joints.index(term.joint), np.zeros((len(rows), model.n_rows))
         torque[:, first + j] = term.torque(drives.of(j), alone[j])[rows]
-        torques.append(torque)
+        basis = recording.trajectory.basis
+        torques.append(torque if basis is None else without_forces(basis[rows], torque))
     return torques

@@ -46,6 +46,14 @@ class TorqueNoise:
     correlation: Array
     origins: tuple[str, ...]
 
+    def last(self, count: int) -> "TorqueNoise":
+        """Return the noise of the last rows, those of the joints.
+
+        Args:
+            count: Number of joints.
+        """
+        return TorqueNoise(self.std[-count:], self.correlation[-count:], self.origins[-count:])
+
     def density(self, step: float) -> Array:
         """Return the density of each joint's noise at low frequency, shape (n,) [(N m)^2 s].
 

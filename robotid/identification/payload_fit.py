@@ -22,14 +22,14 @@ from robotid.judgement.payload_check import PayloadCheck
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.constraints import logged_base
 from robotid.regressor.factors import join
-from robotid.robot.bodies import link_transfer
+from robotid.robot.bodies import link_transfer, usual_links
+from robotid.robot.closure import refuse_loops
 from robotid.robot.drives import DriveTerm
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
-from robotid.robot.parameters import (
-    ParameterLayout,
-)
+from robotid.robot.parameters import ParameterLayout
 from robotid.robot.prior import payload_spread, prior_spread
 
 __all__ = [
@@ -238,8 +238,8 @@ def identify_payload(
         model: The robot; or the path of its URDF, all of whose joints move.
         logs: Recordings with the payloads: a ``Log``, the path of a file, a DataFrame, or several.
         reference: Recordings without them, in the same forms; what both have belongs to the robot.
-        links: Links with the payloads, which may be fixed to a moving link; the last moving link if
-            empty.
+        links: Links with the payloads, which may be fixed to a moving link; if empty, the last
+            moving link, or the base if it floats.
         masses: Known masses, by link [kg].
         unknown_gains: Joints whose ``tau`` in the logs is a current of unknown gain. A known mass,
             or a joint with a known gain, sets their scale.
@@ -264,11 +264,18 @@ def identify_payload(
         require_each(value, str, name, wanted)
     require_kind(masses, (Mapping, type(None)), "masses", "a table of masses [kg] by link")
     model = robot_of(model, logs)
-    model.require_fixed("the identification of a payload")
+    refuse_loops(model, "the identification of a payload")
+    _check_gains(model, unknown_gains)
     settings, mapping = signals or SignalSettings(), structural_mapping(model)
     wanted_families(friction, model.joints)
     read = [
-        read_logs(given, model.joints, prismatic=model.layout.prismatic)
+        read_logs(
+            given,
+            model.joints,
+            prismatic=model.layout.prismatic,
+            base=logged_base(model),
+            passive=model.passive,
+        )
         for given in (logs, reference)
     ]
     loaded, without = (
@@ -281,7 +288,7 @@ def identify_payload(
                 f"{what} has no log, wanted at least one: logs with the payload, and a reference "
                 "without it"
             )
-    links = tuple(links) or model.layout.bodies[-1:]
+    links = tuple(links) or usual_links(model)
 
     def fitted(runs: Sequence[Recordings]) -> PayloadFit:
         return fit_payloads(*runs, links=links, masses=masses or {}, unknown_gains=unknown_gains)
@@ -299,6 +306,15 @@ def identify_payload(
     if masses and not unknown_gains:
         found = replace(found, checks=mass_checks(loaded, without, masses=masses, links=links))
     return found
+
+
+def _check_gains(model: RobotModel, unknown: Sequence[str]) -> None:
+    """Refuse unknown gains where constraint forces are eliminated, which mixes the rows."""
+    if unknown and (model.free_flyer or model.constraints):
+        raise SettingsError(
+            f"unknown gains are stated for {listed(unknown)}; gains are identified for a robot "
+            "with a fixed base, without contacts and loops. State them"
+        )
 
 
 def own_friction(
@@ -374,7 +390,8 @@ def fit_payloads(
     Raises:
         DataError, ModelError, SettingsError, NotConvergedError: As of ``identify_payload``.
     """
-    loaded.model.require_fixed("the identification of a payload")
+    refuse_loops(loaded.model, "the identification of a payload")
+    _check_gains(loaded.model, unknown_gains)
     if not loaded.model.layout.remembering:
         return _fit(loaded, reference, links, masses, unknown_gains)
     # the unknown bodies load the gears

@@ -8,6 +8,10 @@ the filter. The score of a joint, W_j^T (tau_j - W_j theta) / s_j^2, has the cov
 S_j r W_j^T W_j / s_j^4, with r samples per second, however few of them are independent: W_j is
 slow, and slow noise passes the filter. With the bread (sum_j W_j^T W_j / s_j^2)^-1 this gives the
 covariance of weighted least squares, and with the prior's information that of a consistent fit.
+
+Where constraint forces are eliminated, W_j are the projected rows, which have one noise level s.
+The noise e is in the torques of the joints, none in the rows of the base: the score is
+sum_j (P W)_j^T e_j, and its covariance the sum above, without the base's rows.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,13 +45,16 @@ from robotid.identification.assumptions import (
     largest_torques,
 )
 from robotid.identification.result import Identification
+from robotid.logs.data import Log
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
+from robotid.regressor.constraints import logged_base
 from robotid.regressor.factors import Factors, compress, join, merge
 from robotid.regressor.prediction import predict
 from robotid.regressor.used_rows import base_problem, independent_share
+from robotid.robot.closure import refuse_loops
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
@@ -238,7 +245,7 @@ def preview(
 
     Raises:
         DataError: If a motion cannot be read, does not fit the model or is too short, or the base
-            floats.
+            floats without contacts.
         SettingsError: If a setting is out of range, or a joint is unknown.
     """
     require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
@@ -257,7 +264,10 @@ def preview(
         logs = [hold_log(model, e.recording.log, e.recording.signals) for e in given.fitted]
         recordings = Recordings(model, given.mapping, logs)
         run = Run.of(recordings, given.standard, given.estimate.details)
-    read = read_logs(motions, model.joints, prismatic=model.layout.prismatic, needs="motion")
+    read = read_logs(
+        motions, model.joints, prismatic=model.layout.prismatic, needs="motion",
+        base=logged_base(model), passive=model.passive,
+    )  # fmt: skip
     in_memory = [hold_log(model, motion, settings) for motion in read]
     return preview_logs(model, in_memory, choice, noise=noise, run=run)
 
@@ -290,8 +300,14 @@ def preview_logs(
     """
     if not motions:
         raise DataError("no motion was given; at least one is needed to preview anything")
-    model.require_fixed("a preview")
+    refuse_loops(model, "a preview")
+    if model.free_flyer and not model.contacts:
+        raise DataError(
+            f"{model.name}: the base floats without contacts; a preview needs [[contact]], or a "
+            "robot with a fixed base"
+        )
     mapping = structural_mapping(model)
+    motions = [_with_torque(motion) for motion in motions]
     peak, fastest = _largest(model, motions)
     size = largest_torques(model, peak)
     earlier = run or like
@@ -299,7 +315,7 @@ def preview_logs(
     for motion in motions:
         _expect(motion, pi)
     if not isinstance(noise, TorqueNoise):
-        found = None if earlier is None else earlier.noise(mapping.K)
+        found = None if earlier is None else earlier.noise(mapping.K).last(len(model.joints))
         noise = assumed_noise(model, size, noise or {}, correlation, found)
     information = _Information.of(model, mapping, motions, noise)
     information = information if run is None else information.added_to(run)
@@ -323,8 +339,8 @@ class _Information:
     """Information in recordings, made or planned."""
 
     factors: Factors
-    sigma: Array  # (n,), noise level of each joint behind the filter [N m or N]
-    levels: tuple[tuple[Factors, Array], ...]  # of planned motions: noise density per sample, (n,)
+    sigma: Array  # (n_rows,), noise level of each row behind the filter [N m or N]
+    levels: tuple[tuple[Factors, Array], ...]  # of planned motions: density per sample, (n_rows,)
     run: Run | None  # an earlier recording
     squares: Array  # as of Reduction
     samples: int
@@ -343,10 +359,14 @@ class _Information:
         for log in motions:
             part = compress(base_problem(model, mapping, log.whole.trajectory, log.whole.mask))
             density = noise.density(_white_step(log))
-            levels.append((part, density / _row_step(log)))
-            residuals.append(np.minimum(noise.std**2, density * _band(log)))
-        rows = np.array([part.rows for part, _ in levels])
-        mean = np.average(residuals, axis=0, weights=rows + 1e-9)
+            residual = np.minimum(noise.std**2, density * _band(log))
+            no_noise = np.zeros(model.n_rows - len(density))  # in the rows of the base
+            levels.append((part, np.append(no_noise, density) / _row_step(log)))
+            residuals.append(np.append(no_noise, residual))
+        rows = np.array([part.rows for part, _ in levels]) + 1e-9
+        mean = np.average(residuals, axis=0, weights=rows)
+        if model.constraints:
+            mean = np.full(len(mean), np.average(residuals, weights=rows))
         return cls(
             merge([part for part, _ in levels]),
             np.sqrt(mean),
@@ -410,8 +430,17 @@ def _largest(model: RobotModel, motions: Sequence[SurveyedLog]) -> tuple[Array, 
     """Return the largest torque (URDF's bodies) and speed of each joint in motions, (n,)."""
     bodies = model.standard_parameters()
     moved = [np.abs(predict(model, [bodies], log.whole.trajectory)[0]) for log in motions]
-    peak = np.max([torque.max(axis=0) for torque in moved], axis=0)
-    return peak, np.max([np.abs(log.whole.trajectory.v).max(axis=0) for log in motions], axis=0)
+    speeds = [np.abs(log.whole.trajectory.v) for log in motions]
+    peak, fastest = (np.max([x.max(axis=0) for x in own], axis=0) for own in (moved, speeds))
+    first = model.n_rows - len(model.joints)
+    return peak[first:], fastest[first:]
+
+
+def _with_torque(log: SurveyedLog) -> SurveyedLog:
+    """Return a motion whose joints will have torques: without, their rows would not be used."""
+    if log.model.constraints and isinstance(log.source, Log):
+        return hold_log(log.model, replace(log.source, has_torque=True), log.asked, log.locked)
+    return log
 
 
 def _expect(log: SurveyedLog, pi: Array) -> None:

@@ -11,7 +11,7 @@ from robotid.regressor.columns import (
     trajectory_values,
 )
 from robotid.regressor.prediction import predict
-from robotid.robot.drives import Bristles, DriveMotion
+from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
 
 __all__ = ["drive_motion_along", "is_loaded", "remember"]
@@ -25,8 +25,7 @@ def is_loaded(model: RobotModel) -> bool:
     Args:
         model: The robot.
     """
-    terms = (model.layout.drive_parameters[k][1] for k in model.layout.remembering)
-    return any(not isinstance(term, Bristles) for term in terms)
+    return any(term.needs_load for _, term in model.layout.drive_parameters)
 
 
 def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:

@@ -27,6 +27,7 @@ __all__ = [
     "link_places",
     "link_transfer",
     "principal_moments",
+    "usual_links",
 ]
 
 
@@ -194,3 +195,12 @@ def least_density(parameters: Array) -> float:
     axes = np.sqrt(5.0 * np.maximum(principal_moments(parameters)[0], 0.0) / mass)  # (3,) [m]
     volume = 4.0 / 3.0 * np.pi * float(np.prod(axes))
     return mass / volume if volume > 0 else float("inf")
+
+
+def usual_links(model: RobotModel) -> tuple[str, ...]:
+    """Return the link that has the payload unless stated: the last one, or a floating base.
+
+    Args:
+        model: The robot.
+    """
+    return model.layout.bodies[:1] if model.free_flyer else model.layout.bodies[-1:]

@@ -5,12 +5,12 @@ import pinocchio as pin
 from scipy.linalg import qr
 
 from robotid._typing import Array
-from robotid.exceptions import ModelError
+from robotid.exceptions import DataError, ModelError
 from robotid.findings import listed
 from robotid.robot.constraints import frame_id
 from robotid.robot.model import RobotModel
 
-__all__ = ["Chains"]
+__all__ = ["Chains", "refuse_loops"]
 
 _CLOSED = 1e-6  # largest error of a closed loop, relative to the length of the robot
 _MOST = 30  # iterations of Newton's method
@@ -22,6 +22,23 @@ _DEAD = 1e-4  # ... of positions that loops determine, relative to the length of
 _PATH = 25  # steps from the zero position to the first one
 _STEP = 0.25  # [rad, or robot lengths] standard deviation of a step of the random walk
 _APART = 4  # steps of the walk between two states
+
+
+def refuse_loops(model: RobotModel, what: str) -> None:
+    """Refuse a robot with loops or passive joints.
+
+    Args:
+        model: The robot.
+        what: What needs a robot without, as "a preview".
+
+    Raises:
+        DataError: If it is such a robot.
+    """
+    if model.loops or model.passive:
+        found = "loops" if model.loops else "passive joints"
+        raise DataError(
+            f"{model.name} has {found}; {what} needs a robot without loops and passive joints"
+        )
 
 
 class Chains:

@@ -3,6 +3,7 @@
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,6 +13,7 @@ from robotid._settings import is_number, require_each, require_flag, require_kin
 from robotid._typing import Array
 from robotid.exceptions import ModelError, SettingsError
 from robotid.findings import listed
+from robotid.robot.drive_term import DriveTerm
 
 __all__ = ["Constraint", "Contact", "Loop", "check_constraints", "frame_id", "link_positions"]
 
@@ -229,16 +231,23 @@ def _check_kind(constraint: Any, where: str) -> None:  # noqa: ANN401
         )
 
 
-def check_constraints(constraints: Sequence[Constraint], links: Sequence[str], file: str) -> None:
-    """Refuse constraints of links that are not in the URDF, or that are stated twice.
+def check_constraints(
+    constraints: Sequence[Constraint],
+    links: Sequence[str],
+    file: str,
+    own_terms: Mapping[str, Sequence[DriveTerm]] = MappingProxyType({}),
+) -> None:
+    """Refuse constraints of links that are not in the URDF, or stated twice, and wrong terms.
 
     Args:
         constraints: The constraints.
         links: Names of the URDF's links.
         file: Name of the URDF.
+        own_terms: Drive terms by joint.
 
     Raises:
         ModelError: If a link is unknown or repeated.
+        SettingsError: If a drive term needs the load of a joint, of which unknown forces are part.
     """
     require_each(constraints, (Contact, Loop), "constraints", "a list of Contact and Loop")
     for constraint in constraints:
@@ -253,6 +262,12 @@ def check_constraints(constraints: Sequence[Constraint], links: Sequence[str], f
     stated = [constraint.frames for constraint in constraints]
     if twice := [x for k, x in enumerate(stated) if x in stated[:k]]:
         raise ModelError(f"the contact or loop at {listed(twice[0])} is stated twice; remove one")
+    for name, own in own_terms.items() if constraints else ():
+        if loaded := [term.name for term in own if term.needs_load]:
+            raise SettingsError(
+                f"{name} has the drive term {loaded[0]!r}, which depends on the joint load torque; "
+                "it is not known with unknown forces of contacts or loops. Remove the term"
+            )
 
 
 def frame_id(pin_model: pin.Model, link: str) -> int:

@@ -107,6 +107,7 @@ class DriveTerm(ABC):
         is_friction: Whether a job's ``friction`` chooses it; if not, it has a switch of its own.
         follows_direction: Whether its column contains the direction of friction.
         has_state: Whether its column depends on more than the current q, v, a and direction.
+        needs_load: Whether its column depends on the torque of its drive.
         is_measured: Whether it affects the measured torque only, not the motion of the robot.
         guards: "v" or "q" if its column is constant outside the range of the data, else "".
         preference: Preference as the name of a base parameter [-].
@@ -128,6 +129,7 @@ class DriveTerm(ABC):
     is_friction: ClassVar[bool] = True
     follows_direction: ClassVar[bool] = False
     has_state: ClassVar[bool] = False
+    needs_load: ClassVar[bool] = False
     is_measured: ClassVar[bool] = False
     guards: ClassVar[str] = ""
     preference: ClassVar[float] = 1.0

@@ -131,6 +131,7 @@ class LoadFriction(MemorylessTerm):
     highest = 0.5  # a gear with more is self-locking
     follows_direction = True
     is_loaded = True
+    needs_load = True
     has_state = True
     typical = (0.04, 0.1)
 
@@ -467,6 +468,7 @@ class Lag(DriveTerm):
     label = "lag"
     units = ("s", "s")
     has_state = True
+    needs_load = True
     is_measured = True
     is_friction = True
     typical = (0.005, 0.02)

@@ -141,7 +141,7 @@ class RobotModel:
             require_flag(flag, name)
         tree = path if isinstance(path, Tree) else read_tree(path)
         tree = tree.snapped() if snap_angles else tree
-        check_constraints(constraints, tree.links, Path(tree.path).name)
+        check_constraints(constraints, tree.links, Path(tree.path).name, own_terms)
         if mimic not in ("independent", "coupled"):
             raise ModelError(f"mimic is {mimic!r}, wanted 'independent' or 'coupled'")
         if dynamics not in DYNAMICS:

@@ -15,7 +15,7 @@ from robotid.robot.bodies import link_transfer
 from robotid.robot.drives import Lag
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.simulation.motions import Motion
+from robotid.simulation.motions import FloatingMotion, Motion
 from robotid.simulation.plant import Friction, RobotPlant
 from robotid.simulation.sensors import measure
 from robotid.simulation.settings import (
@@ -26,6 +26,7 @@ from robotid.simulation.settings import (
     Simulation,
     by_joint,
 )
+from robotid.simulation.stand import Stand, supported
 from robotid.simulation.truth import another_robot
 
 __all__ = ["Noise", "Run", "another_robot", "carried", "delay", "follow", "simulate"]
@@ -63,6 +64,7 @@ class Run:
     tau: Array  # [N m or N]
     reference: Array  # reference position [rad or m]
     saturated: Array  # share of the time at the torque limit of each drive, shape (n,) [-]
+    stand: Stand | None = None  # of a robot whose base floats
 
 
 def simulate(
@@ -79,9 +81,9 @@ def simulate(
     """Return the log of a simulated robot that tracks a motion.
 
     Args:
-        model: The controller's model of the robot, with a fixed base.
+        model: The controller's model of the robot; if its base floats, with contacts.
         pi: The true standard parameters, shape (p,), drive terms included.
-        motion: The motion to track.
+        motion: The motion to track; a ``FloatingMotion`` if the base floats.
         rate: Sample rate of the log [Hz].
         duration: Length of the log [s].
         rng: Source of the noise.
@@ -90,7 +92,8 @@ def simulate(
             and PD without limits, and ideal sensors.
 
     Raises:
-        DataError: If the base floats, or the simulation diverges.
+        DataError: If contacts cannot cause the motion of a floating base, the robot has a fixed
+            base and contacts or loops, or the simulation diverges.
         SettingsError: If a setting does not fit the robot.
     """
     chosen = settings or Simulation()
@@ -116,16 +119,17 @@ def follow(
     The integrator is a Rosenbrock W-method of order 3, which is stable with stiction.
 
     Args:
-        model: The controller's model of the robot, with a fixed base.
+        model: The controller's model of the robot; if its base floats, with contacts.
         pi: The true standard parameters, shape (p,), drive terms included.
-        motion: The motion to track.
+        motion: The motion to track; a ``FloatingMotion`` if the base floats.
         rate: Sample rate of the run [Hz].
         duration: Length of the run [s].
         settings: Controller, actuators and payload, and the measured side of elastic gears.
         progress: Called with the number of simulated seconds.
 
     Raises:
-        DataError: If the base floats, or the simulation diverges.
+        DataError: If contacts cannot cause the motion of a floating base, the robot has a fixed
+            base and contacts or loops, or the simulation diverges.
         SettingsError: If a setting does not fit the robot.
 
     References:
@@ -136,8 +140,15 @@ def follow(
     t = np.arange(round(duration * rate) + 1) / rate
     loaded = carried(model, pi, settings.payload)
     deflection = settings.payload.start if settings.payload.mass > 0 else math.inf
+    if not model.free_flyer:
+        model.require_fixed("simulation")
     if settings.controller.kind == "perfect":
         return _perfect(model, pi, loaded, motion, t, deflection)
+    if model.free_flyer:
+        raise SettingsError(
+            f"controller: kind is {settings.controller.kind}, wanted perfect: a robot whose base "
+            "floats tracks the motion exactly. State --controller perfect"
+        )
     loops = [_Loop(model, x, settings) for x in (pi, loaded)]
     steps = max(1, math.ceil(1.0 / rate / min(loop.longest_step for loop in loops) - 1e-9))
     _check_size(len(t), steps)
@@ -233,7 +244,7 @@ def _perfect(
 ) -> Run:
     """Return the run of a robot that tracks exactly, by inverse dynamics."""
     q, v, a = motion.evaluate(t)
-    none = np.zeros_like(q)
+    none = np.zeros_like(v)
     segment = np.zeros(len(t), dtype=int)
     rows = Trajectory(t, q, v, a, none, model.joints, None, segment)
     torques = []
@@ -241,7 +252,12 @@ def _perfect(
         robot = model.with_reference(x)
         torques += predict(robot, [x], remember(robot, rows))
     tau = np.where((t >= deflection)[:, None], torques[-1], torques[0])
-    return Run(t, q, v, a, tau, q, np.zeros(q.shape[1]))
+    n = len(model.joints)
+    if isinstance(motion, FloatingMotion):
+        tau, stand = supported(model, motion, t, (q, v, a), tau)
+        q, v, a = (x[:, x.shape[1] - n :] for x in (q, v, a))
+        return Run(t, q, v, a, tau, q, np.zeros(n), stand)
+    return Run(t, q, v, a, tau, q, np.zeros(n))
 
 
 def delay(model: RobotModel, pi: Array, settings: Simulation) -> Array:

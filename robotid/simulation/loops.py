@@ -235,16 +235,16 @@ class ClosedLoopRobot:
                 have no derivatives.
 
         Raises:
-            SettingsError: If the base floats, a drive couples several joints, or the compiled code
-                has no joint of some type.
+            DataError: If the base floats, or the robot has contacts or loops.
+            SettingsError: If a drive couples several joints, or the compiled code has no joint of
+                some type.
         """
-        if model.free_flyer or model.layout.couplings or model.mimic == "coupled":
+        model.require_fixed("the estimator 'simulation', which simulates the controlled joints,")
+        if model.layout.couplings or model.mimic == "coupled":
             raise SettingsError(
-                f"{model.name}: a floating base, drives that couple several joints and coupled "
-                "mimic joints cannot be simulated. Fix the base, leave out [[coupling]], and set "
-                "mimic = 'independent'"
+                f"{model.name}: drives that couple several joints and coupled mimic joints cannot "
+                "be simulated. Leave out [[coupling]], and set mimic = 'independent'"
             )
-        model.require_fixed("simulation")
         if (why := why_not(model)) is not None:
             raise SettingsError(f"{model.name} cannot be simulated: {why}")
         self.model, self.step, self.corrects = model, step, corrects

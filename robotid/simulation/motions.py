@@ -1,4 +1,4 @@
-"""Reference motions: Fourier series within limits, quintics from rest to rest, samples."""
+"""Reference motions: Fourier series, quintics from rest to rest, samples, legged robots."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,9 +8,17 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
+from robotid.logs.base import in_base
 from robotid.robot.model import RobotModel
 
-__all__ = ["FourierTrajectory", "Motion", "ProgramMotion", "SampledMotion", "random_fourier"]
+__all__ = [
+    "FloatingMotion",
+    "FourierTrajectory",
+    "Motion",
+    "ProgramMotion",
+    "SampledMotion",
+    "random_fourier",
+]
 
 _ORDER = 5  # of the polynomials through samples
 _HARMONICS = 5  # of a random motion
@@ -134,6 +142,72 @@ class SampledMotion(Motion):
     def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
         q, v, a = (curve(t) for curve in self._curves)
         return q, v, a
+
+
+@dataclass(frozen=True, eq=False)
+class FloatingMotion(Motion):
+    """A motion of a robot whose base floats: splines through poses and joint positions.
+
+    Attributes:
+        t: Times, shape (N,) [s].
+        pose: Pose of the base, as of ``BaseMotion``, shape (N, 7) [m, -].
+        q: Joint positions, shape (N, n) [rad or m].
+        contacts: Which contacts touch the ground, shape (N, k), bool; each until the next sample.
+    """
+
+    t: Array
+    pose: Array
+    q: Array
+    contacts: Array
+
+    @property
+    def duration(self) -> float:
+        """Duration [s]."""
+        return float(self.t[-1] - self.t[0])
+
+    @cached_property
+    def _samples(self) -> SampledMotion:
+        return SampledMotion(self.t, np.hstack([self.pose, self.q]))
+
+    def touching(self, t: Array) -> Array:
+        """Return which contacts touch the ground, shape (N, k), bool.
+
+        Args:
+            t: Times since the first sample, shape (N,) [s].
+        """
+        rows = np.searchsorted(self.t - self.t[0], t + 1e-9, side="right") - 1
+        flags: Array = self.contacts[np.clip(rows, 0, len(self.t) - 1)]
+        return flags
+
+    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return q (N, 7 + n), v (N, 6 + n) and a (N, 6 + n), the twist with the axes of the base.
+
+        With the unit quaternion p / |p| of the spline p, w = 2 p* dp/dt / |p|^2 (vector part).
+
+        Args:
+            t: Times since the first sample, shape (N,) [s].
+        """
+        x, rate, change = self._samples.evaluate(t)
+        p, dp, ddp = x[:, 3:7], rate[:, 3:7], change[:, 3:7]
+        square = np.sum(p**2, axis=1, keepdims=True)
+        unit = p / np.sqrt(square)
+        w = 2.0 * _vector_part(p, dp) / square
+        alpha = 2.0 * _vector_part(p, ddp) / square
+        alpha -= 2.0 * np.sum(p * dp, axis=1, keepdims=True) / square * w
+        v = in_base(unit, rate[:, :3])
+        a = in_base(unit, change[:, :3]) - np.cross(w, v)
+        return (
+            np.hstack([x[:, :3], unit, x[:, 7:]]),
+            np.hstack([v, w, rate[:, 7:]]),
+            np.hstack([a, alpha, change[:, 7:]]),
+        )
+
+
+def _vector_part(p: Array, rate: Array) -> Array:
+    """Return the vector part of the product p* r of quaternions x y z w, shape (N, 3)."""
+    vector, scalar = p[:, :3], p[:, 3:]
+    part: Array = scalar * rate[:, :3] - rate[:, 3:] * vector - np.cross(vector, rate[:, :3])
+    return part
 
 
 def random_fourier(

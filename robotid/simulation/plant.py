@@ -65,7 +65,7 @@ class RobotPlant:
 
     def __init__(self, model: RobotModel, pi: Array) -> None:
         if model.free_flyer:
-            raise DataError("a robot with a floating base cannot be simulated without contacts")
+            raise DataError("the base floats; forward dynamics need a robot with a fixed base")
         model.require_fixed("simulation")
         if pi.shape != (len(model.layout.names),):
             raise DataError(f"pi has shape {pi.shape}, wanted ({len(model.layout.names)},)")

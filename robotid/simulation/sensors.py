@@ -69,6 +69,7 @@ def measure(
         spread = _TICK * np.arange(len(t))
         t = t + sensors.jitter * rng.standard_normal(len(t))
         t = np.maximum.accumulate(t - spread) + spread
+    of_stand = {} if run.stand is None else run.stand.logged(sensors, logged)
     return Log(
         t=t[logged],
         q=q[logged],
@@ -76,6 +77,7 @@ def measure(
         a=run.a[logged] if sensors.acceleration else None,
         tau=tau[logged],
         joints=joints,
+        **of_stand,
     )
 
 

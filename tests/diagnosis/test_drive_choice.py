@@ -220,7 +220,7 @@ def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
         for k, name in enumerate(found.mapping.base_names)
         if name.startswith(ELBOW)
     }
-    drive = drive_choice._Drive(False, tuple(own), sample.taken, SEEN, 1.0, plain_parts)
+    drive = drive_choice._Drive(False, True, tuple(own), sample.taken, SEEN, 1.0, plain_parts)
     alone = sample.of_joint(j)
     family = FAMILIES["stribeck"]
     grown = drive_choice._grown(alone, drive, [(family, [speed])])
@@ -525,7 +525,7 @@ def test_derivatives_of_terms_by_each_shape_follow_their_columns(rng):
         weight=weight, torque=np.ones(1), segments=segments, rows=n, W=W, r=r,
         independent=np.arange(2), U=np.eye(2), normal=Normal.of(W, r, segments, 6),
     )  # fmt: skip
-    drive = drive_choice._Drive(False, (motion,), (np.arange(n),), ranges, 9.0, {})
+    drive = drive_choice._Drive(False, True, (motion,), (np.arange(n),), ranges, 9.0, {})
     count, trial = drive_choice._with_slopes(sample, drive, families, sizes)
     assert count == 2
     X = np.concatenate([x for _, x in trial.rows])
@@ -581,14 +581,14 @@ def test_each_joint_is_given_its_own_drive_and_what_is_wanted_of_it(monkeypatch,
     sample = SimpleNamespace(
         joints=names, weight=weight, taken=(np.arange(n),), is_prismatic=np.array([0, 0, 1, 0]),
         recordings=[SimpleNamespace(trajectory=None)], at=[SimpleNamespace(tau=tau)], U=U,
-        of_joint=lambda j: ("of", j),
+        of_joint=lambda j: ("of", j), basis=None,
     )  # fmt: skip
     motion = SimpleNamespace(of=lambda j: SimpleNamespace(q=q[:, j], v=v[:, j]))
     monkeypatch.setattr(drive_choice, "take_sample", lambda fit, for_drives: sample)
     monkeypatch.setattr(drive_choice, "drive_motion_along", lambda model, trajectory: motion)
     monkeypatch.setattr(drive_choice, "_auto", lambda *given: ("auto", *given))
     monkeypatch.setattr(drive_choice, "_fixed", lambda *given: ("fixed", *given))
-    model = SimpleNamespace(free_flyer=False, with_reference=lambda pi: None)
+    model = SimpleNamespace(passive=(), with_reference=lambda pi: None)
     mapping = SimpleNamespace(base_names=("c.viscous", "cc.viscous", "c.offset"))
     fit = SimpleNamespace(model=model, mapping=mapping, standard=None)
     wanted = {"a": None, "b": None, "c": ("load", "tanh"), "d": ()}

@@ -1,0 +1,85 @@
+"""Expected standard errors of a motion of a robot on its feet."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.stands import stand
+
+from robotid.exceptions import DataError
+from robotid.export.entries import build_preview
+from robotid.identification.previews import preview
+from robotid.logs.base import BaseMotion
+from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.constraints import constraint_jacobian
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.constraints import Contact
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
+RAW = SignalSettings(cutoff=None, velocity="measured", acceleration="measured")
+
+
+def quadruped(contacts):
+    return RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, terms=("viscous",), constraints=contacts
+    )
+
+
+@pytest.fixture(scope="module")
+def planned():
+    model = quadruped([Contact(foot) for foot in FEET])
+    motion = stand(
+        model, np.tile([0.0, 0.8, -1.6], 4), 0.25, np.random.default_rng(5), parts=5, length=1.0,
+        rate=60.0,
+    )  # fmt: skip
+    t = np.arange(300) / 60.0
+    q, v, a = motion.evaluate(t)
+    flags = motion.touching(t).T
+    log = Log(
+        t, q[:, 7:], 0.0 * q[:, 7:], model.joints, v[:, 6:], a[:, 6:], has_torque=False,
+        base=BaseMotion(q[:, :7], v[:, :6], a[:, :6]),
+        contacts=dict(zip(FEET, flags, strict=True)),
+    )  # fmt: skip
+    return model, log
+
+
+def test_the_errors_are_those_of_least_squares_with_noise_in_the_joints(planned):
+    model, log = planned
+    size = np.linspace(0.01, 0.05, 12)
+    found = preview(
+        model, log, noise=dict(zip(model.joints, size, strict=True)), signals=RAW, estimator="wls"
+    )
+    found_white = preview(model, log, noise=replace(found.noise, correlation=np.zeros(12)),
+                          signals=RAW, estimator="wls")  # fmt: skip
+    np.testing.assert_allclose(found.base_error, found_white.base_error * np.sqrt(0.1 * 60.0))
+    recording = found.expected.fitted[0].recording
+    motion, rows = recording.trajectory, recording.mask.all(axis=1)
+    q, v, a = motion.q, motion.v, motion.a
+    K, independent = found.expected.mapping.K, found.expected.mapping.independent
+    W = joint_torque_regressor(model, q, v, a).reshape(len(q), 18, -1)[rows][..., independent]
+    J = constraint_jacobian(model, q, motion.contacts)[rows]
+    P = np.eye(18) - np.linalg.pinv(J) @ J
+    projected = (P @ W).reshape(-1, len(K))
+    bread = np.linalg.inv(projected.T @ projected)
+    score = (P @ W)[:, 6:].swapaxes(1, 2) * size @ (size[:, None] * (P @ W)[:, 6:])
+    wanted = np.sqrt(np.diag(bread @ score.sum(axis=0) @ bread))
+    np.testing.assert_allclose(found_white.base_error, wanted, rtol=1e-5)
+    level = np.einsum("kjj,j->", P[:, 6:, 6:], size**2) / np.trace(P, axis1=1, axis2=2).sum()
+    np.testing.assert_allclose(found.expected.estimate.sigma, np.sqrt(level), rtol=0.01)
+
+
+def test_the_content_has_the_joints_alone(planned):
+    model, log = planned
+    content = build_preview(preview(model, log, signals=RAW, estimator="wls"))
+    assert [*content["torque"]] == [*content["noise"]] == list(model.joints)
+    assert content["structure"]["base"] == len(content["base_parameters"])
+    assert all(entry["std_error"] > 0 for entry in content["base_parameters"])
+
+
+def test_a_floating_base_needs_contacts(planned):
+    _, log = planned
+    with pytest.raises(DataError, match="the base floats without contacts"):
+        preview(quadruped([]), replace(log, contacts={}), signals=RAW)
