@@ -32,7 +32,7 @@ from robotid.commands.job import Job, LogEntry, read_job
 from robotid.commands.logs import examine
 from robotid.doctor.command_channels import check_commands
 from robotid.doctor.diagnosis import diagnose
-from robotid.logs.formats import write_columns
+from robotid.log_files.formats import write_columns
 from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.parameters import INERTIAL_TERMS

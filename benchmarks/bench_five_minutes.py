@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from setting import machine
 
-from robotid.logs.formats import write_columns
+from robotid.log_files.formats import write_columns
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

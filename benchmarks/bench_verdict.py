@@ -31,7 +31,7 @@ from verdict_cases import CASES, GOOD, ROBOTS, make
 from robotid import identify
 from robotid.commands.job import Job, LogEntry
 from robotid.exceptions import RobotIdError
-from robotid.logs.formats import write_columns
+from robotid.log_files.formats import write_columns
 
 QUICK = (("ur5", "tiago"), ("clean", "clean, far from the URDF", "torque 20 ms late",
          "all torques reversed", "two torque columns swapped", "degrees", "1 kg in the fitted log",

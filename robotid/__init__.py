@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from robotid.identification.payload_fit import identify_payload
     from robotid.identification.previews import preview
     from robotid.identification.result import Identification
+    from robotid.log_files.read import read_log, write_log
     from robotid.logs.base import BaseColumns, BaseMotion
     from robotid.logs.data import Log, Trajectory
-    from robotid.logs.read import read_log, write_log
     from robotid.logs.settings import LogSource, LogUnits, SignalSettings
     from robotid.online.identifier import OnlineIdentifier
     from robotid.report.document import write_report
@@ -85,7 +85,7 @@ _MODULES = {
     "identification.result": ["Identification"],
     "logs.base": ["BaseColumns", "BaseMotion"],
     "logs.data": ["Log", "Trajectory"],
-    "logs.read": ["read_log", "write_log"],
+    "log_files.read": ["read_log", "write_log"],
     "logs.settings": ["LogSource", "LogUnits", "SignalSettings"],
     "online.identifier": ["OnlineIdentifier"],
     "report.document": ["write_report"],

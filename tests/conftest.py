@@ -13,8 +13,8 @@ from helpers.paths import IN_CI, ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.identification.pipeline import identify
+from robotid.log_files.read import read_log, write_log
 from robotid.logs.data import Log
-from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

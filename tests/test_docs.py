@@ -23,8 +23,8 @@ from robotid.doctor.diagnosis import CODES
 from robotid.export.former_keys import FORMER, from_former_keys
 from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement.verdict import WARNING_CODES
-from robotid.logs.formats import write_columns
-from robotid.logs.read import write_log
+from robotid.log_files.formats import write_columns
+from robotid.log_files.read import write_log
 from robotid.robot.drives import TERM_CLASSES, TERMS
 from robotid.robot.examples import example_urdf
 from robotid.simulation.motions import random_fourier

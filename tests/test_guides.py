@@ -21,7 +21,7 @@ import robotid
 from robotid.cli import COMMANDS, main
 from robotid.commands.job import job_from_settings
 from robotid.excitation.files import write_motion
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.robot.examples import example_urdf
 from robotid.simulation.motions import random_fourier
 from robotid.simulation.settings import Simulation

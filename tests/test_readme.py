@@ -11,7 +11,7 @@ from helpers.synthetic import exact_log, truth
 import robotid
 from robotid.cli import main
 from robotid.commands.job import job_from_settings
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.robot.examples import example_urdf
 
 README = (ROOT / "README.md").read_text()

@@ -7,10 +7,10 @@ from pathlib import Path
 from robotid._files import check_file
 from robotid.exceptions import DataError
 from robotid.findings import listed
+from robotid.log_files.formats import open_table, write_columns
+from robotid.log_files.table import prefixes, quantity_of
 from robotid.logs.data import repeated, suggestion
-from robotid.logs.formats import open_table, write_columns
 from robotid.logs.settings import LogSource
-from robotid.logs.table import prefixes, quantity_of
 
 __all__ = ["Conversion", "convert"]
 

@@ -10,7 +10,7 @@ from robotid._typing import Array, ProgressCallback
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.identification.result import Identification
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

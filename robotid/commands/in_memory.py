@@ -13,7 +13,7 @@ from robotid.identification import pipeline
 from robotid.identification.pipeline import robot_of
 from robotid.identification.result import Identification
 from robotid.judgement.verdict import check_ignored
-from robotid.logs.read import Readable, read_logs
+from robotid.log_files.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel

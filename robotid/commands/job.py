@@ -19,11 +19,11 @@ from robotid.fitting.settings import (
     EstimatorSettings,
     SimulationSettings,
 )
-from robotid.logs.columns import Needs
+from robotid.log_files.columns import Needs
+from robotid.log_files.read import LogLayout, lay_out, read_log
+from robotid.log_files.table import Table
 from robotid.logs.data import Log
-from robotid.logs.read import LogLayout, lay_out, read_log
 from robotid.logs.settings import BaseSource, LogSource, LogUnits, SignalSettings
-from robotid.logs.table import Table
 from robotid.logs.transmission import Transmission, check_transmissions
 from robotid.regressor.constraints import logged_base
 from robotid.robot.constraints import Contact, Loop

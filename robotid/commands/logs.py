@@ -19,10 +19,10 @@ from robotid.findings import Finding, by_severity
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import SurveyedLog, survey_log
 from robotid.judgement.verdict import check_ignored
-from robotid.logs.columns import Needs
+from robotid.log_files.columns import Needs
+from robotid.log_files.read import LogLayout
+from robotid.log_files.table import Table
 from robotid.logs.data import Log
-from robotid.logs.read import LogLayout
-from robotid.logs.table import Table
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.versions import code_versions

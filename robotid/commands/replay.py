@@ -23,8 +23,8 @@ from robotid.fitting.evaluation import predict
 from robotid.fitting.survey import hold_log
 from robotid.identification.pictures import shown_evaluation
 from robotid.identification.result import Identification
+from robotid.log_files.formats import open_table
 from robotid.logs.data import Log
-from robotid.logs.formats import open_table
 from robotid.logs.settings import LogSource
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel

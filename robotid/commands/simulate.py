@@ -13,9 +13,9 @@ from robotid._typing import Array, ProgressCallback, ignore_progress
 from robotid.commands.job import Job, LogEntry
 from robotid.exceptions import SettingsError
 from robotid.export.urdf import write_urdf
+from robotid.log_files.formats import check_suffix
+from robotid.log_files.read import write_log
 from robotid.logs.data import Log
-from robotid.logs.formats import check_suffix
-from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping

@@ -10,9 +10,9 @@ import numpy as np
 from robotid._files import check_folder, file_sha256, folder_beside, write_json
 from robotid.commands.job import Job
 from robotid.exceptions import MissingDependencyError, SettingsError
+from robotid.log_files.formats import write_columns
+from robotid.log_files.parquet_files import load_pyarrow
 from robotid.logs.data import Log
-from robotid.logs.formats import write_columns
-from robotid.logs.parquet_files import load_pyarrow
 from robotid.online.identifier import OnlineIdentifier
 from robotid.online.settings import OnlineSettings
 from robotid.online.tracking import Observer, Track, track

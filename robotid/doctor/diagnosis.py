@@ -22,8 +22,8 @@ from robotid.doctor.torques import check_torques
 from robotid.doctor.urdf_base import rounded_robot
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, log_finding
+from robotid.log_files.read import Readable, read_logs
 from robotid.logs.data import Log, Trajectory
-from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import logged_base

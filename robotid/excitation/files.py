@@ -9,7 +9,7 @@ from robotid._files import write_text
 from robotid._text import yaml_name
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
-from robotid.logs.formats import check_suffix, write_columns
+from robotid.log_files.formats import check_suffix, write_columns
 from robotid.simulation.motions import Motion
 
 __all__ = ["check_motion_file", "write_motion"]

@@ -21,13 +21,13 @@ from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.fitting.closed_log import closed_log
 from robotid.fitting.velocity_choice import prefers_measured
+from robotid.log_files.formats import open_table
+from robotid.log_files.read import LogLayout
+from robotid.log_files.table import Place, RowReader, Table, prefixes
 from robotid.logs.data import Log, Trajectory
-from robotid.logs.formats import open_table
-from robotid.logs.read import LogLayout
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import decide, unwrap
 from robotid.logs.smoothing import SPLINE, Segment, filter_reach, process_segments, too_short
-from robotid.logs.table import Place, RowReader, Table, prefixes
 from robotid.logs.time_stamps import blocks_of, map_stamps, median_step
 from robotid.logs.units import check_reach, check_units
 from robotid.regressor.base_parameters import BaseMapping

@@ -19,7 +19,7 @@ from robotid.fitting.settings import ConsistentSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import robot_of, with_drives
 from robotid.judgement.payload_check import PayloadCheck
-from robotid.logs.read import Readable, read_logs
+from robotid.log_files.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import logged_base

@@ -35,7 +35,7 @@ from robotid.identification.result import Asked, Identification
 from robotid.judgement.findings import fit_findings, log_findings, not_written
 from robotid.judgement.unlike_runs import unlike_findings
 from robotid.judgement.verdict import blocking, check_ignored, rejected, warnings_of
-from robotid.logs.read import Readable, read_logs
+from robotid.log_files.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import logged_base

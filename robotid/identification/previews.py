@@ -45,8 +45,8 @@ from robotid.identification.assumptions import (
     largest_torques,
 )
 from robotid.identification.result import Identification
+from robotid.log_files.read import Readable, read_logs
 from robotid.logs.data import Log
-from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping

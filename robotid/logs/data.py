@@ -1,6 +1,6 @@
 """Motion of a robot as arrays: `Log`, the recording, and `Trajectory`, the input of a fit.
 
-Files are read and written by `robotid.logs.read`.
+Files are read and written by `robotid.log_files.read`.
 """
 
 import difflib

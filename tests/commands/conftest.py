@@ -5,7 +5,7 @@ import pytest
 from helpers.paths import URDF
 from helpers.synthetic import exact_log, truth
 
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.robot.model import RobotModel
 
 

@@ -15,7 +15,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
 from robotid.export.urdf import load_identified
-from robotid.logs.read import read_log, write_log
+from robotid.log_files.read import read_log, write_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf

@@ -21,7 +21,7 @@ from robotid._typing import STAGES
 from robotid.cli import compare, doctor, main, printing
 from robotid.cli.console import terminal_progress
 from robotid.identification.pipeline import identify
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.robot.model import RobotModel
 
 ARM = str(ROOT / "urdf" / "planar_2r.urdf")

@@ -14,9 +14,9 @@ from robotid.cli import main
 from robotid.commands.convert import convert
 from robotid.commands.job import job_from_settings
 from robotid.exceptions import DataError
+from robotid.log_files.formats import write_columns
+from robotid.log_files.read import read_log
 from robotid.logs.data import Log
-from robotid.logs.formats import write_columns
-from robotid.logs.read import read_log
 from robotid.logs.settings import LogSource
 from robotid.robot.examples import example_urdf
 

@@ -10,7 +10,7 @@ from helpers.mujoco_plant import plant, torque_log
 from robotid.cli import main
 from robotid.commands import identify
 from robotid.commands.job import read_job
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.robot.families import AUTO
 
 

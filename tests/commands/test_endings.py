@@ -13,7 +13,7 @@ from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.robot.model import RobotModel
 
 URDF = str(ROOT / "urdf" / "planar_2r.urdf")

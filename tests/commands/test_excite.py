@@ -13,7 +13,7 @@ from robotid.commands.job import Job
 from robotid.excitation.clearance import Box
 from robotid.excitation.design import Designer
 from robotid.excitation.settings import MotionSettings
-from robotid.logs.formats import open_table
+from robotid.log_files.formats import open_table
 from robotid.logs.settings import LogSource, SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -21,7 +21,7 @@ from robotid.export.urdf import DYNAMICS_TERMS
 from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
 from robotid.identification.result import Identification
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.friction_projection import project_friction
 from robotid.robot.drives import Stribeck

@@ -5,8 +5,8 @@ import pytest
 
 from robotid.commands.job import Job, job_from_settings, read_job
 from robotid.exceptions import SettingsError
+from robotid.log_files.read import write_log
 from robotid.logs.data import Log
-from robotid.logs.read import write_log
 from robotid.logs.settings import LogSource
 from robotid.robot.constraints import Loop
 from robotid.robot.drives import DRIVE_TERMS

@@ -7,8 +7,8 @@ import pytest
 from helpers.stands import stand
 
 from robotid.cli import main
-from robotid.logs.formats import write_columns
-from robotid.logs.read import read_log
+from robotid.log_files.formats import write_columns
+from robotid.log_files.read import read_log
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -19,7 +19,7 @@ from robotid.cli import main
 from robotid.cli.console import terminal_progress
 from robotid.commands import identify as workflow
 from robotid.exceptions import SettingsError
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.robot.model import RobotModel
 from robotid.workers.cluster import ClusterBackend
 from robotid.workers.plan import WorkPlan

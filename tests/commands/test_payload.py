@@ -15,8 +15,8 @@ from robotid.commands.job import job_from_settings
 from robotid.commands.payload import stated_masses
 from robotid.exceptions import SettingsError
 from robotid.export.result import load_result, stated_scale_check
-from robotid.logs.formats import write_columns
-from robotid.logs.read import write_log
+from robotid.log_files.formats import write_columns
+from robotid.log_files.read import write_log
 from robotid.report.advice import Origin, next_steps
 from robotid.robot.bodies import link_transfer
 from robotid.robot.drives import Tanh

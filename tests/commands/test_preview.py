@@ -13,8 +13,8 @@ from robotid.commands import preview
 from robotid.commands.identify import run_job
 from robotid.commands.job import LogEntry, job_from_settings
 from robotid.commands.preview import _motions
-from robotid.logs.formats import write_columns
-from robotid.logs.read import read_log, write_log
+from robotid.log_files.formats import write_columns
+from robotid.log_files.read import read_log, write_log
 from robotid.robot.examples import example_urdf
 
 NOISE = np.array([2.0, 3.0, 1.0, 0.3, 0.2, 0.1])  # [N m]

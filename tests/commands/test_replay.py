@@ -20,8 +20,8 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.replay import _base_poses, read_findings, replay_identified
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
-from robotid.logs.formats import write_columns
-from robotid.logs.read import write_log
+from robotid.log_files.formats import write_columns
+from robotid.log_files.read import write_log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

@@ -22,7 +22,7 @@ from robotid.commands.report import _require_same
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.fitting.settings import SimulationSettings
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 from robotid.versions import versions

@@ -13,8 +13,8 @@ from robotid.commands.job import Job
 from robotid.commands.simulate import SimulatedFiles, _motion
 from robotid.export.urdf import load_identified
 from robotid.identification.pipeline import identify
-from robotid.logs.formats import write_columns
-from robotid.logs.read import read_log
+from robotid.log_files.formats import write_columns
+from robotid.log_files.read import read_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
 from robotid.simulation.motions import SampledMotion, random_fourier

@@ -9,8 +9,8 @@ from helpers.synthetic import exact_log, truth
 from robotid.commands import track as module
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.track import run_track, serve_track
-from robotid.logs.formats import open_table
-from robotid.logs.read import read_log, write_log
+from robotid.log_files.formats import open_table
+from robotid.log_files.read import read_log, write_log
 from robotid.logs.settings import LogSource, SignalSettings
 from robotid.online.settings import OnlineSettings
 from robotid.viewer.scene import coordinates

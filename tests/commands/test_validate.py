@@ -12,8 +12,8 @@ from robotid.commands import validate
 from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings
 from robotid.commands.validate import validate_result
+from robotid.log_files.read import write_log
 from robotid.logs.data import Log
-from robotid.logs.read import write_log
 
 NOISE = np.array([0.2, 0.05])  # [N m]
 

@@ -15,7 +15,7 @@ from robotid.commands.job import job_from_settings
 from robotid.exceptions import SettingsError
 from robotid.export.ranges import parameter_ranges, stated_ranges
 from robotid.identification.summary import variation_lines
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.robot.examples import example_urdf
 
 COULOMB = "shoulder_lift_joint.coulomb"

@@ -15,7 +15,7 @@ from robotid.commands.job import job_from_settings, read_job
 from robotid.export.urdf import load_identified, write_urdf
 from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
-from robotid.logs.read import read_log, write_log
+from robotid.log_files.read import read_log, write_log
 from robotid.regressor.prediction import predict
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

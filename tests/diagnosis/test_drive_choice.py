@@ -32,7 +32,7 @@ from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify, with_drives
 from robotid.judgement.parameter_table import parameter_entries
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.memory import drive_motion_along, remember

@@ -37,7 +37,7 @@ from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude, identify
 from robotid.judgement.findings import fit_findings
 from robotid.judgement.verdict import warnings_of
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.drives import Harmonic

@@ -14,9 +14,9 @@ from robotid.cli import main
 from robotid.doctor.command_channels import _sampled, check_commands
 from robotid.doctor.diagnosis import check_logs
 from robotid.exceptions import DataError
+from robotid.log_files.formats import write_columns
+from robotid.log_files.read import read_log, write_log
 from robotid.logs.data import Log
-from robotid.logs.formats import write_columns
-from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import LogSource, SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

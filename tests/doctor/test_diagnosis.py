@@ -25,8 +25,8 @@ from robotid.doctor.diagnosis import check_logs, diagnose, findings_to_dict
 from robotid.exceptions import SettingsError
 from robotid.findings import Finding
 from robotid.judgement.verdict import blocking, check_ignored
-from robotid.logs.formats import write_columns
-from robotid.logs.read import write_log
+from robotid.log_files.formats import write_columns
+from robotid.log_files.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

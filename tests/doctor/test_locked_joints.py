@@ -11,7 +11,7 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import examine
 from robotid.doctor.locked_joints import percent_hint
 from robotid.fitting.settings import EstimatorSettings
-from robotid.logs.read import read_log, write_log
+from robotid.log_files.read import read_log, write_log
 from robotid.logs.settings import LogUnits
 from robotid.robot.drives import DRIVE_TERMS
 from robotid.robot.examples import example_urdf

@@ -7,7 +7,7 @@ import yaml
 from robotid.exceptions import SettingsError
 from robotid.excitation.basis import DesignedMotion, FourierBasis
 from robotid.excitation.files import write_motion
-from robotid.logs.formats import open_table
+from robotid.log_files.formats import open_table
 from robotid.logs.settings import LogSource
 
 JOINTS = tuple(f"joint_{k}" for k in range(6))

@@ -22,8 +22,8 @@ from robotid.fitting.regressor_noise import (
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.standard_errors import measured_errors
 from robotid.fitting.survey import hold_log, survey_log
+from robotid.log_files.read import lay_out, write_log
 from robotid.logs.data import Log
-from robotid.logs.read import lay_out, write_log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping

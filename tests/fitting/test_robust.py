@@ -16,8 +16,8 @@ from robotid.fitting.robust import LOSSES, find_outliers, loss_slope, loss_weigh
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log, survey_log
 from robotid.identification.pipeline import conclude
+from robotid.log_files.read import lay_out, write_log
 from robotid.logs.data import Log, Trajectory
-from robotid.logs.read import lay_out, write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join

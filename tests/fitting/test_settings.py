@@ -19,7 +19,7 @@ from robotid.estimators.consistent.penalties import METRICS
 from robotid.exceptions import SettingsError
 from robotid.fitting.robust import LOSSES
 from robotid.fitting.settings import ESTIMATORS, EstimatorSettings, RecursiveSettings
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.logs.settings import SignalSettings
 
 JOBS = Path(__file__).parents[1] / "jobs"

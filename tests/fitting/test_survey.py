@@ -15,10 +15,10 @@ from robotid.exceptions import DataError
 from robotid.fitting import survey
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import ReducedPiece, hold_log, survey_log
+from robotid.log_files.formats import open_table, write_columns
+from robotid.log_files.read import lay_out, read_log, write_log
 from robotid.logs.base import BaseMotion
 from robotid.logs.data import Log
-from robotid.logs.formats import open_table, write_columns
-from robotid.logs.read import lay_out, read_log, write_log
 from robotid.logs.settings import LogUnits, SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
@@ -175,7 +175,7 @@ def test_parquet_is_read_across_its_row_groups(ur5, recording, tmp_path):
 
 def test_blank_lines_of_a_csv_are_no_rows(ur5, recording, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "robotid.logs.csv_files._BLOCK", 170
+        "robotid.log_files.csv_files._BLOCK", 170
     )  # lines, so that pieces start within one
     path = tmp_path / "run.csv"
     write_log(recording, path)

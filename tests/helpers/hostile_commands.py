@@ -32,8 +32,8 @@ from helpers.hostile_inputs import (
 )
 from helpers.recorders import write_lerobot
 from robotid.closed_loop.settings import LoopSettings
+from robotid.log_files.read import write_log
 from robotid.logs.data import Log
-from robotid.logs.read import write_log
 from robotid.robot.drives import FAMILIES
 from robotid.simulation.settings import Simulation
 

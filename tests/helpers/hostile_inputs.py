@@ -28,7 +28,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.cli import main
 from robotid.commands.job import Job
 from robotid.fitting.settings import ESTIMATORS
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.robot.model import RobotModel
 
 __all__ = ["KINDS"]

@@ -17,8 +17,8 @@ from robotid.commands.validate import validate_result
 from robotid.exceptions import DataError, SettingsError
 from robotid.fitting.evaluation import evaluate_logs
 from robotid.fitting.settings import EstimatorSettings
+from robotid.log_files.read import read_log, write_log
 from robotid.logs.data import Log
-from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.drives import DRIVE_TERMS
 

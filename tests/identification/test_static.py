@@ -15,8 +15,8 @@ from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.export.result import load_result
 from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify
+from robotid.log_files.read import write_log
 from robotid.logs.data import Log
-from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import resolve
 from robotid.online.identifier import OnlineIdentifier

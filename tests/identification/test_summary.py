@@ -23,7 +23,7 @@ from robotid.identification.summary import (
     joint_reason,
     verdict_lines,
 )
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.robot.model import RobotModel
 
 

@@ -22,7 +22,7 @@ from robotid.judgement.verdict import (
     rejected,
     warnings_of,
 )
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.robot.examples import example_urdf
 
 NOISE = np.array([2.0, 2.0, 1.0, 0.3, 0.3, 0.1])

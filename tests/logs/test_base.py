@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 
 from robotid.exceptions import DataError
+from robotid.log_files.read import read_log, write_log
 from robotid.logs.base import (
     BaseColumns,
     BaseMotion,
@@ -16,7 +17,6 @@ from robotid.logs.base import (
     quaternions_of_angles,
 )
 from robotid.logs.data import Log
-from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 

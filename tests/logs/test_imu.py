@@ -7,10 +7,10 @@ import pinocchio as pin
 import pytest
 
 from robotid.exceptions import DataError
+from robotid.log_files.read import read_log, write_log
 from robotid.logs.base import BaseColumns, BaseMotion, base_state
 from robotid.logs.data import Log
 from robotid.logs.imu import ImuFrame, ImuMotion, motion_of_imu
-from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 

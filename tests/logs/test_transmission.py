@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from robotid.exceptions import DataError, SettingsError
-from robotid.logs.formats import write_columns
-from robotid.logs.read import read_log
+from robotid.log_files.formats import write_columns
+from robotid.log_files.read import read_log
 from robotid.logs.settings import LogUnits
 from robotid.logs.transmission import Transmission
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from robotid.exceptions import DataError
+from robotid.log_files.formats import write_columns
+from robotid.log_files.read import read_log
 from robotid.logs.data import Log
-from robotid.logs.formats import write_columns
-from robotid.logs.read import read_log
 from robotid.logs.settings import LogUnits
 from robotid.logs.units import check_units
 

@@ -10,8 +10,8 @@ from robotid.cli import main
 from robotid.cli import track as command
 from robotid.commands.job import read_job
 from robotid.exceptions import DataError, MissingDependencyError
-from robotid.logs import parquet_files
-from robotid.logs.read import write_log
+from robotid.log_files import parquet_files
+from robotid.log_files.read import write_log
 from robotid.online.settings import OnlineSettings
 from robotid.online.tracking import track
 

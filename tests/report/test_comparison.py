@@ -19,7 +19,7 @@ from robotid.diagnosis.torque_split import split_torque
 from robotid.exceptions import DataError
 from robotid.export.entries import build_result
 from robotid.export.result import read_result
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.pages.html import code
 from robotid.report import comparison_page
 from robotid.report.comparison import _friction_curves, compare_results, write_comparison

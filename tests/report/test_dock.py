@@ -12,7 +12,7 @@ from helpers.paths import URDF
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.report.advice import Origin
 from robotid.report.dock import Clip, Dock
 from robotid.robot.model import RobotModel

@@ -11,7 +11,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.cli import main
 from robotid.exceptions import DataError
 from robotid.export.result import read_result
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.pages.html import page
 from robotid.report import comparison_page
 from robotid.robot.model import RobotModel

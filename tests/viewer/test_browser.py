@@ -17,7 +17,7 @@ from helpers.paths import URDF
 from helpers.synthetic import perfect, truth
 from PIL import Image
 
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.robot.model import RobotModel
 from robotid.simulation.closed_loop import Noise
 from robotid.simulation.motions import random_fourier

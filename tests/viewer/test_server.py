@@ -15,7 +15,7 @@ from robotid.cli import main
 from robotid.commands.job import job_from_settings
 from robotid.commands.track import serve_track
 from robotid.exceptions import SettingsError
-from robotid.logs.read import write_log
+from robotid.log_files.read import write_log
 from robotid.viewer import server as live_module
 from robotid.viewer.scene import coordinates
 from robotid.viewer.server import LivePage

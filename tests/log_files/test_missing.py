@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from robotid.exceptions import DataError, SettingsError
-from robotid.logs.read import read_log
+from robotid.log_files.read import read_log
 from robotid.logs.settings import LogSource
 
 UR = ("pan", "lift", "elbow", "wrist_1", "wrist_2", "wrist_3")

@@ -13,10 +13,10 @@ from robotid._files import read_json
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
+from robotid.log_files.parquet_files import load_pyarrow
+from robotid.log_files.table import Format, Table, choose, parsing
 from robotid.logs.data import suggestion
-from robotid.logs.parquet_files import load_pyarrow
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Format, Table, choose, parsing
 
 __all__ = ["LeRobotFormat"]
 

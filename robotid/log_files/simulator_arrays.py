@@ -7,8 +7,8 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.log_files.table import Table
 from robotid.logs.base import ACCELERATION, POSE, TWIST, in_base
-from robotid.logs.table import Table
 
 __all__ = ["with_simulator_arrays"]
 

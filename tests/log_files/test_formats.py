@@ -20,9 +20,9 @@ from helpers.recorders import (
 from mcap.writer import Writer as McapLibraryWriter
 
 from robotid.exceptions import DataError, MissingDependencyError, SettingsError
+from robotid.log_files.formats import open_table, write_columns
+from robotid.log_files.read import read_log, write_log
 from robotid.logs.data import Log
-from robotid.logs.formats import open_table, write_columns
-from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import LogSource
 
 JOINTS = ("shoulder", "elbow")
@@ -491,7 +491,7 @@ def test_reading_a_csv_file_loads_no_other_library(tmp_path):
 
     write_log(make_log(), tmp_path / "run.csv")
     code = (
-        "import sys\nfrom robotid.logs.read import read_log\n"
+        "import sys\nfrom robotid.log_files.read import read_log\n"
         f"read_log({str(tmp_path / 'run.csv')!r}, {JOINTS!r})\n"
         "sys.exit(any(m.split('.')[0] in ('rosbags', 'h5py', 'pyarrow') for m in sys.modules))"
     )

@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from robotid.exceptions import DataError, MissingDependencyError, SettingsError
+from robotid.log_files.read import read_log, write_log
 from robotid.logs.data import Log
-from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import LogUnits
 
 JOINTS = ("shoulder", "elbow")
@@ -559,7 +559,7 @@ def test_parquet_without_pyarrow_says_how_to_install_it(tmp_path, monkeypatch):
 
 
 def test_import_does_not_load_pyarrow():
-    code = "import sys, robotid, robotid.logs.read; sys.exit('pyarrow' in sys.modules)"
+    code = "import sys, robotid, robotid.log_files.read; sys.exit('pyarrow' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

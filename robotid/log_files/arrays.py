@@ -15,10 +15,10 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.findings import listed
+from robotid.log_files.simulator_arrays import with_simulator_arrays
+from robotid.log_files.table import Table, WritableFormat, choose, parsing, prefixes
 from robotid.logs.data import suggestion
 from robotid.logs.settings import LogSource
-from robotid.logs.simulator_arrays import with_simulator_arrays
-from robotid.logs.table import Table, WritableFormat, choose, parsing, prefixes
 
 __all__ = ["Hdf5Format", "MatFormat", "NpzFormat"]
 

@@ -6,14 +6,14 @@ from pathlib import Path
 from robotid._files import missing_file, written_whole
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
-from robotid.logs.arrays import Hdf5Format, MatFormat, NpzFormat
-from robotid.logs.bags import BagFormat
-from robotid.logs.csv_files import CsvFormat
-from robotid.logs.foreign_tables import with_own_names
-from robotid.logs.lerobot import LeRobotFormat
-from robotid.logs.parquet_files import ParquetFormat
+from robotid.log_files.arrays import Hdf5Format, MatFormat, NpzFormat
+from robotid.log_files.bags import BagFormat
+from robotid.log_files.csv_files import CsvFormat
+from robotid.log_files.foreign_tables import with_own_names
+from robotid.log_files.lerobot import LeRobotFormat
+from robotid.log_files.parquet_files import ParquetFormat
+from robotid.log_files.table import Format, Table, WritableFormat
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Format, Table, WritableFormat
 
 __all__ = ["check_suffix", "open_table", "write_columns"]
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from robotid.exceptions import DataError
+from robotid.log_files.read import read_log
 from robotid.logs.base import BaseColumns, base_state
-from robotid.logs.read import read_log
 
 JOINTS = ("hip", "knee")
 BASE = BaseColumns(True, twist="world")  # the arrays themselves state their axes

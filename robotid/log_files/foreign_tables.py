@@ -10,9 +10,9 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
+from robotid.log_files.table import Place, RowReader, Table, choose, prefixes
 from robotid.logs.data import suggestion
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Place, RowReader, Table, choose, prefixes
 
 __all__ = ["Frame", "is_frame", "open_frame", "with_own_names"]
 

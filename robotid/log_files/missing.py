@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from robotid._similar import is_commanded, similar_columns, similar_joints
 from robotid.exceptions import DataError
 from robotid.findings import listed, quoted, toml_key
+from robotid.log_files.table import prefixes, quantity_of
 from robotid.logs.settings import LogSource
-from robotid.logs.table import prefixes, quantity_of
 
 __all__ = ["NOUNS", "SIZES", "Missing"]
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
+from robotid.log_files.table import Place, RowReader, Table, WritableFormat, parsing
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Place, RowReader, Table, WritableFormat, parsing
 
 __all__ = ["ParquetFormat", "load_pyarrow"]
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.log_files.table import Place, RowReader, Table, WritableFormat
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Place, RowReader, Table, WritableFormat
 
 __all__ = ["CsvFormat"]
 

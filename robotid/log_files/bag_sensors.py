@@ -12,11 +12,11 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
+from robotid.log_files.table import Table
 from robotid.logs.base import POSE, TWIST
 from robotid.logs.data import suggestion
 from robotid.logs.imu import IMU
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Table
 
 __all__ = ["Sensor", "first_of", "is_low_state", "sensors_of", "with_sensors"]
 

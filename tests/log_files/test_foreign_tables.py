@@ -13,11 +13,11 @@ from helpers.synthetic import exact_log, truth
 import robotid
 from robotid.commands.convert import convert
 from robotid.exceptions import DataError, ModelError
+from robotid.log_files.formats import open_table
+from robotid.log_files.read import read_log, read_logs, write_log
+from robotid.log_files.table import Place
 from robotid.logs.data import Log
-from robotid.logs.formats import open_table
-from robotid.logs.read import read_log, read_logs, write_log
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Place
 from robotid.robot.examples import example_urdf
 
 JOINTS = ("shoulder", "elbow")

@@ -17,9 +17,9 @@ from helpers.recorders import (
 )
 
 from robotid.exceptions import DataError
+from robotid.log_files.read import read_log
 from robotid.logs.base import BaseColumns, quaternions_of_angles
 from robotid.logs.imu import ImuFrame
-from robotid.logs.read import read_log
 from robotid.logs.settings import LogSource
 
 ODOMETRY, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu"

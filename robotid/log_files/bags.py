@@ -17,10 +17,10 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.findings import listed
-from robotid.logs.bag_sensors import Sensor, first_of, is_low_state, sensors_of, with_sensors
+from robotid.log_files.bag_sensors import Sensor, first_of, is_low_state, sensors_of, with_sensors
+from robotid.log_files.table import Format, Table, choose
 from robotid.logs.data import repeated, suggestion
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Format, Table, choose
 
 __all__ = ["BagFormat"]
 

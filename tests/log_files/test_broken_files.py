@@ -11,9 +11,9 @@ import pytest
 import scipy.io
 
 from robotid.exceptions import DataError
+from robotid.log_files.read import read_log, write_log
 from robotid.logs.data import Log
 from robotid.logs.measured_velocity import velocity_lag
-from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 

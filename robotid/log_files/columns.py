@@ -10,10 +10,10 @@ import numpy as np
 from robotid._settings import is_number
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed, quoted, toml_key
+from robotid.log_files.missing import NOUNS, SIZES, Missing
+from robotid.log_files.table import prefixes
 from robotid.logs.data import repeated, suggestion
-from robotid.logs.missing import NOUNS, SIZES, Missing
 from robotid.logs.settings import LogSource
-from robotid.logs.table import prefixes
 from robotid.logs.transmission import Transmission
 
 __all__ = ["NOUNS", "TORQUES", "Finder", "Needs", "without_torque"]

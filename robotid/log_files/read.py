@@ -19,18 +19,18 @@ from robotid._settings import require_each, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
+from robotid.log_files.columns import NOUNS, TORQUES, Finder, Needs, without_torque
+from robotid.log_files.foreign_tables import Frame, is_frame, open_frame, with_own_names
+from robotid.log_files.formats import open_table, write_columns
+from robotid.log_files.table import Table
 from robotid.logs.base import BaseColumns, base_columns, base_of, contacts_of, table_of_base
-from robotid.logs.columns import NOUNS, TORQUES, Finder, Needs, without_torque
 from robotid.logs.data import (
     COLUMNS,
     Log,
     require_finite,
     require_increasing,
 )
-from robotid.logs.foreign_tables import Frame, is_frame, open_frame, with_own_names
-from robotid.logs.formats import open_table, write_columns
 from robotid.logs.settings import PER_SECOND, LogSource, LogUnits
-from robotid.logs.table import Table
 from robotid.logs.transmission import Transmission, check_transmissions
 from robotid.logs.units import check_units
 

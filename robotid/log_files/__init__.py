@@ -1,0 +1,3 @@
+"""Files of recordings: tables, arrays, bags and data sets, read into logs."""
+
+__all__: list[str] = []
