@@ -25,6 +25,9 @@ __all__ = ["COMMANDS", "main"]
 
 # Objects made between two garbage collections. A command makes many, and almost no cycles.
 _OBJECTS = 50_000
+# Threads of BLAS, one each if the environment does not state them: matrices are small, and waiting
+# threads use processor time.
+_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 # Parameters of glibc's mallopt. Only freed memory above these sizes, of one array and in total,
 # goes back to the system. Without them, new pages for every array cost a tenth of a run.
 _MMAP_THRESHOLD, _LARGE = -3, 2**25  # [bytes], the maximum that glibc accepts
@@ -50,6 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     code = 0
     gc.set_threshold(_OBJECTS)
+    for variable in _THREADS:  # before numpy is imported
+        os.environ.setdefault(variable, "1")
     open_closed_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):  # its encoding may lack characters of a name
         sys.stdout.reconfigure(errors="backslashreplace")

@@ -470,3 +470,17 @@ print(made_anew())
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert int(done.stdout.split()[-1]) < 1000  # pages: 60,000 are in all of them
+
+
+@pytest.mark.parametrize("stated", ["", "3"])
+def test_blas_has_one_thread_unless_the_environment_states_another_number(stated):
+    code = (
+        "import os, sys; from robotid.cli import main\n"
+        "try: main(['--version'])\n"
+        "except SystemExit: pass\n"
+        "print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    own = {k: x for k, x in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    own |= {"OPENBLAS_NUM_THREADS": stated} if stated else {}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=own)
+    assert done.stdout.splitlines()[-1] == f"False {stated or '1'}"
