@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import platform
 import re
 import subprocess
