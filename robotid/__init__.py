@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from robotid.commands.in_memory import identify
     from robotid.commands.job import read_job
     from robotid.doctor.diagnosis import check_logs
-    from robotid.doctor.urdf import inspect_urdf
     from robotid.exceptions import RobotIdError
     from robotid.export.mjcf import write_mjcf
     from robotid.export.ranges import write_ranges
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from robotid.robot.constraints import Contact, Loop
     from robotid.robot.model import RobotModel
     from robotid.robot.parameters import Coupling
+    from robotid.urdf_audit.inspection import inspect_urdf
     from robotid.versions import __version__
     from robotid.viewer.replays import replay
 
@@ -72,7 +72,7 @@ _MODULES = {
     "commands.in_memory": ["identify"],
     "commands.job": ["read_job"],
     "doctor.diagnosis": ["check_logs"],
-    "doctor.urdf": ["inspect_urdf"],
+    "urdf_audit.inspection": ["inspect_urdf"],
     "exceptions": ["RobotIdError"],
     "export.mjcf": ["write_mjcf"],
     "export.ranges": ["write_ranges"],

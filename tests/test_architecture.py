@@ -22,7 +22,7 @@ LINES = [
     "_settings pages",
     "robot logs",
     "log_files regressor",
-    "estimators simulation variation workers",
+    "estimators simulation urdf_audit variation workers",
     "doctor",
     "fitting",
     "diagnosis",

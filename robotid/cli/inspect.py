@@ -35,8 +35,8 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid.doctor.urdf import inspect_urdf
     from robotid.exceptions import ModelError
+    from robotid.urdf_audit.inspection import inspect_urdf
 
     content = inspect_urdf(options.urdf, free_flyer=options.free_flyer).to_dict()
     if not (content["robot"] or options.json):

@@ -19,7 +19,6 @@ from robotid.doctor.sample import Probe, smooth_motion, take_probe
 from robotid.doctor.torque_channels import check_torque_channels
 from robotid.doctor.torque_delay import check_torque_delay
 from robotid.doctor.torques import check_torques
-from robotid.doctor.urdf_base import rounded_robot
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, log_finding
 from robotid.log_files.read import Readable, read_logs
@@ -28,6 +27,7 @@ from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import logged_base
 from robotid.robot.model import RobotModel
+from robotid.urdf_audit.rounding import rounded_robot
 
 __all__ = ["CODES", "check_logs", "diagnose", "findings_to_dict"]
 

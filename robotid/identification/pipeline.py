@@ -15,7 +15,6 @@ from robotid.diagnosis.misfit_findings import counterbalanced, settled, with_kno
 from robotid.diagnosis.model_error import settled_shapes, with_model_error
 from robotid.diagnosis.sample import take_sample
 from robotid.doctor.diagnosis import diagnose
-from robotid.doctor.urdf_inertials import impossible_inertials
 from robotid.exceptions import (
     DataError,
     ModelError,
@@ -41,6 +40,7 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import logged_base
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
+from robotid.urdf_audit.inertials import impossible_inertials
 from robotid.variation.variation import vary
 
 __all__ = ["conclude", "identify", "robot_of", "with_drives"]

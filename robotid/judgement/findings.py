@@ -12,7 +12,6 @@ from robotid._typing import Array
 from robotid.diagnosis.decisions import TENFOLD
 from robotid.diagnosis.misfit import Misfit
 from robotid.diagnosis.misfit_findings import misfit_findings
-from robotid.doctor.urdf_geometry import audit_bodies
 from robotid.estimators.consistent.constraints import slabs
 from robotid.findings import Finding, listed
 from robotid.fitting.regressor_noise import encoder_findings
@@ -24,6 +23,7 @@ from robotid.robot.bodies import held_parameters, least_density
 from robotid.robot.geometry import body_boxes, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
+from robotid.urdf_audit.geometry import audit_bodies
 
 __all__ = [
     "consistency_findings",

@@ -11,7 +11,6 @@ from robotid._typing import Array
 from robotid.diagnosis.residuals import friction_split
 from robotid.findings import listed
 from robotid.fitting.drives import DriveChoice
-from robotid.fitting.information import Information, information
 from robotid.identification.pictures import (
     friction_chart,
     parameter_charts,
@@ -22,6 +21,7 @@ from robotid.identification.pictures import (
 from robotid.identification.result import Identification
 from robotid.pages.charts import Chart, chart_html
 from robotid.pages.html import code, figure, folded, number, table, text
+from robotid.report.information import Information, information
 
 __all__ = ["drive_figures", "friction_section", "information_section", "residual_section"]
 

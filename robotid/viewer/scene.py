@@ -17,7 +17,7 @@ from robotid._typing import Array
 from robotid.robot.meshes import Shape, Surface, find_mesh, read_shapes, read_surfaces
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.robot.thinning import thin
+from robotid.viewer.thinning import thin
 
 __all__ = ["Ellipsoid", "Scene", "coordinates", "ellipsoids", "mass_marks", "packed", "robot_scene"]
 

@@ -8,11 +8,11 @@ from functools import lru_cache
 import pytest
 from helpers.paths import DOCS
 
-from robotid.doctor.urdf import inspect_urdf
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot import geometry
 from robotid.robot.examples import example_urdfs
 from robotid.robot.model import RobotModel
+from robotid.urdf_audit.inspection import inspect_urdf
 
 AUDIT, COUNTS = DOCS / "evidence/urdf_audit.md", DOCS / "evidence/base_counts.md"
 WRITES = {"ROBOTID_WRITE_AUDIT", "ROBOTID_WRITE_COUNTS"} & set(os.environ)

@@ -24,14 +24,14 @@ from robotid.doctor.hypotheses import Explanation, _refined
 from robotid.doctor.loads import _payload
 from robotid.doctor.motions import check_excitation
 from robotid.doctor.torque_channels import check_torque_channels
-from robotid.doctor.urdf_geometry import _copies
-from robotid.doctor.urdf_inertials import impossible_inertial
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Inertial
+from robotid.urdf_audit.geometry import _copies
+from robotid.urdf_audit.inertials import impossible_inertial
 
 T = 3.0 + np.arange(2000) / 100
 

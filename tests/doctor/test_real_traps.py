@@ -6,7 +6,7 @@ import pytest
 
 from robotid.commands.job import LogEntry, read_job
 from robotid.doctor.diagnosis import diagnose
-from robotid.doctor.urdf import inspect_urdf
+from robotid.urdf_audit.inspection import inspect_urdf
 
 JOBS = Path(__file__).parents[1] / "jobs"
 # what the notes of each set say, and the finding with the figure that tells it

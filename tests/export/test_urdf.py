@@ -10,7 +10,6 @@ import pytest
 from helpers.closed_chains import four_bar
 from helpers.robots import motion, possible_parameters
 
-from robotid.doctor.urdf import inspect_urdf
 from robotid.estimators import OLS
 from robotid.exceptions import DataError, ModelError
 from robotid.export import urdf
@@ -24,6 +23,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, pseudo_inertia
 from robotid.robot.tree import read_tree
 from robotid.robot.urdf_text import read_with_yourdfpy
+from robotid.urdf_audit.inspection import inspect_urdf
 
 # three joints; a tool on a fixed joint, a frame without inertial, and much that is no dynamics
 RICH = """\ufeff<?xml version="1.0" encoding="utf-8"?>

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from helpers.pages import charts, tables
 
-from robotid.fitting.information import information
 from robotid.identification.pictures import residual_charts
 from robotid.pages.charts import Chart, Series
 from robotid.report.diagnosis import (
@@ -18,6 +17,7 @@ from robotid.report.diagnosis import (
     information_section,
 )
 from robotid.report.errors import _notes
+from robotid.report.information import information
 from robotid.report.torques import _totals
 
 

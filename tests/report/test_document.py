@@ -10,13 +10,13 @@ from helpers.pages import chart, tables
 
 from robotid.exceptions import DataError
 from robotid.findings import Finding
-from robotid.fitting.information import information
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.pages.html import number, percent
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.report.document import write_report
+from robotid.report.information import information
 from robotid.robot.model import RobotModel
 from robotid.versions import versions
 

@@ -13,10 +13,10 @@ from helpers.figures import torques
 from helpers.pages import chart, percent
 
 from robotid.diagnosis.residuals import autocorrelation, spectrum
-from robotid.fitting.information import information
 from robotid.identification.pictures import QUANTILE, torque_charts
 from robotid.report import torques as torques_module
 from robotid.report.advice import Origin
+from robotid.report.information import information
 from robotid.report.torques import torques_section
 
 JOINTS = range(6)

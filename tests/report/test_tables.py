@@ -14,10 +14,10 @@ from helpers.figures import figures
 from helpers.pages import number, percent, tables
 
 from robotid.estimators.determination import Group
-from robotid.fitting.information import information
 from robotid.identification.summary import verdict_cell
 from robotid.pages import html
 from robotid.report.advice import Origin
+from robotid.report.information import information
 from robotid.report.tables import _consistency_notes, _coverage, _drive_table, base_table
 from robotid.report.torques import shown_torques
 from robotid.robot.parameters import INERTIAL_TERMS

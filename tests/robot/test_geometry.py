@@ -4,7 +4,6 @@ from helpers.fitting import fit
 from helpers.hostile_urdfs import FILES
 from helpers.synthetic import exact_log, truth
 
-from robotid.doctor.urdf import inspect_urdf
 from robotid.exceptions import SettingsError
 from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.settings import SignalSettings
@@ -18,6 +17,7 @@ from robotid.robot.geometry import (
 )
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
+from robotid.urdf_audit.inspection import inspect_urdf
 
 URDF = """<robot name="arm">
 <link name="base"/>

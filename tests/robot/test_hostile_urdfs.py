@@ -9,12 +9,12 @@ import pytest
 from helpers.hostile_urdfs import FILES, MESHES, HostileUrdf, run_urdf, urdf_inputs
 from hypothesis import HealthCheck, given, settings
 
-from robotid.doctor.urdf import inspect_urdf
 from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.robot.examples import example_urdf
 from robotid.robot.meshes import find_mesh, read_surfaces
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
+from robotid.urdf_audit.inspection import inspect_urdf
 
 CHAIN = """<link name="l{0}"/>
 <joint name="j{0}" type="{2}"><parent link="l{1}"/><child link="l{0}"/></joint>"""

@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from robotid.robot.meshes import Surface
-from robotid.robot.thinning import thin
+from robotid.viewer.thinning import thin
 
 
 def surface_of(mesh, rgba=None):

@@ -4,10 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robotid.doctor.urdf import inspect_urdf
-from robotid.doctor.urdf_geometry import _against_kinematics, audit_bodies, audit_links
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+from robotid.urdf_audit.geometry import _against_kinematics, audit_bodies, audit_links
+from robotid.urdf_audit.inspection import inspect_urdf
 
 DOCS = Path(__file__).parents[2] / "docs" / "evidence/urdf_audit.md"
 ARM = """<robot name="arm">

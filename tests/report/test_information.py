@@ -7,10 +7,10 @@ import pytest
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
-from robotid.fitting.information import information
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.factors import Factors
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.report.information import information
 from robotid.robot.model import RobotModel
 
 

@@ -6,14 +6,14 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.doctor.diagnosis import check_logs
-from robotid.doctor.urdf import inspect_urdf
-from robotid.doctor.urdf_base import rounded_robot
 from robotid.exceptions import ModelError
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import random_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.urdf_text import read_with_yourdfpy
+from robotid.urdf_audit.inspection import inspect_urdf
+from robotid.urdf_audit.rounding import rounded_robot
 
 CLEAN = """<robot name="two">
   <link name="base"/>

@@ -10,9 +10,6 @@ from typing import Any
 import numpy as np
 
 from robotid._settings import require_flag, require_kind
-from robotid.doctor.urdf_base import rounded_angles, weak_parameters
-from robotid.doctor.urdf_geometry import audit_links
-from robotid.doctor.urdf_inertials import impossible_inertial, negative_masses
 from robotid.exceptions import ModelError
 from robotid.findings import Finding, listed
 from robotid.regressor.base_parameters import (
@@ -25,6 +22,9 @@ from robotid.robot.bodies import LinkPlace, link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import MOVABLE
 from robotid.robot.urdf_text import number_fault, numbers, parse_urdf, read_with_yourdfpy
+from robotid.urdf_audit.geometry import audit_links
+from robotid.urdf_audit.inertials import impossible_inertial, negative_masses
+from robotid.urdf_audit.rounding import rounded_angles, weak_parameters
 
 __all__ = ["Inspection", "Structure", "inspect_urdf"]
 

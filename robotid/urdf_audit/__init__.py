@@ -1,0 +1,3 @@
+"""Audit of a URDF: what is missing, impossible or implausible in it."""
+
+__all__: list[str] = []
