@@ -36,10 +36,7 @@ from robotid.robot.prior import prior_spread
 __all__ = ["with_contact_errors"]
 
 _FIRST, _MOST = 3e-3, 0.02  # [m] initial value of s, and its bound
-_STEPS, _SETTLED = (
-    100,
-    1e-3,
-)  # steps of the evidence's maximisation, relative change of s at its end
+_STEPS, _SETTLED = 100, 1e-3  # steps of the maximisation, relative change of s at its end
 
 
 def with_contact_errors(recordings: Recordings) -> Recordings:

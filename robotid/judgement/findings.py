@@ -421,10 +421,15 @@ def _dense_bodies(fit: Fit) -> list[Finding]:
             continue
         # at equal inertia the density is proportional to the mass to the power of 2.5
         excess = float(now[0]) * (1.0 - (_DENSEST / density) ** 0.4)
+        needs = (
+            f"needs a density of at least {float(f'{density:.2g}'):.0f} kg/m^3 (wanted: at most "
+            f"{_DENSEST:g}, steel has 7900)"
+            if np.isfinite(density)
+            else "is that of a body without volume"
+        )
         message = (
-            f"as identified, the mass of {body} is {now[0]:.3g} kg and its inertia needs a density "
-            f"of at least {float(f'{density:.2g}'):.0f} kg/m^3 (wanted: at most {_DENSEST:g}, "
-            f"steel has 7900): such a body is not possible. {_remedy(fit, body, excess)}"
+            f"as identified, the mass of {body} is {now[0]:.3g} kg and its inertia {needs}: such a "
+            f"body is not possible. {_remedy(fit, body, excess)}"
         )
         evidence = {"mass": float(now[0]), "density": density}
         findings.append(Finding("dense_body", "warning", f"link {body}", message, evidence))

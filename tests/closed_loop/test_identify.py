@@ -285,7 +285,7 @@ def test_a_stated_delay_that_is_wrong_is_no_good_result(leg):
     [bound] = [f for f in found.findings if f.code == "at_bound"]
     assert bound.severity == "warning"
     assert "armature" in bound.message
-    assert "Leave the delay out of [controller]" in bound.message
+    assert "leave the delay out of [controller]" in bound.message.lower()
     assert found.verdict.status != "good"
     assert bound.message in found.verdict.reasons
 

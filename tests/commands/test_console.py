@@ -126,7 +126,8 @@ def test_a_result_names_recordings_with_their_windows_and_commands_that_work(arm
     again = shlex.split(commands[0])
     assert any("--gains" in line for line in commands[1:])  # the scale is not verified
     assert again[again.index("--friction") + 1] == "viscous+coulomb"
-    assert main([*again[1:], "--no-report", "--out", str(out)]) == 0
+    assert again[again.index("--out") + 1] == str(out)
+    assert main([*again[1:], "--no-report"]) == 0
     assert "\nverdict: good" in capsys.readouterr().out
     page = arm_logs / "page.html"
     replay = ["replay", ARM, str(arm_logs / "keep.csv"), str(out), "--html", str(page)]
@@ -266,7 +267,7 @@ def test_compare_shows_the_largest_differences_and_fits_eighty_columns(monkeypat
         "base_parameters": [
             entry | {"name": f"{name}_{k}", "differences": [20.0 - k]} for k in range(15)
         ],
-        "settings": [], "versions": [], "inputs": [],
+        "settings": [], "versions": [], "inputs": [], "changes": [],
     }  # fmt: skip
     compare._show(content)
     lines = capsys.readouterr().out.splitlines()

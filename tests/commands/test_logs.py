@@ -63,6 +63,12 @@ def test_what_is_read_is_what_the_job_says_of_windows_and_of_joints_that_slide(h
     assert (told["units"], told["source"], told["transmissions"]) == (job.units, job.source, [])
 
 
+@dataclass(frozen=True)
+class _Surveyed:
+    name: str
+    unit: str = ""
+
+
 @pytest.mark.parametrize(
     ("in_memory", "counts", "is_static", "length"),
     [
@@ -90,14 +96,16 @@ def test_logs_of_more_rows_than_memory_may_hold_are_cut_into_eighths(
 
     def surveyed(layout, table, model, signals, window, *, length):
         cut.append((layout.name, window, length))
-        return layout.name
+        return _Surveyed(layout.name)
 
     monkeypatch.setattr(module, "_open", opened)
     monkeypatch.setattr(module, "survey_log", surveyed)
     model = SimpleNamespace(is_static=is_static)
-    groups = [LogEntry(Path("a.csv"), 1.0, 2.0), LogEntry(Path("b.csv"))], [LogEntry(Path("a.csv"))]
+    fitted = [LogEntry(Path("a.csv"), 1.0, 2.0, "arm-1"), LogEntry(Path("b.csv"), unit="arm-2")]
+    groups = fitted, [LogEntry(Path("a.csv"))]
     found = survey_logs(job, model, *groups)
-    assert found == (("a.csv", "b.csv"), ("a.csv",))
+    assert [[log.name for log in group] for group in found] == [["a.csv", "b.csv"], ["a.csv"]]
+    assert [[log.unit for log in group] for group in found] == [["arm-1", "arm-2"], [""]]
     assert cut == [
         ("a.csv", (1.0, 2.0), length), ("b.csv", (None, None), length),
         ("a.csv", (None, None), length),
@@ -111,13 +119,13 @@ def test_a_log_that_cannot_be_used_is_refused_alone_where_that_is_wanted(hand, m
         )
 
     monkeypatch.setattr(module, "_open", opened)
-    monkeypatch.setattr(module, "survey_log", lambda layout, *_, **__: layout.name)
+    monkeypatch.setattr(module, "survey_log", lambda layout, *_, **__: _Surveyed(layout.name))
     entries = [LogEntry(Path(f"{name}.csv")) for name in "abc"]
     refused = []
     found = survey_logs(
         hand, hand.model(), entries, refuse=lambda entry, error: refused.append((entry, str(error)))
     )
-    assert found == (("a.csv", "c.csv"),)
+    assert [[log.name for log in group] for group in found] == [["a.csv", "c.csv"]]
     assert refused == [(entries[1], "no")]
     with pytest.raises(DataError, match="no"):
         survey_logs(hand, hand.model(), entries)

@@ -293,7 +293,8 @@ def test_the_torque_to_be_expected_is_that_of_all_motions_with_its_95_percent(rn
         SimpleNamespace(recording=SimpleNamespace(trajectory=SimpleNamespace(tau=x))) for x in tau
     ]
     bands = [SimpleNamespace(parameters=a, total=b) for a, b in zip(parameters, total, strict=True)]
-    model = SimpleNamespace(row_names=("one", "two"), row_units=("N m", "N"))
+    names = ("one", "two")
+    model = SimpleNamespace(row_names=names, joints=names, row_units=("N m", "N"))
     preview = SimpleNamespace(expected=SimpleNamespace(fitted=fitted, model=model), bands=bands)
     found = _expected_torque(preview)
     assert list(found) == ["one", "two"]

@@ -87,7 +87,8 @@ def test_a_consistent_fit_has_every_setting_and_the_weight_of_its_choice(monkeyp
     folds = [Factors(triangle, columns, np.array([k + 9]), mapping.base_names) for k in range(13)]
     asked = []
 
-    def chosen(fit, segments, how):
+    def chosen(fit, segments, how, repeated):
+        assert repeated == 0.25
         asked.append((fit, segments, how))
         return WeightChoice(7.0, how, ((7.0, 0.2),), 0.5)
 
@@ -97,7 +98,7 @@ def test_a_consistent_fit_has_every_setting_and_the_weight_of_its_choice(monkeyp
         prior="riemannian", prior_weight=weight, margin=3e-3, solver="scs", check=True,
         constraints={"extent": "none", "total_mass": [1.0, 9.0]},
     )  # fmt: skip
-    known = Known(model, mapping, pi, spread, 0.3, sigma, tuple(folds))
+    known = Known(model, mapping, pi, spread, 0.3, sigma, tuple(folds), 0.25)
     fit = consistent_fit(settings, known)
     assert (fit.metric, fit.margin, fit.solver, fit.check) == ("riemannian", 3e-3, "scs", True)
     assert fit.independent_share == 0.3

@@ -277,6 +277,7 @@ def test_what_is_concluded_counts_all_findings_but_the_ignored_ones(
     """Of a fit that is given: notes of all logs, errors and warnings of the doctor."""
     fit = Fit(**{f.name: getattr(identified, f.name) for f in fields(Fit) if f.init})
     given, springs = [], []
+    monkeypatch.setattr(pipeline, "with_contact_errors", lambda recordings: recordings)
     monkeypatch.setattr(pipeline, "with_drives", lambda *x, **_: (given.append(x), fit)[1])
     monkeypatch.setattr(pipeline, "counterbalanced", lambda *x: x)
     monkeypatch.setattr(pipeline, "with_known_springs", lambda *x: (springs.append(x), x[0])[1])
@@ -330,13 +331,15 @@ def test_a_verdict_is_given_all_that_is_known_of_a_result(monkeypatch):
         "model": SimpleNamespace(joints=("x", "y"), is_static=True), "refitted": refitted,
         "determination": SimpleNamespace(undetermined=("u",)), "is_consistent": False,
         "_uncertain_drives": ["d"], "is_poorly_excited": "poorly", "log_errors": ("e",),
-        "warnings": ("w",), "scale_check": "s",
+        "warnings": ("w",), "scale_check": "s", "_row": {"x": 6, "y": 7}.get,
+        "joint_torques": {k: SimpleNamespace(sentence=f"row {k}") for k in (6, 7)},
     }  # fmt: skip
     predictions, determined, named = Identification.verdict.func(SimpleNamespace(**own))
     assert predictions == Predictions(
         "fitted", {"c": 1}, ("x", "y"), ["a", "b"], ("hidden", (fit,))
     )
     assert determined == Determined(("u",), False, "poorly", True, ["d"])
+    assert named.pop("cause_of")("y") == "row 7"
     assert named == {"log_errors": ("e",), "warnings": ("w",), "scale_check": "s"}
 
 

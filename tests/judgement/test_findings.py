@@ -426,17 +426,31 @@ def test_bodies_denser_than_any_material_and_than_the_urdf_are_named_with_their_
     layout = SimpleNamespace(n_inertial=40, bodies=tuple("abcd"))
     before[20:30] = ellipsoid(1e3, (0.1, 0.2, 0.3), centres[2])  # not flat
     found = _dense_bodies(
-        SimpleNamespace(model=SimpleNamespace(layout=layout), prior=before, standard=after)
+        SimpleNamespace(
+            model=SimpleNamespace(layout=layout),
+            prior=before,
+            standard=after,
+            is_consistent=True,
+            estimator=EstimatorSettings("consistent"),
+        )
     )
     assert [(f.code, f.severity, f.where) for f in found] == [
         ("dense_body", "warning", "link a"), ("dense_body", "warning", "link c")
     ]  # fmt: skip
     assert found[0].evidence == pytest.approx({"mass": after[0], "density": 20e3})
-    assert f"its mass is {after[0]:.3g} kg and its inertia needs a density of at least 2e+04" in (
-        found[0].message
+    assert (
+        f"the mass of a is {after[0]:.3g} kg and its inertia needs a density of at least 20000"
+        in (found[0].message)
     )
     assert found[1].evidence == {"mass": after[20], "density": np.inf}
     assert "kg and its inertia is that of a body without volume" in found[1].message
+
+
+class Parameters(str):
+    """Parameters by name, whose masses are 2 and 3 kg."""
+
+    def __getitem__(self, part):
+        return np.array([2.0, 3.0])
 
 
 @pytest.mark.parametrize("of_urdf", [True, False])
@@ -444,8 +458,12 @@ def test_impossible_shapes_are_notes_if_the_urdf_or_the_box_of_the_fit_excuses_t
     monkeypatch, of_urdf
 ):
     boxes = {"a": "box a", "b": "box b"}
-    model = SimpleNamespace(name="robot")
-    fit = SimpleNamespace(model=model, prior="before", standard="after")
+    layout = SimpleNamespace(n_inertial=20, bodies=("a", "b"))
+    model = SimpleNamespace(name="robot", layout=layout)
+    after = Parameters("after")
+    fit = SimpleNamespace(
+        model=model, prior="before", standard=after, estimator=EstimatorSettings("consistent")
+    )
     of = {
         "before": [("density", "b")] if of_urdf else [("density", "a"), ("gyration", "b")],
         "after": [("com_outside", "a"), ("density", "b")],
@@ -471,7 +489,9 @@ def test_impossible_shapes_are_notes_if_the_urdf_or_the_box_of_the_fit_excuses_t
     assert two.message == (
         "density of b in after; the URDF has the same fault"
         if of_urdf
-        else "as identified, density of b in after; record more motion of it, or pin it to the URDF"
+        else "as identified, density of b in after. Record motion about more axes, or pin it to "
+        "the URDF. The predicted torque may still be right; do not use mass, centre of mass and "
+        "inertia of this link"
     )
     wanted = [(fit, "a", "box a"), *([] if of_urdf else [(fit, "b", "box b")])]
     assert asked == wanted

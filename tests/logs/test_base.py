@@ -189,11 +189,14 @@ def test_a_contact_is_0_or_1(log, tmp_path):
     (tmp_path / "log.csv").write_text(text)
     with pytest.raises(DataError, match="contact_l_sole is 2 in row 0, wanted 0 or 1"):
         read_log(tmp_path / "log.csv", log.joints, base=BaseColumns(contacts=("l_sole",)))
-    values = np.array([[0, 1], [1, 0], [0, 0.25], [7, 1.0]])
+    values, wanted = (
+        np.array([[0, 1], [1, 0], [0, 0.25], [7, 1.0]]),
+        BaseColumns(contacts=("a", "b")),
+    )
     with pytest.raises(DataError, match=r"run: contact_a is 7 in row 3, wanted 0 or 1"):
-        contacts_of(values, ("a", "b"), "run")
+        contacts_of(values, wanted, "run")
     with pytest.raises(DataError, match=r"run: contact_b is 0.25 in row 2, wanted 0 or 1"):
-        contacts_of(values[:3], ("a", "b"), "run")
+        contacts_of(values[:3], wanted, "run")
 
 
 def test_columns_of_a_base_may_have_other_names(log, tmp_path):

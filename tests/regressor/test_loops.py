@@ -7,6 +7,7 @@ import pandas as pd
 import pinocchio as pin
 import pytest
 
+from robotid._text import seconds
 from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.fitting.closed_log import closed_log
 from robotid.fitting.survey import hold_log, survey_log
@@ -249,7 +250,7 @@ def test_positions_out_of_reach_are_refused(tmp_path):
     with pytest.raises(DataError, match="no position of elbow, pivot closes") as error:
         closed_log(robot, Log(t, t[:, None], t[:, None], ("drive",)))
     left, wanted = (
-        str(error.value).split(f" at t = {x:g} s: ")[1].split(" m remain, wanted at most ")
+        str(error.value).split(f" at t = {seconds(x)} s: ")[1].split(" m remain, wanted at most ")
     )
     assert float(left) >= np.sqrt(0.15**2 + 0.6**2 - 2 * 0.15 * 0.6 * np.cos(x)) - 0.68
     assert wanted.startswith("6e-06 m")
@@ -284,7 +285,9 @@ def test_a_log_in_another_order_keeps_each_joint_and_names_the_loop_that_is_open
     ) as error:
         closed_log(robot, log)
     gaps = Chains(robot).gaps(moved)
-    assert f"at t = {t[13]:g} s: {gaps[13, 1]:.3g} m remain, wanted at most" in str(error.value)
+    assert f"at t = {seconds(t[13])} s: {gaps[13, 1]:.3g} m remain, wanted at most" in str(
+        error.value
+    )
     assert f"at most {0.02 * robot.length:.2g} m" in str(error.value)
     assert gaps[13:, 0].max() < 1e-9
     assert [Chains(robot).is_closed(x) for x in moved[[12, 13]]] == [True, False]

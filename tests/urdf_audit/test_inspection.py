@@ -20,7 +20,7 @@ CLEAN = """<robot name="two">
   <link name="upper"><inertial><mass value="2"/><origin xyz="0.1 0 0"/>
     <inertia ixx="0.1" iyy="0.12" izz="0.11" ixy="0" ixz="0" iyz="0"/></inertial></link>
   <link name="lower"><inertial><mass value="1"/><origin xyz="0.2 0 0"/>
-    <inertia ixx="0.05" iyy="0.06" izz="0.07" ixy="0" ixz="0" iyz="0"/></inertial></link>
+    <inertia ixx="0.02" iyy="0.03" izz="0.035" ixy="0" ixz="0" iyz="0"/></inertial></link>
   <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
     <origin rpy="0 0 0"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="9" velocity="2"/>
     <dynamics damping="0.5" friction="0.25"/></joint>
