@@ -138,8 +138,8 @@ class LogEntry(Settings):
     path: Path = setting(MISSING, "the file", at="log", **_FILE)
     start: float | None = setting(None, "start of the window in the log's own time [s]")
     end: float | None = setting(None, "end of the window [s]")
-    unit: str = setting(
-        "", "name of the robot, if the logs are of several robots of one kind, as 'arm-07'"
+    unit: str | None = setting(
+        None, "name of the robot, if the logs are of several robots of one kind, as 'arm-07'"
     )
 
 

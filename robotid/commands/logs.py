@@ -88,7 +88,7 @@ def survey_logs(
                     raise found
                 window = entry.start, entry.end
                 log = survey_log(*found, model, job.signals, window, length=length)
-                logs.append(replace(log, unit=entry.unit))
+                logs.append(replace(log, unit=entry.unit or ""))
             except DataError as error:
                 if refuse is None:
                     raise

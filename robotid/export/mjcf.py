@@ -316,7 +316,7 @@ def _add_drives(
 
 def _add_loops(top: ET.Element, model: RobotModel, bodies: Mapping[str, ET.Element]) -> None:
     """Add the loops: each point that coincides is a pair of sites, one in each of the links."""
-    equality = ET.SubElement(top, "equality")
+    equality = ET.SubElement(top, "equality") if model.loops else top
     for loop in model.loops:
         axis = model.length * np.array(loop.axis) / np.linalg.norm(loop.axis)
         tag = "weld" if loop.kind == "rigid" else "connect"

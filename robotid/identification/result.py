@@ -166,6 +166,10 @@ class Identification(Fit):
         shown = tuple((chart, f"{joint}: {about[name]}") for name, chart in charts.items())
         return Plot(f"Torque parts and residual of {joint}", shown)
 
+    def _cause_of(self, joint: str) -> str:
+        """Return the cause of a joint's residual, as a sentence."""
+        return self.joint_torques[self._row(joint)].sentence
+
     def _row(self, joint: str) -> int:
         """Return the index of a joint's torque row."""
         require_kind(joint, str, "joint", "the name of a joint")
@@ -217,11 +221,13 @@ class Identification(Fit):
             self.model.is_static,
             self._uncertain_drives,
         )
+        # of long logs only parts are in memory: not enough for the cause of a residual
+        is_partial = any(e.recording.is_partial for e in (*self.fitted, *self.validation))
         return judge(
             predictions,
             determined,
             log_errors=self.log_errors,
             warnings=self.warnings,
             scale_check=self.scale_check,
-            cause_of=lambda joint: self.joint_torques[self._row(joint)].sentence,
+            cause_of=None if is_partial else self._cause_of,
         )

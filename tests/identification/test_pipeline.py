@@ -323,7 +323,8 @@ def test_what_is_concluded_counts_all_findings_but_the_ignored_ones(
 def test_a_verdict_is_given_all_that_is_known_of_a_result(monkeypatch):
     monkeypatch.setattr(result_module, "hidden_joints", lambda model, fitted: ("hidden", fitted))
     monkeypatch.setattr(result_module, "judge", lambda *x, **named: (*x, named))
-    fit = SimpleNamespace(recording=SimpleNamespace(log=SimpleNamespace(has_torque=True)))
+    log = SimpleNamespace(has_torque=True)
+    fit = SimpleNamespace(recording=SimpleNamespace(log=log, is_partial=False))
     refitted = [SimpleNamespace(recording=SimpleNamespace(name=name)) for name in ("a", "b")]
     own = {
         "metrics": lambda: "fitted", "predictions": {"c": 1}, "fitted": (fit,),
@@ -331,15 +332,14 @@ def test_a_verdict_is_given_all_that_is_known_of_a_result(monkeypatch):
         "model": SimpleNamespace(joints=("x", "y"), is_static=True), "refitted": refitted,
         "determination": SimpleNamespace(undetermined=("u",)), "is_consistent": False,
         "_uncertain_drives": ["d"], "is_poorly_excited": "poorly", "log_errors": ("e",),
-        "warnings": ("w",), "scale_check": "s", "_row": {"x": 6, "y": 7}.get,
-        "joint_torques": {k: SimpleNamespace(sentence=f"row {k}") for k in (6, 7)},
+        "warnings": ("w",), "scale_check": "s", "_cause_of": "cause of a joint",
     }  # fmt: skip
     predictions, determined, named = Identification.verdict.func(SimpleNamespace(**own))
     assert predictions == Predictions(
         "fitted", {"c": 1}, ("x", "y"), ["a", "b"], ("hidden", (fit,))
     )
     assert determined == Determined(("u",), False, "poorly", True, ["d"])
-    assert named.pop("cause_of")("y") == "row 7"
+    assert named.pop("cause_of") == "cause of a joint"
     assert named == {"log_errors": ("e",), "warnings": ("w",), "scale_check": "s"}
 
 
