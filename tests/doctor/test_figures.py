@@ -14,8 +14,6 @@ from robotid.doctor import (
     hypotheses,
     loads,
     mounted,
-    urdf_base,
-    urdf_geometry,
 )
 from robotid.doctor.channels import check_channels
 from robotid.doctor.clock import check_clock
@@ -30,6 +28,7 @@ from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Inertial
+from robotid.urdf_audit import geometry, rounding
 from robotid.urdf_audit.geometry import _copies
 from robotid.urdf_audit.inertials import impossible_inertial
 
@@ -350,11 +349,11 @@ def test_rounded_angles_are_reported_by_what_they_change_with_the_largest_error(
         "a": {"3.1416": np.pi, "1.57": np.pi / 2}, "b": {"0.785": np.pi / 4},
         "c": {"-1.5708": -np.pi / 2},
     }  # fmt: skip
-    monkeypatch.setattr(urdf_base, "_rounded", lambda tree: angles)
-    monkeypatch.setattr(urdf_base, "_effect", lambda model, mapping: (2, "two more"))
-    monkeypatch.setattr(urdf_base, "_carrying", lambda tree: {"a", "c", "other"})
+    monkeypatch.setattr(rounding, "_rounded", lambda tree: angles)
+    monkeypatch.setattr(rounding, "_effect", lambda model, mapping: (2, "two more"))
+    monkeypatch.setattr(rounding, "_carrying", lambda tree: {"a", "c", "other"})
     model = SimpleNamespace(tree=SimpleNamespace(path="x/robot.urdf"))
-    felt, other = urdf_base.rounded_angles(model, None)
+    felt, other = rounding.rounded_angles(model, None)
     assert (felt.severity, felt.where) == ("warning", "file robot.urdf")
     assert felt.evidence == pytest.approx({"largest_error": np.pi / 2 - 1.57, "felt": 1.0})
     assert felt.message.startswith("the joints a, c have rounded angles in rpy; write ")
@@ -372,7 +371,7 @@ def test_a_body_is_small_beside_the_mass_of_all():
         pi[31] = 0.9 * mass  # the centre is outside by 0.4 m
         layout = SimpleNamespace(n_inertial=40, bodies=tuple("abcd"))
         points = dict.fromkeys("abcd", np.array([[-0.5, -0.2, -0.1], [0.5, 0.2, 0.1]]))
-        found = list(urdf_geometry.audit_bodies(SimpleNamespace(layout=layout), pi, points))
+        found = list(geometry.audit_bodies(SimpleNamespace(layout=layout), pi, points))
         outside = one(found, "com_outside")
         assert outside.severity == severity
         assert outside.evidence == {"outside": pytest.approx(0.4)}
