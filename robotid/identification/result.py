@@ -221,13 +221,17 @@ class Identification(Fit):
             self.model.is_static,
             self._uncertain_drives,
         )
-        # of long logs only parts are in memory: not enough for the cause of a residual
-        is_partial = any(e.recording.is_partial for e in (*self.fitted, *self.validation))
+        # not of long logs, of which only parts are in memory, and not of projected rows, whose
+        # torques are not those of joints
+        has_cause = not (
+            self.model.constraints
+            or any(e.recording.is_partial for e in (*self.fitted, *self.validation))
+        )
         return judge(
             predictions,
             determined,
             log_errors=self.log_errors,
             warnings=self.warnings,
             scale_check=self.scale_check,
-            cause_of=None if is_partial else self._cause_of,
+            cause_of=self._cause_of if has_cause else None,
         )
