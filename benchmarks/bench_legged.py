@@ -232,7 +232,7 @@ def main():
     parser.add_argument("--unseen", action="store_true", help="only errors on unseen motion")
     options = parser.parse_args()
     runs, seconds = (1, 4.0) if options.quick else (options.runs, options.seconds)
-    for name in options.robots:
+    for name in ("go1", "g1", "cassie") if options.quick else options.robots:
         if options.unseen:
             unseen(name, options.first, seconds)
         else:

@@ -128,7 +128,7 @@ def _row(
     why, link, picture = joint_reason(bar.joint, own), "", ""
     if bar.error is not None:
         picture = _picture(bar, bar.error, marks, limits)
-    if bar.why:
+    if bar.why and why:  # else the link would stand alone on a line
         label = f"residual analysis of {escape(bar.joint)}"
         link = f' <a href="#{bar.why}" aria-label="{label}">analysis</a>'
     return (
