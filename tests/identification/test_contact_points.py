@@ -18,6 +18,7 @@ from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import constraint_jacobian, touching
+from robotid.regressor.factors import triangle_of
 from robotid.regressor.prediction import predict
 from robotid.robot.constraints import Contact, frame_id
 from robotid.robot.examples import example_urdf
@@ -93,6 +94,21 @@ def test_the_size_of_offsets_is_found(rng):
     tau = tau - D @ x
     R = np.linalg.qr(np.column_stack([W, D, tau]), mode="r")
     assert estimated_uncertainty(R, 10 * np.eye(5), np.zeros(5), 1.0, 2000) < 1e-4
+
+
+def test_the_size_of_offsets_that_rows_determine_weakly_has_the_largest_evidence(rng):
+    """Offsets whose own errors are as large as they are; rows without them give the noise."""
+    d, size, level = 400, 0.008, 0.5
+    offsets = size * rng.standard_normal(d)
+    D = np.vstack([np.eye(d) * level / size, np.zeros((2000, d))])
+    W = np.zeros((len(D), 1))
+    W[-1] = 1.0
+    tau = D @ offsets + level * rng.standard_normal(len(D))
+    R = triangle_of(np.column_stack([W, D, tau]))
+    found = estimated_uncertainty(R, np.eye(1), np.zeros(1), 1.0, len(D))
+    # the closed form: the variance of each determined row is level^2 (1 + s^2 / size^2)
+    wanted = size * np.sqrt(np.mean(tau[:d] ** 2) / np.var(tau[d:]) - 1.0)
+    assert found == pytest.approx(wanted, rel=0.1)
 
 
 def test_the_covariance_of_the_score_is_that_of_the_stated_uncertainty(log):

@@ -537,6 +537,7 @@ def test_a_parameter_that_earlier_results_do_not_predict_is_a_change(folder, tmp
         result = copy.deepcopy(read_result(folder / "a.json"))
         for entry in result["base_parameters"]:
             entry["value"] *= 1 + 0.01 * rng.normal()
+            entry["std_error"] *= 1 + 0.1 * k
             if k == 4 and entry["name"] == "joint_2.coulomb":
                 entry["value"] *= 4
         paths.append(tmp_path / f"{k}.json")
