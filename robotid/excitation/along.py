@@ -59,7 +59,7 @@ class MotionRegressor:
             a: Accelerations, shape (N, n) [rad/s^2, m/s^2].
         """
         N, lanes = len(q), row_lanes()
-        block = lanes.width(self._work)
+        block = lanes.LANES
         out = np.zeros((self._shape[0] * self._shape[1], -(-N // block) * block))
         motion = own_motion(q, v, a)
         lanes.inertial_rows(self._tree, self._places, motion, self._work, out, (0, N))

@@ -18,7 +18,6 @@ from robotid.logs.data import Trajectory
 from robotid.regressor.columns import RowPlan
 
 if TYPE_CHECKING:
-    from robotid.regressor.lanes import Work
     from robotid.robot.model import RobotModel
 
 __all__ = [
@@ -37,7 +36,6 @@ __all__ = [
 #: of about 0.5 s per process (importing Numba, reading the compiled code). For seven joints in
 #: series that is 1e5 samples. Compiling it takes some 10 s, once per installation.
 LONG_ENOUGH = 3_500_000
-_DOUBLINGS = 6
 
 
 def work_per_sample(model: "RobotModel") -> int:
@@ -78,7 +76,7 @@ class CompiledWriter:
     """Writes blocks of rows into the same memory; one writer per thread."""
 
     def __init__(self, model: "RobotModel", tree: "Tree", plan: RowPlan, out: Array) -> None:
-        """Prepare to write to ``out``, shape (C, k), k a multiple of 64; see ``why_not`` before."""
+        """Prepare to write to ``out``, shape (C, k), k a multiple of 8; see ``why_not`` before."""
         self._model, self._tree, self._out = model, tree, out
         self._places = _places(tree, plan)
         drives = [drive for row in plan.drives for drive in row]
@@ -153,10 +151,10 @@ class Tree(NamedTuple):
         axes: Array = self.joints[:, 33:36] + self.joints[:, 36:39]  # of which one is 0
         return axes
 
-    def work_space(self) -> "Work":
+    def work_space(self) -> Array:
         """Return a new work space for ``row_lanes``."""
         lanes = row_lanes()
-        work: Work = lanes.work_space(lanes.rows_size(*self.rows.shape), _DOUBLINGS)
+        work: Array = lanes.work_space(lanes.rows_size(*self.rows.shape))
         return work
 
     def places(self, wanted: Array) -> Array:

@@ -1,71 +1,276 @@
-"""Work spaces of lanes, and vector algebra in three dimensions, compiled by Numba.
+"""Eight states side by side: a vector type for compiled code, and algebra in three dimensions.
 
 Imported only where compiled code is used, since importing Numba takes time. Numba stores the
 compiled code in the folder ``__pycache__`` beside this file or, if that is not writable, in its own
 folder in the user's cache; the environment variable ``NUMBA_CACHE_DIR`` sets another one.
 
-The values of one quantity are adjacent in memory, one lane each, so that the processor computes
-several states together. Entry ``at`` of a work space is one such quantity.
+Compiled code computes ``LANES`` states together, one in each lane. An entry ``at`` of a work space
+is one quantity of all of them, adjacent in memory: ``get`` reads it as one vector of the processor,
+``put`` writes it. Vectors have the operators of numbers; a comparison returns a mask for ``where``.
+Numba alone would compute one lane after the other, since it cannot show that an entry written is
+not one that the next lane reads.
 """
 
 import math
+import operator
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from llvmlite.ir import FunctionType
+from llvmlite import ir
 from numba import cfunc, njit, types
-from numba.core.cgutils import unpack_tuple
-from numba.extending import intrinsic
+from numba.core.cgutils import get_or_insert_function, unpack_tuple
+from numba.core.imputils import lower_builtin
+from numba.core.typing import signature
+from numba.core.typing.templates import ConcreteTemplate, infer_global
+from numba.extending import intrinsic, models, register_model
+from numba.np.arrayobj import make_array
 
 from robotid._typing import Array
 
 __all__ = [
-    "Work",
+    "LANES",
     "add",
     "applied",
     "compiled",
+    "copysign",
     "cos_sin",
     "cross",
     "dot",
     "factor",
     "get",
     "get3",
+    "is_any",
+    "lane_of",
     "pointed",
     "put",
     "put3",
+    "put_lane",
+    "read",
     "scale",
     "solve",
     "times",
-    "width",
+    "where",
+    "wide",
+    "with_lane",
     "work_space",
+    "write",
 ]
 
+LANES = 8
 _PAIR = types.UniTuple(types.float64, 2)
 _HALF_PI = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 _ROUND = 6755399441055744.0  # 1.5 2^52: adding and subtracting it rounds to the nearest integer
+_CODE = ir.VectorType(ir.DoubleType(), LANES)
+_CONTRACT = ("contract",)  # a b + c may be rounded once
 
 
-class Work(NamedTuple):
-    """A work space: its entries, one after the other, and the number of lanes of each.
+class _Vector(types.Type):
+    """Numba's type of a vector, a number of each lane."""
 
-    The number of lanes is 2 to the length of ``doublings``: Numba knows the length of a tuple at
-    compile time, so that loops over lanes are vectorised.
+    def __init__(self) -> None:
+        super().__init__(name="vector")
+
+
+class _Mask(types.Type):
+    """Numba's type of a mask, a truth value of each lane."""
+
+    def __init__(self) -> None:
+        super().__init__(name="mask")
+
+
+def _modelled(kind: type[types.Type], code: ir.Type) -> types.Type:
+    class Model(models.PrimitiveModel):  # type: ignore[misc]
+        def __init__(self, manager: Any, own: Any) -> None:
+            super().__init__(manager, own, code)
+
+    register_model(kind)(Model)
+    return kind()
+
+
+_vector = _modelled(_Vector, _CODE)
+_mask = _modelled(_Mask, ir.VectorType(ir.IntType(1), LANES))
+
+
+def _wide(builder: Any, value: Any) -> Any:
+    """Return a value as a vector: a number is the same in each lane."""
+    if isinstance(value.type, ir.VectorType):
+        return value
+    one = builder.insert_element(ir.Constant(_CODE, ir.Undefined), value, ir.IntType(32)(0))
+    lanes = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    return builder.shuffle_vector(one, ir.Constant(_CODE, ir.Undefined), lanes)
+
+
+def _define(
+    function: Any, result: types.Type, arguments: tuple[types.Type, ...], code: Any
+) -> None:
+    """Define a function or operator of vectors; numbers among them become vectors.
+
+    Args:
+        function: The function of Python.
+        result: Type of its result.
+        arguments: Types of its arguments; a vector may be a number instead, but not each one.
+        code: Returns the result, from the builder and the arguments.
     """
+    cases = [arguments]
+    if arguments == (_vector, _vector):
+        cases += [(_vector, types.float64), (types.float64, _vector)]
 
-    numbers: Array
-    doublings: tuple[int, ...]
+    class Template(ConcreteTemplate):  # type: ignore[misc]
+        pass
+
+    Template.cases = [signature(result, *case) for case in cases]
+    infer_global(function)(Template)
+    for case in cases:
+
+        @lower_builtin(function, *case)  # type: ignore[misc]
+        def lower(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            wide = (_wide(builder, x) if _vector in arguments else x for x in values)
+            return code(builder, *wide)
 
 
-def work_space(entries: int, doublings: int) -> Work:
-    """Return a work space of zeros.
+def _call(name: str) -> Any:
+    """Return the code that calls an intrinsic function of LLVM."""
+
+    def code(builder: Any, *arguments: Any) -> Any:
+        kind = ir.FunctionType(_CODE, [_CODE] * len(arguments))
+        own = get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f64")
+        return builder.call(own, arguments)
+
+    return code
+
+
+for _name, *_owns in (
+    ("fadd", operator.add, operator.iadd), ("fsub", operator.sub, operator.isub),
+    ("fmul", operator.mul, operator.imul), ("fdiv", operator.truediv, operator.itruediv),
+):  # fmt: skip
+    for _own in _owns:
+        _define(
+            _own, _vector, (_vector, _vector),
+            lambda builder, x, y, name=_name: getattr(builder, name)(x, y, flags=_CONTRACT),
+        )  # fmt: skip
+for _own, _sign in (
+    (operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">="),
+    (operator.eq, "=="),
+):  # fmt: skip
+    _define(
+        _own, _mask, (_vector, _vector),
+        lambda builder, x, y, sign=_sign: builder.fcmp_ordered(sign, x, y),
+    )  # fmt: skip
+_define(operator.neg, _vector, (_vector,), lambda builder, x: builder.fneg(x))
+_define(abs, _vector, (_vector,), _call("fabs"))
+_define(math.sqrt, _vector, (_vector,), _call("sqrt"))
+_define(operator.and_, _mask, (_mask, _mask), lambda builder, x, y: builder.and_(x, y))
+_define(operator.or_, _mask, (_mask, _mask), lambda builder, x, y: builder.or_(x, y))
+_define(operator.invert, _mask, (_mask,), lambda builder, x: builder.not_(x))
+
+
+@intrinsic
+def read(typing, numbers, at):
+    """Return the vector of adjacent numbers of an array, shape (k,), from index ``at``."""
+
+    def code(context, builder, signature, given):
+        place = _place(context, builder, signature.args[0], *given)
+        vector = builder.load(place)
+        vector.align = 8
+        return vector
+
+    return _vector(numbers, types.intp), code
+
+
+@intrinsic
+def write(typing, numbers, at, value):
+    """Write a vector, or one number for all lanes, to adjacent numbers of an array."""
+
+    def code(context, builder, signature, given):
+        place = _place(context, builder, signature.args[0], *given[:2])
+        builder.store(_wide(builder, given[2]), place).align = 8
+        return context.get_dummy_value()
+
+    return types.none(numbers, types.intp, _number_type(value)), code
+
+
+def _place(context, builder, array, value, at):
+    """Return the address of the vector from an index of an array."""
+    first = builder.gep(make_array(array)(context, builder, value).data, [at])
+    return builder.bitcast(first, _CODE.as_pointer())
+
+
+def _number_type(value):
+    return value if value is _vector else types.float64
+
+
+@intrinsic
+def wide(typing, number):
+    """Return a vector of one number."""
+
+    def code(context, builder, signature, given):
+        return _wide(builder, given[0])
+
+    return _vector(types.float64), code
+
+
+@intrinsic
+def where(typing, mask, x, y):
+    """Return x in the lanes of a mask, and y in the others; either may be a number."""
+
+    def code(context, builder, signature, given):
+        return builder.select(given[0], _wide(builder, given[1]), _wide(builder, given[2]))
+
+    return _vector(mask, _number_type(x), _number_type(y)), code
+
+
+@intrinsic
+def is_any(typing, mask):
+    """Return whether a mask is true in any lane."""
+
+    def code(context, builder, signature, given):
+        bits = builder.bitcast(given[0], ir.IntType(LANES))
+        return builder.icmp_unsigned("!=", bits, bits.type(0))
+
+    return types.boolean(mask), code
+
+
+@intrinsic
+def lane_of(typing, x, lane):
+    """Return the number of one lane."""
+
+    def code(context, builder, signature, given):
+        return builder.extract_element(*given)
+
+    return types.float64(x, types.intp), code
+
+
+@intrinsic
+def with_lane(typing, x, lane, value):
+    """Return a vector with another number in one lane."""
+
+    def code(context, builder, signature, given):
+        return builder.insert_element(given[0], given[2], given[1])
+
+    return _vector(x, types.intp, types.float64), code
+
+
+@intrinsic
+def copysign(typing, x, y):
+    """Return the size of x with the sign of y, of each lane; x may be a number."""
+
+    def code(context, builder, signature, given):
+        return _call("copysign")(builder, _wide(builder, given[0]), given[1])
+
+    return _vector(_number_type(x), y), code
+
+
+def work_space(entries: int) -> Array:
+    """Return a work space of zeros, shape (entries LANES,), each entry in one line of the cache.
 
     Args:
         entries: Number of entries.
-        doublings: Binary logarithm of the number of lanes.
     """
-    return Work(np.zeros(entries << doublings), (0,) * doublings)
+    numbers = np.zeros((entries + 1) * LANES)
+    first = -(numbers.ctypes.data // numbers.itemsize) % LANES
+    return numbers[first : first + entries * LANES]
 
 
 def compiled(function: Any) -> Any:
@@ -100,7 +305,7 @@ def _applied(typing, address, x):
 
     def code(context, builder, signature, given):
         numbers = unpack_tuple(builder, given[1])
-        kind = FunctionType(context.get_value_type(_PAIR), [number.type for number in numbers])
+        kind = ir.FunctionType(context.get_value_type(_PAIR), [number.type for number in numbers])
         return builder.call(builder.inttoptr(given[0], kind.as_pointer()), numbers)
 
     return _PAIR(address, x), code
@@ -110,36 +315,35 @@ applied: Any = intrinsic(_applied)
 
 
 @compiled
-def width(work):
-    """Return the number of lanes."""
-    return 1 << len(work.doublings)
+def get(work, at):
+    """Return a quantity."""
+    return read(work, at * LANES)
 
 
 @compiled
-def get(work, at, lane):
-    """Return a quantity of one lane."""
-    # an unsigned index avoids Numba's check of negative ones, which prevents vectorisation
-    return work.numbers[np.uintp(at * (1 << len(work.doublings)) + lane)]
+def get3(work, at):
+    """Return three neighbouring quantities."""
+    return get(work, at), get(work, at + 1), get(work, at + 2)
 
 
 @compiled
-def get3(work, at, lane):
-    """Return three neighbouring quantities of one lane."""
-    return get(work, at, lane), get(work, at + 1, lane), get(work, at + 2, lane)
+def put(work, at, value):
+    """Write a quantity."""
+    write(work, at * LANES, value)
 
 
 @compiled
-def put(work, at, lane, value):
+def put3(work, at, u):
+    """Write three neighbouring quantities."""
+    put(work, at, u[0])
+    put(work, at + 1, u[1])
+    put(work, at + 2, u[2])
+
+
+@compiled
+def put_lane(work, at, lane, value):
     """Write a quantity of one lane."""
-    work.numbers[np.uintp(at * (1 << len(work.doublings)) + lane)] = value
-
-
-@compiled
-def put3(work, at, lane, u):
-    """Write three neighbouring quantities of one lane."""
-    put(work, at, lane, u[0])
-    put(work, at + 1, lane, u[1])
-    put(work, at + 2, lane, u[2])
+    work[np.uintp(at * LANES + lane)] = value  # Numba checks the sign of other indices
 
 
 @compiled
@@ -192,43 +396,37 @@ def cos_sin(angle):
     cosine = (1.0 - 0.5 * z) + z * z * cosine
     quarter = n - 4.0 * ((n * 0.25 - 0.375 + _ROUND) - _ROUND)  # 0, 1, 2 or 3
     is_odd = (quarter == 1.0) | (quarter == 3.0)
-    x, y = (sine, cosine) if is_odd else (cosine, sine)
-    return (-x if (quarter == 1.0) | (quarter == 2.0) else x), (-y if quarter > 1.5 else y)
+    x, y = where(is_odd, sine, cosine), where(is_odd, cosine, sine)
+    return where((quarter == 1.0) | (quarter == 2.0), -x, x), where(quarter > 1.5, -y, y)
 
 
 @compiled
 def factor(work, n, H):
-    """Write the lower Cholesky factor of the symmetric positive definite H, in place."""
+    """Write the lower Cholesky factor of the symmetric positive definite H, in place.
+
+    Its diagonal is written as the reciprocals, by which ``solve`` multiplies.
+    """
     for j in range(n):
-        for k in range(j):
-            for i in range(j, n):
-                for lane in range(width(work)):
-                    x = get(work, H + j * n + k, lane) * get(work, H + i * n + k, lane)
-                    put(work, H + i * n + j, lane, get(work, H + i * n + j, lane) - x)
-        for lane in range(width(work)):
-            put(work, H + j * n + j, lane, math.sqrt(get(work, H + j * n + j, lane)))
-        for i in range(j + 1, n):
-            for lane in range(width(work)):
-                x = get(work, H + i * n + j, lane) / get(work, H + j * n + j, lane)
-                put(work, H + i * n + j, lane, x)
+        for i in range(j, n):
+            x = get(work, H + i * n + j)
+            for k in range(j):
+                x -= get(work, H + j * n + k) * get(work, H + i * n + k)
+            if i == j:
+                put(work, H + j * n + j, 1.0 / math.sqrt(x))
+            else:
+                put(work, H + i * n + j, x * get(work, H + j * n + j))
 
 
 @compiled
 def solve(work, n, H, x):
     """Solve H y = x with the factor of H, in place."""
     for i in range(n):
+        y = get(work, x + i)
         for k in range(i):
-            for lane in range(width(work)):
-                y = get(work, H + i * n + k, lane) * get(work, x + k, lane)
-                put(work, x + i, lane, get(work, x + i, lane) - y)
-        for lane in range(width(work)):
-            y = get(work, x + i, lane) / get(work, H + i * n + i, lane)
-            put(work, x + i, lane, y)
+            y -= get(work, H + i * n + k) * get(work, x + k)
+        put(work, x + i, y * get(work, H + i * n + i))
     for i in range(n - 1, -1, -1):
+        y = get(work, x + i)
         for k in range(i + 1, n):
-            for lane in range(width(work)):
-                y = get(work, H + k * n + i, lane) * get(work, x + k, lane)
-                put(work, x + i, lane, get(work, x + i, lane) - y)
-        for lane in range(width(work)):
-            y = get(work, x + i, lane) / get(work, H + i * n + i, lane)
-            put(work, x + i, lane, y)
+            y -= get(work, H + k * n + i) * get(work, x + k)
+        put(work, x + i, y * get(work, H + i * n + i))

@@ -13,18 +13,21 @@ They are spatial forces and are transformed like these.
 import numpy as np
 
 from robotid.regressor.lanes import (
+    LANES,
     add,
     compiled,
     cross,
     dot,
     get,
     get3,
+    lane_of,
     put,
     put3,
+    put_lane,
     scale,
     times,
-    width,
     work_space,
+    write,
 )
 from robotid.regressor.tree_lanes import (
     ACCELERATION,
@@ -47,12 +50,12 @@ from robotid.regressor.tree_lanes import (
 )
 
 __all__ = [
+    "LANES",
     "finish_rows",
     "inertial_rows",
     "placements",
     "pull_rows",
     "rows_size",
-    "width",
     "work_space",
 ]
 
@@ -76,11 +79,11 @@ def _load(work, tree, i, motion, first, last):
     """Write q, v, a of a joint from its coordinate; past the end, those of the last sample."""
     q, v, a, _ = motion
     leader, ratio, offset = tree.leaders[i], tree.joints[i, 39], tree.joints[i, 40]
-    for lane in range(width(work)):
+    for lane in range(LANES):
         k = min(first + lane, last)
-        put(work, _MOTION, lane, ratio * q[k, leader] + offset)
-        put(work, _MOTION + 1, lane, ratio * v[k, leader])
-        put(work, _MOTION + 2, lane, ratio * a[k, leader])
+        put_lane(work, _MOTION, lane, ratio * q[k, leader] + offset)
+        put_lane(work, _MOTION + 1, lane, ratio * v[k, leader])
+        put_lane(work, _MOTION + 2, lane, ratio * a[k, leader])
 
 
 @compiled
@@ -95,11 +98,10 @@ def _follow(work, tree, i, size, motion, first, last):
     own, up = _WORLD + (i + 1) * size, _WORLD + (tree.parents[i] + 1) * size
     if tree.slots[i] < 0:  # the floating base: its state is given, its axes are fixed
         for k in range(12):
-            for lane in range(width(work)):
-                put(work, own + VELOCITY + k, lane, motion[3][k, min(first + lane, last)])
+            for lane in range(LANES):
+                put_lane(work, own + VELOCITY + k, lane, motion[3][k, min(first + lane, last)])
         for k in range(36):
-            for lane in range(width(work)):
-                put(work, own + FRAME + k, lane, 1.0 if k % 7 == 0 else 0.0)
+            put(work, own + FRAME + k, 1.0 if k % 7 == 0 else 0.0)
         return
     joint, above = tree.joints[i], _above(tree, i)
     _load(work, tree, i, motion, first, last)
@@ -109,45 +111,41 @@ def _follow(work, tree, i, size, motion, first, last):
         carry(work, own, up + FRAME + 6 * row, own + FRAME + 6 * row)
     s, to = times6(joint[39], axis(joint)), own + FRAME + 6 * tree.slots[i]
     if tree.slots[i] < above:  # a coordinate that also moves the parent
-        for lane in range(width(work)):
-            gather(work, to, lane, s)
+        gather(work, to, s)
     else:
-        for lane in range(width(work)):
-            put6(work, to, lane, s)
+        put6(work, to, s)
 
 
 @compiled
 def _share(work, own):
     """Write d, B by columns, dw and the products of w, common to all rows of a body."""
-    for lane in range(width(work)):
-        v, w = get6(work, own + VELOCITY, lane)
-        a, dw = get6(work, own + ACCELERATION, lane)
-        xx, yy, zz = w[0] * w[0], w[1] * w[1], w[2] * w[2]
-        xy, xz, yz = w[0] * w[1], w[0] * w[2], w[1] * w[2]
-        put3(work, _D, lane, add(a, cross(w, v)))
-        put3(work, _X, lane, (-(yy + zz), xy + dw[2], xz - dw[1]))
-        put3(work, _Y, lane, (xy - dw[2], -(xx + zz), yz + dw[0]))
-        put3(work, _Z, lane, (xz + dw[1], yz - dw[0], -(xx + yy)))
-        put3(work, _DW, lane, dw)
-        put3(work, _WW, lane, (xy, xz, yz))
+    v, w = get6(work, own + VELOCITY)
+    a, dw = get6(work, own + ACCELERATION)
+    xx, yy, zz = w[0] * w[0], w[1] * w[1], w[2] * w[2]
+    xy, xz, yz = w[0] * w[1], w[0] * w[2], w[1] * w[2]
+    put3(work, _D, add(a, cross(w, v)))
+    put3(work, _X, (-(yy + zz), xy + dw[2], xz - dw[1]))
+    put3(work, _Y, (xy - dw[2], -(xx + zz), yz + dw[0]))
+    put3(work, _Z, (xz + dw[1], yz - dw[0], -(xx + yy)))
+    put3(work, _DW, dw)
+    put3(work, _WW, (xy, xz, yz))
 
 
 @compiled
 def _row(work, at):
     """Write the ten columns of one body in one row: m, mc, and I as xx xy yy xz yz zz."""
-    for lane in range(width(work)):
-        u, e = get6(work, at, lane)
-        d, dw = get3(work, _D, lane), get3(work, _DW, lane)
-        X, Y, Z = get3(work, _X, lane), get3(work, _Y, lane), get3(work, _Z, lane)
-        xy, xz, yz = get3(work, _WW, lane)
-        put(work, _COLUMNS, lane, dot(u, d))
-        put3(work, _COLUMNS + 1, lane, add((dot(X, u), dot(Y, u), dot(Z, u)), cross(d, e)))
-        put(work, _COLUMNS + 4, lane, e[0] * dw[0] + e[1] * xz - e[2] * xy)
-        put(work, _COLUMNS + 5, lane, -e[0] * X[2] + e[1] * Y[2] + e[2] * (X[0] - Y[1]))
-        put(work, _COLUMNS + 6, lane, -e[0] * yz + e[1] * dw[1] + e[2] * xy)
-        put(work, _COLUMNS + 7, lane, e[0] * X[1] + e[1] * (Z[2] - X[0]) - e[2] * Z[1])
-        put(work, _COLUMNS + 8, lane, e[0] * (Y[1] - Z[2]) - e[1] * Y[0] + e[2] * Z[0])
-        put(work, _COLUMNS + 9, lane, e[0] * yz - e[1] * xz + e[2] * dw[2])
+    u, e = get6(work, at)
+    d, dw = get3(work, _D), get3(work, _DW)
+    X, Y, Z = get3(work, _X), get3(work, _Y), get3(work, _Z)
+    xy, xz, yz = get3(work, _WW)
+    put(work, _COLUMNS, dot(u, d))
+    put3(work, _COLUMNS + 1, add((dot(X, u), dot(Y, u), dot(Z, u)), cross(d, e)))
+    put(work, _COLUMNS + 4, e[0] * dw[0] + e[1] * xz - e[2] * xy)
+    put(work, _COLUMNS + 5, -e[0] * X[2] + e[1] * Y[2] + e[2] * (X[0] - Y[1]))
+    put(work, _COLUMNS + 6, -e[0] * yz + e[1] * dw[1] + e[2] * xy)
+    put(work, _COLUMNS + 7, e[0] * X[1] + e[1] * (Z[2] - X[0]) - e[2] * Z[1])
+    put(work, _COLUMNS + 8, e[0] * (Y[1] - Z[2]) - e[1] * Y[0] + e[2] * Z[0])
+    put(work, _COLUMNS + 9, e[0] * yz - e[1] * xz + e[2] * dw[2])
 
 
 @compiled
@@ -155,17 +153,14 @@ def _write(work, out, places, start, stride):
     """Copy the wanted ones of the ten columns to their places in the block."""
     for k in range(10):
         if places[k] >= 0:
-            to = places[k] * stride + start
-            for lane in range(width(work)):
-                out[np.uintp(to + lane)] = get(work, _COLUMNS + k, lane)
+            write(out, places[k] * stride + start, get(work, _COLUMNS + k))
 
 
 @compiled
 def _begin(work, tree):
     """Write the acceleration of the world: the negative of gravity."""
     for k in range(3):
-        for lane in range(width(work)):
-            put(work, _WORLD + ACCELERATION + k, lane, -tree.gravity[k])
+        put(work, _WORLD + ACCELERATION + k, -tree.gravity[k])
 
 
 @compiled
@@ -184,7 +179,7 @@ def inertial_rows(tree, places, motion, work, out, span):
     size, stride = FRAME + 6 * places.shape[1], out.shape[1]
     columns = out.reshape(out.size)
     _begin(work, tree)
-    for start in range(span[0], span[1], width(work)):
+    for start in range(span[0], span[1], LANES):
         for i in range(len(tree.parents)):
             own = _WORLD + (i + 1) * size
             _follow(work, tree, i, size, motion, start, span[1] - 1)
@@ -225,30 +220,29 @@ def finish_rows(values, places, widths, weights, root, out, span):
 def _weigh(work, weights, places, first, last):
     """Write the weights of the ten columns of one body in one row."""
     for k in range(10):
-        for lane in range(width(work)):
+        for lane in range(LANES):
             weight = weights[places[k], min(first + lane, last)] if places[k] >= 0 else 0.0
-            put(work, _COLUMNS + k, lane, weight)
+            put_lane(work, _COLUMNS + k, lane, weight)
 
 
 @compiled
 def _pull_row(work, own, at, pull, pulls):
     """Add the adjoints by the ten columns: of an axis, and of the body's motion."""
-    for lane in range(width(work)):
-        u, e = get6(work, at, lane)
-        v, w = get6(work, own + VELOCITY, lane)
-        a, dw = get6(work, own + ACCELERATION, lane)
-        m, h = get(work, _COLUMNS, lane), get3(work, _COLUMNS + 1, lane)
-        one, other = get3(work, _COLUMNS + 4, lane), get3(work, _COLUMNS + 7, lane)
-        M = one[0], one[1], one[2], other[0], other[1], other[2]
-        d, wh, Mw = add(a, cross(w, v)), dot(w, h), times(M, w)
-        by_u = add(add(scale(m, d), cross(dw, h)), add(scale(wh, w), scale(-dot(w, w), h)))
-        by_e = add(add(cross(h, d), times(M, dw)), cross(w, Mw))
-        by_d, by_dw = add(scale(m, u), cross(e, h)), add(cross(h, u), times(M, e))
-        by_w = add(add(scale(dot(w, u), h), scale(wh, u)), scale(-2.0 * dot(h, u), w))
-        by_w = add(add(by_w, cross(v, by_d)), add(cross(Mw, e), times(M, cross(e, w))))
-        put6(work, pull, lane, joined(get6(work, pull, lane), (by_u, by_e)))
-        gather(work, pulls, lane, (cross(by_d, w), by_w))
-        gather(work, pulls + 6, lane, (by_d, by_dw))
+    u, e = get6(work, at)
+    v, w = get6(work, own + VELOCITY)
+    a, dw = get6(work, own + ACCELERATION)
+    m, h = get(work, _COLUMNS), get3(work, _COLUMNS + 1)
+    one, other = get3(work, _COLUMNS + 4), get3(work, _COLUMNS + 7)
+    M = one[0], one[1], one[2], other[0], other[1], other[2]
+    d, wh, Mw = add(a, cross(w, v)), dot(w, h), times(M, w)
+    by_u = add(add(scale(m, d), cross(dw, h)), add(scale(wh, w), scale(-dot(w, w), h)))
+    by_e = add(add(cross(h, d), times(M, dw)), cross(w, Mw))
+    by_d, by_dw = add(scale(m, u), cross(e, h)), add(cross(h, u), times(M, e))
+    by_w = add(add(scale(dot(w, u), h), scale(wh, u)), scale(-2.0 * dot(h, u), w))
+    by_w = add(add(by_w, cross(v, by_d)), add(cross(Mw, e), times(M, cross(e, w))))
+    put6(work, pull, joined(get6(work, pull), (by_u, by_e)))
+    gather(work, pulls, (cross(by_d, w), by_w))
+    gather(work, pulls + 6, (by_d, by_dw))
 
 
 @compiled
@@ -258,21 +252,19 @@ def _pull_joint(work, own, joint, axes, pull, pulls, above):
     The updated adjoints are those of the parent's velocity and acceleration in the body's frame.
     """
     s = axis(joint)
-    for lane in range(width(work)):
-        V, A = get6(work, own + VELOCITY, lane), get6(work, own + ACCELERATION, lane)
-        by_V, by_A = get6(work, pulls, lane), get6(work, pulls + 6, lane)
-        bent, rate = motion_cross(V, s), get(work, _MOTION + 1, lane)
-        by_q = along(bent, by_V) + along(motion_cross(A, s), by_A)
-        put(work, _MOTION, lane, by_q)
-        put(work, _MOTION + 1, lane, along(s, by_V) + along(bent, by_A))
-        put(work, _MOTION + 2, lane, along(s, by_A))
-        back = cross(by_A[0], s[1]), add(cross(by_A[0], s[0]), cross(by_A[1], s[1]))
-        put6(work, pulls, lane, joined(by_V, times6(-rate, back)))
+    V, A = get6(work, own + VELOCITY), get6(work, own + ACCELERATION)
+    by_V, by_A = get6(work, pulls), get6(work, pulls + 6)
+    bent, rate = motion_cross(V, s), get(work, _MOTION + 1)
+    by_q = along(bent, by_V) + along(motion_cross(A, s), by_A)
+    put(work, _MOTION, by_q)
+    put(work, _MOTION + 1, along(s, by_V) + along(bent, by_A))
+    put(work, _MOTION + 2, along(s, by_A))
+    back = cross(by_A[0], s[1]), add(cross(by_A[0], s[0]), cross(by_A[1], s[1]))
+    put6(work, pulls, joined(by_V, times6(-rate, back)))
     for row in range(above):
-        for lane in range(width(work)):
-            seen = motion_cross(get6(work, axes + 6 * row, lane), s)
-            by_q = along(seen, get6(work, pull + 6 * row, lane))
-            put(work, _MOTION, lane, get(work, _MOTION, lane) + by_q)
+        seen = motion_cross(get6(work, axes + 6 * row), s)
+        by_q = along(seen, get6(work, pull + 6 * row))
+        put(work, _MOTION, get(work, _MOTION) + by_q)
 
 
 @compiled
@@ -291,13 +283,12 @@ def pull_rows(tree, places, motion, weights, work, out):
     axes, pulls = FRAME + 6 * depth, FRAME + 12 * depth
     size = pulls + 12
     _begin(work, tree)
-    for start in range(0, N, width(work)):
+    for start in range(0, N, LANES):
         for i in range(bodies):
             own = _WORLD + (i + 1) * size
             _follow(work, tree, i, size, motion, start, N - 1)
             for k in range(axes, size):
-                for lane in range(width(work)):
-                    put(work, own + k, lane, 0.0)
+                put(work, own + k, 0.0)
         for i in range(bodies - 1, -1, -1):
             own, up = _WORLD + (i + 1) * size, _WORLD + (tree.parents[i] + 1) * size
             above, ratio = _above(tree, i), tree.joints[i, 39]
@@ -307,8 +298,9 @@ def pull_rows(tree, places, motion, weights, work, out):
             _load(work, tree, i, motion, start, N - 1)
             _pull_joint(work, own, tree.joints[i], own + FRAME, own + axes, own + pulls, above)
             for k in range(3):
-                for lane in range(min(width(work), N - start)):
-                    out[k, start + lane, tree.leaders[i]] += ratio * get(work, _MOTION + k, lane)
+                change = ratio * get(work, _MOTION + k)
+                for lane in range(min(LANES, N - start)):
+                    out[k, start + lane, tree.leaders[i]] += lane_of(change, lane)
             for row in range(above):
                 pass_up(work, own, own + axes + 6 * row, up + axes + 6 * row)
             pass_up(work, own, own + pulls, up + pulls)
@@ -326,24 +318,23 @@ def placements(tree, q, work, R, p):
         R: Rotations, shape (3, 3, B, N); written.
         p: Origins of the joints, shape (3, B, N); written.
     """
-    N = len(q)
-    for start in range(0, N, width(work)):
+    N, size = len(q), FRAME
+    for start in range(0, N, LANES):
         for i in range(len(tree.parents)):
+            own, up = _WORLD + (i + 1) * size, _WORLD + (tree.parents[i] + 1) * size
             _load(work, tree, i, (q, q, q, q), start, N - 1)
-            place(work, _WORLD, tree.joints[i], _MOTION, 0.0)
-            up = tree.parents[i]
-            for lane in range(min(width(work), N - start)):
-                n = start + lane
-                X, Y, Z, at = placement(work, _WORLD, lane)
-                if up >= 0:
-                    T = _column(R, 0, up, n), _column(R, 1, up, n), _column(R, 2, up, n), at
-                    X, Y, Z = turned(T, X), turned(T, Y), turned(T, Z)
-                    at = add(turned(T, at), (p[0, up, n], p[1, up, n], p[2, up, n]))
-                for c in range(3):
-                    R[c, 0, i, n], R[c, 1, i, n], R[c, 2, i, n] = X[c], Y[c], Z[c]
-                    p[c, i, n] = at[c]
-
-
-@compiled
-def _column(R, c, i, n):
-    return R[0, c, i, n], R[1, c, i, n], R[2, c, i, n]
+            place(work, own, tree.joints[i], _MOTION, 0.0)
+            X, Y, Z, at = placement(work, own)
+            if tree.parents[i] >= 0:
+                T = placement(work, up + VELOCITY)
+                X, Y, Z = turned(T, X), turned(T, Y), turned(T, Z)
+                at = add(turned(T, at), T[3])
+            put6(work, own + VELOCITY, (X, Y))  # the pose in the root link instead of the motion
+            put6(work, own + ACCELERATION, (Z, at))
+            for k in range(12):
+                own_k = get(work, own + VELOCITY + k)
+                for lane in range(min(LANES, N - start)):
+                    if k < 9:
+                        R[k % 3, k // 3, i, start + lane] = lane_of(own_k, lane)
+                    else:
+                        p[k - 9, i, start + lane] = lane_of(own_k, lane)

@@ -34,7 +34,6 @@ from robotid.regressor.lanes import (
     put3,
     scale,
     times,
-    width,
 )
 
 __all__ = [
@@ -67,22 +66,22 @@ _F, _C, _TV, _TA, _TF, BODY = 24, 30, 40, 46, 52, 58  # of derivatives, T: chang
 
 
 @compiled
-def get6(work, at, lane):
-    """Return a spatial vector of one lane."""
-    return get3(work, at, lane), get3(work, at + 3, lane)
+def get6(work, at):
+    """Return a spatial vector."""
+    return get3(work, at), get3(work, at + 3)
 
 
 @compiled
-def put6(work, at, lane, x):
-    """Write a spatial vector of one lane."""
-    put3(work, at, lane, x[0])
-    put3(work, at + 3, lane, x[1])
+def put6(work, at, x):
+    """Write a spatial vector."""
+    put3(work, at, x[0])
+    put3(work, at + 3, x[1])
 
 
 @compiled
-def gather(work, at, lane, x):
-    """Add to a spatial vector of one lane."""
-    put6(work, at, lane, joined(get6(work, at, lane), x))
+def gather(work, at, x):
+    """Add to a spatial vector."""
+    put6(work, at, joined(get6(work, at), x))
 
 
 @compiled
@@ -122,11 +121,11 @@ def axis(joint):
 
 
 @compiled
-def placement(work, own, lane):
+def placement(work, own):
     """Return the columns of R, and p, of a body in its parent."""
     return (
-        get3(work, own + _R, lane), get3(work, own + _R + 3, lane),
-        get3(work, own + _R + 6, lane), get3(work, own + _P, lane),
+        get3(work, own + _R), get3(work, own + _R + 3),
+        get3(work, own + _R + 6), get3(work, own + _P),
     )  # fmt: skip
 
 
@@ -155,50 +154,39 @@ def _into_parent(T, f):
 @compiled
 def place(work, own, joint, q, zero):
     """Write R = A + B cos q + C sin q and p = p0 + d q of a body; q is the entry of coordinates."""
-    cosine, sine = own + VELOCITY, own + VELOCITY + 1  # the velocity is not written yet
-    for lane in range(width(work)):
-        c, s = cos_sin(get(work, q, lane) + zero)
-        put(work, cosine, lane, c)
-        put(work, sine, lane, s)
+    angle = get(work, q) + zero
+    c, s = cos_sin(angle)
     for k in range(9):
-        A, B, C = joint[k], joint[9 + k], joint[18 + k]
-        for lane in range(width(work)):
-            turned = A + B * get(work, cosine, lane) + C * get(work, sine, lane)
-            put(work, own + _R + k, lane, turned)
+        put(work, own + _R + k, joint[k] + joint[9 + k] * c + joint[18 + k] * s)
     for k in range(3):
-        p, d = joint[27 + k], joint[30 + k]
-        for lane in range(width(work)):
-            put(work, own + _P + k, lane, p + d * (get(work, q, lane) + zero))
+        put(work, own + _P + k, joint[27 + k] + joint[30 + k] * angle)
 
 
 @compiled
 def move(work, own, up, joint, v, a):
     """Write velocity and acceleration of a body."""
     s = axis(joint)
-    for lane in range(width(work)):
-        T = placement(work, own, lane)
-        moved = times6(get(work, v, lane), s)
-        V = joined(_into_child(T, get6(work, up + VELOCITY, lane)), moved)
-        changed = joined(times6(get(work, a, lane), s), motion_cross(V, moved))
-        put6(work, own + VELOCITY, lane, V)
-        A = joined(_into_child(T, get6(work, up + ACCELERATION, lane)), changed)
-        put6(work, own + ACCELERATION, lane, A)
+    T = placement(work, own)
+    moved = times6(get(work, v), s)
+    V = joined(_into_child(T, get6(work, up + VELOCITY)), moved)
+    changed = joined(times6(get(work, a), s), motion_cross(V, moved))
+    put6(work, own + VELOCITY, V)
+    A = joined(_into_child(T, get6(work, up + ACCELERATION)), changed)
+    put6(work, own + ACCELERATION, A)
 
 
 @compiled
 def carry(work, own, seen, to):
     """Write a motion from the parent's frame in the body's frame."""
-    for lane in range(width(work)):
-        T = placement(work, own, lane)
-        put6(work, to, lane, _into_child(T, get6(work, seen, lane)))
+    T = placement(work, own)
+    put6(work, to, _into_child(T, get6(work, seen)))
 
 
 @compiled
 def pass_up(work, own, force, to):
     """Add a force on the body to one in its parent's frame."""
-    for lane in range(width(work)):
-        T = placement(work, own, lane)
-        gather(work, to, lane, _into_parent(T, get6(work, force, lane)))
+    T = placement(work, own)
+    gather(work, to, _into_parent(T, get6(work, force)))
 
 
 @compiled
@@ -212,18 +200,16 @@ def _momentum(body, x):
 @compiled
 def _force(work, own, body, to):
     """Write the force J A + V x* J V on a body."""
-    for lane in range(width(work)):
-        V, A = get6(work, own + VELOCITY, lane), get6(work, own + ACCELERATION, lane)
-        f = joined(_momentum(body, A), _force_cross(V, _momentum(body, V)))
-        put6(work, to, lane, f)
+    V, A = get6(work, own + VELOCITY), get6(work, own + ACCELERATION)
+    f = joined(_momentum(body, A), _force_cross(V, _momentum(body, V)))
+    put6(work, to, f)
 
 
 @compiled
 def _give(work, force, joint, to):
     """Write the component of a body's force along its joint."""
     s = axis(joint)
-    for lane in range(width(work)):
-        put(work, to, lane, along(s, get6(work, force, lane)))
+    put(work, to, along(s, get6(work, force)))
 
 
 @compiled
@@ -246,64 +232,59 @@ def mass_matrix(work, tree, bodies, M):
     n, parents, joints = len(tree.parents), tree.parents, tree.joints
     for i in range(n):
         for k in range(10):
-            for lane in range(width(work)):
-                put(work, (i + 1) * BODY + _C + k, lane, bodies[i, k])
+            put(work, (i + 1) * BODY + _C + k, bodies[i, k])
     for i in range(n - 1, -1, -1):
         own, s = (i + 1) * BODY, axis(joints[i])
-        for lane in range(width(work)):
-            put6(work, own + _TF, lane, _momentum(_composite(work, own, lane), s))
+        put6(work, own + _TF, _momentum(_composite(work, own), s))
         _give(work, own + _TF, joints[i], M + i * n + i)
         j = i
         while parents[j] >= 0:
             below, j = (j + 1) * BODY, parents[j]
             at = (j + 1) * BODY
-            for lane in range(width(work)):
-                T = placement(work, below, lane)
-                put6(work, at + _TF, lane, _into_parent(T, get6(work, below + _TF, lane)))
+            T = placement(work, below)
+            put6(work, at + _TF, _into_parent(T, get6(work, below + _TF)))
             _give(work, at + _TF, joints[j], M + i * n + j)
-            for lane in range(width(work)):
-                put(work, M + j * n + i, lane, get(work, M + i * n + j, lane))
+            put(work, M + j * n + i, get(work, M + i * n + j))
         if parents[i] >= 0:
             _join_bodies(work, own, (parents[i] + 1) * BODY)
 
 
 @compiled
-def _composite(work, own, lane):
+def _composite(work, own):
     """Return the ten parameters of the composite of a body and its descendants."""
     at = own + _C
     return (
-        get(work, at, lane), get(work, at + 1, lane), get(work, at + 2, lane),
-        get(work, at + 3, lane), get(work, at + 4, lane), get(work, at + 5, lane),
-        get(work, at + 6, lane), get(work, at + 7, lane), get(work, at + 8, lane),
-        get(work, at + 9, lane),
+        get(work, at), get(work, at + 1), get(work, at + 2),
+        get(work, at + 3), get(work, at + 4), get(work, at + 5),
+        get(work, at + 6), get(work, at + 7), get(work, at + 8),
+        get(work, at + 9),
     )  # fmt: skip
 
 
 @compiled
 def _join_bodies(work, own, up):
     """Add a composite body, in its parent's frame, to the parent's."""
-    for lane in range(width(work)):
-        T = placement(work, own, lane)
-        p = T[3]
-        m, c0, c1, c2, xx, xy, yy, xz, yz, zz = _composite(work, own, lane)
-        c = turned(T, (c0, c1, c2))
-        # R J R^T: R times the columns of J, then R times the rows of the product
-        U, V, W = turned(T, (xx, xy, xz)), turned(T, (xy, yy, yz)), turned(T, (xz, yz, zz))
-        u = turned(T, (U[0], V[0], W[0]))
-        v = turned(T, (U[1], V[1], W[1]))
-        w = turned(T, (U[2], V[2], W[2]))
-        s = 2.0 * dot(p, c) + m * dot(p, p)
-        put(work, up + _C, lane, get(work, up + _C, lane) + m)
-        moment = add(get3(work, up + _C + 1, lane), add(c, scale(m, p)))
-        put3(work, up + _C + 1, lane, moment)
-        xx = u[0] + s - 2.0 * p[0] * c[0] - m * p[0] * p[0]
-        xy = u[1] - p[0] * c[1] - p[1] * c[0] - m * p[0] * p[1]
-        yy = v[1] + s - 2.0 * p[1] * c[1] - m * p[1] * p[1]
-        xz = u[2] - p[0] * c[2] - p[2] * c[0] - m * p[0] * p[2]
-        yz = v[2] - p[1] * c[2] - p[2] * c[1] - m * p[1] * p[2]
-        zz = w[2] + s - 2.0 * p[2] * c[2] - m * p[2] * p[2]
-        put3(work, up + _C + 4, lane, add(get3(work, up + _C + 4, lane), (xx, xy, yy)))
-        put3(work, up + _C + 7, lane, add(get3(work, up + _C + 7, lane), (xz, yz, zz)))
+    T = placement(work, own)
+    p = T[3]
+    m, c0, c1, c2, xx, xy, yy, xz, yz, zz = _composite(work, own)
+    c = turned(T, (c0, c1, c2))
+    # R J R^T: R times the columns of J, then R times the rows of the product
+    U, V, W = turned(T, (xx, xy, xz)), turned(T, (xy, yy, yz)), turned(T, (xz, yz, zz))
+    u = turned(T, (U[0], V[0], W[0]))
+    v = turned(T, (U[1], V[1], W[1]))
+    w = turned(T, (U[2], V[2], W[2]))
+    s = 2.0 * dot(p, c) + m * dot(p, p)
+    put(work, up + _C, get(work, up + _C) + m)
+    moment = add(get3(work, up + _C + 1), add(c, scale(m, p)))
+    put3(work, up + _C + 1, moment)
+    xx = u[0] + s - 2.0 * p[0] * c[0] - m * p[0] * p[0]
+    xy = u[1] - p[0] * c[1] - p[1] * c[0] - m * p[0] * p[1]
+    yy = v[1] + s - 2.0 * p[1] * c[1] - m * p[1] * p[1]
+    xz = u[2] - p[0] * c[2] - p[2] * c[0] - m * p[0] * p[2]
+    yz = v[2] - p[1] * c[2] - p[2] * c[1] - m * p[1] * p[2]
+    zz = w[2] + s - 2.0 * p[2] * c[2] - m * p[2] * p[2]
+    put3(work, up + _C + 4, add(get3(work, up + _C + 4), (xx, xy, yy)))
+    put3(work, up + _C + 7, add(get3(work, up + _C + 7), (xz, yz, zz)))
 
 
 @compiled
@@ -313,38 +294,36 @@ def _change_motion(work, own, up, joint, v, is_first, is_speed):
     It is that of its own joint if the body is the first one that changes.
     """
     s = axis(joint)
-    for lane in range(width(work)):
-        V, A = get6(work, own + VELOCITY, lane), get6(work, own + ACCELERATION, lane)
-        if is_first and is_speed:
-            TV, TA = s, motion_cross(V, s)
-        elif is_first:
-            TV, TA = motion_cross(V, s), motion_cross(A, s)
-        else:
-            T = placement(work, own, lane)
-            TV = _into_child(T, get6(work, up + _TV, lane))
-            bent = motion_cross(TV, times6(get(work, v, lane), s))
-            TA = joined(_into_child(T, get6(work, up + _TA, lane)), bent)
-        put6(work, own + _TV, lane, TV)
-        put6(work, own + _TA, lane, TA)
+    V, A = get6(work, own + VELOCITY), get6(work, own + ACCELERATION)
+    if is_first and is_speed:
+        put6(work, own + _TV, s)
+        put6(work, own + _TA, motion_cross(V, s))
+    elif is_first:
+        put6(work, own + _TV, motion_cross(V, s))
+        put6(work, own + _TA, motion_cross(A, s))
+    else:
+        T = placement(work, own)
+        TV = _into_child(T, get6(work, up + _TV))
+        bent = motion_cross(TV, times6(get(work, v), s))
+        put6(work, own + _TV, TV)
+        put6(work, own + _TA, joined(_into_child(T, get6(work, up + _TA)), bent))
 
 
 @compiled
 def _change_force(work, own, body):
     """Write the derivative of a body's force from those of its velocity and acceleration."""
-    for lane in range(width(work)):
-        V, TV = get6(work, own + VELOCITY, lane), get6(work, own + _TV, lane)
-        f = _momentum(body, get6(work, own + _TA, lane))
-        f = joined(f, _force_cross(TV, _momentum(body, V)))
-        f = joined(f, _force_cross(V, _momentum(body, TV)))
-        put6(work, own + _TF, lane, f)
+    V, TV = get6(work, own + VELOCITY), get6(work, own + _TV)
+    f = _momentum(body, get6(work, own + _TA))
+    f = joined(f, _force_cross(TV, _momentum(body, V)))
+    f = joined(f, _force_cross(V, _momentum(body, TV)))
+    put6(work, own + _TF, f)
 
 
 @compiled
 def _clear(work, at):
     """Write a spatial vector of 0."""
     for k in range(6):
-        for lane in range(width(work)):
-            put(work, at + k, lane, 0.0)
+        put(work, at + k, 0.0)
 
 
 @compiled
@@ -359,8 +338,7 @@ def derivatives(work, tree, bodies, v, T):
             _change_bodies(work, tree, bodies, v, k, kind == 1)
             for i in range(n):
                 if not (tree.is_below[i, k] or tree.is_below[k, i]):
-                    for lane in range(width(work)):
-                        put(work, T + (kind * n + i) * n + k, lane, 0.0)
+                    put(work, T + (kind * n + i) * n + k, 0.0)
             for i in range(n - 1, -1, -1):
                 if not (tree.is_below[i, k] or tree.is_below[k, i]):
                     continue
@@ -368,9 +346,8 @@ def derivatives(work, tree, bodies, v, T):
                 _give(work, own + _TF, tree.joints[i], T + (kind * n + i) * n + k)
                 if i == k and kind == 0:  # the force rotates with its frame
                     s = axis(tree.joints[k])
-                    for lane in range(width(work)):
-                        bent = _force_cross(s, get6(work, own + _F, lane))
-                        gather(work, own + _TF, lane, bent)
+                    bent = _force_cross(s, get6(work, own + _F))
+                    gather(work, own + _TF, bent)
                 if tree.parents[i] >= 0:
                     pass_up(work, own, own + _TF, up + _TF)
 

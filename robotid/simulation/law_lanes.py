@@ -8,11 +8,32 @@ import math
 from functools import cache
 
 from robotid.exceptions import SettingsError
-from robotid.regressor.lanes import applied, compiled, pointed
+from robotid.regressor.lanes import (
+    LANES,
+    applied,
+    compiled,
+    copysign,
+    lane_of,
+    pointed,
+    where,
+    wide,
+    with_lane,
+)
 from robotid.robot.drive_term import BRISTLES, PLAIN, DriveTerm, Law, MemorylessTerm
 from robotid.robot.drives import Bristles
 
-__all__ = ["coded_term", "deflection", "direction", "initial_deflection", "loop_torque", "term"]
+__all__ = [
+    "affine_term",
+    "coded_term",
+    "deflection",
+    "deflection_by_lane",
+    "direction",
+    "initial_deflection",
+    "initial_deflection_by_lane",
+    "loop_torque",
+    "term",
+    "term_by_lane",
+]
 
 _SIGN = 1e-5  # speed over which friction reverses [rad/s or m/s]
 
@@ -87,6 +108,27 @@ def term(codes, shapes, k, q, u, s, s_u):
 
 
 @compiled
+def term_by_lane(codes, shapes, k, q, u, s, s_u):
+    """Return ``term`` of vectors."""
+    y, y_u, y_q = wide(0.0), wide(0.0), wide(0.0)
+    for lane in range(LANES):
+        x, x_u, x_q = term(
+            codes, shapes, k,
+            lane_of(q, lane), lane_of(u, lane), lane_of(s, lane), lane_of(s_u, lane),
+        )  # fmt: skip
+        y, y_u, y_q = with_lane(y, lane, x), with_lane(y_u, lane, x_u), with_lane(y_q, lane, x_q)
+    return y, y_u, y_q
+
+
+@compiled
+def affine_term(codes, k, u):
+    """Return the regressor of an affine term: the speed, its direction, or 1."""
+    if codes[k, 0]:
+        return 1.0 * u
+    return wide(1.0) if codes[k, 2] == PLAIN else direction(u)[0]
+
+
+@compiled
 def direction(u, over=_SIGN):
     """Return the direction of friction, which reverses over a small speed, and its derivative."""
     root = math.sqrt(u * u + over * over)
@@ -104,6 +146,20 @@ def deflection(x, before, u, span):
 
 
 @compiled
+def deflection_by_lane(x, before, u, span):
+    """Return ``deflection`` of vectors."""
+    z, z_u, decay = wide(0.0), wide(0.0), wide(0.0)
+    for lane in range(LANES):
+        y, y_u, left = deflection(x, lane_of(before, lane), lane_of(u, lane), lane_of(span, lane))
+        z, z_u, decay = (
+            with_lane(z, lane, y),
+            with_lane(z_u, lane, y_u),
+            with_lane(decay, lane, left),
+        )
+    return z, z_u, decay
+
+
+@compiled
 def initial_deflection(x, v, time):
     """Return the deflection z of a drive that has moved for a time, and its derivative by speed.
 
@@ -115,6 +171,16 @@ def initial_deflection(x, v, time):
 
 
 @compiled
+def initial_deflection_by_lane(x, v, time):
+    """Return ``initial_deflection`` of vectors."""
+    z, z_v = wide(0.0), wide(0.0)
+    for lane in range(LANES):
+        y, y_v = initial_deflection(x, lane_of(v, lane), time)
+        z, z_v = with_lane(z, lane, y), with_lane(z_v, lane, y_v)
+    return z, z_v
+
+
+@compiled
 def loop_torque(drive, error, speed_error, forward):
     """Return the torque that a loop commands, and 1 below its limit, else 0.
 
@@ -123,4 +189,4 @@ def loop_torque(drive, error, speed_error, forward):
     """
     unlimited, limit = drive[1] * error + drive[2] * speed_error + forward, drive[3]
     is_free = abs(unlimited) < limit
-    return unlimited if is_free else math.copysign(limit, unlimited), 1.0 if is_free else 0.0
+    return where(is_free, unlimited, copysign(limit, unlimited)), where(is_free, 1.0, 0.0)

@@ -24,11 +24,25 @@ the torque. No step crosses a tick. The held torque has its own sensitivities, w
 ticks.
 """
 
-import math
 from typing import NamedTuple
 
 from robotid._typing import Array
-from robotid.regressor.lanes import Work, compiled, factor, get, put, put3, solve, work_space
+from robotid.regressor.lanes import (
+    LANES,
+    compiled,
+    copysign,
+    factor,
+    get,
+    is_any,
+    put,
+    put3,
+    read,
+    solve,
+    where,
+    wide,
+    work_space,
+    write,
+)
 from robotid.regressor.tree_lanes import (
     ACCELERATION,
     BODY,
@@ -40,12 +54,13 @@ from robotid.regressor.tree_lanes import (
 )
 from robotid.robot.drive_term import BRISTLES, LOADED
 from robotid.simulation.law_lanes import (
+    affine_term,
     coded_term,
-    deflection,
+    deflection_by_lane,
     direction,
-    initial_deflection,
+    initial_deflection_by_lane,
     loop_torque,
-    term,
+    term_by_lane,
 )
 
 __all__ = [
@@ -66,8 +81,6 @@ __all__ = [
     "work_of",
 ]
 
-_DOUBLINGS = 3  # of lanes
-LANES = 1 << _DOUBLINGS
 THETA = 0.5  # instant of the forces, relative to the step: exact to second order
 _MOVED_BEFORE = 0.1  # assumed time of motion before the simulation, for initial deflections [s]
 _NEWTON = 60  # largest number of steps; three or four are typical
@@ -117,8 +130,8 @@ class Course(NamedTuple):
             and torque by the delay: means over each step, or values of its tick, shape
             (K, n, 6, LANES).
         steps: Length of each step, shape (K, LANES) [s].
-        ticks: Whether the controller has a tick at the start of a step, shape (K, LANES), bool;
-            True at the first; empty in continuous time.
+        ticks: 1 where the controller has a tick at the start of a step, else 0, shape (K, LANES);
+            1 at the first; empty in continuous time.
         every: Number of steps from one sample to the next.
         start: Initial positions and speeds, shape (2, n, LANES).
     """
@@ -145,7 +158,7 @@ class Motion(NamedTuple):
     S: Array
 
 
-def work_of(joints: int, columns: int, n_bristles: int) -> Work:
+def work_of(joints: int, columns: int, n_bristles: int) -> Array:
     """Return a new work space.
 
     Args:
@@ -155,18 +168,25 @@ def work_of(joints: int, columns: int, n_bristles: int) -> Work:
     """
     n = joints
     own = (n + 1) * BODY + 4 * n * n + 16 * n + 3 * n * columns
-    return work_space(own + n_bristles * (5 + columns), _DOUBLINGS)
+    return work_space(own + n_bristles * (5 + columns))
 
 
-def last_step(work: Work, joints: int) -> tuple[Array, Array]:
+def last_step(work: Array, joints: int) -> tuple[Array, Array]:
     """Return the positions before the last step and its last correction of speeds, (n, LANES).
 
     Args:
         work: Work space after ``roll_out``.
         joints: Number of joints n.
     """
-    rows, q = work.numbers.reshape(-1, LANES), (joints + 1) * BODY
+    rows, q = work.reshape(-1, LANES), (joints + 1) * BODY
     return rows[q : q + joints], rows[q + 6 * joints : q + 7 * joints]
+
+
+@compiled
+def _command(command, i, kind):
+    """Return an input of joint i over a step; ``command`` is all inputs and the step's first."""
+    inputs, first = command
+    return read(inputs, (first + 6 * i + kind) * LANES)
 
 
 @compiled
@@ -180,49 +200,47 @@ def _balance(work, n, at, drives, terms, step, command):
     codes, shapes, values, spans = terms
     if bristles >= 0:
         _presliding(work, n, at, terms, step)
+    rate = 1.0 / (THETA * step)
     for i in range(n):
-        for lane in range(LANES):
-            put(work, load + i, lane, get(work, h + i, lane))
+        tau = get(work, h + i)
         for j in range(n):
-            for lane in range(LANES):
-                m = get(work, M + i * n + j, lane) / (THETA * step[lane])
-                moved = get(work, u + j, lane) - get(work, v + j, lane)
-                put(work, load + i, lane, get(work, load + i, lane) + m * moved)
-                put(work, H + i * n + j, lane, m)
+            m = get(work, M + i * n + j) * rate
+            tau += m * (get(work, u + j) - get(work, v + j))
+            put(work, H + i * n + j, m)
+        put(work, load + i, tau)
         armature, kp, kd = drives[i, 0], drives[i, 1], drives[i, 2]
         offset, viscous, coulomb = drives[i, 4], drives[i, 5], drives[i, 6]
-        for lane in range(LANES):
-            span, tau = THETA * step[lane], get(work, load + i, lane)
-            speed, angle = get(work, u + i, lane), get(work, middle + i, lane)
-            s, s_u = direction(speed)
-            f = get(work, grip + i, lane) + offset + viscous * speed + coulomb * s
-            f_u = get(work, grip + n + i, lane) + viscous + coulomb * s_u
-            f_q, e, e_u = 0.0, 1.0, 0.0
-            for k in range(spans[i, 0], spans[i, 1]):
-                y, y_u, y_q = term(codes, shapes, k, angle, speed, s, s_u)
-                if codes[k, 2] == LOADED:
-                    side = math.copysign(values[k], tau)
-                    e += side * y
-                    e_u += side * y_u
-                    f_q += side * y_q * tau
-                else:
-                    f += values[k] * y
-                    f_u += values[k] * y_u
-                    f_q += values[k] * y_q
-            if held >= 0:  # constant until the next tick
-                torque, is_on = get(work, held + i, lane), 0.0
+        span = THETA * step
+        speed, angle = get(work, u + i), get(work, middle + i)
+        s, s_u = direction(speed)
+        f = get(work, grip + i) + offset + viscous * speed + coulomb * s
+        f_u = get(work, grip + n + i) + viscous + coulomb * s_u
+        f_q, e, e_u = wide(0.0), wide(1.0), wide(0.0)
+        for k in range(spans[i, 0], spans[i, 1]):
+            y, y_u, y_q = term_by_lane(codes, shapes, k, angle, speed, s, s_u)
+            if codes[k, 2] == LOADED:
+                side = copysign(values[k], tau)
+                e += side * y
+                e_u += side * y_u
+                f_q += side * y_q * tau
             else:
-                error = command[i, 0, lane] - get(work, q + i, lane) - span * speed
-                speed_error, forward = command[i, 2, lane] - speed, command[i, 3, lane]
-                torque, is_on = loop_torque(drives[i], error, speed_error, forward)
-            rest = armature * (speed - get(work, v + i, lane)) / span + f - torque
-            slope = armature / span + f_u + is_on * (kd + span * kp)
-            put(work, G + i, lane, tau + rest / e)
-            own = get(work, H + i * n + i, lane) + (slope + tau * e_u) / e
-            put(work, H + i * n + i, lane, own)
-            put(work, by_q + i, lane, f_q)
-            put(work, gains + i, lane, is_on)
-            put(work, loss + i, lane, e)
+                f += values[k] * y
+                f_u += values[k] * y_u
+                f_q += values[k] * y_q
+        if held >= 0:  # constant until the next tick
+            torque, is_on = get(work, held + i), wide(0.0)
+        else:
+            error = _command(command, i, 0) - get(work, q + i) - span * speed
+            speed_error, forward = _command(command, i, 2) - speed, _command(command, i, 3)
+            torque, is_on = loop_torque(drives[i], error, speed_error, forward)
+        rest = armature * rate * (speed - get(work, v + i)) + f - torque
+        slope = armature * rate + f_u + is_on * (kd + span * kp)
+        put(work, G + i, tau + rest / e)
+        own = get(work, H + i * n + i) + (slope + tau * e_u) / e
+        put(work, H + i * n + i, own)
+        put(work, by_q + i, f_q)
+        put(work, gains + i, is_on)
+        put(work, loss + i, e)
 
 
 @compiled
@@ -231,16 +249,15 @@ def _presliding(work, n, at, terms, step):
     u, bristles, grip = at[2], at[13], at[14]
     codes, shapes, values, spans = terms
     for i in range(n):
-        for lane in range(LANES):
-            speed, f, f_u = get(work, u + i, lane), 0.0, 0.0
-            for k in range(spans[i, 0], spans[i, 2]):
-                if codes[k, 2] == BRISTLES:
-                    before = get(work, bristles + 5 * int(shapes[k, 3]), lane)
-                    z, z_u, _ = deflection(shapes[k], before, speed, THETA * step[lane])
-                    f += values[k] * z
-                    f_u += values[k] * z_u
-            put(work, grip + i, lane, f)
-            put(work, grip + n + i, lane, f_u)
+        speed, f, f_u = get(work, u + i), wide(0.0), wide(0.0)
+        for k in range(spans[i, 0], spans[i, 2]):
+            if codes[k, 2] == BRISTLES:
+                before = get(work, bristles + 5 * int(shapes[k, 3]))
+                z, z_u, _ = deflection_by_lane(shapes[k], before, speed, THETA * step)
+                f += values[k] * z
+                f_u += values[k] * z_u
+        put(work, grip + i, f)
+        put(work, grip + n + i, f_u)
 
 
 @compiled
@@ -254,8 +271,7 @@ def _solve(work, n, at, drives, terms, step, command):
         return True
     v, u = at[1], at[2]
     for i in range(n):
-        for lane in range(LANES):
-            put(work, u + i, lane, get(work, v + i, lane))
+        put(work, u + i, get(work, v + i))
     _newton(work, n, at, drives, terms, step, command, True)
     return _newton(work, n, at, drives, terms, step, command, False)
 
@@ -269,11 +285,10 @@ def _add_fall(work, n, at, terms):
         for k in range(spans[i, 0], spans[i, 1]):
             if codes[k, 2] == LOADED:
                 continue
-            for lane in range(LANES):
-                speed, angle = get(work, u + i, lane), get(work, middle + i, lane)
-                _, y_u, _ = term(codes, shapes, k, angle, speed, direction(speed)[0], 0.0)
-                fall = max(-values[k] * y_u, 0.0) / get(work, loss + i, lane)
-                put(work, H + i * n + i, lane, get(work, H + i * n + i, lane) + fall)
+            speed, angle = get(work, u + i), get(work, middle + i)
+            _, y_u, _ = term_by_lane(codes, shapes, k, angle, speed, direction(speed)[0], wide(0.0))
+            fall = where(values[k] * y_u < 0.0, -values[k] * y_u, 0.0) / get(work, loss + i)
+            put(work, H + i * n + i, get(work, H + i * n + i) + fall)
 
 
 @compiled
@@ -292,14 +307,13 @@ def _newton(work, n, at, drives, terms, step, command, is_cautious):
         solve(work, n, H, G)
         is_found = True
         for i in range(n):
-            for lane in range(LANES):
-                before = get(work, u + i, lane)
-                after = before - share * get(work, G + i, lane)
-                halts = after * before < 0.0
-                after = 0.0 if halts else after
-                if halts or not abs(after - before) <= _CLOSE * (1.0 + abs(after)):
-                    is_found = False
-                put(work, u + i, lane, after)
+            before = get(work, u + i)
+            after = before - share * get(work, G + i)
+            halts = after * before < 0.0
+            after = where(halts, 0.0, after)
+            is_close = abs(after - before) <= _CLOSE * (1.0 + abs(after))
+            is_found = is_found and not is_any(halts | ~is_close)
+            put(work, u + i, after)
         if is_found:  # H changes by rounding only
             return True
     return False
@@ -310,10 +324,9 @@ def _advance(work, n, at, step):
     """Advance positions and speeds over a solved step."""
     q, v, u = at[0], at[1], at[2]
     for i in range(n):
-        for lane in range(LANES):
-            speed, before = get(work, u + i, lane), get(work, v + i, lane)
-            put(work, q + i, lane, get(work, q + i, lane) + step[lane] * speed)
-            put(work, v + i, lane, before + (speed - before) / THETA)
+        speed, before = get(work, u + i), get(work, v + i)
+        put(work, q + i, get(work, q + i) + step * speed)
+        put(work, v + i, before + (speed - before) / THETA)
 
 
 @compiled
@@ -321,10 +334,9 @@ def _centre(work, n, at, step, tree, bodies, zeros, speeds, a):
     """Write M and h at the midpoint of the step that results from the given speeds."""
     q, middle, h, M = at[0], at[3], at[4], at[5]
     for i in range(n):
-        for lane in range(LANES):
-            ahead = THETA * step[lane] * get(work, speeds + i, lane)
-            put(work, middle + i, lane, get(work, q + i, lane) + ahead)
-            put(work, a + i, lane, 0.0)
+        ahead = THETA * step * get(work, speeds + i)
+        put(work, middle + i, get(work, q + i) + ahead)
+        put(work, a + i, 0.0)
         place(work, (i + 1) * BODY, tree.joints[i], middle + i, zeros[i])
     inverse_dynamics(work, tree, bodies, speeds, a, h)
     mass_matrix(work, tree, bodies, M)
@@ -341,28 +353,24 @@ def _propagate(work, n, at, sensitivities, columns, drives, terms, step, command
     _combine(work, n, at, sensitivities, drives, step)
     for p in range(P):
         for i in range(n):
-            for lane in range(LANES):
-                put(work, own + i, lane, 0.0)
+            put(work, own + i, 0.0)
         for c in range(sums[p], sums[p + 1]):
             kind, j, index = kinds[c, 0], kinds[c, 1], kinds[c, 2]
             if kind == INERTIAL:
                 inertial_column(work, tree, directions[index], j, own)
             elif kind == ZERO:  # like the position, without gain and friction
                 for i in range(n):
-                    for lane in range(LANES):
-                        x = get(work, T_q + i * n + j, lane)
-                        put(work, own + i, lane, get(work, own + i, lane) + x)
-                for lane in range(LANES):
-                    kp = get(work, gains + j, lane) * drives[j, 1]
-                    x = (get(work, by_q + j, lane) + kp) / get(work, loss + j, lane)
-                    put(work, own + j, lane, get(work, own + j, lane) - x)
+                    x = get(work, T_q + i * n + j)
+                    put(work, own + i, get(work, own + i) + x)
+                kp = get(work, gains + j) * drives[j, 1]
+                x = (get(work, by_q + j) + kp) / get(work, loss + j)
+                put(work, own + j, get(work, own + j) - x)
             elif kind != START and kind != SPEED:
                 _drive_column(work, at, drives, terms, step, command, kinds[c], own)
         if held >= 0:
             for i in range(n):
-                for lane in range(LANES):
-                    x = get(work, by_hold + i * P + p, lane) / get(work, loss + i, lane)
-                    put(work, own + i, lane, get(work, own + i, lane) - x)
+                x = get(work, by_hold + i * P + p) / get(work, loss + i)
+                put(work, own + i, get(work, own + i) - x)
         if bristles >= 0:
             _bristle_column(work, n, at, sensitivities, terms, p, P, False)
         _advance_column(work, n, at, sensitivities, step, p, P)
@@ -379,23 +387,27 @@ def _drive_column(work, at, drives, terms, step, command, column, own):
     codes, shapes = terms.codes, terms.shapes
     kind, j, index = column
     kp, kd = drives[j, 1], drives[j, 2]
-    for lane in range(LANES):
-        span, speed, x = THETA * step[lane], get(work, u + j, lane), 0.0
-        if kind == ARMATURE:
-            x = (speed - get(work, v + j, lane)) / span
-        elif kind == TERM and codes[index, 2] == BRISTLES:
-            x = get(work, bristles + 5 * int(shapes[index, 3]) + 1, lane)
-        elif kind == TERM:
-            angle, (s, s_u) = get(work, middle + j, lane), direction(speed)
-            x, _, _ = term(codes, shapes, index, angle, speed, s, s_u)
-            x *= abs(get(work, load + j, lane)) if codes[index, 2] == LOADED else 1.0
-        elif held < 0:
-            error = command[j, 0, lane] - get(work, q + j, lane) - span * speed
-            speed_error = command[j, 2, lane] - speed
-            torque, is_on = loop_torque(drives[j], error, speed_error, command[j, 3, lane])
-            by_delay = kp * command[j, 1, lane] + kd * command[j, 4, lane] + command[j, 5, lane]
-            x = -_by_loop(kind, is_on, error, speed_error, by_delay, torque)
-        put(work, own + j, lane, get(work, own + j, lane) + x / get(work, loss + j, lane))
+    span, speed, x = THETA * step, get(work, u + j), wide(0.0)
+    if kind == ARMATURE:
+        x = (speed - get(work, v + j)) / span
+    elif kind == TERM and codes[index, 2] == BRISTLES:
+        x = get(work, bristles + 5 * int(shapes[index, 3]) + 1)
+    elif kind == TERM and index >= terms.spans[j, 1]:
+        x = affine_term(codes, index, speed)
+    elif kind == TERM:
+        angle, (s, s_u) = get(work, middle + j), direction(speed)
+        x, _, _ = term_by_lane(codes, shapes, index, angle, speed, s, s_u)
+        if codes[index, 2] == LOADED:
+            x *= abs(get(work, load + j))
+    elif held < 0:
+        error = _command(command, j, 0) - get(work, q + j) - span * speed
+        speed_error = _command(command, j, 2) - speed
+        torque, is_on = loop_torque(drives[j], error, speed_error, _command(command, j, 3))
+        by_delay = (
+            kp * _command(command, j, 1) + kd * _command(command, j, 4) + _command(command, j, 5)
+        )
+        x = -_by_loop(kind, is_on, error, speed_error, by_delay, torque)
+    put(work, own + j, get(work, own + j) + x / get(work, loss + j))
 
 
 @compiled
@@ -410,13 +422,12 @@ def _advance_bristles(work, n, at, terms, step):
         for k in range(spans[i, 0], spans[i, 2]):
             if codes[k, 2] == BRISTLES:
                 z = bristles + 5 * int(shapes[k, 3])
-                for lane in range(LANES):
-                    speed, before = get(work, u + i, lane), get(work, z, lane)
-                    acts, _, share = deflection(shapes[k], before, speed, THETA * step[lane])
-                    after, by_speed, by_before = deflection(shapes[k], before, speed, step[lane])
-                    put(work, z, lane, after)
-                    put(work, z + 1, lane, acts)
-                    put3(work, z + 2, lane, (share, by_speed, by_before))
+                speed, before = get(work, u + i), get(work, z)
+                acts, _, share = deflection_by_lane(shapes[k], before, speed, THETA * step)
+                after, by_speed, by_before = deflection_by_lane(shapes[k], before, speed, step)
+                put(work, z, after)
+                put(work, z + 1, acts)
+                put3(work, z + 2, (share, by_speed, by_before))
 
 
 @compiled
@@ -432,12 +443,11 @@ def _initialise_bristles(work, n, at, by_state, kinds, sums, terms):
             if codes[k, 2] != BRISTLES:
                 continue
             slot, P = int(shapes[k, 3]), len(sums) - 1
-            for lane in range(LANES):
-                z, by_speed = initial_deflection(shapes[k], get(work, v + i, lane), _MOVED_BEFORE)
-                put(work, bristles + 5 * slot, lane, z)
-                for p in range(P):
-                    if kinds[sums[p], 0] == SPEED and kinds[sums[p], 1] == i:
-                        put(work, by_state + slot * P + p, lane, by_speed)
+            z, by_speed = initial_deflection_by_lane(shapes[k], get(work, v + i), _MOVED_BEFORE)
+            put(work, bristles + 5 * slot, z)
+            for p in range(P):
+                if kinds[sums[p], 0] == SPEED and kinds[sums[p], 1] == i:
+                    put(work, by_state + slot * P + p, by_speed)
 
 
 @compiled
@@ -452,14 +462,13 @@ def _bristle_column(work, n, at, sensitivities, terms, p, P, is_after):
                 continue
             slot = int(shapes[k, 3])
             z, Z = bristles + 5 * slot, by_state + slot * P + p
-            for lane in range(LANES):
-                x = get(work, Z, lane)
-                if is_after:
-                    x *= get(work, z + 4, lane)
-                    put(work, Z, lane, x + get(work, z + 3, lane) * get(work, change + i, lane))
-                else:
-                    x *= values[k] * get(work, z + 2, lane) / get(work, loss + i, lane)
-                    put(work, own + i, lane, get(work, own + i, lane) + x)
+            x = get(work, Z)
+            if is_after:
+                x *= get(work, z + 4)
+                put(work, Z, x + get(work, z + 3) * get(work, change + i))
+            else:
+                x *= values[k] * get(work, z + 2) / get(work, loss + i)
+                put(work, own + i, get(work, own + i) + x)
 
 
 @compiled
@@ -471,7 +480,7 @@ def _by_loop(kind, is_on, error, speed_error, by_delay, torque):
         return is_on * speed_error
     if kind == DELAY:
         return is_on * by_delay
-    return (1.0 - is_on) * math.copysign(1.0, torque) if kind == LIMIT else 0.0
+    return (1.0 - is_on) * copysign(1.0, torque) if kind == LIMIT else wide(0.0)
 
 
 @compiled
@@ -482,21 +491,21 @@ def _hold(work, n, at, sensitivities, columns, drives, command, is_tick):
     S, by_hold, P = sensitivities[2], sensitivities[5], len(sums) - 1
     for i in range(n):
         kp, kd = drives[i, 1], drives[i, 2]
-        for lane in range(LANES):
-            if not is_tick[lane]:
-                continue
-            error = command[i, 0, lane] - get(work, q + i, lane)
-            speed_error = command[i, 2, lane] - get(work, v + i, lane)
-            torque, is_on = loop_torque(drives[i], error, speed_error, command[i, 3, lane])
-            by_delay = kp * command[i, 1, lane] + kd * command[i, 4, lane] + command[i, 5, lane]
-            put(work, held + i, lane, torque)
-            for p in range(P):
-                x = kp * get(work, S + i * P + p, lane) + kd * get(work, S + (n + i) * P + p, lane)
-                own = 0.0
-                for c in range(sums[p], sums[p + 1]):
-                    if kinds[c, 1] == i:
-                        own += _by_loop(kinds[c, 0], is_on, error, speed_error, by_delay, torque)
-                put(work, by_hold + i * P + p, lane, own - is_on * x)
+        error = _command(command, i, 0) - get(work, q + i)
+        speed_error = _command(command, i, 2) - get(work, v + i)
+        torque, is_on = loop_torque(drives[i], error, speed_error, _command(command, i, 3))
+        by_delay = (
+            kp * _command(command, i, 1) + kd * _command(command, i, 4) + _command(command, i, 5)
+        )
+        put(work, held + i, where(is_tick, torque, get(work, held + i)))
+        for p in range(P):
+            x = kp * get(work, S + i * P + p) + kd * get(work, S + (n + i) * P + p)
+            own = wide(0.0)
+            for c in range(sums[p], sums[p + 1]):
+                if kinds[c, 1] == i:
+                    own += _by_loop(kinds[c, 0], is_on, error, speed_error, by_delay, torque)
+            own = where(is_tick, own - is_on * x, get(work, by_hold + i * P + p))
+            put(work, by_hold + i * P + p, own)
 
 
 @compiled
@@ -507,22 +516,17 @@ def _combine(work, n, at, sensitivities, drives, step):
     """
     M, by_q, gains, loss = at[5], at[8], at[9], at[11]
     T_q, T_v = sensitivities[0], sensitivities[1]
+    span, rate = THETA * step, 1.0 / (THETA * step)
     for i in range(n):
-        for j in range(n):
-            for lane in range(LANES):
-                span = THETA * step[lane]
-                bent = get(work, T_q + i * n + j, lane)
-                m = get(work, M + i * n + j, lane) / span
-                value = m - span * bent - get(work, T_v + i * n + j, lane)
-                put(work, T_v + i * n + j, lane, value)
+        for k in range(i * n, i * n + n):
+            m, bent = get(work, M + k) * rate, get(work, T_q + k)
+            put(work, T_v + k, m - span * bent - get(work, T_v + k))
         armature, kp, d = drives[i, 0], drives[i, 1], i * n + i
-        for lane in range(LANES):
-            span, e = THETA * step[lane], get(work, loss + i, lane)
-            bent = get(work, by_q + i, lane)
-            by_speed = (armature / span - span * bent) / e
-            by_position = (bent + get(work, gains + i, lane) * kp) / e
-            put(work, T_v + d, lane, get(work, T_v + d, lane) + by_speed)
-            put(work, T_q + d, lane, get(work, T_q + d, lane) + by_position)
+        bent, e = get(work, by_q + i), get(work, loss + i)
+        by_speed = (armature * rate - span * bent) / e
+        by_position = (bent + get(work, gains + i) * kp) / e
+        put(work, T_v + d, get(work, T_v + d) + by_speed)
+        put(work, T_q + d, get(work, T_q + d) + by_position)
 
 
 @compiled
@@ -531,20 +535,17 @@ def _advance_column(work, n, at, sensitivities, step, p, P):
     H = at[7]
     T_q, T_v, S, own, change = sensitivities[:5]
     for i in range(n):
-        for lane in range(LANES):
-            put(work, change + i, lane, -get(work, own + i, lane))
+        moved = -get(work, own + i)
         for j in range(n):
-            for lane in range(LANES):
-                x = get(work, T_v + i * n + j, lane) * get(work, S + (n + j) * P + p, lane)
-                x -= get(work, T_q + i * n + j, lane) * get(work, S + j * P + p, lane)
-                put(work, change + i, lane, get(work, change + i, lane) + x)
+            moved += get(work, T_v + i * n + j) * get(work, S + (n + j) * P + p)
+            moved -= get(work, T_q + i * n + j) * get(work, S + j * P + p)
+        put(work, change + i, moved)
     solve(work, n, H, change)
     for i in range(n):
-        for lane in range(LANES):
-            du, dv = get(work, change + i, lane), get(work, S + (n + i) * P + p, lane)
-            dq = get(work, S + i * P + p, lane) + step[lane] * du
-            put(work, S + i * P + p, lane, dq)
-            put(work, S + (n + i) * P + p, lane, dv + (du - dv) / THETA)
+        du, dv = get(work, change + i), get(work, S + (n + i) * P + p)
+        dq = get(work, S + i * P + p) + step * du
+        put(work, S + i * P + p, dq)
+        put(work, S + (n + i) * P + p, dv + (du - dv) / THETA)
 
 
 @compiled
@@ -552,20 +553,20 @@ def _initialise(work, n, at, sensitivities, columns, terms, gravity, start, out_
     """Write the initial states of roll-outs and their sensitivities."""
     q, v, u, S = at[0], at[1], at[2], sensitivities[2]
     kinds, sums, P = columns.kinds, columns.sums, len(columns.sums) - 1
-    for lane in range(LANES):
-        for k in range(3):
-            put(work, ACCELERATION + k, lane, -gravity[k])
-        for i in range(n):
-            put(work, q + i, lane, start[0, i, lane])
-            put(work, v + i, lane, start[1, i, lane])
-            put(work, u + i, lane, start[1, i, lane])
-        for p in range(P):
-            kind, joint = kinds[sums[p], 0], kinds[sums[p], 1]
-            if kind in (START, SPEED):  # of one joint alone
-                row = joint + (n if kind == SPEED else 0)
-                put(work, S + row * P + p, lane, 1.0)
-                if row < out_S.shape[1]:
-                    out_S[0, row, p, lane] = 1.0
+    first = start.reshape(start.size)
+    for k in range(3):
+        put(work, ACCELERATION + k, -gravity[k])
+    for i in range(n):
+        put(work, q + i, read(first, i * LANES))
+        put(work, v + i, read(first, (n + i) * LANES))
+        put(work, u + i, read(first, (n + i) * LANES))
+    for p in range(P):
+        kind, joint = kinds[sums[p], 0], kinds[sums[p], 1]
+        if kind in (START, SPEED):  # of one joint alone
+            row = joint + (n if kind == SPEED else 0)
+            put(work, S + row * P + p, 1.0)
+            if row < out_S.shape[1]:
+                out_S[0, row, p] = 1.0
     if at[13] >= 0:
         _initialise_bristles(work, n, at, sensitivities[6], kinds, sums, terms)
 
@@ -588,7 +589,11 @@ def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, cor
         corrects: Whether each step is solved a second time, at its midpoint; only without columns.
     """
     command, steps, ticks, every, start = course
-    out_q, out_v, out_S = out
+    out_q, out_v, out_S = (
+        out.q.reshape(out.q.size),
+        out.v.reshape(out.v.size),
+        out.S.reshape(out.S.size),
+    )
     codes = terms.codes
     n, P = len(tree.parents), len(columns.sums) - 1
     q = (n + 1) * BODY
@@ -602,38 +607,40 @@ def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, cor
     bristles, by_state = grip + 2 * n if n_bristles else -1, grip + 2 * n + 5 * n_bristles
     at = (q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, bristles, grip)
     sensitivities = (T_q, T_v, S, own, change, by_hold, by_state)
-    work.numbers[:] = 0.0
-    _initialise(work, n, at, sensitivities, columns, terms, tree.gravity, start, out_S)
+    work[:] = 0.0
+    _initialise(work, n, at, sensitivities, columns, terms, tree.gravity, start, out.S)
+    commands, lengths, starts = (
+        command.reshape(command.size), steps.reshape(steps.size), ticks.reshape(ticks.size)
+    )  # fmt: skip
+    outputs = out.S.shape[1]
     for k in range(len(steps)):
-        step = steps[k]
-        if held >= 0 and ticks[k].any():
-            _hold(work, n, at, sensitivities, columns, drives, command[k], ticks[k])
+        step, now = read(lengths, k * LANES), (commands, 6 * n * k)
+        if held >= 0:
+            is_tick = read(starts, k * LANES) > 0.0
+            if is_any(is_tick):
+                _hold(work, n, at, sensitivities, columns, drives, now, is_tick)
         _centre(work, n, at, step, tree, bodies, zeros, v, a)
-        if not _solve(work, n, at, drives, terms, step, command[k]):
+        if not _solve(work, n, at, drives, terms, step, now):
             return k
         if corrects:
             _centre(work, n, at, step, tree, bodies, zeros, u, a)
-            if not _solve(work, n, at, drives, terms, step, command[k]):
+            if not _solve(work, n, at, drives, terms, step, now):
                 return k
         if bristles >= 0:
             _advance_bristles(work, n, at, terms, step)
         if P:
             for i in range(n):
-                for lane in range(LANES):
-                    moved = get(work, u + i, lane) - get(work, v + i, lane)
-                    put(work, a + i, lane, moved / (THETA * step[lane]))
+                moved = get(work, u + i) - get(work, v + i)
+                put(work, a + i, moved / (THETA * step))
             inverse_dynamics(work, tree, bodies, v, a, h)
             derivatives(work, tree, bodies, v, T_q)  # T_q, followed by T_v
-            _propagate(work, n, at, sensitivities, columns, drives, terms, step, command[k], tree)
+            _propagate(work, n, at, sensitivities, columns, drives, terms, step, now, tree)
         _advance(work, n, at, step)
         if (k + 1) % every == 0:
             sample = (k + 1) // every
             for i in range(n):
-                for lane in range(LANES):
-                    out_q[sample, i, lane] = get(work, q + i, lane)
-                    out_v[sample, i, lane] = get(work, v + i, lane)
-            for i in range(out_S.shape[1]):
-                for p in range(P):
-                    for lane in range(LANES):
-                        out_S[sample, i, p, lane] = get(work, S + i * P + p, lane)
+                write(out_q, (sample * n + i) * LANES, get(work, q + i))
+                write(out_v, (sample * n + i) * LANES, get(work, v + i))
+            for row in range(outputs * P):
+                write(out_S, (sample * outputs * P + row) * LANES, get(work, S + row))
     return -1

@@ -400,7 +400,7 @@ class ClosedLoopRobot:
         size, n = (samples - 1) * every, len(part.joints)
         command = np.zeros((size, n, 6, lanes.LANES))
         steps, start = np.empty((size, lanes.LANES)), np.empty((2, n, lanes.LANES))
-        ticks = np.zeros((0 if loops.rate is None else size, lanes.LANES), dtype=bool)
+        ticks = np.zeros((0 if loops.rate is None else size, lanes.LANES))
         for lane in range(lanes.LANES):
             if lane >= len(windows):  # unused lanes copy the first one
                 command[..., lane], steps[:, lane] = command[..., 0], steps[:, 0]

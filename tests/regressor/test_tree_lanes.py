@@ -20,7 +20,7 @@ JOINT = (
 # a tree that branches twice, of revolute and prismatic joints, all axes tilted
 PARENTS = (0, 1, 2, 2, 1, 5, 0)
 KINDS = ("revolute", "prismatic", "revolute", "continuous", "prismatic", "revolute", "prismatic")
-LANES = 8
+LANES = lanes.LANES
 ZERO = 0.3  # where the encoders have theirs
 
 
@@ -51,8 +51,8 @@ def found(model):
     at_q, at_v, at_a, tau, column = (first + k * n for k in range(5))
     M = first + 5 * n
     by_q, by_v = M + n * n, M + 2 * n * n
-    work = lanes.work_space(by_v + n * n, 3)
-    entries = work.numbers.reshape(-1, LANES)
+    work = lanes.work_space(by_v + n * n)
+    entries = work.reshape(-1, LANES)
     entries[tree_lanes.ACCELERATION : tree_lanes.ACCELERATION + 3] = -tree.gravity[:, None]
     entries[at_q:tau] = np.vstack([q.T - ZERO, v.T, a.T])
     for i in range(n):
