@@ -13,21 +13,18 @@ They are spatial forces and are transformed like these.
 import numpy as np
 
 from robotid.regressor.lanes import (
-    LANES,
     add,
     compiled,
     cross,
     dot,
     get,
     get3,
-    lane_of,
     put,
     put3,
     put_lane,
     scale,
     times,
     work_space,
-    write,
 )
 from robotid.regressor.tree_lanes import (
     ACCELERATION,
@@ -48,6 +45,7 @@ from robotid.regressor.tree_lanes import (
     times6,
     turned,
 )
+from robotid.regressor.vector_lanes import LANES, lane_of, write
 
 __all__ = [
     "LANES",

@@ -27,22 +27,7 @@ ticks.
 from typing import NamedTuple
 
 from robotid._typing import Array
-from robotid.regressor.lanes import (
-    LANES,
-    compiled,
-    copysign,
-    factor,
-    get,
-    is_any,
-    put,
-    put3,
-    read,
-    solve,
-    where,
-    wide,
-    work_space,
-    write,
-)
+from robotid.regressor.lanes import compiled, factor, get, put, solve, work_space
 from robotid.regressor.tree_lanes import (
     ACCELERATION,
     BODY,
@@ -52,13 +37,18 @@ from robotid.regressor.tree_lanes import (
     mass_matrix,
     place,
 )
+from robotid.regressor.vector_lanes import LANES, copysign, is_any, read, where, wide, write
 from robotid.robot.drive_term import BRISTLES, LOADED
+from robotid.simulation.bristle_lanes import (
+    advance_bristles,
+    bristle_column,
+    initialise_bristles,
+    presliding,
+)
 from robotid.simulation.law_lanes import (
     affine_term,
     coded_term,
-    deflection_by_lane,
     direction,
-    initial_deflection_by_lane,
     loop_torque,
     term_by_lane,
 )
@@ -82,7 +72,6 @@ __all__ = [
 ]
 
 THETA = 0.5  # instant of the forces, relative to the step: exact to second order
-_MOVED_BEFORE = 0.1  # assumed time of motion before the simulation, for initial deflections [s]
 _NEWTON = 60  # largest number of steps; three or four are typical
 _CLOSE = 1e-12  # of the speed, relative to 1 + its size
 
@@ -199,7 +188,7 @@ def _balance(work, n, at, drives, terms, step, command):
     q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, bristles, grip = at
     codes, shapes, values, spans = terms
     if bristles >= 0:
-        _presliding(work, n, at, terms, step)
+        presliding(work, n, at, terms, THETA * step)
     rate = 1.0 / (THETA * step)
     for i in range(n):
         tau = get(work, h + i)
@@ -241,23 +230,6 @@ def _balance(work, n, at, drives, terms, step, command):
         put(work, by_q + i, f_q)
         put(work, gains + i, is_on)
         put(work, loss + i, e)
-
-
-@compiled
-def _presliding(work, n, at, terms, step):
-    """Write the presliding friction for the speeds u, and its derivative."""
-    u, bristles, grip = at[2], at[13], at[14]
-    codes, shapes, values, spans = terms
-    for i in range(n):
-        speed, f, f_u = get(work, u + i), wide(0.0), wide(0.0)
-        for k in range(spans[i, 0], spans[i, 2]):
-            if codes[k, 2] == BRISTLES:
-                before = get(work, bristles + 5 * int(shapes[k, 3]))
-                z, z_u, _ = deflection_by_lane(shapes[k], before, speed, THETA * step)
-                f += values[k] * z
-                f_u += values[k] * z_u
-        put(work, grip + i, f)
-        put(work, grip + n + i, f_u)
 
 
 @compiled
@@ -372,10 +344,10 @@ def _propagate(work, n, at, sensitivities, columns, drives, terms, step, command
                 x = get(work, by_hold + i * P + p) / get(work, loss + i)
                 put(work, own + i, get(work, own + i) - x)
         if bristles >= 0:
-            _bristle_column(work, n, at, sensitivities, terms, p, P, False)
+            bristle_column(work, n, at, sensitivities, terms, p, P, False)
         _advance_column(work, n, at, sensitivities, step, p, P)
         if bristles >= 0:
-            _bristle_column(work, n, at, sensitivities, terms, p, P, True)
+            bristle_column(work, n, at, sensitivities, terms, p, P, True)
 
 
 @compiled
@@ -408,67 +380,6 @@ def _drive_column(work, at, drives, terms, step, command, column, own):
         )
         x = -_by_loop(kind, is_on, error, speed_error, by_delay, torque)
     put(work, own + j, get(work, own + j) + x / get(work, loss + j))
-
-
-@compiled
-def _advance_bristles(work, n, at, terms, step):
-    """Write z after a step, the acting z within it, and derivatives of both.
-
-    The derivatives are: of the acting z by z before; of z after by the speed u, and by z before.
-    """
-    u, bristles = at[2], at[13]
-    codes, shapes, values, spans = terms
-    for i in range(n):
-        for k in range(spans[i, 0], spans[i, 2]):
-            if codes[k, 2] == BRISTLES:
-                z = bristles + 5 * int(shapes[k, 3])
-                speed, before = get(work, u + i), get(work, z)
-                acts, _, share = deflection_by_lane(shapes[k], before, speed, THETA * step)
-                after, by_speed, by_before = deflection_by_lane(shapes[k], before, speed, step)
-                put(work, z, after)
-                put(work, z + 1, acts)
-                put3(work, z + 2, (share, by_speed, by_before))
-
-
-@compiled
-def _initialise_bristles(work, n, at, by_state, kinds, sums, terms):
-    """Write the initial z and its derivative by the initial speed v.
-
-    It is that of steady sliding, unless the joint needs more than ``_MOVED_BEFORE`` for it.
-    """
-    v, bristles = at[1], at[13]
-    codes, shapes, values, spans = terms
-    for i in range(n):
-        for k in range(spans[i, 0], spans[i, 2]):
-            if codes[k, 2] != BRISTLES:
-                continue
-            slot, P = int(shapes[k, 3]), len(sums) - 1
-            z, by_speed = initial_deflection_by_lane(shapes[k], get(work, v + i), _MOVED_BEFORE)
-            put(work, bristles + 5 * slot, z)
-            for p in range(P):
-                if kinds[sums[p], 0] == SPEED and kinds[sums[p], 1] == i:
-                    put(work, by_state + slot * P + p, by_speed)
-
-
-@compiled
-def _bristle_column(work, n, at, sensitivities, terms, p, P, is_after):
-    """Add the effect of bristle states to one column; after the step, advance their columns."""
-    loss, bristles = at[11], at[13]
-    own, change, by_state = sensitivities[3], sensitivities[4], sensitivities[6]
-    codes, shapes, values, spans = terms
-    for i in range(n):
-        for k in range(spans[i, 0], spans[i, 2]):
-            if codes[k, 2] != BRISTLES:
-                continue
-            slot = int(shapes[k, 3])
-            z, Z = bristles + 5 * slot, by_state + slot * P + p
-            x = get(work, Z)
-            if is_after:
-                x *= get(work, z + 4)
-                put(work, Z, x + get(work, z + 3) * get(work, change + i))
-            else:
-                x *= values[k] * get(work, z + 2) / get(work, loss + i)
-                put(work, own + i, get(work, own + i) + x)
 
 
 @compiled
@@ -568,7 +479,7 @@ def _initialise(work, n, at, sensitivities, columns, terms, gravity, start, out_
             if row < out_S.shape[1]:
                 out_S[0, row, p] = 1.0
     if at[13] >= 0:
-        _initialise_bristles(work, n, at, sensitivities[6], kinds, sums, terms)
+        initialise_bristles(work, n, at, sensitivities[6], kinds, sums, terms, SPEED)
 
 
 @compiled
@@ -627,7 +538,7 @@ def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, cor
             if not _solve(work, n, at, drives, terms, step, now):
                 return k
         if bristles >= 0:
-            _advance_bristles(work, n, at, terms, step)
+            advance_bristles(work, n, at, terms, THETA * step, step)
         if P:
             for i in range(n):
                 moved = get(work, u + i) - get(work, v + i)

@@ -6,6 +6,7 @@ import pytest
 
 from robotid.regressor import lanes, tree_lanes
 from robotid.regressor.compiled import flatten
+from robotid.regressor.vector_lanes import LANES
 from robotid.robot.model import RobotModel
 
 LINK = (
@@ -20,7 +21,6 @@ JOINT = (
 # a tree that branches twice, of revolute and prismatic joints, all axes tilted
 PARENTS = (0, 1, 2, 2, 1, 5, 0)
 KINDS = ("revolute", "prismatic", "revolute", "continuous", "prismatic", "revolute", "prismatic")
-LANES = lanes.LANES
 ZERO = 0.3  # where the encoders have theirs
 
 
