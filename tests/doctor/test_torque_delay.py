@@ -157,6 +157,18 @@ def test_one_joint_with_a_delay_of_its_own_is_named_and_does_not_count_for_the_o
     assert "leads the position by 100 ms or more" in own.message
 
 
+@pytest.mark.parametrize(("joint", "delay"), [("elbow_joint", 0.03), ("wrist_2_joint", -0.03)])
+def test_a_joint_is_late_although_friction_hides_half_of_it(ur5, joint, delay):
+    log, j = controlled_log("ur5", 100, duration=8.0), ur5.joints.index(joint)
+    tau = log.tau.copy()
+    tau[:, j] = delayed(log, delay).tau[:, j]
+    own, common = found(ur5, replace(log, tau=tau))
+    assert (own.code, own.where) == ("joint_torque_delay", f"run.csv: {joint}")
+    assert own.evidence["delay"] == pytest.approx(delay, abs=0.006)
+    assert 0.35 < own.evidence["gain"] < 0.75
+    assert (common.code, common.severity) == ("torque_delay", "note")
+
+
 def test_the_error_of_a_delay_counts_friction_beside_the_scatter(ur5, monkeypatch):
     squares = np.tile(1 - 0.5 * (1 - (torque_delay._GRID / 0.03 - 1) ** 2), (6, 8, 1))
     misfit = torque_delay._Misfit(squares, np.ones(6), ur5.joints)
@@ -212,7 +224,7 @@ def test_a_delay_of_one_joint_is_beside_that_of_the_others(rng):
     misfit, bottom, bend, at = parabolas(rng)
     shift = np.array([0.0, 0.04, 0.0])[:, None]
     squares = bottom[..., None] + bend[..., None] * (_GRID - (0.1 * at + shift)[..., None]) ** 2
-    own = replace(misfit, squares=squares).own_delay(1)
+    own = replace(misfit, squares=squares).own_delay(1, 0.01)
     whole = np.sum(bend[1] * (0.1 * at[1] + 0.04)) / bend[1].sum()
     step = _GRID[1] - _GRID[0]
     assert own.delay == pytest.approx(whole, abs=0.51 * step)
@@ -231,7 +243,7 @@ def test_a_delay_of_one_joint_is_beside_that_of_the_others(rng):
     )
     assert own.explained == pytest.approx(1 - then / now, abs=2e-3)
     assert own.is_significant
-    assert not misfit.own_delay(0).is_significant
+    assert not misfit.own_delay(0, 0.01).is_significant
 
 
 def test_an_instant_is_as_far_from_a_slow_one_as_the_nearest_on_either_side(rng):
