@@ -270,4 +270,5 @@ def _with_own(recordings: Recordings, fit: Solution, drives: Sequence[DriveChoic
     )  # fmt: skip
     fitted = dict(zip(fit.mapping.names, fit.standard, strict=True))
     start = np.array([fitted.get(name, 0.0) for name in model.layout.names])
-    return recordings.with_model(model.with_reference(start))
+    changed = recordings.with_model(model.with_reference(start))
+    return changed if changed.contacts is None else with_contact_errors(changed)  # of its terms

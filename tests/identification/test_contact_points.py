@@ -1,6 +1,7 @@
 """Errors of points of contact in the intervals."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -13,6 +14,7 @@ from robotid.identification.contact_points import (
     estimated_uncertainty,
     with_contact_errors,
 )
+from robotid.identification.pipeline import _with_own
 from robotid.logs.base import BaseMotion
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -21,6 +23,7 @@ from robotid.regressor.constraints import constraint_jacobian, touching
 from robotid.regressor.factors import triangle_of
 from robotid.regressor.prediction import predict
 from robotid.robot.constraints import Contact, frame_id
+from robotid.robot.drives import Cubic, Viscous
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -126,3 +129,26 @@ def test_the_covariance_of_the_score_is_that_of_the_stated_uncertainty(log):
     assert once.variance > 0.0
     assert errors(0.0) is None
     assert 0.0 < np.abs(errors(None).root).max() < np.inf
+
+
+def test_contact_errors_follow_the_selected_drive_terms(log):
+    """Errors of the points are those of a robot that had these terms from the start."""
+    model = robot(2e-3)
+    plain = with_contact_errors(
+        Recordings(model, structural_mapping(model), (hold_log(model, log, RAW),))
+    )
+    names, pi = plain.mapping.names, model.standard_parameters()
+    drives = [
+        SimpleNamespace(joint="FR_KFE", terms=(Viscous(), Cubic())),
+        SimpleNamespace(joint="HL_HFE", terms=(Viscous(),)),
+    ]
+    changed = _with_own(plain, SimpleNamespace(mapping=plain.mapping, standard=pi), drives)
+    assert len(changed.mapping.base_names) == len(plain.mapping.base_names) + 3
+    fresh = with_contact_errors(
+        Recordings(changed.model, changed.mapping, (hold_log(changed.model, log, RAW),))
+    )
+    assert len(names) + 3 == len(changed.mapping.names)
+    assert changed.contacts.root.shape == (len(changed.mapping.base_names), 6)
+    np.testing.assert_allclose(changed.contacts.root, fresh.contacts.root, rtol=1e-9, atol=1e-15)
+    k = [changed.mapping.base_names.index(f"{x}.viscous") for x in ("FR_KFE", "HL_HFE")]
+    assert (np.abs(changed.contacts.root[k]).max(axis=1) > 0.0).all()
