@@ -69,7 +69,7 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
         Errors "torque_sign", "unsigned_torque", "torque_order", "joint_order", "joint_axis",
         "position_order", "position_sign", "position_offset", "gravity" or "gravity_compensated";
         without these, the findings of ``check_unmounted_parts`` or ``check_loads`` and
-        "unexplained_torque"; in addition a warning "counterbalance".
+        "unexplained_torque"; in addition a warning "counterbalance" or "link_mass".
     """
     probe, balanced = counterbalance(probe, name)
     yield from balanced

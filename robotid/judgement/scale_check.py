@@ -17,7 +17,7 @@ from robotid.regressor.constraints import loop_basis, without_forces
 from robotid.regressor.prediction import predict
 from robotid.regressor.torque import joint_torque_regressor
 
-__all__ = ["ScaleCheck", "check_scale"]
+__all__ = ["ScaleCheck", "check_scale", "friction_shares"]
 
 _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
@@ -230,7 +230,7 @@ def check_scale(found: Fit) -> ScaleCheck:
     """
     model, size = found.model, found.model.layout.n_inertial
     before, after = (float(pi[:size:10].sum()) for pi in (found.prior, found.standard))
-    friction = _friction(found)
+    friction = friction_shares(found)
     errors = [found.metrics(name).per_joint for name in ("estimate", "wls")]
     follows = all(errors[0][j].rmse <= _HELD_BACK * free.rmse for j, free in errors[1].items())
     plain = ScaleCheck(
@@ -274,8 +274,12 @@ def check_scale(found: Fit) -> ScaleCheck:
     )  # fmt: skip
 
 
-def _friction(found: Fit) -> dict[str, float]:
-    """Return the share of friction in the RMS torque of each joint [-]."""
+def friction_shares(found: Fit) -> dict[str, float]:
+    """Return the share of friction in the RMS torque of each joint [-].
+
+    Args:
+        found: The fit.
+    """
     layout = found.model.layout
     is_friction = [name.endswith((".viscous", ".coulomb")) for name in layout.names]
     pi = np.where(is_friction, found.standard, 0.0)

@@ -177,7 +177,7 @@ def _loop_repairs(content: Mapping[str, Any], origin: Origin) -> tuple[Step, ...
     ]
     causes = grouped(warnings, content["joints"])
     causes = tuple(sorted(causes, key=lambda cause: not set(poor).intersection(cause.joints)))
-    steps += [Step(f"{c.messages[0][0].upper()}{c.messages[0][1:]}.") for c in causes[: _MOST - 1]]
+    steps += [Step(f"{_capital(c.messages[0])}.") for c in causes[: _MOST - 1]]
     words = (
         f"Do not use the result: the simulated position of {listed(poor, _NAMED)} is wrong. Find "
         "out in the replay when, correct gains, limits, encoder zeros or the motion, and repeat "
@@ -226,7 +226,8 @@ def _of_verdict(found: Identification) -> list[Cause]:
     """Return the causes of a verdict that no finding names."""
     causes, predictions = [], found.predictions
     measured = [(j, m) for metrics in predictions.values() for j, m in metrics.per_joint.items()]
-    beaten = {joint for joint, m in measured if is_beaten(m)}
+    rescaled = {f.where.rpartition(": ")[2] for f in found.findings if f.code == "gain_change"}
+    beaten = {joint for joint, m in measured if is_beaten(m)} - rescaled
     poor = {j for j, m in measured if m.relative_error_pct and m.relative_error_pct > GOOD}
     for code, joints in (("beaten", beaten), ("poor_prediction", poor)):
         if joints:
@@ -425,7 +426,13 @@ def _zeros(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
 
 def _as_found(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     """Return the messages of the findings, which name a cause and its remedy."""
-    return Step(" ".join(f"{m[0].upper()}{m[1:]}." for cause in causes for m in cause.messages[:1]))
+    return Step(" ".join(f"{_capital(m)}." for cause in causes for m in cause.messages[:1]))
+
+
+def _capital(message: str) -> str:
+    """Return a message as a sentence; the name of a file at its start stays as it is."""
+    first = message.partition(" ")[0].rstrip(":,")
+    return message if "." in first else f"{message[0].upper()}{message[1:]}"
 
 
 def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -470,8 +477,7 @@ def _inspect(found: Identification, origin: Origin, causes: Sequence[Cause]) -> 
 
 
 def _doctor(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    message = causes[0].messages[0]
-    words = f"{message[0].upper()}{message[1:]}."
+    words = f"{_capital(causes[0].messages[0])}."
     return Step(
         words, (shlex.join(["robotid", "doctor", *origin.source]),) if origin.source else ()
     )
@@ -529,6 +535,7 @@ _AS_FOUND = (
     "density",
     "drift",
     "ellipsoid",
+    "gain_change",
     "gravity",
     "gravity_compensated",
     "gyration",
@@ -537,6 +544,7 @@ _AS_FOUND = (
     "joint_order",
     "joint_origin",
     "joint_torque_delay",
+    "link_mass",
     "lost_motion",
     "mass_matrix",
     "moving_contact",

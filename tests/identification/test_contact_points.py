@@ -7,14 +7,15 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from robotid.fitting.drives import DriveChoice
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import hold_log
+from robotid.identification import pipeline
 from robotid.identification.contact_points import (
     _slopes,
     estimated_uncertainty,
     with_contact_errors,
 )
-from robotid.identification.pipeline import _with_own
 from robotid.logs.base import BaseMotion
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -131,24 +132,31 @@ def test_the_covariance_of_the_score_is_that_of_the_stated_uncertainty(log):
     assert 0.0 < np.abs(errors(None).root).max() < np.inf
 
 
-def test_contact_errors_follow_the_selected_drive_terms(log):
+def test_contact_errors_follow_the_selected_drive_terms(log, monkeypatch):
     """Errors of the points are those of a robot that had these terms from the start."""
-    model = robot(2e-3)
+    model, fits = robot(2e-3), []
     plain = with_contact_errors(
         Recordings(model, structural_mapping(model), (hold_log(model, log, RAW),))
     )
-    names, pi = plain.mapping.names, model.standard_parameters()
+    found = SimpleNamespace(mapping=plain.mapping, standard=model.standard_parameters())
     drives = [
-        SimpleNamespace(joint="FR_KFE", terms=(Viscous(), Cubic())),
-        SimpleNamespace(joint="HL_HFE", terms=(Viscous(),)),
+        DriveChoice("FR_KFE", ("cubic",), (Viscous(), Cubic())),
+        DriveChoice("HL_HFE", (), (Viscous(),)),
     ]
-    changed = _with_own(plain, SimpleNamespace(mapping=plain.mapping, standard=pi), drives)
+    monkeypatch.setattr(
+        pipeline, "solve_recordings", lambda *x, **_: SimpleNamespace(solution=found)
+    )
+    monkeypatch.setattr(pipeline, "choose_drives", lambda *x: drives)
+    monkeypatch.setattr(pipeline, "rough_choice", lambda choice: choice)
+    monkeypatch.setattr(pipeline, "replace", lambda fit, **_: fits.append(fit))
+    monkeypatch.setattr(pipeline, "fit_recordings", lambda recordings, choice: recordings)
+    pipeline.with_drives(plain, None, {})
+    (changed,) = fits
     assert len(changed.mapping.base_names) == len(plain.mapping.base_names) + 3
+    assert changed.contacts.root.shape == (len(changed.mapping.base_names), 6)
     fresh = with_contact_errors(
         Recordings(changed.model, changed.mapping, (hold_log(changed.model, log, RAW),))
     )
-    assert len(names) + 3 == len(changed.mapping.names)
-    assert changed.contacts.root.shape == (len(changed.mapping.base_names), 6)
     np.testing.assert_allclose(changed.contacts.root, fresh.contacts.root, rtol=1e-9, atol=1e-15)
     k = [changed.mapping.base_names.index(f"{x}.viscous") for x in ("FR_KFE", "HL_HFE")]
     assert (np.abs(changed.contacts.root[k]).max(axis=1) > 0.0).all()

@@ -398,7 +398,7 @@ def test_a_poor_result_of_commands_is_repaired_and_not_used():
     warnings = [loop_warning("alike", "one"), loop_warning("small", "a.csv: two")]
     steps = loop_steps(loop_content("poor", warnings=warnings), JOB)
     assert [step.words.partition(":")[0] for step in steps] == [
-        "A.csv",  # of the poor joint
+        "a.csv",  # of the poor joint
         "One has alike; do something.",
         "Do not use the result",
     ]
