@@ -157,7 +157,8 @@ class ScaleCheck:
         single = [f"{j} {x:.2f}" for j, x in self.gravity.items() if abs(x - 1.0) > _ANOTHER]
         if self.has_one_factor:
             same = f"The same factor {self.factor:.2f} fits all joints"
-            return f"{excess}. {same}: probable cause: the gains of the torques"
+            cause = "the gains of the torques, or the URDF's mass of a link that loads all of them"
+            return f"{excess}. {same}: probable cause: {cause}"
         is_urdf = self.scale is not None and abs(self.scale - 1.0) <= AGREES
         if is_urdf and self.masses[2] > 0 and by_payload < _BETTER * by_factor:
             load = f"a load of {self.masses[2]:+.3g} kg on the last link that the URDF lacks"

@@ -265,7 +265,14 @@ def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     if payload is not None:
         action = "Correct" if payload.contradicts else "Verify"
         words = f"{check}{action} the torque scale: {payload.message}."
-        again = (origin.again(),) if origin.source else ()
+        gains = _gain_flags(origin) if payload.contradicts else []
+        if gains:
+            words += (
+                " State the gains that the first command prints in the place of GAIN, and verify "
+                "them with another log of a payload: this one determines them."
+            )
+        flags = [x for joint, _ in gains for x in ("--gain", f"{joint}=GAIN")]
+        again = (origin.again(*flags),) if origin.source else ()
         return Step(words, (*_payload_gains(found, payload), *again))
     if found.scale_check.is_total_determined:
         words = (
@@ -283,6 +290,12 @@ def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     line = f'log = "{_LOADED}"\nmass = KG'
     stated = origin.stating("[[payload_check]]", line, "--payload-check", f"{_LOADED}=KG")
     return Step(words, (*stated, *_payload_gains(found)))
+
+
+def _gain_flags(origin: Origin) -> list[tuple[str, str]]:
+    """Return the joint and the value of each gain that a command states."""
+    stated = [value for flag, value in pairwise(origin.source) if flag == "--gain"]
+    return [(joint, value) for joint, _, value in (text.partition("=") for text in stated)]
 
 
 def _payload_gains(found: Identification, payload: PayloadCheck | None = None) -> list[str]:
@@ -397,12 +410,17 @@ def _balanced(causes: Sequence[Cause]) -> list[tuple[str, float]]:
 
 def _payload(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     logs = [x for x in found.validation if not x.is_refitted] or list(found.fitted)
-    log = str(logs[0].recording.log.path)
+    log, urdf = str(logs[0].recording.log.path), str(found.model.tree.path)
     words = (
         "Validate with the payload of the fitted logs: this log has another one. Identify the "
         "payload with robotid payload."
     )
-    words_of = (str(found.model.tree.path), log, "--reference", f"{origin.folder}/result.json")
+    if all(f.evidence.get("mass", 0.0) < 0 for cause in causes for f in cause.findings):
+        # the fitted log carries the payload
+        gains = [x for pair in _gain_flags(origin) for x in ("--gain", "=".join(pair))]
+        loaded = str(found.fitted[0].recording.log.path)
+        return Step(words, origin.using("payload", urdf, loaded, "--reference", log, *gains))
+    words_of = (urdf, log, "--reference", f"{origin.folder}/result.json")
     return Step(words, origin.using("payload", *words_of))
 
 
