@@ -69,6 +69,8 @@ def _show(content: dict[str, Any]) -> None:
     errors = [f"{joint} {cell(x)} %" for joint, x in content["relative_error_pct"].items()]
     echo(f"torque prediction error: {listed(errors)}", "  ")
     if "gains" in content:
+        checked = "the gains are those with which this payload has the stated mass"
+        echo(f"{checked}; verify them with another payload or another log of it", "  ")
         print("\n[torque.gains]")
         for joint, gain in content["gains"].items():
             low, high = gain["interval"]

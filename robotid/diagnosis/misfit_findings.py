@@ -1,7 +1,7 @@
 """Findings of terms that a drive model lacks, and the entries of a job file that add them."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from robotid.diagnosis.candidates import Candidate
@@ -22,7 +22,8 @@ __all__ = [
 ]
 
 _OF_POSITION = ("position_periodic", "spring", "position_offset")
-_OF_MASSES = ("counterbalance", "current_for_torque", "urdf_mismatch")
+_BALANCES = ("counterbalance", "link_mass")
+_OF_MASSES = (*_BALANCES, "current_for_torque", "urdf_mismatch")
 _SPRINGS = ("ripple", "spring")  # parts of the torque that depend on the position
 _DIGITS = "0123456789"
 
@@ -84,29 +85,36 @@ def counterbalanced(found: Sequence[Finding], logs: Sequence[str]) -> dict[str, 
     joints = {}
     for finding in found:
         log, _, joint = finding.where.rpartition(": ")
-        if finding.code == "counterbalance" and log in logs:
+        if finding.code in _BALANCES and log in logs:
             joints[joint] = spring_family(finding.evidence["turned"], COUNTERBALANCE)
     return joints
 
 
-def with_known_springs(found: Sequence[Finding], fit: Fit) -> list[Finding]:
+def with_known_springs(
+    found: Sequence[Finding], fit: Fit, wanted: Mapping[str, Sequence[str] | None]
+) -> list[Finding]:
     """Return the findings before a fit; a counterbalance that its model includes becomes a note.
+
+    A spring that a wrong mass would imitate becomes a note only if it was stated, not selected.
 
     Args:
         found: Findings before the fit.
         fit: The fit, with the terms of its drives.
+        wanted: Families stated for each joint; None: selected.
     """
     own = fit.model.layout.own
     springs = {joint for joint, terms in own.items() if any(t.part in _SPRINGS for t in terms)}
+    auto = [c for c in fit.drives if wanted[c.joint] is None]
+    selected = {c.joint for c in auto if any(t.part in _SPRINGS for t in c.terms)}
+    known = {"counterbalance": springs, "link_mass": springs - selected}
 
     def as_known(finding: Finding) -> Finding:
         joint = finding.where.rpartition(": ")[2]
-        if finding.code != "counterbalance" or joint not in springs:
+        if joint not in known.get(finding.code, ()):
             return finding
         names = listed(term.name for term in own[joint] if term.part in _SPRINGS)
-        message = (
-            f"{finding.message.partition('. Add')[0]}. The model includes it: {names} of {joint}"
-        )
+        what, _, _ = finding.message.replace(". Correct the mass", ". Add it").partition(". Add it")
+        message = f"{what}. The model includes it: {names} of {joint}"
         return replace(finding, severity="note", message=message)
 
     return [as_known(finding) for finding in found]

@@ -44,7 +44,8 @@ _ALIKE = 1.6  # ratio below which two factors are equal: they lie on a grid of s
 _GAIN = 20.0  # decrease of the misfit from which another torque scale is accepted
 _OTHER_SCALE = 3.0  # a torque scale farther from 1 is no error of masses
 _OTHER_UNIT = 30.0  # ... and a common scale of all torques farther from 1 is another unit, no gain
-_CLEARER = 5.0  # decrease of the misfit by a counterbalance beyond that by another torque scale
+_CLEARER = 5.0  # decrease of the misfit by a counterbalance beyond that by another scale or mass
+_FREE, _LEAST = 5.0, 0.1  # spread of a mass that is not taken from the URDF, its smallest factor
 _SCALES = np.logspace(-3, 3, 61)
 _LARGE = 0.08  # payload over the arm's mass that errors of the links do not explain
 _FLOOR = 1e-3  # an unexplained share below this is negligible
@@ -217,7 +218,8 @@ def counterbalance(probe: Probe, name: str) -> tuple[Probe, tuple[Finding, ...]]
     """Return a motion with its counterbalanced joint, if there is one, and the finding.
 
     A joint is counterbalanced if the torques do not fit the URDF's masses as they are, but fit with
-    an additional torque, a cosine and a sine of its position, that opposes gravity.
+    an additional torque, a cosine and a sine of its position, that opposes gravity. If a smaller
+    mass of one link explains the torques as well, the finding is "link_mass".
 
     Args:
         probe: The motion; signs and order must be right.
@@ -243,7 +245,7 @@ def counterbalance(probe: Probe, name: str) -> tuple[Probe, tuple[Finding, ...]]
     chi, j, cancelled, other = min(found, key=lambda x: x[0])
     if not cancelled < _MOST_CANCELLED or _scaled_fit(whole) < chi + _CLEARER:
         return probe, ()
-    return other, (_balanced(other, j, cancelled, name),)
+    return other, (_balanced(other, j, cancelled, _lighter(whole, chi), name),)
 
 
 def _lifting(probe: Probe) -> list[int]:
@@ -274,16 +276,51 @@ def _scaled_fit(model: LoadModel) -> float:
     return chi if is_other and _is_this_robot(model, chi, theta) else np.inf
 
 
-def _balanced(probe: Probe, j: int, cancelled: float, name: str) -> Finding:
+def _lighter(model: LoadModel, chi: float) -> tuple[float, int, float] | None:
+    """Return the misfit, number and factor of a link whose mass explains torques as well as a term.
+
+    Args:
+        model: The load model without the term.
+        chi: Misfit with the term.
+
+    Returns:
+        None if no link with a smaller mass, the others near the URDF's, explains them.
+    """
+    ones, found = np.ones(len(model.R)), []
+    for k in range(len(model.mean) - 4):
+        spread = model.spread.copy()
+        spread[k] = _FREE
+        left, theta, _ = replace(model, spread=spread).fit(ones)
+        if left < chi + _CLEARER and _error_of_links(np.delete(theta, k)) < _MISMATCH:
+            found.append((left, k, float(theta[k])))
+    best = min(found, default=None)
+    return best if best is not None and _LEAST < best[2] < 1.0 else None
+
+
+def _balanced(
+    probe: Probe, j: int, cancelled: float, lighter: tuple[float, int, float] | None, name: str
+) -> Finding:
     joint, extent = probe.model.joints[j], float(np.ptp(probe.motion.q[:, j]))
-    family = spring_family(extent, COUNTERBALANCE)
+    line = f"{drive_line(joint, spring_family(extent, COUNTERBALANCE))} in [drives]"
     message = (
         f"{joint}: a torque that depends on its position cancels {100 * cancelled:.0f} % of its "
         "gravity torque by the URDF, and the other torques contain gravity: the joint has a "
-        f"counterbalance or a spring. Add it to the model: {drive_line(joint, family)} in [drives]"
+        "counterbalance or a spring"
     )
     evidence = {"cancelled_pct": 100 * cancelled, "turned": extent}
-    return log_finding(name, "counterbalance", "warning", message, joint, **evidence)
+    if lighter is None:
+        message = f"{message}. Add it to the model: {line}"
+        return log_finding(name, "counterbalance", "warning", message, joint, **evidence)
+    _, k, factor = lighter
+    link = probe.model.layout.bodies[k]
+    mass = float(probe.model.standard_parameters()[10 * k])
+    message = (
+        f"{message}, or the URDF's mass of {link}, {mass:.3g} kg, is too large: {factor:.2g} times "
+        f"it explains the torques as well. Correct the mass, or, if the joint has a spring, state "
+        f"it: {line}"
+    )
+    evidence |= {"mass": mass, "factor": factor}
+    return log_finding(name, "link_mass", "warning", message, joint, **evidence)
 
 
 def _error_of_links(theta: Array) -> float:

@@ -23,6 +23,7 @@ _NOISE = 3e-3  # share of a torque's variance that is negligible
 _TILT = 5.0  # [deg] angle of gravity from the stated one that is a warning
 _WRONG_TILT = 30.0  # [deg] ... and an error
 _HINT = 0.7  # gain from which a tilt is reported
+_STILL = 1e-3  # [rad, m] range of a joint at rest, as of the finding "static_joint"
 _UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported
 
 
@@ -69,7 +70,7 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
         Errors "torque_sign", "unsigned_torque", "torque_order", "joint_order", "joint_axis",
         "position_order", "position_sign", "position_offset", "gravity" or "gravity_compensated";
         without these, the findings of ``check_unmounted_parts`` or ``check_loads`` and
-        "unexplained_torque"; in addition a warning "counterbalance".
+        "unexplained_torque"; in addition a warning "counterbalance" or "link_mass".
     """
     probe, balanced = counterbalance(probe, name)
     yield from balanced
@@ -88,7 +89,9 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
             parts = list(check_unmounted_parts(probe, loaded.share, name))
             loads = parts or loads
         yield from loads
-        yield from _unexplained(probe, loaded.share, name)
+        # the friction of a joint at rest has any value: nothing contradicts its torque
+        still = np.ptp(probe.motion.q, axis=0) < _STILL
+        yield from _unexplained(probe, np.where(still, 0.0, loaded.share), name)
 
 
 def _sign(reading: _Reading) -> Iterator[Finding]:

@@ -32,7 +32,7 @@ from robotid.fitting.survey import hold_log
 from robotid.identification.contact_points import with_contact_errors
 from robotid.identification.result import Asked, Identification
 from robotid.judgement.findings import fit_findings, log_findings, not_written
-from robotid.judgement.unlike_runs import unlike_findings
+from robotid.judgement.unlike_runs import rescaled_findings, unlike_findings
 from robotid.judgement.verdict import blocking, check_ignored, rejected, warnings_of
 from robotid.log_files.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
@@ -192,8 +192,9 @@ def conclude(
     # the fit reports the excitation over all samples, see finding "undetermined"
     before = [f for f in found if f.severity != "note" and f.code != "excitation"]
     of_fit = fit_findings(fit, misfits, on_misfit, discrepancies)
-    of_fit += unlike_findings(variation)
-    merged = settled(with_known_springs(before, fit), of_fit)
+    loads = {f.where.rpartition(": ")[0] or f.where for f in found if f.code == "payload_change"}
+    of_fit += [*unlike_findings(variation), *rescaled_findings(fit, loads)]
+    merged = settled(with_known_springs(before, fit, wanted), of_fit)
     merged = rejected(merged, result.predictions, result.scale_check)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.validation)]
@@ -247,18 +248,21 @@ def with_drives(
     drives = choose_drives(solved.solution, wanted, balanced)
     if not any(drive.terms for drive in drives):
         return replace(solved.with_errors(), drives=drives)
+
+    def changed() -> Recordings:
+        own = _with_own(recordings, solved.solution, drives)
+        return own if recordings.contacts is None else with_contact_errors(own)  # of its terms
+
     most = _MOST_SHAPES if any(drive.shapes for drive in drives) else 0
     for done in range(most):
         report("fits", 1 + done, 2 + most, "fits")
-        own = _with_own(recordings, solved.solution, drives)
-        solved = solve_recordings(own, rough, is_last=False)
+        solved = solve_recordings(changed(), rough, is_last=False)
         moved = settled_shapes(replace(solved.solution, drives=drives))
         if moved is None:
             break
         drives = moved
     report("fits", 1 + most, 2 + most, "fits")
-    own = _with_own(recordings, solved.solution, drives)
-    return replace(fit_recordings(own, choice), drives=drives)
+    return replace(fit_recordings(changed(), choice), drives=drives)
 
 
 def _with_own(recordings: Recordings, fit: Solution, drives: Sequence[DriveChoice]) -> Recordings:

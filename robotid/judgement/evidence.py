@@ -1,6 +1,6 @@
 """Evidence for a verdict: torque prediction errors, and what the data determine."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -98,9 +98,14 @@ class Predictions:
             why = f"{listed(self.refitted)} contain fitted samples"
         return [f"prediction of unseen motion not evaluated: {why}"]
 
-    def better_by_urdf(self) -> list[str]:
-        """Return the joints that the URDF with fitted drives predicts better, and the remedy."""
+    def better_by_urdf(self, rescaled: Collection[str] = ()) -> list[str]:
+        """Return the joints that the URDF with fitted drives predicts better, and the remedy.
+
+        Args:
+            rescaled: Joints whose gain differs between the logs: that is the cause.
+        """
         worse = [j for own in self.tested.values() for j, m in own.items() if is_beaten(m)]
+        worse = [joint for joint in worse if joint not in rescaled]
         if not worse:
             return []
         return [

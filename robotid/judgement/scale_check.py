@@ -17,7 +17,7 @@ from robotid.regressor.constraints import loop_basis, without_forces
 from robotid.regressor.prediction import predict
 from robotid.regressor.torque import joint_torque_regressor
 
-__all__ = ["ScaleCheck", "check_scale"]
+__all__ = ["ScaleCheck", "check_scale", "friction_shares"]
 
 _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
@@ -157,7 +157,8 @@ class ScaleCheck:
         single = [f"{j} {x:.2f}" for j, x in self.gravity.items() if abs(x - 1.0) > _ANOTHER]
         if self.has_one_factor:
             same = f"The same factor {self.factor:.2f} fits all joints"
-            return f"{excess}. {same}: probable cause: the gains of the torques"
+            cause = "the gains of the torques, or the URDF's mass of a link that loads all of them"
+            return f"{excess}. {same}: probable cause: {cause}"
         is_urdf = self.scale is not None and abs(self.scale - 1.0) <= AGREES
         if is_urdf and self.masses[2] > 0 and by_payload < _BETTER * by_factor:
             load = f"a load of {self.masses[2]:+.3g} kg on the last link that the URDF lacks"
@@ -230,7 +231,7 @@ def check_scale(found: Fit) -> ScaleCheck:
     """
     model, size = found.model, found.model.layout.n_inertial
     before, after = (float(pi[:size:10].sum()) for pi in (found.prior, found.standard))
-    friction = _friction(found)
+    friction = friction_shares(found)
     errors = [found.metrics(name).per_joint for name in ("estimate", "wls")]
     follows = all(errors[0][j].rmse <= _HELD_BACK * free.rmse for j, free in errors[1].items())
     plain = ScaleCheck(
@@ -274,8 +275,12 @@ def check_scale(found: Fit) -> ScaleCheck:
     )  # fmt: skip
 
 
-def _friction(found: Fit) -> dict[str, float]:
-    """Return the share of friction in the RMS torque of each joint [-]."""
+def friction_shares(found: Fit) -> dict[str, float]:
+    """Return the share of friction in the RMS torque of each joint [-].
+
+    Args:
+        found: The fit.
+    """
     layout = found.model.layout
     is_friction = [name.endswith((".viscous", ".coulomb")) for name in layout.names]
     pi = np.where(is_friction, found.standard, 0.0)

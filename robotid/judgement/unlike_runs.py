@@ -1,11 +1,21 @@
 """Findings about logs whose parameters differ from those of the other logs."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from pathlib import Path
 
-from robotid.findings import Finding
+import numpy as np
+
+from robotid.findings import Finding, log_finding
+from robotid.fitting.result import Fit
+from robotid.judgement.evidence import GOOD, error_of
+from robotid.judgement.scale_check import friction_shares
 from robotid.variation.variation import UnlikeRun, Variation
 
-__all__ = ["unlike_findings"]
+__all__ = ["rescaled_findings", "unlike_findings"]
+
+_RESCALED = 0.1  # least difference from 1 of a factor between measured and predicted torque
+_LEFT = 1 / 3  # ... and the largest share of the squared error that it leaves
+_MOSTLY = 0.6  # share of friction in a torque from which friction may have changed, too
 
 
 def unlike_findings(variation: Variation | None) -> Iterator[Finding]:
@@ -30,6 +40,46 @@ def unlike_findings(variation: Variation | None) -> Iterator[Finding]:
             "high": float(high), "probability": found.probability,
         }  # fmt: skip
         yield Finding("unlike_run", "warning", log, f"{message}. {_REMEDY[found.kind]}", evidence)
+
+
+def rescaled_findings(fit: Fit, loaded: Collection[str] = ()) -> Iterator[Finding]:
+    """Yield a finding for each torque of a validation log that is a multiple of its prediction.
+
+    The factor c minimises |tau - c tau_predicted| over the rows used. It is reported if the torque
+    error is above the limit of a good prediction, and the factor removes most of its square.
+
+    Args:
+        fit: The fit.
+        loaded: Names of logs with another payload, which changes the torques, too.
+    """
+    if fit.model.constraints:  # the rows are projected, and mix the joints
+        return
+    friction = dict[str, float]()
+    for e in fit.validation:
+        motion, mask = e.recording.trajectory, e.recording.mask
+        log = Path(e.recording.log.path).name
+        if e.is_refitted or log in loaded:
+            continue
+        for k, joint in enumerate(fit.model.row_names):
+            measured = e.metrics["estimate"].per_joint.get(joint)
+            if joint not in fit.model.joints or measured is None or error_of(measured) <= GOOD:
+                continue
+            tau, own = motion.tau[mask[:, k], k], e.torques["estimate"][mask[:, k], k]
+            factor = float(own @ tau) / max(float(own @ own), 1e-300)
+            left = float(np.sum((tau - factor * own) ** 2) / np.sum((tau - own) ** 2))
+            if abs(factor - 1.0) < _RESCALED or left > _LEFT:
+                continue
+            friction = friction or friction_shares(fit)
+            what = "its gain differs"
+            if friction[joint] > _MOSTLY:
+                what = f"its gain, or its friction ({100 * friction[joint]:.0f} % of it), differs"
+            message = (
+                f"the torque of {joint} is {factor:.2f} times the predicted one. This factor "
+                f"explains {100 * (1 - left):.0f} % of the squared error: {what} between this log "
+                "and the fitted ones; check the gain of each log"
+            )
+            evidence = {"factor": factor, "share_pct": 100 * (1 - left)}
+            yield log_finding(log, "gain_change", "warning", message, joint, **evidence)
 
 
 _REMEDY = {

@@ -53,6 +53,8 @@ _REASONS = {
     "torque: the drive model lacks it",
     "current_for_torque": "the torque fits the URDF only in another scale. If it is a current or "
     "has another unit, masses and inertias are wrong by the same factor",
+    "gain_change": "the torque on a validation log is {factor:.2f} times the predicted one: gain "
+    "or friction differ between the logs",
     "gravity": "the stated direction of gravity may be wrong",
     "gravity_compensated": "the torque may be logged without gravity",
     "repeated_torque": "each torque value is repeated over {rows:.0f} samples: delayed and stepped",
@@ -61,6 +63,8 @@ _REASONS = {
     "joint_order": "the columns may belong to another joint",
     "joint_torque_delay": "the torque is delayed by {delay:+.3f} s relative to the position "
     "(negative: early), the torques of other joints are not",
+    "link_mass": "the URDF's mass of a link, {mass:.3g} kg, is too large ({factor:.2g} times it "
+    "explains the torques), or a spring cancels {cancelled_pct:.0f} % of the gravity torque",
     "lost_motion": "there may be backlash between the joint and its encoder",
     "rolling_contact": "a foot rolls as a ball of radius {radius:.4f} m, which is not stated: its "
     "force acts elsewhere",
@@ -214,7 +218,7 @@ def judge(
     reasons = [
         *predictions.untested(),
         *(reason for _, cautions, _ in largest for reason in cautions),
-        *predictions.better_by_urdf(),
+        *predictions.better_by_urdf({w.joint for w in warnings if w.code == "gain_change"}),
         *_described(warnings),
         *([scale_check.message] if scale_check is not None and is_contradicted else []),
         *predictions.at_rest(),

@@ -177,7 +177,7 @@ def _loop_repairs(content: Mapping[str, Any], origin: Origin) -> tuple[Step, ...
     ]
     causes = grouped(warnings, content["joints"])
     causes = tuple(sorted(causes, key=lambda cause: not set(poor).intersection(cause.joints)))
-    steps += [Step(f"{c.messages[0][0].upper()}{c.messages[0][1:]}.") for c in causes[: _MOST - 1]]
+    steps += [Step(f"{_capital(c.messages[0])}.") for c in causes[: _MOST - 1]]
     words = (
         f"Do not use the result: the simulated position of {listed(poor, _NAMED)} is wrong. Find "
         "out in the replay when, correct gains, limits, encoder zeros or the motion, and repeat "
@@ -226,7 +226,8 @@ def _of_verdict(found: Identification) -> list[Cause]:
     """Return the causes of a verdict that no finding names."""
     causes, predictions = [], found.predictions
     measured = [(j, m) for metrics in predictions.values() for j, m in metrics.per_joint.items()]
-    beaten = {joint for joint, m in measured if is_beaten(m)}
+    rescaled = {f.where.rpartition(": ")[2] for f in found.findings if f.code == "gain_change"}
+    beaten = {joint for joint, m in measured if is_beaten(m)} - rescaled
     poor = {j for j, m in measured if m.relative_error_pct and m.relative_error_pct > GOOD}
     for code, joints in (("beaten", beaten), ("poor_prediction", poor)):
         if joints:
@@ -264,7 +265,14 @@ def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     if payload is not None:
         action = "Correct" if payload.contradicts else "Verify"
         words = f"{check}{action} the torque scale: {payload.message}."
-        again = (origin.again(),) if origin.source else ()
+        gains = _gain_flags(origin) if payload.contradicts else []
+        if gains:
+            words += (
+                " State the gains that the first command prints in the place of GAIN, and verify "
+                "them with another log of a payload: this one determines them."
+            )
+        flags = [x for joint, _ in gains for x in ("--gain", f"{joint}=GAIN")]
+        again = (origin.again(*flags),) if origin.source else ()
         return Step(words, (*_payload_gains(found, payload), *again))
     if found.scale_check.is_total_determined:
         words = (
@@ -282,6 +290,12 @@ def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     line = f'log = "{_LOADED}"\nmass = KG'
     stated = origin.stating("[[payload_check]]", line, "--payload-check", f"{_LOADED}=KG")
     return Step(words, (*stated, *_payload_gains(found)))
+
+
+def _gain_flags(origin: Origin) -> list[tuple[str, str]]:
+    """Return the joint and the value of each gain that a command states."""
+    stated = [value for flag, value in pairwise(origin.source) if flag == "--gain"]
+    return [(joint, value) for joint, _, value in (text.partition("=") for text in stated)]
 
 
 def _payload_gains(found: Identification, payload: PayloadCheck | None = None) -> list[str]:
@@ -396,12 +410,17 @@ def _balanced(causes: Sequence[Cause]) -> list[tuple[str, float]]:
 
 def _payload(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     logs = [x for x in found.validation if not x.is_refitted] or list(found.fitted)
-    log = str(logs[0].recording.log.path)
+    log, urdf = str(logs[0].recording.log.path), str(found.model.tree.path)
     words = (
         "Validate with the payload of the fitted logs: this log has another one. Identify the "
         "payload with robotid payload."
     )
-    words_of = (str(found.model.tree.path), log, "--reference", f"{origin.folder}/result.json")
+    if all(f.evidence.get("mass", 0.0) < 0 for cause in causes for f in cause.findings):
+        # the fitted log carries the payload
+        gains = [x for pair in _gain_flags(origin) for x in ("--gain", "=".join(pair))]
+        loaded = str(found.fitted[0].recording.log.path)
+        return Step(words, origin.using("payload", urdf, loaded, "--reference", log, *gains))
+    words_of = (urdf, log, "--reference", f"{origin.folder}/result.json")
     return Step(words, origin.using("payload", *words_of))
 
 
@@ -425,7 +444,13 @@ def _zeros(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
 
 def _as_found(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     """Return the messages of the findings, which name a cause and its remedy."""
-    return Step(" ".join(f"{m[0].upper()}{m[1:]}." for cause in causes for m in cause.messages[:1]))
+    return Step(" ".join(f"{_capital(m)}." for cause in causes for m in cause.messages[:1]))
+
+
+def _capital(message: str) -> str:
+    """Return a message as a sentence; the name of a file at its start stays as it is."""
+    first = message.partition(" ")[0].rstrip(":,")
+    return message if "." in first else f"{message[0].upper()}{message[1:]}"
 
 
 def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -470,8 +495,7 @@ def _inspect(found: Identification, origin: Origin, causes: Sequence[Cause]) -> 
 
 
 def _doctor(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    message = causes[0].messages[0]
-    words = f"{message[0].upper()}{message[1:]}."
+    words = f"{_capital(causes[0].messages[0])}."
     return Step(
         words, (shlex.join(["robotid", "doctor", *origin.source]),) if origin.source else ()
     )
@@ -529,6 +553,7 @@ _AS_FOUND = (
     "density",
     "drift",
     "ellipsoid",
+    "gain_change",
     "gravity",
     "gravity_compensated",
     "gyration",
@@ -537,6 +562,7 @@ _AS_FOUND = (
     "joint_order",
     "joint_origin",
     "joint_torque_delay",
+    "link_mass",
     "lost_motion",
     "mass_matrix",
     "moving_contact",

@@ -136,6 +136,8 @@ def _names(evaluations: Sequence[Evaluation]) -> str:
 def _facts(found: Identification) -> dict[str, str]:
     before, after, _ = found.scale_check.masses
     change = f" ({100 * (after / before - 1):+.0f} %)".replace("-", "−") if before > 0 else ""
+    if not found.scale_check.is_total_determined:
+        change += ", not determined by torque alone"
     return {
         "Total mass": f"<strong>{before:.2f} → {after:.2f} kg</strong>{change}",
         "Base parameters determined": (

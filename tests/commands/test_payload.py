@@ -129,6 +129,12 @@ def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
     assert step.blocks[0] == (
         f"robotid payload {urdf} {loaded} --reference {bare} --link tool0 --mass 1.8 --gains"
     )
+    typed = Origin((str(urdf), "bare.csv", "--gain", "elbow_joint=3", "--cutoff", "8"), "out")
+    (step,) = [s for s in next_steps(found, typed) if "torque scale" in s.words]
+    assert step.blocks[1:] == (
+        f"robotid identify {urdf} bare.csv --cutoff 8 --gain elbow_joint=GAIN --out out",
+    )
+    assert "verify them with another log of a payload: this one determines them" in step.words
     rewritten = next_steps(found, Origin((), "out"))  # the report of a result names no source
     assert not any("robotid identify" in block for step in rewritten for block in step.blocks)
     right = replace(check, known=2.0)
@@ -149,6 +155,7 @@ def test_gains_come_from_a_known_mass(files, capsys, ur5):
         assert gain["std_error"] < 0.05 * true
     assert all(entry["std_error"] > 0 for entry in found["base_parameters"])
     said = asked(capsys, *words)
+    assert "verify them with another payload or another log of it" in " ".join(said.split())
     assert "[torque.gains]\nshoulder_pan_joint = 1" in said
     stated = f"{ur5.joints[0]}={GAINS[0]}"
     some = json.loads(asked(capsys, *words, "--gain", stated, "--json"))

@@ -25,6 +25,7 @@ from robotid.diagnosis.misfit_findings import (
     setting_of,
     settled,
     with_entries,
+    with_known_springs,
 )
 from robotid.diagnosis.sample import RIDGE, Normal, Sample, Trials, take_sample
 from robotid.diagnosis.selection import p_value
@@ -43,6 +44,7 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.drives import Harmonic
 from robotid.robot.families import AUTO, drive_line
 from robotid.robot.model import RobotModel
+from robotid.simulation.closed_loop import another_robot
 
 log_with = partial(helper.log_with, rate=50.0)  # [Hz]: the effects are slower than 10 Hz
 FIT = EstimatorSettings(draws=0)  # bounds have no part in what is tested here
@@ -268,6 +270,29 @@ def test_a_counterbalance_is_named_taken_into_the_model_and_no_error(ur5):
     (warned, _) = [f for f in stated.findings if f.code == "counterbalance"]
     assert warned.severity == "warning"
     assert stated.verdict.joints[LIFT].status == "usable"
+
+
+def test_a_mass_that_is_too_large_is_named_beside_a_spring(ur5):
+    """The URDF's upper arm has 5 times its mass; the log is of about the right one."""
+    k, log = 10 * ur5.layout.bodies.index("upper_arm_link"), log_with(ur5, 3)
+    pi, truth = ur5.standard_parameters(), another_robot(ur5, np.random.default_rng(3))
+    pi[k : k + 10] *= 5.0
+    (found,) = [f for f in check_logs(ur5.with_parameters(pi), log) if f.severity != "note"]
+    assert (found.code, found.where) == ("link_mass", f"run0.csv: {LIFT}")
+    assert found.evidence["mass"] == pytest.approx(pi[k])
+    wanted = np.linalg.norm(truth[k + 1 : k + 4]) / np.linalg.norm(pi[k + 1 : k + 4])
+    assert found.evidence["factor"] == pytest.approx(wanted, abs=0.06)
+    assert f"the URDF's mass of upper_arm_link, {pi[k]:.3g} kg, is too large" in found.message
+    assert counterbalanced([found], ["run0.csv"]) == {LIFT: "harmonics1"}
+    term = Harmonic(order=1.0)
+    fit = SimpleNamespace(
+        model=SimpleNamespace(layout=SimpleNamespace(own={LIFT: (term,)})),
+        drives=[SimpleNamespace(joint=LIFT, terms=(term,))],
+    )
+    assert with_known_springs([found], fit, {LIFT: None}) == [found]
+    (note,) = with_known_springs([found], fit, {LIFT: ("harmonics1",)})
+    assert note.severity == "note"
+    assert note.message.endswith(f"torques as well. The model includes it: cos1 of {LIFT}")
 
 
 def test_a_counterbalance_of_a_validation_log_alone_has_no_part_in_the_model():

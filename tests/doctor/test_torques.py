@@ -119,3 +119,17 @@ def test_torques_that_are_not_explained_are_reported_one_by_one_or_as_most_of_al
     (most,) = torques._unexplained(PROBE, np.array([0.3, 0.1, 0.4, 0.9]), "run.csv")
     assert (most.where, most.evidence) == ("run.csv", {"joints": 3.0, "share": 0.35})
     assert "the torques of 3 of 4 joints" in most.message
+
+
+def test_the_torque_of_a_joint_at_rest_is_not_unexplained(monkeypatch):
+    """Joints a, c and d rest: their friction has any value between its bounds."""
+    q = np.linspace(0.0, 1.0, 5)[:, None] * [0.0005, 0.5, 0.0, 0.0009] + 2.0
+    probe = SimpleNamespace(model=PROBE.model, motion=SimpleNamespace(q=q))
+    share = Explanation("payload", np.array([0.9, 0.4, 0.8, 0.7]))
+    monkeypatch.setattr(torques, "counterbalance", lambda probe, name: (probe, ()))
+    monkeypatch.setattr(torques, "explanations", lambda probe: (STATED, share, [STATED]))
+    monkeypatch.setattr(torques, "check_loads", lambda *x: ())
+    monkeypatch.setattr(torques, "check_unmounted_parts", lambda *x: ())
+    (found,) = torques.check_torques(probe, "run.csv")
+    assert (found.where, found.evidence) == ("run.csv: b", {"share": 0.4})
+    assert share.share[0] == 0.9

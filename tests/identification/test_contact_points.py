@@ -1,13 +1,16 @@
 """Errors of points of contact in the intervals."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from robotid.fitting.drives import DriveChoice
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import hold_log
+from robotid.identification import pipeline
 from robotid.identification.contact_points import (
     _slopes,
     estimated_uncertainty,
@@ -21,6 +24,7 @@ from robotid.regressor.constraints import constraint_jacobian, touching
 from robotid.regressor.factors import triangle_of
 from robotid.regressor.prediction import predict
 from robotid.robot.constraints import Contact, frame_id
+from robotid.robot.drives import Cubic, Viscous
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -126,3 +130,33 @@ def test_the_covariance_of_the_score_is_that_of_the_stated_uncertainty(log):
     assert once.variance > 0.0
     assert errors(0.0) is None
     assert 0.0 < np.abs(errors(None).root).max() < np.inf
+
+
+def test_contact_errors_follow_the_selected_drive_terms(log, monkeypatch):
+    """Errors of the points are those of a robot that had these terms from the start."""
+    model, fits = robot(2e-3), []
+    plain = with_contact_errors(
+        Recordings(model, structural_mapping(model), (hold_log(model, log, RAW),))
+    )
+    found = SimpleNamespace(mapping=plain.mapping, standard=model.standard_parameters())
+    drives = [
+        DriveChoice("FR_KFE", ("cubic",), (Viscous(), Cubic())),
+        DriveChoice("HL_HFE", (), (Viscous(),)),
+    ]
+    monkeypatch.setattr(
+        pipeline, "solve_recordings", lambda *x, **_: SimpleNamespace(solution=found)
+    )
+    monkeypatch.setattr(pipeline, "choose_drives", lambda *x: drives)
+    monkeypatch.setattr(pipeline, "rough_choice", lambda choice: choice)
+    monkeypatch.setattr(pipeline, "replace", lambda fit, **_: fits.append(fit))
+    monkeypatch.setattr(pipeline, "fit_recordings", lambda recordings, choice: recordings)
+    pipeline.with_drives(plain, None, {})
+    (changed,) = fits
+    assert len(changed.mapping.base_names) == len(plain.mapping.base_names) + 3
+    assert changed.contacts.root.shape == (len(changed.mapping.base_names), 6)
+    fresh = with_contact_errors(
+        Recordings(changed.model, changed.mapping, (hold_log(changed.model, log, RAW),))
+    )
+    np.testing.assert_allclose(changed.contacts.root, fresh.contacts.root, rtol=1e-9, atol=1e-15)
+    k = [changed.mapping.base_names.index(f"{x}.viscous") for x in ("FR_KFE", "HL_HFE")]
+    assert (np.abs(changed.contacts.root[k]).max(axis=1) > 0.0).all()

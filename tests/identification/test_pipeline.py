@@ -317,7 +317,7 @@ def test_what_is_concluded_counts_all_findings_but_the_ignored_ones(
     ((_, asked, wanted, balanced),) = given
     assert (asked, set(wanted.values())) == (choice, {()})
     assert balanced == (found, ["a.csv", "b.csv"])  # of the fitted logs
-    assert springs == [(found[:2], fit)]
+    assert springs == [(found[:2], fit, wanted)]
 
 
 def test_a_verdict_is_given_all_that_is_known_of_a_result(monkeypatch):

@@ -258,7 +258,7 @@ def test_a_floating_base_is_loaded_with_the_whole_mass(monkeypatch, masses, rati
     )  # fmt: skip
     monkeypatch.setattr(scale_check, "stated_mass", lambda fit: None)
     monkeypatch.setattr(scale_check, "determines_total_mass", lambda fit: False)
-    monkeypatch.setattr(scale_check, "_friction", lambda fit: {"a": 0.3})
+    monkeypatch.setattr(scale_check, "friction_shares", lambda fit: {"a": 0.3})
     check = check_scale(found)
     assert (check.scale, check.factor) == pytest.approx((ratio, ratio))
     assert check.masses == pytest.approx((sum(masses), 14.4, 0.0))

@@ -250,6 +250,23 @@ def test_a_setting_is_a_line_of_the_job_file_or_a_flag(identified, code, evidenc
     )
 
 
+def test_the_log_with_the_payload_is_the_one_that_is_identified(identified):
+    """A validation log with less: the fitted log has the payload, and the gains are needed."""
+    typed = replace(FLAGS, source=(*FLAGS.source, "--gain", "elbow_joint=2"))
+    urdf, fitted, kept = (
+        identified.model.tree.path,
+        *(e[0].recording.log.path for e in (identified.fitted, identified.validation)),
+    )
+    blocks = [
+        next_steps(told(identified, warning("payload_change", mass=mass)), typed)[0].blocks[0]
+        for mass in (-3.0, 3.0)
+    ]
+    swapped = [str(urdf), str(fitted), "--reference", str(kept), "--gain", "elbow_joint=2"]
+    assert blocks[0] == shlex.join(["robotid", "payload", *swapped])
+    usual = [str(urdf), str(kept), "--reference", "out/result.json"]
+    assert blocks[1] == shlex.join(["robotid", "payload", *usual])
+
+
 @pytest.mark.parametrize("code", sorted({*WARNING_CODES, "payload"} - {"total_mass"}))
 def test_whatever_leaves_a_result_in_doubt_has_a_step(identified, code):
     """Findings whose remedy is no setting are said again in their own words."""
@@ -398,7 +415,7 @@ def test_a_poor_result_of_commands_is_repaired_and_not_used():
     warnings = [loop_warning("alike", "one"), loop_warning("small", "a.csv: two")]
     steps = loop_steps(loop_content("poor", warnings=warnings), JOB)
     assert [step.words.partition(":")[0] for step in steps] == [
-        "A.csv",  # of the poor joint
+        "a.csv",  # of the poor joint
         "One has alike; do something.",
         "Do not use the result",
     ]

@@ -18,7 +18,7 @@ from robotid.report.diagnosis import (
 )
 from robotid.report.errors import _notes
 from robotid.report.information import information
-from robotid.report.torques import _totals
+from robotid.report.torques import _facts, _totals
 
 
 def test_shares_of_the_data_are_those_of_all_and_of_the_weakest(identified):
@@ -143,3 +143,19 @@ def test_a_joint_is_remarked_where_a_simpler_prediction_is_better(error, urdf, b
     own = {"better_than_constant": better, "relative_error_pct": error}
     own["urdf_relative_error_pct"] = urdf
     assert _notes(own) == wanted
+
+
+@pytest.mark.parametrize(
+    ("is_determined", "beside"), [(True, ""), (False, ", not determined by torque alone")]
+)
+def test_a_total_mass_that_torque_leaves_open_says_so(is_determined, beside):
+    check = SimpleNamespace(masses=(20.0, 23.0, 0.0), is_total_determined=is_determined)
+    found = SimpleNamespace(
+        scale_check=check,
+        determination=SimpleNamespace(rank=4),
+        base=np.zeros(5),
+        wls=SimpleNamespace(condition=70.0),
+    )
+    facts = _facts(found)
+    assert facts["Total mass"] == f"<strong>20.00 → 23.00 kg</strong> (+15 %){beside}"
+    assert facts["Base parameters determined"].startswith("<strong>4 of 5</strong>")
