@@ -11,13 +11,6 @@ from robotid.closed_loop.settings import LoopSettings
 from robotid.exceptions import NotConvergedError
 
 
-@dataclass
-class Fit:
-    theta: np.ndarray
-    covariance: np.ndarray
-    details: dict
-
-
 class DataRange(Exception):
     """What was fitted first, and how."""
 
@@ -77,27 +70,3 @@ def test_speeds_of_saturated_drives_are_the_largest_of_all_logs(monkeypatch):
     np.testing.assert_array_equal(found, [2.0, 3.0, 0.0])
     stated = LoopSettings(limit={"b": 5.0})
     np.testing.assert_array_equal(fit._largest_speeds(model, stated, list(speeds)), [2.0, 0.0, 0.0])
-
-
-def test_what_the_last_halving_changes_is_uncertain_with_its_correlations(monkeypatch):
-    """Changes by one step size are wholly correlated: w' C w rises by (w' change)^2."""
-    change, error, C = np.array([0.03, -0.02]), np.array([0.2, 0.3]), np.diag([0.04, 0.09])
-
-    @dataclass
-    class Stepped:
-        windows: tuple
-        robot: object
-        fine: object = None
-
-    t = np.arange(9) / 250.0
-    simulator = Stepped(
-        (SimpleNamespace(log=SimpleNamespace(t=t)),), SimpleNamespace(model="m", step=2e-3)
-    )
-    estimate = Fit(theta=np.ones(2), covariance=C, details={"left": 0})
-    estimator = SimpleNamespace(moved=lambda now, half, theta: (change, error))
-    monkeypatch.setattr(fit, "ClosedLoopRobot", lambda model, step, corrects: step)
-    monkeypatch.setattr(fit, "_settled", lambda now, estimator, estimate: (now, estimate))
-    _, found = fit.refine_steps(simulator, estimator, estimate)
-    for w in ([1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [2.0, 3.0]):
-        assert w @ found.covariance @ w == pytest.approx(w @ C @ w + np.dot(w, change) ** 2)
-    assert found.details == {"left": 0, "step": 2e-3, "halving": pytest.approx(0.15)}
