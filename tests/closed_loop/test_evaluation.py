@@ -74,7 +74,7 @@ def test_errors_are_of_samples_in_windows_and_the_spread_is_about_the_mean(tmp_p
     robot = ClosedLoopRobot(rail, step=2e-3)
     loops = stated_loops(rail, LoopSettings(kp=300.0, kd=40.0))
     soft = replace(loops, kp=np.array([50.0]))
-    found = run_open_loop(robot, loops, log, {"urdf": soft}, horizons=(0.1, 0.5, 9.0))
+    found = run_open_loop(robot, loops, log, {"urdf": soft}, horizons=(0.1, 0.5, 4.0, 9.0))
     assert np.isnan(found.q[120])
 
     def rms(loops, length):
@@ -83,7 +83,7 @@ def test_errors_are_of_samples_in_windows_and_the_spread_is_about_the_mean(tmp_p
         return np.sqrt(np.mean(missed**2, axis=0))
 
     np.testing.assert_allclose(found.rmse, rms(loops, np.inf))
-    assert list(found.horizons) == [0.1, 0.5]
+    assert list(found.horizons) == [0.1, 0.5], "of the log's 2.5 s, which end at 7.5 s"
     for length, error in found.horizons.items():
         np.testing.assert_allclose(error, rms(loops, length))
     np.testing.assert_allclose(found.spread, np.sqrt(np.mean((q - q.mean()) ** 2)))

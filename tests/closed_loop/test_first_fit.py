@@ -60,3 +60,13 @@ def test_where_a_settling_step_cannot_be_simulated_the_parameters_are_fitted():
     simulator = SimpleNamespace(exact=None, with_better_start=lambda theta: ("from", theta))
     found = fit._settled(simulator, Unsteady(), SimpleNamespace(theta="first"))
     assert found == (("from", "first"), ("fitted", ("from", "first"), "first"))
+
+
+def test_speeds_of_saturated_drives_are_the_largest_of_all_logs(monkeypatch):
+    speeds = {"one": {"a": 2.0, "b": 1.0}, "two": {"b": 3.0}, "three": {"a": 1.5}}
+    monkeypatch.setattr(fit, "largest_speeds", speeds.get)
+    model = SimpleNamespace(joints=("a", "b", "c"))
+    found = fit._largest_speeds(model, LoopSettings(), list(speeds))
+    np.testing.assert_array_equal(found, [2.0, 3.0, 0.0])
+    stated = LoopSettings(limit={"b": 5.0})
+    np.testing.assert_array_equal(fit._largest_speeds(model, stated, list(speeds)), [2.0, 0.0, 0.0])

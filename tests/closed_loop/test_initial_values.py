@@ -17,7 +17,7 @@ from robotid.closed_loop.initial_values import (
     typical_sizes,
     typical_sizes_of_torques,
 )
-from robotid.closed_loop.second_order import SecondOrder
+from robotid.closed_loop.second_order import SecondOrder, _better
 from robotid.closed_loop.settings import LoopSettings
 from robotid.closed_loop.zeros import _Motion
 from robotid.logs.data import Log
@@ -218,3 +218,24 @@ def test_a_load_that_would_push_a_loop_the_wrong_way_does_not_count(rng):
             assert best < 0.5 * bare
         cost = _Motion(q, v, a, error, sense).cost(model, sign, zero)
         assert cost == pytest.approx(60 * np.log(left).sum())
+
+
+def test_each_joint_has_all_of_the_trial_that_suits_it_best(planar, logged):
+    """Positions of a trial that are 0.1 off at one joint and 0.3 at the other, against 0.2."""
+    first, second = (
+        plain_model(planar, [x, x + 1], [1.0, 1.0], values=x + np.arange(6.0)).loops
+        for x in (10.0, 20.0)
+    )
+    second = replace(second, delay=np.array([0.03, 0.04]))
+    n = sum(len(w.log.q[w.counted]) for w in logged)
+    for j, missed in enumerate(([0.1, 0.3], [0.3, 0.1])):
+        outs = [SimpleNamespace(window=w, q=w.log.q[w.counted] + missed) for w in logged]
+        robot = SimpleNamespace(roll_out=lambda trial, windows, outs=outs: outs)
+        cost, found = _better(robot, logged, second, np.full(2, n * 0.2**2), first)
+        better = np.arange(2) == j
+        np.testing.assert_allclose(cost, n * np.where(better, 0.1, 0.2) ** 2)
+        for name in ("armature", "delay"):
+            wanted = np.where(better, getattr(second, name), getattr(first, name))
+            np.testing.assert_array_equal(getattr(found, name), wanted)
+        own = np.r_[second.values[:3], first.values[3:]], np.r_[first.values[:3], second.values[3:]]
+        np.testing.assert_array_equal(found.values, own[j])

@@ -1,9 +1,11 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, recorded
 
+from robotid.closed_loop.findings import _undetermined_encoders
 from robotid.closed_loop.fit import stated_loops
 from robotid.closed_loop.free_parameters import LoopSimulator, free_body_parameters
 from robotid.closed_loop.identify import identify_loops
@@ -72,6 +74,18 @@ def test_a_zero_is_found_to_the_grid_and_then_by_the_fit(moved):
     assert open_.where == "FL_calf_joint"
     [mirror] = [f for f in found.findings if f.code == "mirror_image"]
     assert mirror.where == "FL_thigh_joint, FL_calf_joint"
+
+
+def test_joints_that_gravity_leaves_open_are_named_with_the_largest_margin(leg):
+    margin = np.array([0.01, 0.02, 0.04])
+    found = SimpleNamespace(
+        model=leg[0].model, fit=SimpleNamespace(encoders=SimpleNamespace(margin=margin))
+    )
+    joints = leg[0].model.joints
+    for which, most in (([0, 1], 0.02), ([2, 0], 0.04), ([1], 0.02)):
+        open_, _ = _undetermined_encoders(found, [joints[k] for k in which])
+        assert open_.evidence == {"margin": most}
+        assert f"at most {100 * most:.0f} % more" in open_.message
 
 
 def test_parallel_axes_are_found_chain_by_chain(leg):

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import termios
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from helpers.synthetic import exact_log, truth
 from robotid._typing import STAGES
 from robotid.cli import compare, doctor, main, printing
 from robotid.cli.console import terminal_progress
+from robotid.commands.job import LogEntry
 from robotid.identification.pipeline import identify
 from robotid.log_files.read import write_log
 from robotid.robot.model import RobotModel
@@ -242,6 +244,17 @@ def test_a_clean_doctor_states_the_number_of_logs(capsys):
     notes = [finding(joint, "noise", 1, "note") for joint in ("a", "b")]  # one line of --verbose
     doctor.show({"findings": notes, "joints": ["a", "b"]}, is_verbose=False, logs=1)
     assert capsys.readouterr().out == "1 note hidden (--verbose)\nno fault found in 1 log\n"
+
+
+def test_the_doctor_counts_each_file_of_fitted_and_other_logs_once(monkeypatch, capsys):
+    windows = [LogEntry(Path("a.csv"), 0.0, 1.0), LogEntry(Path("a.csv"), 2.0, 3.0)]
+    others = [LogEntry(Path(name)) for name in ("b.csv", "c.csv", "a.csv")]
+    model = SimpleNamespace(joints=("a",))
+    job = SimpleNamespace(identification=windows, validation=others, ignore=(), model=lambda: model)
+    monkeypatch.setattr(doctor, "job_from_flags", lambda options: job)
+    monkeypatch.setattr("robotid.commands.logs.examine", lambda *_, progress: [])
+    assert doctor.run(SimpleNamespace(json=False, verbose=False)) == 0
+    assert capsys.readouterr().out == "no fault found in 3 logs\n"
 
 
 def test_the_verdict_has_its_colour_on_a_terminal_only(monkeypatch, capsys):

@@ -99,6 +99,21 @@ def test_what_is_stated_reaches_the_simulation(arm, monkeypatch):
     assert blind["signals"] == robotid.SignalSettings()
 
 
+def test_what_is_stated_reaches_the_fit(monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        "robotid.identification.pipeline.identify",
+        lambda *words, **named: asked.append((words, named)),
+    )
+    stated = {
+        "validation": "kept.csv", "signals": robotid.SignalSettings(cutoff=7.0),
+        "estimator": robotid.EstimatorSettings("wls"), "friction": "viscous", "doctor": False,
+        "ignore": ("spikes",), "progress": print,
+    }  # fmt: skip
+    robotid.identify("arm.urdf", "fit.csv", **stated)
+    assert asked == [(("arm.urdf", "fit.csv"), stated)]
+
+
 def test_what_does_not_fit_it_is_refused(arm):
     model, log, _ = arm
     with pytest.raises(

@@ -10,11 +10,13 @@ from helpers.synthetic import exact_log, truth
 
 from robotid._files import file_sha256
 from robotid.cli import main
+from robotid.commands import payload
 from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings
 from robotid.commands.payload import stated_masses
 from robotid.exceptions import SettingsError
 from robotid.export.result import load_result, stated_scale_check
+from robotid.judgement.payload_check import PayloadCheck
 from robotid.log_files.formats import write_columns
 from robotid.log_files.read import write_log
 from robotid.report.advice import Origin, next_steps
@@ -143,6 +145,32 @@ def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
     steps = next_steps(verified, Origin(("job.toml",), "out"))
     assert right.verifies
     assert not any("torque scale" in step.words for step in steps)
+
+
+def test_a_check_of_the_scale_reads_the_windows_that_a_job_states(files, monkeypatch):
+    windows = [(2.0, 5.0), (None, 3.0), (6.0, None)]
+    table = {
+        "urdf": ARM, "identification": [{"log": "bare.csv"}],
+        "payload_check": [
+            {k: x for k, x in (("start", a), ("end", b)) if x is not None}
+            | {"log": "loaded.csv", "mass": 1.8, "link": "tool0"}
+            for a, b in windows
+        ],
+    }  # fmt: skip
+    read = []
+
+    def checked(loaded, reference, *, masses):
+        read.append([log.t[[0, -1]] for own in loaded for log in own.looks])
+        return {"tool0": PayloadCheck("tool0", masses["tool0"])}
+
+    monkeypatch.setattr(payload, "Recordings", lambda model, mapping, run: run)
+    monkeypatch.setattr(payload, "mass_checks", checked)
+    job = job_from_settings(table, "job.toml", files)
+    check = payload.check_payloads(job, job.model(), ())
+    assert (check.known, check.sha256) == (1.8, file_sha256(files / "loaded.csv"))
+    first, last = 0.0, 9.99
+    wanted = [[[a or first, last if b is None else b]] for a, b in windows]
+    np.testing.assert_allclose(read, wanted, atol=0.011)
 
 
 def test_gains_come_from_a_known_mass(files, capsys, ur5):

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.doctor.contacts import check_base
+from robotid.doctor.contacts import _check_radius, check_base
 from robotid.logs.base import BaseMotion, base_state
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -137,6 +137,18 @@ def test_the_radius_of_a_rolling_foot_is_found(robot, ball):
     (finding,) = found(0.01)
     assert finding.evidence["radius"] == pytest.approx(0.025, rel=0.02)
     assert not found(0.025)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_foot_may_roll_along_either_axis(walk, axis):
+    t = np.arange(0.0, 2.0, 0.01)
+    rolls = np.zeros((len(t), 3))
+    rolls[:, axis] = np.sin(5.0 * t)  # the centre's speed per radius, along one axis only
+    v = 0.02 * rolls
+    (found,) = _check_radius(Contact(FEET[0], radius=0.01), walk, v, rolls)
+    assert found.evidence["radius"] == pytest.approx(0.03)
+    assert found.evidence["before"] == pytest.approx(np.median(np.abs(v[:, axis])))
+    assert found.evidence["after"] == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("part", [slice(0, 3), slice(3, 6)])

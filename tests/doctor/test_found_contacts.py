@@ -7,13 +7,14 @@ import pytest
 from helpers.paths import JOBS
 
 from robotid.commands.job import read_job
-from robotid.doctor.found_contacts import find_contacts, with_contacts
+from robotid.doctor.found_contacts import _forces, find_contacts, with_contacts
 from robotid.exceptions import DataError
 from robotid.logs.base import BaseMotion, quaternions_of_angles
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
 from robotid.regressor.constraints import constraint_jacobian
-from robotid.regressor.prediction import predict_instants
+from robotid.regressor.prediction import predict, predict_instants
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -121,3 +122,23 @@ def test_contacts_of_a_trot_agree_with_stated_ones(recordings, monkeypatch):
         decided = np.abs(contact.touches - 0.5) > 0.48
         assert np.mean((contact.touches > 0.5)[decided] == stated[decided]) > 0.975
         assert min(on, off) > 0.2
+
+
+def test_rows_count_by_their_noise_which_their_residuals_give(robot, rng):
+    """Forces are near those with the true weights, though rows of the base have large leverages."""
+    log, *_ = standing(robot, np.ones((300, 4), dtype=bool))
+    motion = process(log, RAW)
+    motion = replace(motion, contacts=np.empty((len(motion.t), 0), dtype=bool))
+    J = constraint_jacobian(robot, motion.q, np.ones((len(motion.t), 4), dtype=bool))
+    sigma = np.where(np.arange(18) < 6, 0.1, 0.01)  # of the base and of the joints
+    f = np.array([1.5, -1.0, 5.0] * 4) * rng.uniform(0.5, 1.5, (len(motion.t), 12))
+    b = np.einsum("kmj,km->kj", J, f) + sigma * rng.standard_normal((len(motion.t), 18))
+    torque = predict(replace(robot, constraints=()), [robot.standard_parameters()], motion)[0]
+    found, _ = _forces(robot, replace(motion, tau=torque - b), robot.contacts)
+
+    def upwards(sigma):
+        return np.array([np.linalg.lstsq((j / sigma).T, x / sigma, rcond=None)[0][2::3]
+                         for j, x in zip(J, b, strict=True)])  # fmt: skip
+
+    wanted, plain = upwards(sigma), upwards(np.ones(18))
+    assert np.std(found - wanted) < 0.75 * np.std(plain - wanted)

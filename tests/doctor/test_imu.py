@@ -176,3 +176,44 @@ def test_an_error_of_the_position_is_no_slip(robot, sway):
     pose[:, 0] += 0.04 * np.clip((sway.t - 1.0) / 0.1, 0.0, 1.0)  # [m] of all feet within 0.1 s
     log = replace(sway, base=replace(sway.base, pose=pose))
     assert not list(check_base(robot, log, RAW))
+
+
+@pytest.mark.parametrize("slips", [True, False])
+def test_of_two_feet_one_slips_at_its_whole_speed(robot, sway, slips):
+    """Relative to the median of both feet its speed is halved, then below 0.1 m/s."""
+    feet = ("HL_FOOT", "FR_FOOT")
+    two = replace(robot, constraints=tuple(Contact(foot) for foot in feet))
+    q, joint = sway.q.copy(), robot.joints.index("HL_HAA")
+    q[:, joint] += 0.1 * np.clip((sway.t - 1.0) / 0.2, 0.0, 1.0) * slips  # 0.5 rad/s over 0.2 s
+    log = replace(sway, q=q, contacts={foot: sway.contacts[foot] for foot in feet})
+    places = link_positions(
+        robot.pin_model, robot.configurations(np.hstack([log.base.pose, q])), feet[:1]
+    )[:, 0]
+    speed = np.linalg.norm(np.gradient(places, log.t, axis=0), axis=1)
+    found = list(check_base(two, log, RAW))
+    assert [x.code for x in found] == ["slipping_foot"] * slips
+    if slips:
+        assert 0.1 < speed.max() < 0.2
+        assert feet[0] in found[0].message
+        rms = np.sqrt(np.mean(speed[speed > 0.1] ** 2))
+        assert found[0].evidence["speed"] == pytest.approx(rms, rel=0.1)
+
+
+def test_what_other_axes_leave_is_stated_as_a_share_of_the_motion(robot, sway):
+    rng = np.random.default_rng(0)
+    noise = 0.15 * np.std(sway.base.imu.values[:, :3]) * rng.standard_normal((len(sway.t), 3))
+
+    def changed(x):
+        return np.hstack([x[:, [1, 0, 2]] * [1, -1, 1] + noise, x[:, 3:]])
+
+    found = next(x for x in check_base(robot, measured(sway, changed), RAW) if x.code == "imu_axes")
+    right, wrong = sway.base.imu.values[:, :3], measured(sway, changed).base.imu.values[:, :3]
+
+    def rms(x):
+        return np.sqrt(np.mean(np.sum(x**2, axis=1)))
+
+    off, best = rms(wrong - right) / rms(right), rms(noise) / rms(right)
+    assert found.evidence["off"] == pytest.approx(off, rel=0.03)
+    assert found.evidence["best"] == pytest.approx(best, rel=0.1)
+    shown = f"{found.evidence['off']:.0%} of the motion, {found.evidence['best']:.0%} at best"
+    assert shown in found.message

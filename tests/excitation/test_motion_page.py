@@ -9,7 +9,7 @@ from robotid.excitation.clearance import Box, Clearance
 from robotid.excitation.course import Course
 from robotid.excitation.design import Designer
 from robotid.excitation.limits import LIMITS, MotionLimits
-from robotid.excitation.motion_page import _expected
+from robotid.excitation.motion_page import _collisions, _expected
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.examples import example_urdf
@@ -89,6 +89,34 @@ def test_the_distance_of_a_course_is_that_of_all_pairs(course):
     assert not changes[~np.array(last)].any()
     nothing = np.zeros(len(around.pairs), dtype=bool)
     assert np.isinf(found.nearness(nothing)[0]).all()
+
+
+def test_the_nearest_pair_is_that_of_the_smallest_margin_not_distance(course, monkeypatch):
+    found = replace(course[-1])  # nothing kept
+    around = found.clearance
+    exact = around.near(around.placed(found.values[0]), np.inf, around.everything).distance
+    least = exact.min(axis=1)
+    far = int(np.argsort(least)[len(least) // 2])
+    assert least[far] > least.min() + 0.03
+    required = np.full(len(least), least.min() - 0.02)
+    required[far] = least[far] - 0.01
+    monkeypatch.setattr(around, "required", required)
+    assert (found.nearest.first, found.nearest.second) == around.named[far]
+    assert found.nearest.distance == pytest.approx(least[far])
+    assert found.nearest.margin == pytest.approx(0.01)
+    assert found.nearest.time == found.t[exact[far].argmin()]
+
+
+def test_the_page_states_the_distance_between_links_beside_the_required_one():
+    entry = {
+        "margin": 0.012, "kept": 0.03, "where": "forearm and post", "time": 1.5, "unread": [],
+        "left_alone": [], "built_near": [],
+    }  # fmt: skip
+    course = SimpleNamespace(nearest=None, clearance=object())
+    assert _collisions({"limits": {"collision": entry}}, course) == (
+        "<p>Smallest margin to a collision: forearm and post, distance 42 mm at 1.50 s. Required: "
+        "30 mm, also between the samples.</p>\n"
+    )
 
 
 def test_distances_of_a_long_motion_are_looked_at_less_often(course):

@@ -1,6 +1,9 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from robotid.excitation import routes
 from robotid.excitation.basis import FourierBasis
 from robotid.excitation.clearance import Clearance
 from robotid.excitation.course import Course
@@ -93,6 +96,47 @@ def test_sweeps_go_both_ways_at_each_speed_while_the_others_rest(designer, rng):
         steady = v[(np.abs(a).max(axis=1) < 1e-9) & (np.abs(v[:, j]) > 1e-6)]
         assert set(np.round(steady[:, j] / fastest, 6)) == {-0.4, -0.1, 0.1, 0.4}
         assert np.abs(np.delete(steady, j, axis=1)).max() == 0.0
+
+
+def test_sweeps_are_about_the_posture_whose_worst_joint_has_the_largest_share(monkeypatch):
+    """Of half ranges of 2 and 1 rad, shares of the worst joints are 0.1, 0.5 and 0.4."""
+    free = np.array([[[2.0, 2.0], [0.0, 0.1]], [[0.5, 0.5], [0.7, 0.1]], [[1.8, 0.6], [0.2, 0.2]]])
+    about = SimpleNamespace(
+        postures=SimpleNamespace(resting=lambda rng, count: np.arange(6.0).reshape(3, 2)),
+        limits=SimpleNamespace(sizes=np.array([[2.0, 1.0]])),
+        examined=lambda *_: SimpleNamespace(contact=None, used=np.zeros((6, 2))),
+    )
+    told = []
+    monkeypatch.setattr(routes, "_free_range", lambda designer, posture: free[int(posture[0]) // 2])
+    monkeypatch.setattr(
+        routes, "_sweeps", lambda *asked: told.append(asked[1:]) or SimpleNamespace(duration=1.0)
+    )
+    design_sweeps(about, None, speeds=(0.1,))
+    [(posture, room, speeds)] = told
+    np.testing.assert_array_equal(posture, [2.0, 3.0])
+    np.testing.assert_allclose(room, 0.8 * free[1])
+    assert speeds == (0.1,)
+
+
+def test_stands_weigh_torques_by_their_noise_over_two_seconds(monkeypatch, rng):
+    """Four of nine postures, one by one: each adds most to log det of the information."""
+    q, W = rng.standard_normal((9, 2)), rng.standard_normal((2, 3, 9))
+    noise, spread = np.array([4.0, 0.01]), np.array([1.0, 2.0, 0.5])  # [(N m)^2 s]
+    W[1] *= 0.05
+    about = SimpleNamespace(
+        postures=SimpleNamespace(resting=lambda rng, count: q), noise=noise, spread=spread,
+        information=SimpleNamespace(rows=lambda *_: SimpleNamespace(W=W)), known=np.eye(3),
+    )  # fmt: skip
+    monkeypatch.setattr(routes, "_visited", lambda designer, places: places)
+    F, wanted = np.eye(3), []
+    of = [(W[..., k] * spread).T @ np.diag(2.0 / noise) @ (W[..., k] * spread) for k in range(9)]
+    for _ in range(4):
+        left = [k for k in range(9) if k not in wanted]
+        wanted.append(max(left, key=lambda k: np.linalg.det(F + of[k])))
+        F = F + of[wanted[-1]]
+    places = design_stands(about, None, count=4)
+    np.testing.assert_array_equal(places[0], q[wanted[0]])
+    assert sorted(places[:, 0]) == sorted(q[wanted, 0])
 
 
 def test_stands_tell_more_of_gravity_than_random_ones(designer):

@@ -63,10 +63,13 @@ def test_drives_behind_gears_have_their_inertia_at_the_motor(identified):
     gears = {"joints": list(identified.model.joints[:2]), "matrix": [-100.0, 50.0]}
     motors = build_result(identified, {"transmission": [gears]})["motors"]
     armature = dict(zip(identified.model.layout.names, identified.standard, strict=True))
-    for joint, ratio in zip(gears["joints"], gears["matrix"], strict=True):
-        inertia = armature[f"{joint}.armature"] / ratio**2
-        assert motors.pop(joint) == {"gear": ratio, "inertia": pytest.approx(inertia)}
-    assert motors == {}
+    wanted = {
+        joint: {"gear": ratio, "inertia": pytest.approx(armature[f"{joint}.armature"] / ratio**2)}
+        for joint, ratio in zip(gears["joints"], gears["matrix"], strict=True)
+    }
+    assert motors == wanted
+    each = [{"joints": [j], "matrix": [g["gear"]]} for j, g in wanted.items()]
+    assert build_result(identified, {"transmission": each})["motors"] == wanted, "in two tables"
 
 
 def finite(value, rel=1e-6):

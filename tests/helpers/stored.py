@@ -35,7 +35,7 @@ _LEFT_OUT = {"versions", "sha256", "seconds", "robotid", "urdf_sha256", "log_sha
 _NUMBER = re.compile(r"(?<![\w.])[-−+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w]|\.\d)")
 _VARIES = re.compile(
     r"\b\d+(?:\.\d+)? (?:ms|s|min) of (?:processor|wall)|\d+\.\d+\.\d+|\bin \d+\.\d s\b"
-    r"|\b\d+\.\d s(?=, \d+ start)"
+    r"|\b\d+\.\d s(?=, \d+ start)|(?<=\| platform \| \(code\) ).+"
 )
 
 

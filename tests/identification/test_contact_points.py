@@ -10,7 +10,7 @@ import pytest
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import hold_log
-from robotid.identification import pipeline
+from robotid.identification import contact_points, pipeline
 from robotid.identification.contact_points import (
     _slopes,
     estimated_uncertainty,
@@ -23,6 +23,7 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import constraint_jacobian, touching
 from robotid.regressor.factors import triangle_of
 from robotid.regressor.prediction import predict
+from robotid.regressor.used_rows import base_problem
 from robotid.robot.constraints import Contact, frame_id
 from robotid.robot.drives import Cubic, Viscous
 from robotid.robot.examples import example_urdf
@@ -160,3 +161,25 @@ def test_contact_errors_follow_the_selected_drive_terms(log, monkeypatch):
     np.testing.assert_allclose(changed.contacts.root, fresh.contacts.root, rtol=1e-9, atol=1e-15)
     k = [changed.mapping.base_names.index(f"{x}.viscous") for x in ("FR_KFE", "HL_HFE")]
     assert (np.abs(changed.contacts.root[k]).max(axis=1) > 0.0).all()
+
+
+@pytest.mark.parametrize(("cutoff", "step"), [(None, 1), (10.0, 2)])
+def test_errors_are_those_of_all_rows_though_only_some_are_used(log, monkeypatch, cutoff, step):
+    """Of rows filtered to a fifth of their band every second is used, with twice the weight."""
+    model = robot(2e-3)
+    mapping = structural_mapping(model)
+    settings = replace(RAW, cutoff=cutoff)
+    recordings = Recordings(model, mapping, (hold_log(model, log, settings),))
+    rows = recordings.fitted[0].whole
+    some = base_problem(model, mapping, rows.trajectory.every(step), rows.mask[::step])
+    W, weight = (np.concatenate([block[k] for block in some.blocks()]) for k in (0, 2))
+    D = np.random.default_rng(2).standard_normal((len(W), 6))
+    monkeypatch.setattr(contact_points, "_slopes", lambda *_: D)
+    found = with_contact_errors(recordings).contacts
+    root = np.sqrt(weight)[:, None]
+    W, D = root * W, root * D
+    np.testing.assert_allclose(found.root, -2e-3 * step * W.T @ D, atol=1e-9 * np.abs(W).max())
+    left = D - W @ np.linalg.lstsq(W, D, rcond=None)[0]  # of D, what parameters cannot explain
+    count = recordings.reduce(is_cut=False)[0].factors.rows.sum()
+    # W has dependent columns here, whose places in the triangle hold a hundredth of D
+    assert found.variance == pytest.approx(4e-6 * step * np.sum(left**2) / count, rel=0.03)

@@ -165,6 +165,19 @@ def test_wrenches_have_the_axes_of_their_frame(tmp_path):
         read_log(path, JOINTS, base=BaseColumns(wrenches=("fz l_sole",)))
 
 
+@pytest.mark.parametrize(("late", "early"), [("/odom", "/left"), ("/left", "/odom")])
+def test_rows_lie_between_the_messages_of_all_topics(tmp_path, late, early):
+    stamps = {late: S, early: S - 0.1}  # 5.003 to 5.403 s, 4.903 to 5.303 s
+    topics = {"/odom": (ODOMETRY, Maker.odometry), "/left": (WRENCH, Maker.wrench)}
+    sensors = {name: (kind, stamps[name], make) for name, (kind, make) in topics.items()}
+    path = write(tmp_path / "log", STATES | sensors)
+    wanted = BaseColumns(True, wrenches=("fz l_sole",), local=("l_sole",))
+    log = read_log(path, JOINTS, base=wanted)
+    np.testing.assert_allclose(log.t, T[1:31])  # 5.01 to 5.30 s
+    np.testing.assert_allclose(log.wrenches["fz l_sole"], 10 * log.t)
+    np.testing.assert_allclose(log.base.pose[:, :3], places(log.t), atol=1e-12)
+
+
 def test_one_of_several_topics_is_stated(tmp_path):
     other = {"/mocap/odom": (ODOMETRY, S, lambda m, t: m.odometry(t, 1.0))}
     path = write(tmp_path / "log", STATES | ODOM | other)

@@ -355,6 +355,21 @@ def test_percentages_become_positions_between_their_ends(run):
     np.testing.assert_allclose(log.v, truth.v[:, :2], atol=1e-12)
 
 
+def test_commands_in_percent_have_the_ends_of_positions(run):
+    truth, ends = make_log(), {"shoulder": (-2.0, 3.0), "elbow": (-0.5, 2.0)}
+    table, sent = {}, truth.q[::-1, :2]  # other values than those of the positions
+    for j, (joint, (low, high)) in enumerate(ends.items()):
+        for kind, x in (("q", truth.q[:, j]), ("qref", sent[:, j])):
+            table[f"{kind}_{joint}"] = 100 * (x - low) / (high - low)
+        for kind, x in (("dq", truth.v[:, j]), ("dqref", truth.v[::-1, j])):
+            table[f"{kind}_{joint}"] = 100 * x / (high - low)
+    units = LogUnits(percent={joint: list(own) for joint, own in ends.items()})
+    log = read_log(run(make_table(**table)), JOINTS[:2], units=units, needs="commands")
+    np.testing.assert_allclose(log.q, truth.q[:, :2], atol=1e-12)
+    np.testing.assert_allclose(log.q_ref, sent, atol=1e-12)
+    np.testing.assert_allclose(log.v_ref, truth.v[::-1, :2], atol=1e-12)
+
+
 @pytest.mark.parametrize("ends", [[0.1], [0.3, 0.3], ["a", 1.0], 5.0, [0.0, np.inf]])
 def test_a_percentage_needs_two_different_ends(ends):
     with pytest.raises(SettingsError, match=r"percent of jaw is .* wanted two different"):

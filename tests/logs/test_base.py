@@ -199,6 +199,17 @@ def test_a_contact_is_0_or_1(log, tmp_path):
         contacts_of(values[:3], wanted, "run")
 
 
+def test_each_contact_has_the_threshold_of_its_own_link():
+    forces = np.array([[10.0, 10.0, 0.0], [30.0, 30.0, 1.0], [60.0, 60.0, 0.0]])
+    wanted = BaseColumns(contacts=("a", "b", "c"), thresholds=(20.0, 50.0, None))
+    flags = {link: own.tolist() for link, own in contacts_of(forces, wanted, "run").items()}
+    assert flags["a"] == [False, True, True]
+    assert flags["b"] == [False, False, True]
+    assert flags["c"] == [False, True, False]
+    some = wanted.present(["contact_b", "contact_c", "contact_d"])  # the file lacks the first
+    assert (some.contacts, some.thresholds) == (("b", "c"), (50.0, None))
+
+
 def test_columns_of_a_base_may_have_other_names(log, tmp_path):
     write_log(log, tmp_path / "log.csv")
     names = {"base_qy": "q2", "base_wz": "yaw_rate", "base_alx": "d", "contact_r_sole": "right"}

@@ -18,7 +18,13 @@ from robotid.identification.summary import verdict_cell
 from robotid.pages import html
 from robotid.report.advice import Origin
 from robotid.report.information import information
-from robotid.report.tables import _consistency_notes, _coverage, _drive_table, base_table
+from robotid.report.tables import (
+    _consistency_notes,
+    _coverage,
+    _drive_table,
+    base_table,
+    consistency_section,
+)
 from robotid.report.torques import shown_torques
 from robotid.robot.parameters import INERTIAL_TERMS
 from robotid.versions import versions
@@ -207,6 +213,21 @@ def test_masses_and_eigenvalues_are_those_of_each_body(shown, identified):
         assert row[1:] == [number(before[0]), number(after[0]), *lows, ""]
     totals = [number(x[:60:10].sum()) for x in (identified.prior, identified.standard)]
     assert table.foot[:3] == ["total", *totals]
+
+
+def test_a_body_is_inconsistent_by_what_was_identified(identified):
+    prior, standard = identified.prior.copy(), identified.standard.copy()
+    prior[14], standard[24] = -1.0, -1.0  # moments of the second and of the third body
+    found = SimpleNamespace(
+        estimate=identified.estimate, mass_matrix=identified.mass_matrix, model=identified.model,
+        sources=identified.sources, prior=prior, standard=standard, is_consistent=False,
+    )  # fmt: skip
+    said = consistency_section(found)
+    assert "Not all bodies and drives are physically consistent" in said
+    rows = tables(said)["Mass and pseudo-inertia of each body"].rows
+    lows = [[smallest_eigenvalue(pi[k : k + 10]) for pi in (prior, standard)] for k in (10, 20)]
+    assert [row[3:5] for row in rows[1:3]] == [[number(x, ".3g") for x in low] for low in lows]
+    assert [row[-1] for row in rows] == ["", "", "inconsistent", "", "", ""]
 
 
 def test_the_notes_on_consistency_are_those_of_the_fit(report, identified):

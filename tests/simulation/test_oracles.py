@@ -101,6 +101,8 @@ def test_an_elastic_gear_swings_at_its_frequency(tmp_path):
     centre = 0.5 * wound / 2.5  # of mass, which stays
     motor = centre + wound * 2.0 / 2.5 * np.cos(w * found.t)
     np.testing.assert_allclose(found.q[:, 0], motor, atol=2e-3 * wound)
+    swings = w**2 * (centre - motor)  # acceleration of the motor, not of the body
+    np.testing.assert_allclose(found.a[:, 0], swings, atol=5e-3 * np.abs(swings).max())
 
 
 def test_a_gear_with_play_hangs_by_its_stiffness(tmp_path):

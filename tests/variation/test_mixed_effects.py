@@ -129,6 +129,26 @@ def test_prediction_of_one_parameter_is_the_brute_force_integral():
     assert found.std_error == pytest.approx(error, rel=0.02)
 
 
+def test_the_mean_is_uncertain_by_the_spread_too_if_runs_have_unlike_errors():
+    """One accurate run differs from eight inaccurate ones: the mean depends on the spread."""
+    x, error = np.append(0.0, 3.0 + 0.1 * np.arange(8)), np.append(0.02, np.full(8, 2.0))
+    runs = Runs((error**-2.0)[:, None, None], (x / error**2)[:, None], np.zeros(9, int), np.ones(1))
+    (found,) = MixedEffects(runs).predict()
+    z = np.linspace(-6.0, 5.0, 20_001)  # log of the spread
+    weight = 1 / (error**2 + np.exp(2 * z)[:, None])
+    total = weight.sum(axis=1) + 1e-4  # the prior of the mean: 0 with a deviation of 100
+    mean = weight @ x / total
+    log = 0.5 * np.log(weight).sum(axis=1) - 0.5 * np.log(total)
+    log += 0.5 * (total * mean**2 - weight @ x**2) + z + scipy.stats.t(4).logpdf(np.exp(z))
+    density = np.exp(log - log.max())
+    density /= density.sum()
+    average = density @ mean
+    within, between = density @ (1 / total), density @ (mean - average) ** 2
+    assert between > 0.2 * within
+    assert found.mean == pytest.approx(average, rel=0.01)
+    assert found.std_error == pytest.approx(np.sqrt(within + between), rel=0.01)
+
+
 def test_a_run_that_tells_nothing_of_a_parameter_changes_nothing():
     unit = [0, 0, 0, 0]
     runs, _ = drawn(np.random.default_rng(5), unit)

@@ -10,7 +10,9 @@ from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import hold_log
 from robotid.judgement.unlike_runs import unlike_findings
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.variation.groups import _inflation, runs_of
+from robotid.robot.model import RobotModel
+from robotid.variation.groups import Group, RunsOf, _groups, _inflation, runs_of
+from robotid.variation.mixed_effects import MixedEffects, Runs
 from robotid.variation.variation import UnlikeRun, Variation, changes, vary
 
 NAMES = [f"run_{k}.csv" for k in range(6)]
@@ -193,6 +195,59 @@ def test_parameters_have_their_mean_spread_and_next_interval(model):
         own.append(true * (1 + 0.1 * rng.normal(size=len(names))[names.index(name)]))
     assert (np.abs(coulomb.values - own) < 5 * coulomb.std_errors).all()
     assert coulomb.to_dict()["by_log"] == coulomb.values.tolist()
+
+
+def stated(name, x, error, *, unit=None, scale=1.0):
+    """Return estimates (k, q) of the terms of a drive in k runs, each with one standard error."""
+    count, size = np.shape(x)
+    names = tuple(f"{name}.{k}" for k in range(size))
+    group = Group("drive", name, names, ("N m",) * size, np.eye(size), (0,))
+    H, units = np.tile(np.eye(size) / error**2, (count, 1, 1)), np.zeros(count, int)
+    units = units if unit is None else np.asarray(unit)
+    runs = Runs(H, np.asarray(x) / error**2, units, np.full(size, scale))
+    return RunsOf(group, np.zeros(size), runs, 1.0)
+
+
+def test_a_run_is_named_by_the_number_of_all_parameters_in_all_runs():
+    """Groups of 1 and 2 parameters in 8 runs: 24 tests, so that p must be below 0.02 / 24."""
+    rng = np.random.default_rng(3)
+    x, others = rng.normal(size=(8, 1)), stated("b", rng.normal(size=(8, 2)), 0.1)
+
+    def p_value(own):  # of run 7, from the others
+        runs = stated("a", own, 0.1).runs
+        (found,) = MixedEffects(runs.without(7)).predict(np.array([0.01]), own[7])
+        return found.probability
+
+    for p, is_named in ((0.003, False), (0.0015, False), (0.0005, True)):
+        low, high = 0.0, 50.0
+        for _ in range(20):  # the value with this p-value
+            x[7] = 0.5 * (low + high)
+            low, high = (low, x[7, 0]) if p_value(x) < p else (x[7, 0], high)
+        assert p_value(x) == pytest.approx(p, rel=0.01)
+        unlike = vary(list("abcdefgh"), (stated("a", x, 0.1), others)).unlike
+        assert [each.run for each in unlike] == [7] * is_named
+
+
+def test_spreads_are_stated_between_units_and_within_them():
+    rng, unit = np.random.default_rng(0), np.repeat(np.arange(8), 6)
+    x = 5.0 * rng.normal(size=8)[unit] + 0.4 * rng.normal(size=len(unit))
+    group = stated("a", x[:, None], 0.02, unit=unit)
+    found = vary([f"{k}" for k in range(len(unit))], (group,))
+    (own,) = found.parameters
+    assert found.units == 8
+    assert own.within == pytest.approx(np.sqrt(np.mean([x[unit == k].var(ddof=1)
+                                                        for k in range(8)])), rel=0.1)  # fmt: skip
+    means = [x[unit == k].mean() for k in range(8)]
+    assert own.prediction.spread == pytest.approx(np.std(means, ddof=1), rel=0.25)
+    assert own.to_dict()["spread_within_units"] == own.within
+
+
+def test_gains_are_of_the_rows_of_joints_behind_those_of_a_floating_base():
+    free = RobotModel.from_urdf(arm().tree.path, joints=(LIFT, ELBOW), free_flyer=True)
+    groups = _groups(free, structural_mapping(free), free.standard_parameters())
+    gains = {group.name: group.rows for group, _ in groups if group.kind == "gain"}
+    assert gains == {LIFT: (6,), ELBOW: (7,)}
+    assert gains == {joint: (free.row_names.index(joint),) for joint in (LIFT, ELBOW)}
 
 
 def test_two_logs_have_no_variation_and_three_are_not_compared(model):
