@@ -205,13 +205,14 @@ def folded(key: str, summary: str, html: str, *, is_open: bool = False) -> str:
     return f'<details id="{key}"{opened}><summary>{summary}</summary>\n{html}</details>\n'
 
 
-def verdict_html(robot: str, status: str, reasons: Sequence[str]) -> str:
+def verdict_html(robot: str, status: str, reasons: Sequence[str], uses: str = "") -> str:
     """Return the heading of a result: robot, verdict and the first reasons.
 
     Args:
         robot: Name of the robot, not escaped.
         status: The verdict.
         reasons: Its reasons, not escaped, the most severe first.
+        uses: What the result can be used for, not escaped.
     """
     items = [f"<li>{escape(reason)}</li>" for reason in reasons]
     more = "".join(items[_FIRST:])
@@ -222,7 +223,7 @@ def verdict_html(robot: str, status: str, reasons: Sequence[str]) -> str:
     return (
         f'<div class="verdict {status.replace(" ", "-")}"><h1>{escape(robot)} '
         f"<span>Verdict: <strong>{status}</strong></span></h1>"
-        f"<ul>{''.join(items[:_FIRST])}</ul>{more}</div>\n"
+        f"<ul>{''.join(items[:_FIRST])}</ul>{more}{f'<p>{escape(uses)}</p>' * bool(uses)}</div>\n"
     )
 
 
