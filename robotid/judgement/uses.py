@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 __all__ = ["uses_line", "uses_of_motion", "uses_of_torques"]
 
 _NAMED = 3  # joints that the line names
-_NOT_VERIFIED = "not verified: no validation log"
+_NOT_VERIFIED = "not verified, no validation log"
 _UNSCALED = "if the torque scale, which is not verified, is right"
 
 
@@ -43,21 +43,21 @@ def uses_of_torques(
         {} if scale_check is None else {j: s for j, s in joints.items() if j in scale_check.gravity}
     )
     if log_errors:
-        predicted = inertials = payload = "no: errors of the recordings"
+        predicted = inertials = payload = "no, errors of the recordings"
     elif scale_check is not None and scale_check.contradicts:
-        inertials = payload = "no: the torque scale is contradicted"
+        inertials = payload = "no, the torque scale is contradicted"
     else:
         is_scaled = scale_check is not None and scale_check.agrees
         inertials = predicted if is_scaled else _with(predicted, _UNSCALED)
-        payload = _predicted(loaded) if loaded else "no: no joint determines its gravity"
+        payload = _predicted(loaded) if loaded else "no, no joint determines its gravity"
         payload = payload if is_scaled else _with(payload, _UNSCALED)
         if not is_consistent:
-            inertials = "no: not physically consistent"
+            inertials = "no, not physically consistent"
         elif "poor" in joints.values():
-            inertials = f"no: torques of {_named(joints, 'poor')} are poor"
+            inertials = f"no, torques of {_named(joints, 'poor')} are poor"
     if is_static:
         predicted = _with(predicted, "at rest and in slow motion")
-        inertials = "no: inertias are the URDF's" if inertials.startswith("yes") else inertials
+        inertials = "no, inertias are the URDF's" if inertials.startswith("yes") else inertials
     return {
         "torque feed-forward": predicted,
         "inertials in simulation": inertials,
@@ -75,7 +75,7 @@ def uses_of_motion(
         log_errors: Faults of the recordings.
         is_scaled: Whether a measured torque determines the scale of all parameters.
     """
-    simulated = "no: errors of the recordings" if log_errors else _predicted(joints)
+    simulated = "no, errors of the recordings" if log_errors else _predicted(joints)
     torque = (
         simulated
         if is_scaled
@@ -84,7 +84,7 @@ def uses_of_motion(
     return {
         "simulation of drives and controllers": simulated,
         "torque feed-forward": torque,
-        "payload estimation": "no: it needs a result from logged torques",
+        "payload estimation": "no, it needs a result from logged torques",
     }
 
 
@@ -104,7 +104,7 @@ def _predicted(joints: Mapping[str, str]) -> str:
         return _NOT_VERIFIED
     poor = [joint for joint, status in tested.items() if status == "poor"]
     if len(poor) == len(tested):
-        return "no: the errors on validation logs are large"
+        return "no, the errors on validation logs are large"
     if poor:
         return f"yes, without {_named(joints, 'poor')}"
     if len(tested) < len(joints):

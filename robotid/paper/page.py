@@ -102,7 +102,7 @@ def _parameter_tables(content: Mapping[str, Any]) -> str:
     parts = []
     for name, model in content["models"].items():
         rows = [
-            [code(parameter), number(true), number(found, ".7g"), number(found - true, ".1e")]
+            [code(parameter), number(true), number(found, ".7g"), number(found - true, ".2g")]
             for parameter, true, found in zip(
                 model["names"], model["P_true"], model["P_hat"][-1], strict=True
             )
@@ -227,5 +227,21 @@ def _energy(content: Mapping[str, Any]) -> str:
 
 
 def _settings(content: Mapping[str, Any]) -> str:
-    rows = [[code(key), text(str(value))] for key, value in content["settings"].items()]
+    rows = [
+        [text(_named(key)), text(_written(value))] for key, value in content["settings"].items()
+    ]
     return table("Settings", ["setting", "value"], rows)
+
+
+def _named(key: str) -> str:
+    """Return the name of a setting as text, with its unit, as "duration [s]"."""
+    words, _, unit = key.rpartition("_")
+    name = f"{words} [{unit}]" if unit in ("rad", "s") else key
+    return name.replace("_", " ")
+
+
+def _written(value: object) -> str:
+    """Return the value of a setting as text; numbers of a list with commas."""
+    if isinstance(value, list):
+        return ", ".join(map(_written, value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
