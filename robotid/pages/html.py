@@ -123,7 +123,7 @@ def percent(value: float | None) -> Cell:
     """
     if value is not None and value >= 1000:
         return number(value, ".0f")
-    return number(value, ".1f" if value is None or value >= 1 else ".2f")
+    return number(value, ".1f" if value is None or value >= 0.995 else ".2f")
 
 
 def with_error(value: float, error: float, *, sign: str = "") -> tuple[Cell, Cell]:
@@ -220,10 +220,11 @@ def verdict_html(robot: str, status: str, reasons: Sequence[str], uses: str = ""
         count = len(items) - _FIRST
         title = f"{count} more reason{'s' if count > 1 else ''}"
         more = f"<details><summary>{title}</summary><ul>{more}</ul></details>"
+    uses = f'<p class="uses">{escape(uses)}</p>' if uses else ""
     return (
         f'<div class="verdict {status.replace(" ", "-")}"><h1>{escape(robot)} '
         f"<span>Verdict: <strong>{status}</strong></span></h1>"
-        f"<ul>{''.join(items[:_FIRST])}</ul>{more}{f'<p>{escape(uses)}</p>' * bool(uses)}</div>\n"
+        f"<ul>{''.join(items[:_FIRST])}</ul>{more}{uses}</div>\n"
     )
 
 
