@@ -14,7 +14,7 @@ __all__ = ["uses_line", "uses_of_motion", "uses_of_torques"]
 
 _NAMED = 3  # joints that the line names
 _NOT_VERIFIED = "not verified, no validation log"
-_UNSCALED = "if the torque scale, which is not verified, is right"
+_UNSCALED = "torque scale not verified"
 
 
 def uses_of_torques(
@@ -76,11 +76,7 @@ def uses_of_motion(
         is_scaled: Whether a measured torque determines the scale of all parameters.
     """
     simulated = "no, errors of the recordings" if log_errors else _predicted(joints)
-    torque = (
-        simulated
-        if is_scaled
-        else _with(simulated, "if the scale, which no torque verifies, is right")
-    )
+    torque = simulated if is_scaled else _with(simulated, "scale not verified by a torque")
     return {
         "simulation of drives and controllers": simulated,
         "torque feed-forward": torque,

@@ -8,7 +8,7 @@ from robotid.judgement.uses import uses_line, uses_of_motion, uses_of_torques
 VERIFIED = ScaleCheck({"a": 1.0, "b": 1.0}, scale=1.0, factor=1.0, masses=(20.0, 20.0, 0.0))
 OPEN = ScaleCheck({"a": 1.2, "b": 1.2}, scale=1.2, factor=1.2, masses=(20.0, 24.0, 0.0))
 WRONG = ScaleCheck({"a": 2.0}, scale=2.0, factor=2.0, masses=(20.0, 40.0, 0.0))
-SCALE = "yes, if the torque scale, which is not verified, is right"
+SCALE = "yes, torque scale not verified"
 
 
 def uses(*statuses, scale_check=VERIFIED, **changes):
@@ -51,7 +51,7 @@ def test_the_scale_of_positions_comes_from_a_torque_only():
     found = uses_of_motion(joints, log_errors=(), is_scaled=False)
     assert [*found.values()] == [
         "yes, without b (not evaluated)",
-        "yes, without b (not evaluated), if the scale, which no torque verifies, is right",
+        "yes, without b (not evaluated), scale not verified by a torque",
         "no, it needs a result from logged torques",
     ]
     scaled = uses_of_motion({"a": "good"}, log_errors=(), is_scaled=True)
