@@ -245,7 +245,7 @@ def _unequal_gains(found: LoopIdentification) -> Iterator[Finding]:
     Equal drives have equal gains: a large difference is an error of one of them.
     """
     free = [x for x in found.fit.simulator.free_parameters if x.what == "kp"]
-    alike: dict[tuple[object, ...], list[int]] = {}
+    alike: dict[tuple[str, float, float], list[int]] = {}
     for j in (x.joints[0] for x in free if len(x.joints) == 1):
         limit = found.model.limits[j]
         alike.setdefault((limit.type, limit.effort, limit.velocity), []).append(j)

@@ -102,7 +102,7 @@ def _parameter_tables(content: Mapping[str, Any]) -> str:
     parts = []
     for name, model in content["models"].items():
         rows = [
-            [code(parameter), number(true), number(found, ".7g"), number(found - true, ".2g")]
+            [code(parameter), number(true), number(found, ".7g"), number(found - true, ".1e")]
             for parameter, true, found in zip(
                 model["names"], model["P_true"], model["P_hat"][-1], strict=True
             )
