@@ -82,10 +82,9 @@ def gallery_card(entry):
 
 def gallery_page(entry):
     """Return the page of one robot: its facts, the command, the live report and replay."""
-    facts = "\n".join(f"| {key} | {value} |" for key, value in entry["facts"].items())
+    facts = "\n".join(f"- {key}: {value}" for key, value in entry["facts"].items())
     command = f"```bash\n{entry['command']}\n```"
-    table = f"| | |\n|---|---|\n{facts}"
-    parts = [f"# {entry['title']}", entry["lesson"], table, command, frames(entry["name"])]
+    parts = [f"# {entry['title']}", entry["lesson"], facts, command, frames(entry["name"])]
     return "\n\n".join(parts) + "\n"
 
 
