@@ -16,10 +16,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
+from scipy.spatial import ConvexHull
 
 import robotid
 from robotid.commands.demo import run_demo
 from robotid.robot.examples import example_urdf
+from robotid.robot.geometry import link_clouds
 from robotid.simulation.closed_loop import Noise, another_robot, simulate
 from robotid.simulation.motions import random_fourier
 
@@ -78,6 +81,9 @@ SIMULATED = {
 RATE = 200.0  # [Hz]
 PERIOD = 10.0  # [s]
 NOISE = Noise(q=2e-5, v=2e-4, tau=0.02)  # [rad], [rad/s], share of the torque
+WIDTH, HEIGHT, MARGIN = 240.0, 170.0, 12.0  # [px] of a picture
+LONG = 70  # [%] of the postures have a shorter reach than that of the picture
+FLAT = 1e-9  # [m] outlines that are smaller in a direction have no area
 
 
 def main():
@@ -121,6 +127,7 @@ def build(name, folder):
         data = os.environ.get("ROBOTID_DATA", written).rstrip("/")
         report = report.replace(f"{data}/", "").replace(written, name)  # where it was built
         (folder / "report.html").write_text(report)
+        (folder / "picture.svg").write_text(picture(found))
         shutil.copyfile(Path(written) / "replay.html", folder / "replay.html")
     return {"name": name, "title": title, "lesson": lesson, "command": command} | facts_of(found)
 
@@ -137,10 +144,57 @@ def simulated(urdf, locked):
     return robotid.identify(model, "first.csv", validation="second.csv")
 
 
+def picture(found):
+    """Return the robot from the side in a posture of the log with a long reach, as SVG."""
+    model = found.model
+    tree, data = model.pin_model, model.pin_model.createData()
+    q = found.fitted[0].recording.trajectory.q[::50]
+    origins, placed = [], []
+    for posture in model.configurations(q):
+        pin.forwardKinematics(tree, data, posture)
+        placed.append([M.homogeneous for M in data.oMi])
+        origins.append([M[:3, 3] for M in placed[-1]])
+    origins = np.array(origins)  # (N, 1 + n, 3)
+    reach = origins[:, -1, :2] - origins[:, 0, :2]
+    length = np.linalg.norm(reach, axis=1)
+    shown = int(np.argsort(length)[LONG * len(length) // 100])
+    view = np.array([[*reach[shown] / length[shown], 0.0], [0.0, 0.0, 1.0]])  # (2, 3)
+    frames = placed[shown]
+    outlines = [
+        outline((points @ frames[body + 1][:3, :3].T + frames[body + 1][:3, 3]) @ view.T)
+        for _, body, points in link_clouds(model)[0]
+    ]
+    joints = origins[shown] @ view.T
+    every = np.vstack([*outlines, joints])
+    low, high = every.min(axis=0), every.max(axis=0)
+    scale = np.min((np.array([WIDTH, HEIGHT]) - 2 * MARGIN) / (high - low))  # [px/m]
+    start = np.array([WIDTH, HEIGHT]) / 2 - scale * (low + high) / 2 * [1, -1]
+
+    def path(points):
+        return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in start + scale * points * [1, -1])
+
+    links = "".join(f'<path d="{path(points)}Z"/>' for points in outlines)
+    if not links:  # its meshes are not at hand
+        links = f'<path d="{path(joints)}" fill="none" stroke-width="18" stroke-opacity=".2"/>'
+    return (
+        f'<svg viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img" aria-label="{model.name}" '
+        f'fill="currentColor" stroke="currentColor" stroke-linejoin="round">'
+        f'<g fill-opacity=".13" stroke-opacity=".45" stroke-width=".8">{links}</g>'
+        f'<path d="{path(joints)}" fill="none" stroke-width="2.5" stroke-linecap="round"/></svg>'
+    )
+
+
+def outline(points):
+    """Return the corners of the convex hull of points in a plane, shape (k, 2) [m]."""
+    if np.linalg.matrix_rank(points - points[0], tol=FLAT) < 2:
+        return points[[0, -1]]
+    return points[ConvexHull(points).vertices]
+
+
 def facts_of(found):
     """Return the figures of an entry, by name."""
     fitted, held_out = (
-        ", ".join(evaluation.recording.log.name for evaluation in logs)
+        ", ".join(evaluation.recording.name for evaluation in logs)
         for logs in (found.fitted, found.validation)
     )
     facts = {

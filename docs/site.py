@@ -1,4 +1,4 @@
-"""Hooks of the site: a page for each command, the notebook, and the gallery where one was built.
+"""Hooks of the site: a page for each command, for each robot of the gallery, and the notebook.
 
 ``mkdocs build -f .mkdocs.yml`` calls them. ``python docs/gallery.py`` builds the gallery,
 ``python docs/notebook.py`` the outputs of the notebook.
@@ -9,6 +9,8 @@ import json
 import re
 import shutil
 import sys
+from functools import cache
+from html import escape
 from importlib import import_module
 from pathlib import Path
 
@@ -22,8 +24,18 @@ import notebook
 GALLERY = Path(__file__).parents[1] / "build" / "gallery"
 
 
+def on_config(config):
+    """Add the robots of the gallery to the navigation."""
+    for part in config["nav"]:
+        if "Gallery" in part:
+            part["Gallery"] = ["gallery.md", *(f"gallery/{name}.md" for name in entries())]
+
+
 def on_files(files, config):
-    """Add the pages of the commands, and that of the notebook."""
+    """Add the pages of the commands, of the robots of the gallery, and that of the notebook."""
+    for entry in entries().values():
+        text = gallery_page(entry)
+        files.append(File.generated(config, f"gallery/{entry['name']}.md", content=text))
     files.append(File.generated(config, "tutorials/first_steps.md", content=notebook.page()))
     for name in COMMANDS:
         text = command_page(name)
@@ -35,14 +47,12 @@ def on_page_markdown(markdown, page, **_):
     """Fill in the gallery and the demo on the landing page; link the notebook's page."""
     if page.file.src_uri != "tutorials/first_steps.md":
         markdown = markdown.replace("first_steps.ipynb)", "first_steps.md)")
-    entries = {}
-    if (GALLERY / "entries.json").exists():
-        entries = {e["name"]: e for e in json.loads((GALLERY / "entries.json").read_text())}
     if page.file.src_uri == "gallery.md":
-        return markdown + "\n".join(map(gallery_entry, entries.values()))
-    if page.file.src_uri == "index.md" and "demo" in entries:
+        cards = "\n".join(map(gallery_card, entries().values()))
+        return f'{markdown}\n<div class="robots">\n{cards}\n</div>\n'
+    if page.file.src_uri == "index.md" and "demo" in entries():
         pictures = re.compile("<!-- demo -->.*?<!-- end of demo -->", re.DOTALL)
-        return pictures.sub(frames("demo"), markdown)
+        return pictures.sub(frames("gallery/demo"), markdown)
     return markdown
 
 
@@ -53,20 +63,37 @@ def on_post_build(config):
             shutil.copytree(made, Path(config["site_dir"]) / folder, dirs_exist_ok=True)
 
 
-def gallery_entry(entry):
-    """Return the section of one robot."""
-    facts = "\n".join(f"| {key} | {value} |" for key, value in entry["facts"].items())
+@cache
+def entries():
+    """Return the entries of the gallery by name; none where it was not built."""
+    path = GALLERY / "entries.json"
+    return {e["name"]: e for e in json.loads(path.read_text())} if path.exists() else {}
+
+
+def gallery_card(entry):
+    """Return the card of a robot: its picture, what it teaches and the command."""
+    picture = (GALLERY / entry["name"] / "picture.svg").read_text()
+    return (
+        f'<div class="robot">\n<a href="gallery/{entry["name"]}.html">{picture}'
+        f"<strong>{entry['title']}</strong></a>\n"
+        f"<p>{entry['lesson']}</p>\n<code>{escape(entry['command'])}</code>\n</div>"
+    )
+
+
+def gallery_page(entry):
+    """Return the page of one robot: its facts, the command, the live report and replay."""
+    facts = "\n".join(f"- {key}: {value}" for key, value in entry["facts"].items())
     command = f"```bash\n{entry['command']}\n```"
-    table = f"| | |\n|---|---|\n{facts}"
-    return f"\n## {entry['title']}\n\n{entry['lesson']}\n\n{table}\n\n{command}\n\n{frames(entry['name'])}\n"
+    parts = [f"# {entry['title']}", entry["lesson"], facts, command, frames(entry["name"])]
+    return "\n\n".join(parts) + "\n"
 
 
-def frames(name):
-    """Return the report and the replay of an entry, each loaded when it is scrolled to."""
+def frames(folder):
+    """Return the report and the replay in a folder, each loaded when it is scrolled to."""
     return "\n\n".join(
-        f'<iframe src="gallery/{name}/{page}.html" title="{page} of {name}" loading="lazy" '
-        f'style="width:100%;height:36rem;border:1px solid #8884"></iframe>\n\n'
-        f"[Open the {page} in a tab of its own](gallery/{name}/{page}.html){{target=_blank}}"
+        f'<iframe src="{folder}/{page}.html" title="{page} of {Path(folder).name}" '
+        f'loading="lazy" style="width:100%;height:36rem;border:1px solid #8884"></iframe>\n\n'
+        f"[Open the {page} in a tab of its own]({folder}/{page}.html){{target=_blank}}"
         for page in ("report", "replay")
     )
 

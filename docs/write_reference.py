@@ -27,7 +27,8 @@ START = """# Job file
 A job file is TOML: `robotid identify job.toml`. Only `urdf` and one `[[identification]]` are needed; every other key has
 the default below. A misspelt key is an error that names the nearest right one. Paths are relative to the job file, and
 `$NAME` in them is filled in from the environment. This page is written by `python docs/write_reference.py` from the settings
-in the code, and so is that on [estimators and controllers](job_estimators.md); `result.json` holds the same keys under `settings`. `robotid schema > job.schema.json` writes them as a JSON
+in the code, and so are those on [logs and signals](job_signals.md) and on
+[estimators and controllers](job_estimators.md); `result.json` holds the same keys under `settings`. `robotid schema > job.schema.json` writes them as a JSON
 schema: with `#:schema job.schema.json` in its first line, editors that know TOML complete and check a job file. Shells complete commands and flags after
 `eval "$(register-python-argcomplete robotid)"`.
 
@@ -88,8 +89,16 @@ TABLES = {
     "[identification]": LogEntry,
     "[payload_check]": PayloadEntry,
 }
+#: The page of a table that is not on that of the job file.
+PAGES = dict.fromkeys(
+    ("signals", "log", "units", "torque", "base", "transmission"), "job_signals.md"
+) | dict.fromkeys(("estimator", "estimator.constraints", "controller"), "job_estimators.md")
 
+LOGS = """# Job file: logs and signals
 
+The tables of a [job file](job_file.md) on the content of a log: columns, units, motors, floating base, and the signal processing.
+This page is written by `python docs/write_reference.py` from the settings in the code.
+"""
 ESTIMATION = """# Job file: estimators
 
 The tables of a [job file](job_file.md) that choose the estimator, its constraints, and the controller of closed-loop identification.
@@ -100,13 +109,15 @@ This page is written by `python docs/write_reference.py` from the settings in th
 def pages():
     """Return the texts of the pages, by file name."""
     first, *sections = job_file().split("\n## ")
-    there = [x for x in sections if x.startswith(("`[estimator", "`[controller]"))]
-    here = [x for x in sections if x not in there]
     texts = {
-        "job_file.md": [first, *here],
-        "job_estimators.md": [ESTIMATION, *there],
+        "job_file.md": [first],
+        "job_signals.md": [LOGS],
+        "job_estimators.md": [ESTIMATION],
         "plant.md": [plant()],
     }
+    for section in sections:
+        table = section.partition("]")[0].strip("`[")
+        texts[PAGES.get(table, "job_file.md")].append(section)
     return {name: "\n## ".join(parts).rstrip() + "\n" for name, parts in texts.items()}
 
 

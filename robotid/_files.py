@@ -5,6 +5,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -16,12 +17,15 @@ from typing import Any
 from robotid.exceptions import DataError, SettingsError
 
 __all__ = [
+    "DATASET",
     "check_file",
     "check_folder",
     "check_path",
+    "dataset_of",
     "file_sha256",
     "finite",
     "folder_beside",
+    "log_exists",
     "missing_file",
     "read_json",
     "source_entry",
@@ -29,6 +33,9 @@ __all__ = [
     "write_text",
     "written_whole",
 ]
+
+#: The description of a LeRobot dataset, in its folder.
+DATASET = Path("meta") / "info.json"
 
 
 def check_path(path: str | Path) -> None:
@@ -302,11 +309,35 @@ def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
     return content
 
 
+def dataset_of(path: Path) -> Path | None:
+    """Return the folder of the LeRobot dataset that a path as ``dataset/episode_3`` names.
+
+    Args:
+        path: The path of a log.
+
+    Returns:
+        The folder; None if the path names no episode of a dataset.
+    """
+    is_episode = re.fullmatch(r"episode_[0-9]+", path.name) and not path.exists()
+    return path.parent if is_episode and (path.parent / DATASET).is_file() else None
+
+
+def log_exists(path: Path) -> bool:
+    """Return whether a log exists: a file, a folder, or a dataset of which it is an episode.
+
+    Args:
+        path: The path of the log.
+    """
+    return path.exists() or dataset_of(path) is not None
+
+
 def file_sha256(path: str | Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal; of a folder, that of its files' hashes.
 
+    That of an episode depends on the files of its dataset and on its number.
+
     Args:
-        path: The file, or the folder of a bag.
+        path: The file, the folder of a bag or a dataset, or an episode, as ``dataset/episode_3``.
 
     Raises:
         DataError: If it is a pipe or a device, whose content changes or does not end.
@@ -314,9 +345,15 @@ def file_sha256(path: str | Path) -> str:
     source = Path(path)
     if source.exists() and not source.is_file() and not source.is_dir():
         raise DataError(missing_file(source, "file"))
-    if source.is_dir():
-        files = sorted(file for file in source.iterdir() if file.is_file())
-        listing = "".join(f"{file_sha256(file)}  {file.name}\n" for file in files)  # as sha256sum
+    listing = ""  # as of sha256sum
+    if (dataset := dataset_of(source)) is not None:
+        listing = f"{file_sha256(dataset)}  {source.name}\n"
+    elif source.is_dir():
+        files = sorted(file for file in source.rglob("*") if file.is_file())
+        names = [file.relative_to(source).as_posix() for file in files]
+        both = zip(files, names, strict=True)
+        listing = "".join(f"{file_sha256(file)}  {name}\n" for file, name in both)
+    if listing or source.is_dir():
         return hashlib.sha256(listing.encode()).hexdigest()
     about = source.stat()
     return _sha256(source.resolve(), about.st_size, about.st_mtime_ns, about.st_ino)
@@ -338,5 +375,5 @@ def source_entry(path: str) -> dict[str, Any]:
     Args:
         path: The file; "" for an input in memory.
     """
-    is_file = bool(path) and Path(path).exists()
+    is_file = bool(path) and log_exists(Path(path))
     return {"path": str(path), "sha256": file_sha256(path) if is_file else None}

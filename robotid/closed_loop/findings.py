@@ -4,10 +4,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from robotid.closed_loop.result import STATED_SCALE, LoopIdentification
 from robotid.closed_loop.term_choice import Tried
 from robotid.closed_loop.zeros import CLEAR, parallel_axes
-from robotid.findings import Finding, by_severity, listed
+from robotid.findings import Finding, by_severity, listed, quoted
 
 __all__ = ["loop_findings"]
 
@@ -15,6 +17,8 @@ _SOFT = 0.5  # share of the residual that remains after a step; a larger one sho
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
 _CHANGE = 0.2  # largest change of a parameter by halving the steps [standard errors]
 _KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
+_POSITIVE = ("kp", "limit")  # parameters whose lower bound is more than 0
+_UNEQUAL = 3.0  # ratio of the gains of equal drives from which on they are reported
 _NAMED = 8  # largest number of parameters that a sentence names
 
 
@@ -79,6 +83,7 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
             f"depends on these parameters{known}",
         )
     yield from _limits_found(found)
+    yield from _unequal_gains(found)
     yield from _encoder_findings(found)
     yield from map(_friction_found, (t for t in found.fit.tried if t.is_chosen))
 
@@ -182,7 +187,7 @@ def _at_bound(found: LoopIdentification) -> Iterator[Finding]:
     at_zero = [
         name
         for name in estimate.details["at_bound"]
-        if name not in others and name.rpartition(".")[2] not in ("kp", "limit")
+        if name not in others and name.rpartition(".")[2] not in _POSITIVE
     ]
     gains = [name for name in ("kp", "kd") if getattr(loop, name) is not None]
     if at_zero:
@@ -202,6 +207,7 @@ def _at_bound(found: LoopIdentification) -> Iterator[Finding]:
             f"{subject}: the estimate is 0, the lower bound. The motion does not excite "
             f"{'them' if len(at_zero) > 1 else 'it'}{wrong}. {todo[0].upper()}{todo[1:]}",
         )
+    yield from _at_least(found)
     if any(name.endswith("delay") for name in at_zero):
         yield Finding(
             "no_delay",
@@ -213,13 +219,60 @@ def _at_bound(found: LoopIdentification) -> Iterator[Finding]:
         )
 
 
+def _at_least(found: LoopIdentification) -> Iterator[Finding]:
+    """Yield which gains and torque limits are estimated at their lower bound, which is not 0."""
+    at_bound = found.estimate.details["at_bound"]
+    least = [
+        f"{free.name} = {free.lowest:.3g}"
+        for free in found.fit.simulator.free_parameters
+        if free.what in _POSITIVE and free.name in at_bound
+    ]
+    if least:
+        names = listed(least, _NAMED)
+        yield Finding(
+            "at_bound",
+            "warning",
+            names,
+            f"{names}: the estimate is the lower bound, a small share of the initial value. The "
+            "joint hardly follows its command, or the model lacks a drive term. Check that command "
+            "and position belong to this joint, and state the value in [controller] if it is known",
+        )
+
+
+def _unequal_gains(found: LoopIdentification) -> Iterator[Finding]:
+    """Yield which joints with equal limits in the URDF have gains that differ, each fitted alone.
+
+    Equal drives have equal gains: a large difference is an error of one of them.
+    """
+    free = [x for x in found.fit.simulator.free_parameters if x.what == "kp"]
+    alike: dict[tuple[str, float, float], list[int]] = {}
+    for j in (x.joints[0] for x in free if len(x.joints) == 1):
+        limit = found.model.limits[j]
+        alike.setdefault((limit.type, limit.effort, limit.velocity), []).append(j)
+    for (_, effort, _), joints in alike.items():
+        kp = found.fit.loops.kp[joints]
+        if kp.max() > _UNEQUAL * kp.min() > 0 and np.isfinite(effort):
+            names = [found.model.joints[j] for j in joints]
+            group = listed(map(quoted, names))
+            yield Finding(
+                "unequal_gains",
+                "note",
+                listed(names, _NAMED),
+                f"{listed(names, _NAMED)} have equal limits of effort and velocity in the URDF, as "
+                f"equal drives have, but kp from {kp.min():.3g} to {kp.max():.3g}. If the drives "
+                "are equal, fit their gains, armature and friction together: "
+                f"groups = {{ NAME = [{group}] }} in [controller]",
+                {"lowest": float(kp.min()), "highest": float(kp.max())},
+            )
+
+
 def _limits_found(found: LoopIdentification) -> Iterator[Finding]:
-    """Yield the estimated torque limits of the drives."""
+    """Yield the estimated torque limits of the drives, except those at a bound."""
     estimate = found.estimate
     for free, value, error in zip(
         found.fit.simulator.free_parameters, estimate.theta, estimate.std_error, strict=True
     ):
-        if free.what == "limit":
+        if free.what == "limit" and free.name not in estimate.details["at_bound"]:
             joint = found.model.limits[free.joints[0]]
             unit = "N" if joint.type == "prismatic" else "N m"
             yield Finding(

@@ -182,6 +182,7 @@ class LoopIdentification(Identified):
             log_errors=self.log_errors,
             cautions=[f.message for f in self.findings if f.code in _CAUTIONS],
             scale=STATED_SCALE if self.is_scaled_by_gain else "",
+            knows_torques=self.loop.kind == "torque" or self.fit.simulator.knows_torques,
         )
 
 

@@ -316,8 +316,8 @@ def identify_job(
         )
     asked = replace(concluded.asked, job=job)
     findings = (*placed.notes, *concluded.findings)
-    check = check_payloads(job, concluded.model, fitted)
-    return replace(concluded, asked=asked, findings=findings, payload_check=check), checkpoint
+    checks = check_payloads(job, concluded.model, fitted)
+    return replace(concluded, asked=asked, findings=findings, payload_checks=checks), checkpoint
 
 
 def _loop_stages() -> Sequence[str]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robotid._files import file_sha256
+from robotid._files import dataset_of, file_sha256, log_exists
 from robotid._typing import STAGES, ProgressCallback, report_stage
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.doctor.diagnosis import diagnose
@@ -235,7 +235,7 @@ def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[Lo
     stated = job_from_settings(settings, Path(path).name, Path())
     hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
     for entry in stated.identification:
-        if not entry.path.exists() or file_sha256(entry.path) not in hashes:
+        if not log_exists(entry.path) or file_sha256(entry.path) not in hashes:
             raise DataError(
                 f"{entry.path}, a fitted log of {path}, is missing or was changed; {advice}"
             )
@@ -292,7 +292,7 @@ def checkpoint_inputs(job: Job) -> dict[str, Any]:
 
 def _identity(path: Path) -> dict[str, Any]:
     """Return size [bytes] and time of change [ns] of a file, or of each file of a folder."""
-    whole = path.resolve()
+    whole = (dataset_of(path) or path).resolve()
     files = sorted(p for p in whole.rglob("*") if p.is_file()) if whole.is_dir() else [whole]
     found = {}
     for file in files:

@@ -120,8 +120,8 @@ def measure_payload(
 
 def check_payloads(
     job: Job, model: RobotModel, reference: Sequence[SurveyedLog]
-) -> PayloadCheck | None:
-    """Return the check of the torque scale with the payloads that a job states.
+) -> tuple[PayloadCheck, ...]:
+    """Return the checks of the torque scale with the payloads that a job states.
 
     Args:
         job: The job.
@@ -129,7 +129,7 @@ def check_payloads(
         reference: Its fitted logs, without payloads.
 
     Returns:
-        The check with the narrowest relative interval; None if the job states none.
+        The checks, that with the narrowest relative interval first.
 
     Raises:
         DataError, ModelError, SettingsError, NotConvergedError: As of ``measure_payload``.
@@ -141,7 +141,7 @@ def check_payloads(
         link = entry.link or model.layout.bodies[-1]
         check = mass_checks(*runs, masses={link: entry.mass})[link]
         checks.append(replace(check, log=str(entry.path), sha256=file_sha256(entry.path)))
-    return min(checks, key=_width, default=None)
+    return tuple(sorted(checks, key=_width))
 
 
 def _width(check: PayloadCheck) -> float:

@@ -5,7 +5,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from robotid._files import check_file, file_sha256, write_text
+from robotid._files import check_file, file_sha256, log_exists, write_text
 from robotid._typing import ProgressCallback, report_stage
 from robotid.commands.identify import identify_job
 from robotid.commands.job import Job, job_from_settings
@@ -116,7 +116,7 @@ def _check_inputs(job: Job, content: Mapping[str, Any], name: str) -> None:
     _check_counts(inputs, job, name)
     for path, entry in zip([job.urdf, *logs], chain(*inputs.values()), strict=True):
         what, wanted = "URDF" if entry["role"] == "urdf" else "log", entry["sha256"]
-        if not path.exists():
+        if not log_exists(path):
             raise DataError(
                 f"the {what} {str(path)!r}, an input of {name}, does not exist; restore it, or "
                 "identify again"

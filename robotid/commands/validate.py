@@ -6,7 +6,7 @@ from itertools import compress
 from pathlib import Path
 from typing import Any
 
-from robotid._files import file_sha256
+from robotid._files import file_sha256, log_exists
 from robotid.closed_loop.evaluation import OpenLoop, position_metrics
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import log_of_commands, survey_logs
@@ -116,7 +116,7 @@ def _fitted_logs(
     job: Job, model: RobotModel, hashes: Collection[str]
 ) -> tuple[list[Log], list[str]]:
     """Return the fitted logs, windows of long ones, and the names of missing ones."""
-    exists = [e.path.exists() and file_sha256(e.path) in hashes for e in job.identification]
+    exists = [log_exists(e.path) and file_sha256(e.path) in hashes for e in job.identification]
     missing = [
         e.path.name for e, found in zip(job.identification, exists, strict=True) if not found
     ]

@@ -1,6 +1,6 @@
 """Checks of the position loops, from commands and positions of a log; no model of the robot."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -51,11 +51,12 @@ _UNLIKE = 0.2  # least relative difference between this speed and the speed of t
 _PULSES = 3  # least number of movements that end at one speed
 
 
-def check_commands(log: Log) -> Iterator[Finding]:
+def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Finding]:
     """Yield the findings on the position loops of the joints.
 
     Args:
         log: The log; without commands, only "no_torque" is yielded.
+        prismatic: Names of the prismatic joints, whose positions are in m.
 
     Yields:
         Notes "no_torque", "loops" (bandwidth and lag of each joint) and "repeated_command"; a
@@ -68,7 +69,9 @@ def check_commands(log: Log) -> Iterator[Finding]:
         yield _without_torque(log)
     if log.q_ref is None:
         return
-    loops = [_Loop(log, j) for j in range(len(log.joints))]
+    loops = [
+        _Loop(log, j, "m" if name in prismatic else "rad") for j, name in enumerate(log.joints)
+    ]
     moved = [loop for loop in loops if loop.is_commanded]
     yield from _shown(log, moved)
     yield from _held(log, moved)
@@ -99,6 +102,7 @@ class _Loop:
 
     log: Log
     joint: int
+    unit: str = "rad"
 
     @property
     def name(self) -> str:
@@ -390,14 +394,15 @@ def _small(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         if share < (_FOLLOWED if loop.lag[0] > 0 else _STUCK):
             sweep, dead = float(np.median(swept)), float(np.median(swept - followed))
             message = (
-                f"{loop.name} follows {100 * share:.0f} % of slow sweeps of {sweep:.3g}: friction, "
-                f"backlash or the dead band of its drive suppress {dead:.2g}; move it by "
-                f"{5 * dead:.2g} or more"
+                f"{loop.name} follows {100 * share:.0f} % of slow sweeps of {sweep:.3g} "
+                f"{loop.unit}: friction, backlash or the dead band of its drive suppress "
+                f"{dead:.2g} {loop.unit}; move it by {5 * dead:.2g} {loop.unit} or more"
             )
         elif sweep < _FEW * step:
             message = (
-                f"{loop.name} has a command range of {sweep:.3g}, {sweep / step:.1f} steps of its "
-                f"encoder: the motion is too small; move it by {5 * _FEW * step:.2g} or more"
+                f"{loop.name} has a command range of {sweep:.3g} {loop.unit}, {sweep / step:.1f} "
+                "steps of its encoder: the motion is too small; move it by "
+                f"{5 * _FEW * step:.2g} {loop.unit} or more"
             )
         else:
             continue
@@ -428,10 +433,10 @@ def _saturated(log: Log, loops: Sequence[_Loop]) -> Iterator[tuple[str, Finding]
             continue
         change = max(change for _, change in clipped)
         message = (
-            f"{loop.name} runs at its largest speed of {top:.3g} /s in {len(clipped)} movements, "
-            f"{100 * share:.2g} % of the rows, while its position error changes by up to "
-            f"{change:.2g}: the drive is at its limit of speed or torque; state the limit in "
-            "[controller], or record a slower motion"
+            f"{loop.name} runs at its largest speed of {top:.3g} {loop.unit}/s in {len(clipped)} "
+            f"movements, {100 * share:.2g} % of the rows, while its position error changes by up "
+            f"to {change:.2g} {loop.unit}: the drive is at its limit of speed or torque; state the "
+            "limit in [controller], or record a slower motion"
         )
         evidence = {"speed": top, "share": share, "error": change}
         found = log_finding(log.name, "saturated", "warning", message, loop.name, **evidence)

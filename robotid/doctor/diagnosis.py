@@ -142,7 +142,8 @@ def _examine_log(
     findings += [log_finding(name, "log_note", "note", note) for note in log.notes]
     if not model.is_static:  # rows of static poses may have gaps between them
         findings += [*check_clock(log), *check_channels(log, signals)]
-    findings += check_commands(log)
+    prismatic = [limit.name for limit in model.limits if limit.type == "prismatic"]
+    findings += check_commands(log, prismatic)
     driven = [joint for joint in log.joints if joint not in model.passive]
     has_torque = log.has_torque and bool(driven)
     sizes = list(check_torque_channels(log.select(driven))) if has_torque else []

@@ -80,12 +80,14 @@ _SHAPE = {
             "half_width": NUMBER,
             "absorbed_by": [TEXT],
         },
-        "payload?": {
-            **dict.fromkeys(("link", "log", "sha256"), TEXT),
-            **dict.fromkeys(("known", "std_error"), NUMBER),
-            "identified": MAYBE,
-            "interval": [NUMBER],
-        },
+        "payloads?": [
+            {
+                **dict.fromkeys(("link", "log", "sha256"), TEXT),
+                **dict.fromkeys(("known", "std_error"), NUMBER),
+                "identified": MAYBE,
+                "interval": [NUMBER],
+            }
+        ],
         "is_stated": FLAG,
     },
     "consistency": {
@@ -104,6 +106,7 @@ _SHAPE = {
     "verdict": {
         "status": _STATUS,
         "reasons": [TEXT],
+        "use_for?": {...: TEXT},
         "per_joint?": {...: {"status": _STATUS, "reasons": [TEXT]}},
         "log_errors?": [TEXT],
         "warnings?": [{field.name: TEXT for field in dataclasses.fields(VerdictWarning)}],
@@ -355,14 +358,14 @@ def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:
     if stated is None:
         return None
     lists = {"unexplained": (stated["unexplained"], 2), "masses": (stated["masses"], 3)}
-    if "payload" in stated:
-        lists["payload.interval"] = stated["payload"]["interval"], 2
+    payloads = stated.get("payloads", [])
+    for k, check in enumerate(payloads):
+        lists[f"payloads[{k}].interval"] = check["interval"], 2
     for name, (numbers, size) in lists.items():
         if len(numbers) != size:
             raise DataError(f"scale_check.{name} has {len(numbers)} numbers, wanted {size}")
     own = {x.name: stated[x.name] for x in dataclasses.fields(ScaleCheck) if x.name in stated}
-    if "payload" in stated:
-        own["payload"] = PayloadCheck.from_dict(stated["payload"])
+    own["payloads"] = tuple(map(PayloadCheck.from_dict, payloads))
     if stated["is_stated"]:  # an earlier version did not test whether torque determines it
         mass = stated.get("stated")
         own["stated"] = StatedMass(()) if mass is None else StatedMass.from_dict(mass)

@@ -63,7 +63,8 @@ class Identification(Fit):
         on_misfit: Names of drive parameters whose errors increased for these.
         variation: Variation of the drives' parameters between three or more fitted logs.
         asked: Stated signals, friction and findings to ignore.
-        payload_check: Check of the torque scale with a payload of known mass; None without one.
+        payload_checks: Checks of the torque scale with payloads of known mass, that with the
+            narrowest interval first.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -74,7 +75,7 @@ class Identification(Fit):
     on_misfit: tuple[str, ...] = ()
     variation: Variation | None = None
     asked: Asked = field(default_factory=Asked)
-    payload_check: PayloadCheck | None = None
+    payload_checks: tuple[PayloadCheck, ...] = ()
 
     def __repr__(self) -> str:
         return identification_line(self, self.estimator.name, self.verdict.status)
@@ -194,7 +195,7 @@ class Identification(Fit):
     @cached_property
     def scale_check(self) -> ScaleCheck:
         """Scale check: identified gravity and masses against the URDF's."""
-        return replace(check_scale(self), payload=self.payload_check)
+        return replace(check_scale(self), payloads=self.payload_checks)
 
     @property
     def _uncertain_drives(self) -> list[str]:

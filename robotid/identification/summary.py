@@ -7,6 +7,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from robotid._text import columns
+from robotid.judgement.uses import uses_line
 from robotid.pages.html import code, number, percent, table, text
 
 if TYPE_CHECKING:
@@ -139,7 +140,7 @@ def variation_lines(variation: Mapping[str, Any] | None) -> list[str]:
 
 
 def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
-    """Return a verdict as lines of text: status, reasons, and the verdict on the other joints.
+    """Return a verdict as lines of text: status, reasons, verdict on the other joints, and uses.
 
     The order is that of the reasons. A reason of a joint is the line of that joint.
 
@@ -162,7 +163,8 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
         for reason in verdict["reasons"]
     ]
     in_order = dict.fromkeys([*filter(None, lines), *cells.values()])
-    return [f"verdict: {verdict['status']}", *in_order]
+    uses = uses_line(verdict.get("use_for", {}))
+    return [f"verdict: {verdict['status']}", *in_order, *([uses] if uses else [])]
 
 
 def verdict_cell(joint: str, verdict: Mapping[str, Any]) -> str:

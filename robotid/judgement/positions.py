@@ -1,10 +1,12 @@
 """The verdict on positions simulated from commands or torques, compared with simpler models."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from robotid.findings import listed
 from robotid.fitting.metrics import JointMetrics, Metrics
 from robotid.judgement.evidence import BEATEN, error_of
+from robotid.judgement.uses import uses_of_motion
 from robotid.judgement.verdict import JointVerdict, Verdict, concluded, on_joint
 
 __all__ = ["GOOD", "POOR", "judge_positions"]
@@ -31,6 +33,7 @@ def judge_positions(
     log_errors: Sequence[str] = (),
     cautions: Sequence[str] = (),
     scale: str = "",
+    knows_torques: bool = False,
 ) -> Verdict:
     """Return the verdict on simulated positions.
 
@@ -42,6 +45,7 @@ def judge_positions(
         log_errors: Faults of the logs that make the result wrong.
         cautions: Why the result is at best usable, whatever its errors are.
         scale: What the scale of all parameters depends on, if no measurement verifies it.
+        knows_torques: Whether measured torques were fitted: they determine the scale.
     """
     found = {
         joint: _judge_joint(joint, metrics.per_joint.get(joint), is_validation) for joint in joints
@@ -59,7 +63,7 @@ def judge_positions(
     if not is_settled:
         warnings.append("the fit has not converged")
     worst = max(map(error_of, metrics.per_joint.values()), default=0.0)
-    return concluded(
+    verdict = concluded(
         found,
         poor=reasons["poor"],
         warnings=[*warnings, *reasons["not evaluated"], *reasons["usable"]],
@@ -69,6 +73,12 @@ def judge_positions(
         log_errors=log_errors,
         is_tested=is_validation and bool(metrics.per_joint),
     )
+    uses = uses_of_motion(
+        {joint: found[joint].status for joint in found if joint in metrics.per_joint},
+        log_errors=log_errors,
+        is_scaled=knows_torques,
+    )
+    return replace(verdict, use_for=uses)
 
 
 def _judge_joint(joint: str, measured: JointMetrics | None, is_validation: bool) -> JointVerdict:

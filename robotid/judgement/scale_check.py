@@ -43,7 +43,7 @@ class ScaleCheck:
         masses: Total mass of the URDF, identified total mass, mass of that payload [kg].
         stated: The masses that the user states, and what torque alone determines of them; None if
             none is stated.
-        payload: The check with a payload of known mass; None if there is none.
+        payloads: The checks with payloads of known mass, that with the narrowest interval first.
         is_total_determined: Whether torque alone determines the total mass within 5 %, so that a
             measured one verifies the scale.
         friction: Share of viscous and Coulomb friction in each joint's torque [-].
@@ -58,7 +58,7 @@ class ScaleCheck:
     unexplained: tuple[float, float] = (0.0, 0.0)
     masses: tuple[float, float, float] = (0.0, 0.0, 0.0)
     stated: StatedMass | None = None
-    payload: PayloadCheck | None = None
+    payloads: tuple[PayloadCheck, ...] = ()
     is_total_determined: bool = False
     friction: Mapping[str, float] = field(default_factory=dict)
     follows: bool = True
@@ -80,12 +80,12 @@ class ScaleCheck:
     @property
     def _decisive(self) -> dict[PayloadCheck | StatedMass, str]:
         """The known masses that verify or contradict the scale, and their names."""
-        checks = {self.payload: "payload of known mass", self.stated: "stated mass"}
-        return {
-            check: name
-            for check, name in checks.items()
-            if check is not None and (check.verifies or check.contradicts)
-        }
+        checks: dict[PayloadCheck | StatedMass, str] = dict.fromkeys(
+            self.payloads, "payload of known mass"
+        )
+        if self.stated is not None:
+            checks[self.stated] = "stated mass"
+        return {c: name for c, name in checks.items() if c.verifies or c.contradicts}
 
     @property
     def has_one_factor(self) -> bool:
@@ -107,15 +107,21 @@ class ScaleCheck:
     @property
     def message(self) -> str:
         """What was verified, or the figure that exceeds its limit, its cause and the remedy."""
+        checks: list[PayloadCheck | StatedMass] = [*self.payloads]
+        checks += [] if self.stated is None else [self.stated]
+        beside = "".join(
+            f". {check.message[0].upper()}{check.message[1:]}"
+            for check in reversed(checks)
+            if check not in self._decisive
+        )
         sentences = [
             f"absolute scale {'verified' if check.verifies else 'contradicted'} by a {name}: "
             f"{check.message}"
             for check, name in sorted(self._decisive.items(), key=lambda item: item[0].verifies)
         ]
         if sentences:
-            return ". ".join([sentences[0], *(f"{x[0].upper()}{x[1:]}" for x in sentences[1:])])
-        texts = [check.message for check in (self.stated, self.payload) if check is not None]
-        beside = "".join(f". {text[0].upper()}{text[1:]}" for text in texts)
+            others = [f"{x[0].upper()}{x[1:]}" for x in sentences[1:]]
+            return ". ".join([sentences[0], *others]) + beside
         if self.agrees:
             return f"{self._agreement}{beside}"
         remedy = (
@@ -123,7 +129,7 @@ class ScaleCheck:
             if self.is_total_determined
             else "Verify it with a payload of known mass (robotid payload)"
         )
-        remedy = f". {remedy}" if self.payload is None else ""
+        remedy = "" if self.payloads else f". {remedy}"
         return f"absolute scale not verified: {self.figures}{self._excess}{beside}{remedy}"
 
     @property
@@ -211,12 +217,11 @@ class ScaleCheck:
         figures = asdict(self) | {
             key: list(getattr(self, key)) for key in ("unexplained", "masses")
         }
-        del figures["stated"], figures["payload"]
+        del figures["stated"], figures["payloads"]
         stated = {} if self.stated is None else {"stated": self.stated.to_dict()}
-        if self.payload is not None:
-            stated["payload"] = self.payload.to_dict()
+        checks = {"payloads": [x.to_dict() for x in self.payloads]} if self.payloads else {}
         concluded = {"agrees": self.agrees, "message": self.message}
-        return figures | {"is_stated": self.stated is not None} | stated | concluded
+        return figures | {"is_stated": self.stated is not None} | stated | checks | concluded
 
 
 def check_scale(found: Fit) -> ScaleCheck:

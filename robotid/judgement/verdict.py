@@ -15,6 +15,7 @@ from robotid.findings import Finding, current_code, listed, not_ignored
 from robotid.fitting.metrics import Metrics
 from robotid.judgement.evidence import Determined, Predictions, error_of
 from robotid.judgement.scale_check import ScaleCheck
+from robotid.judgement.uses import uses_of_torques
 
 __all__ = [
     "WARNING_CODES",
@@ -164,6 +165,7 @@ class Verdict:
         joints: The verdict on each joint of the model.
         log_errors: Faults of the recordings.
         warnings: Warnings of the doctor and of the fit.
+        use_for: Whether the result can be used for a purpose, "yes" or "no" and why, by purpose.
     """
 
     status: str
@@ -171,6 +173,7 @@ class Verdict:
     joints: Mapping[str, JointVerdict] = field(default_factory=dict)
     log_errors: tuple[str, ...] = ()
     warnings: tuple[VerdictWarning, ...] = ()
+    use_for: Mapping[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as plain values, as result.json has it."""
@@ -183,6 +186,7 @@ class Verdict:
             },
             "log_errors": list(self.log_errors),
             "warnings": [asdict(warning) for warning in self.warnings],
+            "use_for": dict(self.use_for),
         }
 
 
@@ -263,7 +267,14 @@ def judge(
     verdict = concluded(
         per_joint, poor=poor, warnings=reasons, good=good, notes=notes, log_errors=log_errors
     )
-    return replace(verdict, warnings=tuple(warnings))
+    uses = uses_of_torques(
+        {joint: per_joint[joint].status for joint in found},
+        is_consistent=determined.is_consistent,
+        is_static=determined.is_static,
+        log_errors=log_errors,
+        scale_check=scale_check,
+    )
+    return replace(verdict, warnings=tuple(warnings), use_for=uses)
 
 
 def concluded(

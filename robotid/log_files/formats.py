@@ -1,9 +1,10 @@
 """Tables in files: named columns of numbers in any format that is known by its suffix."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from robotid._files import missing_file, written_whole
+from robotid._files import DATASET, dataset_of, missing_file, written_whole
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.log_files.arrays import Hdf5Format, MatFormat, NpzFormat
@@ -36,14 +37,23 @@ def open_table(path: Path, source: LogSource) -> Table:
     """Return the table in a file; faults of a column are reported when it is read.
 
     Args:
-        path: A file of a known suffix, or the folder of a ROS 2 bag or of a LeRobot dataset.
+        path: A file of a known suffix, the folder of a ROS 2 bag or of a LeRobot dataset, or an
+            episode of a dataset, as ``dataset/episode_3``.
         source: Place of the log in the file.
 
     Raises:
         DataError: If the file is missing, of another suffix or broken, or its table is not found.
         MissingDependencyError: If a package that reads it is not installed.
-        SettingsError: If the source has a topic of the commands, and the file is no bag.
+        SettingsError: If the source has a topic of the commands, and the file is no bag, or a topic
+            and the path is an episode.
     """
+    if (dataset := dataset_of(path)) is not None:
+        if source.topic not in (None, path.name):
+            raise SettingsError(
+                f"log.topic is {source.topic!r}, but the log is {path.name} of {dataset.name}; "
+                "leave topic out"
+            )
+        path, source = dataset, replace(source, topic=path.name)
     form = _format_of(path)
     if source.command is not None and not isinstance(form, BagFormat):
         raise SettingsError(
@@ -65,7 +75,7 @@ def open_table(path: Path, source: LogSource) -> Table:
 def _format_of(path: Path) -> Format:
     """Return the format of a log that exists."""
     if path.is_dir():
-        is_dataset = (path / "meta" / "info.json").is_file()
+        is_dataset = (path / DATASET).is_file()
         return LeRobotFormat() if is_dataset else BagFormat()
     suffix = path.suffix.lower()
     if not path.exists():

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from robotid._files import read_json
+from robotid._files import DATASET, read_json
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
@@ -75,7 +75,7 @@ class _Column:
 
 def _features(path: Path) -> dict[str, Any]:
     """Return the description of the columns of the dataset."""
-    info = read_json(path / "meta" / "info.json", "description of a LeRobot dataset")
+    info = read_json(path / DATASET, "description of a LeRobot dataset")
     features = info.get("features") if isinstance(info, dict) else None
     if not isinstance(features, dict) or not all(isinstance(x, dict) for x in features.values()):
         raise DataError(

@@ -18,7 +18,6 @@ __all__ = ["Chart", "Series", "broken", "chart_html", "thin"]
 _KINDS = ("line", "dots", "bars", "area")
 _POINTS = 2000  # rows of a chart's data
 _STILL = 200  # points of a line in the static picture
-_WIDTH = 640  # [px] of the static picture
 _LEFT, _RIGHT, _TOP, _BOTTOM = 54, 10, 20, 34  # [px] around its axes
 _THIN = 0.05  # [px] narrower areas are not drawn
 _LINE = 14  # [px] of a row of labels
@@ -64,6 +63,7 @@ class Chart:
         marks: Positions of dotted lines on x.
         logarithmic: The logarithmic axes: "", "x", "y" or "xy".
         height: Height of the plot [px].
+        width: Width of the static picture [px], about that of the chart on a page.
         x_names: Names at x = 0, 1, ... in place of numbers, if any.
 
     Raises:
@@ -80,6 +80,7 @@ class Chart:
     marks: tuple[float, ...] = ()
     logarithmic: str = ""
     height: int = 180
+    width: int = 640
     x_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -276,9 +277,9 @@ class _Axis:
 _Cover = list[tuple[Array, Array]]  # lower and upper edges of what a series covers
 
 
-def _slant(names: Sequence[str]) -> int:
+def _slant(names: Sequence[str], width: int) -> int:
     """Return the height [px] of slanted names below the axis; 0 if they fit horizontally."""
-    room = (_WIDTH - _LEFT - _RIGHT) / max(len(names), 1)
+    room = (width - _LEFT - _RIGHT) / max(len(names), 1)
     longest = _LETTER * max(map(len, names), default=0)
     return round(0.5 * longest) if longest > room else 0
 
@@ -304,7 +305,9 @@ def _still(chart: Chart, x: Array, series: Sequence[_Drawn], points: int) -> str
     """Return the chart as an ``<svg>`` of a few points."""
     series = [item for item in series if not item[0].is_hidden]
     covers = _covers(series)
-    legend, height = _legend(chart, _TOP + chart.height + _BOTTOM + _slant(chart.x_names))
+    legend, height = _legend(
+        chart, _TOP + chart.height + _BOTTOM + _slant(chart.x_names, chart.width)
+    )
     logs = ["x" in chart.logarithmic, "y" in chart.logarithmic]
     edges = [edge for cover in covers for pair in cover for edge in pair]
     values = [x, np.concatenate(edges or [np.empty(0)])]
@@ -312,17 +315,17 @@ def _still(chart: Chart, x: Array, series: Sequence[_Drawn], points: int) -> str
     is_wide = any(s.kind == "bars" for s in chart.series) or bool(chart.x_names)
     across = _Axis(
         *_extent([scaled[0]], 0.5 / max(len(x) - 1, 1) if is_wide else 0.0),
-        _LEFT, _WIDTH - _RIGHT, logs[0],
+        _LEFT, chart.width - _RIGHT, logs[0],
     )  # fmt: skip
     if across.high == across.low:
-        across = _Axis(across.low - 0.5, across.low + 0.5, _LEFT, _WIDTH - _RIGHT, logs[0])
+        across = _Axis(across.low - 0.5, across.low + 0.5, _LEFT, chart.width - _RIGHT, logs[0])
     up = _Axis(*_extent([scaled[1]], 0.04), _TOP + chart.height, _TOP, logs[1])
     drawn = "".join(
         _drawn(chart, x, item, cover, across, up, points)
         for item, cover in zip(series, covers, strict=True)
     )
     return (
-        f'<svg viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{escape(chart.title)}" '
+        f'<svg viewBox="0 0 {chart.width} {height}" role="img" aria-label="{escape(chart.title)}" '
         f'font-size="11" fill="currentColor">{_frame(chart, across, up)}{drawn}'
         f"{legend}</svg>"
     )
@@ -346,7 +349,7 @@ def _frame(chart: Chart, across: _Axis, up: _Axis) -> str:
         f'<text x="{_LEFT - 6}" y="{up(v) + 4:.1f}" text-anchor="end">{word}</text>'
         for v, word in zip(up.ticks, up.words, strict=True)
     ]
-    slant = _slant(chart.x_names)
+    slant = _slant(chart.x_names, chart.width)
     for v, word in zip(columns, chart.x_names or across.words, strict=True):
         place = f"{across(v):.1f} {bottom + 14:.0f}"
         slanted = f'transform="translate({place}) rotate(-30)" text-anchor="end"'
@@ -372,7 +375,7 @@ def _legend(chart: Chart, height: float) -> tuple[str, float]:
     place, down = 4 + _LETTER * (len(chart.y_label) + 3), 12.0
     for series in (s for s in chart.series if not s.is_hidden):
         width = 16 + _LETTER * (len(series.label) + 3)
-        if place + width > _WIDTH + 3 * _LETTER:
+        if place + width > chart.width + 3 * _LETTER:
             place, down = float(_LEFT), height + 8
             height += _LINE
         opacity = 0.5 if series.is_weak else 1.0

@@ -123,7 +123,7 @@ def percent(value: float | None) -> Cell:
     """
     if value is not None and value >= 1000:
         return number(value, ".0f")
-    return number(value, ".1f" if value is None or value >= 1 else ".2f")
+    return number(value, ".1f" if value is None or value >= 0.995 else ".2f")
 
 
 def with_error(value: float, error: float, *, sign: str = "") -> tuple[Cell, Cell]:
@@ -205,13 +205,14 @@ def folded(key: str, summary: str, html: str, *, is_open: bool = False) -> str:
     return f'<details id="{key}"{opened}><summary>{summary}</summary>\n{html}</details>\n'
 
 
-def verdict_html(robot: str, status: str, reasons: Sequence[str]) -> str:
+def verdict_html(robot: str, status: str, reasons: Sequence[str], uses: str = "") -> str:
     """Return the heading of a result: robot, verdict and the first reasons.
 
     Args:
         robot: Name of the robot, not escaped.
         status: The verdict.
         reasons: Its reasons, not escaped, the most severe first.
+        uses: What the result can be used for, not escaped.
     """
     items = [f"<li>{escape(reason)}</li>" for reason in reasons]
     more = "".join(items[_FIRST:])
@@ -219,10 +220,11 @@ def verdict_html(robot: str, status: str, reasons: Sequence[str]) -> str:
         count = len(items) - _FIRST
         title = f"{count} more reason{'s' if count > 1 else ''}"
         more = f"<details><summary>{title}</summary><ul>{more}</ul></details>"
+    uses = f'<p class="uses">{escape(uses)}</p>' if uses else ""
     return (
         f'<div class="verdict {status.replace(" ", "-")}"><h1>{escape(robot)} '
         f"<span>Verdict: <strong>{status}</strong></span></h1>"
-        f"<ul>{''.join(items[:_FIRST])}</ul>{more}</div>\n"
+        f"<ul>{''.join(items[:_FIRST])}</ul>{more}{uses}</div>\n"
     )
 
 

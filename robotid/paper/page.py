@@ -227,5 +227,21 @@ def _energy(content: Mapping[str, Any]) -> str:
 
 
 def _settings(content: Mapping[str, Any]) -> str:
-    rows = [[code(key), text(str(value))] for key, value in content["settings"].items()]
+    rows = [
+        [text(_named(key)), text(_written(value))] for key, value in content["settings"].items()
+    ]
     return table("Settings", ["setting", "value"], rows)
+
+
+def _named(key: str) -> str:
+    """Return the name of a setting as text, with its unit, as "duration [s]"."""
+    words, _, unit = key.rpartition("_")
+    name = f"{words} [{unit}]" if unit in ("rad", "s") else key
+    return name.replace("_", " ")
+
+
+def _written(value: object) -> str:
+    """Return the value of a setting as text; numbers of a list with commas."""
+    if isinstance(value, list):
+        return ", ".join(map(_written, value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

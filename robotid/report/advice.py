@@ -261,8 +261,8 @@ def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
         check = "Check the sign, the order and the unit of the torques and the URDF's masses. "
     source = "stated" if is_number(found.estimator.bounds.total_mass) else "identified"
     masses = f"{after:.4g} kg {source}, {before:.4g} kg in the URDF"
-    payload = found.scale_check.payload
-    if payload is not None:
+    if payloads := found.scale_check.payloads:
+        payload = next((x for x in payloads if x.contradicts), payloads[0])
         action = "Correct" if payload.contradicts else "Verify"
         words = f"{check}{action} the torque scale: {payload.message}."
         gains = _gain_flags(origin) if payload.contradicts else []

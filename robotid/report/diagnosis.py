@@ -31,6 +31,7 @@ _CELL = 11  # [px] of the correlation matrix
 _STEPS = 8  # shades of each sign in it
 _STILL = 100  # points of a friction chart in print
 _LOW = 130  # [px] height of a friction chart
+_NARROW = 300  # [px] width of its static picture
 _CURVES = 8  # friction charts that are not folded
 
 
@@ -168,7 +169,8 @@ def _friction_figures(found: Identification) -> dict[str, str]:
             figures[joint] = f"<p>{escape(joint)}: {why}.</p>\n"
         else:
             caption = f"<strong>{escape(joint)}</strong>"
-            figures[joint] = chart_html(replace(chart, height=_LOW), caption, still=_STILL)
+            drawn = replace(chart, height=_LOW, width=_NARROW)
+            figures[joint] = chart_html(drawn, caption, still=_STILL)
     return figures
 
 

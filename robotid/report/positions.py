@@ -33,9 +33,10 @@ _ERRORS = (
     "<p>error = 100 |q − simulated| / |motion|, with the motion about its mean. The simulation "
     "starts at the log's first sample and has the commands as its only input; errors over "
     "horizons are of simulations that restart from the measurement after each horizon. For "
-    "comparison: the error of the command as position, of the URDF with the stated gains, without "
-    "friction and delay, and of a second-order model of each joint alone.</p>\n"
+    "comparison: the error of the command as position,{} and of a second-order model of each joint "
+    "alone.</p>\n"
 )
+_STATED = " of the URDF with the stated gains, without friction and delay,"
 _DRIVEN_ERRORS = (
     "<p>error = 100 |q − simulated| / |motion|. The simulation has the logged torque as its only "
     f"input and restarts from the measurement every {DRIFTS:g} s, or after another horizon. "
@@ -114,7 +115,7 @@ def shown_positions(
         facts=_facts(content) | _warned(findings, joints),
         steps=loop_steps(content, origin),
         made=f"<p>{escape(_method(content, names))}</p>\n",
-        errors=(_DRIVEN_ERRORS if is_driven else _ERRORS, _horizons(content)),
+        errors=(_compared(content, is_driven=is_driven), _horizons(content)),
         curves=("Positions", _positions(content, fitted, validation, worst, origin, replay)),
         why="",
         parameters=parameter_section(
@@ -214,6 +215,15 @@ def _method(content: Mapping[str, Any], names: Mapping[str, Sequence[str]]) -> s
         f"{listed(names['identification'])} by {content['settings']['estimator']['name']}. "
         + (f"Validation: {listed(validation)}." if validation else "There is no validation log.")
     )
+
+
+def _compared(content: Mapping[str, Any], *, is_driven: bool) -> str:
+    """Return what the error is and which simpler models stand beside it."""
+    if is_driven:
+        return _DRIVEN_ERRORS
+    runs = [content["identification"], *content["validation"]]
+    errors = [m.get("urdf_relative_error_pct") for run in runs for m in run["per_joint"].values()]
+    return _ERRORS.format(_STATED if any(error is not None for error in errors) else "")
 
 
 def _horizons(content: Mapping[str, Any]) -> str:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from robotid.findings import Finding
+from robotid.judgement.uses import uses_line
 from robotid.pages.html import Section, facts_html, folded, page, steps_html, verdict_html
 from robotid.report.advice import Step
 from robotid.report.causes import findings_line, findings_section
@@ -87,8 +88,11 @@ def first_screen(shown: Shown, files: Mapping[str, str]) -> str:
         shown.quantity, shown.counted, shown.rows, shown.verdicts, has_why=bool(shown.why)
     )
     steps = steps_html((step.words, step.blocks) for step in shown.steps)
+    verdict = shown.verdict
+    uses = uses_line(verdict.get("use_for", {}))
+    uses = f"{uses[:1].upper()}{uses[1:]}." if uses else ""
     return (
-        f"{verdict_html(shown.robot, shown.verdict['status'], shown.verdict['reasons'])}"
+        f"{verdict_html(shown.robot, verdict['status'], verdict['reasons'], uses)}"
         f"{facts_html(facts, files)}"
         f'<div class="halves">\n<div>{bars}</div>\n<div>{steps}</div>\n</div>\n'
     )

@@ -8,7 +8,7 @@ import pytest
 import scipy.stats
 from helpers.crane import identified_crane
 
-from robotid.closed_loop import result
+from robotid.closed_loop import findings, result
 from robotid.closed_loop.findings import loop_findings
 from robotid.closed_loop.initial_values import _speed
 from robotid.closed_loop.result import LoopIdentification, logged_motion
@@ -105,6 +105,64 @@ def test_a_parameter_at_its_upper_bound_is_told_from_one_at_0(found):
     assert "the estimate is the upper bound; with more, the gear is self-locking" in above.message
     assert below.where == NAMES[1]
     assert below.message.startswith(f"{NAMES[1]}: the estimate is 0, the lower bound")
+
+
+def test_a_limit_and_a_gain_at_their_lower_bound_are_findings(found):
+    simulator, theta = found.fit.simulator, found.estimate.theta.copy()
+    first, second, *others = simulator.free_parameters
+    limit = replace(first, name="rail.limit", what="limit", lowest=0.25)
+    gain = replace(second, name="turn.kp", what="kp", lowest=1.5)
+    theta[:2] = 0.25, 1.5
+    names = ("rail.limit", "turn.kp", *NAMES[2:])
+
+    def said(*at_bound):
+        details = {**found.estimate.details, "at_bound": at_bound}
+        estimate = replace(found.estimate, theta=theta, details=details, names=names)
+        both = replace(simulator, free_parameters=(limit, gain, *others))
+        at = replace(found, fit=replace(found.fit, simulator=both, estimate=estimate))
+        return [f for f in loop_findings(at, ()) if f.code in ("at_bound", "limit")]
+
+    [bound] = said("rail.limit", "turn.kp")
+    assert (bound.code, bound.severity) == ("at_bound", "warning")
+    assert bound.where == "rail.limit = 0.25, turn.kp = 1.5"
+    bound, free = sorted(said("turn.kp"), key=lambda finding: finding.code)
+    assert bound.where == "turn.kp = 1.5"
+    assert free.where == "rail"
+    assert free.evidence["limit"] == 0.25
+
+
+def test_gains_of_joints_with_equal_limits_that_differ_are_a_note(found):
+    simulator = found.fit.simulator
+    first, second, *others = simulator.free_parameters
+    gains = tuple(
+        replace(x, name=f"{joint}.kp", what="kp", joints=(j,), lowest=0.0)
+        for j, (x, joint) in enumerate(zip((first, second), ("rail", "turn"), strict=True))
+    )
+    estimate = replace(found.estimate, names=("rail.kp", "turn.kp", *NAMES[2:]))
+
+    def said(kp, **limit):
+        loops = replace(found.fit.loops, kp=np.array(kp))
+        own = replace(simulator, free_parameters=(*gains, *others))
+        model = SimpleNamespace(
+            joints=("rail", "turn"),
+            limits=[
+                SimpleNamespace(
+                    name=name, type="revolute", **({"effort": 9.0, "velocity": 4.0} | x)
+                )
+                for name, x in (("rail", {}), ("turn", limit))
+            ],
+        )
+        fit = SimpleNamespace(simulator=own, loops=loops, estimate=estimate)
+        return list(findings._unequal_gains(SimpleNamespace(fit=fit, model=model)))
+
+    [note] = said([6.0, 75.0])
+    assert (note.code, note.severity, note.where) == ("unequal_gains", "note", "rail, turn")
+    assert note.evidence == {"lowest": 6.0, "highest": 75.0}
+    assert "kp from 6 to 75" in note.message
+    assert 'groups = { NAME = ["rail", "turn"] } in [controller]' in note.message
+    assert said([25.0, 75.0]) == []
+    assert said([6.0, 75.0], effort=8.0) == []
+    assert said([6.0, 75.0], velocity=3.0) == []
 
 
 def test_two_sets_that_a_third_pair_joins_are_one(found):

@@ -110,7 +110,9 @@ def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
         ],
     }  # fmt: skip
     found, _ = run_job(job_from_settings(table, "job.toml", files), files / "checked")
-    check = found.scale_check.payload  # that with the narrower interval: the whole log
+    check, other = found.scale_check.payloads  # the narrower interval first: the whole log
+    widths = [high - low for low, high in (check.interval, other.interval)]
+    assert widths[0] < widths[1]
     assert (check.known, check.link) == (1.8, "tool0")
     assert check.identified == pytest.approx(2.0, abs=0.06)
     assert check.interval[0] < 2.0 < check.interval[1]
@@ -118,8 +120,9 @@ def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
     assert found.scale_check.contradicts  # 2 kg are not 1.8 kg
     (reason,) = [r for r in found.verdict.reasons if "payload of known mass" in r]
     assert check.message in reason
+    assert f"{other.message[0].upper()}{other.message[1:]}" in reason or other.message in reason
     whole = load_result(files / "checked").content
-    assert stated_scale_check(whole).payload == check
+    assert stated_scale_check(whole).payloads == (check, other)
     assert job_from_settings(whole["settings"], "x", files).payload_checks == (
         found.asked.job.payload_checks
     )
@@ -140,7 +143,7 @@ def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
     rewritten = next_steps(found, Origin((), "out"))  # the report of a result names no source
     assert not any("robotid identify" in block for step in rewritten for block in step.blocks)
     right = replace(check, known=2.0)
-    verified = replace(found, payload_check=right)
+    verified = replace(found, payload_checks=(right,))
     assert verified.scale_check.agrees == right.verifies
     steps = next_steps(verified, Origin(("job.toml",), "out"))
     assert right.verifies

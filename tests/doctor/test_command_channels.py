@@ -132,9 +132,14 @@ def test_commands_of_few_steps_of_the_encoder_are_named():
 
 
 def test_a_drive_at_its_largest_speed_is_named():
-    clipped = found(record(chirps([0.3, 0.3], 8.0), [Servo(top=1.0), Servo()]))
+    log = record(chirps([0.3, 0.3], 8.0), [Servo(top=1.0), Servo()])
+    clipped = found(log)
     assert list(clipped) == ["saturated"]
     finding = clipped["saturated"]
+    assert f"largest speed of {finding.evidence['speed']:.3g} rad/s in" in finding.message
+    [rail] = [x for x in check_commands(log, ["joint_0"]) if x.code == "saturated"]
+    assert f"largest speed of {finding.evidence['speed']:.3g} m/s in" in rail.message
+    assert f"changes by up to {finding.evidence['error']:.2g} m: " in rail.message
     assert (finding.severity, finding.where) == ("warning", "log: joint_0")
     assert finding.evidence["speed"] == pytest.approx(1.0, rel=0.05)
     assert finding.evidence["error"] > 0.2

@@ -54,16 +54,16 @@ def test_the_message_has_both_masses_their_difference_and_what_follows():
 def test_it_decides_before_the_urdf_and_a_contradiction_before_all():
     urdf = ScaleCheck(scale=1.2, factor=1.2, masses=(20.0, 24.0, 0.0))
     assert not urdf.agrees
-    verified = replace(urdf, payload=SHARP)
+    verified = replace(urdf, payloads=(SHARP,))
     assert verified.agrees
     assert verified.message == (
         f"absolute scale verified by a payload of known mass: {SHARP.message}"
     )
     wrong = replace(SHARP, identified=2.4, interval=(2.3, 2.5))
-    like = ScaleCheck(scale=1.0, factor=1.0, masses=(20.0, 20.0, 0.0), payload=wrong)
+    like = ScaleCheck(scale=1.0, factor=1.0, masses=(20.0, 20.0, 0.0), payloads=(wrong,))
     assert like.contradicts
     assert like.message.startswith("absolute scale contradicted by a payload of known mass: pay")
-    open_ = replace(urdf, payload=replace(SHARP, interval=(1.8, 2.24)))
+    open_ = replace(urdf, payloads=(replace(SHARP, interval=(1.8, 2.24)),))
     assert not open_.agrees
     assert not open_.contradicts
     assert open_.message.endswith("Use a larger payload, or a longer motion")
@@ -74,4 +74,22 @@ def test_it_decides_before_the_urdf_and_a_contradiction_before_all():
     first, second = both.message.split(". Absolute scale ")
     assert first.startswith("absolute scale contradicted by a stated mass")
     assert second.startswith("verified by a payload of known mass")
-    assert PayloadCheck.from_dict(both.to_dict()["payload"]) == SHARP
+    assert PayloadCheck.from_dict(both.to_dict()["payloads"][0]) == SHARP
+
+
+def test_every_payload_counts_and_is_in_the_message():
+    like = ScaleCheck(scale=1.0, factor=1.0, masses=(20.0, 20.0, 0.0))
+    wide = replace(SHARP, known=1.0, identified=1.02, interval=(0.8, 1.24), log="small.csv")
+    wrong = replace(SHARP, known=3.0, identified=3.6, interval=(3.4, 3.8), log="large.csv")
+    both = replace(like, payloads=(SHARP, wide))
+    assert both.agrees
+    second = both.message.split(". Payload of 1 kg on tool0: ")[1]
+    assert second.startswith("torque alone determines 1.02 kg (95 % interval 0.8 to 1.24)")
+    every = replace(like, payloads=(SHARP, wide, wrong))
+    assert every.contradicts
+    assert not every.agrees
+    first, verified = every.message.split(". Absolute scale verified by a payload of known mass: ")
+    assert first == f"absolute scale contradicted by a payload of known mass: {wrong.message}"
+    assert verified.startswith(SHARP.message)
+    assert verified.endswith(f"P{wide.message[1:]}")
+    assert [x["known"] for x in every.to_dict()["payloads"]] == [2.0, 1.0, 3.0]

@@ -79,4 +79,4 @@ def test_the_largest_error_is_the_first_reason():
     found = judged(errors, joints=tuple(errors))
     assert [reason[0] for reason in found.reasons] == ["c", "b", "d", "a"]
     lines = verdict_lines(found.to_dict())
-    assert [line.split()[0] for line in lines] == ["verdict:", "c:", "b:", "d:", "a:"]
+    assert [line.split()[0] for line in lines] == ["verdict:", "c:", "b:", "d:", "a:", "use"]

@@ -18,6 +18,7 @@ from helpers.recorders import (
     write_lerobot,
 )
 
+from robotid._files import file_sha256, log_exists, source_entry
 from robotid.commands.convert import convert
 from robotid.exceptions import DataError, SettingsError
 from robotid.fitting.survey import survey_log
@@ -488,6 +489,30 @@ def test_frames_of_an_episode_are_in_their_order_whatever_that_of_the_rows_and_f
         np.testing.assert_allclose(back.t, np.arange(100 + number) / 50, atol=1e-6)
         np.testing.assert_allclose(back.q, log.q + np.deg2rad(number), atol=1e-6)
         np.testing.assert_allclose(back.q_ref, log.q_ref, atol=1e-6)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_each_log_of_a_job_is_an_episode_of_its_own(tmp_path, version):
+    path = dataset(tmp_path, version, episodes=(3, 12))
+    logs = {number: path / f"episode_{number}" for number in (12, 3)}
+    for number, episode in logs.items():
+        log = read_log(episode, JOINTS, needs="commands", units=DEGREES)
+        assert log.name == f"episode_{number}"
+        q = make_log(100 + number).q + np.deg2rad(number)
+        np.testing.assert_allclose(log.q, q, atol=1e-6)
+    with pytest.raises(DataError, match="arm has no episode 'episode_4'"):
+        read_log(path / "episode_4", JOINTS, needs="commands", units=DEGREES)
+    other = LogSource(topic="episode_3")
+    with pytest.raises(SettingsError, match=r"topic is 'episode_3', but the log is episode_12 of"):
+        read_log(logs[12], JOINTS, needs="commands", source=other)
+    first, second = map(file_sha256, logs.values())
+    assert len({first, second, file_sha256(path)}) == 3
+    assert source_entry(str(logs[3])) == {"path": str(logs[3]), "sha256": second}
+    (file, *_) = sorted(path.glob("data/**/*.parquet"))
+    file.write_bytes(b"x")
+    assert file_sha256(logs[12]) != first
+    assert log_exists(logs[12])
+    assert not log_exists(tmp_path / "episode_3")
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])

@@ -95,6 +95,33 @@ def page(content, followed):
     return page_with(content, [], [followed])
 
 
+def test_the_urdf_with_the_stated_gains_is_named_only_where_there_is_one(content, followed, page):
+    assert "of the URDF with the stated gains, without friction and delay, and of a" in page
+    bare = {
+        **content,
+        **{
+            key: [
+                {
+                    "log": run.get("log", ""),
+                    "per_joint": {
+                        joint: {**own, "urdf_relative_error_pct": None}
+                        for joint, own in run["per_joint"].items()
+                    },
+                }
+                for run in runs
+            ]
+            for key, runs in (
+                ("validation", content["validation"]),
+                ("identification", [content["identification"]]),
+            )
+        },
+    }
+    bare["identification"] = bare["identification"][0]
+    other = page_with(bare, [], [followed])
+    assert "the error of the command as position, and of a second-order model" in other
+    assert "stated gains" not in other
+
+
 def test_errors_are_those_of_the_result(page):
     kept = tables(page)["kept.csv: not fitted"]
     head = ["joint", "error %", "verdict", "RMSE", "unit", "R²", "samples", "URDF %", "command %"]

@@ -34,6 +34,7 @@ function listen() {
   source.addEventListener("end", () => {
     source.close();
     refresh();
+    refreshCharts(true); // no news will draw them when they are scrolled to
     if (clock.follow) clock.time = clock.end;
     show();
     state("the tracker has finished");

@@ -92,14 +92,15 @@ function drawBands() {
   draw();
 }
 
-function refreshCharts() { // of a live page, those in sight
+function refreshCharts(every = false) { // of a live page, those in sight, or at its end every one
+  const wanted = (chart) => every || timeLine.seen.has(chart);
   timeLine.whole = span();
   torqueCharts.forEach(({ chart, below }, j) => {
-    if (![chart, below].some((one) => timeLine.seen.has(one))) return;
+    if (!wanted(chart) && !wanted(below)) return;
     const [ys, residual] = torqueRows(j);
     chart.setData(torqueTable.t, ys);
     if (below) below.setData(torqueTable.t, [residual]);
   });
   for (const { i, chart } of bandCharts)
-    if (timeLine.seen.has(chart)) chart.setData(bandTable.t, bandRows(i), bandHalves(i));
+    if (wanted(chart)) chart.setData(bandTable.t, bandRows(i), bandHalves(i));
 }
