@@ -1,6 +1,7 @@
 """Legged robots with unknown contact forces: intervals, prediction, time.
 
     python benchmarks/bench_legged.py [--runs 20] [--robots go1 g1 talos cassie] [--unseen]
+    python benchmarks/bench_legged.py --excite [--robots go1 talos] [--design 120]
 
 A Go1 stands on point feet in MuJoCo at 0.1 ms with held torques, 18-bit encoders and 0.05 N m of
 torque noise; its joints follow multi-sines, its feet slip and lift at times. G1 and TALOS step in
@@ -10,7 +11,8 @@ a prior, since not all of its links are excited. Counted is how often the 95 % i
 inertial base parameter holds the truth. Beside it the regressor's projected rows are timed against
 those of an arm. With the recordings, a Solo12 that trots in PyBullet is identified from the first
 half of its log: its URDF is the truth. With --unseen: joint torque of the last 30 % of a recording,
-fitted on the others.
+fitted on the others. With --excite: a motion on the feet is designed and followed in MuJoCo by a
+position controller; slip and load of the feet, and the intervals by its log, beside a squat's.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -24,16 +26,22 @@ from dataclasses import replace
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers import cassie
-from helpers.legged import recorded, with_other_bodies
+from helpers.legged import followed, recorded, with_other_bodies
 from helpers.paths import JOBS
 from helpers.walkers import G1, TALOS
 
 from robotid.commands.identify import run_job
 from robotid.commands.job import read_job
 from robotid.exceptions import NotConvergedError, RankDeficientError
+from robotid.excitation.basis import BSplineBasis, FourierBasis
+from robotid.excitation.clearance import Clearance
+from robotid.excitation.design import Designer
+from robotid.excitation.limits import MotionLimits
+from robotid.excitation.standing import standing
 from robotid.fitting.settings import ConsistentSettings
 from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import identify
@@ -41,7 +49,7 @@ from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress
 from robotid.regressor.used_rows import base_problem
-from robotid.robot.constraints import Contact
+from robotid.robot.constraints import Contact, link_positions
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -200,6 +208,137 @@ def unseen(name, seed, duration):
         )
 
 
+#: Posture, soles, lifted feet of each design and joints that lift them, gains.
+STANDS = {
+    "go1": (
+        {f"{leg}_{joint}_joint": x for leg in ("FL", "FR", "RL", "RR")
+         for joint, x in (("thigh", 0.8), ("calf", -1.6))},
+        {}, {(): {}, ("FL_foot",): {"FL_thigh_joint": 1.2, "FL_calf_joint": -2.4}}, (300.0, 5.0),
+    ),
+    "talos": (
+        {f"leg_{side}_{k}_joint": x for side in ("left", "right")
+         for k, x in ((3, -0.6), (4, 1.2), (5, -0.6))}
+        | {"arm_left_2_joint": 0.4, "arm_right_2_joint": -0.4, "arm_left_4_joint": -0.8,
+           "arm_right_4_joint": -0.8, "gripper_left_joint": -0.5, "gripper_right_joint": -0.5},
+        {foot: (-0.1, -0.06, 0.1, 0.06, 0.0) for foot in TALOS.feet}, {(): {}},
+        (TALOS.kp, TALOS.kd),
+    ),
+}  # fmt: skip
+ALLOWED, GROUND = 0.45, 0.8  # coefficient of friction of the design, and in MuJoCo
+CLEARANCE = {"go1": 0.02, "talos": 0.005}  # [m] TALOS' thighs are 12 mm apart
+LOOKS = 250.0  # [Hz] of forces
+
+
+def designer_of(model, name, lifted, duration):
+    """Return the designer of a motion on the feet."""
+    posture, soles, lifts, _ = STANDS[name]
+    posture = posture | lifts[lifted]
+    stand = standing(model, posture=posture, lifted=lifted, soles=soles, friction=ALLOWED)
+    bodies, least = [frame.body for frame in stand.feet.frames], CLEARANCE[name]
+    return stand, Designer.of_model(
+        stand.model, FourierBasis(duration, 5), MotionLimits.of_model(stand.model),
+        clearance=Clearance(stand.model, least=least, floor=0.0, standing=bodies), stand=stand,
+    )  # fmt: skip
+
+
+def squat(designer):
+    """Return the largest squat within the limits: up and down every 2 s, at rest at both ends."""
+    duration = designer.basis.duration
+    basis = BSplineBasis(duration, round(4 * duration))
+    t = np.linspace(0.0, duration, 1000)
+    ramp = np.clip(np.minimum(t, duration - t) / 2.0, 0.0, 1.0)
+    wave = np.linalg.lstsq(
+        basis.derivatives(t, 0)[0][:, 1:], -(ramp**2) * (1 - np.cos(np.pi * t)), rcond=None
+    )[0]
+    C = np.zeros((basis.size, len(designer.information.free)))
+    C[0], C[1:, 2] = designer.start[designer.information.free], wave
+    return replace(designer, basis=basis).checked(C)
+
+
+def tracked(name, stand, designer, design, rng):
+    """Return the log of a designed motion in MuJoCo, and print what its feet did."""
+    plant, model, duration = PLANTS[name](), stand.robot, designer.basis.duration
+    first = design.motion.evaluate(np.zeros(1))[0]
+    grid = np.linspace(0.0, duration, round(LOOKS * duration) + 1)
+    state = design.motion.evaluate(grid)
+    rows = designer.along(*state)
+    planned = designer.information.torque(rows)[:, 6:]
+    at = CubicSpline(grid, np.hstack([state[0][:, 6:], planned]))
+    pose = stand.log(state, grid, "motion").base.pose[0]
+    lifted = [x.frame for x in model.contacts if x not in stand.feet.contacts]
+    feet = TALOS.feet if name == "talos" else FEET
+    kp, kd = STANDS[name][3]
+    drives = {"go1": (ARMATURE, DAMPING, 0.05), "talos": (0.1, 1.0, 0.3)}[name]
+    log = followed(
+        model, feet, lambda t: np.split(at(np.clip(t, 0.0, duration)), 2), rng,
+        posture=np.r_[pose, first[0, 6:]], duration=duration - 0.1, kp=kp, kd=kd, force=True,
+        armature=drives[0], damping=drives[1], torque=drives[2], friction=GROUND, ground=0.005,
+    )  # fmt: skip
+    own = [x.frame for x in stand.feet.contacts]
+    places = link_positions(
+        model.pin_model, model.configurations(np.hstack([log.base.pose, log.q])), own
+    )
+    slip = 1e3 * np.abs(places - places[0])[..., :2].max()
+    f = np.array([[log.wrenches[f"{part} {foot}"] for part in ("fx", "fy", "fz")] for foot in own])
+    used = np.linalg.norm(f[:, :2], axis=1) / np.maximum(f[:, 2], 1e-9)
+    limits = np.array([joint.effort for joint in model.limits])
+    q = design.motion.evaluate(log.t)[0]
+    off = np.abs(log.base.pose[:, :3] - q[:, :3]).max()
+    print(
+        f"  MuJoCo: feet move {slip:.1f} mm, smallest load {f[:, 2].min():.1f} N, friction "
+        f"{used.max():.2f}, torque {100 * (np.abs(log.tau) / limits).max():.0f} % of the limit, "
+        f"base {1e3 * off:.0f} mm off, {sum(not x.all() for x in map(log.contacts.get, own))} feet "
+        f"lift, lifted feet touch: {any(log.contacts[x].any() for x in lifted)}",
+        flush=True,
+    )
+    return replace(log, wrenches={}), plant
+
+
+def excited(name, duration, seconds):
+    """Print what a designed motion and a squat of the same length determine."""
+    errors = {}
+    for lifted in STANDS[name][2]:
+        model, rng = PLANTS[name]().model, np.random.default_rng(0)
+        stand, designer = designer_of(model, name, lifted, duration)
+        motions = {"designed": designer.design(rng, starts=1, seconds=seconds)}
+        if not lifted:
+            motions = {"squat": squat(designer), **motions}
+        for label, design in motions.items():
+            rows = designer.along(*design.motion.evaluate(np.linspace(0.0, duration, 1001)))
+            forces = stand.ground.smallest(
+                designer.information.forces(rows), np.linspace(0.0, duration, 1001)
+            )
+            words = [f"{key} {100 * entry['margin']:.0f} %" for key, entry in forces.items()]
+            base = np.ptp(
+                design.motion.evaluate(np.linspace(0.0, duration, 1001))[0][:, :6], axis=0
+            )
+            print(
+                f"{name} {label}, lifted: {', '.join(lifted) or 'none'}: criterion "
+                f"{design.objective:.3f}, limits used {100 * design.used.max():.0f} %, margins: "
+                f"{', '.join(words)}, {design.seconds:.0f} s\n  the base moves by "
+                f"{', '.join(f'{100 * x:.0f}' for x in base[:3])} cm and "
+                f"{', '.join(f'{x:.2f}' for x in base[3:])} rad"
+            )
+            log, plant = tracked(name, stand, designer, design, np.random.default_rng(1))
+            other = with_other_bodies(model, np.random.default_rng(2))
+            found = identify(
+                other, log, signals=SIGNALS, estimator=PRIOR, friction="none", doctor=False
+            )
+            n = model.layout.n_inertial
+            is_body = found.mapping.independent < n
+            truth = found.mapping.K @ plant.truth(model)
+            z = ((found.base - truth) / found.base_error)[is_body]
+            held = 100 * np.mean(np.abs(z) < found.errors.quantile[is_body])
+            errors[label, lifted] = found.base_error[is_body]
+            line = f"  {held:.0f} % of {len(z)} intervals hold the truth, total mass "
+            line += f"{found.standard[:n:10].sum():.3f} of {plant.truth(model)[:n:10].sum():.3f} kg"
+            if label != "squat":
+                ratio = errors[label, lifted] / errors["squat", ()]
+                line += f"; over the squat's: {np.exp(np.mean(np.log(ratio))):.2f} (mean), "
+                line += f"{ratio.min():.2f} to {ratio.max():.2f}"
+            print(line, flush=True)
+
+
 def speed(duration):
     model = robot()
     log = Go1().log(model, np.random.default_rng(0), duration)
@@ -230,7 +369,13 @@ def main():
     parser.add_argument("--seconds", type=float, default=20.0, help="length of each recording")
     parser.add_argument("--robots", nargs="+", choices=PLANTS, default=[*PLANTS])
     parser.add_argument("--unseen", action="store_true", help="only errors on unseen motion")
+    parser.add_argument("--excite", action="store_true", help="only designed motions on the feet")
+    parser.add_argument("--design", type=float, default=120.0, help="seconds of each design")
     options = parser.parse_args()
+    if options.excite:
+        for name in [name for name in STANDS if name in options.robots]:
+            excited(name, 10.0, 10.0 if options.quick else options.design)
+        return
     runs, seconds = (1, 4.0) if options.quick else (options.runs, options.seconds)
     for name in ("go1", "g1", "cassie") if options.quick else options.robots:
         if options.unseen:

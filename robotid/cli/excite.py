@@ -22,11 +22,13 @@ __all__ = ["EXAMPLES", "MAIN_FLAGS", "SUMMARY", "add_flags", "run"]
 SUMMARY = "design an excitation trajectory within the robot's limits"
 MAIN_FLAGS = (
     "--out", "--report", "--given", "--kind", "--link", "--mass", "--duration", "--share",
-    "--clearance", "--floor", "--joints", "--lock",
+    "--clearance", "--floor", "--posture", "--lifted", "--sole", "--friction-coefficient",
+    "--joints", "--lock",
 )  # fmt: skip
 EXAMPLES = (
     "robotid excite robot.urdf --out motion.csv --report motion.html",
     "robotid excite robot.urdf --kind payload --link tool0 --mass 2 --out m.csv",
+    "robotid excite quadruped.toml --posture FL_calf_joint=-1.6 --lifted FR_foot --out m.csv",
 )
 
 
@@ -69,7 +71,8 @@ def run(options: argparse.Namespace) -> None:
         )  # fmt: skip
     show_found(found, options, _show)
     if not options.json:
-        print_files("", [options.out, *([options.report] if options.report else [])])
+        more = [found[key] for key in ("job", "report") if key in found]
+        print_files("", [options.out, *more])
 
 
 def motion_settings(options: argparse.Namespace) -> "MotionSettings":
@@ -111,6 +114,30 @@ def _boxes(words: Sequence[str], flag: str) -> tuple["Box", ...]:
             )
         boxes.append(Box(name, (x[0], x[1], x[2]), (x[3], x[4], x[5])))
     return tuple(boxes)
+
+
+def _soles(words: Sequence[str], flag: str) -> tuple[tuple[str, tuple[float, ...]], ...]:
+    """Return rectangles that are stated as LINK=x0,y0,x1,y1,z [m].
+
+    Raises:
+        SettingsError: If a word has another form.
+    """
+    from robotid.excitation.settings import FARTHEST
+
+    soles = []
+    for word in words:
+        name, _, numbers = word.partition("=")
+        try:
+            x = tuple(float(number) for number in numbers.split(","))
+        except ValueError:
+            x = ()
+        if len(x) != 5 or not all(abs(number) <= FARTHEST for number in x):
+            raise SettingsError(
+                f"{flag} {word!r}: wanted LINK=x0,y0,x1,y1,z, two corners of the foot and its "
+                f"height in the frame of its link [m], within {FARTHEST:g} m"
+            )
+        soles.append((name, x))
+    return tuple(soles)
 
 
 def _centre(word: str, _: str) -> tuple[float, ...]:
@@ -158,13 +185,17 @@ _MOTION = Flags(
         "--clearance": ("clearance", "M"),
         "--floor": ("floor", "M"),
         "--box": ("boxes", "NAME=x0,y0,z0,x1,y1,z1"),
+        "--posture": ("posture", "JOINT=RAD"),
+        "--lifted": ("lifted", "LINKS"),
+        "--sole": ("soles", "LINK=x0,y0,x1,y1,z"),
+        "--friction-coefficient": ("friction_coefficient", "X"),
         "--noise": ("noise", "JOINT=N_M"),
         "--seed": ("seed", "N"),
         "--starts": ("starts", "N"),
         "--seconds": ("seconds", "S"),
         "--points": ("points", "HZ"),
     },
-    {"--box": _boxes, "--clearance": _clearance, "--com": _centre},
+    {"--box": _boxes, "--sole": _soles, "--clearance": _clearance, "--com": _centre},
 )
 
 
@@ -185,7 +216,7 @@ def _show(content: dict[str, Any]) -> None:
         echo(f"designed for the parameters with the widest intervals: {listed(names, 5)}", "  ")
     print("\nsmallest margin to each limit")
     for name, margin in content["limits"].items():
-        echo(f"  {name:13} {_margin(name, margin)}", 16 * " ")
+        echo(f"  {name:18} {_margin(name, margin)}", 21 * " ")
     if "payload" in content:
         print()
         for words in content["payload"]["words"]:
@@ -194,6 +225,9 @@ def _show(content: dict[str, Any]) -> None:
 
 def _margin(name: str, margin: Mapping[str, Any]) -> str:
     """Return the smallest margin of a motion to a limit, as text."""
+    if "words" in margin:
+        where = f"{margin['where']} at {margin['time']:.2f} s"
+        return f"{100 * margin['margin']:5.1f} %  {where}: {margin['words']}"
     if name != "collision":
         return f"{100 * margin['margin']:5.1f} %  {margin['where']}"
     text = "no pair of links or obstacles comes close"

@@ -7,7 +7,8 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.excitation.clearance import Clearance, Contact
-from robotid.excitation.design import Design, Designer
+from robotid.excitation.design import Designer
+from robotid.excitation.designed import Design
 from robotid.excitation.limits import LIMITS, MotionLimits
 
 __all__ = ["Course"]
@@ -46,7 +47,7 @@ class Course:
         """
         t = np.linspace(0.0, design.duration, design.intervals + 1)
         q, v, a = design.motion.evaluate(t)
-        torque = designer.information.torque(designer.information.rows(q, v, a))
+        torque = designer.information.torque(designer.along(q, v, a))
         return cls.of_motion(t, (q, v, a, torque), designer.limits, designer.clearance)
 
     @classmethod

@@ -17,11 +17,19 @@ from robotid._typing import Array
 from robotid.estimators.determination import base_spread
 from robotid.exceptions import NotConvergedError
 from robotid.excitation.basis import Basis, DesignedMotion
-from robotid.excitation.clearance import Clearance, Contact
-from robotid.excitation.information import Aim, MotionInformation, MotionRows, criterion
+from robotid.excitation.clearance import Clearance, Contact, Nearness
+from robotid.excitation.designed import Design, State
+from robotid.excitation.information import (
+    Aim,
+    Information,
+    MotionInformation,
+    MotionRows,
+    criterion,
+)
 from robotid.excitation.limits import MotionLimits
 from robotid.excitation.multipliers import SOFT, SPARE, Multipliers
 from robotid.excitation.postures import Postures
+from robotid.excitation.standing import BASE, Stand
 from robotid.identification.assumptions import (
     CORRELATION,
     assumed_noise,
@@ -35,7 +43,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 from robotid.simulation.motions import Motion
 
-__all__ = ["Design", "Designer"]
+__all__ = ["Designer"]
 
 _PER_PERIOD = 14  # samples of the grid within the shortest period of a basis
 _POLISHED = 3  # times as many in the last rounds ...
@@ -57,37 +65,6 @@ _STARTED = 10  # random motions of which the best is a start
 
 
 @dataclass(frozen=True, eq=False)
-class Design:
-    """A motion, its criterion and its use of the limits.
-
-    Attributes:
-        motion: The motion.
-        duration: Its length [s].
-        intervals: Number of equal intervals between the samples at which its limits were checked.
-        objective: Its criterion, the smaller the better.
-        condition: Condition number of the base problem, columns in units of the prior deviations.
-        used: Largest used share of each limit, by joint, shape (6, n); 0 where there is no limit.
-        contact: Where the smallest distance is; None if no pair comes near.
-        seconds: Computing time [s].
-        starts: Number of completed starts.
-        is_converged: Whether the best of them has converged.
-        history: Computing time [s] and criterion of each better motion.
-    """
-
-    motion: Motion
-    duration: float
-    intervals: int
-    objective: float
-    condition: float
-    used: Array
-    contact: Contact | None = None
-    seconds: float = 0.0
-    starts: int = 0
-    is_converged: bool = False
-    history: tuple[tuple[float, float], ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
 class Designer:
     """Optimises a motion for the information about the parameters.
 
@@ -104,11 +81,12 @@ class Designer:
         clearance: The distances to collisions; None: they are not checked.
         finer: Number of samples of the grid relative to a coarse one.
         aim: The parameters of interest, if not the base parameters; there is no prior then.
+        start: Middle of the random motions, all coordinates, shape (n,) [rad or m]; random if None.
         moving: Which joints move, shape (n,), bool; all if None. The others rest where the motion
             starts and contribute no information, since static friction may carry any load.
     """
 
-    information: MotionInformation
+    information: Information
     limits: MotionLimits
     basis: Basis
     noise: Array
@@ -119,6 +97,7 @@ class Designer:
     clearance: Clearance | None = None
     finer: int = 1
     aim: Aim | None = None
+    start: Array | None = None
     moving: Array | None = None
 
     @classmethod
@@ -133,6 +112,7 @@ class Designer:
         noise: Mapping[str, float] | None = None,
         correlation: float = CORRELATION,
         run: Run | None = None,
+        stand: Stand | None = None,
     ) -> "Designer":
         """Return a designer with the assumptions of a preview on friction and noise.
 
@@ -145,27 +125,35 @@ class Designer:
             noise: Standard deviation of the torque's noise by joint [N m or N].
             correlation: Time over which it is correlated [s].
             run: Earlier logs: the motion complements their information.
+            stand: The feet and the ground; the robot is the one with joints of its base.
 
         Raises:
             SettingsError: If a setting is not usable.
         """
         criterion(name, np.eye(1))
-        mapping = structural_mapping(model)
+        mapping = structural_mapping(own := model if stand is None else stand.robot)
         size, speed = largest_torques(model, largest_gravity(model)), limits.sizes[1]
         pi = assumed_parameters(model, size, speed) if run is None else run.standard
         found = None if run is None else run.noise(mapping.K)
         density = assumed_noise(model, size, noise or {}, correlation, found).density(0.0)
+        if stand is not None:  # the projection mixes the rows; those of the base have no noise
+            density = np.full(len(density), density[len(BASE) :].sum() / len(density))
         typical = _TYPICAL * np.array([size, speed, speed * 2 * np.pi / basis.shortest])
-        standard_spread = prior_spread(model, typical**2, 1)
+        standard_spread = prior_spread(own, typical**2, 1)
         spread = base_spread(mapping.K, standard_spread)
         given = None
         if run is not None:
             earlier = run.factors.information(run.step / density)
             given = np.eye(len(spread)) + spread[:, None] * earlier * spread
-        information = MotionInformation(model, mapping, mapping.to_base(pi))
+        information: Information
+        if stand is None:
+            information, start = MotionInformation(model, mapping, mapping.to_base(pi)), None
+        else:
+            information, start = stand.information(mapping, pi), stand.feet.posture
         return cls(
-            information, limits, basis, density, spread, standard_spread, given, name, clearance
-        )
+            information, limits, basis, density, spread, standard_spread, given, name, clearance,
+            start=start,
+        )  # fmt: skip
 
     @cached_property
     def _functions(self) -> Array:
@@ -194,12 +182,12 @@ class Designer:
         """
         began, best = time.monotonic(), np.inf
         history: list[tuple[float, float]] = []
-        followed: list[_State] = []
+        followed: list[State] = []
 
         def is_over() -> bool:
             return bool(history) and time.monotonic() - began > seconds
 
-        def follow(designer: Designer, state: _State, rounds: int, settled: float) -> _State:
+        def follow(designer: Designer, state: State, rounds: int, settled: float) -> State:
             """Return the end of the search from a start."""
             nonlocal best
             for state in designer._search(state, rounds, settled, is_over):  # noqa: B020
@@ -214,13 +202,13 @@ class Designer:
             random = [self.random(rng) for _ in range(_STARTED)]
             objective, k = min((self._objective(C), k) for k, C in enumerate(random))
             multipliers = Multipliers(_WEIGHT / self._functions.shape[1])
-            initial = _State(random[k], objective, random[k], multipliers)
+            initial = State(random[k], objective, random[k], multipliers)
             followed.append(follow(self, initial, _ROUNDS, _NEARLY))
         chosen = min(followed, key=lambda state: state.objective)
         fine, best = replace(self, finer=_POLISHED * self.finer), np.inf
         feasible = fine._feasible(chosen.feasible, 1.0 - SPARE)
         multipliers = chosen.multipliers.finer(_POLISHED)
-        initial = _State(feasible, fine._objective(feasible), chosen.iterate, multipliers)
+        initial = State(feasible, fine._objective(feasible), chosen.iterate, multipliers)
         polished = follow(fine, initial, _LAST_ROUNDS, _SETTLED)
         found = replace(self, finer=_FINER * self.finer).checked(polished.feasible)
         return replace(
@@ -239,9 +227,8 @@ class Designer:
         """
         C, contact = self._clear(self._feasible(C, 1.0))
         used, _, rows = self._constraints(C)
-        motion = DesignedMotion(self.basis, C)
         information = self.matrix(rows)
-        return self._assessed(motion, self.basis.duration, information, used, contact)
+        return self._assessed(self._motion(C), self.basis.duration, information, used, contact)
 
     def examined(self, motion: Motion, duration: float, rate: float) -> Design:
         """Return the criterion of any motion, and its use of the limits other than jerk.
@@ -269,9 +256,24 @@ class Designer:
         """
         count = round(duration * rate)
         q, v, a = motion.evaluate(np.linspace(0.0, duration, count + 1))
-        rows = self.information.rows(q, v, a)
+        rows = self.along(q, v, a)
         used = self.limits.used(q, v, a, 0.0 * a, self.information.torque(rows))
         return used, self._informed(rows, duration / count)
+
+    def along(self, q: Array, v: Array, a: Array) -> MotionRows:
+        """Return the rows along a motion of all coordinates.
+
+        Args:
+            q: Joint coordinates, shape (N, n) [rad or m].
+            v: Velocities, shape (N, n) [rad/s or m/s].
+            a: Accelerations, shape (N, n) [rad/s^2 or m/s^2].
+        """
+        free = self.information.free
+        return self.information.rows(q[:, free], v[:, free], a[:, free])
+
+    def _motion(self, C: Array) -> Motion:
+        """Return the motion of all coordinates."""
+        return self.information.motion(DesignedMotion(self.basis, C))
 
     def _assessed(
         self,
@@ -305,7 +307,7 @@ class Designer:
         if self.clearance is None:
             return C, None
         for k in range(_TRIALS):
-            contact = self.clearance.nearest(DesignedMotion(self.basis, C), self.basis.duration)
+            contact = self.clearance.nearest(self._motion(C), self.basis.duration)
             if contact is None or contact.margin >= 0.0:
                 return C, contact
             C = _scaled(C, max(1.0 - 0.01 * 2.0**k, 0.5))
@@ -332,8 +334,10 @@ class Designer:
 
     @cached_property
     def _moves(self) -> Array:
-        """Which joints move, shape (n,), bool."""
-        return np.ones(len(self.noise), dtype=bool) if self.moving is None else self.moving
+        """Which designed joints move, shape (k,), bool."""
+        return (
+            np.ones(len(self.information.free), dtype=bool) if self.moving is None else self.moving
+        )
 
     def judged(self, F: Array) -> tuple[float, Array]:
         """Return the criterion of information about the base parameters, and its gradient.
@@ -349,7 +353,8 @@ class Designer:
 
     def _scale(self, step: float) -> Array:
         """Return the factor of rows with which their squares are information, (n, b, 1)."""
-        weight = self._moves * np.sqrt(step / self.noise)
+        used = 1.0 if self.moving is None else self.moving
+        weight = used * np.sqrt(step / self.noise)
         scale: Array = weight[:, None, None] * self.spread[:, None]
         return scale
 
@@ -381,6 +386,15 @@ class Designer:
             return None
         return np.zeros((len(self.clearance.pairs), self._functions.shape[1], 3))
 
+    def _followed(self, C: Array) -> tuple[MotionRows, Array, Array]:
+        """Return rows, torques (N, n) and used shares of limits (6, N, n) of a motion."""
+        *state, jerk = self._functions @ C
+        rows = self.information.rows(*state)
+        q, v, a = rows.motion
+        every, torque = np.zeros_like(q), self.information.torque(rows)
+        every[:, self.information.free] = jerk
+        return rows, torque, self.limits.used(q, v, a, every, torque)
+
     def _constraints(self, C: Array, spare: float = 0.0) -> tuple[Array, float, MotionRows]:
         """Return used shares of limits (6, N, n), the smallest margin of distances and rows.
 
@@ -388,21 +402,30 @@ class Designer:
             C: Coefficients of a motion, shape (h, n).
             spare: Multiple of the distances' reserve that is subtracted from the margin.
         """
-        q, v, a, jerk = self._functions @ C
-        rows = self.information.rows(q, v, a)
-        used = self.limits.used(q, v, a, jerk, self.information.torque(rows))
-        return used, float(self._margins(q, spare).min(initial=np.inf)), rows
+        rows, _, used = self._followed(C)
+        margins = SOFT * (self.information.margins(rows) - spare * SPARE)
+        if self.clearance is not None:
+            placed = self.clearance.placed(rows.motion[0])
+            own = self.clearance.margins(placed, spare, hints=self._hints)
+            margins = np.vstack([own, margins])
+        return used, float(margins.min(initial=np.inf)), rows
 
-    def _margins(self, q: Array, spare: float) -> Array:
-        """Return margins of distances, shape (pairs, N) [m], as of ``Clearance.margins``."""
-        if self.clearance is None:
-            return np.zeros((0, len(q)))
-        return self.clearance.margins(self.clearance.placed(q), spare, hints=self._hints)
+    def _distances(
+        self, rows: MotionRows, multipliers: Multipliers
+    ) -> tuple[Array, Nearness | None]:
+        """Return distances [m] and then the information's margins, in ``SOFT``, shape (k, N)."""
+        margins, near = SOFT * self.information.margins(rows), None
+        if self.clearance is not None:
+            within = multipliers.distance_without_cost(self._wanted)[: len(self.clearance.pairs)]
+            placed = self.clearance.placed(rows.motion[0])
+            near = self.clearance.near(placed, within, hints=self._hints)
+            margins = np.vstack([near.distance, margins])
+        return margins, near
 
     def _objective(self, C: Array) -> float:
         """Return the criterion of a motion."""
-        q, v, a, _ = self._functions @ C
-        return self.judged(self.matrix(self.information.rows(q, v, a)))[0]
+        *state, _ = self._functions @ C
+        return self.judged(self.matrix(self.information.rows(*state)))[0]
 
     def _lagrangian(self, C: Array, multipliers: Multipliers) -> tuple[float, Array]:
         """Return the augmented Lagrangian of a motion and its gradient, shape (h, n).
@@ -410,42 +433,39 @@ class Designer:
         References:
             Nocedal, Wright (2006), Numerical Optimization, section 17.4.
         """
-        D = self._functions
-        q, v, a, jerk = D @ C
-        rows = self.information.rows(q, v, a)
-        torque = self.information.torque(rows)
+        D, (rows, torque, used) = self._functions, self._followed(C)
         value, by_F = self.judged(self.matrix(rows))
-        used = self.limits.used(q, v, a, jerk, torque)
         cost, pushed = multipliers.of_limits(used)
         by_value = pushed * 2.0 * used / (1.0 - SPARE) ** 2 / self.limits.sizes[:, None]
         by_q, by_v, by_a, by_jerk, by_torque, by_power = by_value
         by_v = by_v + by_power * torque
-        by_torque = by_torque + by_power * v
-        value += cost
-        if self.clearance is not None:
-            aim = self._wanted
-            placed = self.clearance.placed(q)
-            within = multipliers.distance_without_cost(aim)
-            near = self.clearance.near(placed, within, hints=self._hints)
-            cost, pushed = multipliers.of_distances(near.distance, aim)
-            value += cost
+        by_torque = by_torque + by_power * rows.motion[1]
+        distance, near = self._distances(rows, multipliers)
+        too_near, pushed = multipliers.of_distances(distance, self._wanted)
+        if near is not None:
             along = -pushed[near.pairs, near.samples, None] / SOFT * near.gradient
             np.add.at(by_q, near.samples, along)
+            pushed = pushed[len(near.distance) :]
         scale = self._scale(self._step)
         by_W = 2.0 * scale * (by_F @ (scale * rows.W))
-        by_W += self.information.beta[:, None] * by_torque.T[:, None]
-        along_q, along_v, along_a = self.information.pull(rows, by_W)
-        by_motion = (along_q + by_q, along_v + by_v, along_a + by_a, by_jerk)
-        gradient: Array = sum(functions.T @ g for functions, g in zip(D, by_motion, strict=True))
+        found = self.information.gradient(rows, by_W, by_torque, (by_q, by_v, by_a), -pushed)
+        by_state = (*found, by_jerk[:, self.information.free])
+        gradient: Array = sum(functions.T @ g for functions, g in zip(D, by_state, strict=True))
         gradient[1:, ~self._moves] = 0.0
-        return value, gradient
+        return value + cost + too_near, gradient
 
     @property
     def _wanted(self) -> Array:
-        """Distances that the search requires, shape (pairs, 1) [m]."""
+        """Distances that the search requires, as of ``_distances``, shape (k, 1) [m]."""
+        others = np.full((self.information.constraints, 1), 2.0 * SPARE * SOFT)
         if self.clearance is None:
-            return np.zeros((0, 1))
-        return self.clearance.required[:, None] + 2.0 * self.clearance.spare
+            return others
+        return np.vstack([self.clearance.required[:, None] + 2.0 * self.clearance.spare, others])
+
+    @cached_property
+    def _designed(self) -> MotionLimits:
+        """The limits of the coordinates that are designed."""
+        return self.limits.of(self.information.free)
 
     @cached_property
     def postures(self) -> Postures:
@@ -459,12 +479,14 @@ class Designer:
             rng: Random generator of the motion.
 
         Raises:
-            SettingsError: If no posture is found that the robot can hold.
+            SettingsError: If no posture is found that the robot can hold, or not the start.
         """
-        n = len(self.limits.middle)
-        C = rng.standard_normal((self.basis.size, n)) * self.limits.sizes[0]
+        unit = self._designed.sizes[0]
+        C = rng.standard_normal((self.basis.size, len(unit))) * unit
         C[:, ~self._moves] = 0.0
-        C[0] = self.postures.one(rng)
+        given = self.start
+        start = self.postures.one(rng) if given is None else self.postures.required(given)
+        C[0] = start[self.information.free]
         return self._feasible(C, 1.0 - SPARE)
 
     def _feasible(self, C: Array, most: float) -> Array:
@@ -472,10 +494,11 @@ class Designer:
 
         Each joint is scaled to its own limits of position to jerk first; then all are scaled alike.
         """
-        free = most * self.limits.sizes[0] - np.abs(C[0] - self.limits.middle)
+        limits = self._designed
+        free = most * limits.sizes[0] - np.abs(C[0] - limits.middle)
         moving = np.abs(self._functions[:, :, 1:] @ C[1:]).max(axis=1)  # (4, n)
         over = np.vstack(
-            [moving[:1] / np.maximum(free, 1e-9), moving[1:] / self.limits.sizes[1:4] / most]
+            [moving[:1] / np.maximum(free, 1e-9), moving[1:] / limits.sizes[1:4] / most]
         )
         C = _scaled(C, 1.0 / np.maximum(1.0, over.max(axis=0)))
         return self._towards(_scaled(C, 0.0), C, most)
@@ -503,12 +526,12 @@ class Designer:
         return feasible + low * way
 
     def _search(
-        self, state: "_State", rounds: int, settled: float, is_over: Callable[[], bool]
-    ) -> Iterator["_State"]:
+        self, state: State, rounds: int, settled: float, is_over: Callable[[], bool]
+    ) -> Iterator[State]:
         """Yield the state of a search, at first and after each round, until it has converged."""
         from scipy.optimize import minimize
 
-        unit = self.limits.sizes[0]
+        unit = self._designed.sizes[0]
         before = np.inf  # violation of the limits
 
         def scaled(x: Array) -> tuple[float, Array]:
@@ -537,7 +560,7 @@ class Designer:
             if state.is_settled:
                 return
 
-    def _updated(self, state: "_State", C: Array, settled: float) -> tuple["_State", float]:
+    def _updated(self, state: State, C: Array, settled: float) -> tuple[State, float]:
         """Return the state of a search after a round, and the violation of the limits.
 
         Args:
@@ -548,11 +571,7 @@ class Designer:
         used, margin, rows = self._constraints(C)
         own = self.judged(self.matrix(rows))[0]
         multipliers = state.multipliers
-        distance = None
-        if self.clearance is not None:
-            within = multipliers.distance_without_cost(self._wanted)
-            placed = self.clearance.placed(rows.motion[0])
-            distance = self.clearance.near(placed, within, hints=self._hints).distance
+        distance, _ = self._distances(rows, multipliers)
         feasible = self._feasible(C, 1.0 - SPARE)
         objective = self._objective(feasible)
         if objective > state.objective - settled:
@@ -569,30 +588,11 @@ class Designer:
         multipliers = multipliers.raised(used, distance, self._wanted)
         iterate = feasible if is_stalled else C
         is_settled = bool(is_near and gain < settled)
-        return _State(feasible, objective, iterate, multipliers, is_settled), violation
+        return State(feasible, objective, iterate, multipliers, is_settled), violation
 
 
 class _OutOfTime(Exception):
     """The limit of the computing time is reached."""
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    """The state of a search.
-
-    Attributes:
-        feasible: Coefficients of the best motion that satisfies the limits, shape (h, n).
-        objective: Its criterion.
-        iterate: Coefficients at which the search continues; they may violate limits.
-        multipliers: Those of the limits.
-        is_settled: Whether the search has converged.
-    """
-
-    feasible: Array
-    objective: float
-    iterate: Array
-    multipliers: Multipliers
-    is_settled: bool = False
 
 
 def _scaled(C: Array, share: float | Array) -> Array:

@@ -114,7 +114,7 @@ def _limit_table(model: RobotModel, content: Mapping[str, Any], course: Course) 
     """Return the largest used share of each limit, its joint and time, and the margin."""
     rows = []
     for kind, entry in content["limits"].items():
-        if kind == "collision":
+        if kind not in LIMITS:
             continue
         joint, k = model.joints.index(entry["where"]), LIMITS.index(kind)
         unit = (_PRISMATIC if entry["where"] in model.layout.prismatic else _UNITS)[k]
@@ -135,7 +135,32 @@ def _limit_table(model: RobotModel, content: Mapping[str, Any], course: Course) 
         "URDF's limit. 100 % of the others is the stated limit. Positions are measured from the "
         "middle of their range.</p>\n"
     )
-    return note + table("Largest use of each limit", headers, rows) + _collisions(content, course)
+    limits = table("Largest use of each limit", headers, rows)
+    return note + limits + _ground(content) + _collisions(content, course)
+
+
+def _ground(content: Mapping[str, Any]) -> str:
+    """Return the smallest margins of the forces of the ground; empty with a fixed base."""
+    rows = [
+        [
+            text(kind),
+            percent(100 * entry["margin"]),
+            code(entry["where"]),
+            number(entry["time"], ".2f"),
+            text(entry["words"]),
+        ]
+        for kind, entry in content["limits"].items()
+        if "words" in entry
+    ]
+    if not rows:
+        return ""
+    note = (
+        "<p>The forces of the ground are the smallest ones that cause the motion of the base. Flat "
+        "feet stand on their four corners. The margin of the vertical force is in % of the mean "
+        "one, that of the centre of pressure in % of half the width of the foot.</p>\n"
+    )
+    headers = ["constraint", "margin %", "contact", "at [s]", "found"]
+    return note + table("Forces of the ground", headers, rows)
 
 
 def _collisions(content: Mapping[str, Any], course: Course) -> str:

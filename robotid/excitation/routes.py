@@ -9,7 +9,8 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
 from robotid.excitation.clearance import Contact
-from robotid.excitation.design import Design, Designer
+from robotid.excitation.design import Designer
+from robotid.excitation.designed import Design
 from robotid.simulation.motions import Motion
 
 __all__ = ["Route", "design_stands", "design_sweeps"]
