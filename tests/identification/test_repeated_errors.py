@@ -8,10 +8,10 @@ import pytest
 
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import hold_log
-from robotid.identification.contact_points import (
+from robotid.identification.repeated_errors import (
     _slopes,
     estimated_uncertainty,
-    with_contact_errors,
+    with_repeated_errors,
 )
 from robotid.logs.base import BaseMotion
 from robotid.logs.data import Log
@@ -114,10 +114,10 @@ def test_the_size_of_offsets_that_rows_determine_weakly_has_the_largest_evidence
 def test_the_covariance_of_the_score_is_that_of_the_stated_uncertainty(log):
     def errors(uncertainty):
         model = robot(uncertainty)
-        found = with_contact_errors(
+        found = with_repeated_errors(
             Recordings(model, structural_mapping(model), (hold_log(model, log, RAW),))
         )
-        return found.contacts
+        return found.repeated
 
     once, twice = errors(1e-3), errors(2e-3)
     assert once.root.shape[1] == 6
