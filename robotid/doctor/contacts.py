@@ -20,7 +20,7 @@ from robotid.regressor.constraints import constraint_jacobian
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
 
-__all__ = ["check_base"]
+__all__ = ["check_base", "flag_delay"]
 
 _UNLIKE = 0.3  # of the motion: a measured velocity that differs by more is wrong
 _BETTER = 0.5  # ... and is of other axes if these reduce the difference below this share
