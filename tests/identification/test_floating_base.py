@@ -196,7 +196,7 @@ def test_a_bias_of_the_accelerometers_is_in_the_intervals(go1, trot):
     shift = total @ (result.standard - truth_of(go1))
     turned = go1_up(log) @ bias
     weight = total @ truth_of(go1)
-    assert shift == pytest.approx(-weight * turned / (9.81 + turned), rel=0.2)
+    assert shift == pytest.approx(-weight * turned / (9.81 + turned), rel=0.3)
     assert abs(shift) < 2.0 * error < 6.0 * abs(shift)
     drift = float(result.errors.method.rpartition("uncertain by ")[2].removesuffix(" m/s^2"))
     assert drift == pytest.approx(np.linalg.norm(bias), abs=0.05)  # and the mean acceleration
