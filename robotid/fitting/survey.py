@@ -454,15 +454,18 @@ def _with_one_bias(
     layout: LogLayout, windows: tuple[Log, ...]
 ) -> tuple[LogLayout, tuple[Log, ...]]:
     """Return layout and windows with the bias of the gyroscopes at rest in all windows together."""
-    own = [(log, log.base.imu) for log in windows if log.base is not None and log.base.imu]
+    own = [(log.base, log.base.imu) for log in windows if log.base and log.base.imu]
     if layout.base.imu is None or layout.base.imu.bias is not None or not own:
         return layout, windows
-    parts = [(log.t, log.q, imu.values[:, :3] + imu.frame.bias) for log, imu in own]
+    parts = [
+        (log.t, log.q, imu.values[:, :3] + imu.frame.bias)
+        for log, (_, imu) in zip(windows, own, strict=True)
+    ]
     bias, note = bias_at_rest(parts)
     frame, changed = replace(own[0][1].frame, bias=bias), []
-    for part, (log, imu) in zip(parts, own, strict=True):
+    for part, log, (moved, imu) in zip(parts, windows, own, strict=True):
         values = np.hstack([part[2] - bias, imu.values[:, 3:]])
-        base = replace(log.base, imu=replace(imu, values=values, frame=frame))
+        base = replace(moved, imu=replace(imu, values=values, frame=frame))
         before = bias_at_rest([part])[1]
         notes = tuple(note if x == before else x for x in log.notes)
         changed.append(replace(log, base=base, notes=notes))
