@@ -294,11 +294,11 @@ def flag_delay(t: Array, flags: Array, speed: Array, spread: float) -> tuple[flo
     """Return the delay of a contact's flags behind its motion, and its error; None without one.
 
     At each change of the flags the link starts or stops to move: its speed crosses the geometric
-    mean of its median speeds with and without contact. Delayed flags are late at both. What makes
-    them late at lift-offs and early at touch-downs, or differs from step to step, is no delay: a
-    slow lift-off, a slip. So the delay is the mean of the two medians, half of their difference is
-    its error, and that of the scatter is added, and half the spread of the filter: rows of that
-    time beside a contact have no force anyway.
+    mean of its median speeds with and without contact. A delay is the same at both. What has
+    opposite signs at lift-offs and touch-downs, or differs from step to step, is no delay: a slow
+    lift-off, a slip. So the delay is the mean of the two medians, half of their difference is its
+    error, and that of the scatter is added, and half the spread of the filter: rows of that time
+    beside a contact have no force anyway.
 
     Args:
         t: Time stamps, shape (N,) [s].

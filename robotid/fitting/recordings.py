@@ -38,7 +38,7 @@ class RepeatedErrors:
 
     @property
     def described(self) -> str:
-        """The errors in words."""
+        """Description of the errors."""
         points = f"points of contact uncertain by {self.points:.2g} m"
         bias = f"bias of the accelerometers uncertain by {self.bias:.2g} m/s^2"
         parts = [text for x, text in ((self.points, points), (self.bias, bias)) if x > 0.0]

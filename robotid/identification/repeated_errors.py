@@ -10,7 +10,7 @@ rows D of the torque per offset along each axis, and offsets x ~ N(0, s^2) of al
 the score W^T tau has the covariance s^2 W^T D D^T W beside that of its noise. If s is not stated,
 it is the one with the largest evidence.
 
-A bias of the accelerometers acts as a change of gravity that turns with the base. D then has the
+A bias of the accelerometers acts as a change of gravity with the axes of the base. D then has the
 torque per acceleration of the base. Over a log the robot hardly moves away, so its mean
 acceleration in the world is that of the bias, or of a tilted orientation: it is their size, but
 not which of the two.
