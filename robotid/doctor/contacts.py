@@ -1,10 +1,11 @@
 """Checks of the motion of a floating base and of contacts: axes of the twist, flags, gravity."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
+from scipy.special import stdtrit
 
 from robotid._typing import Array
 from robotid.doctor.found_contacts import with_contacts
@@ -19,18 +20,22 @@ from robotid.regressor.constraints import constraint_jacobian
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
 
-__all__ = ["check_base"]
+__all__ = ["check_base", "flag_delay"]
 
 _UNLIKE = 0.3  # of the motion: a measured velocity that differs by more is wrong
 _BETTER = 0.5  # ... and is of other axes if these reduce the difference below this share
 _MOVES = 1e-3  # [m/s or rad/s] RMS from which velocities are compared
 _LONGEST = 0.15  # [s] delay of contact flags that is searched for
-_DELAYED = 0.5  # ratio of squared speeds of the foot below which a delay is found
+_OF_MEDIAN = 1.858  # standard error of a median, times sqrt(n), over the median deviation (normal)
+_CERTAIN = 0.975  # probability that the scatter of a delay is below its bound
 _SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
 _STANDS = 0.3  # ... if it is above this share of its speed without contact
 _MARGIN = 0.03  # [s] after and before a change of contact in which a slip is not examined
 _SLIPS = 0.03  # share of the time in contact with a slip that is reported
-_FEWEST = 5  # changes of a contact without which a delay is not examined
+_BEYOND = 3.0  # standard errors that a slip must exceed
+_WINDOW = 0.2  # [s] in which the mean velocity of a foot in contact is a slip ...
+_DRIFTS = 0.05  # [m/s] ... from this speed on, 1 cm in a window
+_FEWEST = 2  # lift-offs, and touch-downs, without which a delay is not examined
 _ROLLS = 0.3  # median speed at the contact of a rolling foot, as a share of that of its frame ...
 _CREEPS = 2e-3  # [m/s] ... if the frame is faster than this
 
@@ -50,45 +55,56 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         return
     still = replace(signals, velocity="differentiated", acceleration="differentiated")
     try:
-        found = with_contacts(model, log, signals)
-        motion = process(found, still)
+        whole = with_contacts(model, log, signals)
+        motion = process(whole, still)
     except DataError:  # too short, or no contacts: raised again when the log is read
         return
-    for note in found.notes[len(log.notes) :]:
+    for note in whole.notes[len(log.notes) :]:
         yield log_finding(log.name, "log_note", "note", note)
     flags = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
     for k, contact in enumerate(model.contacts):
-        if not contact.always and contact.frame in found.contacts:
-            flags[:, k] = _at(found.contacts[contact.frame], found, motion.t)
+        if not contact.always and contact.frame in whole.contacts:
+            flags[:, k] = _at(whole.contacts[contact.frame], whole, motion.t)
     J, turn = _contact_jacobian(model, motion.q)
     if imu is not None:
-        wrong = list(check_imu(found, motion, _of_pairs(J, flags, motion.v)))
+        wrong = list(check_imu(whole, motion, _of_pairs(J, flags, motion.v)))
         yield from wrong
         if any(finding.code == "imu_axes" for finding in wrong):
             return
     if not model.contacts:
         return
     velocity = np.einsum("kcij,kj->kci", J, motion.v)  # (N, contacts, 3) [m/s]
-    relative = np.sum(_relative(velocity, flags) ** 2, axis=2)
+    relative = _relative(velocity, flags)
     has_ground = log.base is None or log.base.has_position
-    squares = np.sum(velocity**2, axis=2) if has_ground else relative
+    squares = np.sum((velocity if has_ground else relative) ** 2, axis=2)
+    named: dict[int, list[Finding]] = {}
+    trusted = flags.copy()  # without those that have a delay
     for k, contact in enumerate(model.contacts):
         own = log.contacts.get(contact.frame)
         if contact.always:
             own = np.ones(len(log.t), dtype=bool)
         if own is None:  # found from this motion
             continue
-        named = list(_check_flags(contact.frame, log, own, motion, squares[:, k], has_ground))
-        is_delayed = "contact_delay" in [finding.code for finding in named]
+        named[k] = list(
+            _check_flags(contact.frame, log, own, motion, squares[:, k], signals, has_ground)
+        )
+        is_delayed = "contact_delay" in [finding.code for finding in named[k]]
+        trusted[:, k] &= not is_delayed
         if contact.kind == "point" and has_ground and not is_delayed:
             w = np.einsum("kij,kj->ki", turn[:, k], motion.v)
             rolls = np.column_stack([w[:, 1], -w[:, 0], 0.0 * w[:, 2]])  # v / radius
             touching = _at(own, log, motion.t)
-            named = (
-                list(_check_radius(contact, log, velocity[touching, k], rolls[touching])) or named
+            named[k] = (
+                list(_check_radius(contact, log, velocity[touching, k], rolls[touching]))
+                or named[k]
             )
-        slips = np.minimum(squares[:, k], 4.0 * relative[:, k])  # 2 feet: each moves by a half
-        yield from named or _check_slip(contact.frame, log, flags[:, k], motion, slips, signals)
+    relative = _relative(velocity, trusted)
+    for k, found in named.items():
+        ways = [relative[:, k]]
+        if has_ground:  # of 2 feet, each moves by a half
+            ways = [2.0 * relative[:, k], velocity[:, k]]
+        frame = model.contacts[k].frame
+        yield from found or _check_slip(frame, log, flags[:, k], motion, ways, signals)
 
 
 def _at(flags: Array, log: Log, t: Array) -> Array:
@@ -128,29 +144,47 @@ def _of_pairs(J: Array, flags: Array, v: Array) -> tuple[Array, Array]:
 
 
 def _check_slip(
-    link: str, log: Log, flags: Array, motion: Trajectory, squares: Array, signals: SignalSettings
+    link: str,
+    log: Log,
+    flags: Array,
+    motion: Trajectory,
+    ways: Sequence[Array],
+    signals: SignalSettings,
 ) -> Iterator[Finding]:
     """Yield a finding if a link moves during a part of its contacts, away from their ends.
+
+    Contacts are cut into windows. A slip is a mean velocity of a window that its scatter does not
+    explain: slow slips count, vibrations and noise do not.
 
     Args:
         link: The link.
         log: The log.
         flags: Whether it is in contact, shape (N,).
         motion: The smoothed motion.
-        squares: Square of the link's speed that is not that of all links in contact, shape (N,)
-            [m^2/s^2].
+        ways: Velocities of the link, shape (N, 3) [m/s]: that in the world, and that relative to
+            all links in contact. The slowest one counts.
         signals: Settings of the filter, which spreads the motion beyond a contact.
     """
     step = float(np.median(np.diff(motion.t)))
-    reach = _MARGIN + (1.0 / signals.cutoff if signals.cutoff else 0.0)
-    width = 2 * round(reach / step) + 1
-    beside = np.convolve(~flags, np.ones(width), mode="same") > 0.5
-    inside = ~beside
-    slips = inside & (squares > _SLIDES**2)
+    spread = 1.0 / signals.cutoff if signals.cutoff else 0.0
+    width = 2 * round((_MARGIN + spread) / step) + 1
+    inside = np.convolve(~flags, np.ones(width), mode="same") < 0.5
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
+    speeds = np.zeros(len(flags))  # of slips
+    for first, stop in edges.reshape(-1, 2):
+        count = max(1, round((stop - first) * step / _WINDOW))
+        for rows in np.array_split(np.arange(first, stop), count):
+            independent = max(1.0, len(rows) * min(1.0, 2.0 * step / spread if spread else 1.0))
+            means = [v[rows].mean(axis=0) for v in ways]
+            k = int(np.argmin([np.linalg.norm(mean) for mean in means]))
+            error = _rms(ways[k][rows] - means[k]) / np.sqrt(independent)
+            if np.linalg.norm(means[k]) > max(_DRIFTS, _BEYOND * error):
+                speeds[rows] = np.linalg.norm(ways[k][rows], axis=1)
+    slips = speeds > _DRIFTS
     if np.count_nonzero(slips) < _SLIPS * np.count_nonzero(inside) or not slips.any():
         return
     share = np.count_nonzero(slips) / np.count_nonzero(inside)
-    speed, distance = np.sqrt(squares[slips].mean()), step * np.sqrt(squares[slips]).sum()
+    speed, distance = _rms(speeds[slips, None]), step * float(speeds[slips].sum())
     message = (
         f"the link {link} slips in {share:.0%} of its time in contact, at {speed:.2g} m/s (RMS), "
         f"{distance:.2g} m in total. Its force is still eliminated"
@@ -205,7 +239,13 @@ def _check_axes(log: Log) -> Iterator[Finding]:
 
 
 def _check_flags(
-    link: str, log: Log, flags: Array, motion: Trajectory, squares: Array, has_ground: bool
+    link: str,
+    log: Log,
+    flags: Array,
+    motion: Trajectory,
+    squares: Array,
+    signals: SignalSettings,
+    has_ground: bool,
 ) -> Iterator[Finding]:
     """Yield findings on one contact: its flags have a delay, or the link moves in contact.
 
@@ -215,9 +255,9 @@ def _check_flags(
         flags: Whether it touches the ground, by row of the log.
         motion: The smoothed motion.
         squares: Square of the link's speed along it, shape (N,) [m^2/s^2].
+        signals: Settings of the filter.
         has_ground: Whether the speed does not depend on the flags of other links.
     """
-    step = float(np.median(np.diff(motion.t)))
 
     def mean_square(delay: float) -> float:
         """Return the mean square speed in contact if the flags have a delay [s]."""
@@ -225,19 +265,18 @@ def _check_flags(
         return float(squares[touching].mean()) if touching.any() else np.inf
 
     now = mean_square(0.0)
-    changes = int(np.count_nonzero(np.diff(flags.astype(int))))
-    if changes >= _FEWEST and has_ground:
-        reach = int(_LONGEST / step)
-        delays = step * np.arange(-reach, reach + 1)
-        found = np.array([mean_square(delay) for delay in delays])
-        best = float(delays[np.argmin(found)])
-        if found.min() < _DELAYED * now and abs(best) > 1.5 * step:
+    if has_ground:
+        spread = 1.0 / signals.cutoff if signals.cutoff else 0.0
+        found = flag_delay(motion.t, _at(flags, log, motion.t), np.sqrt(squares), spread)
+        if found is not None:
+            delay, error = found
             message = (
-                f"the flags of the contact {link} are delayed by {best:+.3f} s: with this shift "
-                f"its speed in contact is {np.sqrt(found.min()):.2g} m/s instead of "
-                f"{np.sqrt(now):.2g} m/s (RMS). Correct the column contact_{link}"
+                f"the flags of the contact {link} are delayed by {delay:+.3f} +- {error:.3f} s: "
+                f"with this shift its speed in contact is {np.sqrt(mean_square(delay)):.2g} m/s "
+                f"instead of {np.sqrt(now):.2g} m/s (RMS). Correct the column contact_{link}"
             )
-            yield log_finding(log.name, "contact_delay", "warning", message, delay=best)
+            evidence = {"delay": delay, "error": error}
+            yield log_finding(log.name, "contact_delay", "warning", message, **evidence)
             return
     own = np.sqrt(now)
     swings = ~_at(flags, log, motion.t)
@@ -249,6 +288,49 @@ def _check_flags(
             f"it acts at the origin of {link}"
         )
         yield log_finding(log.name, "moving_contact", "warning", message, speed=own)
+
+
+def flag_delay(t: Array, flags: Array, speed: Array, spread: float) -> tuple[float, float] | None:
+    """Return the delay of a contact's flags behind its motion, and its error; None without one.
+
+    At each change of the flags the link starts or stops to move: its speed crosses the geometric
+    mean of its median speeds with and without contact. A delay is the same at both. What has
+    opposite signs at lift-offs and touch-downs, or differs from step to step, is no delay: a slow
+    lift-off, a slip. So the delay is the mean of the two medians, half of their difference is its
+    error, and that of the scatter is added, and half the spread of the filter: rows of that time
+    beside a contact have no force anyway.
+
+    Args:
+        t: Time stamps, shape (N,) [s].
+        flags: Whether the link is in contact, shape (N,).
+        speed: Its speed, shape (N,) [m/s].
+        spread: Time over which the filter spreads motion; shorter contacts are ignored [s].
+    """
+    step = float(np.median(np.diff(t)))
+    width = 2 * round(spread / step) + 1
+    share = np.convolve(flags, np.ones(width), mode="same")
+    flags = share > 0.5 * np.convolve(np.ones(len(flags)), np.ones(width), mode="same")
+    edges = 1 + np.flatnonzero(np.diff(flags.astype(int)))
+    if flags.all() or not flags.any():
+        return None
+    level = np.sqrt(np.median(speed[flags]) * np.median(speed[~flags]))
+    is_still, reach = speed <= level, int(_LONGEST / step)
+    delays: tuple[list[float], list[float]] = ([], [])  # at lift-offs, at touch-downs
+    for before, i, after in zip([0, *edges], edges, [*edges[1:], len(t)], strict=False):
+        first, stop = max(i - reach, (before + i) // 2), min(i + reach, (i + after + 1) // 2)
+        wrong = np.where(is_still[first:stop] == flags[i], 1, -1)  # ... before the change
+        sums = np.cumsum(wrong)
+        k = int(np.argmin(sums))
+        if 0 < k + 1 < stop - first and sums[k] < 0 and sums[-1] > sums[k]:
+            delays[int(flags[i])].append(float(t[i] - t[first + k + 1]))
+    if min(map(len, delays)) < _FEWEST:
+        return None
+    middles = [float(np.median(own)) for own in delays]
+    off = np.concatenate([np.array(x) - y for x, y in zip(delays, middles, strict=True)])
+    scatter = max(_OF_MEDIAN * float(np.median(np.abs(off))), step)  # robust: some slip
+    bound = float(stdtrit(len(off) - 2, _CERTAIN)) * scatter / np.sqrt(len(off))
+    delay, error = 0.5 * sum(middles), 0.5 * (abs(middles[1] - middles[0]) + spread) + bound
+    return (delay, error) if abs(delay) > error + 1.5 * step else None
 
 
 def _check_radius(contact: Contact, log: Log, v: Array, rolls: Array) -> Iterator[Finding]:

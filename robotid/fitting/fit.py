@@ -202,9 +202,8 @@ class Solved:
                 estimate, segments, factors, share, K, sigma,
                 is_filter=is_filter, weight_ratio=ratio, redraws=redraws, more=more,
             )  # fmt: skip
-        if (contacts := ground.recordings.contacts) is not None:
-            own = f"points of contact uncertain by {contacts.uncertainty:.2g} m"
-            errors = replace(errors, method=f"{errors.method}; {own}")
+        if (repeated := ground.recordings.repeated) is not None:
+            errors = replace(errors, method=f"{errors.method}; {repeated.described}")
         if ground.grown != 1.0:
             estimate = replace(estimate, covariance=ground.grown * estimate.covariance)
             wls = replace(wls, covariance=ground.grown * wls.covariance)
@@ -277,8 +276,8 @@ class _Ground:
 
     def more(self, sigma: Array) -> Array | None:
         """Return the covariance of the score in addition to the scatter, (b, b); None: 0."""
-        if (contacts := self.recordings.contacts) is not None:  # all rows have one noise level
-            return np.asarray(contacts.root @ contacts.root.T / sigma[-1] ** 4)
+        if (repeated := self.recordings.repeated) is not None:  # all rows have one noise level
+            return np.asarray(repeated.root @ repeated.root.T / sigma[-1] ** 4)
         return None if self.noise is None else self.noise.meat
 
     @cached_property
@@ -305,8 +304,8 @@ def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool)
     spread = prior_spread(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
     held_out = tuple(chain.from_iterable(logs)) or (factors,)
-    contacts = recordings.contacts
-    repeated = 0.0 if contacts is None else contacts.variance / rough.sigma[-1] ** 2
+    errors = recordings.repeated
+    repeated = 0.0 if errors is None else errors.variance / rough.sigma[-1] ** 2
     before = Known(model, mapping, prior, spread, share, rough.sigma, held_out, repeated)
     pinned = model.layout.owned_by(choice.bounds.pinned)
     return _Ground(recordings, reduction, before, logs, rough, pinned, understated**2)

@@ -18,7 +18,7 @@ from robotid.robot.model import RobotModel
 from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.plan import WorkPlan
 
-__all__ = ["ContactErrors", "Recordings"]
+__all__ = ["Recordings", "RepeatedErrors"]
 
 _SEGMENTS = 48  # of all logs in memory: enough to estimate the scatter of their scores
 _CORRELATIONS = 10  # shortest segment, in correlation times of filtered noise
@@ -28,12 +28,21 @@ _FEW = 8
 
 
 @dataclass(frozen=True, eq=False)
-class ContactErrors:
-    """Effect of the uncertainty of points of contact on all rows."""
+class RepeatedErrors:
+    """Effect of errors that repeat in every step on all rows."""
 
     root: Array  # (b, k), C of the covariance C C^T of W^T tau
     variance: float  # of a row's residual, on average [(N m)^2]
-    uncertainty: float  # of the points, largest standard deviation [m]
+    points: float  # standard deviation of points of contact, the largest [m]
+    bias: float = 0.0  # standard deviation of the bias of accelerometers, per axis [m/s^2]
+
+    @property
+    def described(self) -> str:
+        """Description of the errors."""
+        points = f"points of contact uncertain by {self.points:.2g} m"
+        bias = f"bias of the accelerometers uncertain by {self.bias:.2g} m/s^2"
+        parts = [text for x, text in ((self.points, points), (self.bias, bias)) if x > 0.0]
+        return "; ".join(parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +57,7 @@ class Recordings:
         plan: Processes that work on the pieces of logs in files; None: this process.
         checkpoint: Storage of the reductions until the run is complete.
         weights: Weights of the rows of each log to fit, shapes (N, n_rows); 1 if None.
-        contacts: Effect of the points of contact; None without any.
+        repeated: Effect of errors of points of contact and of an IMU; None without any.
     """
 
     model: RobotModel
@@ -58,7 +67,7 @@ class Recordings:
     plan: WorkPlan | None = None
     checkpoint: Checkpoint | None = None
     weights: tuple[Array, ...] | None = None
-    contacts: ContactErrors | None = None
+    repeated: RepeatedErrors | None = None
 
     @property
     def is_in_memory(self) -> bool:

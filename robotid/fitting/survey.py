@@ -25,6 +25,7 @@ from robotid.log_files.formats import open_table
 from robotid.log_files.read import LogLayout
 from robotid.log_files.table import Place, RowReader, Table, prefixes
 from robotid.logs.data import Log, Trajectory
+from robotid.logs.imu import bias_at_rest
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import decide, unwrap
 from robotid.logs.smoothing import SPLINE, Segment, filter_reach, process_segments, too_short
@@ -437,18 +438,38 @@ def survey_log(
     ranges = _close_looks(first, stop)
     found = [reader.read(wanted, i, j, _near(places, i)) for i, j in ranges]
     windows = tuple(_log_of(layout, x, i) for x, (i, _) in zip(found, ranges, strict=True))
+    layout, windows = _with_one_bias(layout, windows)
     for log in windows:
         check_units(log, layout.units, layout.prismatic)
     positions = _positions(locked, found, layout, model)
-    base = windows[0].base
-    if base is not None and base.imu is not None:  # all pieces have the bias of its first rows
-        layout = replace(layout, base=replace(layout.base, imu=base.imu.frame))
     if table.rows is None:
         length = max(stop - first, 1)
     windows = tuple(with_contacts(model, closed_log(model, log), signals) for log in windows)
     return SurveyedLog(
         model, layout, signals, stamps, first, stop, windows, positions, length, places
     )
+
+
+def _with_one_bias(
+    layout: LogLayout, windows: tuple[Log, ...]
+) -> tuple[LogLayout, tuple[Log, ...]]:
+    """Return layout and windows with the bias of the gyroscopes at rest in all windows together."""
+    own = [(log.base, log.base.imu) for log in windows if log.base and log.base.imu]
+    if layout.base.imu is None or layout.base.imu.bias is not None or not own:
+        return layout, windows
+    parts = [
+        (log.t, log.q, imu.values[:, :3] + imu.frame.bias)
+        for log, (_, imu) in zip(windows, own, strict=True)
+    ]
+    bias, note = bias_at_rest(parts)
+    frame, changed = replace(own[0][1].frame, bias=bias), []
+    for part, log, (moved, imu) in zip(parts, windows, own, strict=True):
+        values = np.hstack([part[2] - bias, imu.values[:, 3:]])
+        base = replace(moved, imu=replace(imu, values=values, frame=frame))
+        before = bias_at_rest([part])[1]
+        notes = tuple(note if x == before else x for x in log.notes)
+        changed.append(replace(log, base=base, notes=notes))
+    return replace(layout, base=replace(layout.base, imu=frame)), tuple(changed)
 
 
 @dataclass(frozen=True, eq=False)

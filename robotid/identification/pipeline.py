@@ -29,7 +29,7 @@ from robotid.fitting.recordings import Recordings
 from robotid.fitting.result import Fit, Solution
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
-from robotid.identification.contact_points import with_contact_errors
+from robotid.identification.repeated_errors import with_repeated_errors
 from robotid.identification.result import Asked, Identification
 from robotid.judgement.findings import fit_findings, log_findings, not_written
 from robotid.judgement.unlike_runs import rescaled_findings, unlike_findings
@@ -176,7 +176,7 @@ def conclude(
         )
     report_stage(progress, "fitting")
     with _explained(found):
-        recordings = with_contact_errors(recordings)
+        recordings = with_repeated_errors(recordings)
         balanced = counterbalanced(found, [log.head.name for log in recordings.fitted])
         fit = with_drives(recordings, choice, wanted, balanced, progress=progress)
     report_stage(progress, "errors and intervals")

@@ -1,5 +1,6 @@
 """Motion of a floating base measured by an IMU: angular velocity and specific force."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from robotid._typing import Array
 
-__all__ = ["IMU", "ImuFrame", "ImuMotion", "inertial_state", "motion_of_imu"]
+__all__ = ["IMU", "ImuFrame", "ImuMotion", "bias_at_rest", "inertial_state", "motion_of_imu"]
 
 #: Names of the values of an IMU: orientation, angular velocity [rad/s], specific force [m/s^2].
 IMU = ("qx", "qy", "qz", "qw", "wx", "wy", "wz", "ax", "ay", "az")
@@ -67,8 +68,7 @@ class ImuMotion:
 def motion_of_imu(t: Array, q: Array, values: Array, frame: ImuFrame) -> tuple[ImuMotion, str]:
     """Return the motion of an IMU without the bias of its gyroscopes, and a note on the bias.
 
-    The bias is the mean angular velocity in all windows of 0.5 s in which joints and gyroscopes are
-    at rest.
+    The bias is that of ``bias_at_rest``.
 
     Args:
         t: Time stamps, shape (N,) [s].
@@ -78,35 +78,45 @@ def motion_of_imu(t: Array, q: Array, values: Array, frame: ImuFrame) -> tuple[I
         frame: Place of the IMU.
     """
     turned = np.hstack([values[:, :3] @ frame.rotation.T, values[:, 3:] @ frame.rotation.T])
-    if frame.bias is not None:
-        turned[:, :3] -= frame.bias
-        return ImuMotion(turned, frame), ""
-    number = ((t - t[0]) / _WINDOW).astype(int)
-    edges = np.searchsorted(number, np.arange(number[-1] + 1))  # the last window may be short
-    resting = [
-        slice(first, stop)
-        for first, stop in pairwise(edges)
-        if stop - first > 4
-        and np.ptp(q[first:stop], axis=0).max(initial=0.0) < _UNMOVED
-        and turned[first:stop, :3].std(axis=0).max() < _STILL
-    ]
-    bias, note = (
-        np.zeros(3),
-        (
-            "the robot is never at rest for 0.5 s: the bias of the gyroscopes is not estimated; "
-            "record 1 s at rest"
-        ),
-    )
-    if resting:
-        means = np.array([turned[rows, :3].mean(axis=0) for rows in resting])
-        bias = means.mean(axis=0)
-        shown = ", ".join(f"{1e3 * x:+.2f}" for x in bias)
-        note = (
-            f"bias of the gyroscopes, estimated in {_WINDOW * len(resting):g} s at rest and "
-            f"subtracted: {shown} mrad/s"
-        )
+    bias, note = frame.bias, ""
+    if bias is None:
+        bias, note = bias_at_rest([(t, q, turned[:, :3])])
     turned[:, :3] -= bias
     return ImuMotion(turned, replace(frame, bias=bias)), note
+
+
+def bias_at_rest(parts: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, str]:
+    """Return the bias of gyroscopes, shape (3,) [rad/s], and a note on it.
+
+    It is the mean angular velocity in all windows of 0.5 s in which joints and gyroscopes are at
+    rest; 0 without one.
+
+    Args:
+        parts: Parts of a log: time stamps (N,) [s], joint positions (N, n) [rad or m], angular
+            velocity with bias (N, 3) [rad/s].
+    """
+    means = []
+    for t, q, w in parts:
+        number = ((t - t[0]) / _WINDOW).astype(int)
+        edges = np.searchsorted(number, np.arange(number[-1] + 1))  # the last window may be short
+        means += [
+            w[first:stop].mean(axis=0)
+            for first, stop in pairwise(edges)
+            if stop - first > 4
+            and np.ptp(q[first:stop], axis=0).max(initial=0.0) < _UNMOVED
+            and w[first:stop].std(axis=0).max() < _STILL
+        ]
+    if not means:
+        return np.zeros(3), (
+            "the robot is never at rest for 0.5 s: the bias of the gyroscopes is not estimated; "
+            "record 1 s at rest"
+        )
+    bias: Array = np.array(means).mean(axis=0)
+    shown = ", ".join(f"{1e3 * x:+.2f}" for x in bias)
+    return bias, (
+        f"bias of the gyroscopes, estimated in {_WINDOW * len(means):g} s at rest and "
+        f"subtracted: {shown} mrad/s"
+    )
 
 
 def inertial_state(

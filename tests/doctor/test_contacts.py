@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.special import stdtrit
 
-from robotid.doctor.contacts import _check_radius, check_base
+from robotid.doctor.contacts import _check_radius, check_base, flag_delay
 from robotid.logs.base import BaseMotion, base_state
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -55,6 +56,50 @@ def test_a_shift_of_flags_is_found(robot, walk, foot, rows, delay):
     assert found.severity == "warning"
     assert found.evidence["delay"] == pytest.approx(0.01 * rows, abs=0.011)
     assert f"the flags of the contact {foot} are delayed by {delay[0]}" in found.message
+
+
+def steps(late_lift, late_touch, slips=0):
+    """Return time, flags and speed of a foot that swings from 0.5 to 0.9 s of each second."""
+    t = 7.0 + 0.002 * np.arange(3000)
+    phase = t % 1.0
+    speed = np.where((phase > 0.499) & (phase < 0.899), 0.8, 0.003)
+    flags = (phase < 0.499 + late_lift) | (phase > 0.899 + late_touch)
+    for k in range(slips):  # the foot stops 0.1 s after two of six touch-downs
+        speed[(t > 7.899 + 3 * k) & (t < 7.999 + 3 * k)] = 0.8
+    return t, flags, speed
+
+
+def test_delayed_flags_are_late_at_lift_offs_and_at_touch_downs():
+    found = flag_delay(*steps(0.06, 0.06), spread=0.0)
+    assert found[0] == pytest.approx(0.06, abs=1e-3)
+    assert found[1] == pytest.approx(stdtrit(9, 0.975) * 0.002 / np.sqrt(11), rel=0.1)
+    delay, error = flag_delay(*steps(0.06, 0.04), spread=0.02)
+    assert delay == pytest.approx(0.05, abs=1e-3)  # half of the difference, half of the spread
+    assert error == pytest.approx(0.01 + 0.01 + stdtrit(9, 0.975) * 0.002 / np.sqrt(11), abs=1e-3)
+    assert flag_delay(*steps(-0.08, -0.06), spread=0.0)[0] == pytest.approx(-0.07, abs=1e-3)
+    assert flag_delay(*steps(0.06, 0.06, slips=2), spread=0.0)[0] == pytest.approx(0.06, abs=1e-3)
+
+
+def test_what_differs_at_lift_offs_and_touch_downs_is_no_delay():
+    for late_lift, late_touch in ((0.06, -0.06), (-0.08, 0.02), (0.0, -0.05), (0.03, 0.005)):
+        assert flag_delay(*steps(late_lift, late_touch), spread=0.02) is None
+    assert flag_delay(*steps(0.015, 0.015), spread=0.04) is None  # within the filter
+    assert flag_delay(*steps(0.0, 0.0, slips=2), spread=0.0) is None
+
+
+def test_a_vibration_in_contact_is_no_slip_and_the_same_mean_speed_is(robot, walk):
+    """Both feet stand always; one of them moves relative to the other."""
+    contacts = tuple(Contact(foot, "surface", always=True) for foot in FEET)
+    other, t = replace(robot, constraints=contacts), walk.t
+    joint = robot.joints.index("HR_HFE")
+
+    def found(angle):
+        q = np.zeros((len(t), 12))
+        q[:, joint] = angle
+        return list(check_base(other, replace(walk, q=q, contacts={}), RAW))
+
+    assert not found(0.004 * np.sin(2 * np.pi * 12.0 * t))
+    assert "slipping_foot" in [f.code for f in found(0.25 * t)]
 
 
 def test_a_slipping_foot_is_found_with_its_speed(robot, walk):

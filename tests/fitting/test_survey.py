@@ -5,6 +5,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pinocchio as pin
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -17,8 +18,9 @@ from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import ReducedPiece, hold_log, survey_log
 from robotid.log_files.formats import open_table, write_columns
 from robotid.log_files.read import lay_out, read_log, write_log
-from robotid.logs.base import BaseMotion
+from robotid.logs.base import BaseColumns, BaseMotion
 from robotid.logs.data import Log
+from robotid.logs.imu import ImuFrame
 from robotid.logs.settings import LogUnits, SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
@@ -260,6 +262,38 @@ def test_positions_of_locked_joints_are_those_of_all_windows_in_radians():
     layout.units = LogUnits("s", "rad")
     plain = survey._positions({"b": "x"}, windows[1:], layout, model)
     np.testing.assert_array_equal(plain["b"], [40.0, 50.0])
+
+
+def test_the_pieces_of_a_log_have_the_bias_of_all_rests_of_its_windows(monkeypatch, tmp_path):
+    """The robot moves in the first window, rests in the middle one and a part of the last one."""
+    monkeypatch.setattr(survey, "_WINDOW", 200)
+    robot = RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True, terms=())
+    t = 3.0 + 0.01 * np.arange(1000)
+    rests = ((t > 6.9) & (t < 9.1)) | (t > 11.495)
+    q = np.where(rests, 0.0, np.sin(9.0 * t))
+    bias, turn = np.array([0.011, -0.02, 0.005]), pin.rpy.rpyToMatrix(0.4, -1.1, 2.9)
+    w = bias + np.where(rests, 0.0, np.cos(7.0 * t))[:, None] + 0.002 * (t > 11.495)[:, None]
+    columns = {"t": t} | {f"{x}_{j}": q for j in robot.joints for x in ("q", "tau")}
+    columns |= {f"imu_{x}": 0.0 * t for x in ("qx", "qy", "qz", "ax", "ay")}
+    columns |= {"imu_qw": 1.0 + 0.0 * t, "imu_az": 9.81 + 0.0 * t}
+    columns |= {f"imu_{x}": y for x, y in zip(("wx", "wy", "wz"), w.T, strict=True)}
+    write_columns(columns, tmp_path / "run.csv")
+    frame = ImuFrame(pin.Quaternion(turn).coeffs(), np.zeros(3), np.array([0.0, 0.0, -9.81]))
+    base, signals = BaseColumns(True, imu=frame), SignalSettings(cutoff=None, trim=0.0)
+    found = long_log(robot, tmp_path / "run.csv", signals, base=base, length=250)
+    # whole half seconds at rest: 3 in the middle window from 7 s, 2 in the last one from 11 s
+    wanted = turn @ (bias + 0.002 * 2 / 5)
+    np.testing.assert_allclose(found.source.base.imu.bias, wanted, atol=1e-6)
+    for log in found.windows:
+        rows = np.searchsorted(t, log.t)
+        values = log.base.imu.values[:, :3]
+        np.testing.assert_allclose(values, w[rows] @ turn.T - wanted, atol=1e-6)
+        (note,) = [x for x in log.notes if "gyroscopes" in x]
+        assert "estimated in 2.5 s at rest" in note
+    pieces = [piece.read().trajectory for piece in found.pieces]
+    at, own = (np.concatenate([getattr(x, name) for x in pieces]) for name in ("t", "v"))
+    rows = np.searchsorted(t, at - 1e-6)
+    np.testing.assert_allclose(own[:, 3:6], w[rows] @ turn.T - wanted, atol=1e-6)
 
 
 def test_windows_of_a_long_log_are_named_by_their_own_rows(monkeypatch):

@@ -297,15 +297,20 @@ def _logged(model, feet, mj, qpos, rows, rng, torque, bits, force):
 def with_other_bodies(model, rng, size=0.08):
     """Return a robot whose bodies differ from those of a URDF, physically consistent.
 
+    Masses differ by up to 25 %. Each body is stretched and sheared, and its mass is displaced.
+
     Args:
         model: The robot.
         rng: Source of the differences.
-        size: Their relative size.
+        size: Of the stretch, and of the displacement relative to the size of the body: the
+            distance of its centre of mass plus its radius of gyration.
     """
     pi = model.standard_parameters()[: model.layout.n_inertial]
     bodies = []
     for J in pseudo_inertia(pi):
         A = np.eye(4) + size * rng.standard_normal((4, 4)) * np.array([1, 1, 1, 0])[:, None]
+        mass, centre = J[3, 3], J[:3, 3] / J[3, 3]
+        A[:3, 3] *= np.linalg.norm(centre) + np.sqrt(np.trace(J[:3, :3]) / mass)
         A[3, 3] = np.sqrt(rng.uniform(0.75, 1.25))
         J = A @ J @ A.T
         trace = np.trace(J[:3, :3]) * np.eye(3) - J[:3, :3]

@@ -179,6 +179,35 @@ def test_an_imu_replaces_position_and_velocity_of_the_base(go1, trot):
     assert found[masses].sum() == pytest.approx(truth[masses].sum(), rel=0.01)
 
 
+def test_a_bias_of_the_accelerometers_is_in_the_intervals(go1, trot):
+    log, bias = trot[0], np.array([0.05, -0.03, 0.06])  # [m/s^2]
+    imu = log.base.imu
+    values = imu.values + np.concatenate([np.zeros(3), bias])
+    biased = replace(log, base=replace(log.base, imu=replace(imu, values=values)))
+    result = robotid.identify(
+        go1, biased, doctor=False, friction="none", signals=SIGNALS, estimator="wls"
+    )
+    off = (result.base - result.mapping.K @ truth_of(go1)) / result.base_error
+    inertial = result.mapping.independent < go1.layout.n_inertial
+    assert np.mean(np.abs(off[inertial]) < result.errors.quantile[inertial]) > 0.9
+    total = (np.arange(len(result.standard)) % 10 == 0) * 1.0
+    total[go1.layout.n_inertial :] = 0.0
+    error = np.sqrt(total @ result.standard_covariance @ total)
+    shift = total @ (result.standard - truth_of(go1))
+    turned = go1_up(log) @ bias
+    weight = total @ truth_of(go1)
+    assert shift == pytest.approx(-weight * turned / (9.81 + turned), rel=0.3)
+    assert abs(shift) < 2.0 * error < 6.0 * abs(shift)
+    drift = float(result.errors.method.rpartition("uncertain by ")[2].removesuffix(" m/s^2"))
+    assert drift == pytest.approx(np.linalg.norm(bias), abs=0.05)  # and the mean acceleration
+
+
+def go1_up(log):
+    """Return the mean vertical in the axes of the base."""
+    q = log.base.pose[:, 3:]
+    return np.array([pin.Quaternion(x).matrix()[2] for x in q]).mean(axis=0)
+
+
 def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_path):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
     job = read_job(JOBS / "legged" / "solo12.toml")

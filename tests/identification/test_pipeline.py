@@ -277,7 +277,7 @@ def test_what_is_concluded_counts_all_findings_but_the_ignored_ones(
     """Of a fit that is given: notes of all logs, errors and warnings of the doctor."""
     fit = Fit(**{f.name: getattr(identified, f.name) for f in fields(Fit) if f.init})
     given, springs = [], []
-    monkeypatch.setattr(pipeline, "with_contact_errors", lambda recordings: recordings)
+    monkeypatch.setattr(pipeline, "with_repeated_errors", lambda recordings: recordings)
     monkeypatch.setattr(pipeline, "with_drives", lambda *x, **_: (given.append(x), fit)[1])
     monkeypatch.setattr(pipeline, "counterbalanced", lambda *x: x)
     monkeypatch.setattr(pipeline, "with_known_springs", lambda *x: (springs.append(x), x[0])[1])

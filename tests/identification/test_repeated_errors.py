@@ -10,11 +10,11 @@ import pytest
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import hold_log
-from robotid.identification import contact_points, pipeline
-from robotid.identification.contact_points import (
+from robotid.identification import pipeline, repeated_errors
+from robotid.identification.repeated_errors import (
     _slopes,
     estimated_uncertainty,
-    with_contact_errors,
+    with_repeated_errors,
 )
 from robotid.logs.base import BaseMotion
 from robotid.logs.data import Log
@@ -119,10 +119,10 @@ def test_the_size_of_offsets_that_rows_determine_weakly_has_the_largest_evidence
 def test_the_covariance_of_the_score_is_that_of_the_stated_uncertainty(log):
     def errors(uncertainty):
         model = robot(uncertainty)
-        found = with_contact_errors(
+        found = with_repeated_errors(
             Recordings(model, structural_mapping(model), (hold_log(model, log, RAW),))
         )
-        return found.contacts
+        return found.repeated
 
     once, twice = errors(1e-3), errors(2e-3)
     assert once.root.shape[1] == 6
@@ -136,7 +136,7 @@ def test_the_covariance_of_the_score_is_that_of_the_stated_uncertainty(log):
 def test_contact_errors_follow_the_selected_drive_terms(log, monkeypatch):
     """Errors of the points are those of a robot that had these terms from the start."""
     model, fits = robot(2e-3), []
-    plain = with_contact_errors(
+    plain = with_repeated_errors(
         Recordings(model, structural_mapping(model), (hold_log(model, log, RAW),))
     )
     found = SimpleNamespace(mapping=plain.mapping, standard=model.standard_parameters())
@@ -155,7 +155,7 @@ def test_contact_errors_follow_the_selected_drive_terms(log, monkeypatch):
     (changed,) = fits
     assert len(changed.mapping.base_names) == len(plain.mapping.base_names) + 3
     assert changed.contacts.root.shape == (len(changed.mapping.base_names), 6)
-    fresh = with_contact_errors(
+    fresh = with_repeated_errors(
         Recordings(changed.model, changed.mapping, (hold_log(changed.model, log, RAW),))
     )
     np.testing.assert_allclose(changed.contacts.root, fresh.contacts.root, rtol=1e-9, atol=1e-15)
@@ -174,8 +174,8 @@ def test_errors_are_those_of_all_rows_though_only_some_are_used(log, monkeypatch
     some = base_problem(model, mapping, rows.trajectory.every(step), rows.mask[::step])
     W, weight = (np.concatenate([block[k] for block in some.blocks()]) for k in (0, 2))
     D = np.random.default_rng(2).standard_normal((len(W), 6))
-    monkeypatch.setattr(contact_points, "_slopes", lambda *_: D)
-    found = with_contact_errors(recordings).contacts
+    monkeypatch.setattr(repeated_errors, "_slopes", lambda *_: D)
+    found = with_repeated_errors(recordings).contacts
     root = np.sqrt(weight)[:, None]
     W, D = root * W, root * D
     np.testing.assert_allclose(found.root, -2e-3 * step * W.T @ D, atol=1e-9 * np.abs(W).max())
