@@ -1,4 +1,4 @@
-"""Checks of the motion of a floating base and of contacts: axes of the twist, flags, gravity."""
+"""Checks of a floating base and of contacts: axes of the twist, flags, gravity, forces."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -9,6 +9,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.doctor.found_contacts import with_contacts
 from robotid.doctor.imu import check_imu
+from robotid.doctor.wrenches import check_wrenches
 from robotid.exceptions import DataError
 from robotid.findings import Finding, log_finding
 from robotid.logs.base import base_state, in_base
@@ -28,6 +29,7 @@ _LONGEST = 0.15  # [s] delay of contact flags that is searched for
 _DELAYED = 0.5  # ratio of squared speeds of the foot below which a delay is found
 _SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
 _STANDS = 0.3  # ... if it is above this share of its speed without contact
+_LOADED = 0.1  # of the largest measured force: a foot with more is on the ground
 _MARGIN = 0.03  # [s] after and before a change of contact in which a slip is not examined
 _SLIPS = 0.03  # share of the time in contact with a slip that is reported
 _FEWEST = 5  # changes of a contact without which a delay is not examined
@@ -58,7 +60,9 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         yield log_finding(log.name, "log_note", "note", note)
     flags = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
     for k, contact in enumerate(model.contacts):
-        if not contact.always and contact.frame in found.contacts:
+        if contact.is_measured:
+            flags[:, k] = _loaded(contact, log, motion.t)
+        elif not contact.always and contact.frame in found.contacts:
             flags[:, k] = _at(found.contacts[contact.frame], found, motion.t)
     J, turn = _contact_jacobian(model, motion.q)
     if imu is not None:
@@ -68,6 +72,7 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
             return
     if not model.contacts:
         return
+    yield from check_wrenches(model, log, motion)
     velocity = np.einsum("kcij,kj->kci", J, motion.v)  # (N, contacts, 3) [m/s]
     relative = np.sum(_relative(velocity, flags) ** 2, axis=2)
     has_ground = log.base is None or log.base.has_position
@@ -76,7 +81,7 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         own = log.contacts.get(contact.frame)
         if contact.always:
             own = np.ones(len(log.t), dtype=bool)
-        if own is None:  # found from this motion
+        if own is None or contact.is_measured:  # found from this motion, or not needed
             continue
         named = list(_check_flags(contact.frame, log, own, motion, squares[:, k], has_ground))
         is_delayed = "contact_delay" in [finding.code for finding in named]
@@ -96,6 +101,14 @@ def _at(flags: Array, log: Log, t: Array) -> Array:
     rows = np.searchsorted(log.t, t + 1e-9, side="right") - 1
     at: Array = flags[rows.clip(0, len(flags) - 1)]
     return at
+
+
+def _loaded(contact: Contact, log: Log, t: Array) -> Array:
+    """Return whether the measured force of a contact is not small, shape (N,), bool."""
+    forces = [part for part in contact.measured if part.startswith("f")]
+    parts = [log.wrenches[f"{part} {contact.frame}"] for part in forces]
+    size = np.linalg.norm(parts, axis=0)
+    return _at(size > _LOADED * size.max(), log, t)
 
 
 def _relative(velocity: Array, flags: Array) -> Array:

@@ -65,8 +65,8 @@ def constraint_jacobian(model: RobotModel, q: Array, contacts: Array) -> Array:
             if x in place and not contacts[k, place[x]]:
                 continue
             own = [pin.getFrameJacobian(pin_model, data, i, axes) for i in ids]
-            rotation = pin.updateFramePlacement(pin_model, data, ids[0]).rotation
-            J[k, first:stop] = x.rows(own, rotation) @ G
+            placement = pin.updateFramePlacement(pin_model, data, ids[0])
+            J[k, first:stop] = x.rows(own, placement) @ G
     return J
 
 
