@@ -121,7 +121,9 @@ def _load_contacts(tables: Sequence[Mapping[str, Any]]) -> tuple[Contact, ...]:
 
 def _dump_contact(contact: Contact) -> dict[str, Any]:
     table = asdict(contact) | {"measured": list(contact.measured), "plate": list(contact.plate)}
-    unstated = {"axes": "world", "plate": [], "threshold": None, "uncertainty": None}
+    unstated: dict[str, Any] = {
+        "axes": "world", "plate": [], "threshold": None, "uncertainty": None,
+    }  # fmt: skip
     return {key: x for key, x in table.items() if key not in unstated or x != unstated[key]}
 
 

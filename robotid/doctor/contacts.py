@@ -7,6 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from robotid._typing import Array
+from robotid.doctor.base_pose import check_order, check_pose
 from robotid.doctor.found_contacts import with_contacts
 from robotid.doctor.imu import check_imu
 from robotid.doctor.wrenches import check_wrenches
@@ -48,6 +49,8 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
     if log.base is not None and log.base.twist is not None and log.base.imu is None:
         yield from _check_axes(log)
     imu = None if log.base is None else log.base.imu
+    if imu is None:
+        yield from check_pose(log)
     if not model.contacts and imu is None:
         return
     still = replace(signals, velocity="differentiated", acceleration="differentiated")
@@ -64,6 +67,9 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
             flags[:, k] = _loaded(contact, log, motion.t)
         elif not contact.always and contact.frame in found.contacts:
             flags[:, k] = _at(found.contacts[contact.frame], found, motion.t)
+    if wrong := list(check_order(model, found, still, motion, flags)):
+        yield from wrong
+        return
     J, turn = _contact_jacobian(model, motion.q)
     if imu is not None:
         wrong = list(check_imu(found, motion, _of_pairs(J, flags, motion.v)))

@@ -4,7 +4,7 @@ With the bodies of the URDF, W pi = J^T f in the rows of a floating base. Each e
 is a change of f or J, which is tried.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
@@ -28,9 +28,11 @@ __all__ = ["check_wrenches"]
 
 _MOST = 400  # samples that are examined
 _BETTER = 0.5  # ratio of the residuals of force or moment below which another reading is found ...
-_NO_WORSE = 1.05  # ... if that of the other one is not above this
+_NO_WORSE = 1.2  # ... if that of the other one is not above this
 _SIMPLER = 1.2  # ... and another change is not found unless it reduces the residual by this factor
+_SMALL = 0.01  # residual of force or moment that is as good as none, relative to the weight
 _ALIKE = (0.6, 1.6)  # factors of the forces that a wrong URDF explains
+_UNITS = {", kN": 1e3, ", kgf": 9.81}
 _MISSING = 0.5  # of the weight: residual of the vertical force of a sample that is reported ...
 _SOME = 0.02  # ... from this share of samples on
 
@@ -40,6 +42,7 @@ class _Reading:
     """Residuals of the base rows with the forces read in one way."""
 
     changes: tuple[str, ...]  # what differs from the job file
+    is_exchanged: bool  # whether forces of two feet are
     factor: float  # of the forces
     residual: Array  # (N, 6) [N, N m]
 
@@ -78,23 +81,29 @@ def check_wrenches(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[
 
     def size(reading: _Reading) -> float:
         force, moment = reading.sizes
-        simple = _SIMPLER ** len(reading.changes)
-        return simple * float(np.hypot(force / weight, moment / (weight * lever)))
+        parts = np.array([force / weight, moment / (weight * lever)])
+        return float(_SIMPLER ** len(reading.changes) * np.prod(parts + _SMALL))
 
     readings = list(_readings(model, motion, torque[:, :6]))
     stated = readings[0]
     better = [x for x in readings if x.is_better(stated) and x.sizes[0] < _MISSING * weight]
     best = min(better, key=size, default=stated)
+    remain = best.sizes[1] > _BETTER * stated.sizes[1] and best.sizes[0] < _BETTER * stated.sizes[0]
+    if remain:  # the force alone does not show which foot it acts on
+        best = min([x for x in better if not x.is_exchanged], key=size, default=best)
     if best is not stated:
         message = (
             f"with the bodies of the URDF, the measured forces of the ground leave {_size(stated)} "
             f"(RMS) of the base unexplained, but only {_size(best)} if {' and '.join(best.changes)}"
             ". Correct the columns wrench_..., or [[contact]]"
         )
-        off, least = size(stated), size(best)
-        yield log_finding(
-            log.name, "measured_wrench", "error", message, off=off, best=least, factor=best.factor
-        )
+        if remain:
+            message += (
+                ". The moments remain: state the plate of each foot, plate = [x, y, z, roll, "
+                "pitch, yaw]"
+            )
+        evidence = {"force": stated.sizes[0], "best": best.sizes[0], "factor": best.factor}
+        yield log_finding(log.name, "measured_wrench", "error", message, **evidence)
         return
     missing = np.abs(stated.residual[:, :3]).max(axis=1) > _MISSING * weight
     if np.mean(missing) > _SOME:
@@ -139,22 +148,22 @@ def _readings(model: RobotModel, motion: Trajectory, torque: Array) -> Iterator[
             names = [model.contacts[k].frame for k in pair]
             changes.append(f"those of {listed(names)} are exchanged")
         wrenches = motion.wrenches[:, np.concatenate(order)]
-        yield from _fitted(other, motion, torque, wrenches, changes)
+        yield from _fitted(other, motion, torque, wrenches, (tuple(changes), pair is not None))
 
 
 def _places(model: RobotModel) -> Iterator[tuple[tuple[str, ...], RobotModel]]:
     """Yield the robot with other axes and origins of the measured forces, and what differs."""
     yield (), model
-    read = {
-        "their axes are those of the link (axes = 'link')": {"axes": "link", "plate": ()},
-        "their axes are those of the world (axes = 'world')": {"axes": "world", "plate": ()},
+    read: dict[str, tuple[str, tuple[float, ...]]] = {
+        "their axes are those of the link (axes = 'link')": ("link", ()),
+        "their axes are those of the world (axes = 'world')": ("world", ()),
     }
     if all(x.is_measured and x.kind == "surface" for x in model.contacts if x.measured):
-        zero = {"axes": "world", "plate": (0.0, 0.0, 0.0)}
+        zero = ("world", (0.0, 0.0, 0.0))
         read["their origin is that of the world (plate = [0, 0, 0])"] = zero
-    for words, changed in read.items():
+    for words, (axes, plate) in read.items():
         contacts = tuple(
-            replace(x, **changed) if isinstance(x, Contact) and x.measured else x
+            replace(x, axes=axes, plate=plate) if isinstance(x, Contact) and x.measured else x
             for x in model.constraints
         )
         if contacts != model.constraints:
@@ -162,7 +171,11 @@ def _places(model: RobotModel) -> Iterator[tuple[tuple[str, ...], RobotModel]]:
 
 
 def _fitted(
-    model: RobotModel, motion: Trajectory, torque: Array, wrenches: Array, changes: Sequence[str]
+    model: RobotModel,
+    motion: Trajectory,
+    torque: Array,
+    wrenches: Array,
+    reading: tuple[tuple[str, ...], bool],
 ) -> Iterator[_Reading]:
     """Yield the residual, and that with a factor of the forces, if the URDF is not its cause."""
     J = constraint_jacobian(model, motion.q, touching(model, motion))[:, :, :6]
@@ -176,10 +189,12 @@ def _fitted(
     left = without_forces(basis, torque)
     square = float(np.sum(caused**2))
     factor = float(np.sum(caused * left)) / square if square > 0.0 else 1.0
-    yield _Reading(tuple(changes), 1.0, left - caused)
+    yield _Reading(*reading, 1.0, left - caused)
     if _ALIKE[0] <= factor <= _ALIKE[1]:
         return
-    words = f"they are multiplied by {factor:.3g} (another unit)"
+    unit = next((name for name, x in _UNITS.items() if _ALIKE[0] < factor / x < _ALIKE[1]), "")
+    words = f"they are multiplied by about {factor:.2g}: another unit{unit}"
     if abs(factor + 1.0) < 1.0 - _ALIKE[0]:
         factor, words = -1.0, "their sign is reversed (forces on the ground instead of on the feet)"
-    yield _Reading((*changes, words), factor, left - factor * caused)
+    changes, is_exchanged = reading
+    yield _Reading((*changes, words), is_exchanged, factor, left - factor * caused)
