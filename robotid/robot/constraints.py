@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -15,7 +15,18 @@ from robotid.exceptions import ModelError, SettingsError
 from robotid.findings import listed
 from robotid.robot.drive_term import DriveTerm
 
-__all__ = ["Constraint", "Contact", "Loop", "check_constraints", "frame_id", "link_positions"]
+if TYPE_CHECKING:
+    from robotid.robot.model import RobotModel
+
+__all__ = [
+    "Constraint",
+    "Contact",
+    "Loop",
+    "check_constraints",
+    "frame_id",
+    "link_positions",
+    "root_poses",
+]
 
 
 @dataclass(frozen=True)
@@ -324,4 +335,23 @@ def link_positions(pin_model: pin.Model, configurations: Array, links: Sequence[
     for k, q in enumerate(np.ascontiguousarray(configurations)):
         pin.framesForwardKinematics(pin_model, data, q)
         found[k] = [data.oMf[i].translation for i in ids]
+    return found
+
+
+def root_poses(model: "RobotModel", q: Array, poses: Array, link: str) -> Array:
+    """Return the poses of the root link from those of another link, x y z qx qy qz qw, (N, 7).
+
+    Args:
+        model: The robot, whose base floats.
+        q: Positions of its joints, shape (N, n) [rad or m].
+        poses: Poses of the link in the world, shape (N, 7) [m, -].
+        link: Name of the link.
+    """
+    pin_model, found = model.pin_model, np.empty_like(poses)
+    data, frame = pin_model.createData(), frame_id(pin_model, link)
+    still = np.hstack([np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(q), 1)), q])
+    for k, q_k in enumerate(np.ascontiguousarray(model.configurations(still))):
+        pin.forwardKinematics(pin_model, data, q_k)
+        place = pin.updateFramePlacement(pin_model, data, frame)
+        found[k] = pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(poses[k]) * place.inverse())
     return found

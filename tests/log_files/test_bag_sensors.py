@@ -16,6 +16,7 @@ from helpers.recorders import (
     to_ns,
 )
 
+from robotid.cli import main
 from robotid.exceptions import DataError
 from robotid.log_files.read import read_log
 from robotid.logs.base import BaseColumns, quaternions_of_angles
@@ -163,6 +164,23 @@ def test_wrenches_have_the_axes_of_their_frame(tmp_path):
     np.testing.assert_allclose(log.wrenches["my l_sole"], log.t)
     with pytest.raises(DataError, match=r"wrench_fz_l_sole.* axes of their frames.*axes = 'link'"):
         read_log(path, JOINTS, base=BaseColumns(wrenches=("fz l_sole",)))
+
+
+def test_a_bag_is_converted_with_base_and_forces(tmp_path, capsys):
+    path, target = write(tmp_path / "log", STATES | ODOM | FORCE), tmp_path / "log.csv"
+    wanted = BaseColumns(True, wrenches=("fz l_sole", "my l_sole"), local=("l_sole",))
+    assert main(["convert", str(path), str(target), "--joints", "knee"]) == 0
+    assert "axes = 'link' in [[contact]]" in capsys.readouterr().out
+    one, other = (read_log(x, ["knee"], base=wanted) for x in (path, target))
+    np.testing.assert_array_equal(one.base.pose, other.base.pose)
+    np.testing.assert_array_equal(one.base.twist, other.base.twist)
+    np.testing.assert_array_equal(other.wrenches["fz l_sole"], one.wrenches["fz l_sole"])
+    np.testing.assert_allclose(other.wrenches["my l_sole"], other.t)
+    twice = write(tmp_path / "twice", STATES | ODOM | {"/mocap": ODOM["/odom"]})
+    assert main(["convert", str(twice), str(target)]) == 1
+    assert "log has 2 topics" in capsys.readouterr().err.replace("twice", "log")
+    assert main(["convert", str(twice), str(target), "--sensors", "/odom"]) == 0
+    np.testing.assert_allclose(read_log(target, JOINTS, base=BASE).base.twist[:, 1], 2.0)
 
 
 def test_one_of_several_topics_is_stated(tmp_path):
