@@ -4,7 +4,7 @@ With the bodies of the URDF, W pi = J^T f in the rows of a floating base. Each e
 is a change of f or J, which is tried.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
@@ -28,6 +28,7 @@ __all__ = ["check_wrenches"]
 
 _MOST = 400  # samples that are examined
 _BETTER = 0.5  # ratio of the residuals of force or moment below which another reading is found ...
+_FORCE, _MOMENT = 0.3, 0.05  # ... of the weight, and of it at the feet's distance: masses may be it
 _NO_WORSE = 1.2  # ... if that of the other one is not above this
 _SIMPLER = 1.2  # ... and another change is not found unless it reduces the residual by this factor
 _SMALL = 0.01  # residual of force or moment that is as good as none, relative to the weight
@@ -52,10 +53,11 @@ class _Reading:
         force, moment = self.residual[:, :3], self.residual[:, 3:]
         return _rms(force), _rms(moment)
 
-    def is_better(self, than: "_Reading") -> bool:
-        """Whether its residual is clearly smaller."""
-        ratios = [x / max(y, 1e-12) for x, y in zip(self.sizes, than.sizes, strict=True)]
-        return min(ratios) < _BETTER and max(ratios) < _NO_WORSE
+    def is_better(self, than: "_Reading", least: Sequence[float]) -> bool:
+        """Whether its residual is clearly smaller, one of force or moment that is not small."""
+        pairs = list(zip(self.sizes, than.sizes, least, strict=True))
+        is_no_worse = all(x < max(_NO_WORSE * y, small) for x, y, small in pairs)
+        return is_no_worse and any(y > small and x < _BETTER * y for x, y, small in pairs)
 
 
 def check_wrenches(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Finding]:
@@ -86,7 +88,9 @@ def check_wrenches(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[
 
     readings = list(_readings(model, motion, torque[:, :6]))
     stated = readings[0]
-    better = [x for x in readings if x.is_better(stated) and x.sizes[0] < _MISSING * weight]
+    least = weight * _FORCE, weight * lever * _MOMENT
+    better = [x for x in readings if x.is_better(stated, least)]
+    better = [x for x in better if x.sizes[0] < _MISSING * weight]
     best = min(better, key=size, default=stated)
     remain = best.sizes[1] > _BETTER * stated.sizes[1] and best.sizes[0] < _BETTER * stated.sizes[0]
     if remain:  # the force alone does not show which foot it acts on
