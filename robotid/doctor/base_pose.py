@@ -46,7 +46,8 @@ def check_pose(log: Log) -> Iterator[Finding]:
         steps = np.diff(values, axis=0)
         size = np.linalg.norm(steps[1:-1] - 0.5 * (steps[:-2] + steps[2:]), axis=1)
         usual = float(np.percentile(size[whole], _USUAL))
-        rows = np.flatnonzero(whole & (size > max(_JUMPS * usual, least)))
+        impact = np.linalg.norm(steps[2:] - steps[:-2], axis=1) > size  # a change of the speed
+        rows = np.flatnonzero(whole & ~impact & (size > max(_JUMPS * usual, least)))
         rows = np.array([k for k in rows if size[k] == size[max(k - 1, 0) : k + 2].max()])
         if not len(rows):
             continue

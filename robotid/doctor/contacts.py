@@ -71,6 +71,7 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         yield from wrong
         return
     J, turn = _contact_jacobian(model, motion.q)
+    wrong = []
     if imu is not None:
         wrong = list(check_imu(found, motion, _of_pairs(J, flags, motion.v)))
         yield from wrong
@@ -78,7 +79,8 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
             return
     if not model.contacts:
         return
-    yield from check_wrenches(model, log, motion)
+    if not wrong:
+        yield from check_wrenches(model, log, motion)
     velocity = np.einsum("kcij,kj->kci", J, motion.v)  # (N, contacts, 3) [m/s]
     relative = np.sum(_relative(velocity, flags) ** 2, axis=2)
     has_ground = log.base is None or log.base.has_position

@@ -74,6 +74,16 @@ def test_jumps_are_found_with_size_and_time(log):
     assert found.evidence["first"] == log.t[100]
 
 
+def test_an_impact_is_no_jump(log):
+    still = BaseMotion(np.tile([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], (len(log.t), 1)))
+    pose = still.pose.copy()
+    pose[100:, 2] += 2.0 * (log.t[100:] - log.t[100])  # 33 mm per row from one row on
+    assert not list(check_pose(replace(log, base=BaseMotion(pose))))
+    pose[100:, 2] += 0.1
+    (found,) = check_pose(replace(log, base=BaseMotion(pose)))
+    assert found.code == "base_jump"
+
+
 def test_a_turn_of_the_tag_is_found_and_one_in_a_gap_is_not(log):
     half = np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])  # 0.2 rad about z
 
