@@ -1,6 +1,7 @@
 """Segment masses of a human from motion and forces of the ground, without torques."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -8,9 +9,12 @@ import pytest
 from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_segments
 
 from robotid import identify
+from robotid.commands.job import Job, LogEntry
+from robotid.commands.replay import Findings, replay_files
 from robotid.exceptions import SettingsError
 from robotid.fitting.estimators import pinned_links
 from robotid.fitting.settings import ConsistentSettings, ConstraintSettings
+from robotid.log_files.read import write_log
 from robotid.logs.base import BaseMotion
 from robotid.logs.settings import SignalSettings
 from robotid.report.advice import Origin, _watch
@@ -125,3 +129,15 @@ def test_a_plate_refuses_axes_and_points():
     ):
         with pytest.raises(SettingsError, match=words):
             replace(plate, **change)
+
+
+def test_a_motion_without_torques_is_replayed_with_its_base(human, tmp_path):
+    rng = np.random.default_rng(1)
+    log = logged(human, walk(human, human, rng, duration=2.0), rng)
+    write_log(log, tmp_path / "log.csv")
+    job = Job(
+        urdf=Path(human.tree.path), joints=human.joints, free_flyer=True, terms=(),
+        contacts=human.contacts, identification=(LogEntry(tmp_path / "log.csv"),),
+    )  # fmt: skip
+    html = replay_files(job, Findings({})).html
+    assert "Motion: log.csv." in html
