@@ -22,6 +22,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("log", metavar="IN", help="log of any format, or the folder of a bag")
     add("out", metavar="OUT", help="file to write; its suffix determines the format")
     add("--joints", metavar="A,B,...", help="joints to write; default: all")
+    add("--sensors", metavar="A,B,...", help="topics of base, IMU and forces; default: all")
     JOB.add(parser, SOURCE)
     add_json(parser)
 
@@ -38,7 +39,8 @@ def run(options: argparse.Namespace) -> None:
     from robotid.logs.settings import LogSource
 
     joints = options.joints.split(",") if options.joints else None
-    source = LogSource(**source_settings(options))
+    topics = tuple(options.sensors.split(",")) if options.sensors else ()
+    source = LogSource(**source_settings(options), sensors=topics)
     done = convert(options.log, options.out, joints=joints, source=source)
     show_found(asdict(done), options, _show)
 
@@ -55,5 +57,7 @@ def source_settings(options: argparse.Namespace) -> dict[str, Any]:
 def _show(done: dict[str, Any]) -> None:
     print(f"{done['path']}: {done['samples']} samples of {len(done['joints'])} joints")
     echo(f"  columns {', '.join(done['columns'])}", "  ")
+    if done["local"]:
+        echo("  wrenches have the axes of their links: axes = 'link' in [[contact]]")
     if done["ignored"]:
         echo(f"  not written, not of a joint: {', '.join(done['ignored'])}", "  ")

@@ -9,12 +9,18 @@ from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.log_files.formats import open_table, write_columns
 from robotid.log_files.table import prefixes, quantity_of
+from robotid.logs.base import ACCELERATION, POSE, TWIST
 from robotid.logs.data import repeated, suggestion
+from robotid.logs.imu import IMU
 from robotid.logs.settings import LogSource
+from robotid.robot.constraints import Contact
 
 __all__ = ["Conversion", "convert"]
 
 _WHOLE = LogSource()
+_BASE = {f"base_{x}" for x in (*POSE, "roll", "pitch", "yaw", *TWIST, *ACCELERATION)}
+_SENSED = {*_BASE, *(f"imu_{x}" for x in IMU)}
+_OF_LINKS = ("contact_", "foot_force_", *(f"wrench_{x}_" for x in Contact.components))
 
 
 @dataclass(frozen=True)
@@ -25,7 +31,8 @@ class Conversion:
     samples: int
     columns: tuple[str, ...]  # with standard names
     joints: tuple[str, ...]
-    ignored: tuple[str, ...]  # columns of the source file that are not a quantity of a joint
+    ignored: tuple[str, ...]  # columns of the source file that are of no joint, base or contact
+    local: bool = False  # whether it has wrenches with the axes of their links
 
 
 def convert(
@@ -42,8 +49,9 @@ def convert(
     Args:
         path: The log to read.
         target: The file to write, .csv, .parquet, .npz, .h5, .hdf5 or .mat; replaced if it exists.
-        joints: Names of the joints to write; all joints of the file if None.
-        source: Topic or group, names of joints in the file, meaning of effort.
+        joints: Names of the joints to write; all joints of the file if None. Columns of a base, of
+            an IMU, of contacts and of wrenches are always written.
+        source: Topic or group, names of joints in the file, meaning of effort, topics of sensors.
 
     Raises:
         DataError: If the file cannot be read, has no time, or lacks a joint.
@@ -61,7 +69,9 @@ def convert(
                 f"{suggestion(joint, by_joint)}"
             )
     wanted = tuple(by_joint) if joints is None else tuple(joints)
-    chosen = ["time", *(name for joint in wanted for name in by_joint[joint])]
+    others = [x for x in opened.names if x in _SENSED or x.startswith(_OF_LINKS)]
+    found |= {name: name for name in others}
+    chosen = ["time", *(name for joint in wanted for name in by_joint[joint]), *others]
     columns = [name for name in found if name in chosen]
     table = opened.read([found[name] for name in columns])
     write_columns({name: table[found[name]] for name in columns}, Path(target))
@@ -71,6 +81,7 @@ def convert(
         columns=tuple(columns),
         joints=wanted,
         ignored=tuple(name for name in opened.names if name not in found.values()),
+        local=opened.axes.get("wrench") == "link" and any(x.startswith("wrench_") for x in others),
     )
 
 

@@ -151,8 +151,9 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         ghosts[Path(ghost).name] = (shadow.t, shadow.q)
     torques, marks, notes = None, _payloads(findings.track), [f"Motion: {entry.path.name}."]
     if is_motion:
-        used, further = _limits_used(job, motion, model)
-        marks, notes = [*marks, *used], [*notes, *further]
+        if not model.free_flyer:  # else the forces of the ground are part of the torques
+            used, further = _limits_used(job, motion, model)
+            marks, notes = [*marks, *used], [*notes, *further]
     else:
         torques = _torques(job, motion, model, robots, findings.results)
         torques = replace(torques, noise=_noise(findings, model))

@@ -1,4 +1,4 @@
-"""Checks of the motion of a floating base and of contacts: axes of the twist, flags, gravity."""
+"""Checks of a floating base and of contacts: axes of the twist, flags, gravity, forces."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -8,8 +8,10 @@ import numpy as np
 from scipy.special import stdtrit
 
 from robotid._typing import Array
+from robotid.doctor.base_pose import check_order, check_pose
 from robotid.doctor.found_contacts import with_contacts
 from robotid.doctor.imu import check_imu
+from robotid.doctor.wrenches import check_wrenches
 from robotid.exceptions import DataError
 from robotid.findings import Finding, log_finding
 from robotid.logs.base import base_state, in_base
@@ -30,6 +32,7 @@ _OF_MEDIAN = 1.858  # standard error of a median, times sqrt(n), over the median
 _CERTAIN = 0.975  # probability that the scatter of a delay is below its bound
 _SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
 _STANDS = 0.3  # ... if it is above this share of its speed without contact
+_LOADED = 0.1  # of the largest measured force: a foot with more is on the ground
 _MARGIN = 0.03  # [s] after and before a change of contact in which a slip is not examined
 _SLIPS = 0.03  # share of the time in contact with a slip that is reported
 _BEYOND = 3.0  # standard errors that a slip must exceed
@@ -51,6 +54,8 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
     if log.base is not None and log.base.twist is not None and log.base.imu is None:
         yield from _check_axes(log)
     imu = None if log.base is None else log.base.imu
+    if imu is None:
+        yield from check_pose(log)
     if not model.contacts and imu is None:
         return
     still = replace(signals, velocity="differentiated", acceleration="differentiated")
@@ -63,9 +68,15 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         yield log_finding(log.name, "log_note", "note", note)
     flags = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
     for k, contact in enumerate(model.contacts):
-        if not contact.always and contact.frame in whole.contacts:
+        if contact.is_measured:
+            flags[:, k] = _loaded(contact, log, motion.t)
+        elif not contact.always and contact.frame in whole.contacts:
             flags[:, k] = _at(whole.contacts[contact.frame], whole, motion.t)
+    if wrong := list(check_order(model, whole, still, motion, flags)):
+        yield from wrong
+        return
     J, turn = _contact_jacobian(model, motion.q)
+    wrong = []
     if imu is not None:
         wrong = list(check_imu(whole, motion, _of_pairs(J, flags, motion.v)))
         yield from wrong
@@ -73,6 +84,8 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
             return
     if not model.contacts:
         return
+    if not wrong:
+        yield from check_wrenches(model, log, motion)
     velocity = np.einsum("kcij,kj->kci", J, motion.v)  # (N, contacts, 3) [m/s]
     relative = _relative(velocity, flags)
     has_ground = log.base is None or log.base.has_position
@@ -83,7 +96,7 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         own = log.contacts.get(contact.frame)
         if contact.always:
             own = np.ones(len(log.t), dtype=bool)
-        if own is None:  # found from this motion
+        if own is None or contact.is_measured:  # found from this motion, or not needed
             continue
         named[k] = list(
             _check_flags(contact.frame, log, own, motion, squares[:, k], signals, has_ground)
@@ -112,6 +125,14 @@ def _at(flags: Array, log: Log, t: Array) -> Array:
     rows = np.searchsorted(log.t, t + 1e-9, side="right") - 1
     at: Array = flags[rows.clip(0, len(flags) - 1)]
     return at
+
+
+def _loaded(contact: Contact, log: Log, t: Array) -> Array:
+    """Return whether the measured force of a contact is not small, shape (N,), bool."""
+    forces = [part for part in contact.measured if part.startswith("f")]
+    parts = [log.wrenches[f"{part} {contact.frame}"] for part in forces]
+    size = np.linalg.norm(parts, axis=0)
+    return _at(size > _LOADED * size.max(), log, t)
 
 
 def _relative(velocity: Array, flags: Array) -> Array:

@@ -33,9 +33,10 @@ __all__ = ["CODES", "check_logs", "diagnose", "findings_to_dict"]
 
 #: Codes of the doctor's errors, which can be ignored.
 CODES = (
-    "base_twist", "gravity", "gravity_compensated", "imu_axes", "imu_gravity", "joint_axis",
-    "joint_order", "delayed_command",
-    "locked_position", "position_offset", "position_order", "position_sign", "spikes",
+    "base_orientation", "base_twist", "gravity", "gravity_compensated", "imu_axes", "imu_gravity",
+    "joint_axis", "joint_order", "delayed_command",
+    "locked_position", "measured_wrench", "position_offset", "position_order", "position_sign",
+    "spikes",
     "torque_order", "torque_sign", "velocity_mismatch", "unsigned_torque", "velocity_order",
     "velocity_scale",
 )  # fmt: skip

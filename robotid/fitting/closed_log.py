@@ -1,4 +1,4 @@
-"""Logs of robots with closed chains: positions of joints that are not logged, and checks."""
+"""Logs as the model needs them: joints of closed chains that are not logged, pose of the root."""
 
 from dataclasses import replace
 
@@ -7,8 +7,10 @@ import numpy as np
 from robotid._text import seconds
 from robotid.exceptions import DataError
 from robotid.findings import listed
+from robotid.logs.base import BaseMotion
 from robotid.logs.data import Log
 from robotid.robot.closure import Chains
+from robotid.robot.constraints import root_poses
 from robotid.robot.model import RobotModel
 
 __all__ = ["closed_log"]
@@ -21,7 +23,7 @@ def closed_log(model: RobotModel, log: Log) -> Log:
     """Return the log of all joints of a robot, with positions of passive joints from its loops.
 
     The torques of passive joints are 0. Velocities, accelerations and commands of a log without the
-    position of a passive joint are not used.
+    position of a passive joint are not used. The pose of the base becomes that of the root link.
 
     Args:
         model: The robot.
@@ -30,8 +32,20 @@ def closed_log(model: RobotModel, log: Log) -> Log:
     Raises:
         DataError: If the loops do not close, or do not determine a missing position.
     """
-    if not (model.passive or model.loops):
+    if model.passive or model.loops:
+        log = _with_passive(model, log)
+    if log.base is None or not log.base.link:
         return log
+    pose = root_poses(model, log.q, log.base.pose, log.base.link)
+    if not log.base.has_position:
+        pose[:, :3] = 0.0
+    note = f"the pose of the base is computed from that of {log.base.link}"
+    base = BaseMotion(pose, imu=log.base.imu)
+    return replace(log, base=base, notes=(*log.notes, note))
+
+
+def _with_passive(model: RobotModel, log: Log) -> Log:
+    """Return the log with the positions of all joints, and no torque of passive ones."""
     missing = np.array([joint not in log.joints for joint in model.joints])
     q, tau = np.zeros((2, len(log.t), len(missing)))
     logged = np.flatnonzero(~missing)

@@ -12,11 +12,11 @@ from robotid.estimators.consistent.weighting import Segments, choose_weight, con
 from robotid.fitting.settings import BoundedSettings, ConstraintSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import Factors, gather
-from robotid.robot.bodies import held_parameters
+from robotid.robot.bodies import held_parameters, negligible_bodies
 from robotid.robot.geometry import body_boxes, geometry_half_spaces
 from robotid.robot.model import RobotModel
 
-__all__ = ["Known", "consistent_fit", "make_constraints"]
+__all__ = ["Known", "consistent_fit", "make_constraints", "pinned_links"]
 
 _FOLDS = 6  # of the cross-validation, prior_weight = "cv"
 
@@ -47,12 +47,15 @@ class Known:
         return covariance
 
 
-def consistent_fit(settings: BoundedSettings, known: Known) -> Consistent:
+def consistent_fit(
+    settings: BoundedSettings, known: Known, *, pins_negligible: bool = True
+) -> Consistent:
     """Return the physically consistent estimator, which can also project an estimate.
 
     Args:
         settings: The settings.
         known: The robot and its prior.
+        pins_negligible: Whether links of negligible mass keep the URDF's values.
 
     Raises:
         SettingsError: If constraints contradict each other or do not match the robot.
@@ -60,6 +63,8 @@ def consistent_fit(settings: BoundedSettings, known: Known) -> Consistent:
     bounds, weight, model = settings.bounds, settings.prior_weight, known.model
     geometry = geometry_half_spaces(model, bounds.com_within)
     extent = body_boxes(model) if bounds.extent == "box" else {}
+    if pins_negligible:
+        bounds = replace(bounds, pinned=pinned_links(bounds, model))
     fit = Consistent(
         layout=model.layout,
         K=known.mapping.K,
@@ -91,6 +96,17 @@ def consistent_fit(settings: BoundedSettings, known: Known) -> Consistent:
     return replace(
         fit, prior_weight=choice.weight, plausible_weight=choice.plausible, choice=choice
     )
+
+
+def pinned_links(bounds: ConstraintSettings, model: RobotModel) -> tuple[str, ...]:
+    """Return the links that keep the URDF's values: those stated, and those of negligible mass.
+
+    Args:
+        bounds: The constraints of the job; a link with bounds of its own is free.
+        model: The robot.
+    """
+    bounded = {*bounds.pinned, *bounds.mass, *bounds.com}
+    return (*bounds.pinned, *(x for x in negligible_bodies(model) if x not in bounded))
 
 
 def make_constraints(

@@ -12,7 +12,7 @@ from robotid.estimators.determination import Determination, base_spread, determi
 from robotid.estimators.estimator import Weighing
 from robotid.exceptions import NotConvergedError, RankDeficientError, SettingsError
 from robotid.fitting.baselines import urdf_with_drives
-from robotid.fitting.estimators import Known, consistent_fit
+from robotid.fitting.estimators import Known, consistent_fit, pinned_links
 from robotid.fitting.evaluation import evaluate_logs
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.regressor_noise import RegressorNoise, find_regressor_noise
@@ -307,7 +307,7 @@ def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool)
     errors = recordings.repeated
     repeated = 0.0 if errors is None else errors.variance / rough.sigma[-1] ** 2
     before = Known(model, mapping, prior, spread, share, rough.sigma, held_out, repeated)
-    pinned = model.layout.owned_by(choice.bounds.pinned)
+    pinned = model.layout.owned_by(pinned_links(choice.bounds, model))
     return _Ground(recordings, reduction, before, logs, rough, pinned, understated**2)
 
 

@@ -376,7 +376,8 @@ class LogCholeskySettings(ConsistentSettings):
         from robotid.fitting.estimators import consistent_fit
 
         rng = np.random.default_rng(self.seed)
-        return LogCholesky(consistent_fit(self, known), starts=self.starts, rng=rng)
+        fit = consistent_fit(self, known, pins_negligible=False)
+        return LogCholesky(fit, starts=self.starts, rng=rng)
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from robotid.estimators.segments import FEWEST_SEGMENTS, scatter
 from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.fitting.bands import TorqueBand, expected_band
-from robotid.fitting.estimators import Known, consistent_fit
+from robotid.fitting.estimators import Known, consistent_fit, pinned_links
 from robotid.fitting.evaluation import evaluate_logs
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import ConsistentSettings, EstimatorSettings
@@ -507,7 +507,8 @@ def _expected(
     model, mapping = known.model, known.mapping
     standard = known.pi if information.run is None else pi
     rows = information.factors.weighted(information.sigma / np.sqrt(information.share))[:, :-1]
-    before = base_spread(mapping.K, known.spread, model.layout.owned_by(choice.bounds.pinned))
+    pinned = model.layout.owned_by(pinned_links(choice.bounds, model))
+    before = base_spread(mapping.K, known.spread, pinned)
     fitted, _ = evaluate_logs(motions, (), {"estimate": pi, "wls": pi}, known.pi)
     inflation = np.mean([level / information.sigma**2 for _, level in information.levels])
     errors = StandardErrors("noise expected", 0, float(inflation), np.full(len(mapping.K), np.inf))

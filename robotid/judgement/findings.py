@@ -19,7 +19,7 @@ from robotid.fitting.result import Fit
 from robotid.fitting.settings import BoundedSettings, ConsistentSettings
 from robotid.judgement.correlation import correlated_parameters
 from robotid.logs.data import Log
-from robotid.robot.bodies import held_parameters, least_density
+from robotid.robot.bodies import held_parameters, least_density, negligible_bodies
 from robotid.robot.geometry import body_boxes, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -382,14 +382,16 @@ def _impossible_shapes(fit: Fit) -> list[Finding]:
     """Return the identified bodies that are not possible in their geometry.
 
     As notes if the URDF's body is not possible either, or if the body is in the box of a fit with
-    extents.
+    extents. Bodies of negligible mass are left out.
     """
     model, points = fit.model, body_points(fit.model)
-    boxes = body_boxes(model)
+    boxes, negligible = body_boxes(model), negligible_bodies(model)
     before = {(finding.code, finding.where) for finding in audit_bodies(model, fit.prior, points)}
     findings = []
     for finding in audit_bodies(model, fit.standard, points):
         body = finding.where.removeprefix("link ")
+        if body in negligible:  # it keeps the URDF's values, and has no effect
+            continue
         if (finding.code, finding.where) in before:
             message = f"{finding.message.partition(';')[0]}; the URDF has the same fault"
             finding = replace(finding, severity="note", message=message)

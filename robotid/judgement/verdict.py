@@ -44,6 +44,7 @@ _SMALL = 5.0  # [%] of the torque: a missing drive term below this gives no warn
 _REASONS = {
     "angle_scale": "positions fit best when multiplied by another factor",
     "active_bound": "the data, or the masses that result from it, contradict a stated bound",
+    "base_jump": "the pose of the base jumps {jumps:.0f} times: its acceleration there is wrong",
     "clipped": "the torque is clipped at a limit",
     "contact_delay": "contact flags are delayed by {delay:+.3f} s (negative: early): contact "
     "forces remain in the rows",
@@ -70,6 +71,7 @@ _REASONS = {
     "rolling_contact": "a foot rolls as a ball of radius {radius:.4f} m, which is not stated: its "
     "force acts elsewhere",
     "moving_contact": "a link moves at {speed:.2g} m/s while it is in contact",
+    "measured_wrench": "forces of the ground are missing in a part of the log",
     "mass_matrix": "the mass matrix is not positive definite in all poses",
     "payload_change": "its last link carries {mass:+.2g} kg relative to the fitted logs",
     "position_offset": "the position may have an offset",

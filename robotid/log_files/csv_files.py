@@ -19,6 +19,7 @@ from robotid.logs.settings import LogSource
 __all__ = ["CsvFormat"]
 
 _BLOCK = 4096  # lines read at a time
+_SENSED = ("base_", "imu_", "contact_", "wrench_")  # columns that other devices record
 
 
 class CsvFormat(WritableFormat):
@@ -135,6 +136,8 @@ class _CsvRows(RowReader):
                     if not _is_number(cells[i]):
                         found = repr(cells[i][:80]) if cells[i].strip() else "empty"
                         hint = "; write decimals with a point" if "," in cells[i] else ""
+                        if found == "empty" and self.names[i].startswith(_SENSED):
+                            hint = "; interpolate a column of another rate at the joints' stamps"
                         return DataError(
                             f"{where}: {self.names[i]} is {found} at row {row}, wanted a "
                             f"number{hint}; remove the row or correct the recording"

@@ -42,6 +42,7 @@ Readable = Log | str | Path | Frame
 
 _SI = LogUnits()
 _WHOLE = LogSource()
+_SPARSE = 0.02  # share of rows without a value from which a column has another rate
 _BASE = BaseColumns()
 
 
@@ -225,6 +226,9 @@ class LogLayout:
                 values[kind] = self._to_si(kind, values[kind], is_motor)
             values[kind] = self._of_joints(kind, values[kind])
         t, where = self.stamps(values["time"][:, 0]), Path(self.path).name or "log"
+        for kind, array in values.items():
+            if kind in ("contact", "wrench") or kind.startswith("base "):
+                _require_rate(array, self.columns[kind], where)
         base, note = base_of(t, values["q"], values, self.base)
         flags = values.pop("contact", None)
         contacts = {} if flags is None else contacts_of(flags, self.base, where)
@@ -274,6 +278,17 @@ class LogLayout:
                 moved += np.array(gear.offset)[:, None]
             values[:, places] = moved.T
         return values
+
+
+def _require_rate(values: Array, names: Sequence[str], where: str) -> None:
+    """Refuse columns that have no value in many rows, as those of another rate."""
+    share = np.isnan(values).mean(axis=0)
+    if (share > _SPARSE).any():
+        sparse = [name for name, own in zip(names, share, strict=True) if own > _SPARSE]
+        raise DataError(
+            f"{where}: {share.max():.0%} of the rows have no value of {listed(sparse)}, as of "
+            "another rate than that of the joints; interpolate at the time stamps of the joints"
+        )
 
 
 def lay_out(

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,6 +58,7 @@ class BaseMotion:
             not recorded.
         imu: Values of an IMU, which determine angular velocity and acceleration; None without one.
             The position is 0 if it was not recorded.
+        link: The link whose pose it is; "" for the root link. Only the root link has velocities.
 
     Raises:
         DataError: If a shape is not the expected one, or a quaternion is not of length 1.
@@ -66,6 +68,7 @@ class BaseMotion:
     twist: Array | None = None
     acceleration: Array | None = None
     imu: ImuMotion | None = None
+    link: str = ""
 
     def __post_init__(self) -> None:
         for name, width in (("pose", 7), ("twist", 6), ("acceleration", 6)):
@@ -93,7 +96,7 @@ class BaseMotion:
         """
         imu = None if self.imu is None else self.imu.at(rows)
         arrays = {"pose": self.pose, "twist": self.twist, "acceleration": self.acceleration}
-        some: dict[str, Array] = {name: x[rows] for name, x in arrays.items() if x is not None}
+        some: dict[str, Any] = {name: x[rows] for name, x in arrays.items() if x is not None}
         return replace(self, imu=imu, **some)
 
     @property
@@ -121,6 +124,7 @@ class BaseColumns:
         imu: Place of an IMU in the base, whose ``imu_wx`` to ``imu_az`` replace velocities and
             accelerations; orientation is that of the base, or of the IMU, ``imu_qx`` to
             ``imu_qw``; the position may be missing. None without an IMU.
+        link: The link whose pose is read; "" for the root link. Its velocities are not read.
     """
 
     floats: bool = False
@@ -130,6 +134,7 @@ class BaseColumns:
     thresholds: tuple[float | None, ...] = ()
     local: tuple[str, ...] = ()
     imu: ImuFrame | None = None
+    link: str = ""
 
     def present(self, names: Collection[str]) -> "BaseColumns":
         """Return the same with only those contacts that a file has; the others may be found.
@@ -181,6 +186,8 @@ def base_columns(
 def _columns_of_base(where: str, names: Sequence[str], wanted: BaseColumns) -> dict[str, list[str]]:
     """Return the columns of the motion of the base, by kind."""
     forms = {"pose": POSE, "angles": _ANGLES, "twist": TWIST, "acceleration": ACCELERATION}
+    if wanted.link:
+        forms = {"pose": POSE, "angles": _ANGLES}
     whole = {kind: [f"base_{end}" for end in ends] for kind, ends in forms.items()}
     orientations = ["pose", "angles"]
     if wanted.imu is not None:
@@ -227,7 +234,9 @@ def base_of(
     pose, frame = _pose_of(values, wanted.imu), wanted.imu
     if pose is None:
         return None, ""
-    base = BaseMotion(pose, values.get("base twist"), values.get("base acceleration"))
+    twist, acceleration = values.get("base twist"), values.get("base acceleration")
+    link = "" if "base imu quaternion" in values else wanted.link  # its place is stated by imu
+    base = BaseMotion(pose, twist, acceleration, link=link)
     if frame is not None:
         imu, note = motion_of_imu(t, q, _checked(values["base imu"], "IMU", 6), frame)
         return replace(base, imu=imu), note

@@ -198,6 +198,11 @@ class BaseSource(Settings):
         "axes of the velocities base_vx to base_wz: base, those of the base link, or world",
         among=("base", "world"),
     )
+    link: str | None = setting(
+        None,
+        "the link whose pose base_x to base_qw are, as the chest of a human; the root link if not "
+        "stated. Velocities of another link are not read",
+    )
     imu: str | None = setting(
         None,
         "the link of an IMU, fixed to the root link; its angular velocity and specific force, "

@@ -65,8 +65,8 @@ def constraint_jacobian(model: RobotModel, q: Array, contacts: Array) -> Array:
             if x in place and not contacts[k, place[x]]:
                 continue
             own = [pin.getFrameJacobian(pin_model, data, i, axes) for i in ids]
-            rotation = pin.updateFramePlacement(pin_model, data, ids[0]).rotation
-            J[k, first:stop] = x.rows(own, rotation) @ G
+            placement = pin.updateFramePlacement(pin_model, data, ids[0])
+            J[k, first:stop] = x.rows(own, placement) @ G
     return J
 
 
@@ -255,11 +255,14 @@ def logged_base(model: RobotModel, source: BaseSource = _AS_IS) -> BaseColumns:
 
     Args:
         model: The robot.
-        source: Axes of the velocities of the base, and the link of its IMU.
+        source: Axes of the velocities of the base, its link, and the link of its IMU.
 
     Raises:
-        ModelError: If the link of the IMU is not fixed to the base.
+        ModelError: If a link is unknown, or that of the IMU is not fixed to the base.
     """
+    link = source.link or ""
+    if link:
+        _require_link(model, link, "link")
     flagged = [x for x in model.contacts if not x.always]
     return BaseColumns(
         model.free_flyer,
@@ -269,16 +272,21 @@ def logged_base(model: RobotModel, source: BaseSource = _AS_IS) -> BaseColumns:
         thresholds=tuple(x.threshold for x in flagged),
         local=tuple(x.frame for x in model.contacts if x.axes == "link"),
         imu=None if source.imu is None or not model.free_flyer else _imu_frame(model, source.imu),
+        link="" if link == model.tree.root else link,
     )
+
+
+def _require_link(model: RobotModel, link: str, key: str) -> None:
+    if link not in model.tree.links:
+        raise ModelError(
+            f"{key} in [base] is {link!r}, which is not a link of {model.name}; links: "
+            f"{listed(model.tree.links)}{suggestion(link, model.tree.links)}"
+        )
 
 
 def _imu_frame(model: RobotModel, link: str) -> ImuFrame:
     """Return the place of an IMU in the base."""
-    if link not in model.tree.links:
-        raise ModelError(
-            f"imu in [base] is {link!r}, which is not a link of {model.name}; links: "
-            f"{listed(model.tree.links)}{suggestion(link, model.tree.links)}"
-        )
+    _require_link(model, link, "imu")
     frame = model.pin_model.frames[frame_id(model.pin_model, link)]
     if frame.parentJoint != 1:
         raise ModelError(

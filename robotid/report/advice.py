@@ -463,10 +463,17 @@ def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) ->
 
 
 def _watch(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    rows = found.metrics().per_joint
+    where, why = _named(causes, found.model.joints), "a wrong torque channel, a spring, gear ripple"
+    if not any(joint in rows for joint in found.model.joints):  # no torques were measured
+        where = "the base"
+        why = (
+            "noise of the motion (lower cutoff), a force that is not measured, a delay between "
+            "motion and forces"
+        )
     words = (
-        f"Examine the residual of {_named(causes, found.model.joints)} in the section Residual "
-        "analysis and in the replay. Possible causes: a wrong torque channel, a spring, gear "
-        "ripple."
+        f"Examine the residual of {where} in the section Residual analysis and in the replay. "
+        f"Possible causes: {why}."
     )
     return Step(words, _replay(found, origin))
 
@@ -546,6 +553,8 @@ _CAUSES = {
 _AS_FOUND = (
     "angle_scale",
     "active_bound",
+    "base_jump",
+    "base_orientation",
     "com_outside",
     "constant_torque",
     "contact_delay",
@@ -565,6 +574,7 @@ _AS_FOUND = (
     "link_mass",
     "lost_motion",
     "mass_matrix",
+    "measured_wrench",
     "moving_contact",
     "payload",
     "position_order",

@@ -26,9 +26,12 @@ __all__ = [
     "least_density",
     "link_places",
     "link_transfer",
+    "negligible_bodies",
     "principal_moments",
     "usual_links",
 ]
+
+_NEGLIGIBLE = 1e-5  # of the mass of the robot
 
 
 @dataclass(frozen=True)
@@ -143,6 +146,20 @@ def inertial_parameters(inertial: Inertial) -> Array:
     about_origin = R @ moments @ R.T + m * (c @ c * np.eye(3) - np.outer(c, c))
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = about_origin.tolist()
     return np.array([m, *(m * c), xx, xy, yy, xz, yz, zz])
+
+
+def negligible_bodies(model: RobotModel) -> tuple[str, ...]:
+    """Return the bodies whose mass in the URDF is negligible, as between the axes of a ball joint.
+
+    Bodies without mass are not among them, nor inconsistent ones.
+
+    Args:
+        model: The robot.
+    """
+    J = pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial])
+    mass, least = J[:, 3, 3], np.linalg.eigvalsh(J)[:, 0]
+    is_negligible = (least > 0.0) & (mass <= _NEGLIGIBLE * mass.sum())
+    return tuple(np.array(model.layout.bodies)[is_negligible].tolist())
 
 
 def central_inertial(parameters: Array) -> Inertial:

@@ -200,7 +200,7 @@ class Chains:
             own = [pin.getFrameJacobian(pin_model, data, i, axes) for i in ids]
             places = [data.oMf[i] for i in ids]
             errors.append(loop.error(places))
-            rows.append(loop.rows(own, places[0].rotation))
+            rows.append(loop.rows(own, places[0]))
         J = np.vstack(rows) @ self._model.velocity_map[:, self._first :]
         return self._unit * np.concatenate(errors), self._unit[:, None] * J
 

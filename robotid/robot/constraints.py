@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -15,7 +15,18 @@ from robotid.exceptions import ModelError, SettingsError
 from robotid.findings import listed
 from robotid.robot.drive_term import DriveTerm
 
-__all__ = ["Constraint", "Contact", "Loop", "check_constraints", "frame_id", "link_positions"]
+if TYPE_CHECKING:
+    from robotid.robot.model import RobotModel
+
+__all__ = [
+    "Constraint",
+    "Contact",
+    "Loop",
+    "check_constraints",
+    "frame_id",
+    "link_positions",
+    "root_poses",
+]
 
 
 @dataclass(frozen=True)
@@ -29,7 +40,8 @@ class Contact:
         measured: Components of the wrench of the ground on the link that are measured, of fx, fy,
             fz, mx, my, mz with the axes of the world and the origin of the link. The others are
             unknown.
-        always: Whether it touches the ground at all samples; else logs state when.
+        always: Whether it touches the ground at all samples; else logs state when. True if all
+            components are measured: the wrench itself states it.
         radius: Of a ball that rolls on level ground: the force of the ground acts this far below
             the frame [m].
         uncertainty: Standard deviation of the point of contact, along each axis [m]; None: it is
@@ -38,6 +50,9 @@ class Contact:
             measures.
         threshold: Force above which it touches the ground [N], if the log's column of the contact
             is a force; None for a column of 0 and 1.
+        plate: Force plate whose origin and axes the measured components have: x, y, z [m] and, if
+            they are not 0, roll, pitch, yaw [rad] of the plate in the world; empty for the origin
+            of the link.
     """
 
     frame: str
@@ -48,6 +63,7 @@ class Contact:
     uncertainty: float | None = None
     axes: str = "world"
     threshold: float | None = None
+    plate: tuple[float, ...] = ()
 
     sizes: ClassVar[dict[str, int]] = {"point": 3, "surface": 6}
     components: ClassVar[tuple[str, ...]] = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -83,6 +99,23 @@ class Contact:
             raise SettingsError(
                 f"threshold of the contact {self.frame!r} is {self.threshold!r}, wanted a force [N]"
             )
+        self._check_plate()
+        if self.is_measured:
+            object.__setattr__(self, "always", True)
+
+    def _check_plate(self) -> None:
+        wanted = "x, y, z [m] and roll, pitch, yaw [rad]"
+        numbers = require_each(self.plate, (int, float), "plate of a contact", wanted)
+        if len(numbers) not in (0, 3, 6) or not np.isfinite(np.array(numbers, dtype=float)).all():
+            raise SettingsError(
+                f"plate of the contact {self.frame!r} is {listed(numbers)}, wanted {wanted}, or "
+                "x, y, z"
+            )
+        if numbers and (self.kind, self.axes) != ("surface", "world"):
+            raise SettingsError(
+                f"the contact {self.frame!r} has a plate, and kind {self.kind!r} and axes "
+                f"{self.axes!r}; wanted kind 'surface', and no axes: they are those of the plate"
+            )
 
     @property
     def rows_measured(self) -> list[int]:
@@ -99,19 +132,28 @@ class Contact:
         """Name for messages."""
         return self.frame
 
-    def rows(self, jacobians: Sequence[Array], rotation: Array) -> Array:
+    @property
+    def is_measured(self) -> bool:
+        """Whether its whole wrench is measured."""
+        return len(self.measured) == self.sizes[self.kind]
+
+    def rows(self, jacobians: Sequence[Array], placement: pin.SE3) -> Array:
         """Return the velocity that the contact prevents, per speed of the robot, shape (m, nv).
 
         Args:
             jacobians: Jacobian of the frame with the axes of the world, shape (6, nv).
-            rotation: Axes of the link in the world, shape (3, 3).
+            placement: Placement of the link in the world.
         """
         rows = jacobians[0][: self.sizes[self.kind]].copy()
+        axes = placement.rotation if self.axes == "link" else np.eye(3)
         rows[0] -= self.radius * jacobians[0][4]  # v + w x (0, 0, -radius)
         rows[1] += self.radius * jacobians[0][3]
-        if self.axes == "world":
-            return rows
-        turned: Array = (rotation.T @ rows.reshape(-1, 3, rows.shape[1])).reshape(rows.shape)
+        if self.plate:  # at its origin, v + w x d
+            angles = np.array([*self.plate[3:], 0.0, 0.0, 0.0][:3], dtype=float)
+            axes = pin.rpy.rpyToMatrix(angles)
+            d = np.array(self.plate[:3], dtype=float) - placement.translation
+            rows[:3] -= pin.skew(d) @ rows[3:]
+        turned: Array = (axes.T @ rows.reshape(-1, 3, rows.shape[1])).reshape(rows.shape)
         return turned
 
 
@@ -167,17 +209,17 @@ class Loop:
         """Return plain values for a file."""
         return {"frames": list(self.frames), "kind": self.kind, "axis": list(self.axis)}
 
-    def rows(self, jacobians: Sequence[Array], rotation: Array) -> Array:
+    def rows(self, jacobians: Sequence[Array], placement: pin.SE3) -> Array:
         """Return the relative velocity that the loop prevents, per speed, shape (m, nv).
 
         Args:
             jacobians: Jacobians of the two frames with the axes of the world, each (6, nv).
-            rotation: Axes of the first frame in the world, shape (3, 3).
+            placement: Placement of the first frame in the world.
         """
         relative = jacobians[0] - jacobians[1]
         if self.kind != "hinge":
             return relative[: self.sizes[self.kind]]
-        return np.vstack([relative[:3], self._across(rotation) @ relative[3:]])
+        return np.vstack([relative[:3], self._across(placement.rotation) @ relative[3:]])
 
     def error(self, placements: Sequence[pin.SE3]) -> Array:
         """Return the displacement that the loop prevents, shape (m,) [m, rad]; 0 if it is closed.
@@ -293,4 +335,23 @@ def link_positions(pin_model: pin.Model, configurations: Array, links: Sequence[
     for k, q in enumerate(np.ascontiguousarray(configurations)):
         pin.framesForwardKinematics(pin_model, data, q)
         found[k] = [data.oMf[i].translation for i in ids]
+    return found
+
+
+def root_poses(model: "RobotModel", q: Array, poses: Array, link: str) -> Array:
+    """Return the poses of the root link from those of another link, x y z qx qy qz qw, (N, 7).
+
+    Args:
+        model: The robot, whose base floats.
+        q: Positions of its joints, shape (N, n) [rad or m].
+        poses: Poses of the link in the world, shape (N, 7) [m, -].
+        link: Name of the link.
+    """
+    pin_model, found = model.pin_model, np.empty_like(poses)
+    data, frame = pin_model.createData(), frame_id(pin_model, link)
+    still = np.hstack([np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(q), 1)), q])
+    for k, q_k in enumerate(np.ascontiguousarray(model.configurations(still))):
+        pin.forwardKinematics(pin_model, data, q_k)
+        place = pin.updateFramePlacement(pin_model, data, frame)
+        found[k] = pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(poses[k]) * place.inverse())
     return found

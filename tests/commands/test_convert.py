@@ -14,7 +14,7 @@ from robotid.cli import main
 from robotid.commands.convert import convert
 from robotid.commands.job import job_from_settings
 from robotid.exceptions import DataError
-from robotid.log_files.formats import write_columns
+from robotid.log_files.formats import open_table, write_columns
 from robotid.log_files.read import read_log
 from robotid.logs.data import Log
 from robotid.logs.settings import LogSource
@@ -111,6 +111,22 @@ def test_what_cannot_be_named_is_refused_and_nothing_is_written(tmp_path, arrays
     with pytest.raises(DataError, match=r"has no joint 'b'|has no column|several columns"):
         convert(tmp_path / "run.npz", tmp_path / "out.csv", joints=["b"])
     assert [path.name for path in tmp_path.iterdir()] == ["run.npz"]
+
+
+def test_columns_of_base_contacts_and_forces_are_kept(tmp_path, log):
+    kept = ["base_x", "base_qw", "base_roll", "base_alz", "imu_qx", "imu_az", "contact_l_foot",
+            "wrench_mz_l_foot", "foot_force_0"]  # fmt: skip
+    lost = ["base_state", "imu_temperature", "wrench_size_l_foot"]
+    table = {"time": log.t} | {f"q_{x}": log.q[:, k] for k, x in enumerate(JOINTS)}
+    table |= {name: k + log.t for k, name in enumerate([*kept, *lost])}
+    write_columns(table, tmp_path / "run.parquet")
+    done = convert(tmp_path / "run.parquet", tmp_path / "run.csv", joints=["elbow"])
+    assert done.columns == ("time", "q_elbow", *kept)
+    assert done.ignored == tuple(lost)
+    assert not done.local
+    back = open_table(tmp_path / "run.csv", LogSource()).read(kept)
+    for k, name in enumerate(kept):
+        np.testing.assert_array_equal(back[name], k + log.t)
 
 
 def test_the_command_converts_and_names_what_it_wrote(tmp_path, log, bag, capsys):

@@ -89,7 +89,7 @@ TALOS = Biped(
 )  # fmt: skip
 
 
-def _waves(rng, count, lowest, highest, tones=6):
+def waves(rng, count, lowest, highest, tones=6):
     """Return sines that start at 0, values from times, shape (N, count), of size about 1."""
     f = rng.uniform(lowest, highest, (tones, count))
     size = rng.dirichlet(np.ones(tones), count).T
@@ -101,7 +101,7 @@ def _smooth(x):
     return x**3 * (10 - 15 * x + 6 * x**2)
 
 
-def _shares(t):
+def shares(t):
     """Return the share of the weight that is wanted on the left foot, and lifts of both feet."""
     u = np.maximum(t, 0.0) % _PERIOD / _PERIOD
     share = 0.5 * (1 + _smooth(u / 0.1) - 2 * _smooth((u - 0.45) / 0.1) + _smooth((u - 0.9) / 0.1))
@@ -126,12 +126,12 @@ def steps(biped, model, rng, duration):
     """
     t = np.arange(-SETTLES - 2 / _PLAN, duration + 3 / _PLAN, 1 / _PLAN)
     body, late = _Posture(biped, model), np.maximum(t, 0.0)
-    wave, other = _waves(rng, 6, 0.1, 0.7), _waves(rng, len(model.joints), 0.1, 0.9)
+    wave, other = waves(rng, 6, 0.1, 0.7), waves(rng, len(model.joints), 0.1, 0.9)
     ramp = _smooth(late / 2.0)[:, None]
     trunk = wave(late) * ramp * [0.015, 0.01, 0.05, 0.12, 0.12, 0.12]
     arms = other(late) * ramp * np.where(body.is_leg, 0.0, 0.5)
-    swings = 0.3 * _waves(rng, 6, 0.3, 1.5)(late) * [0.1, 0.1, 0.05, 0.5, 0.5, 0.5]
-    share, lifts = _shares(t)
+    swings = 0.3 * waves(rng, 6, 0.3, 1.5)(late) * [0.1, 0.1, 0.05, 0.5, 0.5, 0.5]
+    share, lifts = shares(t)
     between = _pendulum(share, body.data.com[0][2])
     up = np.array([0.0, 0.0, 0.06, 0.0, 0.0, 0.0])
     places = []

@@ -478,6 +478,7 @@ def test_impossible_shapes_are_notes_if_the_urdf_or_the_box_of_the_fit_excuses_t
     monkeypatch.setattr(findings, "audit_bodies", audit)
     monkeypatch.setattr(findings, "body_points", lambda one: "points")
     monkeypatch.setattr(findings, "body_boxes", lambda one: boxes)
+    monkeypatch.setattr(findings, "negligible_bodies", lambda one: ())
     asked = []
     monkeypatch.setattr(findings, "_is_within_box", lambda *own: asked.append(own) or own[1] == "a")
     one, two = _impossible_shapes(fit)

@@ -16,6 +16,7 @@ from helpers.recorders import (
     to_ns,
 )
 
+from robotid.cli import main
 from robotid.exceptions import DataError
 from robotid.log_files.read import read_log
 from robotid.logs.base import BaseColumns, quaternions_of_angles
@@ -176,6 +177,23 @@ def test_rows_lie_between_the_messages_of_all_topics(tmp_path, late, early):
     np.testing.assert_allclose(log.t, T[1:31])  # 5.01 to 5.30 s
     np.testing.assert_allclose(log.wrenches["fz l_sole"], 10 * log.t)
     np.testing.assert_allclose(log.base.pose[:, :3], places(log.t), atol=1e-12)
+
+
+def test_a_bag_is_converted_with_base_and_forces(tmp_path, capsys):
+    path, target = write(tmp_path / "log", STATES | ODOM | FORCE), tmp_path / "log.csv"
+    wanted = BaseColumns(True, wrenches=("fz l_sole", "my l_sole"), local=("l_sole",))
+    assert main(["convert", str(path), str(target), "--joints", "knee"]) == 0
+    assert "axes = 'link' in [[contact]]" in capsys.readouterr().out
+    one, other = (read_log(x, ["knee"], base=wanted) for x in (path, target))
+    np.testing.assert_array_equal(one.base.pose, other.base.pose)
+    np.testing.assert_array_equal(one.base.twist, other.base.twist)
+    np.testing.assert_array_equal(other.wrenches["fz l_sole"], one.wrenches["fz l_sole"])
+    np.testing.assert_allclose(other.wrenches["my l_sole"], other.t)
+    twice = write(tmp_path / "twice", STATES | ODOM | {"/mocap": ODOM["/odom"]})
+    assert main(["convert", str(twice), str(target)]) == 1
+    assert "log has 2 topics" in capsys.readouterr().err.replace("twice", "log")
+    assert main(["convert", str(twice), str(target), "--sensors", "/odom"]) == 0
+    np.testing.assert_allclose(read_log(target, JOINTS, base=BASE).base.twist[:, 1], 2.0)
 
 
 def test_one_of_several_topics_is_stated(tmp_path):

@@ -8,12 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from robotid.exceptions import DataError, MissingDependencyError, SettingsError
 from robotid.log_files.read import read_log, write_log
+from robotid.logs.base import BaseColumns
 from robotid.logs.data import Log
 from robotid.logs.settings import LogUnits
 
@@ -680,3 +682,24 @@ def test_real_recordings_in_other_units_are_refused(path, tmp_path):
             reread(v=log.v * degrees)
         with pytest.raises(DataError, match="opposite sign"):
             reread(v=-log.v)
+
+
+def test_columns_of_another_rate_are_named_with_their_share():
+    t = np.arange(40) / 100
+    held = np.where(np.arange(40) % 4, np.nan, t)
+    wanted = BaseColumns(True, wrenches=("fz f", "mx f"))
+    pose = {f"base_{x}": 0.0 * t for x in ("x", "y", "z", "qx", "qy", "qz")} | {"base_qw": t**0}
+    table = {"time": t, "q_a": t, "wrench_fz_f": held, "wrench_mx_f": t} | pose
+    words = r"75% of the rows have no value of {}, as of another rate .*; interpolate at the time"
+    with pytest.raises(DataError, match=words.format("wrench_fz_f")):
+        read_log(pd.DataFrame(table), ["a"], base=wanted)
+    with pytest.raises(DataError, match=words.format("base_x")):
+        read_log(pd.DataFrame(table | {"base_x": held, "wrench_fz_f": t}), ["a"], base=wanted)
+    whole = read_log(pd.DataFrame(table | {"wrench_fz_f": t}), ["a"], base=wanted)
+    np.testing.assert_array_equal(whole.wrenches["fz f"], t)
+
+
+def test_an_empty_cell_of_another_device_names_the_rate(tmp_path):
+    (tmp_path / "run.csv").write_text("time,q_a,wrench_fz_f\n0,1,2\n0.1,1,\n0.2,1,3\n")
+    with pytest.raises(DataError, match=r"wrench_fz_f is empty at row 1.*column of another rate"):
+        read_log(tmp_path / "run.csv", ["a"], base=BaseColumns(wrenches=("fz f",)))

@@ -1,0 +1,114 @@
+"""Checks of the pose of a floating base: jumps, and the order of its quaternion."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from robotid._text import seconds
+from robotid._typing import Array
+from robotid.findings import Finding, log_finding
+from robotid.logs.base import BaseMotion
+from robotid.logs.data import Log, Trajectory
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
+from robotid.logs.time_stamps import median_step
+from robotid.robot.constraints import link_positions
+from robotid.robot.model import RobotModel
+
+__all__ = ["check_order", "check_pose"]
+
+_USUAL = 95.0  # percentile of the steps of a pose relative to those before and after ...
+_JUMPS = 10.0  # ... times which a step is a jump ...
+_SMALLEST = (5e-3, 0.02)  # [m], [rad] ... if it is not below this
+_GAP = 2.5  # median steps of time: a longer one is a gap, over which the pose may change
+_MOVES = 0.02  # [m/s] RMS speed of feet in contact below which no other order is tried
+_BETTER = 0.5  # ratio of the speeds below which another order is found
+_ABOVE = 0.3  # vertical distance of base and feet over their distance, from which one is above
+
+
+def check_pose(log: Log) -> Iterator[Finding]:
+    """Yield findings on the logged pose of a base: jumps from one row to the next.
+
+    Args:
+        log: The log, with a base.
+    """
+    if log.base is None:
+        return
+    dt, pose = np.diff(log.t), log.base.pose
+    whole = dt < _GAP * median_step(log.t)
+    whole = whole[1:-1] & whole[:-2] & whole[2:]
+    if not whole.any():
+        return
+    for values, least, unit in zip(
+        (pose[:, :3], 2.0 * pose[:, 3:]), _SMALLEST, ("m", "rad"), strict=True
+    ):
+        steps = np.diff(values, axis=0)
+        size = np.linalg.norm(steps[1:-1] - 0.5 * (steps[:-2] + steps[2:]), axis=1)
+        usual = float(np.percentile(size[whole], _USUAL))
+        impact = np.linalg.norm(steps[2:] - steps[:-2], axis=1) > size  # a change of the speed
+        rows = np.flatnonzero(whole & ~impact & (size > max(_JUMPS * usual, least)))
+        rows = np.array([k for k in rows if size[k] == size[max(k - 1, 0) : k + 2].max()])
+        if not len(rows):
+            continue
+        times = [float(log.t[k + 2]) for k in rows]
+        message = (
+            f"the pose of the base jumps {len(rows)} time{'s' * (len(rows) > 1)}, first at t = "
+            f"{seconds(times[0])} s by {size[rows[0]]:.2g} {unit}; 95 % of its steps differ by "
+            f"less than {usual:.2g} {unit} from their neighbours: a marker or tag was found again, "
+            "or odometry was corrected. Its acceleration there is wrong. Fit the times between "
+            "jumps, with start and end, or correct base_x to base_qw"
+        )
+        evidence = {"jumps": float(len(rows)), "size": float(size[rows].max()), "first": times[0]}
+        yield log_finding(log.name, "base_jump", "warning", message, **evidence)
+
+
+def check_order(
+    model: RobotModel, log: Log, signals: SignalSettings, motion: Trajectory, flags: Array
+) -> Iterator[Finding]:
+    """Yield a finding if the quaternion of the base has another order, or is that of the inverse.
+
+    The feet in contact then hardly move, and are not above the base.
+
+    Args:
+        model: The robot, with contacts.
+        log: The log.
+        signals: How the log becomes a trajectory.
+        motion: Its smoothed motion.
+        flags: Which contacts touch the ground, shape (N, k), bool.
+    """
+    if log.base is None or not log.base.has_position or not flags.any():
+        return
+    speed, height = _of_feet(model, motion, flags)
+    if speed < _MOVES and height < _ABOVE:
+        return
+    q = log.base.pose[:, 3:]
+    readings = {
+        "its order is qw qx qy qz: state base_qw = 'base_qx', base_qx = 'base_qy', base_qy = "
+        "'base_qz' and base_qz = 'base_qw' in [columns]": np.roll(q, -1, axis=1),
+        "it is the orientation of the world in the base: reverse the signs of base_qx, base_qy and "
+        "base_qz": q * np.array([-1.0, -1.0, -1.0, 1.0]),
+    }
+    for words, quaternion in readings.items():
+        base = BaseMotion(np.hstack([log.base.pose[:, :3], quaternion]))
+        own, above = _of_feet(model, process(replace(log, base=base), signals), flags)
+        if above < _ABOVE and (own < _BETTER * speed or height > _ABOVE):
+            message = (
+                f"with the quaternion of the base as logged, the feet in contact move at "
+                f"{speed:.2g} m/s (RMS) {'above' if height > _ABOVE else 'below'} the base, else "
+                f"at {own:.2g} m/s below it: {words}"
+            )
+            evidence = {"speed": speed, "best": own}
+            yield log_finding(log.name, "base_orientation", "error", message, **evidence)
+            return
+
+
+def _of_feet(model: RobotModel, motion: Trajectory, flags: Array) -> tuple[float, float]:
+    """Return RMS speed [m/s] of feet in contact, and mean height above the base per distance."""
+    frames = [x.frame for x in model.contacts]
+    feet = link_positions(model.pin_model, model.configurations(motion.q), frames)
+    speeds = np.linalg.norm(np.gradient(feet, motion.t, axis=0), axis=2)
+    gravity: Array = model.pin_model.gravity.linear
+    off = feet - motion.q[:, None, :3]
+    heights = off @ (-gravity / np.linalg.norm(gravity)) / np.linalg.norm(off, axis=2).clip(1e-9)
+    return float(np.sqrt(np.mean(speeds[flags] ** 2))), float(heights.mean())

@@ -1,0 +1,101 @@
+"""Findings on the pose of a floating base: jumps, and the order of its quaternion."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.humans import FEET, human_urdf, logged, walk
+
+from robotid.doctor.base_pose import check_pose
+from robotid.doctor.contacts import check_base
+from robotid.logs.base import BaseMotion
+from robotid.logs.settings import SignalSettings
+from robotid.robot.constraints import Contact
+from robotid.robot.model import RobotModel
+
+SLOW = SignalSettings(cutoff=4.0)
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    path = tmp_path_factory.mktemp("human") / "human.urdf"
+    path.write_text(human_urdf())
+    return RobotModel.from_urdf(
+        path, free_flyer=True, terms=(), constraints=[Contact(foot, "surface") for foot in FEET]
+    )
+
+
+@pytest.fixture(scope="module")
+def log(robot):
+    """Return a walk with flags of the feet: which one has the lower height."""
+    motion = walk(robot, robot, np.random.default_rng(2), duration=6.0, rate=60.0)
+    log = logged(robot, motion, np.random.default_rng(3))
+    heights = np.array([[place.translation[2] for place in row] for row in motion.feet])
+    flags = {foot: heights[:, k] < 0.0801 for k, foot in enumerate(FEET)}
+    return replace(log, contacts=flags, wrenches={})
+
+
+def with_quaternion(log, change):
+    pose = log.base.pose.copy()
+    pose[:, 3:] = change(pose[:, 3:])
+    return replace(log, base=BaseMotion(pose))
+
+
+def test_signs_of_quaternions_have_no_effect(robot, log):
+    signs = np.where(np.random.default_rng(0).random(len(log.t)) < 0.5, -1.0, 1.0)
+    flipped = with_quaternion(log, lambda q: signs[:, None] * q)
+    assert not list(check_base(robot, flipped, SLOW))
+    assert np.abs(flipped.base.pose - log.base.pose).max() < 1e-15
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda q: np.roll(q, 1, axis=1), "its order is qw qx qy qz"),
+        (lambda q: q * [-1.0, -1.0, -1.0, 1.0], "it is the orientation of the world in the base"),
+    ],
+)
+def test_another_order_of_the_quaternion_is_named(robot, log, change, words):
+    (found,) = check_base(robot, with_quaternion(log, change), SLOW)
+    assert (found.code, found.severity) == ("base_orientation", "error")
+    assert words in found.message
+    assert found.evidence["best"] < 0.1  # [m/s], noise of the markers
+
+
+def test_jumps_are_found_with_size_and_time(log):
+    assert not list(check_pose(log))
+    pose = log.base.pose.copy()
+    pose[100:, 0] += 0.04
+    pose[200:, 2] -= 0.06
+    (found,) = check_pose(replace(log, base=BaseMotion(pose)))
+    assert (found.code, found.severity) == ("base_jump", "warning")
+    assert found.evidence["jumps"] == 2
+    assert found.evidence["size"] == pytest.approx(0.06, rel=0.1)
+    assert found.evidence["first"] == log.t[100]
+
+
+def test_an_impact_is_no_jump(log):
+    still = BaseMotion(np.tile([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], (len(log.t), 1)))
+    pose = still.pose.copy()
+    pose[100:, 2] += 2.0 * (log.t[100:] - log.t[100])  # 33 mm per row from one row on
+    assert not list(check_pose(replace(log, base=BaseMotion(pose))))
+    pose[100:, 2] += 0.1
+    (found,) = check_pose(replace(log, base=BaseMotion(pose)))
+    assert found.code == "base_jump"
+
+
+def test_a_turn_of_the_tag_is_found_and_one_in_a_gap_is_not(log):
+    half = np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])  # 0.2 rad about z
+
+    def turned(q):
+        x, y, z, w = q.T
+        a, b = half[2], half[3]
+        later = np.column_stack([b * x - a * y, b * y + a * x, b * z + a * w, b * w - a * z])
+        return np.where(np.arange(len(q))[:, None] < 150, q, later)
+
+    jumped = with_quaternion(log, turned)
+    (found,) = check_pose(jumped)
+    assert found.evidence["size"] == pytest.approx(0.2, abs=0.02)
+    assert " rad;" in found.message
+    apart = np.where(np.arange(len(log.t)) < 150, log.t, log.t + 5.0)
+    assert not list(check_pose(replace(jumped, t=apart)))

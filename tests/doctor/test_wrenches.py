@@ -1,0 +1,128 @@
+"""Findings on measured forces of the ground: sign, unit, foot, axes, and plates that are missed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_segments
+
+from robotid.doctor.contacts import check_base
+from robotid.doctor.wrenches import check_wrenches
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
+from robotid.robot.constraints import Contact
+from robotid.robot.model import RobotModel
+
+SLOW = SignalSettings(cutoff=4.0)
+PLATES = [
+    pin.SE3(pin.rpy.rpyToMatrix(np.pi, 0, yaw), np.array([0.1, y, -0.05]))  # z downwards
+    for yaw, y in ((0.3, 0.2), (0.0, -0.25))
+]
+
+
+def human(urdf, *, plates=None, **options):
+    own = [{"axes": "link"}, {"axes": "link"}]
+    if plates:
+        angles = [pin.rpy.matrixToRpy(p.rotation) for p in plates]
+        own = [
+            {"plate": (*p.translation, *rpy)} for p, rpy in zip(plates, angles, strict=True)
+        ]  # fmt: skip
+    contacts = [
+        Contact(foot, "surface", PARTS, **{**x, **options})
+        for foot, x in zip(FEET, own, strict=True)
+    ]
+    return RobotModel.from_urdf(urdf, free_flyer=True, terms=(), constraints=contacts)
+
+
+@pytest.fixture(scope="module")
+def urdf(tmp_path_factory):
+    path = tmp_path_factory.mktemp("human") / "human.urdf"
+    path.write_text(human_urdf())
+    return path
+
+
+@pytest.fixture(scope="module")
+def motion(urdf):
+    """Return a walk of a human whose segments differ from those of the URDF by 15 %."""
+    model, rng = human(urdf), np.random.default_rng(3)
+    return walk(model, with_other_segments(model, rng), rng, duration=6.0, rate=60.0)
+
+
+@pytest.fixture(scope="module")
+def log(urdf, motion):
+    return logged(human(urdf), motion, np.random.default_rng(4))
+
+
+def found(model, log):
+    return list(check_wrenches(model, log, process(log, SLOW)))
+
+
+def exchanged(log):
+    names = {foot: other for foot, other in zip(FEET, FEET[::-1], strict=True)}
+    wrenches = {x: log.wrenches[f"{x[:2]} {names[x[3:]]}"] for x in log.wrenches}
+    return replace(log, wrenches=wrenches)
+
+
+def scaled(log, factor):
+    return replace(log, wrenches={x: factor * y for x, y in log.wrenches.items()})
+
+
+def test_right_forces_have_no_finding_though_feet_move(urdf, log):
+    assert not list(check_base(human(urdf), log, SLOW))
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "factor"),
+    [
+        (lambda log: scaled(log, -1.0), ["their sign is reversed"], -1.0),
+        (exchanged, ["those of LeftFoot, RightFoot are exchanged"], 1.0),
+        (lambda log: scaled(exchanged(log), -1.0), ["are exchanged", "sign is reversed"], -1.0),
+        (lambda log: scaled(log, 1e-3), ["another unit, kN"], 1e3),
+    ],
+)
+def test_a_fault_of_the_columns_is_named(urdf, log, change, words, factor):
+    (finding,) = found(human(urdf), change(log))
+    assert (finding.code, finding.severity) == ("measured_wrench", "error")
+    assert all(text in finding.message for text in words)
+    assert ("exchanged" in finding.message) == ("are exchanged" in " ".join(words))
+    assert finding.evidence["factor"] == pytest.approx(factor, rel=0.2)
+    assert finding.evidence["best"] < 0.2 * 70 * 9.81  # what masses of the URDF leave
+
+
+def test_forces_of_plates_have_the_origin_and_axes_of_the_plates(urdf, motion):
+    rng = np.random.default_rng(5)
+    of_plates = logged(human(urdf), motion, rng, plates=PLATES)
+    assert not found(human(urdf, plates=PLATES), of_plates)
+    (finding,) = found(human(urdf), of_plates)  # read as those of shoes
+    assert "their sign is reversed" in finding.message  # the plates' z is downwards
+    assert "exchanged" not in finding.message
+    assert "state the plate of each foot" in finding.message
+
+
+def test_the_origin_of_the_world_is_named(urdf, motion):
+    at_zero = [pin.SE3.Identity()] * 2
+    of_world = logged(human(urdf), motion, np.random.default_rng(5), plates=at_zero)
+    assert not found(human(urdf, plates=at_zero), of_world)
+    for model in (human(urdf), human(urdf, plates=PLATES)):
+        (finding,) = found(model, of_world)
+        assert "plate = [0, 0, 0]" in finding.message
+
+
+def test_steps_beside_the_plates_are_found_with_their_times(urdf, log):
+    beside = (log.t > 2.0) & (log.t < 3.0)
+    missed = {x: np.where(beside, 0.0, y) for x, y in log.wrenches.items()}
+    (finding,) = found(human(urdf), replace(log, wrenches=missed))
+    assert (finding.code, finding.severity) == ("measured_wrench", "warning")
+    assert finding.evidence["share"] == pytest.approx(1.0 / 5.6, rel=0.1)  # 0.2 s trimmed
+    assert "first at 2.0" in finding.message
+
+
+def test_vertical_forces_alone_show_their_sign_and_foot(urdf, log):
+    contacts = [Contact(foot, "point", ("fz",), always=True) for foot in FEET]
+    model = replace(human(urdf), constraints=tuple(contacts))
+    # the feet on the ground are level: their z is the world's
+    vertical = replace(log, wrenches={f"fz {foot}": log.wrenches[f"fz {foot}"] for foot in FEET})
+    assert not found(model, vertical)
+    (finding,) = found(model, scaled(vertical, -1.0))
+    assert "their sign is reversed" in finding.message
