@@ -17,6 +17,7 @@ from pathlib import Path
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
+import mujoco
 import numpy as np
 import pinocchio as pin
 
@@ -61,6 +62,10 @@ def main():
     print()
     fleets(1 if options.quick else 5)
     unlike(1 if options.quick else 20)
+    print("| arms in MuJoCo | sets | named | another | none |\n|---|---|---|---|---|")
+    alike_logs(6 if options.quick else 150)
+    alike_fleets(6 if options.quick else 150)
+    odd_fleets(1 if options.quick else 20)
 
 
 def recordings():
@@ -129,6 +134,71 @@ def simulated(model, pi, rng, *, seconds=12.0, rate=60.0):
     return Log(t=t, q=q, v=v, a=a, tau=tau, joints=model.joints)
 
 
+def recorded(model, pi, rng, *, seconds=6.0, rate=200.0, gain=1.0, load=0.0):
+    """Return the log of an arm that MuJoCo simulates at 0.1 ms, under a controller at 1 kHz.
+
+    The controller reads encoders of 18 bits and holds its torque; the log has the encoders and the
+    torque with noise of 2 %, by ``gain`` too large at the elbow. The last link has a load [kg].
+    """
+    hold, step = 1e-3, 1e-4
+    period = round(1.0 / (rate * hold))
+    t = hold * np.arange(round(seconds / hold))
+    q_ref, v_ref, _ = random_fourier(model, rng, period=seconds).evaluate(t)
+    pi = pi.copy()
+    pi[10 * len(model.layout.bodies) - 10] += load
+    plant = mujoco.MjModel.from_xml_string(mjcf(model, pi, step))
+    state = mujoco.MjData(plant)
+    state.qpos[:], state.qvel[:] = q_ref[0], v_ref[0]
+    kp, kd, steps = np.array([4e3, 3e3, 500.0]), np.array([200.0, 120.0, 15.0]), round(hold / step)
+    v, before, rows = v_ref[0].copy(), quantised(q_ref[0]), []
+    for k in range(len(t)):
+        q = quantised(state.qpos)
+        v += 0.2 * ((q - before) / hold - v)  # first-order filter
+        before = q
+        tau = kp * (q_ref[k] - q) + kd * (v_ref[k] - v)
+        if k % period == 0:
+            rows.append((t[k], q, tau))
+        state.ctrl[:] = tau
+        mujoco.mj_step(plant, state, steps)
+    t, q, tau = map(np.array, zip(*rows, strict=True))
+    tau = tau + 0.02 * np.std(tau, axis=0) * rng.standard_normal(tau.shape)
+    return Log(t=t, q=q, tau=tau * np.array([1.0, gain, 1.0]), joints=model.joints)
+
+
+def quantised(q):
+    """Return positions as encoders of 18 bits a turn read them."""
+    size = 2 * np.pi / 2**18
+    return size * np.round(q / size)
+
+
+def mjcf(model, pi, step):
+    """Return a serial arm in MuJoCo's format, from Pinocchio's frames and parameters."""
+    robot, names, body, end = loaded(model, pi), model.layout.names, "", ""
+    for j, joint in enumerate(model.joints, start=1):
+        of = {term: pi[names.index(f"{joint}.{term}")] for term in model.layout.terms}
+        frame, inertia = robot.jointPlacements[j], robot.inertias[j]
+        x, y, z, w = pin.Quaternion(frame.rotation).coeffs()
+        I = inertia.inertia
+        axis = {"X": "1 0 0", "Y": "0 1 0", "Z": "0 0 1"}[robot.joints[j].shortname()[-1]]
+        body += (
+            f'<body pos="{numbers(frame.translation)}" quat="{numbers((w, x, y, z))}">'
+            f'<inertial mass="{inertia.mass}" pos="{numbers(inertia.lever)}" fullinertia="'
+            f'{numbers((I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]))}"/>'
+            f'<joint name="{joint}" axis="{axis}" damping="{of["viscous"]}" '
+            f'frictionloss="{of["coulomb"]}" armature="{of["armature"]}"/>'
+        )
+        end += "</body>"
+    motors = "".join(f'<motor joint="{joint}"/>' for joint in model.joints)
+    return (
+        f'<mujoco><option timestep="{step}" integrator="implicitfast"/><worldbody>{body}{end}'
+        f"</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+
+
+def numbers(values):
+    return " ".join(map(str, np.asarray(values).tolist()))
+
+
 def loaded(model, pi):
     """Return Pinocchio's model with the inertial parameters of pi."""
     robot = model.pin_model.copy()
@@ -150,10 +220,13 @@ def arm():
 
 def groups(model, logs, unit):
     """Return the fit's information on each run."""
-    held = [
-        replace(hold_log(model, log, SignalSettings(cutoff=None, trim=0.0)), unit=str(u))
-        for log, u in zip(logs, unit, strict=True)
-    ]
+    signals = SignalSettings(cutoff=None, trim=0.0)
+    return groups_of(model, [hold_log(model, log, signals) for log in logs], unit)
+
+
+def groups_of(model, held, unit):
+    """Return the fit's information on each run, from logs that were read."""
+    held = [replace(log, unit=str(u)) for log, u in zip(held, unit, strict=True)]
     some = Recordings(model, structural_mapping(model), held)
     return solve_recordings(some, EstimatorSettings(draws=0)).with_errors().runs
 
@@ -221,6 +294,84 @@ def unlike(count):
             wrong += not all(is_right)
             none += not found
         print(f"| {kind} | {right} | {wrong} | {none} |", flush=True)
+
+
+class Plants:
+    """Logs of arms that MuJoCo simulates: sets of 6 logs, and of 5 robots with 2 logs each.
+
+    Sets are drawn from a pool of as many logs, or robots, as there are sets.
+    """
+
+    def __init__(self, seed):
+        self.model, self.pi, self.friction = arm()
+        self.rng = np.random.default_rng([11, seed])
+
+    def robot(self):
+        """Return the parameters of another robot."""
+        own = self.pi.copy()
+        own[self.friction] *= 1 + BETWEEN * self.rng.normal(size=len(self.friction))
+        return own
+
+    def log(self, own, **changed):
+        """Return a log of a robot; friction varies between logs."""
+        own = own.copy()
+        own[self.friction] *= 1 + WITHIN * self.rng.normal(size=len(self.friction))
+        log = recorded(self.model, own, self.rng, **changed)
+        return hold_log(self.model, log, SignalSettings())
+
+    def vary(self, logs, unit):
+        return vary([str(k) for k in range(len(logs))], groups_of(self.model, logs, unit))
+
+    def fleet(self, pool, first=()):
+        """Return the variation of 5 robots, of a pool and those stated."""
+        chosen = self.rng.choice(len(pool), 5 - len(first), replace=False)
+        logs = [log for robot in (*first, *(pool[k] for k in chosen)) for log in robot]
+        return self.vary(logs, np.repeat(np.arange(5), 2))
+
+
+def alike_logs(count):
+    """Print how often one of 6 alike logs has a finding."""
+    plants = Plants(0)
+    pool = [plants.log(plants.pi) for _ in range(count)]
+    alarms = 0
+    for _ in range(count):
+        chosen = plants.rng.choice(count, 6, replace=False)
+        alarms += bool(plants.vary([pool[k] for k in chosen], ["a"] * 6).unlike)
+    print(f"| 6 alike logs | {count} | | {alarms} | {count - alarms} |", flush=True)
+
+
+def alike_fleets(count):
+    """Print how often 5 alike robots have a finding."""
+    plants = Plants(1)
+    pool = [[plants.log(own), plants.log(own)] for own in (plants.robot() for _ in range(count))]
+    found = [plants.fleet(pool) for _ in range(count)]
+    of_robots, of_logs = (
+        sum(bool(f.unlike_units) for f in found),
+        sum(bool(f.unlike) for f in found),
+    )
+    alarms = sum(bool(f.unlike_units or f.unlike) for f in found)
+    print(f"| 5 alike robots, 2 logs each | {count} | | {alarms} ({of_robots} of robots, {of_logs} "
+          f"of logs) | {count - alarms} |", flush=True)  # fmt: skip
+
+
+def odd_fleets(count):
+    """Print how often one of 5 robots that differs is named with its cause."""
+    plants, joint = Plants(2), "elbow_joint"
+    pool = [[plants.log(own), plants.log(own)] for own in (plants.robot() for _ in range(12))]
+    for kind in KINDS:
+        right = wrong = none = 0
+        for _ in range(count):
+            own = plants.robot()
+            changed = {"gain": {"gain": 1.15}, "payload": {"load": 1.0}}.get(kind, {})
+            if kind == "friction":
+                own[plants.model.layout.names.index(f"{joint}.coulomb")] *= 3.0
+            each = plants.fleet(pool, ([plants.log(own, **changed), plants.log(own, **changed)],))
+            cause = {"friction": "drive"}.get(kind, kind)
+            is_right = [(x.run, x.kind) == (0, cause) for x in each.unlike_units]
+            right += any(is_right)
+            wrong += not all(is_right) or bool(each.unlike)
+            none += not is_right
+        print(f"| one of 5 robots: {kind} | {count} | {right} | {wrong} | {none} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -37,6 +37,7 @@ from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.variation.groups import RunsOf
+from robotid.variation.variation import Variation
 
 __all__ = ["Fit", "Solution"]
 
@@ -86,6 +87,7 @@ class Fit(Identified, Solution):
         open_terms: Uncertainties of the drive models; ``standard_covariance`` includes them.
         regressor_noise: Effect of position quantisation on least squares; None: negligible.
         runs: Information of each of three or more fitted logs on parameters that may vary.
+        variation: Variation of the drives' parameters between these logs.
     """
 
     estimator: EstimatorSettings
@@ -98,6 +100,7 @@ class Fit(Identified, Solution):
     open_terms: tuple[OpenTerm, ...] = ()
     regressor_noise: RegressorNoise | None = None
     runs: tuple[RunsOf, ...] = ()
+    variation: Variation | None = None
     _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
 
     def friction(
