@@ -178,12 +178,12 @@ def mjcf(model, pi, step):
         of = {term: pi[names.index(f"{joint}.{term}")] for term in model.layout.terms}
         frame, inertia = robot.jointPlacements[j], robot.inertias[j]
         x, y, z, w = pin.Quaternion(frame.rotation).coeffs()
-        I = inertia.inertia
+        moments = inertia.inertia
         axis = {"X": "1 0 0", "Y": "0 1 0", "Z": "0 0 1"}[robot.joints[j].shortname()[-1]]
         body += (
             f'<body pos="{numbers(frame.translation)}" quat="{numbers((w, x, y, z))}">'
             f'<inertial mass="{inertia.mass}" pos="{numbers(inertia.lever)}" fullinertia="'
-            f'{numbers((I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]))}"/>'
+            f'{numbers(moments[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)])}"/>'
             f'<joint name="{joint}" axis="{axis}" damping="{of["viscous"]}" '
             f'frictionloss="{of["coulomb"]}" armature="{of["armature"]}"/>'
         )
@@ -299,7 +299,8 @@ def unlike(count):
 class Plants:
     """Logs of arms that MuJoCo simulates: sets of 6 logs, and of 5 robots with 2 logs each.
 
-    Sets are drawn from a pool of as many logs, or robots, as there are sets.
+    Sets are drawn from a pool of as many logs, or robots, as there are sets. Alike logs are
+    compared about the fit to the whole pool.
     """
 
     def __init__(self, seed):
@@ -319,32 +320,35 @@ class Plants:
         log = recorded(self.model, own, self.rng, **changed)
         return hold_log(self.model, log, SignalSettings())
 
-    def vary(self, logs, unit):
-        return vary([str(k) for k in range(len(logs))], groups_of(self.model, logs, unit))
-
-    def fleet(self, pool, first=()):
-        """Return the variation of 5 robots, of a pool and those stated."""
-        chosen = self.rng.choice(len(pool), 5 - len(first), replace=False)
-        logs = [log for robot in (*first, *(pool[k] for k in chosen)) for log in robot]
-        return self.vary(logs, np.repeat(np.arange(5), 2))
+    def chosen(self, found, logs, unit):
+        """Return the variation of some logs of a pool, about the fit to all."""
+        own = [
+            replace(group, runs=replace(group.runs, H=group.runs.H[logs], h=group.runs.h[logs],
+                                        unit=np.array(unit)))
+            for group in found
+        ]  # fmt: skip
+        return vary([str(k) for k in range(len(logs))], own)
 
 
 def alike_logs(count):
     """Print how often one of 6 alike logs has a finding."""
     plants = Plants(0)
-    pool = [plants.log(plants.pi) for _ in range(count)]
-    alarms = 0
-    for _ in range(count):
-        chosen = plants.rng.choice(count, 6, replace=False)
-        alarms += bool(plants.vary([pool[k] for k in chosen], ["a"] * 6).unlike)
+    pool = groups_of(plants.model, [plants.log(plants.pi) for _ in range(count)], ["a"] * count)
+    sets = [plants.rng.choice(count, 6, replace=False) for _ in range(count)]
+    alarms = sum(bool(plants.chosen(pool, logs, [0] * 6).unlike) for logs in sets)
     print(f"| 6 alike logs | {count} | | {alarms} | {count - alarms} |", flush=True)
 
 
 def alike_fleets(count):
     """Print how often 5 alike robots have a finding."""
     plants = Plants(1)
-    pool = [[plants.log(own), plants.log(own)] for own in (plants.robot() for _ in range(count))]
-    found = [plants.fleet(pool) for _ in range(count)]
+    logs = [plants.log(own) for own in (plants.robot() for _ in range(count)) for _ in range(2)]
+    pool = groups_of(plants.model, logs, np.repeat(np.arange(count), 2))
+    found = []
+    for _ in range(count):
+        robots = plants.rng.choice(count, 5, replace=False)
+        own = np.column_stack([2 * robots, 2 * robots + 1]).ravel()
+        found.append(plants.chosen(pool, own, np.repeat(np.arange(5), 2)))
     of_robots, of_logs = (
         sum(bool(f.unlike_units) for f in found),
         sum(bool(f.unlike) for f in found),
@@ -365,7 +369,11 @@ def odd_fleets(count):
             changed = {"gain": {"gain": 1.15}, "payload": {"load": 1.0}}.get(kind, {})
             if kind == "friction":
                 own[plants.model.layout.names.index(f"{joint}.coulomb")] *= 3.0
-            each = plants.fleet(pool, ([plants.log(own, **changed), plants.log(own, **changed)],))
+            others = plants.rng.choice(len(pool), 4, replace=False)
+            logs = [plants.log(own, **changed), plants.log(own, **changed)]
+            logs += [log for k in others for log in pool[k]]
+            found = groups_of(plants.model, logs, np.repeat(np.arange(5), 2))
+            each = vary([str(k) for k in range(10)], found)
             cause = {"friction": "drive"}.get(kind, kind)
             is_right = [(x.run, x.kind) == (0, cause) for x in each.unlike_units]
             right += any(is_right)

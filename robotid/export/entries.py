@@ -9,6 +9,7 @@ import numpy as np
 from robotid._files import finite, source_entry
 from robotid.export.former_keys import with_former_keys
 from robotid.export.ranges import parameter_ranges
+from robotid.export.samples import covariance_entry
 from robotid.fitting.bands import QUANTILE, typical_friction
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.evaluation import Evaluation
@@ -96,6 +97,9 @@ def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[
             "segments": found.errors.segments,
             "inflation": found.errors.inflation,
         },
+        "covariance": covariance_entry(
+            found.model.layout.names, found.standard_covariance, found.at_bound
+        ),
         "motors": _motors(found, settings),
         "friction": {drive.joint: _friction(found, drive) for drive in found.drives},
         "consistency": {

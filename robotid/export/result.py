@@ -98,6 +98,7 @@ _SHAPE = {
     "ranges?": {"robot": TEXT, "drives": {...: TABLE}},
     "simulation?": {"controller": {"kind": TEXT, "rate?": MAYBE}},
     "own_terms?": {...: [TABLE]},
+    "covariance?": {"names": [TEXT], "root": [[NUMBER]]},
     "drive_moments?": {...: {"terms": [TEXT], "products": [[NUMBER]], "torque": NUMBER}},
     "identification": _METRICS,
     "validation": [{"log": TEXT, **_METRICS}],

@@ -28,6 +28,7 @@ _FREEDOM = 4.0  # degrees of freedom of the half Student prior of a standard dev
 _LEAST, _MOST = -6.0, 5.0  # logarithm of the standard deviations over their plausible size
 _GRID = np.linspace(_LEAST, _MOST, 45)
 _FIRST = -1.0  # the same at the start of the search
+_NEAR = 2.0  # ... and largest distance of a stated start: the gradient is small beyond
 _STEP = 1e-5  # of the numerical gradient
 _TAIL = 0.025  # probability beyond each end of an interval
 _WIDEST = 40.0  # standard deviations that contain every end
@@ -134,6 +135,7 @@ class MixedEffects:
 
     Attributes:
         runs: The runs.
+        first: Deviations at the start of their search, shape (levels or more, q); None: typical.
 
     References:
         Patterson, Thompson (1971), Recovery of inter-block information when block sizes are
@@ -142,6 +144,7 @@ class MixedEffects:
     """
 
     runs: Runs
+    first: Array | None = None
 
     @property
     def n_levels(self) -> int:
@@ -159,6 +162,9 @@ class MixedEffects:
             return -values[0], -(values[1:] - values[0]) / _STEP
 
         first, bounds = np.full(size, _FIRST), [(_LEAST, _MOST)] * size
+        if self.first is not None:
+            first = np.log(self.first[: self.n_levels] / self.runs.scale).ravel()
+            first = np.clip(first, _FIRST - _NEAR, _FIRST + _NEAR)
         found = scipy.optimize.minimize(
             objective, first, jac=True, method="L-BFGS-B", bounds=bounds
         )

@@ -165,9 +165,11 @@ def vary(
     if len(names) < FEWEST_RUNS or not groups:
         return None
     parameters: list[VaryingParameter] = []
-    for group in groups:
+    models = [MixedEffects(group.runs) for group in groups]
+    for group, model in zip(groups, models, strict=True):
         if group.group.kind == "drive":
-            parameters += _parameters(group)
+            parameters += _parameters(group, model)
+    pairs = list(zip(groups, models, strict=True))
     unit = groups[0].runs.unit
     n_units = int(unit.max()) + 1
     compared_units = range(n_units if n_units > FEWEST_RUNS else 0)
@@ -175,13 +177,13 @@ def vary(
     size = sum(group.runs.h.shape[1] for group in groups)
     n_tests = size * (len(compared_units) + len(compared_runs))
     unlike_units = [
-        found for u in compared_units if (found := _unlike(groups, u, n_tests, is_unit=True))
+        found for u in compared_units if (found := _unlike(pairs, u, n_tests, is_unit=True))
     ]
     different = {each.run for each in unlike_units}
     unlike = [
         found
         for run in compared_runs
-        if unit[run] not in different and (found := _unlike(groups, run, n_tests, is_unit=False))
+        if unit[run] not in different and (found := _unlike(pairs, run, n_tests, is_unit=False))
     ]
     return Variation(
         tuple(names), n_units, tuple(parameters), tuple(unlike),
@@ -243,9 +245,8 @@ def changes(values: Array, std_errors: Array) -> list[tuple[int, int, Prediction
     return sorted(found, key=lambda each: each[2].probability)
 
 
-def _parameters(group: RunsOf) -> Iterator[VaryingParameter]:
+def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter]:
     """Yield the parameters of a group on which the runs have information."""
-    model = MixedEffects(group.runs)
     values, errors = model.values
     known = np.einsum("kpp->p", group.runs.H) > 0.0
     for p, prediction in enumerate(model.with_one_more()):
@@ -261,23 +262,29 @@ def _parameters(group: RunsOf) -> Iterator[VaryingParameter]:
             )
 
 
-def _unlike(groups: Sequence[RunsOf], at: int, n_tests: int, *, is_unit: bool) -> UnlikeRun | None:
+def _unlike(
+    pairs: Sequence[tuple[RunsOf, MixedEffects]], at: int, n_tests: int, *, is_unit: bool
+) -> UnlikeRun | None:
     """Return how a run or a unit differs from the others; None if it does not."""
-    found = [each for group in groups for each in _compared(group, at, n_tests, is_unit=is_unit)]
+    found = [
+        each
+        for group, every in pairs
+        for each in _compared(group, every, at, n_tests, is_unit=is_unit)
+    ]
     return max(found, key=lambda each: each[0])[1] if found else None
 
 
 def _compared(
-    group: RunsOf, at: int, n_tests: int, *, is_unit: bool
+    group: RunsOf, every: MixedEffects, at: int, n_tests: int, *, is_unit: bool
 ) -> Iterator[tuple[float, UnlikeRun]]:
     """Yield the difference of a run or unit from the others, if any, and what it explains."""
     runs = group.runs
     if is_unit:
-        others, own = MixedEffects(runs.without_unit(at)), runs.of_unit(at)
+        others, own = MixedEffects(runs.without_unit(at), every.deviation), runs.of_unit(at)
         x, covariance = others.estimate_unit(own)
         information = own.H.sum(axis=0)
     else:
-        others, information = MixedEffects(runs.without(at)), runs.H[at]
+        others, information = MixedEffects(runs.without(at), every.deviation), runs.H[at]
         covariance = np.linalg.inv(information + np.diag((UNKNOWN * runs.scale) ** -2.0))
         x = covariance @ runs.h[at]
     variance = np.diag(covariance)
