@@ -20,9 +20,11 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 import mujoco
 import numpy as np
 import pinocchio as pin
+from scipy.linalg import block_diag
 
 from robotid.commands.job import LogEntry, read_job
 from robotid.commands.logs import survey_logs
+from robotid.fitting.bands import expected_band
 from robotid.fitting.fit import solve_recordings
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
@@ -35,9 +37,10 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.families import wanted_families
 from robotid.robot.model import RobotModel
 from robotid.simulation.motions import random_fourier
+from robotid.variation.draws import correlated_scores, scores_to_values
 from robotid.variation.groups import runs_of
 from robotid.variation.mixed_effects import UNKNOWN, MixedEffects
-from robotid.variation.variation import vary
+from robotid.variation.variation import SCORES, vary
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"
 UNLOADED = (
@@ -46,6 +49,7 @@ UNLOADED = (
 )  # fmt: skip
 JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")
 WITHIN, BETWEEN = 0.05, 0.15  # spread of friction between runs, between robots
+COMMON = 0.7  # correlation of frictions between robots
 KINDS = ("friction", "gain", "payload")
 
 
@@ -55,8 +59,8 @@ def main():
     options = parser.parse_args()
     if "ROBOTID_DATA" not in os.environ:
         sys.exit("set ROBOTID_DATA to the folder of the recordings")
-    print("| recordings | logs | 95 % of the next log | of the mean alone | parameters |")
-    print("|---|---|---|---|---|")
+    print("| recordings | logs | 95 % of the next log | of the mean | parameters | 95 % jointly |")
+    print("|---|---|---|---|---|---|")
     for name, entries in recordings():
         left_out(name, entries, 1 if options.quick else len(entries))
     print()
@@ -79,26 +83,105 @@ def recordings():
 
 
 def left_out(name, entries, count):
-    """Print how often drive parameters of a log are within what the other logs predict."""
+    """Print how well the other logs predict the drives and the torque of a log."""
     job = read_job(JOBS / f"{name}.toml")
     job = replace(job, identification=tuple(entries), validation=())
     model = job.model()
     (logs,) = survey_logs(job, model, entries)
-    inside = alike = total = 0
+    inside = alike = total = joint = 0
+    errors, rows = [], []
+    rng = np.random.default_rng(0)
     for k in range(count):
         others = [log for j, log in enumerate(logs) if j != k]
-        some = Recordings(model, structural_mapping(model), others)
+        some = Recordings(model, structural_mapping(model), others, [logs[k]])
         fit = with_drives(some, job.estimator, wanted_families(job.friction, model.joints))
+        fit = replace(fit, variation=vary([str(j) for j in range(len(others))], fit.runs))
+        error, share = torque_errors(fit)
+        errors.append(error)
+        rows.append(share)
         every = some.with_model(fit.model)
         every = replace(every, fitted=[log.with_model(fit.model) for log in logs])
         segments = [every.segments(j, log.whole.trajectory) for j, log in enumerate(every.fitted)]
         unit = np.zeros(len(logs), int)
-        for group in runs_of(fit.model, every.mapping, segments, fit.standard, fit.wls.sigma, unit):
-            if group.group.kind == "drive":
-                found = compared(group.runs, k)
-                inside, alike, total = np.add((inside, alike, total), found)
+        found = runs_of(fit.model, every.mapping, segments, fit.standard, fit.wls.sigma, unit)
+        drives = [group for group in found if group.group.kind == "drive"]
+        for group in drives:
+            inside, alike, total = np.add((inside, alike, total), compared(group.runs, k))
+        joint += fit.variation is not None and is_likely(drives, k, rng)
     print(f"| {name} | {len(logs)} | {100 * inside / total:.1f} % | {100 * alike / total:.1f} % "
-          f"| {total} |", flush=True)  # fmt: skip
+          f"| {total} | {joint} of {count} |", flush=True)  # fmt: skip
+    if fit.between is None:
+        return
+    errors, rows = np.array(errors), np.nanmean(rows, axis=(0, 2))
+    ratio = np.exp(np.nanmean(np.log(errors), axis=(0, 2)))
+    print(f"  torque of the log left out, measured RMSE over expected, geometric mean: with spread "
+          f"{ratio[0]:.2f}, without {ratio[1]:.2f}; rows within 95 %: {100 * rows[0]:.1f} %, "
+          f"{100 * rows[1]:.1f} %", flush=True)  # fmt: skip
+
+
+def torque_errors(fit):
+    """Return measured over expected RMSE, and the share of rows in the band, shapes (2, n).
+
+    Of the validation log, with the spread between logs and without it.
+    """
+    (log,) = fit.validation
+    motion, mask = log.recording.trajectory, log.recording.mask
+    ratios, shares = [], []
+    for between in (fit.between, None):
+        band = expected_band(fit, log, between)
+        used = mask[band.samples]
+        residual = (motion.tau - log.torques["estimate"])[band.samples]
+        count = np.where(used.sum(axis=0) > 20, used.sum(axis=0), np.nan)
+        measured = np.sqrt((residual**2 * used).sum(axis=0) / count)
+        expected = np.sqrt((band.total**2 * used).sum(axis=0) / count)
+        ratios.append(measured / expected)
+        shares.append(np.where(count > 0, band.coverage(motion.tau, log.torques["estimate"], mask),
+                               np.nan))  # fmt: skip
+    return ratios, shares
+
+
+def is_likely(drives, k, rng):
+    """Return whether a run is among the 95 % of draws nearest to the mean, all drives together.
+
+    Distances are Mahalanobis distances by the covariance of the draws. Values that the run hardly
+    determines are left out.
+    """
+    others = [replace(group, runs=group.runs.without(k)) for group in drives]
+    names = [str(j) for j in range(len(others[0].runs.h))]
+    variation = vary(names, others)
+    at = {each.name: j for j, each in enumerate(variation.parameters)}
+    truth, errors, order = [], [], []
+    for group in drives:
+        runs = group.runs
+        C = np.linalg.inv(runs.H[k] + np.diag((UNKNOWN * runs.scale) ** -2.0))
+        x, known = C @ runs.h[k] + group.centre, np.sqrt(np.diag(C)) < runs.scale
+        own = [p for p in np.flatnonzero(known) if group.group.parameters[p] in at]
+        truth += x[own].tolist()
+        errors.append(C[np.ix_(own, own)])
+        order += [at[group.group.parameters[p]] for p in own]
+    draws = drawn(variation, 4000, rng)[:, order]
+    noise = rng.standard_normal(draws.shape) @ np.linalg.cholesky(block_diag(*errors)).T
+    return mahalanobis_rank(draws + noise, np.array(truth)) < 0.95
+
+
+def drawn(variation, count, rng):
+    """Return draws of the drive parameters of the next run or robot, shape (count, m)."""
+    found = [each.prediction for each in variation.parameters]
+    share = np.array([(2 * 1.96 * each.std_error / np.ptp(each.ends)) ** 2 for each in found])
+    size = (count, len(found))
+    z = correlated_scores(rng.standard_normal(size), np.minimum(share, 1.0),
+                          variation.correlation, rng.standard_normal(size))  # fmt: skip
+    return np.column_stack([
+        scores_to_values(z[:, p], SCORES, each.quantiles(SCORES), -np.inf)
+        for p, each in enumerate(found)
+    ])  # fmt: skip
+
+
+def mahalanobis_rank(draws, x):
+    """Return the share of draws that are nearer to the mean than x."""
+    mean, P = draws.mean(axis=0), np.linalg.inv(np.cov(draws.T))
+    distance = np.einsum("ki,ij,kj->k", draws - mean, P, draws - mean)
+    return np.mean(distance < (x - mean) @ P @ (x - mean))
 
 
 def compared(runs, k):
@@ -235,13 +318,20 @@ def fleets(count):
     """Print coverage for the next robot and of the spreads, of 20 robots with 5 runs each."""
     model, pi, friction = arm()
     names, units, runs = model.layout.names, 20, 5
-    nexts, spreads, total = 0, 0, 0
+    nexts, spreads, total, joint, box = 0, 0, 0, [], []
+
+    def another(rng):
+        """Return a robot; frictions of robots correlate by COMMON."""
+        own, size = pi.copy(), len(friction)
+        deviation = np.sqrt(COMMON) * rng.normal() + np.sqrt(1 - COMMON) * rng.normal(size=size)
+        own[friction] *= 1 + BETWEEN * deviation
+        return own
+
     for seed in range(count):
         rng = np.random.default_rng(seed)
         logs, robots = [], []
         for u in range(units + 1):
-            robot = pi.copy()
-            robot[friction] *= 1 + BETWEEN * rng.normal(size=len(friction))
+            robot = another(rng)
             robots.append(robot)
             for _ in range(runs if u < units else 0):
                 own = robot.copy()
@@ -259,8 +349,25 @@ def fleets(count):
                 first, last = each.prediction.spread_ends
                 spreads += first < BETWEEN * pi[k] < last
                 total += 1
+        own = [
+            p for p, each in enumerate(variation.parameters) if names.index(each.name) in friction
+        ]
+        order = [names.index(variation.parameters[p].name) for p in own]
+        draws = drawn(variation, 4000, rng)[:, own]
+        alone = np.column_stack([rng.permutation(x) for x in draws.T])  # a box: no correlation
+        for _ in range(20):
+            left = another(rng)
+            x = left[order] + WITHIN * pi[order] * rng.normal(size=len(order))
+            joint.append(mahalanobis_rank(draws, x))
+            box.append(mahalanobis_rank(alone, x))
     print(f"| {count} fleets of {units} robots, {runs} runs each | of {total} |")
     print("|---|---|")
+    for words, ranks in (("samples", joint), ("samples without correlation", box)):
+        ranks = np.array(ranks)
+        print(
+            f"| robots left out, jointly within 95 % (50 %) of {words} | "
+            f"{100 * np.mean(ranks < 0.95):.0f} % ({100 * np.mean(ranks < 0.5):.0f} %) |"
+        )
     print(f"| next robot within 95 % | {100 * nexts / total:.0f} % |")
     print(
         f"| spread between robots within its 95 % | {100 * spreads / total:.0f} % |\n", flush=True

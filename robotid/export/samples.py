@@ -137,12 +137,11 @@ def sample(result: "Result", count: int, rng: np.random.Generator) -> tuple[list
 
     def is_possible(x: Array) -> Array:
         drawn = nominal + x
-        signs = (drawn[:, is_bounded] >= 0.0).all(axis=1)
-        signs &= (drawn[:, is_positive] > 0.0).all(axis=1)
+        signs: Array = (drawn[:, is_bounded] >= 0.0).all(axis=1)
+        signs = signs & (drawn[:, is_positive] > 0.0).all(axis=1)
         bodies = (drawn[:, : model.layout.n_inertial] - held).reshape(-1)
         eigenvalues = np.linalg.eigvalsh(pseudo_inertia(bodies)).reshape(len(x), -1)
-        possible: Array = signs & (eigenvalues > 0.0).all(axis=1)
-        return possible
+        return np.asarray(signs & (eigenvalues > 0.0).all(axis=1))
 
     x = possible_draws(root, is_possible, count, rng)
     drawn = nominal + x

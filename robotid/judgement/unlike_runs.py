@@ -55,8 +55,8 @@ _UNIT_REMEDY = {
     "identify this robot alone",
     "gain": "Its torque constant or sensor differs: correct its torque, or identify this robot "
     "alone",
-    "drive": "Its drive may be worn, cold, or of another version: identify this robot alone, or use "
-    "the interval of the next robot",
+    "drive": "Its drive may be worn, cold, or of another version: identify this robot alone, or "
+    "use the interval of the next robot",
 }
 
 

@@ -100,4 +100,4 @@ def scores_to_values(z: Array, scores: Array, quantiles: Array, least: float) ->
     values = np.interp(z, scores, quantiles)
     values = values + slope[0] * np.minimum(z - scores[0], 0.0)
     values = values + slope[-1] * np.maximum(z - scores[-1], 0.0)
-    return np.maximum(values, least)
+    return np.asarray(np.maximum(values, least))

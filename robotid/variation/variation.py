@@ -1,6 +1,6 @@
 """Variation of parameters between runs: spreads, the next run, runs that are unlike the others."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -11,12 +11,22 @@ from robotid._typing import Array
 from robotid.variation.groups import FEWEST_RUNS, RunsOf
 from robotid.variation.mixed_effects import UNKNOWN, MixedEffects, Prediction, Runs
 
-__all__ = ["SCORES", "UnlikeRun", "Variation", "VaryingParameter", "changes", "vary"]
+__all__ = [
+    "SCORES",
+    "UnlikeRun",
+    "Variation",
+    "VaryingParameter",
+    "between_covariance",
+    "changes",
+    "shrunk_correlation",
+    "vary",
+]
 
 #: Standard normal scores at which result.json has the quantiles of the predictive distribution.
 SCORES = np.linspace(-3.5, 3.5, 15)
 _CHANGE = 0.05  # plausible standard deviation of a parameter between results, over its size
 _FALSE_ALARMS = 0.02  # probability that one of alike runs or units is named
+_WIDTH = 2 * 1.959964  # of a 95 % interval [standard deviations]
 _LEAST_SHRUNK = 1e-3  # smallest share of the shrinkage: the correlation has an inverse
 
 
@@ -189,6 +199,36 @@ def vary(
         tuple(names), n_units, tuple(parameters), tuple(unlike),
         tuple(units) or tuple(map(str, range(n_units))), tuple(unlike_units), tuple(unit.tolist()),
     )  # fmt: skip
+
+
+def between_covariance(
+    variation: Mapping[str, Any], names: Sequence[str], covariance: Array
+) -> Array:
+    """Return the covariance of parameters in the next run that the fit to all runs lacks.
+
+    With the variance of the fit, it gives each drive parameter the variance of a normal
+    distribution whose 95 % interval is as wide as the prediction interval.
+
+    Args:
+        variation: As of ``Variation.to_dict``.
+        names: Names of p parameters.
+        covariance: Their covariance by the fit, shape (p, p).
+
+    Returns:
+        Shape (p, p); 0 for parameters that do not vary.
+    """
+    at = {name: k for k, name in enumerate(names)}
+    parameters = variation["parameters"]
+    own = [k for k, name in enumerate(parameters) if name in at]
+    places = [at[name] for name in parameters if name in at]
+    entries = [entry for name, entry in parameters.items() if name in at]
+    width = np.array([np.ptp(entry["next_interval"]) for entry in entries])
+    variance = (width / _WIDTH) ** 2 - np.diag(covariance)[places]
+    std = np.sqrt(np.maximum(variance, 0.0))
+    found = np.zeros_like(covariance)
+    R = np.array(variation["correlation"])[np.ix_(own, own)]
+    found[np.ix_(places, places)] = std[:, None] * R * std
+    return found
 
 
 def shrunk_correlation(values: Array) -> Array:
