@@ -137,8 +137,9 @@ def sample(result: "Result", count: int, rng: np.random.Generator) -> tuple[list
 
     def is_possible(x: Array) -> Array:
         drawn = nominal + x
-        signs: Array = (drawn[:, is_bounded] >= 0.0).all(axis=1)
-        signs = signs & (drawn[:, is_positive] > 0.0).all(axis=1)
+        signs = (drawn[:, is_bounded] >= 0.0).all(axis=1) & (drawn[:, is_positive] > 0.0).all(
+            axis=1
+        )
         bodies = (drawn[:, : model.layout.n_inertial] - held).reshape(-1)
         eigenvalues = np.linalg.eigvalsh(pseudo_inertia(bodies)).reshape(len(x), -1)
         return np.asarray(signs & (eigenvalues > 0.0).all(axis=1))
