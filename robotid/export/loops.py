@@ -42,6 +42,7 @@ def loop_entries(found: LoopIdentification) -> dict[str, Any]:
         "ranges": {"undetermined": [*unfitted, *found.undetermined]},
         "loop_parameters": _loop_parameters(found),
         "covariance": _covariance(found),
+        **({} if found.variation is None else {"variation": found.variation.to_dict()}),
         "validation": [
             {"log": run.log.path, "name": run.name, **position_metrics(model, (run,)).to_dict()}
             for run in found.validation

@@ -133,7 +133,9 @@ def sample(result: "Result", count: int, rng: np.random.Generator) -> tuple[list
     held, terms = held_parameters(model), [name.rpartition(".")[2] for name in names]
     is_positive = np.isin(terms, _POSITIVE) & (np.arange(len(names)) >= size)
     is_bounded = np.isin(terms, _NOT_NEGATIVE) | is_positive
-    is_bounded[:size] = model.layout.is_nonnegative() & ~np.array(spread[:size], dtype=bool)
+    is_bounded[:size] = model.layout.is_nonnegative()
+    signed, varies = is_bounded.copy(), np.array(spread, dtype=bool)  # drawn anew below
+    is_bounded, is_positive = is_bounded & ~varies, is_positive & ~varies
 
     def is_possible(x: Array) -> Array:
         drawn = nominal + x
@@ -156,8 +158,7 @@ def sample(result: "Result", count: int, rng: np.random.Generator) -> tuple[list
         R = np.array(result.content["variation"]["correlation"])[np.ix_(order, order)]
         z = correlated_scores(scores, share, R, rng.standard_normal(scores.shape))
         for k, (i, name) in enumerate(zip(at.tolist(), own, strict=True)):
-            is_nonnegative = model.layout.is_nonnegative()[i]
-            least = 0.0 if is_nonnegative else -math.inf
+            least = 0.0 if signed[i] else -math.inf
             drawn[:, i] = scores_to_values(z[:, k], SCORES, between[name]["quantiles"], least)
     return names, drawn
 

@@ -40,6 +40,7 @@ _BESIDE = {
     "steady": "constant\nspeed %",
 }
 _NO_REPORT = "robotid.write_report(found, 'report.html') writes the whole report"
+_SHOWN_SPREADS = ("coulomb", "viscous", "kp", "kd", "delay")
 
 
 def identification_line(found: Identified, estimator: str, status: str) -> str:
@@ -134,7 +135,7 @@ def variation_lines(variation: Mapping[str, Any] | None) -> list[str]:
     shares: dict[str, list[float]] = {}
     for name, found in variation["parameters"].items():
         term = name.rpartition(".")[2]
-        if term in ("coulomb", "viscous") and abs(found["mean"]) > found["std_error"]:
+        if term in _SHOWN_SPREADS and abs(found["mean"]) > found["std_error"]:
             shares.setdefault(term, []).append(100 * found["spread"] / abs(found["mean"]))
     if not shares:
         return []

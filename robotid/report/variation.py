@@ -1,29 +1,29 @@
 """Section on the variation of drive parameters between logs."""
 
+from collections.abc import Mapping
 from html import escape
 
 import numpy as np
 
-from robotid.fitting.bands import next_errors
-from robotid.identification.result import Identification
 from robotid.pages.html import Cell, code, table, text, with_error
-from robotid.variation.variation import VaryingParameter
+from robotid.variation.variation import Variation, VaryingParameter
 
 __all__ = ["variation_section"]
 
 _ROOM = 0.15  # of the prediction interval, beyond the farthest mark
 
 
-def variation_section(found: Identification) -> str:
+def variation_section(variation: Variation | None, torques: Mapping[str, str]) -> str:
     """Return the values of drive parameters in each log, and the prediction of the next log.
 
     Args:
-        found: The identification.
+        variation: The variation between logs.
+        torques: Expected RMS torque error of the next log with its unit, by joint; none for a
+            result from commands.
 
     Returns:
         HTML; "" for fewer than three logs.
     """
-    variation = found.variation
     if variation is None:
         return ""
     different = {(each.run, each.name) for each in variation.unlike}
@@ -43,11 +43,11 @@ def variation_section(found: Identification) -> str:
         "range. Links are the same in all logs. Last columns: expected error of the mean, and "
         f"width from low to high, with one more {one}, in % of those of today.</p>\n"
     )
-    rows_of = zip(found.model.row_names, found.model.row_units, next_errors(found), strict=True)
-    torques = ", ".join(f"{escape(row)} {error:.3g} {unit}" for row, unit, error in rows_of)
-    intro += (
-        f"<p>Expected RMS torque error of the next {one}, on motions like these: {torques}.</p>\n"
-    )
+    if torques:
+        own = ", ".join(f"{escape(row)} {error}" for row, error in torques.items())
+        intro += (
+            f"<p>Expected RMS torque error of the next {one}, on motions like these: {own}.</p>\n"
+        )
     return intro + table(caption, headers, rows, is_data=True)
 
 

@@ -12,7 +12,7 @@ from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import hold_log
 from robotid.judgement.unlike_runs import unlike_findings
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.variation.groups import Group, RunsOf, _inflation, runs_of
+from robotid.variation.groups import Group, RunsOf, inflation_of, runs_of
 from robotid.variation.mixed_effects import Runs
 from robotid.variation.variation import (
     UnlikeRun,
@@ -134,7 +134,7 @@ def test_inflation_is_1_for_independent_rows():
             A = rng.normal(size=(4, rows, 3))
             e = 1.5 * rng.normal(size=(4, rows))
             runs.append((np.einsum("sri,srj->sij", A, A), np.einsum("sri,sr->si", A, e)))
-        found.append(_inflation(runs))
+        found.append(inflation_of(runs))
     assert np.mean(found) == pytest.approx(1.5**2, rel=0.06)
 
 
@@ -287,6 +287,10 @@ def test_the_unit_that_differs_is_named_and_its_logs_are_not():
     assert finding.message.endswith("remove the load, or identify this robot alone")
     content = found.to_dict()
     assert [each["run"] for each in content["unlike_units"]] == ["arm-3"]
+    single, _ = units_of(np.random.default_rng(0), np.array([9.0, 0.0]), units=7, runs=1)
+    found = vary(names[:7], [single])
+    assert [each.run for each in found.unlike_units] == [3]
+    assert found.unlike == ()
     alike, _ = units_of(np.random.default_rng(1), np.zeros(2))
     assert vary(names, [alike], []).unlike_units == ()
 
