@@ -450,11 +450,10 @@ def stated_between(result: Mapping[str, Any], model: RobotModel) -> Array | None
     Returns:
         Shape (p, p); None for fewer than three fitted logs, or if an earlier version wrote it.
     """
-    names = model.layout.names
-    C, variation = stated_covariance(result, names), result.get("variation")
-    if C is None or variation is None or "correlation" not in variation:
+    variation = result.get("variation")
+    if variation is None or "correlation" not in variation:
         return None
-    return between_covariance(variation, names, C)
+    return between_covariance(variation, model.layout.names)
 
 
 def stated_model(result: Mapping[str, Any], model: RobotModel) -> RobotModel:

@@ -233,8 +233,7 @@ class Fit(Identified, Solution):
         """
         if self.variation is None:
             return None
-        C = self.standard_covariance
-        return between_covariance(self.variation.to_dict(), self.model.layout.names, C)
+        return between_covariance(self.variation.to_dict(), self.model.layout.names)
 
     @cached_property
     def _bands(self) -> tuple[TorqueBand, ...]:

@@ -26,7 +26,6 @@ __all__ = [
 SCORES = np.linspace(-3.5, 3.5, 15)
 _CHANGE = 0.05  # plausible standard deviation of a parameter between results, over its size
 _FALSE_ALARMS = 0.02  # probability that one of alike runs or units is named
-_WIDTH = 2 * 1.959964  # of a 95 % interval [standard deviations]
 _LEAST_SHRUNK = 1e-3  # smallest share of the shrinkage: the correlation has an inverse
 
 
@@ -201,18 +200,15 @@ def vary(
     )  # fmt: skip
 
 
-def between_covariance(
-    variation: Mapping[str, Any], names: Sequence[str], covariance: Array
-) -> Array:
+def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Array:
     """Return the covariance of parameters in the next run that the fit to all runs lacks.
 
-    With the variance of the fit, it gives each drive parameter the variance of a normal
-    distribution whose 95 % interval is as wide as the prediction interval.
+    Standard deviations are the medians of the spreads: between runs, or between units and between
+    the runs of a unit.
 
     Args:
         variation: As of ``Variation.to_dict``.
         names: Names of p parameters.
-        covariance: Their covariance by the fit, shape (p, p).
 
     Returns:
         Shape (p, p); 0 for parameters that do not vary.
@@ -222,10 +218,9 @@ def between_covariance(
     own = [k for k, name in enumerate(parameters) if name in at]
     places = [at[name] for name in parameters if name in at]
     entries = [entry for name, entry in parameters.items() if name in at]
-    width = np.array([np.ptp(entry["next_interval"]) for entry in entries])
-    variance = (width / _WIDTH) ** 2 - np.diag(covariance)[places]
-    std = np.sqrt(np.maximum(variance, 0.0))
-    found = np.zeros_like(covariance)
+    spreads = [(entry["spread"], entry.get("spread_within_units", 0.0)) for entry in entries]
+    std = np.hypot(*np.array(spreads).reshape(-1, 2).T)
+    found = np.zeros((len(names), len(names)))
     R = np.array(variation["correlation"])[np.ix_(own, own)]
     found[np.ix_(places, places)] = std[:, None] * R * std
     return found

@@ -302,24 +302,18 @@ def test_three_units_are_not_compared():
 
 def test_spread_of_drives_adds_to_the_covariance_of_the_fit():
     names = ["link.m", "b.coulomb", "a.viscous", "a.coulomb"]
-    C = np.diag([9.0, 0.04, 0.01, 4.0])
-    width = 2 * 1.959964
     variation = {
         "parameters": {
-            "a.viscous": {"next_interval": [1.0, 1.0 + 0.5 * width]},
-            "c.viscous": {"next_interval": [0.0, 1.0]},
-            "b.coulomb": {"next_interval": [-1.0, -1.0 + 0.3 * width]},
-            "a.coulomb": {"next_interval": [2.0, 2.0 + 1.0 * width]},
+            "a.viscous": {"spread": 0.5},
+            "c.viscous": {"spread": 9.0},
+            "b.coulomb": {"spread": 0.3, "spread_within_units": 0.4},
         },
-        "correlation": [
-            [1.0, 0.1, -0.6, 0.2], [0.1, 1, 0.1, 0.1], [-0.6, 0.1, 1.0, 0], [0.2, 0.1, 0, 1.0]
-        ],
-    }  # fmt: skip
-    a, b = np.sqrt(0.25 - 0.01), np.sqrt(0.09 - 0.04)
+        "correlation": [[1.0, 0.1, -0.6], [0.1, 1.0, 0.2], [-0.6, 0.2, 1.0]],
+    }
     wanted = np.zeros((4, 4))
-    wanted[2, 2], wanted[1, 1] = a * a, b * b
-    wanted[1, 2] = wanted[2, 1] = -0.6 * a * b  # a.coulomb: the fit is less certain already
-    assert between_covariance(variation, names, C) == pytest.approx(wanted, abs=1e-9)
+    wanted[2, 2], wanted[1, 1] = 0.25, 0.25
+    wanted[1, 2] = wanted[2, 1] = -0.6 * 0.25
+    assert between_covariance(variation, names) == pytest.approx(wanted, abs=1e-12)
 
 
 def test_correlation_is_that_between_logs_or_between_units():
