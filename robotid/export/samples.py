@@ -75,8 +75,7 @@ def write_samples(result: "Result", target: Path, count: int, seed: int) -> None
         raise SettingsError(f"seed is {seed}, wanted a whole number, 0 or more")
     names, values = sample(result, count, np.random.default_rng(seed))
     model, pi = result.identified
-    entries = (*result.content["standard_parameters"], *result.content["drive_parameters"])
-    units = {entry["name"]: entry["unit"] for entry in entries}
+    units = {entry["name"]: entry["unit"] for entry in result.content["drive_parameters"]}
     covariance = np.cov(values.T) if count > 1 else np.zeros((len(names),) * 2)
     content = {
         "robot": model.name,
@@ -87,7 +86,7 @@ def write_samples(result: "Result", target: Path, count: int, seed: int) -> None
         "projected_drives": _projected(result, values),
         "parameters": {
             "names": names,
-            "units": [units[name] for name in names],
+            "units": [*model.layout.units, *(units[name] for name in names[len(pi) :])],
             "nominal": [*pi.tolist(), *_nominal(result, names[len(pi) :])],
             "mean": values.mean(axis=0).tolist(),
             "covariance": covariance.tolist(),

@@ -6,12 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
+from helpers.commanded_results import written_result
+from helpers.mujoco_plant import plant
 
 import robotid
 from robotid.cli import main
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
-from robotid.export.samples import sample
+from robotid.export.samples import sample, write_samples
 from robotid.robot.parameters import pseudo_inertia
 from robotid.variation.variation import SCORES
 
@@ -143,3 +145,41 @@ def test_results_of_earlier_versions_have_no_covariance(folder):
     content = {key: value for key, value in result.content.items() if key != "covariance"}
     with pytest.raises(DataError, match="of an earlier version has no covariance; identify"):
         sample(replace(result, content=content), 3, np.random.default_rng(0))
+
+
+def test_samples_of_gains_are_positive_and_vary_with_the_logs(tmp_path):
+    leg = plant("leg", np.random.default_rng(0), delay=0.004)
+    result = load_result(written_result(leg, tmp_path / "out"))
+    names, first = list(result.robot.layout.names), leg.drives[0]
+    own = [f"{first.joint}.delay", f"{first.joint}.kp", f"{leg.drives[1].joint}.kp"]
+    root = [[]] * len(names) + [[0.004], [0.0, 0.5], [0.0, 0.3, 0.4]]
+    spread = 0.8 * first.kp
+    variation = {
+        "parameters": {
+            own[1]: {
+                "std_error": 0.1 * spread,
+                "next_interval": [first.kp - 1.96 * spread, first.kp + 1.96 * spread],
+                "next_quantiles": (first.kp + spread * SCORES).tolist(),
+            }
+        },
+        "correlation": [[1.0]],
+    }
+    stated = {"covariance": {"names": [*names, *own], "root": root}, "variation": variation}
+    every, values = sample(
+        replace(result, content={**result.content, **stated}), 1500, np.random.default_rng(2)
+    )
+    assert every == [*names, *own]
+    assert (values[:, : len(names)] == result.parameters).all()
+    delay, kp, other = values[:, len(names) :].T
+    half = scipy.stats.truncnorm(-1.0, np.inf, 0.004, 0.004)
+    assert scipy.stats.kstest(delay, half.cdf).pvalue > 1e-3
+    wide = scipy.stats.truncnorm(-1 / 0.8, np.inf, first.kp, spread)
+    assert scipy.stats.kstest(kp, wide.cdf).pvalue > 1e-3
+    assert other.std() == pytest.approx(0.5, rel=0.1)
+    # of the error of the mean, a tenth of the deviation, the other gain knows 0.6
+    assert np.corrcoef(kp, other)[0, 1] == pytest.approx(0.06, abs=0.08)
+    plain = replace(result, content={**result.content, "covariance": stated["covariance"]})
+    write_samples(plain, tmp_path / "x.json", 20, 1)
+    content = json.loads((tmp_path / "x.json").read_text())
+    assert content["parameters"]["units"][-3:] == ["s", "N m/rad", "N m/rad"]
+    assert len(content["drives"][first.joint]["kp"]) == 20
