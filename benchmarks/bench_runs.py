@@ -2,8 +2,12 @@
 
 Recordings: each log is left out of the fit; its drive parameters are compared with the 95 %
 prediction interval of the other logs, and with the interval of their mean alone, as if runs were
-alike. Simulated arms (Pinocchio's inverse dynamics, not the regressor): coverage for the next robot
-and of the spreads, causes named in runs that differ, false alarms in runs that do not.
+alike; all of them together with draws of their joint distribution; its torque error with the
+expected one. Servos: the fit is to all logs, the prediction from the others to first order.
+Simulated arms (Pinocchio's inverse dynamics, not the regressor): coverage for the next robot, one
+by one and jointly, and of the spreads; causes named in runs that differ, false alarms in runs that
+do not. Arms in MuJoCo (0.1 ms, torque held for 1 ms, encoders of 18 bits): false alarms for logs
+and robots, causes named in robots that differ.
 
     ROBOTID_DATA=folder python benchmarks/bench_runs.py [--quick]
 """
@@ -13,15 +17,21 @@ import os
 import sys
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
+import mujoco
 import numpy as np
 import pinocchio as pin
+from scipy.linalg import block_diag
 
-from robotid.commands.job import LogEntry, read_job
+from robotid.closed_loop.runs import loop_runs
+from robotid.commands.identify import run_job
+from robotid.commands.job import LogEntry, job_from_settings, read_job
 from robotid.commands.logs import survey_logs
+from robotid.fitting.bands import expected_band
 from robotid.fitting.fit import solve_recordings
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
@@ -34,17 +44,23 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.families import wanted_families
 from robotid.robot.model import RobotModel
 from robotid.simulation.motions import random_fourier
+from robotid.variation.draws import correlated_scores, scores_to_values
 from robotid.variation.groups import runs_of
 from robotid.variation.mixed_effects import UNKNOWN, MixedEffects
-from robotid.variation.variation import vary
+from robotid.variation.variation import SCORES, vary
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"
 UNLOADED = (
     "ident_20200210_30s12h", "ident_20200212_50s12h", "ident_20200219_14harm", "val_ptp10",
     *(f"jointwise_{k}" for k in range(1, 7)),
 )  # fmt: skip
+SERVOS = {
+    "shoulder_pan": "Rotation", "shoulder_lift": "Pitch", "elbow_flex": "Elbow",
+    "wrist_flex": "Wrist_Pitch", "wrist_roll": "Wrist_Roll", "gripper": "Jaw",
+}  # fmt: skip
 JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")
 WITHIN, BETWEEN = 0.05, 0.15  # spread of friction between runs, between robots
+COMMON = 0.7  # correlation of frictions between robots
 KINDS = ("friction", "gain", "payload")
 
 
@@ -54,13 +70,19 @@ def main():
     options = parser.parse_args()
     if "ROBOTID_DATA" not in os.environ:
         sys.exit("set ROBOTID_DATA to the folder of the recordings")
-    print("| recordings | logs | 95 % of the next log | of the mean alone | parameters |")
-    print("|---|---|---|---|---|")
+    print("| recordings | logs | 95 % of the next log | of the mean | parameters | 95 % jointly |")
+    print("|---|---|---|---|---|---|")
     for name, entries in recordings():
         left_out(name, entries, 1 if options.quick else len(entries))
+    if not options.quick:
+        servos()
     print()
     fleets(1 if options.quick else 5)
     unlike(1 if options.quick else 20)
+    print("| arms in MuJoCo | sets | named | another | none |\n|---|---|---|---|---|")
+    alike_logs(6 if options.quick else 150)
+    alike_fleets(6 if options.quick else 150)
+    odd_fleets(1 if options.quick else 20)
 
 
 def recordings():
@@ -74,26 +96,126 @@ def recordings():
 
 
 def left_out(name, entries, count):
-    """Print how often drive parameters of a log are within what the other logs predict."""
+    """Print how well the other logs predict the drives and the torque of a log."""
     job = read_job(JOBS / f"{name}.toml")
     job = replace(job, identification=tuple(entries), validation=())
     model = job.model()
     (logs,) = survey_logs(job, model, entries)
-    inside = alike = total = 0
+    inside = alike = total = joint = 0
+    errors, rows = [], []
+    rng = np.random.default_rng(0)
     for k in range(count):
         others = [log for j, log in enumerate(logs) if j != k]
-        some = Recordings(model, structural_mapping(model), others)
+        some = Recordings(model, structural_mapping(model), others, [logs[k]])
         fit = with_drives(some, job.estimator, wanted_families(job.friction, model.joints))
+        fit = replace(fit, variation=vary([str(j) for j in range(len(others))], fit.runs))
+        error, share = torque_errors(fit)
+        errors.append(error)
+        rows.append(share)
         every = some.with_model(fit.model)
         every = replace(every, fitted=[log.with_model(fit.model) for log in logs])
         segments = [every.segments(j, log.whole.trajectory) for j, log in enumerate(every.fitted)]
         unit = np.zeros(len(logs), int)
-        for group in runs_of(fit.model, every.mapping, segments, fit.standard, fit.wls.sigma, unit):
-            if group.group.kind == "drive":
-                found = compared(group.runs, k)
-                inside, alike, total = np.add((inside, alike, total), found)
+        found = runs_of(fit.model, every.mapping, segments, fit.standard, fit.wls.sigma, unit)
+        drives = [group for group in found if group.group.kind == "drive"]
+        for group in drives:
+            inside, alike, total = np.add((inside, alike, total), compared(group.runs, k))
+        joint += fit.variation is not None and is_likely(drives, k, rng)
     print(f"| {name} | {len(logs)} | {100 * inside / total:.1f} % | {100 * alike / total:.1f} % "
-          f"| {total} |", flush=True)  # fmt: skip
+          f"| {total} | {joint} of {count} |", flush=True)  # fmt: skip
+    if fit.between is None:
+        return
+    errors, rows = np.array(errors), np.nanmean(rows, axis=(0, 2))
+    ratio = np.exp(np.nanmean(np.log(errors), axis=(0, 2)))
+    print(f"  torque of the log left out, measured RMSE over expected, geometric mean: with spread "
+          f"{ratio[0]:.2f}, without {ratio[1]:.2f}; rows within 95 %: {100 * rows[0]:.1f} %, "
+          f"{100 * rows[1]:.1f} %", flush=True)  # fmt: skip
+
+
+def torque_errors(fit):
+    """Return measured over expected RMSE, and the share of rows in the band, shapes (2, n).
+
+    Of the validation log, with the spread between logs and without it.
+    """
+    (log,) = fit.validation
+    motion, mask = log.recording.trajectory, log.recording.mask
+    ratios, shares = [], []
+    for between in (fit.between, None):
+        band = expected_band(fit, log, between)
+        used = mask[band.samples]
+        residual = (motion.tau - log.torques["estimate"])[band.samples]
+        count = np.where(used.sum(axis=0) > 20, used.sum(axis=0), np.nan)
+        measured = np.sqrt((residual**2 * used).sum(axis=0) / count)
+        expected = np.sqrt((band.total**2 * used).sum(axis=0) / count)
+        ratios.append(measured / expected)
+        shares.append(np.where(count > 0, band.coverage(motion.tau, log.torques["estimate"], mask),
+                               np.nan))  # fmt: skip
+    return ratios, shares
+
+
+def is_likely(drives, k, rng):
+    """Return whether a run is among the 95 % of draws nearest to the mean, all drives together.
+
+    Distances are Mahalanobis distances by the covariance of the draws. Values that the run hardly
+    determines are left out.
+    """
+    others = [replace(group, runs=group.runs.without(k)) for group in drives]
+    names = [str(j) for j in range(len(others[0].runs.h))]
+    variation = vary(names, others)
+    at = {each.name: j for j, each in enumerate(variation.parameters)}
+    truth, errors, order = [], [], []
+    for group in drives:
+        runs = group.runs
+        C = np.linalg.inv(runs.H[k] + np.diag((UNKNOWN * runs.scale) ** -2.0))
+        x, known = C @ runs.h[k] + group.centre, np.sqrt(np.diag(C)) < runs.scale
+        own = [p for p in np.flatnonzero(known) if group.group.parameters[p] in at]
+        truth += x[own].tolist()
+        errors.append(C[np.ix_(own, own)])
+        order += [at[group.group.parameters[p]] for p in own]
+    draws = drawn(variation, 4000, rng)[:, order]
+    noise = rng.standard_normal(draws.shape) @ np.linalg.cholesky(block_diag(*errors)).T
+    return mahalanobis_rank(draws + noise, np.array(truth)) < 0.95
+
+
+def drawn(variation, count, rng):
+    """Return draws of the drive parameters of the next run or robot, shape (count, m)."""
+    found = [each.prediction for each in variation.parameters]
+    share = np.array([(2 * 1.96 * each.std_error / np.ptp(each.ends)) ** 2 for each in found])
+    size = (count, len(found))
+    z = correlated_scores(rng.standard_normal(size), np.minimum(share, 1.0),
+                          variation.correlation, rng.standard_normal(size))  # fmt: skip
+    return np.column_stack([
+        scores_to_values(z[:, p], SCORES, each.quantiles(SCORES), -np.inf)
+        for p, each in enumerate(found)
+    ])  # fmt: skip
+
+
+def mahalanobis_rank(draws, x):
+    """Return the share of draws that are nearer to the mean than x."""
+    mean, P = draws.mean(axis=0), np.linalg.inv(np.cov(draws.T))
+    distance = np.einsum("ki,ij,kj->k", draws - mean, P, draws - mean)
+    return np.mean(distance < (x - mean) @ P @ (x - mean))
+
+
+def servos():
+    """Print the same for the eight logs of an arm of six servos, about the fit to all of them."""
+    folder = Path(os.environ["ROBOTID_DATA"]) / "commands" / "so101"
+    columns = {f"{kind}_{joint}": f"{kind}_{name}" for joint, name in SERVOS.items()
+               for kind in ("q", "qref")}  # fmt: skip
+    settings = {
+        "urdf": str(example_urdf("so101.urdf")), "columns": columns,
+        "estimator": {"name": "simulation"}, "model": {"friction": "viscous+coulomb"},
+        "controller": {"groups": {"servo": list(SERVOS)}},
+        "identification": [{"log": str(path)} for path in sorted(folder.glob("*.parquet"))],
+    }  # fmt: skip
+    with TemporaryDirectory() as out:
+        found, _ = run_job(job_from_settings(settings, "job.toml", folder), Path(out) / "out")
+    inside = alike = total = 0
+    for group in loop_runs(found.model, found.fit.simulator, found.estimate):
+        for k in range(len(group.runs.h)):
+            inside, alike, total = np.add((inside, alike, total), compared(group.runs, k))
+    print(f"| so101 | {len(found.fitted)} | {100 * inside / total:.1f} % | "
+          f"{100 * alike / total:.1f} % | {total} | |", flush=True)  # fmt: skip
 
 
 def compared(runs, k):
@@ -129,6 +251,71 @@ def simulated(model, pi, rng, *, seconds=12.0, rate=60.0):
     return Log(t=t, q=q, v=v, a=a, tau=tau, joints=model.joints)
 
 
+def recorded(model, pi, rng, *, seconds=6.0, rate=200.0, gain=1.0, load=0.0):
+    """Return the log of an arm that MuJoCo simulates at 0.1 ms, under a controller at 1 kHz.
+
+    The controller reads encoders of 18 bits and holds its torque; the log has the encoders and the
+    torque with noise of 2 %, by ``gain`` too large at the elbow. The last link has a load [kg].
+    """
+    hold, step = 1e-3, 1e-4
+    period = round(1.0 / (rate * hold))
+    t = hold * np.arange(round(seconds / hold))
+    q_ref, v_ref, _ = random_fourier(model, rng, period=seconds).evaluate(t)
+    pi = pi.copy()
+    pi[10 * len(model.layout.bodies) - 10] += load
+    plant = mujoco.MjModel.from_xml_string(mjcf(model, pi, step))
+    state = mujoco.MjData(plant)
+    state.qpos[:], state.qvel[:] = q_ref[0], v_ref[0]
+    kp, kd, steps = np.array([4e3, 3e3, 500.0]), np.array([200.0, 120.0, 15.0]), round(hold / step)
+    v, before, rows = v_ref[0].copy(), quantised(q_ref[0]), []
+    for k in range(len(t)):
+        q = quantised(state.qpos)
+        v += 0.2 * ((q - before) / hold - v)  # first-order filter
+        before = q
+        tau = kp * (q_ref[k] - q) + kd * (v_ref[k] - v)
+        if k % period == 0:
+            rows.append((t[k], q, tau))
+        state.ctrl[:] = tau
+        mujoco.mj_step(plant, state, steps)
+    t, q, tau = map(np.array, zip(*rows, strict=True))
+    tau = tau + 0.02 * np.std(tau, axis=0) * rng.standard_normal(tau.shape)
+    return Log(t=t, q=q, tau=tau * np.array([1.0, gain, 1.0]), joints=model.joints)
+
+
+def quantised(q):
+    """Return positions as encoders of 18 bits a turn read them."""
+    size = 2 * np.pi / 2**18
+    return size * np.round(q / size)
+
+
+def mjcf(model, pi, step):
+    """Return a serial arm in MuJoCo's format, from Pinocchio's frames and parameters."""
+    robot, names, body, end = loaded(model, pi), model.layout.names, "", ""
+    for j, joint in enumerate(model.joints, start=1):
+        of = {term: pi[names.index(f"{joint}.{term}")] for term in model.layout.terms}
+        frame, inertia = robot.jointPlacements[j], robot.inertias[j]
+        x, y, z, w = pin.Quaternion(frame.rotation).coeffs()
+        moments = inertia.inertia
+        axis = {"X": "1 0 0", "Y": "0 1 0", "Z": "0 0 1"}[robot.joints[j].shortname()[-1]]
+        body += (
+            f'<body pos="{numbers(frame.translation)}" quat="{numbers((w, x, y, z))}">'
+            f'<inertial mass="{inertia.mass}" pos="{numbers(inertia.lever)}" fullinertia="'
+            f'{numbers(moments[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)])}"/>'
+            f'<joint name="{joint}" axis="{axis}" damping="{of["viscous"]}" '
+            f'frictionloss="{of["coulomb"]}" armature="{of["armature"]}"/>'
+        )
+        end += "</body>"
+    motors = "".join(f'<motor joint="{joint}"/>' for joint in model.joints)
+    return (
+        f'<mujoco><option timestep="{step}" integrator="implicitfast"/><worldbody>{body}{end}'
+        f"</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+
+
+def numbers(values):
+    return " ".join(map(str, np.asarray(values).tolist()))
+
+
 def loaded(model, pi):
     """Return Pinocchio's model with the inertial parameters of pi."""
     robot = model.pin_model.copy()
@@ -150,10 +337,13 @@ def arm():
 
 def groups(model, logs, unit):
     """Return the fit's information on each run."""
-    held = [
-        replace(hold_log(model, log, SignalSettings(cutoff=None, trim=0.0)), unit=str(u))
-        for log, u in zip(logs, unit, strict=True)
-    ]
+    signals = SignalSettings(cutoff=None, trim=0.0)
+    return groups_of(model, [hold_log(model, log, signals) for log in logs], unit)
+
+
+def groups_of(model, held, unit):
+    """Return the fit's information on each run, from logs that were read."""
+    held = [replace(log, unit=str(u)) for log, u in zip(held, unit, strict=True)]
     some = Recordings(model, structural_mapping(model), held)
     return solve_recordings(some, EstimatorSettings(draws=0)).with_errors().runs
 
@@ -162,13 +352,20 @@ def fleets(count):
     """Print coverage for the next robot and of the spreads, of 20 robots with 5 runs each."""
     model, pi, friction = arm()
     names, units, runs = model.layout.names, 20, 5
-    nexts, spreads, total = 0, 0, 0
+    nexts, spreads, total, joint, box = 0, 0, 0, [], []
+
+    def another(rng):
+        """Return a robot; frictions of robots correlate by COMMON."""
+        own, size = pi.copy(), len(friction)
+        deviation = np.sqrt(COMMON) * rng.normal() + np.sqrt(1 - COMMON) * rng.normal(size=size)
+        own[friction] *= 1 + BETWEEN * deviation
+        return own
+
     for seed in range(count):
         rng = np.random.default_rng(seed)
         logs, robots = [], []
         for u in range(units + 1):
-            robot = pi.copy()
-            robot[friction] *= 1 + BETWEEN * rng.normal(size=len(friction))
+            robot = another(rng)
             robots.append(robot)
             for _ in range(runs if u < units else 0):
                 own = robot.copy()
@@ -186,8 +383,25 @@ def fleets(count):
                 first, last = each.prediction.spread_ends
                 spreads += first < BETWEEN * pi[k] < last
                 total += 1
+        own = [
+            p for p, each in enumerate(variation.parameters) if names.index(each.name) in friction
+        ]
+        order = [names.index(variation.parameters[p].name) for p in own]
+        draws = drawn(variation, 4000, rng)[:, own]
+        alone = np.column_stack([rng.permutation(x) for x in draws.T])  # a box: no correlation
+        for _ in range(20):
+            left = another(rng)
+            x = left[order] + WITHIN * pi[order] * rng.normal(size=len(order))
+            joint.append(mahalanobis_rank(draws, x))
+            box.append(mahalanobis_rank(alone, x))
     print(f"| {count} fleets of {units} robots, {runs} runs each | of {total} |")
     print("|---|---|")
+    for words, ranks in (("samples", joint), ("samples without correlation", box)):
+        ranks = np.array(ranks)
+        print(
+            f"| robots left out, jointly within 95 % (50 %) of {words} | "
+            f"{100 * np.mean(ranks < 0.95):.0f} % ({100 * np.mean(ranks < 0.5):.0f} %) |"
+        )
     print(f"| next robot within 95 % | {100 * nexts / total:.0f} % |")
     print(
         f"| spread between robots within its 95 % | {100 * spreads / total:.0f} % |\n", flush=True
@@ -221,6 +435,92 @@ def unlike(count):
             wrong += not all(is_right)
             none += not found
         print(f"| {kind} | {right} | {wrong} | {none} |", flush=True)
+
+
+class Plants:
+    """Logs of arms that MuJoCo simulates: sets of 6 logs, and of 5 robots with 2 logs each.
+
+    Sets are drawn from a pool of as many logs, or robots, as there are sets. Alike logs are
+    compared about the fit to the whole pool.
+    """
+
+    def __init__(self, seed):
+        self.model, self.pi, self.friction = arm()
+        self.rng = np.random.default_rng([11, seed])
+
+    def robot(self):
+        """Return the parameters of another robot."""
+        own = self.pi.copy()
+        own[self.friction] *= 1 + BETWEEN * self.rng.normal(size=len(self.friction))
+        return own
+
+    def log(self, own, **changed):
+        """Return a log of a robot; friction varies between logs."""
+        own = own.copy()
+        own[self.friction] *= 1 + WITHIN * self.rng.normal(size=len(self.friction))
+        log = recorded(self.model, own, self.rng, **changed)
+        return hold_log(self.model, log, SignalSettings())
+
+    def chosen(self, found, logs, unit):
+        """Return the variation of some logs of a pool, about the fit to all."""
+        own = [
+            replace(group, runs=replace(group.runs, H=group.runs.H[logs], h=group.runs.h[logs],
+                                        unit=np.array(unit)))
+            for group in found
+        ]  # fmt: skip
+        return vary([str(k) for k in range(len(logs))], own)
+
+
+def alike_logs(count):
+    """Print how often one of 6 alike logs has a finding."""
+    plants = Plants(0)
+    pool = groups_of(plants.model, [plants.log(plants.pi) for _ in range(count)], ["a"] * count)
+    sets = [plants.rng.choice(count, 6, replace=False) for _ in range(count)]
+    alarms = sum(bool(plants.chosen(pool, logs, [0] * 6).unlike) for logs in sets)
+    print(f"| 6 alike logs | {count} | | {alarms} | {count - alarms} |", flush=True)
+
+
+def alike_fleets(count):
+    """Print how often 5 alike robots have a finding."""
+    plants = Plants(1)
+    logs = [plants.log(own) for own in (plants.robot() for _ in range(count)) for _ in range(2)]
+    pool = groups_of(plants.model, logs, np.repeat(np.arange(count), 2))
+    found = []
+    for _ in range(count):
+        robots = plants.rng.choice(count, 5, replace=False)
+        own = np.column_stack([2 * robots, 2 * robots + 1]).ravel()
+        found.append(plants.chosen(pool, own, np.repeat(np.arange(5), 2)))
+    of_robots, of_logs = (
+        sum(bool(f.unlike_units) for f in found),
+        sum(bool(f.unlike) for f in found),
+    )
+    alarms = sum(bool(f.unlike_units or f.unlike) for f in found)
+    print(f"| 5 alike robots, 2 logs each | {count} | | {alarms} ({of_robots} of robots, {of_logs} "
+          f"of logs) | {count - alarms} |", flush=True)  # fmt: skip
+
+
+def odd_fleets(count):
+    """Print how often one of 5 robots that differs is named with its cause."""
+    plants, joint = Plants(2), "elbow_joint"
+    pool = [[plants.log(own), plants.log(own)] for own in (plants.robot() for _ in range(12))]
+    for kind in KINDS:
+        right = wrong = none = 0
+        for _ in range(count):
+            own = plants.robot()
+            changed = {"gain": {"gain": 1.15}, "payload": {"load": 1.0}}.get(kind, {})
+            if kind == "friction":
+                own[plants.model.layout.names.index(f"{joint}.coulomb")] *= 3.0
+            others = plants.rng.choice(len(pool), 4, replace=False)
+            logs = [plants.log(own, **changed), plants.log(own, **changed)]
+            logs += [log for k in others for log in pool[k]]
+            found = groups_of(plants.model, logs, np.repeat(np.arange(5), 2))
+            each = vary([str(k) for k in range(10)], found)
+            cause = {"friction": "drive"}.get(kind, kind)
+            is_right = [(x.run, x.kind) == (0, cause) for x in each.unlike_units]
+            right += any(is_right)
+            wrong += not all(is_right) or bool(each.unlike)
+            none += not is_right
+        print(f"| one of 5 robots: {kind} | {count} | {right} | {wrong} | {none} |", flush=True)
 
 
 if __name__ == "__main__":

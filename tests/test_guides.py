@@ -9,6 +9,7 @@ import textwrap
 import tomllib
 from importlib import import_module
 
+import mujoco
 import numpy as np
 import pytest
 from helpers.commanded_results import written_result
@@ -21,7 +22,9 @@ import robotid
 from robotid.cli import COMMANDS, main
 from robotid.commands.job import job_from_settings
 from robotid.excitation.files import write_motion
+from robotid.export.samples import sample
 from robotid.log_files.read import write_log
+from robotid.regressor.prediction import predict_instants
 from robotid.robot.examples import example_urdf
 from robotid.simulation.motions import random_fourier
 from robotid.simulation.settings import Simulation
@@ -224,6 +227,22 @@ def test_draws_are_within_the_ranges(tmp_path, monkeypatch, identified, capsys):
     monkeypatch.chdir(tmp_path)
     robotid.save_result(identified, "result")
     assert main(commands("how_to/domain_randomisation.md")[0]) == 0
-    names = run("how_to/domain_randomisation.md")
+    names = run("how_to/domain_randomisation.md", 0)
     assert set(names["draw"]) == set(names["bodies"])
     assert all(mass > 0 for mass in names["draw"].values())
+    for command in commands("how_to/domain_randomisation.md")[1:3]:
+        assert main(command) == 0
+    names = run("how_to/domain_randomisation.md", 1)
+    samples, model, layout = names["samples"], names["model"], identified.model.layout
+    names["set_sample"](model, 17)
+    capsys.readouterr()
+    assert samples["parameters"]["names"] == list(layout.names)
+    result = robotid.load_result("result")
+    pi = sample(result, 1000, np.random.default_rng(0))[1][17]
+    data = mujoco.MjData(model)
+    q, v, a = np.random.default_rng(3).uniform(-1.0, 1.0, (3, model.nv))
+    data.qpos[:], data.qvel[:], data.qacc[:] = q, v, a
+    mujoco.mj_inverse(model, data)
+    wanted = predict_instants(result.robot, pi, q, v, a)
+    offsets = [pi[layout.names.index(f"{joint}.offset")] for joint in layout.joints]
+    np.testing.assert_allclose(data.qfrc_inverse, wanted - offsets, atol=0.05)

@@ -142,7 +142,8 @@ def _drive_lines(result: Mapping[str, Any]) -> list[str]:
         for entry in result["drive_parameters"]
         if entry["std_error"] is not None
     ]
-    return columns(("parameter", "value", "+-", "unit"), rows)
+    found = columns(("parameter", "value", "+-", "unit"), rows)
+    return found + variation_lines(result.get("variation"))
 
 
 def _worst(result: Mapping[str, Any]) -> str:

@@ -43,4 +43,14 @@ def _show(found: dict[str, Any]) -> None:
     for recording in found["validation"]:
         echo(f"\n{recording['name']}", "  ")
         print("\n".join(error_lines(recording, width=terminal_width())))
+        if expected := recording.get("expected"):
+            source = "fit and spread between logs" if expected["with_spread"] else "fit"
+            own = [
+                f"{joint} {each['rmse']:.3g} ({each['within_95_pct']:.0f} %)"
+                for joint, each in expected["per_joint"].items()
+                if each["within_95_pct"] is not None
+            ]
+            echo(
+                f"expected rmse by the {source} (share of rows within 95 %): {', '.join(own)}", "  "
+            )
     print_verdict(found["verdict"])

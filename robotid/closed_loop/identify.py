@@ -11,18 +11,21 @@ from robotid.closed_loop.evaluation import run_open_loop
 from robotid.closed_loop.findings import loop_findings
 from robotid.closed_loop.fit import STAGES, Fitted, fit_loops, stated_loops
 from robotid.closed_loop.result import LoopIdentification, identified_loops
+from robotid.closed_loop.runs import loop_runs
 from robotid.closed_loop.settings import LoopSettings
 from robotid.exceptions import DataError
 from robotid.findings import Finding
 from robotid.fitting.settings import SimulationSettings
 from robotid.identification.result import Asked
 from robotid.judgement.findings import not_written
+from robotid.judgement.unlike_runs import unlike_findings
 from robotid.judgement.verdict import blocking
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 from robotid.simulation.loops import Loops, open_loops
+from robotid.variation.variation import vary
 
 __all__ = ["identify_loops", "with_gravity"]
 
@@ -38,6 +41,7 @@ def identify_loops(
     chooses: bool = True,
     examined: Sequence[Finding] = (),
     ignore: Sequence[str] = (),
+    units: Sequence[str] = (),
     progress: ProgressCallback = ignore_progress,
 ) -> LoopIdentification:
     """Identify drives, loops and bodies from logs of commands and positions.
@@ -53,6 +57,7 @@ def identify_loops(
         chooses: Whether further friction terms are tried.
         examined: The doctor's findings of the logs.
         ignore: Codes of its errors to ignore.
+        units: Name of the robot of each log to fit; one robot if empty.
         progress: Called with the stages.
 
     Raises:
@@ -100,7 +105,13 @@ def identify_loops(
         found,
         log_errors=tuple(finding.message for finding in errors),
         asked=Asked(used, ignore=tuple(ignore)),
+        variation=vary(
+            [log.name for log in logs],
+            loop_runs(model, simulator, fitted.estimate, units),
+            sorted(set(units)),
+        ),
     )
+    examined = [*examined, *unlike_findings(found.variation)]
     return replace(found, findings=(*loop_findings(found, examined), *not_written(errors)))
 
 

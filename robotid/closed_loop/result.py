@@ -26,6 +26,7 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.friction_projection import DriveMoments, drive_moments
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
+from robotid.variation.variation import Variation
 
 __all__ = ["STATED_SCALE", "LoopIdentification", "identified_loops", "logged_motion"]
 
@@ -53,6 +54,8 @@ class LoopIdentification(Identified):
         log_errors: Errors in the logs that invalidate the result, found by the doctor.
         report: File of the report, if one was written with the result.
         asked: Signal settings and ignored findings of the request.
+        variation: Variation of the parameters of loops and drives between three or more fitted
+            logs of commands.
     """
 
     loop: LoopSettings
@@ -64,6 +67,7 @@ class LoopIdentification(Identified):
     log_errors: tuple[str, ...] = ()
     report: str = ""
     asked: Asked = field(default_factory=Asked)
+    variation: Variation | None = None
 
     def __repr__(self) -> str:
         return identification_line(self, self.estimator.name, self.verdict.status)

@@ -17,6 +17,7 @@ from robotid.commands.logs import (
     locked_as_logged,
     needed_of,
     survey_logs,
+    units_of_logs,
 )
 from robotid.commands.payload import check_payloads
 from robotid.doctor.diagnosis import diagnose
@@ -342,6 +343,7 @@ def _identify_loops(
     found = identify_loops(
         model, logs, validation, job.controller, job.estimator, signals=job.signals,
         chooses=AUTO in job.terms, examined=diagnose(model, logs, validation, job.signals),
-        ignore=job.ignore, progress=progress or ignore_progress,
+        ignore=job.ignore, units=units_of_logs(job.identification),
+        progress=progress or ignore_progress,
     )  # fmt: skip
     return replace(found, asked=replace(found.asked, job=job))

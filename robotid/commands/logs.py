@@ -40,6 +40,7 @@ __all__ = [
     "log_of_commands",
     "needed_of",
     "survey_logs",
+    "units_of_logs",
 ]
 
 _PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of its own
@@ -80,7 +81,7 @@ def survey_logs(
 
     def survey(entries: Sequence[LogEntry]) -> tuple[SurveyedLog, ...]:
         logs = []
-        _check_units(entries)
+        units_of_logs(entries)
         for entry in entries:
             try:
                 found = opened[entry.path]
@@ -98,8 +99,15 @@ def survey_logs(
     return tuple(survey(entries) for entries in groups)
 
 
-def _check_units(entries: Sequence[LogEntry]) -> None:
-    """Refuse logs of which only some state their robot."""
+def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:
+    """Return the unit (name of the robot) of each log; "" if none is stated.
+
+    Args:
+        entries: The logs.
+
+    Raises:
+        SettingsError: If only some state their robot.
+    """
     unnamed = [entry for entry in entries if not entry.unit]
     if 0 < len(unnamed) < len(entries):
         named = next(entry for entry in entries if entry.unit)
@@ -107,6 +115,7 @@ def _check_units(entries: Sequence[LogEntry]) -> None:
             f"{unnamed[0].path.name} has no unit, but {named.path.name} has unit = "
             f"{named.unit!r}; state the unit (name of the robot) of each log, or of none"
         )
+    return [entry.unit or "" for entry in entries]
 
 
 def examine(

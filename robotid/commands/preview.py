@@ -1,6 +1,7 @@
 """Expected standard errors of motions before they are recorded, compared with achieved ones."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import result_run
 from robotid.exceptions import DataError
 from robotid.export.entries import build_preview
-from robotid.export.result import load_result
+from robotid.export.result import load_result, stated_between
 from robotid.fitting.survey import SurveyedLog, survey_log
 from robotid.identification.previews import preview_logs
 from robotid.robot.model import RobotModel
@@ -56,7 +57,8 @@ def preview_job(
     hashes = {entry["sha256"] for entry in result["inputs"] if entry["role"] == "identification"}
     if not any(file_sha256(entry.path) in hashes for entry in job.identification):
         motions = _motions(job, model, job.identification)
-        return build_preview(preview_logs(model, motions, job.estimator, run=run, **stated))
+        found = preview_logs(model, motions, job.estimator, run=run, **stated)
+        return build_preview(replace(found, between=stated_between(result, model)))
     motions = _motions(job, model, fitted)
     alone = preview_logs(model, motions, job.estimator, like=run, **stated)
     return _with_achieved(build_preview(alone), result)

@@ -6,7 +6,9 @@ from itertools import compress
 from pathlib import Path
 from typing import Any
 
-from robotid._files import file_sha256, log_exists
+import numpy as np
+
+from robotid._files import file_sha256, finite, log_exists
 from robotid.closed_loop.evaluation import OpenLoop, position_metrics
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import log_of_commands, survey_logs
@@ -16,12 +18,15 @@ from robotid.export.loops import open_loop_entry
 from robotid.export.result import (
     Result,
     load_result,
+    stated_between,
+    stated_covariance,
     stated_model,
     stated_parameters,
     stated_scale_check,
     stated_urdf_with_drives,
 )
 from robotid.findings import Finding, listed
+from robotid.fitting.bands import rms_error, torque_band
 from robotid.fitting.evaluation import (
     Evaluation,
     evaluate_logs,
@@ -34,6 +39,7 @@ from robotid.judgement.evidence import Determined, Predictions
 from robotid.judgement.positions import judge_positions
 from robotid.judgement.verdict import Verdict, VerdictWarning, blocking, judge, warnings_of
 from robotid.logs.data import Log
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 
 __all__ = ["validate_result"]
@@ -78,8 +84,42 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     return {
         "result": str(path),
         "predicted_with": result["outputs"].get("urdf", "base parameters of result.json"),
-        "validation": [recording_metrics(e, "estimate") for e in evaluations],
+        "validation": [
+            recording_metrics(e, "estimate") | _expected(result, model, e) for e in evaluations
+        ],
         "verdict": verdict.to_dict(),
+    }
+
+
+def _expected(
+    result: Mapping[str, Any], model: RobotModel, evaluation: Evaluation
+) -> dict[str, Any]:
+    """Return the expected torque error of a log by the result, and how often it is within 95 %.
+
+    The error has the uncertainty of the parameters, the spread of the drives between logs, if three
+    or more were fitted, and the residual of the fit.
+    """
+    covariance = stated_covariance(result, model.layout.names)
+    if covariance is None:
+        return {}
+    between = stated_between(result, model)
+    of_fit = result["identification"]["per_joint"]
+    noise = np.array([of_fit.get(row, {}).get("rmse") or 0.0 for row in model.row_names])
+    recording, mapping = evaluation.recording, structural_mapping(model)
+    C = covariance if between is None else covariance + between
+    motion = recording.trajectory
+    band = torque_band(model, mapping, motion, mapping.K @ C @ mapping.K.T, noise)
+    inside = band.coverage(motion.tau, evaluation.torques["estimate"], recording.mask)
+    rows = zip(model.row_names, rms_error([band]), inside, strict=True)
+    return {
+        "expected": {
+            "with_spread": between is not None,
+            "per_joint": {
+                row: {"rmse": float(error), "within_95_pct": finite(100.0 * share)}
+                for row, error, share in rows
+                if row in of_fit
+            },
+        }
     }
 
 

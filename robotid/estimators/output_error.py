@@ -20,7 +20,7 @@ from robotid.estimators.segments import FEWEST_SEGMENTS, at_least, sandwich, sca
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, triangle_of
 
-__all__ = ["OutputError", "Residual", "Simulator", "is_at_bound", "linearised"]
+__all__ = ["OutputError", "Residual", "Simulator", "is_at_bound", "linearised", "segment_scores"]
 
 _CAUTIOUS = 1e-3  # damping of a step: parameters that are not identifiable do not move
 _NEARLY_FREE = 1e-6  # damping of the last step, near the minimum
@@ -487,6 +487,25 @@ def linearised(
     """
     found = simulator.residuals(theta, with_slopes=True, with_starts=frees)
     yield from _whitened(found, weights, frees=frees)
+
+
+def segment_scores(simulator: Simulator, estimate: Estimate) -> tuple[Array, Array]:
+    """Return A'A (s, c, c) and A'b (s, c) of whitened residuals, window by window.
+
+    The effect of the windows' initial states is projected out.
+
+    Args:
+        simulator: The simulator, with s windows and parts of robots that are simulated together.
+        estimate: Result of ``OutputError.fit``: its parameters, correlation and noise level.
+    """
+    weights = _Weights(estimate.details["correlation"], estimate.sigma)
+    parts = list(linearised(simulator, weights, estimate.theta, frees=True))
+    H = np.zeros((len(parts), len(estimate.theta), len(estimate.theta)))
+    g = np.zeros(H.shape[:2])
+    for k, (A, b, columns) in enumerate(parts):
+        H[k][np.ix_(columns, columns)] = A.T @ A
+        g[k, columns] = A.T @ b
+    return H, g
 
 
 def _whitened(

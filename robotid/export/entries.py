@@ -9,7 +9,8 @@ import numpy as np
 from robotid._files import finite, source_entry
 from robotid.export.former_keys import with_former_keys
 from robotid.export.ranges import parameter_ranges
-from robotid.fitting.bands import QUANTILE, typical_friction
+from robotid.export.samples import covariance_entry
+from robotid.fitting.bands import QUANTILE, next_errors, typical_friction
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.identified import SOURCES, Identified
@@ -96,6 +97,9 @@ def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[
             "segments": found.errors.segments,
             "inflation": found.errors.inflation,
         },
+        "covariance": covariance_entry(
+            found.model.layout.names, found.standard_covariance, found.at_bound
+        ),
         "motors": _motors(found, settings),
         "friction": {drive.joint: _friction(found, drive) for drive in found.drives},
         "consistency": {
@@ -113,8 +117,16 @@ def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[
             "validation": [recording_metrics(e, "wls") for e in found.validation],
         },
         "scale_check": found.scale_check.to_dict(),
-        **({} if found.variation is None else {"variation": found.variation.to_dict()}),
+        **_variation(found),
     }
+
+
+def _variation(found: Identification) -> dict[str, Any]:
+    """Return the variation between three or more logs, with the torque error of the next log."""
+    if found.variation is None:
+        return {}
+    rows = zip(found.model.row_names, next_errors(found).tolist(), strict=True)
+    return {"variation": found.variation.to_dict() | {"next_torque_rmse": dict(rows)}}
 
 
 def build_preview(preview: "Preview") -> dict[str, Any]:

@@ -19,7 +19,7 @@ class Option:
 
     words: str
     metavar: str
-    kind: type[float | str] = str
+    kind: type[int] | type[float] | type[str] = str
     among: tuple[str, ...] = ()
 
 
@@ -69,6 +69,11 @@ FORMATS: dict[str, Format] = {
         "YAML of 95 % intervals, for domain randomisation",
         "_ranges.yaml",
         use_of_gains="Randomise the drives within their intervals.",
+        options={
+            "samples": Option("also FILE.samples.json with N samples of the joint distribution",
+                              "N", int),
+            "seed": Option("seed of these samples, default 0", "K", int),
+        },
     ),
 }  # fmt: skip
 

@@ -9,9 +9,12 @@ import numpy as np
 from robotid._files import finite, source_entry
 from robotid.closed_loop.evaluation import OpenLoop, position_metrics, position_units
 from robotid.closed_loop.result import LoopIdentification
+from robotid.export.samples import covariance_entry
 from robotid.robot.model import RobotModel
 
 __all__ = ["loop_entries", "loop_inputs", "open_loop_entry"]
+
+_LOOP_TERMS = ("kp", "kd", "delay", "limit", "zero")
 
 
 def loop_entries(found: LoopIdentification) -> dict[str, Any]:
@@ -38,6 +41,8 @@ def loop_entries(found: LoopIdentification) -> dict[str, Any]:
         },
         "ranges": {"undetermined": [*unfitted, *found.undetermined]},
         "loop_parameters": _loop_parameters(found),
+        "covariance": _covariance(found),
+        **({} if found.variation is None else {"variation": found.variation.to_dict()}),
         "validation": [
             {"log": run.log.path, "name": run.name, **position_metrics(model, (run,)).to_dict()}
             for run in found.validation
@@ -107,6 +112,20 @@ def _loop_parameters(found: LoopIdentification) -> list[dict[str, Any]]:
                      "unit": unit, "source": source}
                 )  # fmt: skip
     return entries
+
+
+def _covariance(found: LoopIdentification) -> dict[str, Any]:
+    """Return the root of the covariance of standard parameters, then gains, delays and zeros."""
+    simulator, estimate, model = found.fit.simulator, found.estimate, found.model
+    names, slopes = list(model.layout.names), [simulator.standard(model, estimate.theta)[1]]
+    free = simulator.free_parameters
+    for k, parameter in enumerate(free):
+        if parameter.what in _LOOP_TERMS:
+            names += [f"{model.joints[j]}.{parameter.what}" for j in parameter.joints]
+            slopes += [np.eye(len(free))[k : k + 1]] * len(parameter.joints)
+    S = np.vstack(slopes) * ~np.isin(simulator.names, estimate.details["at_bound"])
+    C = S @ estimate.covariance @ S.T
+    return covariance_entry(names, C, np.zeros(len(names), dtype=bool))
 
 
 def _controller(found: LoopIdentification) -> dict[str, Any]:

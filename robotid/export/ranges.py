@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 from robotid._files import write_text
 from robotid._settings import require_kind
 from robotid._typing import Array
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, SettingsError
 from robotid.export.commanded import commanded_drives
 from robotid.export.exported import Written
+from robotid.export.samples import SIMULATED, write_samples
 from robotid.export.urdf import link_parameters
 from robotid.export.yaml_text import yaml_text
 from robotid.fitting.bands import QUANTILE
@@ -45,8 +46,6 @@ __all__ = [
     "write_ranges",
 ]
 
-#: Drive terms of simulators.
-_SIMULATED = ("viscous", "coulomb", "offset")
 #: Parameters of drives that cannot be negative.
 _NOT_NEGATIVE = {"kd", "delay", *(name for name, term in TERMS.items() if term.is_nonnegative)}
 _HEAD = """\
@@ -75,23 +74,35 @@ gains kp and kd, the delay of commands and the zero of the encoder.
 """
 
 
-def export(result: "Result", target: Path) -> Written:
-    """Write the ranges that a result states, as YAML.
+def export(
+    result: "Result", target: Path, *, samples: int | None = None, seed: int | None = None
+) -> Written:
+    """Write the ranges that a result states, as YAML, and samples beside it, as JSON.
 
     Args:
         result: The result.
-        target: The file to write.
+        target: The file to write; samples are in the file with ``.samples.json`` in place of its
+            suffix.
+        samples: Number of samples of the joint distribution; None: no samples.
+        seed: Seed of the samples; 0 if None.
 
     Raises:
-        DataError: If the result has no URDF, because it is wrong, or no ranges.
-        SettingsError: If the target is a folder.
+        DataError: If the result has no URDF, because it is wrong, or no ranges, or no covariance
+            for samples.
+        SettingsError: If the target is a folder, or an option is out of range.
     """
+    if samples is None and seed is not None:
+        raise SettingsError("seed is an option of samples; state their number, samples, too")
     model, pi = result.identified  # raises for a result without URDF
     has_gains = bool(commanded_drives(model, pi, result.content, result.path.name))
     if "ranges" not in result.content and not has_gains:
         raise DataError(f"{result.path.name} of an earlier version has no ranges; identify again")
+    files = [target]
+    if samples is not None:
+        files.append(target.with_suffix(".samples.json"))
+        write_samples(result, files[1], samples, seed or 0)
     write_text(ranges_text(stated_ranges(result.content)), target)
-    return Written((target,), (), {})
+    return Written(files, (), {})
 
 
 def parameter_ranges(found: Identified) -> dict[str, Any]:
@@ -113,7 +124,7 @@ def parameter_ranges(found: Identified) -> dict[str, Any]:
     layout, sources = found.model.layout, found.sources
     errors, covariance = found.standard_error, found.standard_covariance
     quantile = found.standard_quantile
-    variation = getattr(found, "variation", None)
+    variation = getattr(found, "variation", None)  # not of a result from commands
     between = {} if variation is None else {each.name: each for each in variation.parameters}
     drives: dict[str, dict[str, Any]] = {drive.name: {} for drive in layout.drives}
     for k, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
@@ -171,7 +182,7 @@ def projected_ranges(found: Identified) -> dict[str, Any]:
         {"projected_drives": {drive: {term: range}}}, or nothing without such drives.
     """
     moments = found.moments if found.model.layout.own else {}
-    drives = project_friction(found.model, found.standard, moments, _SIMULATED).drives
+    drives = project_friction(found.model, found.standard, moments, SIMULATED).drives
     ranges: dict[str, dict[str, Any]] = {}
     for drive in drives:
         C = found.standard_covariance[np.ix_(drive.own, drive.own)]
@@ -213,6 +224,13 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
             least=0.0 if term in _NOT_NEGATIVE else -math.inf,
         )
         drives.setdefault(drive, {})[term] = ends | {"unit": entry["unit"]}
+    for name, entry in content.get("variation", {}).get("parameters", {}).items():
+        drive, _, term = name.rpartition(".")
+        own = drives.get(drive, {}).get(term)
+        if own is not None and "low" in own and own["source"] != "bound":
+            low, high = entry["next_interval"]
+            least = 0.0 if term in _NOT_NEGATIVE or term == "kp" else -math.inf
+            own |= {"low": max(low, least), "high": high, "source": "logs"}
     empty = {"robot": content["robot"], "confidence": 0.95, "bodies": {}, "drives": {}}
     ranges = content.get("ranges", empty)
     merged = {drive: terms | ranges["drives"].get(drive, {}) for drive, terms in drives.items()}

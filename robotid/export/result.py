@@ -37,6 +37,7 @@ from robotid.regressor.friction_projection import (
 )
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
+from robotid.variation.variation import between_covariance
 
 if TYPE_CHECKING:
     from robotid.closed_loop.evaluation import OpenLoop
@@ -45,6 +46,8 @@ __all__ = [
     "Result",
     "load_result",
     "read_result",
+    "stated_between",
+    "stated_covariance",
     "stated_model",
     "stated_parameters",
     "stated_scale_check",
@@ -100,6 +103,7 @@ _SHAPE = {
     "ranges?": {"robot": TEXT, "drives": {...: TABLE}},
     "simulation?": {"controller": {"kind": TEXT, "rate?": MAYBE}},
     "own_terms?": {...: [TABLE]},
+    "covariance?": {"names": [TEXT], "root": [[NUMBER]]},
     "drive_moments?": {...: {"terms": [TEXT], "products": [[NUMBER]], "torque": NUMBER}},
     "identification": _METRICS,
     "validation": [{"log": TEXT, **_METRICS}],
@@ -418,6 +422,41 @@ def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
             f"the result has no value of {listed(missing, 5)}: the URDF has changed; identify again"
         )
     return np.array([stated[name] for name in model.layout.names])
+
+
+def stated_covariance(result: Mapping[str, Any], names: Sequence[str]) -> Array | None:
+    """Return the covariance of parameters of a result; None if an earlier version wrote it.
+
+    Args:
+        result: Content of a result.json.
+        names: Names of k parameters.
+
+    Returns:
+        Shape (k, k); 0 for a parameter that was not identified.
+    """
+    if "covariance" not in result:
+        return None
+    own = dict(zip(result["covariance"]["names"], result["covariance"]["root"], strict=True))
+    root = np.zeros((len(names), max(map(len, own.values()), default=0)))
+    for row, name in zip(root, names, strict=True):
+        row[: len(own.get(name, ()))] = own.get(name, ())
+    return root @ root.T
+
+
+def stated_between(result: Mapping[str, Any], model: RobotModel) -> Array | None:
+    """Return the covariance of a robot's parameters in another log, in addition to that of the fit.
+
+    Args:
+        result: Content of a result.json.
+        model: The robot.
+
+    Returns:
+        Shape (p, p); None for fewer than three fitted logs, or if an earlier version wrote it.
+    """
+    variation = result.get("variation")
+    if variation is None or "correlation" not in variation:
+        return None
+    return between_covariance(variation, model.layout.names)
 
 
 def stated_model(result: Mapping[str, Any], model: RobotModel) -> RobotModel:

@@ -32,7 +32,9 @@ __all__ = [
     "expected_band",
     "fitted_moments",
     "friction_curve",
+    "next_errors",
     "recording_bands",
+    "rms_error",
     "torque_band",
     "typical_friction",
 ]
@@ -115,22 +117,48 @@ def torque_band(
     return TorqueBand(samples, std, np.asarray(noise))
 
 
-def expected_band(found: "Fit", evaluation: "Evaluation") -> TorqueBand:
+def expected_band(
+    found: "Fit", evaluation: "Evaluation", between: Array | None = None
+) -> TorqueBand:
     """Return the torque band of a recording by the fit's noise level, not by its own residual.
 
     Args:
         found: The fit.
         evaluation: The recording.
+        between: Covariance of the standard parameters in another log, in addition to that of the
+            fit, shape (p, p); None: 0.
     """
     K, motion = found.mapping.K, evaluation.recording.trajectory
     moves = np.array([term.moves for term in found.open_terms]).reshape(-1, K.shape[1])
-    covariance = K @ (found.standard_covariance - moves.T @ moves) @ K.T
+    C = found.standard_covariance - moves.T @ moves
+    covariance = K @ (C if between is None else C + between) @ K.T
 
     def errors(rows: Array) -> list[tuple[Array, Array]]:
         return list(zip(moves @ K.T, open_torques(found, evaluation, rows), strict=True))
 
     sigma = found.estimate.sigma
     return torque_band(found.model, found.mapping, motion, covariance, sigma, errors)
+
+
+def next_errors(found: "Fit") -> Array:
+    """Return the expected RMS torque error of the next log, shape (n_rows,) [N m, N].
+
+    Its motion is like that of the fitted logs, and its drives vary like theirs.
+
+    Args:
+        found: A fit of three or more logs.
+    """
+    bands = [expected_band(found, evaluation, found.between) for evaluation in found.fitted]
+    return rms_error(bands)
+
+
+def rms_error(bands: Sequence[TorqueBand]) -> Array:
+    """Return the expected RMS error of predicted torques, shape (n_rows,) [N m, N].
+
+    Args:
+        bands: Bands of one or more recordings.
+    """
+    return np.asarray(np.sqrt(np.mean(np.vstack([b.total for b in bands]) ** 2, axis=0)))
 
 
 def recording_bands(found: "Fit") -> tuple[TorqueBand, ...]:
@@ -145,8 +173,11 @@ def recording_bands(found: "Fit") -> tuple[TorqueBand, ...]:
         found: The fit.
     """
     evaluations = (*found.fitted, *found.validation)
-    bands = [expected_band(found, evaluation) for evaluation in evaluations]
     is_fitted = [k < len(found.fitted) or e.is_refitted for k, e in enumerate(evaluations)]
+    bands = [
+        expected_band(found, evaluation, None if is_own else found.between)
+        for evaluation, is_own in zip(evaluations, is_fitted, strict=True)
+    ]
     own: dict[bool, list[tuple[TorqueBand, Evaluation]]] = {True: [], False: []}
     for kind, band, evaluation in zip(is_fitted, bands, evaluations, strict=True):
         own[kind].append((band, evaluation))

@@ -37,6 +37,7 @@ from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.variation.groups import RunsOf
+from robotid.variation.variation import Variation, between_covariance
 
 __all__ = ["Fit", "Solution"]
 
@@ -86,6 +87,7 @@ class Fit(Identified, Solution):
         open_terms: Uncertainties of the drive models; ``standard_covariance`` includes them.
         regressor_noise: Effect of position quantisation on least squares; None: negligible.
         runs: Information of each of three or more fitted logs on parameters that may vary.
+        variation: Variation of the drives' parameters between these logs.
     """
 
     estimator: EstimatorSettings
@@ -98,6 +100,7 @@ class Fit(Identified, Solution):
     open_terms: tuple[OpenTerm, ...] = ()
     regressor_noise: RegressorNoise | None = None
     runs: tuple[RunsOf, ...] = ()
+    variation: Variation | None = None
     _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
 
     def friction(
@@ -215,11 +218,22 @@ class Fit(Identified, Solution):
         """Return the uncertainty band of the torques predicted for a recording.
 
         Args:
-            evaluation: A recording; if it is not one of this fit, the band has the fit's noise.
+            evaluation: A recording; if it is not one of this fit, the band has the fit's noise,
+                and the spread of the drives between three or more fitted logs.
         """
         every = zip((*self.fitted, *self.validation), self._bands, strict=True)
         own = next((band for e, band in every if e is evaluation), None)
-        return expected_band(self, evaluation) if own is None else own
+        return expected_band(self, evaluation, self.between) if own is None else own
+
+    @cached_property
+    def between(self) -> Array | None:
+        """Covariance of the standard parameters in another log, in addition to that of the fit.
+
+        Shape (p, p); None for fewer than three fitted logs.
+        """
+        if self.variation is None:
+            return None
+        return between_covariance(self.variation.to_dict(), self.model.layout.names)
 
     @cached_property
     def _bands(self) -> tuple[TorqueBand, ...]:

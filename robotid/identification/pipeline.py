@@ -183,17 +183,17 @@ def conclude(
     sample = take_sample(fit)
     misfits, discrepancies = explain_residual(fit, sample)
     fit, on_misfit = with_model_error(fit, sample, misfits)
-    variation = vary([Path(e.recording.log.path).name for e in fit.fitted], fit.runs)
+    names = [Path(e.recording.log.path).name for e in fit.fitted]
+    units = sorted({log.unit for log in recordings.fitted})
+    fit = replace(fit, variation=vary(names, fit.runs, units))
     own = {field.name: getattr(fit, field.name) for field in fields(fit)}
     asked = Asked(recordings.fitted[0].asked, friction, tuple(ignore))
-    result = Identification(
-        **own, misfits=misfits, on_misfit=on_misfit, variation=variation, asked=asked
-    )
+    result = Identification(**own, misfits=misfits, on_misfit=on_misfit, asked=asked)
     # the fit reports the excitation over all samples, see finding "undetermined"
     before = [f for f in found if f.severity != "note" and f.code != "excitation"]
     of_fit = fit_findings(fit, misfits, on_misfit, discrepancies)
     loads = {f.where.rpartition(": ")[0] or f.where for f in found if f.code == "payload_change"}
-    of_fit += [*unlike_findings(variation), *rescaled_findings(fit, loads)]
+    of_fit += [*unlike_findings(fit.variation), *rescaled_findings(fit, loads)]
     merged = settled(with_known_springs(before, fit, wanted), of_fit)
     merged = rejected(merged, result.predictions, result.scale_check)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
@@ -251,7 +251,7 @@ def with_drives(
 
     def changed() -> Recordings:
         own = _with_own(recordings, solved.solution, drives)
-        return own if recordings.contacts is None else with_contact_errors(own)  # of its terms
+        return own if recordings.repeated is None else with_repeated_errors(own)  # of its terms
 
     most = _MOST_SHAPES if any(drive.shapes for drive in drives) else 0
     for done in range(most):

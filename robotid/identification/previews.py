@@ -170,11 +170,13 @@ class Preview:
         noise: The noise of the torque.
         before: Standard errors of the base parameters from the earlier run only, shape (b,), inf
             where it does not determine one; None without an earlier run.
+        between: As of ``Fit.between`` of an earlier result, which widens the bands.
     """
 
     expected: Identification
     noise: TorqueNoise
     before: Array | None = None
+    between: Array | None = None
 
     def __repr__(self) -> str:
         determined, found = self.expected.determination, self.expected
@@ -210,7 +212,8 @@ class Preview:
     @property
     def bands(self) -> tuple[TorqueBand, ...]:
         """Expected band of each motion's predicted torques."""
-        return tuple(expected_band(self.expected, e) for e in self.expected.fitted)
+        found = self.expected
+        return tuple(expected_band(found, e, self.between) for e in found.fitted)
 
     @property
     def words(self) -> str:
@@ -269,7 +272,8 @@ def preview(
         base=logged_base(model), passive=model.passive,
     )  # fmt: skip
     in_memory = [hold_log(model, motion, settings) for motion in read]
-    return preview_logs(model, in_memory, choice, noise=noise, run=run)
+    found = preview_logs(model, in_memory, choice, noise=noise, run=run)
+    return found if given is None else replace(found, between=given.between)
 
 
 def preview_logs(

@@ -28,7 +28,6 @@ from robotid.logs.data import suggestion
 from robotid.logs.settings import SignalSettings
 from robotid.pages.plots import Plot
 from robotid.robot.families import AUTO
-from robotid.variation.variation import Variation
 
 __all__ = ["Asked", "Identification"]
 
@@ -61,7 +60,6 @@ class Identification(Fit):
         report: File of the report, if one was written with the result.
         misfits: Terms that its drive models lack.
         on_misfit: Names of drive parameters whose errors increased for these.
-        variation: Variation of the drives' parameters between three or more fitted logs.
         asked: Stated signals, friction and findings to ignore.
         payload_checks: Checks of the torque scale with payloads of known mass, that with the
             narrowest interval first.
@@ -73,7 +71,6 @@ class Identification(Fit):
     report: str = ""
     misfits: tuple[Misfit, ...] = ()
     on_misfit: tuple[str, ...] = ()
-    variation: Variation | None = None
     asked: Asked = field(default_factory=Asked)
     payload_checks: tuple[PayloadCheck, ...] = ()
 

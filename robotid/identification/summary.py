@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from html import escape
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from robotid._text import columns
@@ -22,6 +23,7 @@ __all__ = [
     "identification_line",
     "identification_text",
     "joint_reason",
+    "one_more_gain",
     "variation_lines",
     "verdict_cell",
     "verdict_lines",
@@ -39,6 +41,7 @@ _BESIDE = {
     "steady": "constant\nspeed %",
 }
 _NO_REPORT = "robotid.write_report(found, 'report.html') writes the whole report"
+_SHOWN_SPREADS = ("coulomb", "viscous", "kp", "kd", "delay")
 
 
 def identification_line(found: Identified, estimator: str, status: str) -> str:
@@ -121,7 +124,9 @@ def friction_lines(friction: Mapping[str, Any]) -> list[str]:
 
 
 def variation_lines(variation: Mapping[str, Any] | None) -> list[str]:
-    """Return the spread of friction between logs as text, no line for fewer than three logs.
+    """Return the spread of friction between logs, and what one more log would add, as text.
+
+    There is no line for fewer than three logs.
 
     Args:
         variation: As in result.json; None for fewer than three logs.
@@ -131,12 +136,38 @@ def variation_lines(variation: Mapping[str, Any] | None) -> list[str]:
     shares: dict[str, list[float]] = {}
     for name, found in variation["parameters"].items():
         term = name.rpartition(".")[2]
-        if term in ("coulomb", "viscous") and abs(found["mean"]) > found["std_error"]:
+        if term in _SHOWN_SPREADS and abs(found["mean"]) > found["std_error"]:
             shares.setdefault(term, []).append(100 * found["spread"] / abs(found["mean"]))
     if not shares:
         return []
     words = [f"{term} {min(x):.2g} to {max(x):.2g} %" for term, x in sorted(shares.items())]
-    return [f"spread between {len(variation['logs'])} logs, by joint: {', '.join(words)}"]
+    lines = [f"spread between {len(variation['logs'])} logs, by joint: {', '.join(words)}"]
+    gains = {
+        name: one_more_gain(found)
+        for name, found in variation["parameters"].items()
+        if "one_more" in found
+    }
+    if gains:
+        member = "robot" if variation["units"] > 1 else "log"
+        most = max(gains, key=lambda name: gains[name][1])
+        error, width = (100 * median(x) for x in zip(*gains.values(), strict=True))
+        lines.append(
+            f"one more {member}: standard errors of the means {error:.2g} % smaller, intervals of "
+            f"the next {member} {width:.2g} % narrower (medians; most: {most} "
+            f"{100 * gains[most][1]:.2g} %)"
+        )
+    return lines
+
+
+def one_more_gain(parameter: Mapping[str, Any]) -> tuple[float, float]:
+    """Return the shares by which the error of a mean and a prediction interval would decrease.
+
+    Args:
+        parameter: A parameter of the variation between logs, as in result.json.
+    """
+    error, width = (parameter["one_more"][key] for key in ("std_error", "interval_width"))
+    low, high = parameter["next_interval"]
+    return 1.0 - error / parameter["std_error"], 1.0 - width / (high - low)
 
 
 def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:

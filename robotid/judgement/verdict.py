@@ -87,6 +87,7 @@ _REASONS = {
     "torque_sign": "the torque may have the opposite sign",
     "unexplained_torque": "gravity, inertia and friction do not explain much of the torque",
     "unlike_run": "the log differs from the other logs",
+    "unlike_unit": "the robot differs from the other robots",
     "unsigned_torque": "the torque may be a magnitude without sign",
     "unmounted_part": "{mass:.2g} kg of the URDF's last link were probably not mounted",
     "urdf_mismatch": "the torques do not fit the URDF's masses: the URDF may be of another robot "

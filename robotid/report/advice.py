@@ -585,6 +585,7 @@ _AS_FOUND = (
     "torque_order",
     "torque_sign",
     "unlike_run",
+    "unlike_unit",
     "unmounted_part",
     "unsigned_torque",
 )

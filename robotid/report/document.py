@@ -1,6 +1,7 @@
 """The report of an identification as one self-contained HTML file."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from robotid.identification.result import Identification
 from robotid.report.advice import Origin
 from robotid.report.shown import Shown, page_of
 from robotid.report.torques import shown_torques
+from robotid.report.variation import variation_section
 
 if TYPE_CHECKING:
     from robotid.closed_loop.result import LoopIdentification
@@ -62,6 +64,7 @@ def _of_loops(found: "LoopIdentification", at: Origin, replay: str) -> Shown:
 
     require_kind(found, LoopIdentification, "identification", "a robotid.Identification")
     result = build_result(found, {"estimator": found.estimator.to_dict()})
-    return shown_positions(
+    shown = shown_positions(
         result, found.fitted, found.validation, at, (found.model, found.standard), replay
     )
+    return replace(shown, variation=variation_section(found.variation, {}))

@@ -9,7 +9,7 @@ import numpy as np
 
 from robotid.export.entries import input_entries
 from robotid.findings import listed
-from robotid.fitting.bands import TorqueBand
+from robotid.fitting.bands import TorqueBand, next_errors
 from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.metrics import Metrics
 from robotid.identification.pictures import torque_charts
@@ -98,7 +98,7 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
         friction=friction_section(found, worst),
         bodies=parameter_picture(found) + ellipsoid_pictures(found),
         why=why_section(found),
-        variation=variation_section(found),
+        variation=variation_section(found.variation, _next_errors(found)),
         parameters=parameter_section(
             found.model,
             found.standard if found.has_urdf else None,
@@ -119,6 +119,14 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
             "versions": ("Versions", version_table(versions())),
         },
     )
+
+
+def _next_errors(found: Identification) -> dict[str, str]:
+    """Return the expected RMS torque error of the next log with its unit, by row."""
+    if found.variation is None:
+        return {}
+    rows = zip(found.model.row_names, found.model.row_units, next_errors(found), strict=True)
+    return {row: f"{error:.3g} {unit}" for row, unit, error in rows}
 
 
 def _joints(metrics: Metrics, wls: Metrics) -> dict[str, dict[str, Any]]:

@@ -1,26 +1,29 @@
 """Section on the variation of drive parameters between logs."""
 
+from collections.abc import Mapping
 from html import escape
 
-from robotid.identification.result import Identification
+import numpy as np
+
 from robotid.pages.html import Cell, code, table, text, with_error
-from robotid.variation.variation import VaryingParameter
+from robotid.variation.variation import Variation, VaryingParameter
 
 __all__ = ["variation_section"]
 
 _ROOM = 0.15  # of the prediction interval, beyond the farthest mark
 
 
-def variation_section(found: Identification) -> str:
+def variation_section(variation: Variation | None, torques: Mapping[str, str]) -> str:
     """Return the values of drive parameters in each log, and the prediction of the next log.
 
     Args:
-        found: The identification.
+        variation: The variation between logs.
+        torques: Expected RMS torque error of the next log with its unit, by joint; none for a
+            result from commands.
 
     Returns:
         HTML; "" for fewer than three logs.
     """
-    variation = found.variation
     if variation is None:
         return ""
     different = {(each.run, each.name) for each in variation.unlike}
@@ -28,16 +31,23 @@ def variation_section(found: Identification) -> str:
     for each in variation.parameters:
         name, *figures = _figures(each)
         rows.append([name, Cell(_marks(each, variation.runs, different), "text"), *figures])
-    headers = ["parameter", "in each log", "mean", "± error", "spread", "low", "high", "unit"]
-    new, members = ("log of this robot", "logs")
+    new, members, one = ("log of this robot", "logs", "log")
     if variation.units > 1:
-        new, members = (f"robot (after {variation.units})", "robots")
+        new, members, one = (f"robot (after {variation.units})", "robots", "robot")
+    headers = ["parameter", "in each log", "mean", "± error", "spread", "low", "high", "unit",
+               "± error with one more", "width with one more"]  # fmt: skip
     caption = f"Drive parameters in {len(variation.runs)} logs; low to high: 95 % of the next {new}"
     intro = (
         f"<p>Mean and its standard error; standard deviation between {members} (spread), median of "
         f"its estimate. The next {new} lies between low and high with 95 % probability: the shaded "
-        "range. Links are the same in all logs.</p>\n"
+        "range. Links are the same in all logs. Last columns: expected error of the mean, and "
+        f"width from low to high, with one more {one}, in % of those of today.</p>\n"
     )
+    if torques:
+        own = ", ".join(f"{escape(row)} {error}" for row, error in torques.items())
+        intro += (
+            f"<p>Expected RMS torque error of the next {one}, on motions like these: {own}.</p>\n"
+        )
     return intro + table(caption, headers, rows, is_data=True)
 
 
@@ -47,7 +57,9 @@ def _figures(each: VaryingParameter) -> list[Cell]:
     mean, error = with_error(found.mean, found.std_error)
     low, high = (with_error(float(x), found.std_error)[0] for x in found.ends)
     spread = with_error(found.spread, found.spread)[1]
-    return [code(each.name), mean, error, spread, low, high, text(each.unit)]
+    less, narrower = found.after[0] / found.std_error, found.after[1] / float(np.ptp(found.ends))
+    more = [text(f"{100 * share:.0f} %") for share in (less, narrower)]
+    return [code(each.name), mean, error, spread, low, high, text(each.unit), *more]
 
 
 def _marks(each: VaryingParameter, runs: tuple[str, ...], different: set[tuple[int, str]]) -> str:

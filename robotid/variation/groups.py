@@ -18,7 +18,7 @@ from robotid.regressor.factors import Factors
 from robotid.robot.model import RobotModel
 from robotid.variation.mixed_effects import Runs
 
-__all__ = ["FEWEST_RUNS", "Group", "RunsOf", "runs_of"]
+__all__ = ["FEWEST_RUNS", "Group", "RunsOf", "inflation_of", "runs_of"]
 
 #: Smallest number of runs whose scatter is estimated.
 FEWEST_RUNS = 3
@@ -95,7 +95,7 @@ def runs_of(
         H, h = (np.array([each[k].sum(axis=0) for each in own]) for k in (0, 1))
         if not H.any():  # no run has any effect of these parameters
             continue
-        scale, inflation = _scale(group, centre, H.sum(axis=0), model, standard), _inflation(own)
+        scale, inflation = _scale(group, centre, H.sum(axis=0), model, standard), inflation_of(own)
         runs = Runs(H / inflation, h / inflation, unit, scale)
         found.append(RunsOf(group, centre, runs, inflation))
     return tuple(found)
@@ -147,11 +147,14 @@ def _products(
     return H, g
 
 
-def _inflation(runs: Sequence[tuple[Array, Array]]) -> float:
+def inflation_of(runs: Sequence[tuple[Array, Array]]) -> float:
     """Return the variance of the scores of segments about each run's estimate.
 
     It is relative to that of independent rows of the stated noise level, and common to all runs: a
     run alone has too few segments.
+
+    Args:
+        runs: Of each run, A^T A (s, q, q) and A^T r (s, q) of its s segments.
     """
     scatter, expected = 0.0, 0.0
     for H, g in runs:

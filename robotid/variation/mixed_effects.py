@@ -9,7 +9,8 @@ prior about a plausible size. The standard deviation that a prediction depends o
 numerically: with few runs, its uncertainty is the largest part of the prediction interval.
 """
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,6 +28,7 @@ _FREEDOM = 4.0  # degrees of freedom of the half Student prior of a standard dev
 _LEAST, _MOST = -6.0, 5.0  # logarithm of the standard deviations over their plausible size
 _GRID = np.linspace(_LEAST, _MOST, 45)
 _FIRST = -1.0  # the same at the start of the search
+_NEAR = 2.0  # ... and largest distance of a stated start: the gradient is small beyond
 _STEP = 1e-5  # of the numerical gradient
 _TAIL = 0.025  # probability beyond each end of an interval
 _WIDEST = 40.0  # standard deviations that contain every end
@@ -55,7 +57,25 @@ class Runs:
         Args:
             run: Index of the run.
         """
-        left = np.arange(len(self.h)) != run
+        return self._only(np.arange(len(self.h)) != run)
+
+    def without_unit(self, unit: int) -> "Runs":
+        """Return the runs of the other units.
+
+        Args:
+            unit: Index of the unit.
+        """
+        return self._only(self.unit != unit)
+
+    def of_unit(self, unit: int) -> "Runs":
+        """Return the runs of one unit.
+
+        Args:
+            unit: Index of the unit.
+        """
+        return self._only(self.unit == unit)
+
+    def _only(self, left: Array) -> "Runs":
         _, unit = np.unique(self.unit[left], return_inverse=True)
         return replace(self, H=self.H[left], h=self.h[left], unit=unit)
 
@@ -72,6 +92,10 @@ class Prediction:
         ends: Ends of the 95 % prediction interval of a new run or unit, shape (2,).
         probability: Two-sided probability of a deviation as large as that of a given value; 1 if
             none was given.
+        mixture: Predictive distribution of a new run or unit, a mixture of normal distributions:
+            weights, means and standard deviations, shape (3, g).
+        after: Expected standard error of the mean, and expected width of the prediction interval,
+            with one more run, or one more unit if there are several; NaN if not computed.
     """
 
     mean: float
@@ -80,6 +104,8 @@ class Prediction:
     spread_ends: Array
     ends: Array
     probability: float = 1.0
+    mixture: Array = field(default_factory=lambda: np.zeros((3, 0)))
+    after: tuple[float, float] = (math.nan, math.nan)
 
     def shifted(self, centre: float) -> "Prediction":
         """Return the prediction of the parameter plus a constant.
@@ -87,7 +113,20 @@ class Prediction:
         Args:
             centre: The constant.
         """
-        return replace(self, mean=self.mean + centre, ends=self.ends + centre)
+        moved = self.mixture + np.array([[0.0], [centre], [0.0]])
+        return replace(self, mean=self.mean + centre, ends=self.ends + centre, mixture=moved)
+
+    def quantiles(self, scores: Array) -> Array:
+        """Return quantiles of the predictive distribution.
+
+        Args:
+            scores: Standard normal scores of their probabilities, shape (k,): 1.96 for 97.5 %.
+
+        Returns:
+            The quantiles, shape (k,).
+        """
+        wanted = scipy.special.ndtr(scores)
+        return np.array([_mixture_quantile(p, *self.mixture) for p in wanted])
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +135,7 @@ class MixedEffects:
 
     Attributes:
         runs: The runs.
+        first: Deviations at the start of their search, shape (levels or more, q); None: typical.
 
     References:
         Patterson, Thompson (1971), Recovery of inter-block information when block sizes are
@@ -104,6 +144,7 @@ class MixedEffects:
     """
 
     runs: Runs
+    first: Array | None = None
 
     @property
     def n_levels(self) -> int:
@@ -121,6 +162,9 @@ class MixedEffects:
             return -values[0], -(values[1:] - values[0]) / _STEP
 
         first, bounds = np.full(size, _FIRST), [(_LEAST, _MOST)] * size
+        if self.first is not None:
+            first = np.log(self.first[: self.n_levels] / self.runs.scale).ravel()
+            first = np.clip(first, _FIRST - _NEAR, _FIRST + _NEAR)
         found = scipy.optimize.minimize(
             objective, first, jac=True, method="L-BFGS-B", bounds=bounds
         )
@@ -145,8 +189,23 @@ class MixedEffects:
         values, errors = _predicted(U, runs.H, runs.h, centre, around)
         return values, np.sqrt(np.einsum("kpp->kp", errors))
 
+    def estimate_unit(self, runs: Runs) -> tuple[Array, Array]:
+        """Return the mean of another unit from its runs alone, and its covariance.
+
+        Its runs vary as those of these units.
+
+        Args:
+            runs: The runs of the other unit.
+
+        Returns:
+            Shapes (q,) and (q, q).
+        """
+        W, w, _, _ = _integrated(runs.H, runs.h, self.deviation[0])
+        covariance = np.linalg.inv(W.sum(axis=0) + np.diag((UNKNOWN * runs.scale) ** -2.0))
+        return covariance @ w.sum(axis=0), covariance
+
     def predict(
-        self, own: Array | None = None, value: Array | None = None
+        self, own: Array | None = None, value: Array | None = None, *, is_unit: bool = False
     ) -> tuple[Prediction, ...]:
         """Return the prediction of each parameter in a new run of a new unit, q items.
 
@@ -156,21 +215,17 @@ class MixedEffects:
         Args:
             own: Variance of the estimates of the new run, shape (q,); 0 if None.
             value: Estimates of the new run, whose probability is computed, shape (q,); or None.
+            is_unit: Whether the mean of a new unit is predicted, without a deviation of its run.
         """
-        q = len(self.runs.scale)
+        q, levels = len(self.runs.scale), slice(1 if is_unit else 0, None)
         own = np.zeros(q) if own is None else own
         found = []
         for p in range(q):
-            tried = np.repeat(self.deviation[None], len(_GRID), axis=0)
-            tried[:, -1, p] = self.runs.scale[p] * np.exp(_GRID)
-            log_likelihood, means, covariances = self._likelihood(tried)
-            log_density = log_likelihood + _log_prior(_GRID)
-            weight = np.exp(log_density - log_density.max())
-            weight /= weight.sum()
-            centres, variance = means[:, p], covariances[:, p, p]
-            mean = float(weight @ centres)
-            error = float(np.sqrt(weight @ (variance + (centres - mean) ** 2)))
-            std = np.sqrt(variance + (tried[:, :, p] ** 2).sum(axis=1) + own[p])
+            tried, log_density, centres, variance, _ = self._on_grid(p)
+            weight = _weight(log_density)
+            mean, error = _moments(weight, centres, variance)
+            between = (tried[:, levels, p] ** 2).sum(axis=1) + own[p]
+            std = np.sqrt(variance + between)
             probability = 1.0
             if value is not None:
                 below = _mixture(value[p], weight, centres, std)
@@ -181,8 +236,56 @@ class MixedEffects:
             )
             ends = _mixture_ends(weight, centres, std)
             spread_ends = np.array([low, high])
-            found.append(Prediction(mean, error, median, spread_ends, ends, min(probability, 1.0)))
+            found.append(
+                Prediction(
+                    mean, error, median, spread_ends, ends, min(probability, 1.0),
+                    np.array([weight, centres, std]),
+                )
+            )  # fmt: skip
         return tuple(found)
+
+    def with_one_more(self) -> tuple[Prediction, ...]:
+        """Return the prediction of each parameter, with what one more run would add, q items.
+
+        With several units it is one more unit. The new run or unit is expected to give as much
+        information as the mean of the others. The information about the mean then increases by
+        1 / k. The expected log likelihood of the new value, at the median of the spread, is added
+        to the density of the spread.
+        """
+        found = []
+        for p, each in enumerate(self.predict()):
+            tried, log_density, centres, variance, alone = self._on_grid(p)
+            total = alone + variance  # of the estimate of a new member about the mean
+            expected = float(np.interp(each.spread, tried[:, -1, p], total))
+            weight = _weight(log_density - 0.5 * (np.log(total) + expected / total))
+            more = variance * self.n_members / (self.n_members + 1.0)
+            _, error = _moments(weight, centres, more)
+            std = np.sqrt(more + (tried[:, :, p] ** 2).sum(axis=1))
+            width = float(np.ptp(_mixture_ends(weight, centres, std)))
+            found.append(replace(each, after=(error, width)))
+        return tuple(found)
+
+    @property
+    def n_members(self) -> int:
+        """Number of units if there are several, of runs otherwise."""
+        return int(self.runs.unit.max()) + 1 if self.n_levels == 2 else len(self.runs.h)
+
+    def _on_grid(self, p: int) -> tuple[Array, Array, Array, Array, Array]:
+        """Return the model for standard deviations of parameter p at the highest level.
+
+        Returns:
+            Standard deviations (g, levels, q); logarithm of their density, mean of the parameter,
+            variance of the mean, and variance of the estimate of a typical member about its mean,
+            each of shape (g,).
+        """
+        tried = np.repeat(self.deviation[None], len(_GRID), axis=0)
+        tried[:, -1, p] = self.runs.scale[p] * np.exp(_GRID)
+        log_likelihood, means, covariances = self._likelihood(tried)
+        prior = np.diag((UNKNOWN * self.runs.scale) ** -2.0)
+        members = (np.linalg.inv(covariances) - prior) / self.n_members
+        alone = np.linalg.inv(members + prior)[:, p, p]
+        log_density = log_likelihood + _log_prior(_GRID)
+        return tried, log_density, means[:, p], covariances[:, p, p], alone
 
     def _deviation(self, z: Array) -> Array:
         """Return standard deviations, shape (..., levels, q), from logarithms over the scale."""
@@ -260,13 +363,29 @@ def _mixture(x: float, weight: Array, means: Array, std: Array) -> float:
     return float(weight @ scipy.special.ndtr((x - means) / std))
 
 
+def _mixture_quantile(probability: float, weight: Array, means: Array, std: Array) -> float:
+    """Return the value with a probability of smaller values in a mixture of normals."""
+    middle, widest = float(weight @ means), _WIDEST * float(std.max())
+    found: float = scipy.optimize.brentq(
+        lambda x: _mixture(x, weight, means, std) - probability, middle - widest, middle + widest
+    )
+    return found
+
+
 def _mixture_ends(weight: Array, means: Array, std: Array) -> Array:
     """Return the ends of the 95 % interval of a mixture of normal distributions, shape (2,)."""
-    middle, widest = float(weight @ means), _WIDEST * float(std.max())
-    ends = [
-        scipy.optimize.brentq(
-            lambda x, p=p: _mixture(x, weight, means, std) - p, middle - widest, middle + widest
-        )
-        for p in (_TAIL, 1.0 - _TAIL)
-    ]
+    ends = [_mixture_quantile(p, weight, means, std) for p in (_TAIL, 1.0 - _TAIL)]
     return np.array(ends)
+
+
+def _weight(log_density: Array) -> Array:
+    """Return weights that sum to 1, shape (g,), from the logarithm of a density."""
+    weight = np.exp(log_density - log_density.max())
+    normed: Array = weight / weight.sum()
+    return normed
+
+
+def _moments(weight: Array, centres: Array, variance: Array) -> tuple[float, float]:
+    """Return the mean of a mixture, and its standard deviation."""
+    mean = float(weight @ centres)
+    return mean, float(np.sqrt(weight @ (variance + (centres - mean) ** 2)))

@@ -1,7 +1,8 @@
 """Variation of parameters between runs: spreads, the next run, runs that are unlike the others."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,22 @@ from robotid._typing import Array
 from robotid.variation.groups import FEWEST_RUNS, RunsOf
 from robotid.variation.mixed_effects import UNKNOWN, MixedEffects, Prediction, Runs
 
-__all__ = ["UnlikeRun", "Variation", "VaryingParameter", "changes", "vary"]
+__all__ = [
+    "SCORES",
+    "UnlikeRun",
+    "Variation",
+    "VaryingParameter",
+    "between_covariance",
+    "changes",
+    "shrunk_correlation",
+    "vary",
+]
 
+#: Standard normal scores at which result.json has the quantiles of the predictive distribution.
+SCORES = np.linspace(-3.5, 3.5, 15)
 _CHANGE = 0.05  # plausible standard deviation of a parameter between results, over its size
-_FALSE_ALARMS = 0.02  # probability that one of alike runs is named
+_FALSE_ALARMS = 0.02  # probability that one of alike runs or units is named
+_LEAST_SHRUNK = 1e-3  # smallest share of the shrinkage: the correlation has an inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +62,11 @@ class VaryingParameter:
             "spread_interval": found.spread_ends.tolist(),
             **({} if self.within is None else {"spread_within_units": self.within}),
             "next_interval": found.ends.tolist(),
+            "next_quantiles": found.quantiles(SCORES).tolist(),
+            "one_more": {
+                "std_error": found.after[0],
+                "interval_width": found.after[1],
+            },
             "by_log": self.values.tolist(),
             "std_error_by_log": self.std_errors.tolist(),
         }
@@ -56,10 +74,10 @@ class VaryingParameter:
 
 @dataclass(frozen=True, eq=False)
 class UnlikeRun:
-    """A run that differs from what the others predict.
+    """A run, or a unit, that differs from what the others predict.
 
     Attributes:
-        run: Index of the run.
+        run: Index of the run, or of the unit.
         kind: "drive", "gain" or "payload".
         where: Drive, joint or link.
         name: The parameter that differs most.
@@ -88,14 +106,38 @@ class Variation:
     Attributes:
         runs: Names of the k runs.
         units: Number of units (robots).
-        parameters: The parameters of the drives.
+        parameters: The parameters of the drives, m items.
         unlike: Runs that differ from the others, at most one cause for each.
+        unit_names: Names of the units, in the order of their indices.
+        unlike_units: Units that differ from the others, at most one cause for each; their runs
+            are not in ``unlike``.
+        of_runs: Index of the unit of each run, k items.
     """
 
     runs: tuple[str, ...]
     units: int
     parameters: tuple[VaryingParameter, ...]
     unlike: tuple[UnlikeRun, ...]
+    unit_names: tuple[str, ...] = ()
+    unlike_units: tuple[UnlikeRun, ...] = ()
+    of_runs: tuple[int, ...] = ()
+
+    @cached_property
+    def correlation(self) -> Array:
+        """Correlation of the parameters between runs, or between units if there are several.
+
+        It is that of the values in the runs or units, shrunk to 0 by its own uncertainty; shape
+        (m, m).
+
+        References:
+            Schaefer, Strimmer (2005), A shrinkage approach to large-scale covariance matrix
+            estimation, doi:10.2202/1544-6115.1175, section 2.4 (target D).
+        """
+        values = np.array([each.values for each in self.parameters]).reshape(-1, len(self.runs))
+        if self.units > 1:
+            unit = np.array(self.of_runs)
+            values = np.stack([values[:, unit == u].mean(axis=1) for u in range(self.units)], 1)
+        return shrunk_correlation(values.T)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, as result.json has them."""
@@ -103,37 +145,110 @@ class Variation:
             "logs": list(self.runs),
             "units": self.units,
             "parameters": {each.name: each.to_dict() for each in self.parameters},
+            "correlation": self.correlation.tolist(),
             "unlike": [
                 asdict(each) | {"run": self.runs[each.run], "ends": each.ends.tolist()}
                 for each in self.unlike
             ],
-        }
+            **({"unlike_units": [
+                asdict(each) | {"run": self.unit_names[each.run], "ends": each.ends.tolist()}
+                for each in self.unlike_units
+            ]} if self.units > 1 else {}),
+        }  # fmt: skip
 
 
-def vary(names: Sequence[str], groups: Sequence[RunsOf]) -> Variation | None:
+def vary(
+    names: Sequence[str], groups: Sequence[RunsOf], units: Sequence[str] = ()
+) -> Variation | None:
     """Return the variation between runs, or None for fewer than three runs.
 
-    A run is compared with the prediction of the other runs, group by group. Of the groups that
-    differ, the cause named is the one that explains most of the run's residual.
+    A run is compared with the prediction of the other runs, and a unit with that of the other
+    units, group by group. Of the groups that differ, the cause named is the one that explains most
+    of the residual.
 
     Args:
         names: Names of the k runs.
         groups: Information of the runs on each group of parameters.
+        units: Names of the units in the order of their indices; their numbers if empty.
     """
     if len(names) < FEWEST_RUNS or not groups:
         return None
     parameters: list[VaryingParameter] = []
-    for group in groups:
+    models = [MixedEffects(group.runs) for group in groups]
+    for group, model in zip(groups, models, strict=True):
         if group.group.kind == "drive":
-            parameters += _parameters(group)
-    n_tests = sum(group.runs.h.size for group in groups)
-    unlike = []
-    for run in range(len(names)) if len(names) > FEWEST_RUNS else ():
-        found = [each for group in groups for each in _compared(group, run, n_tests)]
-        if found:
-            unlike.append(max(found, key=lambda each: each[0])[1])
-    units = int(groups[0].runs.unit.max()) + 1
-    return Variation(tuple(names), units, tuple(parameters), tuple(unlike))
+            parameters += _parameters(group, model)
+    pairs = list(zip(groups, models, strict=True))
+    unit = groups[0].runs.unit
+    n_units = int(unit.max()) + 1
+    compared_units = range(n_units if n_units > FEWEST_RUNS else 0)
+    compared_runs = range(len(names) if len(names) > FEWEST_RUNS else 0)
+    size = sum(group.runs.h.shape[1] for group in groups)
+    n_tests = size * (len(compared_units) + len(compared_runs))
+    unlike_units = [
+        found for u in compared_units if (found := _unlike(pairs, u, n_tests, is_unit=True))
+    ]
+    different = {each.run for each in unlike_units}
+    unlike = [
+        found
+        for run in compared_runs
+        if unit[run] not in different and (found := _unlike(pairs, run, n_tests, is_unit=False))
+    ]
+    return Variation(
+        tuple(names), n_units, tuple(parameters), tuple(unlike),
+        tuple(units) or tuple(map(str, range(n_units))), tuple(unlike_units), tuple(unit.tolist()),
+    )  # fmt: skip
+
+
+def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Array:
+    """Return the covariance of parameters in the next run that the fit to all runs lacks.
+
+    Standard deviations are the medians of the spreads: between runs, or between units and between
+    the runs of a unit.
+
+    Args:
+        variation: As of ``Variation.to_dict``.
+        names: Names of p parameters.
+
+    Returns:
+        Shape (p, p); 0 for parameters that do not vary.
+    """
+    at = {name: k for k, name in enumerate(names)}
+    parameters = variation["parameters"]
+    own = [k for k, name in enumerate(parameters) if name in at]
+    places = [at[name] for name in parameters if name in at]
+    entries = [entry for name, entry in parameters.items() if name in at]
+    spreads = [(entry["spread"], entry.get("spread_within_units", 0.0)) for entry in entries]
+    std = np.hypot(*np.array(spreads).reshape(-1, 2).T)
+    found = np.zeros((len(names), len(names)))
+    R = np.array(variation["correlation"])[np.ix_(own, own)]
+    found[np.ix_(places, places)] = std[:, None] * R * std
+    return found
+
+
+def shrunk_correlation(values: Array) -> Array:
+    """Return the correlation of parameters, shrunk to 0 by its own uncertainty.
+
+    r* = (1 - lambda) r with lambda = sum Var(r_ij) / sum r_ij^2 over i != j, within [0, 1].
+
+    Args:
+        values: Values in k runs, shape (k, m).
+
+    Returns:
+        Shape (m, m), positive definite.
+    """
+    k, m = values.shape
+    centred = values - values.mean(axis=0)
+    std = np.sqrt((centred**2).sum(axis=0) / (k - 1))
+    z = centred / np.where(std > 0.0, std, 1.0)
+    products = z[:, :, None] * z[:, None, :]
+    mean = products.mean(axis=0)
+    r = k / (k - 1) * mean
+    variance = k / (k - 1) ** 3 * ((products - mean) ** 2).sum(axis=0)
+    off = ~np.eye(m, dtype=bool)
+    size = float((r[off] ** 2).sum())
+    share = min(max(float(variance[off].sum()) / size, _LEAST_SHRUNK), 1.0) if size else 1.0
+    return np.where(off, (1.0 - share) * r, 1.0)
 
 
 def changes(values: Array, std_errors: Array) -> list[tuple[int, int, Prediction]]:
@@ -165,12 +280,11 @@ def changes(values: Array, std_errors: Array) -> list[tuple[int, int, Prediction
     return sorted(found, key=lambda each: each[2].probability)
 
 
-def _parameters(group: RunsOf) -> Iterator[VaryingParameter]:
+def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter]:
     """Yield the parameters of a group on which the runs have information."""
-    model = MixedEffects(group.runs)
     values, errors = model.values
     known = np.einsum("kpp->p", group.runs.H) > 0.0
-    for p, prediction in enumerate(model.predict()):
+    for p, prediction in enumerate(model.with_one_more()):
         if known[p]:
             centre = float(group.centre[p])
             yield VaryingParameter(
@@ -183,22 +297,43 @@ def _parameters(group: RunsOf) -> Iterator[VaryingParameter]:
             )
 
 
-def _compared(group: RunsOf, run: int, n_tests: int) -> Iterator[tuple[float, UnlikeRun]]:
-    """Yield the difference of a run from the others, if there is one, and what it explains."""
+def _unlike(
+    pairs: Sequence[tuple[RunsOf, MixedEffects]], at: int, n_tests: int, *, is_unit: bool
+) -> UnlikeRun | None:
+    """Return how a run or a unit differs from the others; None if it does not."""
+    found = [
+        each
+        for group, every in pairs
+        for each in _compared(group, every, at, n_tests, is_unit=is_unit)
+    ]
+    return max(found, key=lambda each: each[0])[1] if found else None
+
+
+def _compared(
+    group: RunsOf, every: MixedEffects, at: int, n_tests: int, *, is_unit: bool
+) -> Iterator[tuple[float, UnlikeRun]]:
+    """Yield the difference of a run or unit from the others, if any, and what it explains."""
     runs = group.runs
-    covariance = np.linalg.inv(runs.H[run] + np.diag((UNKNOWN * runs.scale) ** -2.0))
-    x, variance = covariance @ runs.h[run], np.diag(covariance)
-    expected = MixedEffects(runs.without(run)).predict(variance, x)
+    if is_unit:
+        others, own = MixedEffects(runs.without_unit(at), every.deviation), runs.of_unit(at)
+        x, covariance = others.estimate_unit(own)
+        information = own.H.sum(axis=0)
+    else:
+        others, information = MixedEffects(runs.without(at), every.deviation), runs.H[at]
+        covariance = np.linalg.inv(information + np.diag((UNKNOWN * runs.scale) ** -2.0))
+        x = covariance @ runs.h[at]
+    variance = np.diag(covariance)
+    expected = others.predict(variance, x, is_unit=is_unit)
     p = int(np.argmin([each.probability for each in expected]))
     if expected[p].probability * n_tests >= _FALSE_ALARMS:
         return
     differs = x - np.array([each.mean for each in expected])
-    explained = group.inflation * float(differs @ runs.H[run] @ differs)
+    explained = group.inflation * float(differs @ information @ differs)
     centre = float(group.centre[p])
     if group.group.kind == "payload":  # relative to the other runs
         centre = -expected[p].mean
     yield explained, UnlikeRun(
-        run, group.group.kind, group.group.name, group.group.parameters[p], group.group.units[p],
+        at, group.group.kind, group.group.name, group.group.parameters[p], group.group.units[p],
         centre + float(x[p]), float(np.sqrt(variance[p])), centre + expected[p].ends,
         expected[p].probability,
     )  # fmt: skip

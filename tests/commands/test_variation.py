@@ -10,13 +10,18 @@ from helpers.driven import JOINTS, arm, driven_log
 from helpers.synthetic import truth
 
 from robotid.cli.identify import show_result
+from robotid.cli.validate import _show as show_validation
 from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings
+from robotid.commands.preview import preview_job
+from robotid.commands.validate import validate_result
 from robotid.exceptions import SettingsError
 from robotid.export.ranges import parameter_ranges, stated_ranges
 from robotid.identification.summary import variation_lines
 from robotid.log_files.read import write_log
+from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
+from robotid.variation.variation import SCORES
 
 COULOMB = "shoulder_lift_joint.coulomb"
 
@@ -64,6 +69,13 @@ def test_result_has_the_variation_of_each_drive_parameter(result, folder):
         each.prediction.mean, each.prediction.std_error, each.prediction.spread
     )  # fmt: skip
     assert entry["std_error_by_log"] == each.std_errors.tolist()
+    assert entry["one_more"] == dict(
+        zip(("std_error", "interval_width"), each.prediction.after, strict=True)
+    )
+    assert entry["next_quantiles"][7] == pytest.approx(each.prediction.quantiles(np.zeros(1))[0])
+    low, high = np.interp([-1.96, 1.96], SCORES, entry["next_quantiles"])
+    assert [low, high] == pytest.approx(entry["next_interval"], rel=0.1)
+    assert np.array(variation["correlation"]).shape == (len(own), len(own))
     assert entry["unit"] == "N m"
     assert "spread_within_units" not in entry
 
@@ -117,8 +129,88 @@ def test_terminal_prints_the_spread(result, capsys):
         "y.offset": {"mean": 1.0, "std_error": 0.1, "spread": 0.1},
     }}  # fmt: skip
     assert variation_lines(entry) == ["spread between 3 logs, by joint: coulomb 2.5 to 25 %"]
+    entry["units"] = 2
+    for each, error, width in zip(
+        entry["parameters"].values(), (0.09, 0.05, 1.8, 0.08), (0.9, 0.5, 0.7, 0.8), strict=True
+    ):
+        each |= {"next_interval": [-0.5, 0.5],
+                 "one_more": {"std_error": error, "interval_width": width}}  # fmt: skip
+    assert variation_lines(entry)[1] == (
+        "one more robot: standard errors of the means 15 % smaller, intervals of the next robot "
+        "25 % narrower (medians; most: y.coulomb 50 %)"
+    )
     assert variation_lines(None) == []
     assert variation_lines({"logs": ["a"], "parameters": {}}) == []
+
+
+def spread_of(found, log, count=3000):
+    """Return the RMS torque of drawn differences of the parameters, per joint."""
+    rng, C = np.random.default_rng(0), found.standard_covariance + found.between
+    w, V = np.linalg.eigh(C)
+    x = rng.standard_normal((count, len(C))) @ (V * np.sqrt(w.clip(0))).T
+    Y = joint_torque_regressor(found.model, log.q[::10], log.v[::10], log.a[::10])
+    return np.sqrt(np.mean((Y @ x.T).reshape(-1, len(JOINTS), count) ** 2, axis=(0, 2)))
+
+
+def test_validation_expects_the_error_of_the_next_log(result, folder, capsys):
+    found, content = result
+    log = driven_log(found.model, truth(found.model), 9, duration=6.0)
+    write_log(log, folder / "next.csv")
+    done = validate_result(folder / "out" / "result.json", [folder / "next.csv"])
+    expected = done["validation"][0]["expected"]
+    assert expected["with_spread"] is True
+    noise = [content["identification"]["per_joint"][joint]["rmse"] for joint in JOINTS]
+    wanted = np.hypot(spread_of(found, log), noise)
+    assert [expected["per_joint"][joint]["rmse"] for joint in JOINTS] == pytest.approx(
+        wanted, rel=0.05
+    )
+    assert all(0 <= x["within_95_pct"] <= 100 for x in expected["per_joint"].values())
+    assert min(x["within_95_pct"] for x in expected["per_joint"].values()) > 60
+    del expected["per_joint"]["elbow_joint"], expected["per_joint"]["wrist_1_joint"]
+    expected["per_joint"]["shoulder_lift_joint"] = {"rmse": 1.234, "within_95_pct": 94.6}
+    show_validation(done)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert (
+        "expected rmse by the fit and spread between logs (share of rows within 95 %): "
+        "shoulder_lift_joint 1.23 (95 %)"
+    ) in printed
+
+
+def test_next_log_has_a_larger_expected_error_than_the_residual(result, folder):
+    found, content = result
+    rmse = content["variation"]["next_torque_rmse"]
+    assert list(rmse) == list(JOINTS)
+    logs = [driven_log(found.model, truth(found.model), run, duration=6.0) for run in range(4)]
+    own = np.sqrt(np.mean([spread_of(found, log) ** 2 for log in logs], axis=0))
+    assert list(rmse.values()) == pytest.approx(np.hypot(own, found.estimate.sigma), rel=0.06)
+    page = (folder / "out" / "report.html").read_text()
+    assert f"next log, on motions like these: {JOINTS[0]} {rmse[JOINTS[0]]:.3g} N m" in page
+
+
+def test_preview_adds_the_spread_between_logs(result, folder):
+    found, _ = result
+    log = driven_log(found.model, truth(found.model), 9, duration=6.0)
+    write_log(log, folder / "next.csv")
+    job = job_from_settings(
+        {**settings(folder), "identification": [{"log": str(folder / "next.csv")}]}, "j", folder
+    )
+    given = folder / "out" / "result.json"
+    wide = preview_job(job, str(given))["torque"]
+    bare = json.loads(given.read_text())
+    del bare["variation"]
+    other = folder / "bare"
+    other.mkdir()
+    for file in given.parent.iterdir():
+        if file.suffix in (".urdf", ".json"):
+            (other / file.name).write_bytes(file.read_bytes())
+    (other / "result.json").write_text(json.dumps(bare))
+    narrow = preview_job(job, str(other))["torque"]
+    K = found.mapping.K
+    W = joint_torque_regressor(found.model, log.q, log.v, log.a)[:, found.mapping.independent]
+    added = np.einsum("ij,jk,ik->i", W, K @ found.between @ K.T, W).reshape(-1, len(JOINTS))
+    for j, joint in enumerate(JOINTS):
+        squares = (wide[joint]["half_width"] ** 2 - narrow[joint]["half_width"] ** 2) / 1.96**2
+        assert squares == pytest.approx(added[:, j].mean(), rel=0.1), joint
 
 
 def test_robots_are_stated_by_unit(folder):

@@ -213,6 +213,38 @@ def test_ends_of_loop_parameters_are_as_far_as_each_reaches():
                 assert (own["low"], own["high"]) == pytest.approx((low, high), abs=1e-12)
 
 
+def test_ends_of_gains_are_those_of_the_next_log():
+    entries = [
+        ("a.kp", 20.0, 2.0),
+        ("a.delay", 0.01, 0.002),
+        ("a.kd", 0.5, None),
+        ("b.zero", 0.1, 0.1),
+    ]
+    content = {
+        "robot": "arm",
+        "structure": {"undetermined": []},
+        "drive_parameters": [
+            {"name": name, "value": value, "std_error": error, "unit": "x"}
+            for name, value, error in entries
+        ],
+        "variation": {
+            "parameters": {
+                "a.kp": {"next_interval": [-1.0, 33.0]},
+                "a.delay": {"next_interval": [0.004, 0.02]},
+                "b.zero": {"next_interval": [-0.7, 0.4]}, "a.kd": {"next_interval": [0.1, 0.9]},
+                "calf.armature": {"next_interval": [0.0, 1.0]},
+            }
+        },
+    }  # fmt: skip
+    drives = stated_ranges(content)["drives"]
+    ends = {name: (drives[name[0]][name[2:]].get("low"), drives[name[0]][name[2:]].get("high"),
+                   drives[name[0]][name[2:]]["source"]) for name, *_ in entries}  # fmt: skip
+    assert ends == {
+        "a.kp": (0.0, 33.0, "logs"), "a.delay": (0.004, 0.02, "logs"),
+        "a.kd": (None, None, "stated"), "b.zero": (-0.7, 0.4, "logs"),
+    }  # fmt: skip
+
+
 def test_projected_friction_is_as_wide_as_draws_of_what_it_replaces(ur5):
     """Of terms whose intervals reach differently far, the farthest."""
     elbow, rng = "elbow_joint", np.random.default_rng(3)

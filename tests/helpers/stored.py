@@ -31,7 +31,10 @@ _DIGITS = 7
 _OF_CHART = 5  # digits: of numbers of 16 bits, or of pixels
 _SINGULAR = 1e6  # condition numbers from which on rounding makes them
 _LONG = 24  # numbers of a list that is told by a few of its own
-_LEFT_OUT = {"versions", "sha256", "seconds", "robotid", "urdf_sha256", "log_sha256", "platform"}
+_LEFT_OUT = {
+    "versions", "sha256", "seconds", "robotid", "urdf_sha256", "log_sha256", "platform",
+    "root",  # of a covariance: rounding turns it
+}  # fmt: skip
 _NUMBER = re.compile(r"(?<![\w.])[-−+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w]|\.\d)")
 _VARIES = re.compile(
     r"\b\d+(?:\.\d+)? (?:ms|s|min) of (?:processor|wall)|\d+\.\d+\.\d+|\bin \d+\.\d s\b"

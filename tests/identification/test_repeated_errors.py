@@ -154,13 +154,13 @@ def test_contact_errors_follow_the_selected_drive_terms(log, monkeypatch):
     pipeline.with_drives(plain, None, {})
     (changed,) = fits
     assert len(changed.mapping.base_names) == len(plain.mapping.base_names) + 3
-    assert changed.contacts.root.shape == (len(changed.mapping.base_names), 6)
+    assert changed.repeated.root.shape == (len(changed.mapping.base_names), 6)
     fresh = with_repeated_errors(
         Recordings(changed.model, changed.mapping, (hold_log(changed.model, log, RAW),))
     )
-    np.testing.assert_allclose(changed.contacts.root, fresh.contacts.root, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(changed.repeated.root, fresh.repeated.root, rtol=1e-9, atol=1e-15)
     k = [changed.mapping.base_names.index(f"{x}.viscous") for x in ("FR_KFE", "HL_HFE")]
-    assert (np.abs(changed.contacts.root[k]).max(axis=1) > 0.0).all()
+    assert (np.abs(changed.repeated.root[k]).max(axis=1) > 0.0).all()
 
 
 @pytest.mark.parametrize(("cutoff", "step"), [(None, 1), (10.0, 2)])
@@ -175,7 +175,7 @@ def test_errors_are_those_of_all_rows_though_only_some_are_used(log, monkeypatch
     W, weight = (np.concatenate([block[k] for block in some.blocks()]) for k in (0, 2))
     D = np.random.default_rng(2).standard_normal((len(W), 6))
     monkeypatch.setattr(repeated_errors, "_slopes", lambda *_: D)
-    found = with_repeated_errors(recordings).contacts
+    found = with_repeated_errors(recordings).repeated
     root = np.sqrt(weight)[:, None]
     W, D = root * W, root * D
     np.testing.assert_allclose(found.root, -2e-3 * step * W.T @ D, atol=1e-9 * np.abs(W).max())

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.optimize
 import scipy.stats
 
 from robotid.variation.mixed_effects import MixedEffects, Prediction, Runs
@@ -181,3 +182,85 @@ def test_prediction_is_shifted_by_a_constant():
     assert (moved.mean, moved.std_error, moved.spread, moved.probability) == (11.0, 0.5, 0.2, 0.3)
     assert moved.ends.tolist() == [10.0, 12.5]
     assert moved.spread_ends.tolist() == [0.1, 0.4]
+
+
+def test_a_unit_is_estimated_from_its_runs_and_predicted_without_their_deviation():
+    unit = np.repeat(np.arange(4), 2)
+    runs, blocks = drawn(np.random.default_rng(9), unit)
+    left = 2
+    model = MixedEffects(runs.without_unit(left))
+    x, C = model.estimate_unit(runs.of_unit(left))
+    own = [block for block, u in zip(blocks, unit, strict=True) if u == left]
+    A = scipy.linalg.block_diag(*[A for A, _ in own])
+    X, y = np.concatenate([A for A, _ in own]), np.concatenate([y for _, y in own])
+    V = A @ np.kron(np.eye(2), np.diag(model.deviation[0] ** 2)) @ A.T + np.eye(len(y))
+    P = X.T @ np.linalg.solve(V, X) + np.diag((100.0 * SCALE) ** -2.0)
+    assert pytest.approx(np.linalg.inv(P)) == C
+    assert x == pytest.approx(np.linalg.solve(P, X.T @ np.linalg.solve(V, y)))
+    pairs = zip(model.predict(is_unit=True), model.predict(), model.deviation[0], strict=True)
+    for of_unit, of_run, deviation in pairs:
+        assert of_unit.mean == of_run.mean
+        variance = of_run.mixture[2] ** 2 - of_unit.mixture[2] ** 2
+        assert variance == pytest.approx(np.full(len(variance), deviation**2))
+    assert runs.of_unit(left).unit.tolist() == [0, 0]
+    assert runs.without_unit(left).unit.tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_the_start_of_the_search_does_not_matter():
+    runs, _ = drawn(np.random.default_rng(3), (0, 0, 1, 1, 1, 2))
+    best = MixedEffects(runs).deviation
+    for first in (best, 3.0 * best, np.full((2, 2), 1e-9)):
+        assert MixedEffects(runs, first).deviation == pytest.approx(best, rel=0.02)
+    alone = Runs(runs.H, runs.h, np.zeros(6, int), SCALE)
+    assert MixedEffects(alone, best).deviation == pytest.approx(
+        MixedEffects(alone).deviation, rel=0.02
+    )
+
+
+def test_quantiles_are_those_of_the_mixture():
+    weight, mean, std = np.array([0.3, 0.7]), np.array([1.0, 2.0]), np.array([0.5, 3.0])
+    found = Prediction(
+        1.7, 0.1, 0.2, np.zeros(2), np.zeros(2), mixture=np.array([weight, mean, std])
+    )
+    values = found.shifted(4.0).quantiles(np.array([-2.0, 0.0, 1.5])) - 4.0
+    below = (weight * scipy.stats.norm.cdf((values[:, None] - mean) / std)).sum(axis=1)
+    assert below == pytest.approx(scipy.stats.norm.cdf([-2.0, 0.0, 1.5]))
+
+
+def test_one_more_run_adds_its_expected_likelihood():
+    x, error = np.array([1.3, 2.1, 1.7, 2.6, 1.9]), 0.3
+    runs = Runs(np.full((5, 1, 1), error**-2.0), (x / error**2)[:, None], np.zeros(5, int),
+                np.array([0.3]))  # fmt: skip
+    (found,) = MixedEffects(runs).with_one_more()
+    s = 0.3 * np.exp(np.linspace(-6, 5, 45))
+    v = s**2 + error**2
+    log = -0.5 * (4 * np.log(v) + ((x - x.mean()) ** 2).sum() / v)
+    log += np.log(s) + np.log(scipy.stats.t(4).pdf(s / 0.3))
+    total, at = v * 6 / 5, (found.spread**2 + error**2) * 6 / 5
+    log -= 0.5 * (np.log(total) + at / total)
+    weight = np.exp(log - log.max())
+    weight /= weight.sum()
+    assert found.after[0] == pytest.approx(np.sqrt(weight @ (v / 6)), rel=0.01)
+    std = np.sqrt(v / 6 + s**2)
+
+    def beyond(end):
+        return weight @ scipy.stats.norm.sf(end / std)
+
+    end = scipy.optimize.brentq(lambda end: beyond(end) - 0.025, 0.0, 50.0)
+    assert found.after[1] == pytest.approx(2 * end, rel=0.01)
+    assert found.after[1] < np.ptp(found.ends)
+
+
+def test_one_more_run_narrows_intervals_as_much_as_expected():
+    rng, expected, found = np.random.default_rng(5), [], []
+    for _ in range(40):
+        x = 0.4 * rng.normal(size=7) + 0.1 * rng.normal(size=7)
+        every = Runs(np.full((7, 1, 1), 100.0), 100.0 * x[:, None], np.zeros(7, int),
+                     np.array([0.3]))  # fmt: skip
+        (before,) = MixedEffects(every.without(6)).with_one_more()
+        (after,) = MixedEffects(every).predict()
+        expected.append((before.after[0] / before.std_error, before.after[1] / np.ptp(before.ends)))
+        found.append((after.std_error / before.std_error, np.ptp(after.ends) / np.ptp(before.ends)))
+    assert np.mean(np.log(found), axis=0) == pytest.approx(
+        np.mean(np.log(expected), axis=0), abs=0.05
+    )

@@ -1,5 +1,7 @@
 """What runs tell about drives, gains and a payload: from logs of a robot that differs in one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.driven import EXACT, FIT, arm, driven_log
@@ -11,9 +13,16 @@ from robotid.fitting.survey import hold_log
 from robotid.judgement.unlike_runs import unlike_findings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
-from robotid.variation.groups import Group, RunsOf, _groups, _inflation, runs_of
+from robotid.variation.groups import Group, RunsOf, _groups, inflation_of, runs_of
 from robotid.variation.mixed_effects import MixedEffects, Runs
-from robotid.variation.variation import UnlikeRun, Variation, changes, vary
+from robotid.variation.variation import (
+    UnlikeRun,
+    Variation,
+    between_covariance,
+    changes,
+    shrunk_correlation,
+    vary,
+)
 
 NAMES = [f"run_{k}.csv" for k in range(6)]
 LIFT, ELBOW = "shoulder_lift_joint", "elbow_joint"
@@ -126,7 +135,7 @@ def test_inflation_is_1_for_independent_rows():
             A = rng.normal(size=(4, rows, 3))
             e = 1.5 * rng.normal(size=(4, rows))
             runs.append((np.einsum("sri,srj->sij", A, A), np.einsum("sri,sr->si", A, e)))
-        found.append(_inflation(runs))
+        found.append(inflation_of(runs))
     assert np.mean(found) == pytest.approx(1.5**2, rel=0.06)
 
 
@@ -305,3 +314,70 @@ def test_changes_are_those_that_earlier_results_do_not_predict():
     assert found[:2] == (5, 1)
     assert found[2].ends[0] < -0.4 < found[2].ends[1]
     assert changes(values[:3], errors[:3]) == []
+
+
+def units_of(rng, shift, *, units=5, runs=2):
+    """Return a group of two payload terms in runs of units; one unit is shifted."""
+    unit = np.repeat(np.arange(units), runs)
+    x = 0.1 * rng.normal(size=(units, 2))[unit] + 0.05 * rng.normal(size=(len(unit), 2))
+    x[unit == 3] += shift
+    H = np.tile(np.diag([400.0, 900.0]), (len(unit), 1, 1))
+    h = np.einsum("kij,kj->ki", H, x + rng.normal(size=x.shape) / [20.0, 30.0])
+    group = Group("payload", "tool", ("tool.m", "tool.mcx"), ("kg", "kg m"), np.eye(2), (0,))
+    return RunsOf(group, np.zeros(2), Runs(H, h, unit, np.array([0.1, 0.1])), 1.0), unit
+
+
+def test_the_unit_that_differs_is_named_and_its_logs_are_not():
+    group, unit = units_of(np.random.default_rng(0), np.array([2.0, 0.0]))
+    names = [f"{k}.csv" for k in range(10)]
+    found = vary(names, [group], [f"arm-{u}" for u in range(5)])
+    (odd,) = found.unlike_units
+    assert (odd.run, odd.kind, odd.name) == (3, "payload", "tool.m")
+    assert odd.value == pytest.approx(2.0, abs=0.3)
+    assert not {3} & {unit[each.run] for each in found.unlike}
+    (finding,) = [each for each in unlike_findings(found) if each.code == "unlike_unit"]
+    assert finding.where == "unit arm-3"
+    assert "more than in the other units; 4 other units predict" in finding.message
+    assert finding.message.endswith("remove the load, or identify this robot alone")
+    content = found.to_dict()
+    assert [each["run"] for each in content["unlike_units"]] == ["arm-3"]
+    single, _ = units_of(np.random.default_rng(0), np.array([9.0, 0.0]), units=7, runs=1)
+    found = vary(names[:7], [single])
+    assert [each.run for each in found.unlike_units] == [3]
+    assert found.unlike == ()
+    alike, _ = units_of(np.random.default_rng(1), np.zeros(2))
+    assert vary(names, [alike], []).unlike_units == ()
+
+
+def test_three_units_are_not_compared():
+    group, _ = units_of(np.random.default_rng(0), np.array([9.0, 0.0]), units=3)
+    assert vary([f"{k}.csv" for k in range(6)], [group]).unlike_units == ()
+
+
+def test_spread_of_drives_adds_to_the_covariance_of_the_fit():
+    names = ["link.m", "b.coulomb", "a.viscous", "a.coulomb"]
+    variation = {
+        "parameters": {
+            "a.viscous": {"spread": 0.5},
+            "c.viscous": {"spread": 9.0},
+            "b.coulomb": {"spread": 0.3, "spread_within_units": 0.4},
+        },
+        "correlation": [[1.0, 0.1, -0.6], [0.1, 1.0, 0.2], [-0.6, 0.2, 1.0]],
+    }
+    wanted = np.zeros((4, 4))
+    wanted[2, 2], wanted[1, 1] = 0.25, 0.25
+    wanted[1, 2] = wanted[2, 1] = -0.6 * 0.25
+    assert between_covariance(variation, names) == pytest.approx(wanted, abs=1e-12)
+
+
+def test_correlation_is_that_between_logs_or_between_units():
+    group, unit = units_of(np.random.default_rng(2), np.zeros(2), units=6)
+    drive = replace(group.group, kind="drive", parameters=("a.viscous", "a.coulomb"))
+    found = vary([str(k) for k in range(12)], [replace(group, group=drive)])
+    values = np.array([each.values for each in found.parameters])
+    means = np.array([values[:, unit == u].mean(axis=1) for u in range(6)])
+    assert found.correlation == pytest.approx(shrunk_correlation(means))
+    one = replace(group.runs, unit=np.zeros(12, int))
+    found = vary([str(k) for k in range(12)], [replace(group, group=drive, runs=one)])
+    values = np.array([each.values for each in found.parameters])
+    assert found.correlation == pytest.approx(shrunk_correlation(values.T))
