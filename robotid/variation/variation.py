@@ -8,11 +8,10 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.variation.groups import FEWEST_RUNS, RunsOf
-from robotid.variation.mixed_effects import UNKNOWN, MixedEffects, Prediction, Runs
+from robotid.variation.mixed_effects import UNKNOWN, MixedEffects, Prediction
 
-__all__ = ["UnlikeRun", "Variation", "VaryingParameter", "changes", "vary"]
+__all__ = ["UnlikeRun", "Variation", "VaryingParameter", "vary"]
 
-_CHANGE = 0.05  # plausible standard deviation of a parameter between results, over its size
 _FALSE_ALARMS = 0.02  # probability that one of alike runs is named
 
 
@@ -134,35 +133,6 @@ def vary(names: Sequence[str], groups: Sequence[RunsOf]) -> Variation | None:
             unlike.append(max(found, key=lambda each: each[0])[1])
     units = int(groups[0].runs.unit.max()) + 1
     return Variation(tuple(names), units, tuple(parameters), tuple(unlike))
-
-
-def changes(values: Array, std_errors: Array) -> list[tuple[int, int, Prediction]]:
-    """Return the parameters that differ from what earlier results predict.
-
-    From the fourth result on, each is compared with all before it. The probability that one of
-    results without any change is named is 2 %.
-
-    Args:
-        values: Parameters of k results in order of time, shape (k, q).
-        std_errors: Their standard errors, shape (k, q), positive.
-
-    Returns:
-        Index of the result, index of the parameter, and its prediction, the least probable first.
-    """
-    typical = np.abs(np.median(values, axis=0))
-    scale = np.maximum(_CHANGE * typical, np.median(std_errors, axis=0))
-    n_tests, found = max(len(values) - FEWEST_RUNS, 0) * values.shape[1], []
-    for k in range(FEWEST_RUNS, len(values)):
-        for p in range(values.shape[1]):
-            H = std_errors[:k, p, None, None] ** -2.0
-            h = H[:, 0] * values[:k, p, None]
-            runs = Runs(H, h, np.zeros(k, dtype=int), scale[p : p + 1])
-            (expected,) = MixedEffects(runs).predict(
-                std_errors[k, p : p + 1] ** 2, values[k, p : p + 1]
-            )
-            if expected.probability * n_tests < _FALSE_ALARMS:
-                found.append((k, p, expected))
-    return sorted(found, key=lambda each: each[2].probability)
 
 
 def _parameters(group: RunsOf) -> Iterator[VaryingParameter]:

@@ -11,7 +11,7 @@ from robotid.fitting.survey import hold_log
 from robotid.judgement.unlike_runs import unlike_findings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.variation.groups import _inflation, runs_of
-from robotid.variation.variation import UnlikeRun, Variation, changes, vary
+from robotid.variation.variation import UnlikeRun, Variation, vary
 
 NAMES = [f"run_{k}.csv" for k in range(6)]
 LIFT, ELBOW = "shoulder_lift_joint", "elbow_joint"
@@ -236,17 +236,3 @@ def test_findings_name_log_value_and_prediction():
         "value": 1.2, "std_error": 0.011, "low": 0.98, "high": 1.03, "probability": 1e-7,
     }  # fmt: skip
     assert [*unlike_findings(None)] == []
-
-
-def test_changes_are_those_that_earlier_results_do_not_predict():
-    rng, alarms = np.random.default_rng(0), 0
-    for _ in range(20):
-        values = np.array([5.0, -0.4, 0.0]) + [0.2, 0.05, 0.01] * rng.normal(size=(8, 3))
-        errors = np.tile([0.1, 0.02, 0.01], (8, 1))
-        alarms += bool(changes(values, errors))
-    assert alarms <= 2
-    values[5, 1] = -1.5
-    (found,) = changes(values, errors)[:1]
-    assert found[:2] == (5, 1)
-    assert found[2].ends[0] < -0.4 < found[2].ends[1]
-    assert changes(values[:3], errors[:3]) == []
