@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
 
 from robotid._typing import Array
 
@@ -14,6 +13,7 @@ __all__ = ["Cause", "cause_of"]
 _TERM = re.compile(r"(?:(?P<sign>[+-]) )?(?:(?P<size>[0-9.e+-]+) )?(?P<name>\S+\.\S+)")
 _EXPLAINED = 0.5  # smallest share of a change that its cause explains
 _WEIGHT = 2.0  # evidence that each parameter of a cause must add (Akaike)
+_FAR = 3.0  # standard errors beyond which a relative change differs
 _UNSCALED = "offset"  # drive term that is not of friction; a gain leaves it, for it may be a zero
 _INERTIA = "armature"  # ... that never changes by itself
 _MASS = ("m", "mcx", "mcy", "mcz")
@@ -48,9 +48,9 @@ def cause_of(
     """Return the cause that explains most of a change.
 
     Each cause is a linear subspace of changes: those of the friction terms of a drive; of its
-    offset; the drive's terms times a common factor, and likewise all inertial parameters, whose
-    torque other joints measure, too; those by mass and first moments of the last link. The
-    explained part of chi^2 less 2 for each dimension is compared.
+    offset; a common factor of the drive's terms and of a body, whose parameters this joint measures
+    best; those by mass and first moments of the last link. The explained part of chi^2 less 2 for
+    each dimension is compared. Without a body that changes likewise, a drive's change is friction.
 
     Args:
         parameters: Expression of each of the q base parameters by its name.
@@ -60,25 +60,20 @@ def cause_of(
         change: Their change, shape (q,).
         std_errors: Its standard errors, shape (q,).
     """
-    names, d = list(parameters), change / std_errors
-    found = []
-    for kind, where, columns in _causes(
-        names, list(parameters.values()), drives, last_link, before
-    ):
-        A = columns / std_errors[:, None]
-        A = A[:, A.any(axis=0)]
-        if not A.shape[1]:
-            continue
-        x = np.linalg.pinv(A) @ d
-        explained, rank = float(d @ (A @ x)), np.linalg.matrix_rank(A)
-        found.append((explained - _WEIGHT * rank, explained, kind, where, columns))
+    names, found = list(parameters), []
+    expressions = list(parameters.values())
+    every = _causes(names, expressions, drives, last_link, before, change, std_errors)
+    for kind, where, columns in every:
+        if columns.any():
+            *_, explained = _fitted(columns, change, std_errors)
+            rank = int(np.linalg.matrix_rank(columns / std_errors[:, None]))
+            found.append((explained - _WEIGHT * rank, explained, kind, where, columns))
     other = Cause("other", "", 0.0, 0.0)
     if not found:
         return other
     _, explained, kind, where, columns = max(found, key=lambda each: each[0])
-    # a change of everything by noise alone is not the cause's to explain
-    noise = float(scipy.stats.chi2.ppf(0.5, len(d)))
-    if explained < _EXPLAINED * max(float(d @ d) - noise, explained):
+    total = float(((change / std_errors) ** 2).sum()) - len(change)  # without that of noise
+    if explained < _EXPLAINED * total:
         return other
     return Cause(kind, where, *_size(kind, columns, before, change, std_errors))
 
@@ -89,11 +84,19 @@ def _causes(
     drives: Sequence[str],
     last_link: str,
     before: Array,
+    change: Array,
+    std_errors: Array,
 ) -> Iterator[tuple[str, str, Array]]:
     """Yield kind, joint or link, and columns of each cause in the q parameters, shape (q, r)."""
+
+    def factor(own: Array) -> tuple[float, float]:
+        """Return the common relative change of some parameters, and its standard error."""
+        x, error, _ = _fitted((before * own)[:, None], change, std_errors)
+        return x, error
+
     eye, owners = np.eye(len(names)), [name.rpartition(".")[0] for name in names]
     terms = [name.rpartition(".")[2] for name in names]
-    inertial = np.array([owner not in drives for owner in owners])
+    bodies = dict.fromkeys(owner for owner in owners if owner not in drives)
     for drive in drives:
         own = np.array([owner == drive for owner in owners])
         offset = own & np.array([term == _UNSCALED for term in terms])
@@ -101,8 +104,12 @@ def _causes(
         yield "friction", drive, eye[:, own & ~offset & ~armature]
         yield "offset", drive, eye[:, offset]
         scaled = own & ~offset
-        if scaled.sum() > 1:
-            yield "gain", drive, np.column_stack([before * scaled, before * inertial])
+        for body in bodies if scaled.any() else ():
+            moved = np.array([owner == body for owner in owners])
+            (x, x_error), (y, y_error) = factor(scaled), factor(moved)
+            is_alike = abs(x - y) < _FAR * np.hypot(x_error, y_error)
+            if is_alike and abs(y) > _FAR * y_error > 0.0:
+                yield "gain", drive, (before * (scaled | moved))[:, None]
     K = np.array([[_coefficient(text, f"{last_link}.{t}") for t in _MASS] for text in expressions])
     yield "payload", last_link, K
 
@@ -119,10 +126,15 @@ def _size(
     kind: str, columns: Array, before: Array, change: Array, std_errors: Array
 ) -> tuple[float, float]:
     """Return the size of a cause with its standard error."""
-    A = columns / std_errors[:, None]
     if kind == "friction":  # weighted mean of the relative changes
-        own = columns.any(axis=1)
-        A = (before * own / std_errors)[:, None]
+        columns = (before * columns.any(axis=1))[:, None]
+    x, error, _ = _fitted(columns, change, std_errors)
+    return x, error
+
+
+def _fitted(columns: Array, change: Array, std_errors: Array) -> tuple[float, float, float]:
+    """Return the first coefficient of a change, its standard error, and the explained chi^2."""
+    A, d = columns / std_errors[:, None], change / std_errors
     C = np.linalg.pinv(A.T @ A)
-    x = C @ (A.T @ (change / std_errors))
-    return float(x[0]), float(np.sqrt(C[0, 0]))
+    x = C @ (A.T @ d)
+    return float(x[0]), float(np.sqrt(C[0, 0])), float(d @ A @ x)
