@@ -5,7 +5,8 @@ the covariance of weighted least squares on the rows of its motion: the motions,
 covariance are those of robotid, the noise is drawn. Friction varies by 5 % between results. From
 the eleventh result on: no change; friction of the elbow 40 % higher; friction that rises by 5 % per
 result; a gain that is 10 % lower; a payload of 0.5 kg. The delay counts results from the change on.
-With ROBOTID_DATA: the logs of the UR10e, one result for each log, by the date in their names.
+With ROBOTID_DATA: the logs of the UR10e, a result for each, with viscous and Coulomb friction;
+logs that determine too little for a result are named.
 
     ROBOTID_DATA=folder python benchmarks/bench_history.py [--quick]
 """
@@ -24,12 +25,14 @@ from bench_runs import JOBS, UNLOADED, WITHIN, arm
 
 from robotid.commands.identify import run_job
 from robotid.commands.job import LogEntry, read_job
+from robotid.exceptions import RobotIdError
 from robotid.logs.data import Trajectory
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress
 from robotid.regressor.torque import build_problem
 from robotid.report.comparison import compare_results
 from robotid.report.history import history_of
+from robotid.robot.drives import DRIVE_TERMS
 from robotid.simulation.motions import random_fourier
 
 RESULTS, CHANGED, MOTIONS = 20, 10, 8
@@ -136,17 +139,24 @@ def recorded():
     known = {entry.path.stem: entry for entry in (*job.identification, *job.validation)}
     folder = job.identification[0].path.parent
     names = [*UNLOADED, *(x.stem for x in folder.glob("*.parquet") if x.stem.endswith("load"))]
-    print(f"\nUR10e, {len(names)} logs: {', '.join(names)}")
+    used = []
     with tempfile.TemporaryDirectory() as where:
-        paths = []
         for name in names:
             entry = known.get(name, LogEntry(folder / f"{name}.parquet"))
-            own = replace(job, identification=(entry,), validation=(), report=False)
-            run_job(own, Path(where, name))
-            paths.append(Path(where, name, "result.json"))
-        content = compare_results(paths)
+            own = replace(job, identification=(entry,), validation=(), report=False,
+                          terms=DRIVE_TERMS)  # fmt: skip
+            try:
+                run_job(own, Path(where, name))
+            except RobotIdError as error:
+                print(f"- {name}: no result: {str(error)[:120]}")
+            else:
+                used.append(name)
+        content = compare_results([Path(where, name, "result.json") for name in used])
+    print(f"\nUR10e, {len(used)} results: {', '.join(used)}")
+    print(f"{len(content['alarms'])} alarms")
     for each in content["alarms"]:
-        print(f"- {names[ord(each['result']) - 65]}: {each['message']} ({each['parameters']})")
+        shown = ", ".join(each["parameters"])
+        print(f"- {used[ord(each['result']) - 65]}: {each['message']} ({shown})")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from robotid.variation.mixed_effects import MixedEffects, Prediction, Runs
 
 __all__ = ["UnlikeUnit", "between_units"]
 
-_SCALE = 0.05  # plausible standard deviation between units, over the parameter's size
+_SCALE = 0.1  # smallest plausible standard deviation between units, over the parameter's size
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,9 @@ def between_units(
     if len(left) < FEWEST_RUNS:
         return None
     own, errors = values[left], std_errors[left]
-    scale = max(_SCALE * abs(float(np.median(own))), float(np.median(errors)))
+    scale = max(
+        _SCALE * abs(float(np.median(own))), float(np.median(errors)), float(np.std(own, ddof=1))
+    )
     H = errors[:, None, None] ** -2.0
     one = np.zeros(len(left), dtype=int)  # a unit has one estimate here: it is the lowest level
     model = MixedEffects(Runs(H, H[:, 0] * own[:, None], one, np.array([scale])))
