@@ -18,6 +18,7 @@ __all__ = ["history_of", "history_section"]
 _EPOCH = (
     1e8  # [s] earliest time stamp of logs that are ordered by it: of 1973, not of a log's start
 )
+_UNKNOWN = 1e3  # standard error of what a result does not determine, over the largest value
 _HALF = 1.96  # standard errors of a 95 % interval
 _REMEDY = {
     "friction": "Warm the robot up and repeat the log. If the friction remains, check lubrication, "
@@ -46,7 +47,8 @@ def history_of(
     Returns:
         Plain values: "order" (indices of the results by the time stamps of their logs, if these
         are dates, otherwise as given), "by_time" (whether they are), "false_alarms", "changes"
-        (parameters that earlier results do not predict) and "alarms" (their causes).
+        (parameters that earlier results do not predict) and "alarms" (their causes). Parameters
+        that a result does not determine have no weight in it.
 
     Raises:
         SettingsError: If the probability is not between 0 and 1.
@@ -66,6 +68,10 @@ def history_of(
         values, errors = (
             np.array([each[key] for each in known]).T[order] for key in ("values", "std_errors")
         )
+        weak = [results[k].get("structure", {}).get("undetermined", ()) for k in order]
+        is_weak = np.array([[each["name"] in own for each in known] for own in weak])
+        size = np.maximum(np.abs(values).max(axis=0), errors.max(axis=0))
+        errors = np.where(is_weak, _UNKNOWN * size, errors)
         found = changes(values, errors, false_alarms=false_alarms)
     names = [labels[k] for k in order]
     content["changes"] = [
