@@ -47,7 +47,7 @@ def test_a_missing_table_is_refused(tmp_path):
 def test_rows_are_written_in_groups_of_a_fixed_size(tmp_path, monkeypatch):
     monkeypatch.setattr(text_tables, "_GROUP", 4)
     rows = [{"name": f"n{k}", "value": k / 3} if k != 5 else {"name": "n5"} for k in range(10)]
-    for path, size in (("a", 1), ("b", 7)):
+    for path, size in (("a", 1), ("b", 10)):
         with parquet_rows(tmp_path / path, {"name": str, "value": float}) as table:
             for k in range(0, 10, size):
                 table.add(rows[k : k + size])
