@@ -26,7 +26,7 @@ __all__ = ["FALSE_ALARMS", "Change", "Steps", "changes", "steps_of"]
 FALSE_ALARMS = 0.02
 _CHANGE = 0.05  # plausible standard deviation of a parameter between results, over its size
 _GRID = 32  # standard deviations s over which it is integrated
-_LEAST, _MOST = 0.05, 30.0  # their range, over the standard error, over the scatter
+_LEAST, _MOST = 0.05, 30.0  # their range, over the smallest standard error, over the scatter
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,12 +116,15 @@ def steps_of(values: Array, std_errors: Array) -> Steps:
     """
     centre = np.median(values, axis=0)
     x, variance = (values - centre).T[:, None], std_errors.T[:, None] ** 2  # (q, 1, k)
-    error = np.median(std_errors, axis=0)
+    error = std_errors.min(axis=0)
     low, high = _LEAST * error, _MOST * np.maximum(np.std(values, axis=0), error)
     s = np.exp(np.linspace(np.log(low), np.log(high), _GRID, axis=1))[:, :, None]  # (q, grid, 1)
     w = 1.0 / (s**2 + variance)
-    sums = [np.cumsum(each, axis=2) for each in (w, w * x, w * x**2)]
-    parts = [[S[:, :, :-1] for S in sums], [S[:, :, -1:] - S[:, :, :-1] for S in sums]]
+    terms = w, w * x, w * x**2
+    parts = [  # sums over the results before and after each place; no differences of large numbers
+        [np.cumsum(each, axis=2)[:, :, :-1] for each in terms],
+        [np.cumsum(each[:, :, ::-1], axis=2)[:, :, -2::-1] for each in terms],
+    ]
     means = [S1 / S0 for S0, S1, _ in parts]
     misfit = sum(S2 - S1**2 / S0 for S0, S1, S2 in parts)
     density = 0.5 * (np.log(w).sum(axis=2, keepdims=True) - misfit)
@@ -146,7 +149,7 @@ def steps_of(values: Array, std_errors: Array) -> Steps:
 def _expected(x: Array, std_errors: Array, before: slice, k: int) -> Prediction:
     """Return the prediction of a result from those before the change."""
     own, errors = x[before], std_errors[before]
-    scale = max(_CHANGE * abs(float(np.median(own))), float(np.median(errors)))
+    scale = max(_CHANGE * abs(float(np.median(own))), float(errors.min()))
     H = errors[:, None, None] ** -2.0
     runs = Runs(H, H[:, 0] * own[:, None], np.zeros(len(own), dtype=int), np.array([scale]))
     (expected,) = MixedEffects(runs).predict(std_errors[k : k + 1] ** 2, x[k : k + 1])

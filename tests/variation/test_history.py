@@ -92,3 +92,19 @@ def test_the_cause_of_a_change_is_named_with_its_size(cause):
     assert found.size == pytest.approx(size, abs=0.02)
     if cause[0] == "offset":
         assert found.std_error == pytest.approx(0.02)
+
+
+def test_results_that_determine_nothing_have_no_weight():
+    rng = np.random.default_rng(6)
+    x, errors = 2.0 + 0.05 * rng.normal(size=(12, 1)), np.full((12, 1), 1e-3)
+    x[8:] += 1.0
+    alike = changes(x, errors)
+    assert [each.first for each in alike] == [8]
+    order = [0, 1, 2, 3, 12, 13, 4, 5, 6, 7, 14, 8, 9, 10, 11]
+    more = np.vstack([x, [[40.0], [-30.0], [0.0]]])[order]
+    wide = np.vstack([errors, np.full((3, 1), 1e5)])[order]
+    (found,) = changes(more, wide)
+    assert found.first in (10, 11)  # the result in between is on either side
+    steps, own = steps_of(more, wide), steps_of(x, errors)
+    assert steps.change[0, 9] == pytest.approx(own.change[0, 7], rel=1e-3)
+    assert steps.std_error[0, 9] == pytest.approx(own.std_error[0, 7], rel=0.2)
