@@ -119,7 +119,7 @@ def simulated(count):
         for seed in range(count):
             rng = np.random.default_rng([number, seed])
             rows = history(model, mapping, pi, friction, H, kind, rng)
-            alarms = history_of([about] * RESULTS, rows, labels)["alarms"]
+            alarms = history_of([about] * RESULTS, rows, labels)["findings"]
             early = [x for x in alarms if not cause or int(x["result"]) < CHANGED]
             late = [x for x in alarms if cause and int(x["result"]) >= CHANGED]
             false += bool(early)
@@ -154,7 +154,7 @@ def recorded():
         content = compare_results([Path(where, name, "result.json") for name in used])
     print(f"\nUR10e, {len(used)} results: {', '.join(used)}")
     print(f"{len(content['alarms'])} alarms")
-    for each in content["alarms"]:
+    for each in content["findings"]:
         shown = ", ".join(each["parameters"])
         print(f"- {used[ord(each['result']) - 65]}: {each['message']} ({shown})")
 

@@ -31,14 +31,14 @@ def compare_results(
 
     Args:
         paths: At least two result.json files.
-        false_alarms: Probability that results without a change have an alarm.
+        false_alarms: Probability that results without a change have a finding.
 
     Returns:
         Plain values: "results" (label, name, path, robot, estimator, verdict; the name is the
         unique part of the path), "validation" and "fitted" (errors by joint, one column per
         result), "fitted_alike" and "notes" (what is not comparable, and the reason),
         "friction" (curves by joint), "base_parameters" (values, standard errors, and the difference
-        to the first result over the combined standard error), "order", "changes" and "alarms" of
+        to the first result over the combined standard error), "order", "changes" and "findings" of
         the results over time, as of ``history_of``, "settings", "inputs" and "versions" that
         differ. The largest difference comes first.
 

@@ -1,4 +1,4 @@
-"""Parameters over results in order of time: alarms, their causes, charts."""
+"""Parameters over results in order of time: findings, their causes, charts."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -36,18 +36,18 @@ def history_of(
     labels: Sequence[str],
     false_alarms: float = FALSE_ALARMS,
 ) -> dict[str, Any]:
-    """Return order, changes and alarms of results.
+    """Return order, changes and findings of results.
 
     Args:
         results: Contents of their result.json.
         parameters: Base parameters with the values and standard errors of all results.
         labels: Names of the results.
-        false_alarms: Probability that a history without a change has an alarm.
+        false_alarms: Probability that a history without a change has a finding.
 
     Returns:
         Plain values: "order" (indices of the results by the time stamps of their logs, if these
         are dates, otherwise as given), "by_time" (whether they are), "false_alarms", "changes"
-        (parameters that earlier results do not predict) and "alarms" (their causes). Parameters
+        (parameters that earlier results do not predict) and "findings" (their causes). Parameters
         that a result does not determine have no weight in it.
 
     Raises:
@@ -88,7 +88,7 @@ def history_of(
         }
         for each in found
     ]
-    content["alarms"] = _alarms(results[0], known, values, errors, found, names)
+    content["findings"] = _findings(results[0], known, values, errors, found, names)
     return content
 
 
@@ -99,7 +99,7 @@ def _first_time(result: Mapping[str, Any]) -> float | None:
     return min(known) if known else None
 
 
-def _alarms(
+def _findings(
     result: Mapping[str, Any],
     known: Sequence[Mapping[str, Any]],
     values: Array,
@@ -107,8 +107,8 @@ def _alarms(
     found: Sequence[Change],
     labels: Sequence[str],
 ) -> list[dict[str, Any]]:
-    """Return the alarms with their causes; later alarms of the same change are joined with it."""
-    alarms: list[dict[str, Any]] = []
+    """Return the findings with their causes; later ones of the same change are joined with it."""
+    findings: list[dict[str, Any]] = []
     raised: list[int] = []  # index of the result of each
     drives = list(dict.fromkeys(e["name"].rpartition(".")[0] for e in result["drive_parameters"]))
     bodies = [entry["name"].rpartition(".")[0] for entry in result["standard_parameters"]]
@@ -123,14 +123,14 @@ def _alarms(
         cause = cause_of(expressions, drives, link, *at)
         names = [known[each.parameter]["name"] for each in own]
         same = [
-            alarm for alarm, before in zip(alarms, raised, strict=True)
-            if (alarm["kind"], alarm["where"]) == (cause.kind, cause.where) and first <= before
+            finding for finding, before in zip(findings, raised, strict=True)
+            if (finding["kind"], finding["where"]) == (cause.kind, cause.where) and first <= before
         ]  # fmt: skip
         if same:
             same[-1]["parameters"] += [name for name in names if name not in same[-1]["parameters"]]
             continue
         raised.append(k)
-        alarms.append(
+        findings.append(
             {
                 "result": labels[k],
                 "since": labels[first],
@@ -143,7 +143,7 @@ def _alarms(
                 "remedy": _REMEDY[cause.kind],
             }
         )
-    return alarms
+    return findings
 
 
 def _message(cause: Cause, names: Sequence[str]) -> str:
@@ -165,7 +165,7 @@ def _message(cause: Cause, names: Sequence[str]) -> str:
 
 
 def history_section(content: Mapping[str, Any]) -> str:
-    """Return the section of a comparison with changes: alarms, parameters, a chart of each.
+    """Return the section of a comparison with changes: findings, parameters, a chart of each.
 
     Args:
         content: The value of ``compare_results``.
@@ -176,13 +176,13 @@ def history_section(content: Mapping[str, Any]) -> str:
     source = "of the time stamps of their logs" if content["by_time"] else "in which they are given"
     intro = (
         f"<p>Results in the order {source}: {escape(in_time)}. Each is compared with those before "
-        f"it. A history without a change has an alarm with a probability of at most "
+        f"it. A history without a change has a finding with a probability of at most "
         f"{100 * content['false_alarms']:.3g} %.</p>\n"
     )
-    alarms = [
+    findings = [
         [text(each["result"]), text(each["since"]), text(each["message"]),
          code(", ".join(each["parameters"])), text(each["remedy"])]
-        for each in content["alarms"]
+        for each in content["findings"]
     ]  # fmt: skip
     rows = [
         [
@@ -202,7 +202,7 @@ def history_section(content: Mapping[str, Any]) -> str:
     heads = ["result", "changed since", "cause", "parameters", "what to do"]
     return (
         intro
-        + table("Alarms", heads, alarms)
+        + table("Findings", heads, findings)
         + table(caption, headers, rows, is_data=True)
         + f'<div class="plots">\n{charts}</div>\n'
     )

@@ -1,4 +1,4 @@
-"""Changes of parameters over results in order of time: a sequential test, and its alarms.
+"""Changes of parameters over results in order of time: a sequential test, and its findings.
 
 A step of a parameter after result c is tested by the model
 
@@ -8,7 +8,7 @@ the mixed-effects model of runs of one robot with a step. mu and delta have flat
 without errors e_k this is the t-test, whose level holds for any spread s. At every new result,
 steps are tested before the last 1, 2, 4, ... results, parameter by parameter. The j-th tested
 result has the share 1 / (j (j + 1)) of the probability of a false alarm. These add up to one: the
-probability holds for a history of any length, and an alarm never depends on later results.
+probability holds for a history of any length, and a finding never depends on later results.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from robotid.variation.mixed_effects import MixedEffects, Prediction, Runs
 
 __all__ = ["FALSE_ALARMS", "Change", "Steps", "changes", "steps_of"]
 
-#: Probability that a history without a change has an alarm.
+#: Probability that a history without a change has a finding.
 FALSE_ALARMS = 0.02
 _CHANGE = 0.05  # plausible standard deviation of a parameter between results, over its size
 _GRID = 32  # standard deviations s over which it is integrated
@@ -50,10 +50,10 @@ class Steps:
 
 @dataclass(frozen=True)
 class Change:
-    """An alarm: a parameter has changed.
+    """A finding: a parameter has changed.
 
     Attributes:
-        result: Index of the result that raises the alarm.
+        result: Index of the result that raises the finding.
         start: Index of the first result that it is compared with.
         first: Index of the first result after the change, the most likely one.
         parameter: Index of the parameter.
@@ -72,15 +72,15 @@ class Change:
 def changes(
     values: Array, std_errors: Array, *, false_alarms: float = FALSE_ALARMS
 ) -> list[Change]:
-    """Return the alarms of a history. After an alarm, the parameter is compared with its new level.
+    """Return the findings of a history; after one, the parameter is compared with its new level.
 
     Args:
         values: Parameters of k results in order of time, shape (k, q).
         std_errors: Their standard errors, shape (k, q), positive.
-        false_alarms: Probability that a history without any change has an alarm.
+        false_alarms: Probability that a history without any change has a finding.
 
     Returns:
-        The alarms in the order of time, those of one result with the least probable first.
+        The findings in the order of time, those of one result with the least probable first.
 
     References:
         Lai (1995), Sequential changepoint detection in quality control and dynamical systems

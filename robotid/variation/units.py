@@ -39,7 +39,7 @@ def between_units(
     Args:
         values: The parameter of each unit, shape (u,).
         std_errors: Its standard errors, shape (u,), positive.
-        level: Probability of a difference by chance, for each unit, below which it is unlike.
+        level: Probability of a difference without a cause, for each unit, below which it is unlike.
 
     Returns:
         The prediction, and the units that are unlike, the most unlikely first; None for fewer than

@@ -584,24 +584,24 @@ def test_results_are_in_the_order_of_the_dates_of_their_logs(folder, tmp_path, c
     starts = [1.7e9 + 86400.0 * day for day in (3, 0, 5, 1, 2, 4)]
     content = write_comparison(history(folder, tmp_path, starts, 4.0), tmp_path / "page.html")
     assert (content["order"], content["by_time"]) == ([1, 3, 4, 0, 5, 2], True)
-    (alarm,) = content["alarms"]
-    assert (alarm["result"], alarm["since"]) == ("C", "C")
-    assert (alarm["kind"], alarm["where"]) == ("friction", "joint_2")
-    assert alarm["size"] == pytest.approx(3.0, rel=0.05)
-    assert set(alarm["parameters"]) == {"joint_2.coulomb", "joint_2.viscous"}
+    (finding,) = content["findings"]
+    assert (finding["result"], finding["since"]) == ("C", "C")
+    assert (finding["kind"], finding["where"]) == ("friction", "joint_2")
+    assert finding["size"] == pytest.approx(3.0, rel=0.05)
+    assert set(finding["parameters"]) == {"joint_2.coulomb", "joint_2.viscous"}
     page = (tmp_path / "page.html").read_text()
     assert "of the time stamps of their logs: B, D, E, A, F, C." in page
-    assert tables(page)["Alarms"].rows[0][:2] == ["C", "C"]
+    assert tables(page)["Findings"].rows[0][:2] == ["C", "C"]
     named = [chart for chart in charts(page) if "over the results" in chart["title"]]
-    assert {chart["title"].split()[0] for chart in named} == set(alarm["parameters"])
+    assert {chart["title"].split()[0] for chart in named} == set(finding["parameters"])
     assert named[0]["x_names"] == list("BDEAFC")
     assert named[0]["marks"] == [4.5]
     words = ["compare", *(str(tmp_path / f"{k}.json") for k in range(6))]
     assert main(words) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "alarm: C: friction of joint_2 is 3" in printed
+    assert "finding: C: friction of joint_2 is 3" in printed
     assert main([*words, "--false-alarms", "1e-9"]) == 0
-    assert "alarm" not in capsys.readouterr().out
+    assert "finding:" not in capsys.readouterr().out
     assert main([*words, "--false-alarms", "2"]) == 2
     assert "false_alarms is 2, wanted a probability" in capsys.readouterr().err
 
@@ -613,9 +613,9 @@ def test_time_stamps_from_the_start_of_a_log_are_no_order(folder, tmp_path):
 
 def test_a_value_that_a_result_does_not_determine_raises_no_alarm(folder, tmp_path):
     paths = history(folder, tmp_path, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], 4.0)
-    assert len(compare_results(paths)["alarms"]) == 1
+    assert len(compare_results(paths)["findings"]) == 1
     last = read_result(paths[-1])
     last["structure"]["undetermined"] = ["joint_2.coulomb", "joint_2.viscous"]
     write_json(last, paths[-1])
     content = compare_results(paths)
-    assert (content["alarms"], content["changes"]) == ([], [])
+    assert (content["findings"], content["changes"]) == ([], [])
