@@ -36,8 +36,8 @@ _TRIM_THRESHOLD, _SPARE = -1, 2**26  # [bytes]
 #: The commands in the order of the help. Each is a module with SUMMARY, add_flags and run; one with
 #: many flags also has MAIN_FLAGS and EXAMPLES, for its short help.
 COMMANDS = (
-    "demo", "paper", "inspect", "identify", "track", "excite", "preview", "replay", "doctor",
-    "validate", "payload", "report", "compare", "export", "simulate", "convert", "schema",
+    "demo", "paper", "inspect", "identify", "fleet", "track", "excite", "preview", "replay",
+    "doctor", "validate", "payload", "report", "compare", "export", "simulate", "convert", "schema",
 )  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """A job: from its files to the folder of results."""
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -269,7 +269,12 @@ def _remove_stale(files: Iterable[Path]) -> None:
 
 
 def identify_job(
-    job: Job, model: RobotModel, plan: WorkPlan, folder: Path | None = None
+    job: Job,
+    model: RobotModel,
+    plan: WorkPlan,
+    folder: Path | None = None,
+    *,
+    refuse: Callable[[LogEntry, DataError], None] | None = None,
 ) -> tuple[Identification, Checkpoint | None]:
     """Identify from a job's logs; only finished pieces of long logs are written.
 
@@ -278,15 +283,18 @@ def identify_job(
         model: Its robot.
         plan: Workers for long logs.
         folder: Folder of the checkpoint, which stores finished pieces; none if None.
+        refuse: As of ``survey_logs``.
 
     Raises:
         DataError, ModelError, NotConvergedError, RankDeficientError, SettingsError, WorkerError:
             As of ``run_job``.
     """
     check_ignored(job.ignore)
-    fitted, validation = survey_logs(job, model, job.identification, job.validation)
+    groups = job.identification, job.validation
+    fitted, validation = survey_logs(job, model, *groups, refuse=refuse)
     if not fitted:
-        raise DataError("no log is given, wanted at least one to identify from")
+        which = "no log is usable" if job.identification else "no log is given"
+        raise DataError(f"{which}, wanted at least one to identify from")
     report_stage(plan.progress, "checking logs")
     placed = locked_as_logged(job, model, fitted, validation)
     job, model, fitted, validation = placed.job, placed.model, placed.fitted, placed.validation

@@ -35,6 +35,7 @@ __all__ = [
     "checkpoint_inputs",
     "examine",
     "examine_logs",
+    "identity_of",
     "job_of_result",
     "locked_as_logged",
     "log_of_commands",
@@ -295,12 +296,19 @@ def checkpoint_inputs(job: Job) -> dict[str, Any]:
         "versions": code_versions(),
         "settings": settings,
         "urdf_sha256": file_sha256(job.urdf),
-        "logs": [_identity(entry.path) for entry in job.identification],
+        "logs": [identity_of(entry.path) for entry in job.identification],
     }
 
 
-def _identity(path: Path) -> dict[str, Any]:
-    """Return size [bytes] and time of change [ns] of a file, or of each file of a folder."""
+def identity_of(path: Path) -> dict[str, Any]:
+    """Return size [bytes] and time of change [ns] of a file, or of each file of a folder.
+
+    Args:
+        path: The file or the folder.
+
+    Raises:
+        OSError: If it does not exist.
+    """
     whole = (dataset_of(path) or path).resolve()
     files = sorted(p for p in whole.rglob("*") if p.is_file()) if whole.is_dir() else [whole]
     found = {}

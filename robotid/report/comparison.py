@@ -14,8 +14,9 @@ from robotid.export.result import load_result
 from robotid.export.urdf import terms_from_facts
 from robotid.findings import listed
 from robotid.report.comparison_page import comparison_page
+from robotid.report.history import history_of
 from robotid.robot.drives import TERMS, DriveMotion
-from robotid.variation.variation import changes
+from robotid.variation.history import FALSE_ALARMS
 
 __all__ = ["compare_results", "write_comparison"]
 
@@ -23,24 +24,28 @@ _SPEEDS = 40  # of a friction curve, in each direction
 _FILES = ("urdf", "identification", "validation")  # settings that are shown as inputs
 
 
-def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
+def compare_results(
+    paths: Sequence[str | Path], *, false_alarms: float = FALSE_ALARMS
+) -> dict[str, Any]:
     """Compare results of the same robot and the same base parameters.
 
     Args:
         paths: At least two result.json files.
+        false_alarms: Probability that results without a change have a finding.
 
     Returns:
         Plain values: "results" (label, name, path, robot, estimator, verdict; the name is the
         unique part of the path), "validation" and "fitted" (errors by joint, one column per
         result), "fitted_alike" and "notes" (what is not comparable, and the reason),
         "friction" (curves by joint), "base_parameters" (values, standard errors, and the difference
-        to the first result over the combined standard error), "changes" (parameters of the fourth
-        and later results that the results before them do not predict), "settings", "inputs" and
-        "versions" that differ. The largest difference comes first.
+        to the first result over the combined standard error), "order", "changes" and "findings" of
+        the results over time, as of ``history_of``, "settings", "inputs" and "versions" that
+        differ. The largest difference comes first.
 
     Raises:
         DataError: If there are fewer than two results, one is not readable, or their base
             parameters differ; the message names the differences.
+        SettingsError: If the probability is not between 0 and 1.
     """
     if len(paths) < 2:
         raise DataError(f"compare takes at least two results, found {len(paths)}")
@@ -77,26 +82,29 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
         "notes": notes,
         "friction": _friction_curves(results),
         "base_parameters": parameters,
-        "changes": _changes(parameters),
+        **history_of(results, parameters, [_label(k) for k in range(len(paths))], false_alarms),
         "settings": _differences([_flat(_chosen(result)) for result in results]),
         "inputs": _inputs(results),
         "versions": _differences([r.get("versions", {"robotid": r["robotid"]}) for r in results]),
     }
 
 
-def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[str, Any]:
+def write_comparison(
+    paths: Sequence[str | Path], target: str | Path, *, false_alarms: float = FALSE_ALARMS
+) -> dict[str, Any]:
     """Compare results, write the page, and return the content of ``compare_results``.
 
     Args:
         paths: At least two result.json files.
         target: The HTML file to write, atomically.
+        false_alarms: As of ``compare_results``.
 
     Raises:
         DataError: If the results cannot be compared, or the folder of the target is missing.
-        SettingsError: If the target is a folder.
+        SettingsError: If the target is a folder, or the probability is not between 0 and 1.
     """
     check_file(Path(target))
-    content = compare_results(paths)
+    content = compare_results(paths, false_alarms=false_alarms)
     write_text(comparison_page(content), target)
     return content
 
@@ -302,26 +310,6 @@ def _base_parameters(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any
             }
         )
     return sorted(rows, key=lambda row: -_farthest(row["differences"]))
-
-
-def _changes(parameters: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the parameters of later results that the earlier results do not predict."""
-    known = [each for each in parameters if all(each["std_errors"])]
-    if not known:
-        return []
-    values, errors = (np.array([each[key] for each in known]).T for key in ("values", "std_errors"))
-    return [
-        {
-            "result": _label(k),
-            "name": known[p]["name"],
-            "unit": known[p]["unit"],
-            "value": values[k, p],
-            "std_error": errors[k, p],
-            "predicted": expected.ends.tolist(),
-            "probability": expected.probability,
-        }
-        for k, p, expected in changes(values, errors)
-    ]
 
 
 def _farthest(differences: Sequence[float | None]) -> float:

@@ -12,6 +12,7 @@ from robotid._text import period
 from robotid._typing import Array
 from robotid.pages.charts import Chart, Series, chart_html
 from robotid.pages.html import Cell, code, number, page, percent, table, text, with_error
+from robotid.report.history import history_section
 
 __all__ = ["comparison_page"]
 
@@ -30,7 +31,7 @@ def comparison_page(content: Mapping[str, Any]) -> str:
     """
     sections = {
         "errors": ("Prediction errors", _errors_section(content)),
-        **({"changes": ("Changes", _changes_section(content))} if content["changes"] else {}),
+        **({"changes": ("Changes", history_section(content))} if content["changes"] else {}),
         "friction": ("Friction", _friction_section(content)),
         "settings": ("Different settings", _differing(content, "settings", "setting")),
         "base": ("Base parameters", _base_section(content)),
@@ -145,23 +146,6 @@ def _percents(errors: Sequence[float | None], alike: bool) -> list[Cell]:
         Cell(f"<strong>{cell.html}</strong>", "number", cell.value) if cell.html == least else cell
         for cell in cells
     ]
-
-
-def _changes_section(content: Mapping[str, Any]) -> str:
-    """Return the table of parameters that earlier results do not predict."""
-    rows = [
-        [
-            text(each["result"]),
-            code(each["name"]),
-            *with_error(each["value"], each["std_error"]),
-            *(with_error(x, each["std_error"])[0] for x in each["predicted"]),
-            text(each["unit"]),
-        ]
-        for each in content["changes"]
-    ]
-    headers = ["result", "parameter", "value", "± error", "low", "high", "unit"]
-    caption = "Parameters outside what the results before them predict; low to high: 95 %"
-    return table(caption, headers, rows, is_data=True)
 
 
 def _friction_section(content: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.variation.groups import FEWEST_RUNS, RunsOf
-from robotid.variation.mixed_effects import UNKNOWN, MixedEffects, Prediction, Runs
+from robotid.variation.mixed_effects import UNKNOWN, MixedEffects, Prediction
 
 __all__ = [
     "SCORES",
@@ -17,14 +17,12 @@ __all__ = [
     "Variation",
     "VaryingParameter",
     "between_covariance",
-    "changes",
     "shrunk_correlation",
     "vary",
 ]
 
 #: Standard normal scores at which result.json has the quantiles of the predictive distribution.
 SCORES = np.linspace(-3.5, 3.5, 15)
-_CHANGE = 0.05  # plausible standard deviation of a parameter between results, over its size
 _FALSE_ALARMS = 0.02  # probability that one of alike runs or units is named
 _LEAST_SHRUNK = 1e-3  # smallest share of the shrinkage: the correlation has an inverse
 
@@ -249,35 +247,6 @@ def shrunk_correlation(values: Array) -> Array:
     size = float((r[off] ** 2).sum())
     share = min(max(float(variance[off].sum()) / size, _LEAST_SHRUNK), 1.0) if size else 1.0
     return np.where(off, (1.0 - share) * r, 1.0)
-
-
-def changes(values: Array, std_errors: Array) -> list[tuple[int, int, Prediction]]:
-    """Return the parameters that differ from what earlier results predict.
-
-    From the fourth result on, each is compared with all before it. The probability that one of
-    results without any change is named is 2 %.
-
-    Args:
-        values: Parameters of k results in order of time, shape (k, q).
-        std_errors: Their standard errors, shape (k, q), positive.
-
-    Returns:
-        Index of the result, index of the parameter, and its prediction, the least probable first.
-    """
-    typical = np.abs(np.median(values, axis=0))
-    scale = np.maximum(_CHANGE * typical, np.median(std_errors, axis=0))
-    n_tests, found = max(len(values) - FEWEST_RUNS, 0) * values.shape[1], []
-    for k in range(FEWEST_RUNS, len(values)):
-        for p in range(values.shape[1]):
-            H = std_errors[:k, p, None, None] ** -2.0
-            h = H[:, 0] * values[:k, p, None]
-            runs = Runs(H, h, np.zeros(k, dtype=int), scale[p : p + 1])
-            (expected,) = MixedEffects(runs).predict(
-                std_errors[k, p : p + 1] ** 2, values[k, p : p + 1]
-            )
-            if expected.probability * n_tests < _FALSE_ALARMS:
-                found.append((k, p, expected))
-    return sorted(found, key=lambda each: each[2].probability)
 
 
 def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter]:

@@ -11,14 +11,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from robotid._files import written_whole
+from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.regressor.factors import Reduction
-from robotid.workers.pieces import Piece
+from robotid.workers.pieces import Workload
 
 __all__ = ["FOLDER", "Checkpoint", "released_on_error"]
 
@@ -63,6 +64,15 @@ class _Lock:
             )
 
 
+class _Stored(Protocol):
+    """A result that arrays can represent, bit by bit."""
+
+    def to_arrays(self) -> dict[str, Array]: ...
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> Any: ...  # noqa: ANN401
+
+
 @dataclass(frozen=True)
 class Checkpoint:
     """A folder with a file per finished piece, for one set of inputs.
@@ -71,25 +81,28 @@ class Checkpoint:
     """
 
     folder: Path
-    key: str  # SHA-256 of all inputs of the reductions, in hexadecimal
+    key: str  # SHA-256 of all inputs of the results, in hexadecimal
     lock: _Lock
+    kind: type[_Stored] = Reduction  # of the results
 
     @classmethod
     def open(
         cls,
         parent: str | Path,
         inputs: Mapping[str, Any],
-        pieces: Sequence[Piece],
+        pieces: Sequence[Workload],
         *,
         resume: bool = False,
+        kind: type[_Stored] = Reduction,
     ) -> "Checkpoint":
-        """Open the checkpoint of a reduction; an old one is replaced unless it is resumed.
+        """Open the checkpoint of work on pieces; an old one is replaced unless it is resumed.
 
         Args:
             parent: Folder of the results; created if it does not exist.
-            inputs: All inputs of the reductions, as JSON values.
+            inputs: All inputs of the work, as JSON values.
             pieces: The pieces.
             resume: Whether finished pieces of an interrupted run are used.
+            kind: Type of the results, with ``to_arrays`` and ``from_arrays``.
 
         Raises:
             DataError: If the checkpoint to resume has other inputs or cannot be read, or another
@@ -100,7 +113,7 @@ class Checkpoint:
         text = json.dumps(stated, sort_keys=True, indent=1)
         folder.mkdir(parents=True, exist_ok=True)
         key = hashlib.sha256(text.encode()).hexdigest()
-        found = cls(folder, key, _Lock(folder))
+        found = cls(folder, key, _Lock(folder), kind)
         with released_on_error(found):
             found._prepare(text, resume=resume)
         return found
@@ -130,8 +143,8 @@ class Checkpoint:
         found = self.folder.glob(f"piece-{'[0-9]' * 6}.npz")
         return frozenset(int(path.stem.split("-")[1]) for path in found)
 
-    def load(self, index: int) -> Reduction:
-        """Return a stored reduction, with the same bits.
+    def load(self, index: int) -> Any:  # noqa: ANN401
+        """Return a stored result, with the same bits.
 
         Args:
             index: Index of the piece.
@@ -150,17 +163,17 @@ class Checkpoint:
             ) from error
         if str(content.pop("key")) != self.key:
             raise DataError(f"{path} is of a run with other inputs. Delete it", "checkpoint")
-        return Reduction.from_arrays(content)
+        return self.kind.from_arrays(content)
 
-    def save(self, index: int, name: str, reduction: Reduction) -> None:
-        """Store the reduction of a piece; the file is written completely or not at all.
+    def save(self, index: int, name: str, result: _Stored) -> None:
+        """Store the result of a piece; the file is written completely or not at all.
 
         Args:
             index: Index of the piece.
             name: Name of the piece.
-            reduction: Its reduction.
+            result: Its result.
         """
-        content: dict[str, Any] = reduction.to_arrays()
+        content: dict[str, Any] = result.to_arrays()
         content |= {"key": self.key, "piece": name}
         with written_whole(self._path(index)) as beside, beside.open("wb") as file:
             np.savez(file, **content)

@@ -88,6 +88,7 @@ class WorkPlan:
         what: str,
         *,
         checkpoint: Checkpoint | None = None,
+        counted: str = "samples",
     ) -> Iterator[Any]:
         """Process every piece by the chosen workers; yields results as ``map_pieces`` does.
 
@@ -96,11 +97,13 @@ class WorkPlan:
             pieces: The pieces.
             what: Name of the work.
             checkpoint: As in ``map_pieces``.
+            counted: As in ``map_pieces``.
         """
         with self._backend(pieces) as backend:
             yield from map_pieces(
-                work, pieces, what, backend=backend, progress=self.progress, checkpoint=checkpoint
-            )
+                work, pieces, what, backend=backend, progress=self.progress,
+                checkpoint=checkpoint, counted=counted,
+            )  # fmt: skip
 
 
 def map_pieces(
@@ -111,6 +114,7 @@ def map_pieces(
     backend: Backend | None = None,
     progress: ProgressCallback | None = None,
     checkpoint: Checkpoint | None = None,
+    counted: str = "samples",
 ) -> Iterator[Any]:
     """Process every piece; only results that are ahead of their order are in memory.
 
@@ -119,8 +123,9 @@ def map_pieces(
         pieces: The pieces.
         what: Name of the work.
         backend: The backend; this process if None.
-        progress: Called with (what, samples done, samples in total, "samples").
-        checkpoint: Stores the results, if they are reductions; a resumed one provides them.
+        progress: Called with (what, samples done, samples in total, counted).
+        checkpoint: Stores the results, of its kind; a resumed one provides them.
+        counted: What the samples of the pieces are.
 
     Yields:
         One result per piece, in order, with the same bits for any backend.
@@ -135,10 +140,10 @@ def map_pieces(
     total = sum(piece.samples for piece in pieces)
     done = total - sum(piece.samples for _, piece in missing)
     _log.info(
-        "%s %d pieces, %d of them finished before, %d samples in total: %s",
-        what, len(pieces), len(stored), total, chosen.description,
+        "%s %d pieces, %d of them finished before, %d %s in total: %s",
+        what, len(pieces), len(stored), total, counted, chosen.description,
     )  # fmt: skip
-    report(what, done, total, "samples")
+    report(what, done, total, counted)
     early: dict[int, Any] = {}
     left = len(missing)
     with _resumable(checkpoint), closing(chosen.run(work, missing)) as finished:  # type: ignore[type-var]
@@ -149,7 +154,7 @@ def map_pieces(
                 if checkpoint is not None:
                     checkpoint.save(index, pieces[index].name, result)
                 done += pieces[index].samples
-                report(what, done, total, "samples")
+                report(what, done, total, counted)
                 left -= 1
                 if not left:
                     next(finished, None)  # ends the iterator, so that the work is not cancelled

@@ -280,7 +280,7 @@ def test_compare_shows_the_largest_differences_and_fits_eighty_columns(monkeypat
         "base_parameters": [
             entry | {"name": f"{name}_{k}", "differences": [20.0 - k]} for k in range(15)
         ],
-        "settings": [], "versions": [], "inputs": [], "changes": [],
+        "settings": [], "versions": [], "inputs": [], "changes": [], "findings": [],
     }  # fmt: skip
     compare._show(content)
     lines = capsys.readouterr().out.splitlines()

@@ -469,7 +469,7 @@ def test_compare(shown):
             {"name": "b.m", "values": [2.0, None], "std_errors": [0.3, None], "unit": "kg",
              "differences": [None]},
         ],
-        "changes": [],
+        "changes": [], "findings": [],
         "settings": [{"name": "signals.cutoff", "values": ["8", None]}],
         "versions": [{"name": "numpy", "values": ["1", "2"]}],
         "inputs": [

@@ -561,3 +561,61 @@ def test_a_parameter_that_earlier_results_do_not_predict_is_a_change(folder, tmp
     printed = " ".join(capsys.readouterr().out.split())
     assert f"change: E: joint_2.coulomb is {own[-1]:.4g} +- " in printed
     assert f"the results before it predict {low:.3g} to {high:.3g}" in printed
+
+
+def history(folder, where, starts, change):
+    """Write results whose joint_2.coulomb changes at the last of them in time; return paths."""
+    rng, paths = np.random.default_rng(3), []
+    for k, start in enumerate(starts):
+        result = copy.deepcopy(read_result(folder / "a.json"))
+        for entry in result["inputs"]:
+            if entry["role"] == "identification":
+                entry["start"] = start
+        for entry in result["base_parameters"]:
+            entry["value"] *= 1 + 0.01 * rng.normal()
+            if start == max(starts) and entry["name"] in ("joint_2.coulomb", "joint_2.viscous"):
+                entry["value"] *= change
+        paths.append(where / f"{k}.json")
+        write_json(result, paths[-1])
+    return paths
+
+
+def test_results_are_in_the_order_of_the_dates_of_their_logs(folder, tmp_path, capsys):
+    starts = [1.7e9 + 86400.0 * day for day in (3, 0, 5, 1, 2, 4)]
+    content = write_comparison(history(folder, tmp_path, starts, 4.0), tmp_path / "page.html")
+    assert (content["order"], content["by_time"]) == ([1, 3, 4, 0, 5, 2], True)
+    (finding,) = content["findings"]
+    assert (finding["result"], finding["since"]) == ("C", "C")
+    assert (finding["kind"], finding["where"]) == ("friction", "joint_2")
+    assert finding["size"] == pytest.approx(3.0, rel=0.05)
+    assert set(finding["parameters"]) == {"joint_2.coulomb", "joint_2.viscous"}
+    page = (tmp_path / "page.html").read_text()
+    assert "of the time stamps of their logs: B, D, E, A, F, C." in page
+    assert tables(page)["Findings"].rows[0][:2] == ["C", "C"]
+    named = [chart for chart in charts(page) if "over the results" in chart["title"]]
+    assert {chart["title"].split()[0] for chart in named} == set(finding["parameters"])
+    assert named[0]["x_names"] == list("BDEAFC")
+    assert named[0]["marks"] == [4.5]
+    words = ["compare", *(str(tmp_path / f"{k}.json") for k in range(6))]
+    assert main(words) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "finding: C: friction of joint_2 is 3" in printed
+    assert main([*words, "--false-alarms", "1e-9"]) == 0
+    assert "finding:" not in capsys.readouterr().out
+    assert main([*words, "--false-alarms", "2"]) == 2
+    assert "false_alarms is 2, wanted a probability" in capsys.readouterr().err
+
+
+def test_time_stamps_from_the_start_of_a_log_are_no_order(folder, tmp_path):
+    content = compare_results(history(folder, tmp_path, [3.0, 0.0, 5.0, 1.0, 2.0], 1.0))
+    assert (content["order"], content["by_time"]) == ([0, 1, 2, 3, 4], False)
+
+
+def test_a_value_that_a_result_does_not_determine_raises_no_alarm(folder, tmp_path):
+    paths = history(folder, tmp_path, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], 4.0)
+    assert len(compare_results(paths)["findings"]) == 1
+    last = read_result(paths[-1])
+    last["structure"]["undetermined"] = ["joint_2.coulomb", "joint_2.viscous"]
+    write_json(last, paths[-1])
+    content = compare_results(paths)
+    assert (content["findings"], content["changes"]) == ([], [])

@@ -19,7 +19,6 @@ from robotid.variation.variation import (
     UnlikeRun,
     Variation,
     between_covariance,
-    changes,
     shrunk_correlation,
     vary,
 )
@@ -300,20 +299,6 @@ def test_findings_name_log_value_and_prediction():
         "value": 1.2, "std_error": 0.011, "low": 0.98, "high": 1.03, "probability": 1e-7,
     }  # fmt: skip
     assert [*unlike_findings(None)] == []
-
-
-def test_changes_are_those_that_earlier_results_do_not_predict():
-    rng, alarms = np.random.default_rng(0), 0
-    for _ in range(20):
-        values = np.array([5.0, -0.4, 0.0]) + [0.2, 0.05, 0.01] * rng.normal(size=(8, 3))
-        errors = np.tile([0.1, 0.02, 0.01], (8, 1))
-        alarms += bool(changes(values, errors))
-    assert alarms <= 2
-    values[5, 1] = -1.5
-    (found,) = changes(values, errors)[:1]
-    assert found[:2] == (5, 1)
-    assert found[2].ends[0] < -0.4 < found[2].ends[1]
-    assert changes(values[:3], errors[:3]) == []
 
 
 def units_of(rng, shift, *, units=5, runs=2):

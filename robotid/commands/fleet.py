@@ -1,0 +1,402 @@
+"""A fleet: a table of units (robots) and their logs, each unit identified by a worker."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid._files import check_folder, folder_beside, write_json, write_text
+from robotid._typing import Array
+from robotid.commands.identify import identify_job
+from robotid.commands.job import Job, LogEntry, PayloadEntry, read_job
+from robotid.commands.logs import identity_of
+from robotid.exceptions import DataError, SettingsError
+from robotid.export.entries import build_result
+from robotid.fitting.settings import SimulationSettings
+from robotid.log_files.text_tables import parquet_rows, read_text_table
+from robotid.logs.data import suggestion
+from robotid.report.fleet import fleet_page
+from robotid.variation.groups import FEWEST_RUNS
+from robotid.variation.history import FALSE_ALARMS
+from robotid.variation.units import between_units
+from robotid.versions import code_versions
+from robotid.workers.checkpoint import Checkpoint, released_on_error
+from robotid.workers.pieces import Workload
+from robotid.workers.plan import WorkPlan
+
+__all__ = ["COLUMNS", "FleetUnit", "UnitResult", "identify_unit", "read_fleet", "run_fleet"]
+
+#: Columns of the table.
+COLUMNS = {
+    "unit": "name of the robot",
+    "log": "its log",
+    "urdf": "its URDF",
+    "payload": "known mass on its last link [kg], which checks the scale of the torques",
+    "job": "job file with the settings",
+}
+_FILES = ("fleet.parquet", "fleet.json", "fleet.html")
+_RESULTS: Mapping[str, type] = {
+    "unit": str, "log": str, "status": str, "verdict": str, "reasons": str, "parameter": str,
+    "value": float, "std_error": float, "spread": float, "parameter_unit": str, "error": str,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class FleetUnit(Workload):
+    """A unit with its logs: the work of one task.
+
+    Attributes:
+        unit: Its name.
+        logs: Its logs, and the known payload of each [kg] or None.
+        urdf: Its URDF; that of the job if None.
+        job: Job file with the settings, whose logs are not used; none if None.
+    """
+
+    unit: str
+    logs: tuple[tuple[Path, float | None], ...]
+    urdf: Path | None
+    job: Path | None
+
+    @property
+    def name(self) -> str:
+        """Name in messages."""
+        return f"unit {self.unit}"
+
+    @property
+    def samples(self) -> int:
+        """Number of its logs, which the progress counts."""
+        return len(self.logs)
+
+    def stated(self) -> Job:
+        """Return the job of the unit.
+
+        Raises:
+            SettingsError: If the job file is not usable.
+        """
+        job = Job(Path()) if self.job is None else read_job(self.job)
+        if isinstance(job.estimator, SimulationSettings):
+            raise SettingsError(
+                "the estimator is 'simulation', wanted one of torques, as 'consistent'; identify "
+                "robots from commands with robotid identify"
+            )
+        return replace(
+            job,
+            urdf=self.urdf or job.urdf,
+            identification=tuple(LogEntry(path) for path, mass in self.logs if mass is None),
+            validation=(),
+            payload_checks=tuple(
+                PayloadEntry(path, mass) for path, mass in self.logs if mass is not None
+            ),
+        )
+
+
+@dataclass(frozen=True)
+class UnitResult:
+    """The result of a unit.
+
+    Attributes:
+        rows: Its rows of the table of results.
+        robot: Name of the robot in the URDF; "" if it is not identified.
+        expressions: Expression of each base parameter.
+    """
+
+    rows: list[dict[str, Any]]
+    robot: str
+    expressions: dict[str, str]
+
+    def to_arrays(self) -> dict[str, Array]:
+        """Return the result as arrays by name, for a checkpoint."""
+        content = json.dumps([self.rows, self.robot, self.expressions], allow_nan=False)
+        return {"content": np.frombuffer(content.encode(), dtype=np.uint8)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> "UnitResult":
+        """Return the result from its arrays; see ``to_arrays``.
+
+        Args:
+            arrays: The arrays by name.
+        """
+        return cls(*json.loads(arrays["content"].tobytes()))
+
+
+def read_fleet(
+    path: str | Path, urdf: str | Path | None = None, job: str | Path | None = None
+) -> list[FleetUnit]:
+    """Return the units of a table, in the order of their first rows.
+
+    Args:
+        path: The table, .csv or .parquet, with the columns "unit" and "log", and optionally those
+            of ``COLUMNS``. Paths in it are relative to its folder.
+        urdf: URDF of units whose rows do not name one.
+        job: Job file of units whose rows do not name one.
+
+    Raises:
+        DataError: If the table is not usable; the message names row, column and value.
+    """
+    source = Path(path)
+    names, rows = read_text_table(source)
+    for name in ("unit", "log"):
+        if name not in names:
+            near = suggestion(name, names)
+            raise DataError(
+                f"{source.name} has no column {name!r} ({COLUMNS[name]}); columns: "
+                f"{', '.join(names)}{near}"
+            )
+    for name in names:
+        missing = [known for known in COLUMNS if known not in names]
+        if name not in COLUMNS and (near := suggestion(name, missing)):
+            raise DataError(
+                f"{source.name} has an unknown column {name!r}{near} Rename it; columns that are "
+                "read: " + ", ".join(COLUMNS)
+            )
+    if not rows:
+        raise DataError(f"{source.name} has no rows, wanted one for each log")
+    by_unit: dict[str, list[tuple[int, dict[str, str]]]] = {}
+    for number, row in enumerate(rows, start=1):
+        for name in ("unit", "log"):
+            if not row[name]:
+                raise DataError(
+                    f"{source.name} row {number}, column {name!r}: no value, wanted the "
+                    f"{COLUMNS[name]}; fill it in, or remove the row"
+                )
+        by_unit.setdefault(row["unit"], []).append((number, row))
+    return [_unit(source, name, own, urdf, job) for name, own in by_unit.items()]
+
+
+def _unit(
+    source: Path,
+    name: str,
+    rows: Sequence[tuple[int, Mapping[str, str]]],
+    urdf: str | Path | None,
+    job: str | Path | None,
+) -> FleetUnit:
+    """Return a unit of the table from its rows."""
+    first, stated = rows[0]
+    for column in ("urdf", "job"):
+        for number, row in rows:
+            if row.get(column, "") != stated.get(column, ""):
+                raise DataError(
+                    f"{source.name} row {number}, column {column!r}: {row[column]!r}, but row "
+                    f"{first} of the unit {name!r} has {stated[column]!r}; state the same for all "
+                    "logs of a unit, or other names of units"
+                )
+    seen: dict[str, int] = {}
+    logs = []
+    for number, row in rows:
+        if row["log"] in seen:
+            raise DataError(
+                f"{source.name} row {number}, column 'log': {row['log']!r} is in row "
+                f"{seen[row['log']]}, too; remove one of the rows"
+            )
+        seen[row["log"]] = number
+        logs.append((source.parent / row["log"], _mass(source, number, row.get("payload", ""))))
+    own_urdf, own_job = (
+        source.parent / stated[column] if stated.get(column) else default and Path(default)
+        for column, default in (("urdf", urdf), ("job", job))
+    )
+    if not (own_urdf or own_job):
+        raise DataError(
+            f"{source.name} row {first}, column 'urdf': the unit {name!r} has no URDF; fill it in, "
+            "or state one for all units with --urdf"
+        )
+    return FleetUnit(name, tuple(logs), own_urdf or None, own_job or None)
+
+
+def _mass(source: Path, number: int, text: str) -> float | None:
+    """Return the payload of a row [kg]; None without one."""
+    try:
+        mass = float(text or 0.0)
+    except ValueError:
+        mass = float("nan")
+    if not 0.0 <= mass < 1e6:
+        raise DataError(
+            f"{source.name} row {number}, column 'payload': {text!r}, wanted a mass in kg, 0 or "
+            "empty for none"
+        )
+    return mass or None
+
+
+def identify_unit(unit: FleetUnit, threads: int | None) -> UnitResult:
+    """Identify a unit; a failure is a row of its result.
+
+    A log that cannot be read is a row, too; the unit is identified from its other logs.
+
+    Args:
+        unit: The unit.
+        threads: Ignored: a unit is identified in one thread.
+    """
+    del threads
+    refused: dict[Path, str] = {}
+    rows: list[dict[str, Any]] = []
+    try:
+        job = unit.stated()
+        found, _ = identify_job(
+            job, job.model(), WorkPlan(1),
+            refuse=lambda entry, error: refused.update({entry.path: str(error)}),
+        )  # fmt: skip
+        result = build_result(found, job.to_dict(), outputs={})
+        used = [e.path for e in job.identification if e.path not in refused]
+        rows += _rows(unit.unit, used, result)
+        about = result["robot"], {e["name"]: e["expression"] for e in result["base_parameters"]}
+    except Exception as error:  # the fleet goes on: the error is in the table, with its type
+        text = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
+        rows, about = [{"unit": unit.unit, "status": "failed", "error": text}], ("", {})
+    rows += [
+        {"unit": unit.unit, "log": str(path), "status": "failed", "error": error}
+        for path, error in refused.items()
+    ]
+    return UnitResult(rows, *about)
+
+
+def _rows(unit: str, logs: Sequence[Path], result: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a result: base parameters of the unit, drive parameters of its logs."""
+    verdict, between = result["verdict"], result.get("variation") or {"parameters": {}}
+    common = {"unit": unit, "status": "done"}
+    of_unit = {"verdict": verdict["status"], "reasons": "; ".join(verdict["reasons"])}
+    for entry in result["base_parameters"]:
+        own = between["parameters"].get(entry["name"])
+        mean = own and {"value": own["mean"], "std_error": own["std_error"],
+                        "spread": own["spread"]}  # fmt: skip
+        plain = {"value": entry["value"], "std_error": entry["std_error"]}
+        yield {
+            **common, **of_unit, "parameter": entry["name"], "parameter_unit": entry["unit"],
+            **(mean or plain),
+        }  # fmt: skip
+    for k, path in enumerate(logs if between["parameters"] else ()):
+        for name, own in between["parameters"].items():
+            yield {
+                **common, "log": str(path), "parameter": name, "parameter_unit": own["unit"],
+                "value": own["by_log"][k], "std_error": own["std_error_by_log"][k],
+            }  # fmt: skip
+
+
+def run_fleet(
+    units: Sequence[FleetUnit], folder: str | Path, *, plan: WorkPlan | None = None
+) -> dict[str, Any]:
+    """Identify all units; write fleet.parquet, fleet.json and fleet.html.
+
+    Finished units are stored in a checkpoint until all are, and are not repeated by a resumed run.
+    Files of results are written when all units are finished, with the same bits.
+
+    Args:
+        units: The units.
+        folder: Folder of the results; created if it is missing.
+        plan: The workers; this process if None.
+
+    Returns:
+        The content of fleet.json: "units" (how many), "logs", "done", "verdicts" (how many of
+        each), "failures", "parameters" (variation between units) and "unlike".
+
+    Raises:
+        DataError: If the checkpoint to resume has other inputs.
+        SettingsError: If the folder is not writable.
+        WorkerError: If a worker process ends before its work is done; on a cluster, if every worker
+            that processes a unit ends.
+    """
+    chosen, target = plan or WorkPlan(1), Path(folder)
+    check_folder(target, _FILES)
+    checkpoint = Checkpoint.open(
+        target, _inputs(units), units, resume=chosen.resume, kind=UnitResult
+    )
+    with chosen, released_on_error(checkpoint):
+        for _ in chosen.map(
+            identify_unit, units, "identifying", checkpoint=checkpoint, counted="logs"
+        ):
+            pass
+        with folder_beside(target) as partial:
+            gathered = _Gathered()
+            with parquet_rows(partial / "fleet.parquet", _RESULTS) as table:
+                for k in range(len(units)):  # one after the other: not all are in memory
+                    result = checkpoint.load(k)
+                    table.add(result.rows)
+                    gathered.add(result)
+            content = gathered.content(units)
+            write_json(content, partial / "fleet.json")
+            write_text(fleet_page(content), partial / "fleet.html")
+    checkpoint.remove()
+    return content
+
+
+def _inputs(units: Sequence[FleetUnit]) -> dict[str, Any]:
+    """Return what determines the results, with a hash for each unit."""
+
+    def digest(unit: FleetUnit) -> str:
+        files = [path for path, _ in unit.logs] + [x for x in (unit.urdf, unit.job) if x]
+        states = [identity_of(path) if path.exists() else None for path in files]
+        text = json.dumps([states, [mass for _, mass in unit.logs], str(unit.urdf), str(unit.job)])
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    return {"versions": code_versions(), "units": {unit.unit: digest(unit) for unit in units}}
+
+
+class _Gathered:
+    """What the page and the variation between units need of all results."""
+
+    def __init__(self) -> None:
+        self._values: dict[tuple[str, str, str, str], list[tuple[str, float, float]]] = {}
+        self._failures: list[dict[str, str]] = []
+        self._verdicts: dict[str, int] = {}
+
+    def add(self, result: UnitResult) -> None:
+        """Add the result of a unit.
+
+        Args:
+            result: The result.
+        """
+        for row in result.rows:
+            if row["status"] == "failed":
+                shown = {"unit": row["unit"], "log": row.get("log", ""), "error": row["error"]}
+                self._failures.append(shown)
+            elif "log" not in row and row["std_error"]:
+                name = row["parameter"]
+                key = result.robot, name, result.expressions[name], row["parameter_unit"]
+                own = row["unit"], row["value"], row["std_error"]
+                self._values.setdefault(key, []).append(own)
+        verdict = next((row["verdict"] for row in result.rows if row.get("verdict")), None)
+        if verdict is not None:
+            self._verdicts[verdict] = self._verdicts.get(verdict, 0) + 1
+
+    def content(self, units: Sequence[FleetUnit]) -> dict[str, Any]:
+        """Return the content of fleet.json.
+
+        Args:
+            units: All units.
+        """
+        several = {key: own for key, own in self._values.items() if len(own) >= FEWEST_RUNS}
+        n_tests = sum(map(len, several.values()))
+        parameters, unlike = [], []
+        for (robot, name, expression, unit), own in several.items():
+            values, errors = (np.array([each[k] for each in own]) for k in (1, 2))
+            found = between_units(values, errors, FALSE_ALARMS / n_tests)
+            if found is None:
+                continue
+            prediction, different = found
+            parameters.append(
+                {
+                    "robot": robot, "name": name, "expression": expression, "unit": unit,
+                    "units": len(own), "mean": prediction.mean, "std_error": prediction.std_error,
+                    "spread": prediction.spread, "spread_interval": prediction.spread_ends.tolist(),
+                    "next_interval": prediction.ends.tolist(), "values": values.tolist(),
+                }
+            )  # fmt: skip
+            unlike += [
+                {
+                    "unit": own[each.unit][0], "parameter": name, "value": own[each.unit][1],
+                    "std_error": own[each.unit][2], "parameter_unit": unit,
+                    "others": prediction.ends.tolist(), "probability": each.probability,
+                }
+                for each in different
+            ]  # fmt: skip
+        return {
+            "units": len(units),
+            "logs": sum(len(unit.logs) for unit in units),
+            "done": sum(self._verdicts.values()),
+            "verdicts": self._verdicts,
+            "failures": self._failures,
+            "parameters": parameters,
+            "unlike": sorted(unlike, key=lambda each: each["probability"]),
+        }

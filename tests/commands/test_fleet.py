@@ -1,0 +1,186 @@
+"""A fleet: the table, results of units, failures, resumed runs with the same bits, the page."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+from helpers.pages import tables
+from helpers.paths import ROOT
+from helpers.synthetic import exact_log, truth
+
+from robotid.cli import main
+from robotid.commands import fleet
+from robotid.commands.fleet import read_fleet, run_fleet
+from robotid.exceptions import DataError
+from robotid.log_files.read import write_log
+from robotid.robot.model import RobotModel
+from robotid.workers.checkpoint import FOLDER
+from robotid.workers.plan import WorkPlan
+
+URDF = ROOT / "urdf" / "planar_2r.urdf"
+FILES = ("fleet.parquet", "fleet.json", "fleet.html")
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    """A table of four units, with three logs, one, one, and one that is missing."""
+    folder, rng = tmp_path_factory.mktemp("fleet"), np.random.default_rng(0)
+    model, lines = RobotModel.from_urdf(URDF), ["unit,log,urdf,site"]
+    k = model.layout.names.index("joint_2.coulomb")
+    for unit, count in (("a", 3), ("b", 1), ("c", 1)):
+        for run in range(count):
+            pi = truth(model)
+            pi[k] *= 1.0 + 0.1 * rng.normal()
+            log = exact_log(model, pi, rng, samples=250, noise=0.1)
+            write_log(replace(log, t=log.t + 50.0), folder / f"{unit}{run}.csv")
+            lines.append(f"{unit},{unit}{run}.csv,{URDF},north")
+    lines += [f"a,lost.csv,{URDF},north", f"d,none.csv,{URDF},"]
+    (folder / "fleet.csv").write_text("\n".join(lines) + "\n")
+    return folder / "fleet.csv"
+
+
+@pytest.fixture(scope="module")
+def done(table, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("done")
+    return folder, run_fleet(read_fleet(table), folder)
+
+
+def rows_of(folder, **wanted):
+    every = pyarrow.parquet.read_table(folder / "fleet.parquet").to_pylist()
+    return [row for row in every if all(row[key] == value for key, value in wanted.items())]
+
+
+def test_a_unit_has_the_result_of_identify(table, done, tmp_path):
+    log = table.parent / "b0.csv"
+    assert main(["identify", str(URDF), str(log), "--out", str(tmp_path), "--no-report"]) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    rows = rows_of(done[0], unit="b", status="done")
+    expected = {e["name"]: (e["value"], e["std_error"]) for e in result["base_parameters"]}
+    assert {row["parameter"]: (row["value"], row["std_error"]) for row in rows} == expected
+    assert {row["verdict"] for row in rows} == {result["verdict"]["status"]}
+    assert {row["log"] for row in rows} == {None}
+
+
+def test_a_unit_of_three_logs_has_mean_spread_and_the_values_of_its_logs(table, done, tmp_path):
+    logs = [str(table.parent / f"a{k}.csv") for k in range(3)]
+    assert main(["identify", str(URDF), *logs, "--out", str(tmp_path), "--no-report"]) == 0
+    varying = json.loads((tmp_path / "result.json").read_text())["variation"]["parameters"]
+    for name, own in varying.items():
+        (row,) = rows_of(done[0], unit="a", log=None, parameter=name)
+        found = row["value"], row["std_error"], row["spread"]
+        assert found == (own["mean"], own["std_error"], own["spread"])
+        by_log = {row["log"]: row["value"] for row in rows_of(done[0], unit="a", parameter=name)}
+        assert [by_log[log] for log in logs] == own["by_log"]
+
+
+def test_a_failure_is_a_row_and_the_others_are_identified(done, table):
+    folder, content = done
+    assert (content["units"], content["logs"], content["done"]) == (4, 7, 3)
+    (lost,) = rows_of(folder, log=str(table.parent / "lost.csv"))
+    assert (lost["unit"], lost["status"], lost["value"]) == ("a", "failed", None)
+    assert "there is no log file" in lost["error"]
+    unit, log = rows_of(folder, unit="d")
+    assert unit["error"].startswith("DataError: no log is usable")
+    assert "none.csv" in log["error"]
+    page = tables((folder / "fleet.html").read_text())
+    shown = page["Units and logs that were not identified"].rows
+    assert [row[0] for row in shown] == ["a", "d", "d"]
+    assert sum(content["verdicts"].values()) == 3
+
+
+def test_variation_between_units_is_that_of_their_values(done):
+    folder, content = done
+    entry = next(e for e in content["parameters"] if e["name"] == "joint_2.coulomb")
+    rows = rows_of(folder, parameter="joint_2.coulomb", log=None)
+    assert entry["values"] == [row["value"] for row in rows]
+    low, high = entry["next_interval"]
+    assert low < min(entry["values"]) < entry["mean"] < max(entry["values"]) < high
+    assert entry["units"] == 3
+
+
+def test_an_interrupted_run_is_resumed_with_the_same_bits(table, done, tmp_path, monkeypatch):
+    units, first = read_fleet(table), fleet.identify_unit
+
+    def interrupted(unit, threads):
+        if unit.unit == "c":
+            raise KeyboardInterrupt
+        return first(unit, threads)
+
+    monkeypatch.setattr(fleet, "identify_unit", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_fleet(units, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {FOLDER}
+    repeated = []
+    monkeypatch.setattr(
+        fleet, "identify_unit", lambda unit, threads: repeated.append(unit.unit) or first(unit, 1)
+    )
+    run_fleet(units, tmp_path, plan=WorkPlan(1, resume=True))
+    assert repeated == ["c", "d"]
+    for name in FILES:
+        assert (tmp_path / name).read_bytes() == (done[0] / name).read_bytes()
+    assert {path.name for path in tmp_path.iterdir()} == set(FILES)
+
+
+def test_another_table_does_not_resume(table, tmp_path, monkeypatch):
+    def interrupted(unit, threads):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fleet, "identify_unit", interrupted)
+    units = read_fleet(table)
+    with pytest.raises(KeyboardInterrupt):
+        run_fleet(units, tmp_path)
+    other = [replace(units[0], logs=units[0].logs[:1]), *units[1:]]
+    with pytest.raises(DataError, match=r"checkpoint of other inputs: units\.a was"):
+        run_fleet(other, tmp_path, plan=WorkPlan(1, resume=True))
+
+
+def test_rows_state_urdf_job_and_payload(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("log,unit,payload,job\nx.csv,one,,own.toml\ny.csv,two,2.5,\nz.csv,two,0,\n")
+    one, two = read_fleet(path, "arm.urdf", "all.toml")
+    assert (one.unit, one.job, one.logs) == (
+        "one", tmp_path / "own.toml", ((tmp_path / "x.csv", None),)
+    )  # fmt: skip
+    assert two.logs == ((tmp_path / "y.csv", 2.5), (tmp_path / "z.csv", None))
+    assert (str(two.urdf), str(two.job)) == ("arm.urdf", "all.toml")
+    job = replace(two, job=None).stated()
+    assert [entry.path.name for entry in job.identification] == ["z.csv"]
+    assert [(entry.path.name, entry.mass) for entry in job.payload_checks] == [("y.csv", 2.5)]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("unit,logs\na,x\n", r"has no column 'log' \(its log\); columns: unit, logs\. Did you mean "
+         "'logs'"),
+        ("unit,log,payloads\na,x,1\n", "unknown column 'payloads'. Did you mean 'payload'"),
+        ("unit,log\n", "has no rows"),
+        ("unit,log\na,x\n,y\n", "row 2, column 'unit': no value, wanted the name of the robot"),
+        ("unit,log,urdf\na,x,1.urdf\na,y,2.urdf\n", "row 2, column 'urdf': '2.urdf', but row 1 of "
+         "the unit 'a' has '1.urdf'"),
+        ("unit,log,urdf\na,x,1.urdf\na,x,1.urdf\n", "row 2, column 'log': 'x' is in row 1"),
+        ("unit,log\na,x\n", "row 1, column 'urdf': the unit 'a' has no URDF"),
+        ("unit,log,payload,urdf\na,x,heavy,u\n", "row 1, column 'payload': 'heavy', wanted a mass"),
+        ("unit,log,payload,urdf\na,x,-1,u\n", "row 1, column 'payload': '-1', wanted a mass"),
+    ],
+)  # fmt: skip
+def test_a_bad_table_is_refused_with_row_column_and_value(tmp_path, text, said):
+    path = tmp_path / "t.csv"
+    path.write_text(text)
+    with pytest.raises(DataError, match=said):
+        read_fleet(path)
+
+
+def test_the_command_prints_what_failed_and_takes_a_parquet_table(table, tmp_path, capsys):
+    rows = {"unit": ["d"], "log": ["none.csv"], "payload": [None], "urdf": [str(URDF)]}
+    pyarrow.parquet.write_table(pyarrow.table(rows), tmp_path / "t.parquet")
+    words = ["fleet", str(tmp_path / "t.parquet"), "--out", str(tmp_path / "out"), "--workers", "1"]
+    assert main(words) == 1
+    printed = " ".join(capsys.readouterr().out.split())
+    assert printed.startswith("0 of 1 units identified, 1 logs failed: d: DataError: no log is")
+    assert main([*words, "--json"]) == 1
+    content = json.loads(capsys.readouterr().out)
+    assert content == json.loads((tmp_path / "out" / "fleet.json").read_text())
+    assert content["failures"][1]["log"] == str(tmp_path / "none.csv")

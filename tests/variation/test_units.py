@@ -1,0 +1,37 @@
+"""Variation of a parameter between many units, and units that differ."""
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from robotid.variation.units import between_units
+
+
+def test_mean_spread_and_next_interval_of_precise_values_are_those_of_the_sample():
+    rng = np.random.default_rng(2)
+    x = 4.0 + 0.6 * rng.normal(size=60)
+    prediction, unlike = between_units(x, np.full(60, 1e-4), 1e-6)
+    assert unlike == ()
+    assert prediction.mean == pytest.approx(x.mean(), rel=1e-4)
+    assert prediction.spread == pytest.approx(np.std(x, ddof=1), rel=0.05)
+    half = scipy.stats.t.ppf(0.975, 59) * np.std(x, ddof=1) * np.sqrt(1 + 1 / 60)
+    expected = [x.mean() - half, x.mean() + half]
+    np.testing.assert_allclose(prediction.ends, expected, atol=0.06)
+
+
+def test_units_that_differ_are_named_and_left_out_of_the_prediction():
+    rng = np.random.default_rng(5)
+    x = -2.0 + 0.1 * rng.normal(size=30)
+    alike, _ = between_units(x, np.full(30, 0.02), 1e-4)
+    x[[7, 20]] += [1.5, -3.0]
+    prediction, unlike = between_units(x, np.full(30, 0.02), 1e-4)
+    assert sorted(each.unit for each in unlike) == [7, 20]
+    assert all(each.probability < 1e-4 for each in unlike)
+    assert prediction.mean == pytest.approx(alike.mean, abs=0.03)
+    np.testing.assert_allclose(prediction.ends, alike.ends, atol=0.06)
+
+
+def test_a_value_with_a_large_error_is_not_unlike():
+    x, errors = np.array([1.0, 1.02, 0.97, 1.01, 3.0]), np.array([0.01, 0.01, 0.01, 0.01, 1.0])
+    assert between_units(x, errors, 1e-3)[1] == ()
+    assert between_units(x[:2], errors[:2], 1e-3) is None
