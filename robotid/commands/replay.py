@@ -11,6 +11,7 @@ from robotid._files import read_json
 from robotid._typing import Array
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import log_of_commands
+from robotid.constrained.closed_log import closed_log
 from robotid.exceptions import DataError, SettingsError
 from robotid.excitation.clearance import Clearance
 from robotid.excitation.course import Course
@@ -18,7 +19,6 @@ from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.export.result import Result, load_result, stated_model, stated_urdf_with_drives
 from robotid.export.shape import FILE, NUMBER, TABLE, TEXT, check_shape
 from robotid.findings import listed
-from robotid.fitting.closed_log import closed_log
 from robotid.fitting.evaluation import predict
 from robotid.fitting.survey import hold_log
 from robotid.identification.pictures import shown_evaluation

@@ -9,10 +9,10 @@ from dataclasses import replace
 from typing import Any
 
 from robotid._settings import require_kind
+from robotid.constrained.contacts import check_base
 from robotid.doctor.channels import check_channels
 from robotid.doctor.clock import check_clock, check_rest
 from robotid.doctor.command_channels import check_commands
-from robotid.doctor.contacts import check_base
 from robotid.doctor.motions import check_excitation, check_repeated_motion
 from robotid.doctor.mounted import Segments, check_payload_change
 from robotid.doctor.sample import Probe, smooth_motion, take_probe

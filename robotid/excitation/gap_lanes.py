@@ -13,7 +13,7 @@ References:
 
 import numpy as np
 
-from robotid.regressor.lanes import compiled
+from robotid.kernels.lanes import compiled
 
 __all__ = ["lower_bounds"]
 

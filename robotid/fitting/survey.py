@@ -16,11 +16,10 @@ import numpy as np
 
 from robotid._text import seconds
 from robotid._typing import Array
-from robotid.doctor.found_contacts import with_contacts
+from robotid.constrained.closed_log import closed_log
+from robotid.constrained.found_contacts import with_contacts
 from robotid.exceptions import DataError
 from robotid.findings import listed
-from robotid.fitting.closed_log import closed_log
-from robotid.fitting.velocity_choice import prefers_measured
 from robotid.log_files.formats import open_table
 from robotid.log_files.read import LogLayout
 from robotid.log_files.table import Place, RowReader, Table, prefixes
@@ -38,6 +37,7 @@ from robotid.regressor.factors import Reduction
 from robotid.regressor.memory import is_loaded, remember
 from robotid.regressor.rows import COMPILED, choose_engine
 from robotid.regressor.used_rows import base_problem, row_mask, static_rows
+from robotid.regressor.velocity_choice import prefers_measured
 from robotid.robot.model import RobotModel
 from robotid.workers.pieces import Piece, Workload
 

@@ -12,7 +12,7 @@ They are spatial forces and are transformed like these.
 
 import numpy as np
 
-from robotid.regressor.lanes import (
+from robotid.kernels.lanes import (
     add,
     compiled,
     cross,
@@ -26,7 +26,7 @@ from robotid.regressor.lanes import (
     times,
     work_space,
 )
-from robotid.regressor.tree_lanes import (
+from robotid.kernels.tree_lanes import (
     ACCELERATION,
     FRAME,
     VELOCITY,
@@ -45,7 +45,7 @@ from robotid.regressor.tree_lanes import (
     times6,
     turned,
 )
-from robotid.regressor.vector_lanes import LANES, lane_of, write
+from robotid.kernels.vector_lanes import LANES, lane_of, write
 
 __all__ = [
     "LANES",

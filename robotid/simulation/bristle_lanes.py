@@ -4,8 +4,8 @@ Imported only for closed-loop simulations. The arguments are those of ``loop_lan
 term has five entries: z, the z that acts within a step, and three derivatives.
 """
 
-from robotid.regressor.lanes import compiled, get, put, put3
-from robotid.regressor.vector_lanes import wide
+from robotid.kernels.lanes import compiled, get, put, put3
+from robotid.kernels.vector_lanes import wide
 from robotid.robot.drive_term import BRISTLES
 from robotid.simulation.law_lanes import deflection_by_lane, initial_deflection_by_lane
 

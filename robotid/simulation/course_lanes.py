@@ -5,7 +5,7 @@ Imported only for closed-loop simulations.
 
 import numpy as np
 
-from robotid.regressor.lanes import compiled
+from robotid.kernels.lanes import compiled
 
 __all__ = ["average_command", "divide_rows"]
 

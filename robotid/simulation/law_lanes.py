@@ -8,8 +8,8 @@ import math
 from functools import cache
 
 from robotid.exceptions import SettingsError
-from robotid.regressor.lanes import applied, compiled, pointed
-from robotid.regressor.vector_lanes import LANES, copysign, lane_of, where, wide, with_lane
+from robotid.kernels.lanes import applied, compiled, pointed
+from robotid.kernels.vector_lanes import LANES, copysign, lane_of, where, wide, with_lane
 from robotid.robot.drive_term import BRISTLES, PLAIN, DriveTerm, Law, MemorylessTerm
 from robotid.robot.drives import Bristles
 

@@ -27,8 +27,8 @@ ticks.
 from typing import NamedTuple
 
 from robotid._typing import Array
-from robotid.regressor.lanes import compiled, factor, get, put, solve, work_space
-from robotid.regressor.tree_lanes import (
+from robotid.kernels.lanes import compiled, factor, get, put, solve, work_space
+from robotid.kernels.tree_lanes import (
     ACCELERATION,
     BODY,
     derivatives,
@@ -37,7 +37,7 @@ from robotid.regressor.tree_lanes import (
     mass_matrix,
     place,
 )
-from robotid.regressor.vector_lanes import LANES, copysign, is_any, read, where, wide, write
+from robotid.kernels.vector_lanes import LANES, copysign, is_any, read, where, wide, write
 from robotid.robot.drive_term import BRISTLES, LOADED
 from robotid.simulation.bristle_lanes import (
     advance_bristles,

@@ -8,8 +8,8 @@ import pinocchio as pin
 import pytest
 
 from robotid._text import seconds
+from robotid.constrained.closed_log import closed_log
 from robotid.exceptions import DataError, ModelError, SettingsError
-from robotid.fitting.closed_log import closed_log
 from robotid.fitting.survey import hold_log, survey_log
 from robotid.identification.pipeline import identify
 from robotid.log_files.read import lay_out, read_log, write_log

@@ -22,7 +22,7 @@ References:
     Featherstone (2008), Rigid Body Dynamics Algorithms, chapters 2, 5 and 6.
 """
 
-from robotid.regressor.lanes import (
+from robotid.kernels.lanes import (
     add,
     compiled,
     cos_sin,

@@ -8,10 +8,10 @@ import numpy as np
 from scipy.special import stdtrit
 
 from robotid._typing import Array
-from robotid.doctor.base_pose import check_order, check_pose
-from robotid.doctor.found_contacts import with_contacts
-from robotid.doctor.imu import check_imu
-from robotid.doctor.wrenches import check_wrenches
+from robotid.constrained.base_pose import check_order, check_pose
+from robotid.constrained.found_contacts import with_contacts
+from robotid.constrained.imu import check_imu
+from robotid.constrained.wrenches import check_wrenches
 from robotid.exceptions import DataError
 from robotid.findings import Finding, log_finding
 from robotid.logs.base import base_state, in_base

@@ -7,8 +7,8 @@ import pandas as pd
 import pinocchio as pin
 import pytest
 
+from robotid.constrained.closed_log import closed_log
 from robotid.exceptions import ModelError
-from robotid.fitting.closed_log import closed_log
 from robotid.log_files.read import read_log
 from robotid.logs.settings import BaseSource
 from robotid.regressor.constraints import logged_base

@@ -7,8 +7,8 @@ import pinocchio as pin
 import pytest
 from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_segments
 
-from robotid.doctor.contacts import check_base
-from robotid.doctor.wrenches import check_wrenches
+from robotid.constrained.contacts import check_base
+from robotid.constrained.wrenches import check_wrenches
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.robot.constraints import Contact

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from scipy.special import stdtrit
 
-from robotid.doctor.contacts import _check_radius, check_base, flag_delay
+from robotid.constrained.contacts import _check_radius, check_base, flag_delay
 from robotid.logs.base import BaseMotion, base_state
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings

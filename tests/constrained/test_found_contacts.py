@@ -7,7 +7,7 @@ import pytest
 from helpers.paths import JOBS
 
 from robotid.commands.job import read_job
-from robotid.doctor.found_contacts import _forces, find_contacts, with_contacts
+from robotid.constrained.found_contacts import _forces, find_contacts, with_contacts
 from robotid.exceptions import DataError
 from robotid.logs.base import BaseMotion, quaternions_of_angles
 from robotid.logs.data import Log

@@ -8,7 +8,7 @@ import pytest
 from helpers.paths import JOBS
 
 from robotid.commands.job import read_job
-from robotid.doctor.contacts import check_base
+from robotid.constrained.contacts import check_base
 from robotid.logs.base import BaseMotion, base_state, in_base, quaternions_of_angles
 from robotid.logs.data import Log
 from robotid.logs.imu import ImuFrame, ImuMotion

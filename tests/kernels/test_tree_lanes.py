@@ -4,9 +4,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.regressor import lanes, tree_lanes
+from robotid.kernels import lanes, tree_lanes
+from robotid.kernels.vector_lanes import LANES
 from robotid.regressor.compiled import flatten
-from robotid.regressor.vector_lanes import LANES
 from robotid.robot.model import RobotModel
 
 LINK = (

@@ -20,7 +20,7 @@ from numba.core.cgutils import unpack_tuple
 from numba.extending import intrinsic
 
 from robotid._typing import Array
-from robotid.regressor.vector_lanes import LANES, read, where, write
+from robotid.kernels.vector_lanes import LANES, read, where, write
 
 __all__ = [
     "add",

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from robotid.regressor.lanes import compiled, cos_sin, factor, get, put, put_lane, solve, work_space
-from robotid.regressor.vector_lanes import (
+from robotid.kernels.lanes import compiled, cos_sin, factor, get, put, put_lane, solve, work_space
+from robotid.kernels.vector_lanes import (
     LANES,
     copysign,
     is_any,

@@ -8,7 +8,7 @@ import pytest
 from helpers.corruptions import clean_log, robot
 from helpers.driven import arm
 
-from robotid.fitting import velocity_choice
+from robotid.regressor import velocity_choice
 from robotid.fitting.survey import hold_log
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings

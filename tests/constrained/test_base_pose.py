@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers.humans import FEET, human_urdf, logged, walk
 
-from robotid.doctor.base_pose import check_pose
-from robotid.doctor.contacts import check_base
+from robotid.constrained.base_pose import check_pose
+from robotid.constrained.contacts import check_base
 from robotid.logs.base import BaseMotion
 from robotid.logs.settings import SignalSettings
 from robotid.robot.constraints import Contact
