@@ -22,13 +22,11 @@ __all__ = ["EXAMPLES", "MAIN_FLAGS", "SUMMARY", "add_flags", "run"]
 SUMMARY = "design an excitation trajectory within the robot's limits"
 MAIN_FLAGS = (
     "--out", "--report", "--given", "--kind", "--link", "--mass", "--duration", "--share",
-    "--clearance", "--floor", "--posture", "--lifted", "--sole", "--friction-coefficient",
-    "--joints", "--lock",
+    "--clearance", "--floor", "--posture", "--lifted", "--joints", "--lock",
 )  # fmt: skip
 EXAMPLES = (
     "robotid excite robot.urdf --out motion.csv --report motion.html",
-    "robotid excite robot.urdf --kind payload --link tool0 --mass 2 --out m.csv",
-    "robotid excite quadruped.toml --posture FL_calf_joint=-1.6 --lifted FR_foot --out m.csv",
+    "robotid excite quadruped.toml --lifted FR_foot --out motion.csv",
 )
 
 

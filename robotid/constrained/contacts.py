@@ -66,12 +66,7 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         return
     for note in whole.notes[len(log.notes) :]:
         yield log_finding(log.name, "log_note", "note", note)
-    flags = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
-    for k, contact in enumerate(model.contacts):
-        if contact.is_measured:
-            flags[:, k] = _loaded(contact, log, motion.t)
-        elif not contact.always and contact.frame in whole.contacts:
-            flags[:, k] = _at(whole.contacts[contact.frame], whole, motion.t)
+    flags = _flags(model, log, whole, motion.t)
     if wrong := list(check_order(model, whole, still, motion, flags)):
         yield from wrong
         return
@@ -86,6 +81,28 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         return
     if not wrong:
         yield from check_wrenches(model, log, motion)
+    yield from _check_feet(model, log, motion, J, turn, flags, signals)
+
+
+def _flags(model: RobotModel, log: Log, whole: Log, t: Array) -> Array:
+    """Return whether each contact of a log is in contact at times, shape (N, contacts), bool.
+
+    ``whole`` is the log with the contacts that were found.
+    """
+    flags = np.ones((len(t), len(model.contacts)), dtype=bool)
+    for k, contact in enumerate(model.contacts):
+        if contact.is_measured:
+            flags[:, k] = _loaded(contact, log, t)
+        elif not contact.always and contact.frame in whole.contacts:
+            flags[:, k] = _at(whole.contacts[contact.frame], whole, t)
+    return flags
+
+
+def _check_feet(
+    model: RobotModel, log: Log, motion: Trajectory, J: Array, turn: Array, flags: Array,
+    signals: SignalSettings,
+) -> Iterator[Finding]:  # fmt: skip
+    """Yield findings on the motion of each link in contact."""
     velocity = np.einsum("kcij,kj->kci", J, motion.v)  # (N, contacts, 3) [m/s]
     relative = _relative(velocity, flags)
     has_ground = log.base is None or log.base.has_position

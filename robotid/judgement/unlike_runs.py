@@ -68,7 +68,7 @@ def rescaled_findings(fit: Fit, loaded: Collection[str] = ()) -> Iterator[Findin
     for e in fit.validation:
         motion, mask = e.recording.trajectory, e.recording.mask
         log = Path(e.recording.log.path).name
-        if e.is_refitted or log in loaded:
+        if e.is_refitted or e.recording.is_partial or log in loaded:
             continue
         for k, joint in enumerate(fit.model.row_names):
             measured = e.metrics["estimate"].per_joint.get(joint)

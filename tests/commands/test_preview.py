@@ -151,10 +151,14 @@ def test_noise_that_is_stated_is_that_of_every_preview(monkeypatch, given, is_ow
         "_motions": lambda job, model, entries: [str(entry.path) for entry in entries],
         "result_run": lambda job, path: (job, [before], "found", "a run"),
         "load_result": lambda path: SimpleNamespace(content=result),
+        "stated_between": lambda content, model: (content is result, model),
+        "replace": lambda found, **own: heard.update(own),
         "file_sha256": str,
     }.items():
         monkeypatch.setattr(preview, name, stands_for)
     preview.preview_job(job, given, noise={"a": 0.2}, correlation=0.3)
+    if given and not is_own:
+        assert heard.pop("between") == (True, "found")
     assert (heard.pop("noise"), heard.pop("correlation")) == ({"a": 0.2}, 0.3)
     wanted = {"model": "found" if given else "bare", "estimator": "wls"}
     wanted["motions"] = ["old.csv" if is_own else "new.csv"]

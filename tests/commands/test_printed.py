@@ -55,11 +55,11 @@ def test_excite(shown):
         "designed for the parameters with the widest intervals: p1, p2",
         "",
         "smallest margin to each limit",
-        "  position       12.3 %  two",
-        "  velocity       -2.0 %  one",
-        "  collision      12.3 mm above the clearance of 50 mm, hand and post at 3.46 s; not",
-        "                  checked, shapes not readable: a.stl; not checked, in contact by",
-        "                  design: b, c; smaller clearance, close by design: d",
+        "  position            12.3 %  two",
+        "  velocity            -2.0 %  one",
+        "  collision           12.3 mm above the clearance of 50 mm, hand and post at 3.46 s; not",
+        "                       checked, shapes not readable: a.stl; not checked, in contact by",
+        "                       design: b, c; smaller clearance, close by design: d",
         "",
         "a word",
         "another",
@@ -140,6 +140,8 @@ def test_payload(shown):
         "  centre of mass: not determined; it hardly turns",
         "  inertia: not determined; it is light",
         "torque prediction error: one 1.2 %, two 12.3 %",
+        "the gains are those with which this payload has the stated mass; verify them with",
+        "  another payload or another log of it",
         "",
         "[torque.gains]",
         "one = 14.12  # 95 % interval 13.7 to 14.55",
@@ -404,10 +406,11 @@ def test_export_and_convert(shown):
         "  one: no delay",
     ]
     done = {"path": "o.csv", "samples": 7, "joints": ["a", "b"], "columns": ["q", "tau"],
-            "ignored": ["x"]}  # fmt: skip
+            "ignored": ["x"], "local": ["sole"]}  # fmt: skip
     assert shown(convert._show, done) == [
         "o.csv: 7 samples of 2 joints",
         "  columns q, tau",
+        "  wrenches have the axes of their links: axes = 'link' in [[contact]]",
         "  not written, not of a joint: x",
     ]
 

@@ -334,7 +334,7 @@ def test_a_saturated_drive_is_reported_with_the_largest_error_of_all_movements()
         q += [q[-1] + 1.25 * dt * (k + 1) for k in range(count)] + [target] * 150
         command += [target] * (count + 150)
     q, command = np.array(q), np.array(command)
-    loop = SimpleNamespace(name="a", joint=0, q=q, command=command, step=dt)
+    loop = SimpleNamespace(name="a", joint=0, q=q, command=command, step=dt, unit="rad")
     log = SimpleNamespace(name="run.csv", q=np.random.default_rng(0).random((len(q), 1)))
     ((name, found),) = command_channels._saturated(log, [loop])
     assert (name, found.where) == ("a", "run.csv: a")

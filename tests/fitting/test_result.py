@@ -80,7 +80,9 @@ def test_predictions_are_of_logs_without_fitted_rows():
 
 
 def test_a_band_is_that_of_the_recording_or_of_the_noise_of_the_fit(monkeypatch):
-    monkeypatch.setattr(result_module, "expected_band", lambda found, e: ("expected", e))
+    monkeypatch.setattr(
+        result_module, "expected_band", lambda found, e, between: ("expected", e, between)
+    )
     a, b, c, other = (SimpleNamespace(name=name) for name in "abcd")
-    own = SimpleNamespace(fitted=(a, b), validation=(c,), _bands=(1, 2, 3))
-    assert [Fit.band(own, e) for e in (a, b, c, other)] == [1, 2, 3, ("expected", other)]
+    own = SimpleNamespace(fitted=(a, b), validation=(c,), _bands=(1, 2, 3), between=7)
+    assert [Fit.band(own, e) for e in (a, b, c, other)] == [1, 2, 3, ("expected", other, 7)]

@@ -286,7 +286,7 @@ def test_what_is_concluded_counts_all_findings_but_the_ignored_ones(
     monkeypatch.setattr(pipeline, "with_model_error", lambda fit, *_: (fit, ("a.viscous",)))
     logs = [
         SimpleNamespace(head=SimpleNamespace(name=name, path=name, notes=(f"note {k}",)),
-                        asked=SignalSettings(cutoff=3.0 + k))
+                        asked=SignalSettings(cutoff=3.0 + k), unit=None)
         for k, name in enumerate(("a.csv", "b.csv", "c.csv"))
     ]  # fmt: skip
     recordings = SimpleNamespace(model=fit.model, fitted=logs[:2], validation=logs[2:])
@@ -317,7 +317,9 @@ def test_what_is_concluded_counts_all_findings_but_the_ignored_ones(
     ((_, asked, wanted, balanced),) = given
     assert (asked, set(wanted.values())) == (choice, {()})
     assert balanced == (found, ["a.csv", "b.csv"])  # of the fitted logs
-    assert springs == [(found[:2], fit, wanted)]
+    ((before, of_fit, asked_terms),) = springs
+    assert (before, asked_terms) == (found[:2], wanted)
+    assert of_fit.estimate is fit.estimate
 
 
 def test_a_verdict_is_given_all_that_is_known_of_a_result(monkeypatch):
@@ -385,11 +387,16 @@ def test_fits_are_counted_and_end_with_the_shapes_that_settled(monkeypatch, sett
     monkeypatch.setattr(pipeline, "_with_own", lambda recordings, fit, own: (fit.k, own[0].k))
     monkeypatch.setattr(pipeline, "settled_shapes", lambda fit: next(moved))
     monkeypatch.setattr(pipeline, "fit_recordings", lambda own, choice: Solved(own))
-    found = pipeline.with_drives("all", "exact", {}, progress=lambda *x: reported.append(x))
+    everything = SimpleNamespace(repeated=None)
+    found = pipeline.with_drives(everything, "exact", {}, progress=lambda *x: reported.append(x))
     last = reported.pop()
     assert last == ("fits", 3, 4, "fits")
     assert reported == [("fits", 0, 1, "fits"), ("fits", 1, 4, "fits"), ("fits", 2, 4, "fits")]
-    assert solved == [("all", "exact", True), ((1, 0), "rough", False), ((2, 1), "rough", False)]
+    assert solved == [
+        (everything, "exact", True),
+        ((1, 0), "rough", False),
+        ((2, 1), "rough", False),
+    ]
     final = 1 if settles else 2
     assert (found.k, found.drives) == ((3, final), drives[final])
 

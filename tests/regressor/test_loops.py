@@ -369,7 +369,7 @@ def test_errors_change_as_rows_and_drift_state(kind, rng):
         np.append(x.rotation @ v[:3], x.rotation @ v[3:])
         for x, v in zip(places, other, strict=True)
     ]
-    rows = loop.rows([x[:, None] for x in columns], M.rotation)[:, 0]
+    rows = loop.rows([x[:, None] for x in columns], M)[:, 0]
     np.testing.assert_allclose(rows, (error(1e-6, other) - error(-1e-6, other)) / 2e-6, atol=1e-8)
     turning = [x.rotation @ v[3:] for x, v in zip(places, twists, strict=True)]
     centripetal = [

@@ -8,10 +8,10 @@ import pytest
 from helpers.corruptions import clean_log, robot
 from helpers.driven import arm
 
-from robotid.regressor import velocity_choice
 from robotid.fitting.survey import hold_log
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
+from robotid.regressor import velocity_choice
 from robotid.regressor.torque import joint_torque_regressor
 
 LSB = 2 * np.pi / 4096  # [rad] of a 12-bit encoder
