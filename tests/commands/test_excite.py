@@ -335,7 +335,7 @@ def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt
 
     def designed(*words):
         out = pan_tilt.with_name("motion.csv")
-        quick = ["--duration", "2", "--seconds", "0.1", "--starts", "1", "--points", "1000"]
+        quick = ["--duration", "2", "--seconds", "60", "--starts", "1", "--points", "1000"]
         command = ["excite", str(pan_tilt), "--out", str(out), *quick, "--json", *words]
         assert main(command) == 0
         return json.loads(capsys.readouterr().out)["limits"]["collision"], out.read_text()

@@ -99,7 +99,7 @@ def check_errors(one, other):
 
 
 def without_bands(metrics):
-    """Return metrics without what standard errors determine, whose segments pieces cut elsewhere."""
+    """Return metrics without what follows standard errors: pieces cut segments elsewhere."""
     if isinstance(metrics, list):
         return [without_bands(entry) for entry in metrics]
     return {key: value for key, value in metrics.items() if key not in ("band", "expected")}
