@@ -18,14 +18,8 @@ from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import hold_log
 from robotid.identification import payload_fit
-from robotid.identification.payload_fit import (
-    Gain,
-    Payload,
-    PayloadFit,
-    _gains,
-    _payload,
-    identify_payload,
-)
+from robotid.identification.payload import Gain, Payload, PayloadFit, payload_of
+from robotid.identification.payload_fit import _gains, identify_payload
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -282,7 +276,7 @@ def test_errors_about_the_centre_of_mass_are_those_of_first_order(rng):
     )
     J = (J / (2 * step)[:, None]).T
     errors = np.sqrt(np.diag(J @ C @ J.T))
-    found = _payload(SimpleNamespace(length=1.0), "tool", x, C, freedom)
+    found = payload_of(SimpleNamespace(length=1.0), "tool", x, C, freedom)
     np.testing.assert_allclose(found.com, COM)
     np.testing.assert_allclose(found.inertia, INERTIA, atol=1e-12)
     np.testing.assert_allclose(found.com_std_error, errors[:3], rtol=1e-5)
@@ -295,10 +289,10 @@ def test_errors_about_the_centre_of_mass_are_those_of_first_order(rng):
     # an inertia is open from 0.3 of the mean principal moment on, a centre from 0.05 lengths
     for factor, is_open in ((0.95, False), (1.05, True)):
         wider = (factor * 0.3 * np.trace(INERTIA) / 3 / errors[3:].max()) ** 2 * C
-        long = _payload(SimpleNamespace(length=100.0), "tool", x, wider, np.full(10, np.inf))
+        long = payload_of(SimpleNamespace(length=100.0), "tool", x, wider, np.full(10, np.inf))
         assert ("inertia" in long.reasons, "com" in long.reasons) == (is_open, False)
         length = errors[:3].max() / 0.05 / factor
-        short = _payload(SimpleNamespace(length=length), "tool", x, C, freedom)
+        short = payload_of(SimpleNamespace(length=length), "tool", x, C, freedom)
         assert ("com" in short.reasons) == is_open
 
 
@@ -567,6 +561,6 @@ def test_a_payload_of_no_significant_mass_has_nothing_else():
     model = SimpleNamespace(length=100.0)
     why = "the payload on tool does not differ significantly from 0 kg"
     for mass, reasons in ((0.29, {"com": why, "inertia": why}), (0.31, {})):
-        own = _payload(model, "tool", np.append(mass, x[1:]), C, np.full(10, np.inf)).reasons
+        own = payload_of(model, "tool", np.append(mass, x[1:]), C, np.full(10, np.inf)).reasons
         assert {key: own[key] for key in reasons} == reasons
         assert (why in own.values()) is bool(reasons)
