@@ -267,11 +267,10 @@ def _expected(
     """Return the expected standard errors of a log of the motion, with those of earlier logs."""
     if stand is not None:
         model, log = stand.robot, _log(stand, design, settings, path)
-        in_memory = hold_log(model, log, job.signals)
-        return preview_logs(model, [in_memory], job.estimator, noise=settings.noise, run=run)
-    t = np.arange(round(design.duration * settings.points) + 1) / settings.points
-    q, v, a = design.motion.evaluate(np.minimum(t, design.duration))
-    log = Log(t, q, np.zeros_like(q), model.joints, v, a, path)
+    else:
+        t = np.arange(round(design.duration * settings.points) + 1) / settings.points
+        q, v, a = design.motion.evaluate(np.minimum(t, design.duration))
+        log = Log(t, q, np.zeros_like(q), model.joints, v, a, path)
     in_memory = hold_log(model, log, job.signals)
     return preview_logs(model, [in_memory], job.estimator, noise=settings.noise, run=run)
 
