@@ -264,10 +264,11 @@ def test_a_joint_that_stops_reverses_in_the_filtered_motion(model):
     predicted = np.where(np.arange(600)[:, None] % 2, 3.0, -3.0) * np.ones(3)
     tau = predicted + typical / 1.4826 * np.where(np.arange(600)[:, None] % 4 < 2, 1, -1)
 
-    def size(row, j, error, segment=np.zeros(600, dtype=int)):
+    def size(row, j, error, segment=None):
         """Return the size of an outlier with an error in typical ones, None if it is not found."""
         off = tau.copy()
         off[row, j] = predicted[row, j] + error * typical[j]
+        segment = np.zeros(600, dtype=int) if segment is None else segment
         motion = Trajectory(t, v, v, 0.0 * v, off, model.joints, 100.0, segment)
         recording = SimpleNamespace(
             trajectory=motion, mask=np.ones((600, 3), dtype=bool),
