@@ -67,8 +67,8 @@ _REASONS = {
     "link_mass": "the URDF's mass of a link, {mass:.3g} kg, is too large ({factor:.2g} times it "
     "explains the torques), or a spring cancels {cancelled_pct:.0f} % of the gravity torque",
     "lost_motion": "there may be backlash between the joint and its encoder",
-    "rolling_contact": "feet roll as balls of radius {radius:.4f} m, which is not stated: the "
-    "force of the ground acts elsewhere",
+    "rolling_contact": "feet roll as balls of a radius that is not stated: the force of the "
+    "ground acts elsewhere",
     "moving_contact": "a link moves at {speed:.2g} m/s while it is in contact",
     "mass_matrix": "the mass matrix is not positive definite in all poses",
     "payload_change": "its last link carries {mass:+.2g} kg relative to the fitted logs",
