@@ -203,6 +203,16 @@ def test_a_result_without_trouble_is_measured_used_and_played(identified):
     assert f"robotid export {result} --format mjcf --out ur5.xml" in blocks
 
 
+def test_a_step_names_no_joint_of_a_note(identified):
+    lift, elbow = identified.model.joints[1:3]
+    steps = [
+        next_steps(told(identified, *(warning("constraint_costs", *each) for each in pairs)), JOB)
+        for pairs in (((lift, "note"), (elbow, "warning")), ((lift, "note"), (elbow, "note")))
+    ]
+    assert steps[0][0].words.startswith(f"Examine the residual of {elbow} in the section")
+    assert "Examine" not in words(steps[1])
+
+
 def test_an_error_comes_before_a_warning_and_three_steps_are_enough(identified):
     codes = ("undetermined", "current_for_torque", "torque_delay", "unexplained_torque")
     found = told(
