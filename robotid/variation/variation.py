@@ -165,6 +165,12 @@ def changes(values: Array, std_errors: Array) -> list[tuple[int, int, Prediction
     return sorted(found, key=lambda each: each[2].probability)
 
 
+def _covariance(H: Array, scale: Array) -> Array:
+    """Return the covariance of parameters (q, q) of their information, and almost no prior."""
+    covariance: Array = np.linalg.inv(H + np.diag((UNKNOWN * scale) ** -2.0))
+    return covariance
+
+
 def _parameters(group: RunsOf) -> Iterator[VaryingParameter]:
     """Yield the parameters of a group on which the runs have information."""
     model = MixedEffects(group.runs)
@@ -184,10 +190,19 @@ def _parameters(group: RunsOf) -> Iterator[VaryingParameter]:
 
 
 def _compared(group: RunsOf, run: int, n_tests: int) -> Iterator[tuple[float, UnlikeRun]]:
-    """Yield the difference of a run from the others, if there is one, and what it explains."""
+    """Yield the difference of a run from the others, if there is one, and what it explains.
+
+    A payload is compared only if the run determines it: a run in which the last joints are at rest
+    has a large moment and a wrong mass in place of any other effect.
+    """
     runs = group.runs
-    covariance = np.linalg.inv(runs.H[run] + np.diag((UNKNOWN * runs.scale) ** -2.0))
+    covariance = _covariance(runs.H[run], runs.scale)
     x, variance = covariance @ runs.h[run], np.diag(covariance)
+    if group.group.kind == "payload":
+        together = np.diag(_covariance(runs.H.sum(axis=0), runs.scale))
+        plausible = runs.scale**2  # what all runs do not determine, no motion does
+        if np.any((variance > plausible) & (together <= plausible)):
+            return
     expected = MixedEffects(runs.without(run)).predict(variance, x)
     p = int(np.argmin([each.probability for each in expected]))
     if expected[p].probability * n_tests >= _FALSE_ALARMS:
