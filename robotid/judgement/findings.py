@@ -515,7 +515,8 @@ def _outlier_findings(fit: Fit) -> list[Finding]:
     advice = "check the recording there, cut it out, or set robust = 'tukey' in [estimator]"
     if fit.estimator.is_robust:
         advice = "the robust loss downweighted them"
-    found = f"{len(outliers)} outliers in the fitted logs: {'; '.join(places)}"
+    count = f"{len(outliers)} outlier{'s' if len(outliers) > 1 else ''}"
+    found = f"{count} in the fitted logs: {'; '.join(places)}"
     evidence = {"places": float(len(outliers)), "largest": outliers[0].size}
     where, message = outliers[0].joint, f"{found}{more}; {advice}"
     return [Finding("outliers", "warning", where, message, evidence)]

@@ -104,6 +104,7 @@ def test_five_outliers_are_named_and_the_others_counted():
     assert few.endswith("j4 at 5.000 s of run.csv: measured 14, predicted -8, residual 36 times "
                         "the typical one; check the recording there, cut it out, or set robust = "
                         "'tukey' in [estimator]")  # fmt: skip
+    assert said(1, False).startswith("1 outlier in the fitted logs: j0 at 0.000 s")
     assert "j5" not in many
     assert many.endswith(
         "residual 36 times the typical one; and 2 more; the robust loss downweighted them"
