@@ -152,7 +152,8 @@ def in_digits_of(value: float, error: float | None) -> tuple[str, str]:
         error: Its standard error; without one the value has four digits.
 
     Returns:
-        Both, with the same power of ten, as "8.562" and "0.023"; a dash without an error.
+        Both, with the same power of ten, as "8.562" and "0.023"; a dash without an error. A value
+        that is rounded to 0 has no power of ten: "0" and "1.2e-05".
     """
     if error is None or not (math.isfinite(error) and error > 0):
         return f"{value:.4g}", "-"
@@ -162,7 +163,8 @@ def in_digits_of(value: float, error: float | None) -> tuple[str, str]:
     top = max(math.floor(math.log10(abs(value))) if value else last, last + 1)
     if _PLAIN[0] <= top < _PLAIN[1]:
         return f"{value:.{max(-last, 0)}f}", f"{error:.{max(-last, 0)}f}"
-    return tuple(f"{x / 10**top:.{top - last}f}e{top:+03d}" for x in (value, error))  # type: ignore[return-value]
+    shown, half = (f"{x / 10**top:.{top - last}f}e{top:+03d}" for x in (value, error))
+    return (shown if value else "0"), half
 
 
 def period(start: float, end: float) -> str:

@@ -251,19 +251,22 @@ def _joints_of(finding: Finding, joints: Sequence[str]) -> set[str]:
 def _merged(findings: Sequence[Finding], joints: Sequence[str]) -> tuple[str, ...]:
     """Return the messages; those that differ only in names of joints or logs and numbers are one.
 
-    Text to type has one value, because a user cannot type a range of values.
+    Text to type has one value, because a user cannot type a range of values. If no log has all the
+    joints of a message, the logs with the same joints have one.
     """
     logs = {finding.where.rpartition(": ")[0] or finding.where for finding in findings}
     names = sorted({name for name in (*joints, *logs) if name}, key=len, reverse=True)
     named = "|".join(rf"'{x}'|(?<!\w){x}(?!\w)" for x in map(re.escape, names))
     slots = "|".join([_TYPED, *([named] if named else []), _RANGE])
     slot = re.compile(f"({slots})")
-    alike: dict[tuple[str, ...], list[list[str]]] = {}
+    alike: dict[tuple[str, ...], list[tuple[Finding, list[str]]]] = {}
     for finding in findings:
         parts = slot.split(finding.message)  # text, slot, text, slot, ..., text
-        alike.setdefault(tuple(parts[::2]), []).append(parts[1::2])
+        alike.setdefault(tuple(parts[::2]), []).append((finding, parts[1::2]))
     merged = []
-    for texts, filled in alike.items():
+    for texts, filled in (
+        (x, own) for x, all_ in alike.items() for own in _by_joints(all_, joints)
+    ):
         columns = list(zip(*filled, strict=True))
         if any(map(_are_far, columns)):  # one setting does not suit them all
             words = [list(values) for values in filled]
@@ -271,6 +274,26 @@ def _merged(findings: Sequence[Finding], joints: Sequence[str]) -> tuple[str, ..
             words = [[_in_one(list(dict.fromkeys(values))) for values in columns]]
         merged += ["".join(a + b for a, b in zip(texts, [*own, ""], strict=True)) for own in words]
     return tuple(merged)
+
+
+def _by_joints(
+    filled: Sequence[tuple[Finding, list[str]]], joints: Sequence[str]
+) -> list[list[list[str]]]:
+    """Return the words of findings, together for logs with the same joints.
+
+    They are together for all logs if one of them has all the joints: its own sentence is true.
+    """
+    of_log: dict[str, set[str]] = {}
+    for finding, _ in filled:
+        log = finding.where.rpartition(": ")[0]
+        of_log.setdefault(log, set()).update(_joints_of(finding, joints))
+    if set().union(*of_log.values()) in of_log.values():
+        return [[words for _, words in filled]]
+    found: dict[frozenset[str], list[list[str]]] = {}
+    for finding, words in filled:
+        own = of_log[finding.where.rpartition(": ")[0]]
+        found.setdefault(frozenset(own), []).append(words)
+    return list(found.values())
 
 
 def _are_far(values: Sequence[str]) -> bool:

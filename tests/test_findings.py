@@ -41,6 +41,31 @@ def test_findings_of_one_code_are_one_cause_and_say_what_they_share_once():
     assert (old.severity, old.joints, old.messages) == ("note", (), ("the URDF is of 2020",))
 
 
+def test_logs_with_other_joints_are_named_one_by_one():
+    """No sentence on all three joints, because none of the logs has them all."""
+    joints = ["j1", "j2", "j3"]
+
+    def rest(log, joint, size):
+        message = f"{log}: {joint} at rest (range {size} rad): move it, or lock it"
+        return Finding("static_joint", "warning", f"{log}: {joint}", message)
+
+    sizes = {"a.csv": {"j2": 1e-4, "j3": 3e-4}, "b.csv": {"j1": 2e-4, "j3": 5e-4},
+             "c.csv": {"j2": 4e-4, "j3": 2e-4}}  # fmt: skip
+    findings = [rest(log, *pair) for log, own in sizes.items() for pair in own.items()]
+    (cause,) = grouped(findings, joints)
+    assert cause.messages == (
+        "a.csv, c.csv: j2, j3 at rest (range 0.0001 to 0.0004 rad): move it, or lock it",
+        "b.csv: j1, j3 at rest (range 0.0002 to 0.0005 rad): move it, or lock it",
+    )
+    assert cause.joints == tuple(joints)
+    whole = [rest("d.csv", joint, 6e-4) for joint in joints]  # true of d.csv
+    (cause,) = grouped([*findings, *whole], joints)
+    assert cause.messages == (
+        "a.csv, b.csv, c.csv, d.csv: j2, j3, j1 at rest (range 0.0001 to 0.0006 rad): move it, or "
+        "lock it",
+    )
+
+
 def late(log, seconds, rows="4"):
     message = (
         f"{log}: {1e3 * seconds:.1f} ms late, held for {rows} rows; set torque_delay = "

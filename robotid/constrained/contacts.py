@@ -13,7 +13,7 @@ from robotid.constrained.found_contacts import with_contacts
 from robotid.constrained.imu import check_imu
 from robotid.constrained.wrenches import check_wrenches
 from robotid.exceptions import DataError
-from robotid.findings import Finding, log_finding
+from robotid.findings import Finding, listed, log_finding
 from robotid.logs.base import base_state, in_base
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
@@ -40,6 +40,7 @@ _WINDOW = 0.2  # [s] in which the mean velocity of a foot in contact is a slip .
 _DRIFTS = 0.05  # [m/s] ... from this speed on, 1 cm in a window
 _FEWEST = 2  # lift-offs, and touch-downs, without which a delay is not examined
 _ROLLS = 0.3  # median speed at the contact of a rolling foot, as a share of that of its frame ...
+_ALIKE = 1.1  # ratio of two radii that are stated as one
 _CREEPS = 2e-3  # [m/s] ... if the frame is faster than this
 
 
@@ -109,6 +110,7 @@ def _check_feet(
     squares = np.sum((velocity if has_ground else relative) ** 2, axis=2)
     named: dict[int, list[Finding]] = {}
     trusted = flags.copy()  # without those that have a delay
+    rolling: list[tuple[float, str, float, float]] = []
     for k, contact in enumerate(model.contacts):
         own = log.contacts.get(contact.frame)
         if contact.always:
@@ -124,10 +126,9 @@ def _check_feet(
             w = np.einsum("kij,kj->ki", turn[:, k], motion.v)
             rolls = np.column_stack([w[:, 1], -w[:, 0], 0.0 * w[:, 2]])  # v / radius
             touching = _at(own, log, motion.t)
-            named[k] = (
-                list(_check_radius(contact, log, velocity[touching, k], rolls[touching]))
-                or named[k]
-            )
+            if found_radius := _radius(contact, velocity[touching, k], rolls[touching]):
+                rolling.append(found_radius)
+                del named[k]
     relative = _relative(velocity, trusted)
     for k, found in named.items():
         ways = [relative[:, k]]
@@ -135,6 +136,7 @@ def _check_feet(
             ways = [2.0 * relative[:, k], velocity[:, k]]
         frame = model.contacts[k].frame
         yield from found or _check_slip(frame, log, flags[:, k], motion, ways, signals)
+    yield from _rolling(log.name, sorted(rolling))
 
 
 def _at(flags: Array, log: Log, t: Array) -> Array:
@@ -371,18 +373,21 @@ def flag_delay(t: Array, flags: Array, speed: Array, spread: float) -> tuple[flo
     return (delay, error) if abs(delay) > error + 1.5 * step else None
 
 
-def _check_radius(contact: Contact, log: Log, v: Array, rolls: Array) -> Iterator[Finding]:
-    """Yield a finding if a foot in contact rolls as a ball of another radius than stated.
+def _radius(contact: Contact, v: Array, rolls: Array) -> tuple[float, str, float, float] | None:
+    """Return the radius of a foot in contact that rolls as a ball of another one than stated.
 
     Args:
         contact: The contact.
-        log: The log.
         v: Velocity at the contact with the stated radius, shape (N, 3) [m/s].
         rolls: Change of the centre's velocity per radius of a ball that rolls, shape (N, 3) [1/s].
+
+    Returns:
+        The radius [m], the link, and the median speed at the contact with the stated and with this
+        radius [m/s]; None if the foot does not roll.
     """
     pace = np.linalg.norm(rolls, axis=1)
     if not np.any(pace > 0.0):
-        return
+        return None
     # weighted median of v / roll: the smallest sum of |v - change roll|, samples that slip apart
     u, along = rolls[:, :2].ravel(), v[:, :2].ravel()
     ratio = along[u != 0.0] / u[u != 0.0]
@@ -394,15 +399,33 @@ def _check_radius(contact: Contact, log: Log, v: Array, rolls: Array) -> Iterato
     )
     radius = contact.radius + change
     if radius <= 0.0 or before < _CREEPS or after > _ROLLS * before:
-        return
-    message = (
-        f"the link {contact.frame} rolls on the ground as a ball of radius {radius:.4f} m: with it "
-        f"the median speed at the contact is {after:.2g} m/s, with {contact.radius:g} m it is "
-        f"{before:.2g} m/s. State radius = {radius:.4f} in [[contact]]"
-    )
-    yield log_finding(
-        log.name, "rolling_contact", "warning", message, radius=radius, before=before, after=after
-    )
+        return None
+    return radius, contact.frame, before, after
+
+
+def _rolling(log: str, feet: Sequence[tuple[float, str, float, float]]) -> Iterator[Finding]:
+    """Yield a finding for the feet of about one radius.
+
+    Args:
+        log: Name of the log.
+        feet: Radius, link, speeds before and after of each, as of ``_radius``, in ascending order.
+    """
+    while feet:
+        alike = [foot for foot in feet if foot[0] < _ALIKE * feet[0][0]]
+        feet = feet[len(alike) :]
+        radius = float(np.median([foot[0] for foot in alike]))
+        before, after = max(foot[2] for foot in alike), max(foot[3] for foot in alike)
+        links, most = listed(sorted(foot[1] for foot in alike)), "at most "
+        who = f"the links {links} roll on the ground as balls"
+        if len(alike) == 1:
+            who, most = f"the link {links} rolls on the ground as a ball", ""
+        message = (
+            f"{who} of radius {radius:.4f} m: with it the median speed at the contact is "
+            f"{most}{after:.2g} m/s, with the stated radius {most}{before:.2g} m/s. State radius = "
+            f"{radius:.4f} in [[contact]]"
+        )
+        figures = {"radius": radius, "before": before, "after": after}
+        yield log_finding(log, "rolling_contact", "warning", message, **figures)
 
 
 def _rms(values: Array) -> float:

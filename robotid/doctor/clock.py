@@ -63,22 +63,20 @@ def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterato
     for j, joint in enumerate(log.joints):
         extent = float(np.ptp(motion.q[:, j]))
         share = float(np.mean(speed[:, j] > _STILL))
+        is_prismatic = joint in layout.prismatic
+        size = f"range {extent:.2g} {'m' if is_prismatic else 'rad'}"
         if extent < _STATIC:
             code, severity = "static_joint", "warning"
             message = (
-                f"{joint} is at rest (range {extent:.2g}): this log does not determine its "
-                "friction and inertia, nor most parameters of the links that it carries; move it, "
-                "or lock it"
+                f"{joint} at rest ({size}): this log does not determine friction and inertia of "
+                "the joint, nor most parameters of the links that it carries; move it, or lock it"
             )
-        elif (
-            extent < (_HARDLY_PRISMATIC if joint in layout.prismatic else _HARDLY)
-            or share < _MOVING
-        ):
+        elif extent < (_HARDLY_PRISMATIC if is_prismatic else _HARDLY) or share < _MOVING:
             code, severity = "hardly_moves", "note"
             message = (
-                f"{joint} hardly moves (range {extent:.2g}, moving {100 * share:.2g} % of the "
-                "time): parameters that only this joint excites are poorly determined; move it "
-                "farther and longer"
+                f"little motion of {joint} ({size}, moving {100 * share:.2g} % of the time): "
+                "parameters that only such a joint excites are poorly determined; move it farther "
+                "and longer"
             )
         else:
             continue

@@ -410,9 +410,10 @@ def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Fin
         return
     link = probe.model.layout.bodies[-1]
     message = (
-        f"{link} carries about {abs(mass):.2g} +- {error:.2g} kg {'more' if mass > 0 else 'less'} "
-        "than in the URDF; if a tool or payload is mounted, add it to the URDF, else it is "
-        "identified as part of the last link"
+        f"{link} carries roughly {abs(mass):.2g} kg {'more' if mass > 0 else 'less'} than in the "
+        "URDF, if the URDF's other masses and the gains are right; if a tool or payload is "
+        "mounted, add it to the URDF, else it is identified as part of the last link. robotid "
+        "payload, with a log without it as --reference, identifies it with an interval"
     )
     evidence = {"mass": mass, "std_error": error, "mcx": load[1], "mcy": load[2], "mcz": load[3]}
     severity = "warning" if abs(mass) - 2 * error > _LARGE * arm else "note"

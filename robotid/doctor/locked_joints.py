@@ -32,19 +32,21 @@ def check_locked(
         asked: Joints that the user asked to lock.
         units: Units of the log.
     """
+    prismatic = {joint.name for joint in model.tree.movable if joint.type == "prismatic"}
     for joint, q in positions.items():
+        unit = "m" if joint in prismatic else "rad"
         stated = model.locked[joint]
         middle, extent = float(np.median(q)), float(np.ptp(q))
         if extent <= STILL and abs(middle - stated) <= STILL:
             continue
         default = "" if joint in asked else " by default"
         if extent > STILL:
-            what = f"moves over a range of {extent:.3g} in the log"
+            what = f"moves over a range of {extent:.3g} {unit} in the log"
             todo = f"identify {joint}, too, or use only the part of the log in which it is at rest"
         else:
-            what = f"is at {middle:.4g} in the log"
+            what = f"is at {middle:.4g} {unit} in the log"
             todo = f"state locked = {{ {joint} = {middle:.4g} }} (--lock {joint}={middle:.4g})"
-        message = f"{joint} is locked at {stated:.4g}{default} but {what}; {todo}"
+        message = f"{joint} is locked at {stated:.4g} {unit}{default} but {what}; {todo}"
         message += percent_hint(model, joint, middle, units)
         evidence = {"stated": stated, "median": middle, "range": extent}
         yield log_finding(log, "locked_position", "error", message, joint, **evidence)

@@ -373,14 +373,27 @@ def link_parameters(model: RobotModel, pi: Array) -> dict[str, Array]:
     _check_parameters(model, pi)
     layout = model.layout
     advice = "identify with the estimator 'consistent', whose bodies and drives are possible"
-    own = pi[: layout.n_inertial] - held_parameters(model)
-    for link, J in zip(layout.bodies, pseudo_inertia(own), strict=True):
-        smallest = float(np.linalg.eigvalsh(J)[0])
+    held = held_parameters(model)
+    whole, urdf = pi[: layout.n_inertial], model.standard_parameters()[: layout.n_inertial]
+    own = whole - held
+    for k, link in enumerate(layout.bodies):
+        smallest, of_whole, of_urdf = (
+            float(np.linalg.eigvalsh(pseudo_inertia(x[10 * k : 10 * k + 10])[0])[0])
+            for x in (own, whole, urdf - held)
+        )
         if not smallest > 0:
             others = f", without links beyond {listed(model.locked)}," if model.locked else ""
+            todo = advice
+            if not of_urdf > 0:
+                todo = "the URDF's own is impossible, too: correct it (robotid inspect)"
+            elif of_whole > 0:  # what is taken off makes it impossible
+                todo = (
+                    f"links beyond locked joints keep the URDF's inertials, {held[10 * k]:.3g} kg "
+                    f"of {whole[10 * k]:.3g} kg; correct these, or identify the locked joints, too"
+                )
             raise ModelError(
                 f"link {link!r}{others} would be physically impossible: the smallest eigenvalue of "
-                f"its pseudo-inertia is {smallest:.3g}, wanted > 0; {advice}"
+                f"its pseudo-inertia is {smallest:.3g}, wanted > 0; {todo}"
             )
     for i in np.flatnonzero(layout.is_nonnegative() & (pi < 0)):
         raise ModelError(

@@ -12,6 +12,7 @@ from robotid.estimators import WLS
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.recordings import Recordings
+from robotid.logs.data import Trajectory
 from robotid.regressor.factors import join
 from robotid.regressor.prediction import predict
 from robotid.robot.drives import DriveMotion
@@ -142,7 +143,9 @@ def find_outliers(
     """Return the rows with very large residuals, the largest first.
 
     Near a reversal an error of the size of the step of Coulomb friction is also accepted: during
-    stiction the friction torque can have any value between its two bounds.
+    stiction the friction torque can have any value between its two bounds, and a joint that stops
+    reverses in the filtered motion. A reversal is near if the filtered velocity has it within
+    1 / cutoff [s], or would have it at the sample's acceleration.
 
     Args:
         model: The robot.
@@ -158,7 +161,8 @@ def find_outliers(
     for e in evaluations:
         motion, mask, prediction = e.recording.trajectory, e.recording.mask, e.torques["estimate"]
         scales = _scales([motion.tau - prediction], [mask])
-        reverses = np.abs(motion.v) <= np.abs(motion.a) / (e.recording.signals.cutoff or np.inf)
+        near = 1.0 / (e.recording.signals.cutoff or np.inf)  # [s]
+        reverses = (np.abs(motion.v) <= near * np.abs(motion.a)) | _is_reversed(motion, near)
         excess = np.abs(motion.tau - prediction) - np.where(reverses, step, 0.0)
         rms = np.sqrt(np.mean(motion.tau**2, axis=0))
         sizes = np.where(excess >= _MATTERS * rms, excess / scales, 0.0)
@@ -171,6 +175,25 @@ def find_outliers(
                 tau, wanted, size = (float(x[worst, j]) for x in (motion.tau, prediction, sizes))
                 found.append(Outlier(log, joint, at, tau, wanted, size, k - i))
     return tuple(sorted(found, key=lambda outlier: -outlier.size))
+
+
+def _is_reversed(motion: Trajectory, near: float) -> Array:
+    """Return whether each velocity changes its sign within a time, before or after a sample.
+
+    Args:
+        motion: The motion, N samples.
+        near: The time [s].
+
+    Returns:
+        Shape (N, n_rows), bool. A change of sign between two segments is none.
+    """
+    t, found = motion.t, np.zeros(motion.v.shape, dtype=bool)
+    within = (np.diff(motion.segment) == 0)[:, None]
+    for j, changes in enumerate((within & (motion.v[1:] * motion.v[:-1] < 0.0)).T):
+        at = t[np.flatnonzero(changes)]  # of the sample before the change, the other one follows
+        after = t[np.flatnonzero(changes) + 1]
+        found[:, j] = np.searchsorted(at, t + near, side="right") > np.searchsorted(after, t - near)
+    return found
 
 
 def _friction_step(model: RobotModel, standard: Array) -> Array:

@@ -9,7 +9,16 @@ import numpy as np
 from robotid.findings import listed
 from robotid.fitting.metrics import JointMetrics, Metrics
 
-__all__ = ["BEATEN", "GOOD", "POOR", "Determined", "Predictions", "error_of", "is_beaten"]
+__all__ = [
+    "BEATEN",
+    "GOOD",
+    "POOR",
+    "Determined",
+    "Predictions",
+    "error_of",
+    "is_beaten",
+    "is_harmless_cost",
+]
 
 #: [%] largest torque prediction error on validation logs of a joint that is "good".
 GOOD = 15.0
@@ -21,6 +30,8 @@ BEATEN = 1.05
 _TIE = 0.3  # [%] ... and, for the URDF with fitted drives, by this share of the torque
 _OPTIMISM = 2.0  # validation error over fitted error beyond which the fit is over-fitted
 _BASE = "base."  # of the rows of a floating base
+_WRONG = 2.0  # an error this many times that of WLS gives a warning ...
+_HARMLESS = 1.0  # [%] ... but not below this share of the torque
 _NAMED = 8  # parameters that a reason names
 
 
@@ -206,6 +217,16 @@ def is_beaten(measured: JointMetrics) -> bool:
     """
     driven = measured.baselines.get("urdf_with_drives")
     return driven is not None and error_of(measured) > max(BEATEN * driven, driven + _TIE)
+
+
+def is_harmless_cost(error: float, wls_error: float) -> bool:
+    """Return whether constraints cost so little torque error that the verdict does not count it.
+
+    Args:
+        error: Torque error with them [%].
+        wls_error: Torque error of unconstrained WLS [%].
+    """
+    return error < max(_WRONG * wls_error, _HARMLESS)
 
 
 def error_of(measured: JointMetrics) -> float:

@@ -18,6 +18,7 @@ from robotid.fitting.regressor_noise import encoder_findings
 from robotid.fitting.result import Fit
 from robotid.fitting.settings import BoundedSettings, ConsistentSettings
 from robotid.judgement.correlation import correlated_parameters
+from robotid.judgement.evidence import is_harmless_cost
 from robotid.logs.data import Log
 from robotid.robot.bodies import held_parameters, least_density, negligible_bodies
 from robotid.robot.geometry import body_boxes, body_points
@@ -41,6 +42,7 @@ _ROUNDING = 1e-6  # [m^2] tolerance of a body that touches its box
 _NAMED = 5  # outliers that a finding names
 _WIDE = 1e-2  # margin of a pseudo-inertia above which it may restrict a fit
 _DIFFERS = 1.2  # residual of a consistent fit over that of WLS above which it is reported
+_LITTLE = 5.0  # [%] ... as a note if the constraints add less to the torque error
 _SHRUNK = 0.1  # of the URDF's smallest eigenvalue: below, a body is barely possible
 _MUCH = 0.2  # ... if links on locked joints have more than this share of its mass
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
@@ -91,19 +93,38 @@ def fit_findings(
         )
         where = evaluation.recording.log.path
         findings.append(Finding("validation_was_fitted", "warning", where, message))
-    wls, asked = fit.metrics("wls").per_joint, _asked(fit)
+    return findings + _costs(fit)
+
+
+def _costs(fit: Fit) -> list[Finding]:
+    """Return the joints whose torque error the constraints increase.
+
+    It is a note if they add little, sqrt(error^2 - wls^2) of the torque, the verdict does not count
+    it, and the user states no constraint.
+    """
+    findings, wls, asked = [], fit.metrics("wls").per_joint, _asked(fit)
     locked = _locked_links(fit)
     for joint, measured in fit.metrics().per_joint.items():
         free = wls[joint]
-        if measured.rmse > _DIFFERS * free.rmse:
-            message = (
-                f"{joint}: the residual is {measured.rmse:.3g} {measured.unit}, that of "
-                f"unconstrained WLS {free.rmse:.3g}: physics and data disagree; check "
-                f"{asked}{locked}the torque scale (gains), the drive model and the payload"
+        if measured.rmse <= _DIFFERS * free.rmse:
+            continue
+        error, least = measured.relative_error_pct, free.relative_error_pct or 0.0
+        message = (
+            f"{joint}: the residual is {measured.rmse:.3g} {measured.unit}, that of "
+            f"unconstrained WLS {free.rmse:.3g}"
+        )
+        is_little = error is not None and error**2 - least**2 < _LITTLE**2
+        if is_little and is_harmless_cost(error or 0.0, least) and not (asked or locked):
+            severity = "note"
+            message += f": {error:.2g} % instead of {least:.2g} % of the torque; no action needed"
+        else:
+            severity = "warning"
+            message += (
+                f": physics and data disagree; check {asked}{locked}the torque scale (gains), the "
+                "drive model and the payload"
             )
-            errors = {"error_pct": measured, "wls_error_pct": free}
-            evidence = {key: m.relative_error_pct or 0.0 for key, m in errors.items()}
-            findings.append(Finding("constraint_costs", "warning", joint, message, evidence))
+        evidence = {"error_pct": error or 0.0, "wls_error_pct": least}
+        findings.append(Finding("constraint_costs", severity, joint, message, evidence))
     return findings
 
 
@@ -496,7 +517,8 @@ def _outlier_findings(fit: Fit) -> list[Finding]:
     advice = "check the recording there, cut it out, or set robust = 'tukey' in [estimator]"
     if fit.estimator.is_robust:
         advice = "the robust loss downweighted them"
-    found = f"{len(outliers)} outliers in the fitted logs: {'; '.join(places)}"
+    count = f"{len(outliers)} outlier{'s' if len(outliers) > 1 else ''}"
+    found = f"{count} in the fitted logs: {'; '.join(places)}"
     evidence = {"places": float(len(outliers)), "largest": outliers[0].size}
     where, message = outliers[0].joint, f"{found}{more}; {advice}"
     return [Finding("outliers", "warning", where, message, evidence)]

@@ -13,7 +13,7 @@ from robotid.doctor.diagnosis import CODES
 from robotid.exceptions import SettingsError
 from robotid.findings import Finding, current_code, listed, not_ignored
 from robotid.fitting.metrics import Metrics
-from robotid.judgement.evidence import Determined, Predictions, error_of
+from robotid.judgement.evidence import Determined, Predictions, error_of, is_harmless_cost
 from robotid.judgement.scale_check import ScaleCheck
 from robotid.judgement.uses import uses_of_torques
 
@@ -36,8 +36,6 @@ _LOGGER = logging.getLogger("robotid")
 
 _REJECTED = 5.0  # [%] a smaller prediction error rejects a hypothesis on columns or masses
 _SCALED = 2.0  # a gravity torque within this factor of the URDF's contradicts a wrong unit
-_WRONG = 2.0  # an error this many times that of WLS gives a warning ...
-_HARMLESS = 1.0  # [%] ... but not below this share of the torque
 _SMALL = 5.0  # [%] of the torque: a missing drive term below this gives no warning
 #: Reasons of a verdict by code of the warning: such a result is at most "usable". Names in braces
 #: are figures of the evidence.
@@ -68,8 +66,8 @@ _REASONS = {
     "link_mass": "the URDF's mass of a link, {mass:.3g} kg, is too large ({factor:.2g} times it "
     "explains the torques), or a spring cancels {cancelled_pct:.0f} % of the gravity torque",
     "lost_motion": "there may be backlash between the joint and its encoder",
-    "rolling_contact": "a foot rolls as a ball of radius {radius:.4f} m, which is not stated: its "
-    "force acts elsewhere",
+    "rolling_contact": "feet roll as balls of a radius that is not stated: the force of the "
+    "ground acts elsewhere",
     "moving_contact": "a link moves at {speed:.2g} m/s while it is in contact",
     "measured_wrench": "forces of the ground are missing in a part of the log",
     "mass_matrix": "the mass matrix is not positive definite in all poses",
@@ -492,5 +490,4 @@ def _is_harmless(finding: Finding) -> bool:
         return finding.evidence["error_pct"] < _SMALL and "replaces" not in finding.evidence
     if finding.code != "constraint_costs":
         return False
-    error, wls = finding.evidence["error_pct"], finding.evidence["wls_error_pct"]
-    return error < max(_WRONG * wls, _HARMLESS)
+    return is_harmless_cost(finding.evidence["error_pct"], finding.evidence["wls_error_pct"])

@@ -17,6 +17,7 @@ _DEGREES = 180 / np.pi  # degrees in a radian
 _EPOCHS = 6e8, 5e9  # [s] since 1970: dates from 1989 to 2128
 _SLOWEST = 0.1  # [s] a longer median step has another unit
 _FARTHEST = 4 * np.pi  # [rad] a joint beyond two revolutions is in degrees
+_USUAL = 2 * np.pi  # [rad] ... and one within a revolution is in radians if others are farther
 _SEGMENT = 0.1  # [s] over which the motion is averaged against noise and jitter
 _GAP = 5  # [median steps] a longer step is a gap
 _ALIKE = 0.9  # correlation from which two signals are proportional
@@ -102,12 +103,39 @@ def check_reach(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
         largest = np.where(is_revolute, np.abs(values).max(axis=0), 0.0)  # (n,)
         j = int(np.argmax(largest))
         if largest[j] > _FARTHEST:
+            how = _how_to_state("angle", "deg", "rad")
+            if alone := _alone(log, kind, j, np.delete(largest, j)[np.delete(is_revolute, j)]):
+                how = f"{alone}. If all joints are in degrees, {how[0].lower()}{how[1:]}"
             raise DataError(
                 f"{log.name}: {kind}_{log.joints[j]} reaches {largest[j]:.4g}, which looks like "
-                f"degrees (in radians {largest[j] / (2 * np.pi):.1f} revolutions). "
-                f"{_how_to_state('angle', 'deg', 'rad')}",
+                f"degrees (in radians {largest[j] / (2 * np.pi):.1f} revolutions). {how}",
                 code="angle_unit",
             )
+
+
+def _alone(log: Log, kind: str, j: int, others: Array) -> str:
+    """Return how to convert one joint that alone looks like degrees, as text; else "".
+
+    Args:
+        log: The log.
+        kind: "q", or "qref" if only the commanded position is too large.
+        j: Index of the joint.
+        others: Largest position of each other revolute joint; one alone is not enough to compare.
+    """
+    if len(others) < 2 or others.max() > _USUAL:
+        return ""
+    kinds = [kind]
+    if kind == "q" and not _is_near(np.abs(_velocity_factor(log)), 1 / _DEGREES)[j]:
+        kinds += [name for name, values in (("dq", log.v), ("ddq", log.a)) if values is not None]
+    if kind == "q" and log.q_ref is not None and np.abs(log.q_ref[:, j]).max() > _FARTHEST:
+        kinds.append("qref")
+    *first, last = [f"{each}_{log.joints[j]}" for each in kinds]
+    columns = f"{', '.join(first)} and {last}" if first else last
+    return (
+        f"The other revolute joints reach at most {others.max():.3g}: this joint alone may be in "
+        f"degrees. Then multiply {columns} by {np.pi / 180:.7f} (pi / 180) in the recording, "
+        "because a stated unit applies to all joints"
+    )
 
 
 def _check_commands(log: Log, is_revolute: Array) -> None:

@@ -126,7 +126,8 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
         origin: The source of the result.
     """
     asked: dict[int, list[Cause]] = {}
-    causes = (*grouped(found.findings, found.model.joints), *_of_verdict(found))
+    findings = [finding for finding in found.findings if finding.severity != "note"]
+    causes = (*grouped(findings, found.model.joints), *_of_verdict(found))
     named = {
         j for c in causes if c.severity != "note" and c.code in _NAMED_CAUSES for j in c.joints
     }

@@ -249,6 +249,12 @@ def shrunk_correlation(values: Array) -> Array:
     return np.where(off, (1.0 - share) * r, 1.0)
 
 
+def _covariance(H: Array, scale: Array) -> Array:
+    """Return the covariance of parameters (q, q) of their information, and almost no prior."""
+    covariance: Array = np.linalg.inv(H + np.diag((UNKNOWN * scale) ** -2.0))
+    return covariance
+
+
 def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter]:
     """Yield the parameters of a group on which the runs have information."""
     values, errors = model.values
@@ -281,7 +287,11 @@ def _unlike(
 def _compared(
     group: RunsOf, every: MixedEffects, at: int, n_tests: int, *, is_unit: bool
 ) -> Iterator[tuple[float, UnlikeRun]]:
-    """Yield the difference of a run or unit from the others, if any, and what it explains."""
+    """Yield the difference of a run or unit from the others, if any, and what it explains.
+
+    A payload is compared only if the run determines it: a run in which the last joints are at rest
+    has a large moment and a wrong mass in place of any other effect.
+    """
     runs = group.runs
     if is_unit:
         others, own = MixedEffects(runs.without_unit(at), every.deviation), runs.of_unit(at)
@@ -289,9 +299,14 @@ def _compared(
         information = own.H.sum(axis=0)
     else:
         others, information = MixedEffects(runs.without(at), every.deviation), runs.H[at]
-        covariance = np.linalg.inv(information + np.diag((UNKNOWN * runs.scale) ** -2.0))
+        covariance = _covariance(information, runs.scale)
         x = covariance @ runs.h[at]
     variance = np.diag(covariance)
+    if group.group.kind == "payload":
+        together = np.diag(_covariance(runs.H.sum(axis=0), runs.scale))
+        plausible = runs.scale**2  # what all runs do not determine, no motion does
+        if np.any((variance > plausible) & (together <= plausible)):
+            return
     expected = others.predict(variance, x, is_unit=is_unit)
     p = int(np.argmin([each.probability for each in expected]))
     if expected[p].probability * n_tests >= _FALSE_ALARMS:

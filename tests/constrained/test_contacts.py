@@ -7,7 +7,8 @@ import pinocchio as pin
 import pytest
 from scipy.special import stdtrit
 
-from robotid.constrained.contacts import _check_radius, check_base, flag_delay
+from robotid.constrained.contacts import _radius, _rolling, check_base, flag_delay
+from robotid.judgement.verdict import warnings_of
 from robotid.logs.base import BaseMotion, base_state
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -184,16 +185,31 @@ def test_the_radius_of_a_rolling_foot_is_found(robot, ball):
     assert not found(0.025)
 
 
+def test_feet_of_one_radius_are_one_finding():
+    feet = [(0.018, "RL", 0.05, 0.002), (0.0182, "FR", 0.07, 0.001), (0.0197, "FL", 0.06, 0.004),
+            (0.03, "RR", 0.08, 0.003)]  # fmt: skip
+    three, one = _rolling("run.csv", feet)
+    assert "the links FL, FR, RL roll on the ground as balls of radius 0.0182 m" in three.message
+    assert "at most 0.004 m/s, with the stated radius at most 0.07 m/s" in three.message
+    assert three.evidence == {"radius": 0.0182, "before": 0.07, "after": 0.004}
+    assert "the link RR rolls on the ground as a ball of radius 0.0300 m" in one.message
+    assert "is 0.003 m/s, with the stated radius 0.08 m/s" in one.message
+    assert [f.where for f in (three, one)] == ["run.csv", "run.csv"]
+    (reason,) = warnings_of([three, one], ["FL_HAA"])  # one line
+    assert reason.message.startswith("run.csv: feet roll as balls of a radius that is not stated")
+    assert list(_rolling("run.csv", [])) == []
+
+
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_foot_may_roll_along_either_axis(walk, axis):
+def test_a_foot_may_roll_along_either_axis(axis):
     t = np.arange(0.0, 2.0, 0.01)
     rolls = np.zeros((len(t), 3))
     rolls[:, axis] = np.sin(5.0 * t)  # the centre's speed per radius, along one axis only
     v = 0.02 * rolls
-    (found,) = _check_radius(Contact(FEET[0], radius=0.01), walk, v, rolls)
-    assert found.evidence["radius"] == pytest.approx(0.03)
-    assert found.evidence["before"] == pytest.approx(np.median(np.abs(v[:, axis])))
-    assert found.evidence["after"] == pytest.approx(0.0, abs=1e-12)
+    radius, _, before, after = _radius(Contact(FEET[0], radius=0.01), v, rolls)
+    assert radius == pytest.approx(0.03)
+    assert before == pytest.approx(np.median(np.abs(v[:, axis])))
+    assert after == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("part", [slice(0, 3), slice(3, 6)])

@@ -162,3 +162,5 @@ def test_joints_that_hardly_move_are_named_with_their_range_and_share(slider):
     still = found["static_joint"]
     assert (still.where, still.severity) == ("run.csv: torso_lift_joint", "warning")
     assert still.evidence == {"range": 0.0, "moving_share": 0.0}
+    assert "torso_lift_joint at rest (range 0 m): this log" in still.message
+    assert "arm_1_joint (range 0.8 rad, moving 8 % of" in found["hardly_moves"].message

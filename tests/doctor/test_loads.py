@@ -147,7 +147,7 @@ def test_a_load_is_a_warning_if_it_surely_weighs_a_twelfth_of_the_arm_more_or_le
     assert none == []
     assert [f.severity for (f,) in others] == ["note", "note", "warning"]
     (last,) = others[-1]
-    assert f"about {heavy + 0.01:.2g} +- 0.1 kg {word}" in last.message
+    assert f"roughly {heavy + 0.01:.2g} kg {word} than in the URDF, if" in last.message
     assert list(last.evidence.values()) == pytest.approx([*load[:1], error, *load[1:]])
 
 

@@ -9,7 +9,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import examine
-from robotid.doctor.locked_joints import percent_hint
+from robotid.doctor.locked_joints import check_locked, percent_hint
 from robotid.fitting.settings import EstimatorSettings
 from robotid.log_files.read import read_log, write_log
 from robotid.logs.settings import LogUnits
@@ -52,7 +52,7 @@ def found(job):
 def test_a_joint_that_stands_elsewhere_is_named_with_its_position(job, stated):
     (finding,) = found(replace(job(None), locked={stated: 0.5}))
     assert (finding.severity, finding.where) == ("error", f"run.csv: {HELD}")
-    assert "wrist_3_joint is locked at 0.5 but is at 0.7" in finding.message
+    assert "wrist_3_joint is locked at 0.5 rad but is at 0.7 rad in the log" in finding.message
     assert f"state locked = {{ {HELD} = 0.7 }}" in finding.message
 
 
@@ -87,7 +87,7 @@ def test_logs_that_disagree_of_a_joint_place_it_nowhere(job, tmp_path):
     write_log(replace(log, q=log.q + 0.1 * (np.arange(6) == 5), a=None), tmp_path / "two.csv")
     two = replace(one, validation=(LogEntry(tmp_path / "two.csv"),))
     assert [f.where for f in found(two)] == [f"run.csv: {HELD}", f"two.csv: {HELD}"]
-    assert "at 0 by default but is" in found(two)[0].message
+    assert "at 0 rad by default but is" in found(two)[0].message
 
 
 def test_a_joint_that_moves_is_named_and_leads_the_verdict(job, tmp_path):
@@ -97,6 +97,19 @@ def test_a_joint_that_moves_is_named_and_leads_the_verdict(job, tmp_path):
     assert "identify wrist_3_joint, too" in finding.message
     identification, _ = run_job(moving, tmp_path / "out")
     assert identification.verdict.reasons[0] == finding.message
+
+
+def test_positions_and_ranges_have_the_unit_of_their_joint():
+    fingers = {"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.03, "panda_joint7": 0.5}
+    arm = [f"panda_joint{i}" for i in range(1, 7)]
+    panda = RobotModel.from_urdf(example_urdf("panda.urdf"), joints=arm, locked=fingers)
+    logged = (np.linspace(0.0, 0.04, 5), np.full(5, 0.09), np.linspace(0.1, 0.9, 5))
+    positions = dict(zip(fingers, logged, strict=True))
+    asked, units = list(fingers), LogUnits()
+    one, two, seven = check_locked(panda, positions, "run.csv", asked, units)
+    assert "is locked at 0.03 m but moves over a range of 0.04 m in the log" in one.message
+    assert "is locked at 0.03 m but is at 0.09 m in the log" in two.message
+    assert "is locked at 0.5 rad but moves over a range of 0.8 rad in the log" in seven.message
 
 
 def test_a_joint_that_stands_where_it_is_said_to_is_not_named(job):

@@ -303,8 +303,22 @@ def test_a_body_lighter_than_what_it_holds_is_refused(source, tmp_path, rng):
     pi = possible_parameters(model, rng)
     pi[:10] *= 0.2  # possible as a whole, but lighter than hand and tool, which are held
     assert np.linalg.eigvalsh(pseudo_inertia(pi[:10])[0])[0] > 0
-    with pytest.raises(ModelError, match=r"link 'upper', without links beyond elbow, sl"):
+    with pytest.raises(ModelError, match=r"link 'upper', without links beyond elbow, sl") as e:
         write_urdf(model, pi, tmp_path / "new.urdf")
+    # hand and tool, 0.5 + 0.3 kg: no estimator helps, their masses do
+    advice = f"keep the URDF's inertials, 0.8 kg of {pi[0]:.3g} kg; correct these, or identify the"
+    assert advice in str(e.value)
+    assert "consistent" not in str(e.value)
+
+
+def test_a_link_that_the_urdf_states_impossible_is_corrected_there(source, tmp_path):
+    thin = 'iyz="0" izz="0.01"/></inertial></link>'
+    source.write_text(source.read_text().replace(thin, thin.replace("0.01", "0.03")))
+    model = RobotModel.from_urdf(source)  # 0.03 > 0.01 + 0.01
+    with pytest.raises(ModelError, match="link 'hand' would be") as caught:
+        write_urdf(model, model.standard_parameters(), tmp_path / "new.urdf")
+    advice = "wanted > 0; the URDF's own is impossible, too: correct it (robotid inspect)"
+    assert str(caught.value).endswith(advice)
 
 
 @pytest.mark.parametrize("term", ["armature", "viscous", "coulomb"])

@@ -232,7 +232,7 @@ def test_a_reversal_excuses_the_step_of_coulomb_friction_of_its_own_joint(model)
     slow = {(60, 0): 0.19, (120, 0): 0.21, (60, 1): 0.2, (180, 1): 0.0, (60, 2): 0.1, (240, 2): 0.3}
     for k, (row, j) in enumerate(slow):
         off[row, j] = step[j] + (11.0, 12.5, 13.5, 11.5, 14.5, 11.9)[k] * typical[j]
-    v, a = np.ones((400, 3)), np.zeros((400, 3))
+    v, a = -np.ones((400, 3)), np.zeros((400, 3))
     for (row, j), speed in slow.items():
         v[row, j], a[row, j] = -speed, 1.0
     predicted = np.where(np.arange(400)[:, None] % 2, 3.0, -3.0) * np.ones(3)
@@ -249,6 +249,46 @@ def test_a_reversal_excuses_the_step_of_coulomb_friction_of_its_own_joint(model)
     wanted = {(60, 1): 13.5, (60, 2): 14.5}  # excused in part; in full beside a reversal
     wanted |= {(120, 0): step[0] / typical[0] + 12.5, (240, 2): step[2] / typical[2] + 11.9}
     assert sizes == pytest.approx(wanted)
+
+
+def test_a_joint_that_stops_reverses_in_the_filtered_motion(model):
+    """At the peak of the overshoot the acceleration is 0, and the velocity is that of a reversal.
+
+    The velocity of joint 1 changes its sign between rows 109 and 110, that of joint 2 between rows
+    404 and 405: within 0.125 s at a cut-off of 8 Hz are 97 to 122, and 392 to 417.
+    """
+    t, pi = 12.0 + np.arange(600) / 100, truth(model)
+    step = 2 * pi[[model.layout.names.index(f"{joint}.coulomb") for joint in model.joints]]
+    typical = 1.4826 * np.array([0.2, 0.3, 0.5])
+    v = np.column_stack([np.full(600, 0.4), 13.095 - t, 0.01 * (t - 16.045)])
+    predicted = np.where(np.arange(600)[:, None] % 2, 3.0, -3.0) * np.ones(3)
+    tau = predicted + typical / 1.4826 * np.where(np.arange(600)[:, None] % 4 < 2, 1, -1)
+
+    def size(row, j, error, segment=None):
+        """Return the size of an outlier with an error in typical ones, None if it is not found."""
+        off = tau.copy()
+        off[row, j] = predicted[row, j] + error * typical[j]
+        segment = np.zeros(600, dtype=int) if segment is None else segment
+        motion = Trajectory(t, v, v, 0.0 * v, off, model.joints, 100.0, segment)
+        recording = SimpleNamespace(
+            trajectory=motion, mask=np.ones((600, 3), dtype=bool),
+            log=Log(t, v, tau, model.joints), signals=SignalSettings(cutoff=8.0),
+        )  # fmt: skip
+        evaluation = SimpleNamespace(recording=recording, torques={"estimate": predicted})
+        found = find_outliers(model, [evaluation], pi)
+        assert [model.joints.index(o.joint) for o in found] == [j] * len(found)
+        return found[0].size if found else None
+
+    steps = step / typical
+    for first, last, j in ((97, 122, 1), (392, 417, 2)):
+        for row in (first, last):
+            assert size(row, j, steps[j] + 11.0) is None
+            assert size(row, j, steps[j] + 15.0) == pytest.approx(15.0)  # injected: still found
+        for row in (first - 1, last + 1):
+            assert size(row, j, steps[j] + 11.0) == pytest.approx(steps[j] + 11.0)
+    assert size(110, 0, steps[0] + 11.0) == pytest.approx(steps[0] + 11.0)  # of another joint
+    gap = (np.arange(600) >= 110).astype(int)  # the sign changes between two segments
+    assert size(110, 1, steps[1] + 11.0, gap) == pytest.approx(steps[1] + 11.0)
 
 
 def test_a_coupled_drive_steps_at_each_of_its_joints_by_its_ratio():

@@ -104,6 +104,7 @@ def test_five_outliers_are_named_and_the_others_counted():
     assert few.endswith("j4 at 5.000 s of run.csv: measured 14, predicted -8, residual 36 times "
                         "the typical one; check the recording there, cut it out, or set robust = "
                         "'tukey' in [estimator]")  # fmt: skip
+    assert said(1, False).startswith("1 outlier in the fitted logs: j0 at 0.000 s")
     assert "j5" not in many
     assert many.endswith(
         "residual 36 times the typical one; and 2 more; the robust loss downweighted them"
@@ -376,8 +377,12 @@ def test_a_fit_is_reported_by_its_determination_its_refitted_logs_and_costly_joi
     def measured(rmse, error):
         return SimpleNamespace(rmse=rmse, unit="N m", relative_error_pct=error)
 
-    own = {"a": measured(1.19, 11.0), "b": measured(2.5, None), "c": measured(0.61, 9.0)}
-    wls = {"a": measured(1.0, 10.0), "b": measured(2.0, 8.0), "c": measured(0.5, 7.0)}
+    own = {"a": measured(1.19, 11.0), "b": measured(2.5, None), "c": measured(0.61, 9.0),
+           "d": measured(0.4, 4.9), "e": measured(0.4, 4.9), "f": measured(0.3, 5.8),
+           "g": measured(0.3, 5.9)}  # fmt: skip
+    wls = {"a": measured(1.0, 10.0), "b": measured(2.0, 8.0), "c": measured(0.5, 7.0),
+           "d": measured(0.2, 2.5), "e": measured(0.2, 2.4), "f": measured(0.2, 3.0),
+           "g": measured(0.2, 3.0)}  # fmt: skip
     fit = SimpleNamespace(
         determination=SimpleNamespace(
             groups=() if rank == 9 else ("x",), rank=rank, names=range(9), described=lambda: "x is"
@@ -398,10 +403,19 @@ def test_a_fit_is_reported_by_its_determination_its_refitted_logs_and_costly_joi
     refitted, costs = found[2:4], found[4:]
     assert [f.where for f in refitted] == ["k.csv", "l.csv"]
     assert "the validation log l.csv 0-1 s contains" in refitted[1].message
-    assert [(f.code, f.where, f.evidence) for f in costs] == [
-        ("constraint_costs", "b", {"error_pct": 0.0, "wls_error_pct": 8.0}),
-        ("constraint_costs", "c", {"error_pct": 9.0, "wls_error_pct": 7.0}),
+    assert {f.code for f in costs} == {"constraint_costs"}
+    assert [(f.severity, f.where, f.evidence) for f in costs] == [
+        ("warning", "b", {"error_pct": 0.0, "wls_error_pct": 8.0}),
+        ("warning", "c", {"error_pct": 9.0, "wls_error_pct": 7.0}),
+        ("note", "d", {"error_pct": 4.9, "wls_error_pct": 2.5}),  # 4.2 %, less than twice
+        ("warning", "e", {"error_pct": 4.9, "wls_error_pct": 2.4}),
+        ("note", "f", {"error_pct": 5.8, "wls_error_pct": 3.0}),  # 4.96 % of the torque
+        ("warning", "g", {"error_pct": 5.9, "wls_error_pct": 3.0}),  # 5.08 %
     ]
+    assert costs[2].message == (
+        "d: the residual is 0.4 N m, that of unconstrained WLS 0.2: 4.9 % instead of 2.5 % of the "
+        "torque; no action needed"
+    )
     assert costs[1].message.startswith(
         "c: the residual is 0.61 N m, that of unconstrained WLS 0.5: physics and data disagree"
     )

@@ -1,5 +1,7 @@
 """Units of a log file: what is stated becomes SI, what looks wrong is refused."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -57,6 +59,43 @@ def test_more_than_two_turns_look_like_degrees(turns, is_refused):
         check_units(far, LogUnits())
     check_units(far, LogUnits(angle="rad"))
     check_units(far, LogUnits(), prismatic=["a"])
+
+
+def three(scale, **scales):
+    """A log from 5 s of three joints; columns in other units by factors (3,), q if not stated."""
+    t = 5.0 + T
+    q = np.column_stack([0.8 * np.sin(2 * T), 0.3 * np.cos(3 * T), 0.5 + np.sin(T)])
+    v = np.column_stack([1.6 * np.cos(2 * T), -0.9 * np.sin(3 * T), np.cos(T)])
+    columns = {"v": v, "q_ref": q + 0.01}
+    changed = {key: columns[key] * scales[key] for key in scales}
+    return Log(t, q * scale, np.zeros_like(q), ("a", "b", "c"), **changed)
+
+
+def test_one_joint_in_degrees_is_converted_alone():
+    """pi / 180 is 0.0174533; the others reach 0.8 (a), 0.3 (b), 1.5 (c)."""
+    one, c = np.array([1.0, 1.0, 1.0]), np.array([1.0, 1.0, 180 / np.pi])
+    advice = "at most 0.8: this joint alone may be in degrees. Then multiply {} by 0.0174533"
+    for changes, columns in (
+        ({"scale": c}, "q_c"),
+        ({"scale": c, "v": c}, "q_c and dq_c"),
+        ({"scale": c, "v": one}, "q_c"),  # the velocity is in radians
+        ({"scale": c, "v": c, "q_ref": c}, "q_c, dq_c and qref_c"),
+        ({"scale": c, "q_ref": one}, "q_c"),
+    ):
+        with pytest.raises(DataError, match=re.escape(advice.format(columns))) as caught:
+            check_units(three(**changes), LogUnits())
+        assert "in the recording, because a stated unit applies to all joints" in str(caught.value)
+        assert '. If all joints are in degrees, state units angle = "deg"' in str(caught.value)
+    a = 180 / np.pi * np.array([1.0, 0.0, 0.0]) + [0.0, 1.0, 1.0]
+    with pytest.raises(DataError, match=r"most 1\.51: this joint alone .* multiply qref_a by"):
+        check_units(three(one, q_ref=a), LogUnits())
+    # all in degrees, a joint farther than a revolution, and too few joints to compare
+    for log, prismatic in (
+        (three(180 / np.pi * one), ()), (three([8.0, 1.0, 180 / np.pi]), ()), (three(c), ("a",))
+    ):  # fmt: skip
+        with pytest.raises(DataError, match="looks like degrees") as caught:
+            check_units(log, LogUnits(), prismatic)
+        assert "alone" not in str(caught.value)
 
 
 @pytest.mark.parametrize(("step", "unit"), [(0.2, "ms"), (10.0, "ms"), (1e4, "us"), (1e7, "ns")])

@@ -203,6 +203,18 @@ def test_a_result_without_trouble_is_measured_used_and_played(identified):
     assert f"robotid export {result} --format mjcf --out ur5.xml" in blocks
 
 
+def test_a_step_names_no_joint_of_a_note(identified):
+    calm = next_steps(told(identified), JOB)[0].words
+    lift, other = [joint for joint in identified.model.joints if joint not in calm][:2]
+    steps = [
+        next_steps(told(identified, *(warning("constraint_costs", *each) for each in pairs)), JOB)
+        for pairs in (((lift, "note"), (other, "warning")), ((lift, "note"), (other, "note")))
+    ]
+    named = [[x in each[0].words for x in (lift, other)] for each in steps]
+    assert all(each[0].words.startswith("Examine the residual of") for each in steps)
+    assert named == [[False, True], [False, False]]
+
+
 def test_an_error_comes_before_a_warning_and_three_steps_are_enough(identified):
     codes = ("undetermined", "current_for_torque", "torque_delay", "unexplained_torque")
     found = told(

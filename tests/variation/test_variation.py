@@ -236,6 +236,33 @@ def test_a_run_is_named_by_the_number_of_all_parameters_in_all_runs():
         assert [each.run for each in unlike] == [7] * is_named
 
 
+def test_a_payload_is_compared_only_in_runs_that_determine_it():
+    """Runs of 4 parameters with scale 1; run 6 differs by 40 along its determined direction.
+
+    No run has information on parameter 2 (no motion determines it). Run 6 has sd 0.1 along
+    (1, 0, 0, 1) / sqrt(2), and the information ``weak`` across it and on parameter 1.
+    """
+    rng, along = np.random.default_rng(5), np.array([1.0, 0.0, 0.0, 1.0]) / np.sqrt(2.0)
+    known = np.diag([1.0, 1.0, 0.0, 1.0])
+    x = 0.3 * rng.normal(size=(7, 4))
+    x[6] += 40.0 * along
+
+    def unlike(weak, kind="payload", of_others=known):
+        H = np.tile(100.0 * of_others, (7, 1, 1))
+        H[6] = (100.0 - weak) * np.outer(along, along) + weak * known
+        names = ("m", "mcx", "mcy", "mcz")
+        group = Group(kind, "tool", tuple(f"tool.{n}" for n in names), ("kg",) * 4, np.eye(4), (0,))
+        runs = Runs(H, np.einsum("kij,kj->ki", H, x), np.zeros(7, int), np.ones(4))
+        own = vary(list("abcdefg"), (RunsOf(group, np.zeros(4), runs, 1.0),)).unlike
+        return [(each.run, each.kind) for each in own]
+
+    # sd of m and mcz: sqrt(0.5 / 100 + 0.5 / weak); 1 at weak = 0.5025; of mcx: 1 / sqrt(weak)
+    assert unlike(1.1) == [(6, "payload")]
+    assert unlike(0.9) == []  # mcx: 1.05
+    assert unlike(0.9, "drive") == [(6, "drive")]
+    assert unlike(0.9, of_others=np.diag([1.0, 0, 0, 1])) == [(6, "payload")]  # no run has mcx
+
+
 def test_spreads_are_stated_between_units_and_within_them():
     rng, unit = np.random.default_rng(0), np.repeat(np.arange(8), 6)
     x = 5.0 * rng.normal(size=8)[unit] + 0.4 * rng.normal(size=len(unit))
