@@ -30,6 +30,7 @@ LINES = [
     "identification",
     "closed_loop",
     "online export viewer excitation",
+    "advice",
     "report",
     "commands paper",
     "cli",

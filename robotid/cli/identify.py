@@ -52,9 +52,11 @@ def run(options: argparse.Namespace) -> int:
 
     with progress_of(options) as progress:
         report_stage(progress, "reading logs")  # before what takes the first second: its modules
+        from robotid.advice.loop_steps import loop_steps
+        from robotid.advice.next_steps import next_steps
+        from robotid.advice.steps import Origin
         from robotid.commands.identify import run_job
         from robotid.identification.result import Identification
-        from robotid.report.advice import Origin, loop_steps, next_steps
         from robotid.workers.plan import WorkPlan
 
         job = job_from_flags(options)

@@ -9,7 +9,7 @@ from robotid._text import command_lines, period, terminal_width, tinted, wrapped
 from robotid.findings import Finding, grouped, number_of
 
 if TYPE_CHECKING:
-    from robotid.report.advice import Step
+    from robotid.advice.steps import Step
 
 
 __all__ = [

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from robotid._files import check_folder, folder_beside, write_json
 from robotid._settings import require_kind
 from robotid._typing import STAGES, ProgressCallback, ignore_progress, report_stage
+from robotid.advice.steps import Origin
 from robotid.closed_loop.settings import LoopSettings
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import (
@@ -33,7 +34,6 @@ from robotid.judgement.findings import locked_findings
 from robotid.judgement.verdict import check_ignored
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.friction_projection import project_friction
-from robotid.report.advice import Origin
 from robotid.report.document import write_report
 from robotid.robot.drives import DriveTerm
 from robotid.robot.families import AUTO, wanted_families

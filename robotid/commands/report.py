@@ -7,6 +7,7 @@ from typing import Any
 
 from robotid._files import check_file, file_sha256, log_exists, write_text
 from robotid._typing import ProgressCallback, report_stage
+from robotid.advice.steps import Origin
 from robotid.commands.identify import identify_job
 from robotid.commands.job import Job, job_from_settings
 from robotid.commands.logs import log_of_commands
@@ -14,7 +15,6 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.export.result import load_result
 from robotid.findings import listed
 from robotid.identification.result import Identification
-from robotid.report.advice import Origin
 from robotid.report.document import write_report
 from robotid.report.positions import shown_positions
 from robotid.report.shown import page_of

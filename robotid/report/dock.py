@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote, urlencode
 
+from robotid.advice.steps import Origin
 from robotid.pages.html import command_html
-from robotid.report.advice import Origin
 
 __all__ = ["Clip", "Dock"]
 

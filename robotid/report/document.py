@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from robotid._files import write_text
 from robotid._settings import require_each, require_kind
+from robotid.advice.steps import Origin
 from robotid.export.entries import build_result
 from robotid.identification.result import Identification
-from robotid.report.advice import Origin
 from robotid.report.shown import Shown, page_of
 from robotid.report.torques import shown_torques
 from robotid.report.variation import variation_section

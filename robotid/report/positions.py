@@ -10,13 +10,14 @@ import numpy as np
 
 from robotid._text import period
 from robotid._typing import Array
+from robotid.advice.loop_steps import loop_steps
+from robotid.advice.steps import Origin
 from robotid.closed_loop.evaluation import DRIFTS, OpenLoop, position_metrics
 from robotid.exceptions import DataError
 from robotid.export.ranges import source_of
 from robotid.findings import Finding, grouped, listed
 from robotid.pages.charts import Chart, Series, chart_html
 from robotid.pages.html import code, number, table, text
-from robotid.report.advice import Origin, loop_steps
 from robotid.report.curves import curves_section, drawn
 from robotid.report.dock import Clip, Dock
 from robotid.report.errors import POSITION, Errors, worst_errors

@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from robotid.advice.steps import Step
 from robotid.findings import Finding
 from robotid.judgement.uses import uses_line
 from robotid.pages.html import Section, facts_html, folded, page, steps_html, verdict_html
-from robotid.report.advice import Step
 from robotid.report.causes import findings_line, findings_section
 from robotid.report.errors import Errors, Quantity, error_bars, error_table, worst_errors
 from robotid.report.tables import sources_fact

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from robotid.advice.next_steps import next_steps
+from robotid.advice.steps import Origin
 from robotid.export.entries import input_entries
 from robotid.findings import listed
 from robotid.fitting.bands import TorqueBand, next_errors
@@ -18,7 +20,6 @@ from robotid.judgement.parameter_table import parameter_entries
 from robotid.logs.settings import SignalSettings
 from robotid.pages.charts import chart_html
 from robotid.pages.html import percent
-from robotid.report.advice import Origin, next_steps
 from robotid.report.bodies import parameter_picture
 from robotid.report.curves import curves_section, drawn
 from robotid.report.diagnosis import (

@@ -303,9 +303,11 @@ def _compared(
         x = covariance @ runs.h[at]
     variance = np.diag(covariance)
     if group.group.kind == "payload":
-        together = np.diag(_covariance(runs.H.sum(axis=0), runs.scale))
+        alone, together = (
+            np.diag(_covariance(H, runs.scale)) for H in (information, runs.H.sum(axis=0))
+        )
         plausible = runs.scale**2  # what all runs do not determine, no motion does
-        if np.any((variance > plausible) & (together <= plausible)):
+        if np.any((alone > plausible) & (together <= plausible)):
             return
     expected = others.predict(variance, x, is_unit=is_unit)
     p = int(np.argmin([each.probability for each in expected]))

@@ -9,6 +9,8 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid._files import file_sha256
+from robotid.advice.next_steps import next_steps
+from robotid.advice.steps import Origin
 from robotid.cli import main
 from robotid.commands import payload
 from robotid.commands.identify import run_job
@@ -19,7 +21,6 @@ from robotid.export.result import load_result, stated_scale_check
 from robotid.judgement.payload_check import PayloadCheck
 from robotid.log_files.formats import write_columns
 from robotid.log_files.read import write_log
-from robotid.report.advice import Origin, next_steps
 from robotid.robot.bodies import link_transfer
 from robotid.robot.drives import Tanh
 from robotid.robot.examples import example_urdf

@@ -14,13 +14,14 @@ from helpers.commanded_results import written_result
 from helpers.mujoco_plant import plant
 from helpers.paths import DOCS, ROOT
 
+from robotid.advice.loop_steps import loop_steps
+from robotid.advice.steps import Origin
 from robotid.cli import main
 from robotid.commands.export import export_result
 from robotid.exceptions import SettingsError
 from robotid.export.exported import Written
 from robotid.export.formats import FORMATS, Format, Option
 from robotid.export.result import load_result
-from robotid.report.advice import Origin, loop_steps
 from robotid.robot.urdf_text import read_with_yourdfpy
 
 #: How the consumer of each format reads the stiffness or the Coulomb friction of a joint.

@@ -9,6 +9,8 @@ import pytest
 from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_segments
 
 from robotid import identify
+from robotid.advice.next_steps import _watch
+from robotid.advice.steps import Origin
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.replay import Findings, replay_files
 from robotid.exceptions import SettingsError
@@ -17,7 +19,6 @@ from robotid.fitting.settings import ConsistentSettings, ConstraintSettings
 from robotid.log_files.read import write_log
 from robotid.logs.base import BaseMotion
 from robotid.logs.settings import SignalSettings
-from robotid.report.advice import Origin, _watch
 from robotid.robot.bodies import negligible_bodies
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from robotid.advice.steps import sentence_of
 from robotid.findings import Finding
 from robotid.judgement import unlike_runs
 from robotid.judgement.evidence import Predictions
 from robotid.judgement.unlike_runs import rescaled_findings
 from robotid.judgement.verdict import warnings_of
-from robotid.report.advice import _capital
 
 JOINTS = ("a", "b", "c")
 
@@ -103,4 +103,4 @@ def test_bodies_are_not_blamed_for_another_gain():
     ],
 )
 def test_the_name_of_a_file_keeps_its_letters(message, wanted):
-    assert _capital(Finding("x", "warning", "y", message).message) == wanted
+    assert sentence_of(Finding("x", "warning", "y", message).message) == wanted

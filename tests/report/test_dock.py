@@ -11,9 +11,9 @@ from helpers.browsing import until, visit
 from helpers.paths import URDF
 from helpers.synthetic import exact_log, truth
 
+from robotid.advice.steps import Origin
 from robotid.cli import main
 from robotid.log_files.read import write_log
-from robotid.report.advice import Origin
 from robotid.report.dock import Clip, Dock
 from robotid.robot.model import RobotModel
 

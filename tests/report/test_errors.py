@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from helpers.pages import bars
 
+from robotid.advice.next_steps import next_steps
+from robotid.advice.steps import Origin
 from robotid.judgement.evidence import GOOD, POOR
 from robotid.report import bars as errors
-from robotid.report.advice import Origin, next_steps
 from robotid.report.errors import TORQUE, Errors, error_bars, worst_errors
 from robotid.report.shown import first_screen
 from robotid.report.torques import shown_torques

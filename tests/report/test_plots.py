@@ -12,10 +12,10 @@ import pytest
 from helpers.figures import torques
 from helpers.pages import chart, percent
 
+from robotid.advice.steps import Origin
 from robotid.diagnosis.residuals import autocorrelation, spectrum
 from robotid.identification.pictures import QUANTILE, torque_charts
 from robotid.report import torques as torques_module
-from robotid.report.advice import Origin
 from robotid.report.information import information
 from robotid.report.torques import torques_section
 

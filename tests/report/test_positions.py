@@ -9,11 +9,11 @@ from helpers.commanded_results import by_position, written_result
 from helpers.mujoco_plant import LEG, plant
 from helpers.pages import bars, chart, charts, tables
 
+from robotid.advice.steps import Origin
 from robotid.closed_loop.evaluation import OpenLoop
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.logs.data import Log
-from robotid.report.advice import Origin
 from robotid.report.errors import worst_errors
 from robotid.report.positions import _charts, _fixed, _horizons, _undetermined, shown_positions
 from robotid.report.shown import page_of

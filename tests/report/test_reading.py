@@ -9,8 +9,8 @@ import pytest
 from helpers.browsing import until, visit
 from helpers.pages import tables
 
+from robotid.advice.steps import Origin
 from robotid.pages.html import asset
-from robotid.report.advice import Origin
 from robotid.report.document import write_report
 
 PARAMETERS = "Parameters of links and drives"

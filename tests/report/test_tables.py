@@ -13,10 +13,10 @@ import pytest
 from helpers.figures import figures
 from helpers.pages import number, percent, tables
 
+from robotid.advice.steps import Origin
 from robotid.estimators.determination import Group
 from robotid.identification.summary import verdict_cell
 from robotid.pages import html
-from robotid.report.advice import Origin
 from robotid.report.information import information
 from robotid.report.tables import (
     _consistency_notes,

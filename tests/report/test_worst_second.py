@@ -7,7 +7,7 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 import pytest
 
-from robotid.report.advice import Origin
+from robotid.advice.steps import Origin
 from robotid.report.dock import Dock
 from robotid.report.torques import torques_section
 from robotid.report.worst_second import Residual, worst_html, worst_second

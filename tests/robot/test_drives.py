@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
+from robotid.advice.steps import Origin
 from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.export.urdf import load_identified, read_sidecar, write_urdf
 from robotid.identification.pipeline import identify
@@ -24,7 +25,6 @@ from robotid.regressor.torque import (
     joint_torque_regressor,
     trajectory_regressor,
 )
-from robotid.report.advice import Origin
 from robotid.report.torques import shown_torques
 from robotid.robot.drives import (
     DRIVE_TERMS,

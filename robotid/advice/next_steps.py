@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from robotid._settings import is_number
+from robotid.advice.steps import MOST, NAMED, Origin, Step, exports_of, sentence_of
 from robotid.diagnosis.misfit_findings import setting_of, with_entries
-from robotid.export.formats import FORMATS
-from robotid.findings import Cause, Finding, grouped, listed, toml_key
+from robotid.findings import Cause, grouped, listed, toml_key
 from robotid.judgement.evidence import GOOD, is_beaten
 from robotid.robot.drives import COUNTERBALANCE, DriveTerm
 from robotid.robot.families import spring_family
@@ -21,99 +21,11 @@ if TYPE_CHECKING:
     from robotid.identification.result import Identification
     from robotid.judgement.payload_check import PayloadCheck
 
-__all__ = ["Origin", "Step", "loop_steps", "next_steps"]
+__all__ = ["next_steps"]
 
-_MOST = 3  # steps
-_NAMED = 4  # joints that a step names
 _NEW = "NEW.csv"
 _LOADED = "LOADED.csv"
 _PLAIN = "viscous+coulomb"
-_APPENDED = ("--validate",)  # flags that add to what was stated before
-
-
-@dataclass(frozen=True)
-class Step:
-    """One next step.
-
-    Attributes:
-        words: The action, imperative, and its reason.
-        blocks: Commands, or lines of the job file; each is copied separately.
-    """
-
-    words: str
-    blocks: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Origin:
-    """The source of a result and its folder, for commands.
-
-    Attributes:
-        source: The arguments of ``robotid identify``: a job file, or URDF, logs and flags; empty
-            if no command made the result.
-        folder: Folder of the results; "" if they were not written.
-        replay: File that ``robotid replay`` writes, from the report's folder; "" if there is none.
-    """
-
-    source: tuple[str, ...] = ()
-    folder: str = ""
-    replay: str = ""
-
-    @property
-    def job(self) -> str:
-        """The job file; "" if there is none."""
-        return self.source[0] if self.source and self.source[0].endswith(".toml") else ""
-
-    def again(self, *flags: str) -> str:
-        """Return the command that repeats the identification.
-
-        Args:
-            flags: Flags to append.
-        """
-        out = ["--out", self.folder] if self.folder else []
-        return shlex.join(["robotid", "identify", *_without(self.source, flags), *flags, *out])
-
-    def stating(self, table: str, line: str, *flags: str) -> tuple[str, ...]:
-        """Return the blocks that repeat the identification with another setting.
-
-        Args:
-            table: Table of the job file that has the setting.
-            line: Line of the setting in that table.
-            flags: The equivalent flags of the command line, if there are any.
-        """
-        if flags and self.source and not self.job:
-            return (self.again(*flags),)
-        return (f"{table}\n{line}", *([self.again()] if self.job else []))
-
-    def using(self, command: str, *words: str) -> tuple[str, ...]:
-        """Return a command that reads the results; nothing if they were not written.
-
-        Args:
-            command: Name of the command.
-            words: Its arguments.
-        """
-        return (shlex.join(["robotid", command, *words]),) if self.folder else ()
-
-
-def _without(source: Sequence[str], flags: Sequence[str]) -> list[str]:
-    """Return the words of a command without the flags that new flags replace."""
-    replaced = {_key(*pair) for pair in pairwise(flags) if pair[0] not in _APPENDED}
-    words, remaining = [*source, ""], []
-    skip = False
-    for word, following in pairwise(words):
-        flag, sign, value = word.partition("=")
-        has_separate_value = word.startswith("--") and not sign
-        if not skip and _key(flag, value if sign else following) not in replaced:
-            remaining.append(word)
-            continue
-        skip = has_separate_value and not skip
-    return remaining
-
-
-def _key(flag: str, value: str) -> tuple[str, str]:
-    """Return the key of a flag: its name, and the joint if its value is JOINT=VALUE."""
-    name, sign, _ = value.partition("=")
-    return flag, name if sign else ""
 
 
 def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
@@ -142,72 +54,7 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
             asked.setdefault(number, []).append(cause)
     urgent = sorted(asked, key=lambda k: (all(c.severity != "error" for c in asked[k]), k))
     steps = [_STEPS[number][0](found, origin, asked[number]) for number in urgent]
-    return _once([*steps, *_uses(found, origin, steps)][:_MOST])
-
-
-def loop_steps(content: Mapping[str, Any], origin: Origin) -> tuple[Step, ...]:
-    """Return the next steps for a result of closed-loop identification.
-
-    They are its uses, if it was written; of a poor result, what to correct, three at most.
-
-    Args:
-        content: Content of its result.json.
-        origin: The source of the result, and its folder.
-    """
-    if content["verdict"]["status"] == "poor":
-        return _loop_repairs(content, origin)[:_MOST]
-    exports = _exports(
-        content["robot"], origin, has_gains=content["simulation"]["controller"]["kind"] != "torque"
-    )
-    return (_loop_replay(content, origin), *exports) if origin.folder else ()
-
-
-def _loop_repairs(content: Mapping[str, Any], origin: Origin) -> tuple[Step, ...]:
-    """Return what to correct for a poor result: logs, causes that findings name, joints."""
-    verdict, steps = content["verdict"], []
-    again = (origin.again(),) if origin.source else ()
-    if errors := verdict["log_errors"]:
-        words = f"Correct the logs, then repeat the identification: {errors[0]}."
-        doctor = (shlex.join(["robotid", "doctor", *origin.source]),) if origin.source else ()
-        return (Step(words, (*doctor, *again)),)
-    poor = [name for name, own in verdict["per_joint"].items() if own["status"] == "poor"]
-    warnings = [
-        Finding(entry["code"], entry["severity"], entry["where"], entry["message"])
-        for entry in content["warnings"]
-        if entry["severity"] == "warning"
-    ]
-    causes = grouped(warnings, content["joints"])
-    causes = tuple(sorted(causes, key=lambda cause: not set(poor).intersection(cause.joints)))
-    steps += [Step(f"{_capital(c.messages[0])}.") for c in causes[: _MOST - 1]]
-    words = (
-        f"Do not use the result: the simulated position of {listed(poor, _NAMED)} is wrong. Find "
-        "out in the replay when, correct gains, limits, encoder zeros or the motion, and repeat "
-        "the identification."
-    )
-    return (*steps, Step(words, (*_loop_replay(content, origin).blocks, *again)))
-
-
-def _loop_replay(content: Mapping[str, Any], origin: Origin) -> Step:
-    """Return the step that plays a result of closed-loop identification."""
-    paths = {x["role"]: x["path"] for x in reversed(content["inputs"])}  # the first of each role
-    urdf = paths.get("urdf", "")
-    log = paths.get("validation", paths.get("identification", ""))
-    has_gains = content["simulation"]["controller"]["kind"] != "torque"
-    words = "Compare measured and predicted torque in the replay."
-    if has_gains:
-        words = "Compare the commanded, measured and simulated robot in the replay."
-    return Step(words, origin.using("replay", urdf, log, f"{origin.folder}/result.json"))
-
-
-def _exports(robot: str, origin: Origin, *, has_gains: bool = False) -> list[Step]:
-    """Return the exports of a result to the formats that can use it."""
-    steps = []
-    for name, form in FORMATS.items():
-        if words := form.use_of_gains if has_gains else form.use:
-            target = f"{robot or 'robot'}{form.suffix}"
-            stated = (f"{origin.folder}/result.json", "--format", name, "--out", target)
-            steps.append(Step(words, origin.using("export", *stated)))
-    return steps
+    return _once([*steps, *_uses(found, origin, steps)][:MOST])
 
 
 def _once(steps: Sequence[Step]) -> tuple[Step, ...]:
@@ -252,7 +99,7 @@ def _step_for(cause: Cause) -> int | None:
 
 def _named(causes: Sequence[Cause], wanted: Sequence[str] = ()) -> str:
     """Return the joints of causes, as part of a sentence."""
-    return listed(dict.fromkeys(j for cause in causes for j in cause.joints) or wanted, _NAMED)
+    return listed(dict.fromkeys(j for cause in causes for j in cause.joints) or wanted, NAMED)
 
 
 def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -314,7 +161,7 @@ def _payload_gains(found: Identification, payload: PayloadCheck | None = None) -
 def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     joints = list(dict.fromkeys(j for cause in causes for j in cause.joints))
     words = (
-        f"If the column is a current, state the gain of {listed(joints or ['the joints'], _NAMED)} "
+        f"If the column is a current, state the gain of {listed(joints or ['the joints'], NAMED)} "
         "in N m per A (N per A for a prismatic joint): the torque is consistent with the URDF only "
         "at another scale. A payload of known mass determines unknown gains: the last command."
     )
@@ -342,8 +189,8 @@ def _locks(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
         for finding in cause.findings
         if "median" in finding.evidence
     }
-    asked = places or dict.fromkeys(joints if len(joints) <= _NAMED else ["*"], "POSITION")
-    words = f"State the true positions of the locked joints {listed(places or joints, _NAMED)}."
+    asked = places or dict.fromkeys(joints if len(joints) <= NAMED else ["*"], "POSITION")
+    words = f"State the true positions of the locked joints {listed(places or joints, NAMED)}."
     flags = [x for joint, place in asked.items() for x in ("--lock", f"{joint}={place}")]
     line = "\n".join(f"{toml_key(joint)} = {place}" for joint, place in asked.items())
     return Step(words, origin.stating("[locked]", line, *flags))
@@ -445,13 +292,7 @@ def _zeros(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
 
 def _as_found(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     """Return the messages of the findings, which name a cause and its remedy."""
-    return Step(" ".join(f"{_capital(m)}." for cause in causes for m in cause.messages[:1]))
-
-
-def _capital(message: str) -> str:
-    """Return a message as a sentence; the name of a file at its start stays as it is."""
-    first = message.partition(" ")[0].rstrip(":,")
-    return message if "." in first else f"{message[0].upper()}{message[1:]}"
+    return Step(" ".join(f"{sentence_of(m)}." for cause in causes for m in cause.messages[:1]))
 
 
 def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -503,7 +344,7 @@ def _inspect(found: Identification, origin: Origin, causes: Sequence[Cause]) -> 
 
 
 def _doctor(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    words = f"{_capital(causes[0].messages[0])}."
+    words = f"{sentence_of(causes[0].messages[0])}."
     return Step(
         words, (shlex.join(["robotid", "doctor", *origin.source]),) if origin.source else ()
     )
@@ -526,7 +367,7 @@ def _uses(found: Identification, origin: Origin, asked: Sequence[Step]) -> list[
         )
         steps.append(validated)
     if found.has_urdf and not is_poor:
-        steps = [*_exports(found.model.name, origin), *steps]
+        steps = [*exports_of(found.model.name, origin), *steps]
     typed = {block for step in asked for block in step.blocks}
     if not found.scale_check.agrees:
         check = _scale(found, origin, ())

@@ -8,6 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from robotid.advice.loop_steps import loop_steps
+from robotid.advice.next_steps import next_steps
+from robotid.advice.steps import Origin
 from robotid.cli import _parser
 from robotid.commands.job import job_from_settings
 from robotid.diagnosis.candidates import CANDIDATES, couplings, ripples
@@ -17,7 +20,6 @@ from robotid.findings import Finding
 from robotid.fitting.joint_motion import JointMotion
 from robotid.fitting.settings import ConsistentSettings
 from robotid.judgement.verdict import WARNING_CODES
-from robotid.report.advice import Origin, loop_steps, next_steps
 from robotid.robot.examples import example_urdf
 
 JOB = Origin(("my job.toml",), "out")
