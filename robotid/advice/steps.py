@@ -100,7 +100,13 @@ def _key(flag: str, value: str) -> tuple[str, str]:
 
 
 def exports_of(robot: str, origin: Origin, *, has_gains: bool = False) -> list[Step]:
-    """Return the exports of a result to the formats that can use it."""
+    """Return the exports of a result to the formats that can use it.
+
+    Args:
+        robot: Name of the robot.
+        origin: The source of the result, and its folder.
+        has_gains: Whether the result has gains of controllers.
+    """
     steps = []
     for name, form in FORMATS.items():
         if words := form.use_of_gains if has_gains else form.use:
@@ -111,6 +117,10 @@ def exports_of(robot: str, origin: Origin, *, has_gains: bool = False) -> list[S
 
 
 def sentence_of(message: str) -> str:
-    """Return a message as a sentence; the name of a file at its start stays as it is."""
+    """Return a message as a sentence; the name of a file at its start stays as it is.
+
+    Args:
+        message: The message of a finding.
+    """
     first = message.partition(" ")[0].rstrip(":,")
     return message if "." in first else f"{message[0].upper()}{message[1:]}"

@@ -8,7 +8,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.closed_loop.drive_torques import drive_torques
-from robotid.estimators.output_error import Residual
+from robotid.estimators.simulator import Residual
 from robotid.exceptions import NotConvergedError
 from robotid.logs.data import Trajectory
 from robotid.regressor.memory import remember

@@ -9,7 +9,7 @@ fast effects such as a delay.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import scipy.linalg
@@ -17,10 +17,11 @@ import scipy.linalg
 from robotid._typing import Array, ProgressCallback, ignore_progress
 from robotid.estimators.estimator import Estimate, Estimator
 from robotid.estimators.segments import FEWEST_SEGMENTS, at_least, sandwich, scatter
+from robotid.estimators.simulator import Residual, Simulator
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, triangle_of
 
-__all__ = ["OutputError", "Residual", "Simulator", "is_at_bound", "linearised", "segment_scores"]
+__all__ = ["OutputError", "is_at_bound", "linearised", "segment_scores"]
 
 _CAUTIOUS = 1e-3  # damping of a step: parameters that are not identifiable do not move
 _NEARLY_FREE = 1e-6  # damping of the last step, near the minimum
@@ -37,71 +38,6 @@ _NO_TRACE = 1e-3  # effect of an initial state in noise levels below which it is
 #: which an encoder stays at one step while a joint reverses.
 _SEGMENTS = 48
 _LOST = 1e-6  # relative reduction of the prior variance below which a parameter is undetermined
-
-
-@dataclass(frozen=True, eq=False)
-class Residual:
-    """Measured minus simulated output over one window, for joints that are simulated together.
-
-    Attributes:
-        e: Residual, shape (N, k) [rad or m].
-        slopes: Derivatives of the simulated output by the parameters, shape (N, k, c'); None if
-            not requested.
-        joints: Indices of the joints, shape (k,).
-        columns: Indices of the parameters, shape (c',).
-        by_start: Derivatives by the initial state of the window's simulation, shape (N, k, s); None
-            or s = 0 if it is known, or if they are not requested.
-    """
-
-    e: Array
-    slopes: Array | None
-    joints: Array
-    columns: Array
-    by_start: Array | None = None
-
-
-class Simulator(Protocol):
-    """Interface of a simulator and its parameters.
-
-    Attributes:
-        names: Names of the c parameters.
-        prior: Prior values, shape (c,).
-        prior_std: Prior standard deviations, shape (c,); infinite without prior knowledge.
-        bounds: Lower and upper bounds, shape (2, c); infinite without a bound.
-    """
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-    @property
-    def prior(self) -> Array: ...
-    @property
-    def prior_std(self) -> Array: ...
-    @property
-    def bounds(self) -> Array: ...
-
-    def residuals(
-        self, theta: Array, *, with_slopes: bool, with_starts: bool = False
-    ) -> Sequence[Residual]:
-        """Return measured minus simulated outputs, window by window.
-
-        Args:
-            theta: Parameters, shape (c,).
-            with_slopes: Whether derivatives by the parameters are computed.
-            with_starts: Whether derivatives by the initial states of windows are computed.
-
-        Raises:
-            NotConvergedError: If the simulation with these parameters fails.
-        """
-
-    def rows(self, theta: Array) -> tuple[Array, Array]:
-        """Return additional linearised residuals of unit weight, as those of torques.
-
-        Args:
-            theta: Parameters, shape (c,).
-
-        Returns:
-            A, shape (m, c), and b, shape (m,): the residuals of theta + x are b - A x.
-        """
 
 
 @dataclass(frozen=True, eq=False)

@@ -490,7 +490,6 @@ TERMS: dict[str, DriveTerm] = {
 #: Names of the terms that are identified by default.
 DRIVE_TERMS = tuple(TERMS)
 
-
 #: The terms with shape parameters, and those that a single joint may have, by class.
 TERM_CLASSES: dict[str, type[DriveTerm]] = {
     kind.__name__: kind
@@ -499,7 +498,6 @@ TERM_CLASSES: dict[str, type[DriveTerm]] = {
         PositionCoulomb, Presliding, LuGre, Spring, Hat, Counterbalance, Lag,
     )
 }  # fmt: skip
-
 
 #: Family of a counterbalance that opposes gravity.
 COUNTERBALANCE = "harmonics1"
@@ -513,9 +511,8 @@ _TABLE = 8  # entries of a tabulated spring
 def _curve(data_range: DataRange) -> tuple[DriveTerm, ...]:
     """Return the ramps of a monotone curve over the data's speeds, narrower at low speed."""
     knots = data_range["v"][1] * np.linspace(0.0, 1.0, _KNOTS + 1) ** 2
-    return tuple(
-        Ramp(number=k, low=a, high=b) for k, (a, b) in enumerate(pairwise(knots.tolist()), start=1)
-    )
+    pairs = enumerate(pairwise(knots.tolist()), start=1)
+    return tuple(Ramp(number=k, low=a, high=b) for k, (a, b) in pairs)
 
 
 def _table(data_range: DataRange) -> tuple[DriveTerm, ...]:
@@ -538,11 +535,6 @@ def _harmonics(highest: int) -> Callable[[DataRange], tuple[DriveTerm, ...]]:
         )
 
     return make
-
-
-def _once_a_turn() -> tuple[DriveTerm, ...]:
-    """Return cosine and sine of the position, unguarded, since gravity contains them too."""
-    return (Harmonic(), Harmonic(is_sine=True))
 
 
 def _by_position(data_range: DataRange) -> tuple[DriveTerm, ...]:
@@ -573,7 +565,8 @@ FAMILIES: dict[str, Family] = {
         Family("lag", "a delayed torque (a delay, an elastic gear)",
                lambda data_range: (Lag(),), is_automatic=True),
         Family(COUNTERBALANCE, "a torque with one period per revolution, as of a counterbalance",
-               lambda data_range: _once_a_turn(), needs=0.1),
+               # unguarded, since gravity contains them too
+               lambda data_range: (Harmonic(), Harmonic(is_sine=True)), needs=0.1),
         Family("harmonics2", "a spring or counterbalance torque that depends on the position",
                _harmonics(2), needs=0.5, is_automatic=True, code="spring",
                instead=(COUNTERBALANCE, "spring")),

@@ -6,7 +6,8 @@ import pytest
 from scipy.signal import lfilter
 
 from robotid.estimators import Estimator, output_error
-from robotid.estimators.output_error import OutputError, Residual, _freed, linearised
+from robotid.estimators.output_error import OutputError, _freed, linearised
+from robotid.estimators.simulator import Residual
 from robotid.exceptions import DataError, NotConvergedError
 
 DT, RHO, SIGMA = 0.02, 0.9, 0.02
