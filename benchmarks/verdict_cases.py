@@ -17,7 +17,7 @@ import pinocchio as pin
 import scipy.linalg
 import scipy.signal
 
-from robotid.robot.bodies import held_parameters
+from robotid.robot.bodies import held_parameters, least_density
 from robotid.robot.examples import example_urdf
 from robotid.robot.geometry import body_points
 from robotid.robot.model import GRAVITY, RobotModel
@@ -30,6 +30,7 @@ TONES = 8  # sinusoids of a motion
 LOWEST, HIGHEST = 0.05, 0.8  # [Hz]
 QUANTILE = {"turns": 1.5, "slides": 0.3}  # [rad or m] largest amplitude
 SPEED = {"turns": 1.5, "slides": 0.3}  # [rad/s or m/s] largest speed
+DENSEST = 12_000.0  # [kg/m^3] of a body of a true robot: lead has 11,340
 SIGN_SPEED = 1e-3  # [rad/s or m/s] over which Coulomb friction changes its sign
 #: Sensor noise: position [rad or m], velocity [same/s], torque, white and coloured, as a share of
 #: the joint's standard deviation.
@@ -193,15 +194,17 @@ def build(robot, key, *, is_far=False, turn=None, resize=False, folder=None):
 def deformed(model, inertial, rng, share):
     """Return bodies whose points were moved by an affine map, with another density.
 
-    They can exist: the centre of mass of each body lies inside the box around its geometry, and its
-    mass no farther from it than the box reaches. A body of the URDF that cannot moves a little.
+    They can exist: the centre of mass of each body lies inside the box around its geometry, its
+    mass no farther from it than the box reaches, and no body is denser than any material. A body of
+    the URDF that cannot moves a little.
     """
     bodies, points = [], body_points(model)
     for name, J in zip(model.layout.bodies, pseudo_inertia(inertial), strict=True):
         is_bound = name in points and fits(J, points[name])
+        is_solid = is_material(J)
         own = share if is_bound or name not in points else min(share, 0.1)
         moved = deform(J, rng, own)
-        while is_bound and not fits(moved, points[name]):
+        while (is_bound and not fits(moved, points[name])) or (is_solid and not is_material(moved)):
             moved = deform(J, rng, own)
         bodies.append(inertial_from_pseudo_inertia(moved))
     return np.concatenate(bodies)
@@ -222,6 +225,11 @@ def fits(J, points):
     spread = np.sqrt(np.diag(J)[:3] / J[3, 3] - centre**2)  # root mean square about the centre
     inside = (low <= centre) & (centre <= high)
     return bool((inside & (spread < np.maximum(high - centre, centre - low))).all())
+
+
+def is_material(J):
+    """Return whether a material has the density that a body of that pseudo-inertia needs."""
+    return least_density(inertial_from_pseudo_inertia(J)) <= DENSEST
 
 
 def move(model, rng, rate, duration, is_kept=False):
