@@ -140,9 +140,9 @@ class _Misfit:
         best = float(_GRID[np.argmin(squares.sum(axis=0))])
         error = float(np.hypot(_GRID[1] - _GRID[0], np.sqrt((len(delays) - 1) * np.var(delays))))
         explained = 1.0 - float((then.sum() + _EXACT) / (now.sum() + _EXACT))
-        is_better = np.count_nonzero(then < now) >= len(now) - 1
+        is_better = bool(np.count_nonzero(then < now) >= len(now) - 1)
         is_better = is_better and explained > float(self.by_load(common)[k])
-        is_distinct = abs(best - common) > _SIGNIFICANT * error and is_better
+        is_distinct = bool(abs(best - common) > _SIGNIFICANT * error) and is_better
         is_inside = abs(best) <= 0.5 * _LONGEST and abs(best - common) > max(
             _OWN, _ROWS_APART * step
         )
