@@ -285,7 +285,11 @@ def _common(misfit: _Misfit, step: float, signals: SignalSettings, name: str) ->
     )
     is_significant = is_significant and not misfit.is_of_load
     total = delay + signals.torque_delay
-    if not is_significant:
+    if misfit.is_of_load:
+        todo = (
+            ", but friction that grows with the load explains the torques better; no action needed"
+        )
+    elif not is_significant:
         todo = ", which is not significant; no action needed"
     elif gain > _HELPS:
         todo = (

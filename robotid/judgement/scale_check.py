@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 from robotid._typing import Array
 from robotid.findings import listed
@@ -358,7 +358,7 @@ def common_factor(ratios: Array, sensitivity: Array, inertial: Array) -> tuple[f
     factor = float(one @ r / (one @ one))
     free = len(ratios) - 1
     spread = np.linalg.norm(r - factor * one) / np.sqrt(free)
-    return factor, float(scipy.stats.t.ppf(0.975, free) * spread / np.linalg.norm(one))
+    return factor, float(scipy.special.stdtrit(free, 0.975) * spread / np.linalg.norm(one))
 
 
 def friction_shares(found: Fit) -> dict[str, float]:

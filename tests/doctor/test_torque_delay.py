@@ -360,3 +360,16 @@ def test_the_delay_of_a_joint_is_compared_with_none_if_the_others_have_friction_
     others = _Misfit(squares, np.ones(3), ("a", "b", "c"))
     assert others.own_delay(0, 0.01).common == pytest.approx(0.03, abs=1e-6)
     assert replace(others, loaded=0.3 * squares).own_delay(0, 0.01).common == 0.0
+
+
+@pytest.mark.parametrize(("share", "is_late"), [(0.05, False), (0.2, True)])
+def test_the_delay_of_one_joint_that_friction_by_load_explains_better_is_none(share, is_late):
+    """The delay of 30 ms leaves a tenth of its torque, friction by load a share of it."""
+    late = 1 - 0.9 * (1 - (_GRID / 0.03 - 1) ** 2)
+    squares = np.tile(1 + 100 * _GRID**2, (3, 8, 1))
+    squares[1] = late
+    loaded = squares.copy()
+    loaded[1] *= share
+    own = _Misfit(squares, np.ones(3), ("a", "b", "c"), loaded).own_delay(1, 0.01)
+    assert own.explained == pytest.approx(0.9, abs=1e-4)
+    assert own.is_significant is is_late
