@@ -8,10 +8,12 @@ import pytest
 from helpers.paths import ROOT
 
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.bodies import least_density
+from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
 sys.path.append(str(ROOT / "benchmarks"))
-from verdict_cases import CASES, ROBOTS, build, make, move
+from verdict_cases import CASES, ROBOTS, build, coupling, make, move, periodic, stribeck
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +36,10 @@ def test_true_robots_are_possible_and_move_within_their_limits(name):
     arm = build(ROBOTS[name], (0, 4), is_far=True)
     J = pseudo_inertia(arm.pi[: arm.model.layout.n_inertial])
     assert (np.linalg.eigvalsh(J) > 0).all()
+    urdf = RobotModel.from_urdf(ROBOTS[name].path, joints=ROBOTS[name].joints).standard_parameters()
+    for b in range(len(J)):
+        before, now = (least_density(pi[10 * b : 10 * b + 10]) for pi in (urdf, arm.pi))
+        assert now <= 12_000 or before > 12_000  # no material is as dense
     run = move(arm.model, np.random.default_rng(5), 100.0, 30.0)
     for j, joint in enumerate(arm.model.limits):
         if joint.has_limits:
@@ -51,6 +57,17 @@ def test_a_fault_changes_what_is_recorded(name, clean, tmp_path):
         for kind, right in ((found.fitted, clean.fitted), (found.kept, clean.kept))
     ]
     assert not all(same) or found.urdf != clean.urdf
+
+
+@pytest.mark.parametrize("fault", [stribeck, periodic, coupling])
+def test_a_fault_of_the_plant_is_the_same_in_every_recording(fault):
+    """Where two recordings pass the same state, the fault adds the same torque."""
+    arm = build(ROBOTS["planar 2R"], (0, 2))
+    run = move(arm.model, np.random.default_rng(3), 100.0, 8.0)
+    part = replace(run, **{x: getattr(run, x)[300:500] for x in ("t", "q", "v", "a", "tau")})
+    whole, piece = (fault(one, arm).tau - one.tau for one in (run, part))
+    assert np.abs(whole).max() > 0
+    np.testing.assert_allclose(piece, whole[300:500], rtol=1e-12, atol=1e-12)
 
 
 def test_the_same_seed_gives_the_same_recording(tmp_path):

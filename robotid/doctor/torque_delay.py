@@ -66,11 +66,14 @@ class _Misfit:
             (n, blocks, delays).
         rows: Number of instants of each joint, shape (n,).
         joints: Names of these joints.
+        loaded: The same sums if friction also grows with the load, shape (n, blocks, delays); None:
+            not compared.
     """
 
     squares: Array
     rows: Array
     joints: tuple[str, ...]
+    loaded: Array | None = None
 
     def delays_without(self, axis: int) -> list[float]:
         """Return the delays of the jackknife over joints (axis 0) or blocks of the log (1)."""
@@ -79,11 +82,32 @@ class _Misfit:
             return [self.without({k}).delay() for k in parts]
         return [replace(self, squares=np.delete(self.squares, k, axis=1)).delay() for k in parts]
 
+    @property
+    def is_of_load(self) -> bool:
+        """Whether friction by load, which looks like a delay, explains more than the delay."""
+        return self.loaded is not None and self.gain() < float(self.by_load(0.0).mean())
+
+    def by_load(self, delay: float) -> Array:
+        """Return the share of the unexplained torque that friction by load explains, shape (n,).
+
+        Args:
+            delay: The delay of the torque [s].
+        """
+        if self.loaded is None:
+            return np.zeros(len(self.squares))
+        now, then = (
+            np.array([[np.interp(delay, _GRID, block) for block in joint] for joint in squares])
+            for squares in (self.squares, self.loaded)
+        )
+        share: Array = 1.0 - (then.sum(axis=1) + _EXACT) / (now.sum(axis=1) + _EXACT)
+        return share
+
     def without(self, left_out: Collection[int]) -> "_Misfit":
         """Return the misfit of the joints that are not left out."""
         used = [k for k in range(len(self.rows)) if k not in left_out]
         names = tuple(self.joints[k] for k in used)
-        return _Misfit(self.squares[used], self.rows[used], names)
+        loaded = None if self.loaded is None else self.loaded[used]
+        return _Misfit(self.squares[used], self.rows[used], names, loaded)
 
     def exceptions(self, step: float) -> dict[int, "_OwnDelay"]:
         """Return the joints with a delay of their own, the clearest first.
@@ -104,11 +128,12 @@ class _Misfit:
 
     def own_delay(self, k: int, step: float) -> "_OwnDelay":
         """Return the delay that explains the torque of one joint best."""
-        common = self.without({k}).delay()
+        others = self.without({k})
+        common = 0.0 if others.is_of_load else others.delay()
         common = common if np.isfinite(common) else 0.0
         squares = self.squares[k]
-        others = [np.delete(squares, b, axis=0).sum(axis=0) for b in range(len(squares))]
-        delays = [float(_GRID[np.argmin(other)]) for other in others]
+        rests = [np.delete(squares, b, axis=0).sum(axis=0) for b in range(len(squares))]
+        delays = [float(_GRID[np.argmin(rest)]) for rest in rests]
         pairs = list(zip(delays, squares, strict=True))
         now = np.array([np.interp(common, _GRID, block) for block in squares])
         then = np.array([np.interp(delay, _GRID, block) for delay, block in pairs])
@@ -116,7 +141,8 @@ class _Misfit:
         error = float(np.hypot(_GRID[1] - _GRID[0], np.sqrt((len(delays) - 1) * np.var(delays))))
         explained = 1.0 - float((then.sum() + _EXACT) / (now.sum() + _EXACT))
         is_better = bool(np.count_nonzero(then < now) >= len(now) - 1)
-        is_distinct = abs(best - common) > _SIGNIFICANT * error and is_better
+        is_better = is_better and explained > float(self.by_load(common)[k])
+        is_distinct = bool(abs(best - common) > _SIGNIFICANT * error) and is_better
         is_inside = abs(best) <= 0.5 * _LONGEST and abs(best - common) > max(
             _OWN, _ROWS_APART * step
         )
@@ -194,12 +220,14 @@ class _Window:
         drive: Of each joint's inertia, frictions and position, and of coupled drives, (N, n, k).
         steady: Whether the drive is far from stiction, shape (N, n), bool.
         delayed: Torques at each delay of the grid after the instants, shape (n, delays, N).
+        load: Friction that grows with the URDF's torque, per unit of its coefficient, (N, n).
     """
 
     inertial: Array
     drive: Array
     steady: Array
     delayed: Array
+    load: Array | None = None
 
 
 def check_torque_delay(
@@ -255,8 +283,13 @@ def _common(misfit: _Misfit, step: float, signals: SignalSettings, name: str) ->
     is_significant = abs(delay) > _SIGNIFICANT * error and gain > (
         _HELPS if abs(delay) > _DELAYED else 0.0
     )
+    is_significant = is_significant and not misfit.is_of_load
     total = delay + signals.torque_delay
-    if not is_significant:
+    if misfit.is_of_load:
+        todo = (
+            ", but friction that grows with the load explains the torques better; no action needed"
+        )
+    elif not is_significant:
         todo = ", which is not significant; no action needed"
     elif gain > _HELPS:
         todo = (
@@ -292,11 +325,14 @@ def _misfit(
     ends = np.cumsum(model.support()[:, : model.layout.n_inertial].sum(axis=1)).tolist()
     own = [slice(*pair) for pair in pairwise([0, *ends])]
     found = [_squares(windows, j, part) for j, part in enumerate(own)] if windows else []
-    used = {model.joints[j]: one for j, one in enumerate(found) if one is not None}
+    used = {j: one for j, one in enumerate(found) if one is not None}
     if len(used) < max(2.0, len(own) / 2):
         return None
     squares, rows = zip(*used.values(), strict=True)
-    return _Misfit(np.array(squares), np.array(rows, dtype=float), tuple(used))
+    of_load = [_squares(windows, j, own[j], has_load=True) for j in used]
+    loaded = np.array([one[0] for one in of_load if one is not None])
+    names = tuple(model.joints[j] for j in used)
+    return _Misfit(np.array(squares), np.array(rows, dtype=float), names, loaded)
 
 
 def _segments(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
@@ -337,9 +373,11 @@ def _window(
     own = np.stack([motion.a[rows], v, *signs, v * np.abs(v), *waves], axis=2)
     own = low_pass(own, 1 / step, signals)[::every][inner]
     state = motion.q[coarse], motion.v[coarse], motion.a[coarse]
+    inertial, coupled = (columns(model, *state) for columns in (carried_columns, coupled_columns))
+    load = _interpolated(motion.t[coarse], np.abs(_of_urdf(model, inertial)), t) * signs[0]
+    load = low_pass(load, 1 / step, signals)[::every][inner]
     inertial, coupled = (
-        low_pass(columns(model, *state), 1 / (step * every), signals)[inner]
-        for columns in (carried_columns, coupled_columns)
+        low_pass(columns, 1 / (step * every), signals)[inner] for columns in (inertial, coupled)
     )
     at = motion.t[coarse[inner]]
     is_reversal = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
@@ -348,7 +386,17 @@ def _window(
     tau = low_pass(motion.tau[rows], 1 / step, signals)
     delayed = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 2, 0).copy()
     drive = np.concatenate([own, coupled], axis=2)
-    return _Window(inertial, drive, np.column_stack(steady), delayed)
+    return _Window(inertial, drive, np.column_stack(steady), delayed, load)
+
+
+def _of_urdf(model: RobotModel, carried: Array) -> Array:
+    """Return the torque of the URDF's bodies from ``carried_columns``, shape (N, n)."""
+    size = model.layout.n_inertial
+    support, pi = model.support()[:, :size], model.standard_parameters()[:size]
+    ends = np.cumsum(support.sum(axis=1))
+    weighted = np.cumsum(carried * np.concatenate([pi[row] for row in support]), axis=1)
+    torque: Array = np.diff(weighted[:, ends - 1], axis=1, prepend=0.0)
+    return torque
 
 
 def _interpolated(t: Array, values: Array, times: Array) -> Array:
@@ -366,10 +414,13 @@ def _distance(at: Array, slow: Array) -> Array:
     return distance
 
 
-def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, int] | None:
+def _squares(
+    windows: Sequence[_Window], j: int, own: slice, *, has_load: bool = False
+) -> tuple[Array, int] | None:
     """Return the unexplained part of joint j's torque, shape (blocks, delays), and its instants.
 
-    Its inertial columns are ``own``. None for a joint that moves in too few instants.
+    Its inertial columns are ``own``; its friction grows with the load, too, if asked. None for a
+    joint that moves in too few instants.
     """
     steady = [window.steady[:, j] for window in windows]
     used = sum(map(np.count_nonzero, steady))
@@ -379,6 +430,9 @@ def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, int
     inertial = np.concatenate([window.inertial[at, own] for window, at in pairs])
     drive = np.concatenate([window.drive[at, j] for window, at in pairs])
     X = np.hstack([inertial, drive, np.ones((used, 1))])
+    if has_load:
+        load = [window.load[at, j] for window, at in pairs if window.load is not None]
+        X = np.column_stack([X, np.concatenate(load)])
     tau = np.concatenate([window.delayed[j][:, at] for window, at in pairs], axis=1)
     tau -= tau.mean(axis=1, keepdims=True)  # (delays, N)
     size = np.einsum("dk,dk->d", tau, tau)

@@ -77,6 +77,8 @@ _SHAPE = {
         **{key: [NUMBER] for key in ("unexplained", "masses")},
         "scale": MAYBE,
         "factor": NUMBER,
+        "common?": [NUMBER],
+        "mass_error?": NUMBER,
         "stated?": {
             "names": [TEXT],
             "ratio": MAYBE,
@@ -362,6 +364,7 @@ def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:
     if stated is None:
         return None
     lists = {"unexplained": (stated["unexplained"], 2), "masses": (stated["masses"], 3)}
+    lists |= {"common": (stated["common"], 2)} if "common" in stated else {}
     payloads = stated.get("payloads", [])
     for k, check in enumerate(payloads):
         lists[f"payloads[{k}].interval"] = check["interval"], 2
@@ -369,6 +372,7 @@ def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:
         if len(numbers) != size:
             raise DataError(f"scale_check.{name} has {len(numbers)} numbers, wanted {size}")
     own = {x.name: stated[x.name] for x in dataclasses.fields(ScaleCheck) if x.name in stated}
+    own |= {"common": tuple(stated["common"])} if "common" in stated else {}
     own["payloads"] = tuple(map(PayloadCheck.from_dict, payloads))
     if stated["is_stated"]:  # an earlier version did not test whether torque determines it
         mass = stated.get("stated")

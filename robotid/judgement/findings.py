@@ -20,7 +20,12 @@ from robotid.fitting.settings import BoundedSettings, ConsistentSettings
 from robotid.judgement.correlation import correlated_parameters
 from robotid.judgement.evidence import is_harmless_cost
 from robotid.logs.data import Log
-from robotid.robot.bodies import held_parameters, least_density, negligible_bodies
+from robotid.robot.bodies import (
+    density_share,
+    held_parameters,
+    least_density,
+    negligible_bodies,
+)
 from robotid.robot.geometry import body_boxes, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -48,6 +53,7 @@ _MUCH = 0.2  # ... if links on locked joints have more than this share of its ma
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
 _BEYOND = 0.02  # share of samples outside the fitted range of friction that is reported
 _DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
+_UNLIKELY = 0.05  # share of the bodies that the errors allow below which one is not possible
 _AT_BOUND = 1e-3  # relative difference of a mass from a stated bound that determines it
 _VANISHED = 0.05  # share of a link's URDF mass below which the link has practically vanished
 
@@ -431,14 +437,16 @@ def _impossible_shapes(fit: Fit) -> list[Finding]:
 def _dense_bodies(fit: Fit) -> list[Finding]:
     """Return the identified bodies whose inertia needs a density above that of any material.
 
-    Bodies that have this density in the URDF are left out, and all of a result that is not
-    physically consistent, which is a reason of its own.
+    As notes if the errors of mass and inertia allow a body of a material and no stated mass
+    determines it. Bodies that have this
+    density in the URDF are left out, and all of a result that is not physically consistent, which
+    is a reason of its own.
     """
     if not fit.is_consistent:
         return []
     findings, size = [], fit.model.layout.n_inertial
     before, after = (pi[:size].reshape(-1, 10) for pi in (fit.prior, fit.standard))
-    for body, was, now in zip(fit.model.layout.bodies, before, after, strict=True):
+    for k, (body, was, now) in enumerate(zip(fit.model.layout.bodies, before, after, strict=True)):
         density = least_density(now)
         if density <= max(_DENSEST, least_density(was)):
             continue
@@ -450,12 +458,23 @@ def _dense_bodies(fit: Fit) -> list[Finding]:
             if np.isfinite(density)
             else "is that of a body without volume"
         )
+        own = slice(10 * k, 10 * k + 10)
+        covariance = fit.standard_covariance[own, own]
+        share = density_share(now, covariance, _DENSEST, np.random.default_rng(0))
+        severity, error = "warning", ""
+        conclusion = "such a body is not possible"
+        if share > _UNLIKELY and not _stated_of(fit, body):
+            severity, error = "note", f" +- {1.96 * np.sqrt(covariance[0, 0]):.2g}"
+            conclusion = (
+                f"{100 * share:.0f} % of the bodies that these errors allow need less, so the data "
+                "do not determine this link"
+            )
         message = (
-            f"as identified, the mass of {body} is {now[0]:.3g} kg and its inertia {needs}: such a "
-            f"body is not possible. {_remedy(fit, body, excess)}"
+            f"as identified, the mass of {body} is {now[0]:.3g}{error} kg and its inertia {needs}: "
+            f"{conclusion}. {_remedy(fit, body, excess)}"
         )
         evidence = {"mass": float(now[0]), "density": density}
-        findings.append(Finding("dense_body", "warning", f"link {body}", message, evidence))
+        findings.append(Finding("dense_body", severity, f"link {body}", message, evidence))
     return findings
 
 
@@ -467,20 +486,26 @@ def _remedy(fit: Fit, body: str, excess: float = 0.0) -> str:
         body: The body.
         excess: Mass that it has beyond the largest possible one [kg]; 0 if that is unknown.
     """
-    bounds, layout = fit.estimator.bounds, fit.model.layout
-    masses = fit.standard[: layout.n_inertial : 10]
     cure = "Record motion about more axes, or pin it to the URDF"
-    stated, pair, mass = "total_mass", bounds.total, float(masses.sum())
-    if body in bounds.masses:
-        stated, pair = f"mass of {body}", bounds.masses[body]
-        mass = float(masses[layout.bodies.index(body)])
-    if pair is not None and np.isclose(mass, pair, rtol=_AT_BOUND).any():
+    for stated, mass in _stated_of(fit, body).items():
         limit = f" (possible: up to about {mass - excess:.3g} kg)" if excess > 0 else ""
         cure = f"Check the stated {stated} of {mass:.4g} kg{limit}: weigh it, or remove it"
     return (
         f"{cure}. The predicted torque may still be right; do not use mass, centre of mass and "
         "inertia of this link"
     )
+
+
+def _stated_of(fit: Fit, body: str) -> dict[str, float]:
+    """Return the mass that the user states and that determines a body's, by its name [kg]."""
+    bounds, layout = fit.estimator.bounds, fit.model.layout
+    masses = fit.standard[: layout.n_inertial : 10]
+    stated, pair, mass = "total_mass", bounds.total, float(masses.sum())
+    if body in bounds.masses:
+        stated, pair = f"mass of {body}", bounds.masses[body]
+        mass = float(masses[layout.bodies.index(body)])
+    is_at = pair is not None and np.isclose(mass, pair, rtol=_AT_BOUND).any()
+    return {stated: mass} if is_at else {}
 
 
 def _bound_findings(fit: Fit) -> list[Finding]:

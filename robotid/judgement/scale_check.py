@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import scipy.special
 
 from robotid._typing import Array
 from robotid.findings import listed
@@ -16,8 +17,9 @@ from robotid.judgement.stated_mass import AGREES, StatedMass, determines_total_m
 from robotid.regressor.constraints import loop_basis, without_forces
 from robotid.regressor.prediction import predict
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.parameters import pseudo_inertia
 
-__all__ = ["ScaleCheck", "check_scale", "friction_shares"]
+__all__ = ["ScaleCheck", "check_scale", "common_factor", "friction_shares"]
 
 _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
@@ -26,6 +28,9 @@ _HELD_BACK = 1.5  # residual over that of WLS beyond which the prior determines 
 _ANOTHER = 0.35  # difference of gravity and total mass from which on they contradict the scale
 _OFF = 0.1  # a common factor of all torques is reported if it is at least so far from 1,
 _CLEARLY = 4.0  # ... if that distance is so many times the unexplained share of gravity
+_LIKE = 1e-6  # variance of a ratio beside errors of links, for joints that the same links load
+_TOTAL = "total mass"
+_NORMAL = 1.96  # half width of a 95 % interval in standard errors
 _BETTER = 0.5  # ... and that share is less than this times the one with a payload
 
 
@@ -49,6 +54,9 @@ class ScaleCheck:
         friction: Share of viscous and Coulomb friction in each joint's torque [-].
         follows: Whether the result fits the data about as well as WLS. A result that its prior
             determines agrees with the URDF whatever the sensors measured.
+        common: Factor common to the ratios of the joints, and half the width of its 95 % interval
+            [-], as errors of the URDF spread the ratios; None with fewer than two.
+        mass_error: Standard error of the identified total mass [kg].
     """
 
     gravity: Mapping[str, float] = field(default_factory=dict)
@@ -62,6 +70,8 @@ class ScaleCheck:
     is_total_determined: bool = False
     friction: Mapping[str, float] = field(default_factory=dict)
     follows: bool = True
+    common: tuple[float, float] | None = None
+    mass_error: float = 0.0
 
     @property
     def agrees(self) -> bool:
@@ -72,10 +82,27 @@ class ScaleCheck:
 
     @property
     def contradicts(self) -> bool:
-        """Whether a known mass, or else gravity and total mass of the URDF, contradict it."""
+        """Whether a known mass, or else gravity and total mass of the URDF, contradict it.
+
+        A difference that errors of the URDF's links explain contradicts nothing, nor does a total
+        mass whose interval includes that of the URDF.
+        """
         if self._decisive:
             return any(check.contradicts for check in self._decisive)
-        return (bool(self._ratios_whole) and self._off > _ANOTHER) or self.has_one_factor
+        return self.has_one_factor or (self._is_far and not self._is_urdf)
+
+    @property
+    def _is_far(self) -> bool:
+        """Whether gravity, or a total mass that is determined so far, differs by more than 35 %."""
+        before, after, _ = self.masses
+        has_mass = abs(after - before) > _NORMAL * self.mass_error
+        is_any = self._ratios_whole if has_mass else self.scale is not None
+        return bool(is_any) and self._off_by(has_mass=has_mass) > _ANOTHER
+
+    @property
+    def _is_urdf(self) -> bool:
+        """Whether the spread of the joints' ratios explains a common factor other than 1."""
+        return self.common is not None and abs(self.common[0] - 1.0) <= self.common[1]
 
     @property
     def _decisive(self) -> dict[PayloadCheck | StatedMass, str]:
@@ -91,8 +118,10 @@ class ScaleCheck:
     def has_one_factor(self) -> bool:
         """Whether one common factor explains gravity: the scale is wrong, not single masses."""
         by_factor, by_payload = self.unexplained
-        return abs(self.factor - 1.0) > max(_OFF, _CLEARLY * by_factor) and (
-            by_factor < _BETTER * by_payload
+        return (
+            abs(self.factor - 1.0) > max(_OFF, _CLEARLY * by_factor)
+            and by_factor < _BETTER * by_payload
+            and not self._is_urdf
         )
 
     @property
@@ -159,6 +188,12 @@ class ScaleCheck:
         if beyond:
             verb = "differs" if len(beyond) == 1 else "differ"
             excess = f"; {' and '.join(beyond)} {verb} by more than {100 * limit:.0f} %{excess}"
+        if self.common is not None and limit > AGREES and self._is_urdf:
+            common, half = self.common
+            excess += (
+                f". The factor common to the joints is {common:.2f} +- {half:.2g} (95 %), as the "
+                "URDF's errors spread theirs: 1 is possible"
+            )
         by_factor, by_payload = self.unexplained
         single = [f"{j} {x:.2f}" for j, x in self.gravity.items() if abs(x - 1.0) > _ANOTHER]
         if self.has_one_factor:
@@ -188,24 +223,31 @@ class ScaleCheck:
     def _ratios_whole(self) -> dict[str, float]:
         """Identified over URDF's gravity torque and total mass, without a payload [-]."""
         before, after, _ = self.masses
-        mass = (
-            {} if self._is_total_open else {"total mass": after / before if before > 0 else np.inf}
-        )
+        mass = {} if self._is_total_open else {_TOTAL: after / before if before > 0 else np.inf}
         return ({} if self.scale is None else {"gravity torque": self.factor}) | mass
 
     @property
     def _off(self) -> float:
-        """Relative difference of gravity and total mass, less a payload if it explains them [-].
+        """Relative difference of gravity and total mass, less a payload if it explains them [-]."""
+        return self._off_by(has_mass=True)
+
+    def _off_by(self, *, has_mass: bool) -> float:
+        """Return the relative difference, less a payload if it explains it [-].
 
         A payload without mass is ignored: it does not determine the scale.
+
+        Args:
+            has_mass: Whether the total mass counts, not gravity alone.
         """
         before, after, payload = self.masses
+        ratios = {k: x for k, x in self._ratios_whole.items() if has_mass or k != _TOTAL}
+        whole = max((abs(ratio - 1.0) for ratio in ratios.values()), default=np.inf)
         if not (before > 0 and payload > 0):
-            return self._off_whole
+            return whole
         with_load = abs((self.scale or 1.0) - 1.0)
-        if not self._is_total_open:
+        if has_mass and not self._is_total_open:
             with_load = max(with_load, abs((after - payload) / before - 1.0))
-        return min(with_load, self._off_whole)
+        return min(with_load, whole)
 
     @property
     def _off_whole(self) -> float:
@@ -217,7 +259,8 @@ class ScaleCheck:
         figures = asdict(self) | {
             key: list(getattr(self, key)) for key in ("unexplained", "masses")
         }
-        del figures["stated"], figures["payloads"]
+        del figures["stated"], figures["payloads"], figures["common"]
+        figures |= {} if self.common is None else {"common": list(self.common)}
         stated = {} if self.stated is None else {"stated": self.stated.to_dict()}
         checks = {"payloads": [x.to_dict() for x in self.payloads]} if self.payloads else {}
         concluded = {"agrees": self.agrees, "message": self.message}
@@ -253,6 +296,7 @@ def check_scale(found: Fit) -> ScaleCheck:
     if model.loops:
         G = without_forces(loop_basis(model, q), G)
     last = G[:, :, size - 10 : size - 6]  # m, mcx, mcy, mcz of the last body
+    by_body = G[:, :, :size]
     G = G[:, :, found.mapping.independent]
     at_rest = np.arange(len(found.prior)) < size
     of_urdf, of_result = (
@@ -264,20 +308,57 @@ def check_scale(found: Fit) -> ScaleCheck:
         return plain
     K = found.mapping.K * at_rest
     covariance = K @ found.standard_covariance @ K.T
-    gravity, error = {}, {}
+    gravity, error, known = {}, {}, []
     for j in np.flatnonzero(load > _LOADED**2 * load.max()).tolist():
         w = of_urdf[:, j] @ G[:, j] / load[j]  # (b,), ratio = w beta
         spread = float(np.sqrt(max(w @ covariance @ w, 0.0)))
         if spread < _KNOWN:
             gravity[model.row_names[j]] = float(of_urdf[:, j] @ of_result[:, j] / load[j])
             error[model.row_names[j]] = spread
+            known.append(j)
+    common = None
+    if len(known) > 1:
+        A = np.einsum("nj,njk->jk", of_urdf[:, known], by_body[:, known]) / load[known, None]
+        common = common_factor(np.array([*gravity.values()]), A, found.prior[:size])
     factor = float(np.sum(of_urdf * of_result) / load.sum())
     scale, payload, left = _with_payload(of_urdf, of_result, last)
     rest = float(np.linalg.norm(of_result - factor * of_urdf) / np.linalg.norm(of_result))
     return replace(
         plain, gravity=gravity, gravity_error=error, scale=scale, factor=factor,
-        unexplained=(rest, left), masses=(before, after, payload),
+        unexplained=(rest, left), masses=(before, after, payload), common=common,
+        mass_error=float(np.sqrt(max(found.standard_covariance[:size:10, :size:10].sum(), 0.0))),
     )  # fmt: skip
+
+
+def common_factor(ratios: Array, sensitivity: Array, inertial: Array) -> tuple[float, float]:
+    """Return the factor common to the gravity torques of joints, and its 95 % half-width [-].
+
+    A scale s of all torques and relative errors of the URDF's links give ratios r = s (1 + E e):
+    e are errors of mass and of the centre of mass, over the link's radius of gyration; independent,
+    of one unknown standard deviation. Generalised least squares with the covariance E E^T gives s;
+    the residual gives the deviation, Student's t with one degree of freedom less than joints the
+    interval. Errors of the data spread the ratios, too, and are included so.
+
+    Args:
+        ratios: Identified over URDF's gravity torque of at least two joints, shape (k,).
+        sensitivity: Derivatives of the URDF's ratios by its parameters, shape (k, 10 b).
+        inertial: The URDF's inertial parameters, shape (10 b,).
+    """
+    A, pi = sensitivity.reshape(len(ratios), -1, 10), inertial.reshape(-1, 10)
+    J = pseudo_inertia(inertial)
+    # mass times radius of gyration
+    moment = np.sqrt(
+        np.maximum(
+            pi[:, 0] * np.trace(J[:, :3, :3], axis1=1, axis2=2) - np.sum(pi[:, 1:4] ** 2, 1), 0
+        )
+    )
+    E = np.column_stack([np.einsum("kbp,bp->kb", A, pi), *(A[:, :, i] * moment for i in (1, 2, 3))])
+    L = np.linalg.cholesky(E @ E.T + _LIKE * np.eye(len(ratios)))
+    one, r = np.linalg.solve(L, np.column_stack([np.ones(len(ratios)), ratios])).T
+    factor = float(one @ r / (one @ one))
+    free = len(ratios) - 1
+    spread = np.linalg.norm(r - factor * one) / np.sqrt(free)
+    return factor, float(scipy.special.stdtrit(free, 0.975) * spread / np.linalg.norm(one))
 
 
 def friction_shares(found: Fit) -> dict[str, float]:

@@ -21,6 +21,7 @@ from robotid.robot.tree import Inertial
 __all__ = [
     "LinkPlace",
     "central_inertial",
+    "density_share",
     "held_parameters",
     "inertial_parameters",
     "least_density",
@@ -32,6 +33,7 @@ __all__ = [
 ]
 
 _NEGLIGIBLE = 1e-5  # of the mass of the robot
+_DRAWS = 2000  # bodies that an estimate allows
 
 
 @dataclass(frozen=True)
@@ -212,6 +214,34 @@ def least_density(parameters: Array) -> float:
     axes = np.sqrt(5.0 * np.maximum(principal_moments(parameters)[0], 0.0) / mass)  # (3,) [m]
     volume = 4.0 / 3.0 * np.pi * float(np.prod(axes))
     return mass / volume if volume > 0 else float("inf")
+
+
+def density_share(
+    parameters: Array, covariance: Array, density: float, rng: np.random.Generator
+) -> float:
+    """Return the share of the bodies that the errors allow that need at most a density [-].
+
+    Bodies are drawn from the normal distribution of the estimate; draws that no mass distribution
+    has, with a pseudo-inertia that is not positive definite, are left out. With J the
+    pseudo-inertia, ``least_density`` is m^3 / (4/3 pi 5^1.5 sqrt(det J)).
+
+    Args:
+        parameters: Inertial parameters of the body, shape (10,).
+        covariance: Their covariance, shape (10, 10).
+        density: The density [kg/m^3].
+        rng: Source of the draws.
+
+    Returns:
+        The share; 0 if no draw is a body.
+    """
+    values, axes = np.linalg.eigh(covariance)
+    root = axes * np.sqrt(np.maximum(values, 0.0))
+    drawn = parameters + rng.standard_normal((_DRAWS, 10)) @ root.T
+    J = pseudo_inertia(drawn.ravel())
+    is_body = np.linalg.eigvalsh(J)[:, 0] > 0
+    needed = drawn[is_body, 0] ** 3 / np.sqrt(np.linalg.det(J[is_body]))
+    within = needed <= 4.0 / 3.0 * np.pi * 5.0**1.5 * density
+    return float(within.mean()) if is_body.any() else 0.0
 
 
 def usual_links(model: RobotModel) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.corruptions import clean_log, controlled_log, late, robot, table_of
 from helpers.driven import arm
@@ -296,6 +297,12 @@ def test_a_window_has_the_columns_and_delayed_torques_of_its_instants(rng):
     columns += [wave(k * q) for k in (1, 2, 3, 4) for wave in (np.cos, np.sin)]
     np.testing.assert_allclose(found.drive, np.stack(columns, axis=2)[at], atol=1e-12)
     np.testing.assert_allclose(found.inertial, carried_columns(model, q[at], v[at], a[at]))
+    # the URDF's torque by Pinocchio, away from the ends, where splines differ
+    data = model.pin_model.createData()
+    bodies = [pin.rnea(model.pin_model, data, q[k], v[k], a[k]) for k in at]
+    smooth = np.abs(t[at] - t[80]) < 0.4
+    wanted = np.abs(bodies) * np.tanh(v[at] / 0.02)
+    np.testing.assert_allclose(found.load[smooth], wanted[smooth], atol=1e-3 * np.abs(wanted).max())
     turns = np.vstack([np.diff(np.sign(v[11:151]), axis=0) != 0, np.zeros((1, 3), dtype=bool)])
     slow = turns | (np.abs(v[11:151]) < 0.05)
     for j in range(3):
@@ -306,3 +313,63 @@ def test_a_window_has_the_columns_and_delayed_torques_of_its_instants(rng):
         wanted = spline(t[at] + _GRID[:, None])
         inside = np.abs(t[at] - t[80]) < 0.4  # ends of splines differ
         np.testing.assert_allclose(found.delayed[j][:, inside], wanted[:, inside], atol=1e-4)
+
+
+def test_friction_by_load_explains_what_least_squares_with_its_column_leave_less(rng):
+    windows = []
+    for count in (90, 110):
+        inertial, drive = rng.standard_normal((count, 4)), rng.standard_normal((count, 2, 3))
+        load, steady = rng.standard_normal((count, 2)), rng.random((count, 2)) < 0.9
+        delayed = rng.standard_normal((2, 81, count))
+        delayed[1] += 2.0 * load[:, 1]
+        windows.append(torque_delay._Window(inertial, drive, steady, delayed, load))
+    plain, rows = torque_delay._squares(windows, 1, slice(1, 4))
+    loaded, _ = torque_delay._squares(windows, 1, slice(1, 4), has_load=True)
+    at = [w.steady[:, 1] for w in windows]
+    X = np.concatenate(
+        [np.column_stack([w.inertial[k, 1:4], w.drive[k, 1], np.ones(k.sum()), w.load[k, 1]])
+         for w, k in zip(windows, at, strict=True)]
+    )  # fmt: skip
+    tau = np.concatenate([w.delayed[1][:, k] for w, k in zip(windows, at, strict=True)], axis=1).T
+    size = np.sum((tau - tau.mean(axis=0)) ** 2, axis=0)
+    left, without = (
+        np.sum((tau - A @ np.linalg.lstsq(A, tau)[0]) ** 2, axis=0) / size for A in (X, X[:, :-1])
+    )
+    np.testing.assert_allclose(loaded.sum(axis=0), left, rtol=1e-8)
+    misfit = _Misfit(plain[None], np.array([rows]), ("a",), loaded[None])
+    k = 52  # of the grid
+    wanted = 1 - (left[k] + _EXACT) / (without[k] + _EXACT)
+    assert misfit.by_load(_GRID[k]) == pytest.approx([wanted], rel=1e-9)
+    assert 0.7 < wanted < 0.9
+
+
+@pytest.mark.parametrize(("share", "is_late"), [(0.3, False), (0.8, True)])
+def test_a_delay_that_friction_by_load_explains_better_is_none(ur5, monkeypatch, share, is_late):
+    """The delay of 30 ms leaves half of the torque without it, friction by load a share of it."""
+    squares = np.tile(1 - 0.5 * (1 - (_GRID / 0.03 - 1) ** 2), (6, 8, 1))
+    misfit = _Misfit(squares, np.ones(6), ur5.joints, share * squares)
+    assert misfit.by_load(0.0) == pytest.approx(np.full(6, 1 - share), abs=1e-4)
+    monkeypatch.setattr(torque_delay, "_misfit", lambda *_: misfit)
+    (finding,) = found(ur5, clean_log(ur5, 100, duration=2.0))
+    assert finding.evidence["delay"] == pytest.approx(0.03, abs=1e-6)
+    assert (finding.severity == "warning") is is_late
+
+
+def test_the_delay_of_a_joint_is_compared_with_none_if_the_others_have_friction_by_load():
+    squares = np.tile(1 - 0.5 * (1 - (_GRID / 0.03 - 1) ** 2), (3, 8, 1))
+    others = _Misfit(squares, np.ones(3), ("a", "b", "c"))
+    assert others.own_delay(0, 0.01).common == pytest.approx(0.03, abs=1e-6)
+    assert replace(others, loaded=0.3 * squares).own_delay(0, 0.01).common == 0.0
+
+
+@pytest.mark.parametrize(("share", "is_late"), [(0.05, False), (0.2, True)])
+def test_the_delay_of_one_joint_that_friction_by_load_explains_better_is_none(share, is_late):
+    """The delay of 30 ms leaves a tenth of its torque, friction by load a share of it."""
+    late = 1 - 0.9 * (1 - (_GRID / 0.03 - 1) ** 2)
+    squares = np.tile(1 + 100 * _GRID**2, (3, 8, 1))
+    squares[1] = late
+    loaded = squares.copy()
+    loaded[1] *= share
+    own = _Misfit(squares, np.ones(3), ("a", "b", "c"), loaded).own_delay(1, 0.01)
+    assert own.explained == pytest.approx(0.9, abs=1e-4)
+    assert own.is_significant is is_late

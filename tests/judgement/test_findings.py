@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from robotid.findings import Finding
 from robotid.fitting.robust import Outlier
@@ -22,6 +23,7 @@ from robotid.judgement.findings import (
     consistency_findings,
     locked_findings,
 )
+from robotid.robot.bodies import density_share
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia
@@ -444,6 +446,7 @@ def test_bodies_denser_than_any_material_and_than_the_urdf_are_named_with_their_
             model=SimpleNamespace(layout=layout),
             prior=before,
             standard=after,
+            standard_covariance=np.zeros((40, 40)),
             is_consistent=True,
             estimator=EstimatorSettings("consistent"),
         )
@@ -458,6 +461,49 @@ def test_bodies_denser_than_any_material_and_than_the_urdf_are_named_with_their_
     )
     assert found[1].evidence == {"mass": after[20], "density": np.inf}
     assert "kg and its inertia is that of a body without volume" in found[1].message
+
+
+@pytest.mark.parametrize(("of_mass", "severity"), [(0.02, "warning"), (0.35, "note")])
+def test_a_dense_body_is_possible_if_the_errors_of_its_mass_allow_less(of_mass, severity):
+    """At equal second moments the density is proportional to the mass to the power of 2.5."""
+    before, after = (ellipsoid(x, (0.03, 0.04, 0.05), (0, 0, 0)) for x in (2e3, 18e3))
+    mass = float(after[0])
+    # the second moments stay: only the entry of the mass varies
+    covariance = np.zeros((20, 20))
+    covariance[10, 10] = (of_mass * mass) ** 2
+    fit = SimpleNamespace(
+        model=SimpleNamespace(layout=SimpleNamespace(n_inertial=20, bodies=("a", "b"))),
+        prior=np.tile(before, 2), standard=np.concatenate([before, after]), is_consistent=True,
+        standard_covariance=covariance, estimator=EstimatorSettings("consistent"),
+    )  # fmt: skip
+    (finding,) = _dense_bodies(fit)
+    assert (finding.where, finding.severity) == ("link b", severity)
+    largest = (12e3 / 18e3) ** 0.4 * mass
+    below = scipy.stats.norm.cdf(largest, mass, of_mass * mass)
+    above = 1 - scipy.stats.norm.cdf(0, mass, of_mass * mass)  # of the draws that are bodies
+    share = (below - (1 - above)) / above
+    found = density_share(after, covariance[10:, 10:], 12e3, np.random.default_rng(1))
+    assert found == pytest.approx(share, abs=4 * np.sqrt(0.25 / 2000))
+    if severity == "note":
+        assert f"is {mass:.3g} +- {1.96 * of_mass * mass:.2g} kg" in finding.message
+        assert "so the data do not determine this link" in finding.message
+
+
+def test_errors_of_the_second_moments_allow_less_density_too():
+    """The volume grows with the square root of each second moment about the centre."""
+    body = ellipsoid(15e3, (0.03, 0.04, 0.05), (0, 0, 0))
+    alone = np.zeros((10, 10))
+    along = np.array([0, 0, 0, 0, 0.0, 0, 1, 0, 0, 1])  # mass apart along x
+    moment = float(body[0]) * 0.03**2 / 5
+    alone += np.outer(along, along) * (0.3 * moment) ** 2
+    needed = (15e3 / 12e3) ** 2 * moment  # for a volume larger by 15 to 12
+    below = scipy.stats.norm.cdf(0, moment, 0.3 * moment)
+    share = scipy.stats.norm.sf(needed, moment, 0.3 * moment) / (1 - below)
+    assert 0.02 < share < 0.2
+    found = density_share(body, alone, 12e3, np.random.default_rng(2))
+    assert found == pytest.approx(share, abs=4 * np.sqrt(share / 2000))
+    assert density_share(body, np.zeros((10, 10)), 12e3, np.random.default_rng(2)) == 0.0
+    assert density_share(body, np.zeros((10, 10)), 16e3, np.random.default_rng(2)) == 1.0
 
 
 class Parameters(str):

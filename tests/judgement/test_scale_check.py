@@ -12,8 +12,9 @@ from helpers.synthetic import exact_log, truth
 from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement import scale_check
 from robotid.judgement.findings import fit_findings
-from robotid.judgement.scale_check import ScaleCheck, check_scale
+from robotid.judgement.scale_check import ScaleCheck, check_scale, common_factor
 from robotid.logs.settings import SignalSettings
+from robotid.robot.parameters import inertial_from_pseudo_inertia
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0, velocity="measured")
 NOISE = 0.05 * np.array([4, 4, 2, 1, 1, 0.5])
@@ -148,7 +149,11 @@ def test_a_needle_denser_than_any_material_is_named_unless_the_urdf_has_it(ur5, 
     second = slice(10, 20)  # 7.6 kg about the URDF's frame, semi-axes of 6, 6 and 225 mm
     x, y, z = 7.6 * np.array([0.006, 0.006, 0.225]) ** 2 / 5.0
     needle[second] = [7.6, 0.0, 0.0, 0.0, y + z, 0.0, z + x, 0.0, 0.0, x + y]
-    (finding,) = dense(replace(found, standard=needle))
+    sure = replace(
+        found, standard=needle, standard_covariance=1e-6 * found.standard_covariance
+    )  # its errors allow no other body
+    (finding,) = dense(sure)
+    assert finding.severity == "warning"
     assert finding.where == f"link {ur5.layout.bodies[1]}"
     density = 7.6 / (4.0 / 3.0 * np.pi * 0.006 * 0.006 * 0.225)
     assert finding.evidence == {"mass": 7.6, "density": pytest.approx(density)}
@@ -169,8 +174,9 @@ def test_a_needle_denser_than_any_material_is_named_unless_the_urdf_has_it(ur5, 
         asked = EstimatorSettings(constraints=stated)
         (finding,) = dense(replace(found, standard=needle, estimator=asked))
         assert f"Check the stated {cure}: weigh it, or remove it. " in finding.message
+        assert finding.severity == "warning"  # whatever the errors allow
     wide = EstimatorSettings(constraints={"total_mass": [0.5 * total, 2.0 * total]})
-    (finding,) = dense(replace(found, standard=needle, estimator=wide))
+    (finding,) = dense(replace(sure, estimator=wide))
     assert "Record motion" in finding.message  # the range does not determine the mass
     assert dense(replace(found, standard=needle, prior=needle)) == []
     flat = found.standard.copy()
@@ -224,6 +230,11 @@ def test_its_figures_are_those_of_pinocchios_gravity_over_the_poses_of_all_logs(
     assert scale_check.gravity_error == {
         j: pytest.approx(e, rel=1e-4) for j, (_, e) in known.items()
     }
+    masses_of = found.standard_covariance[:size:10, :size:10]
+    assert scale_check.mass_error == pytest.approx(np.sqrt(masses_of.sum()), rel=1e-9)
+    few = [model.joints.index(j) for j in known]
+    common = common_factor(ratio[few], weights[few], found.prior[:size]) if len(few) > 1 else None
+    assert scale_check.common == (common and pytest.approx(common, rel=1e-4))
     P = columns(slice(size - 10, size - 6)).reshape(-1, 4)
     both = np.linalg.lstsq(np.column_stack([u.ravel(), P]), g.ravel())[0]
     assert scale_check.scale == pytest.approx(both[0], rel=1e-6)
@@ -240,6 +251,84 @@ def test_its_figures_are_those_of_pinocchios_gravity_over_the_poses_of_all_logs(
     torque = found.standard[k[0]] * v + found.standard[k[1]] * np.sign(v)
     share = np.linalg.norm(torque, axis=0) / np.linalg.norm(tau, axis=0)
     np.testing.assert_allclose(list(scale_check.friction.values()), share, rtol=1e-9)
+
+
+def bodies_of(rng, count):
+    """Return the parameters of random bodies, (count, 10), and their radii of gyration [m]."""
+    mass = rng.uniform(1.0, 4.0, count)
+    c, axes = rng.normal(0.0, 0.1, (count, 3)), rng.uniform(0.02, 0.1, (count, 3))
+    second = [m * (np.diag(a**2) + np.outer(x, x)) for m, a, x in zip(mass, axes, c, strict=True)]
+    J = np.zeros((count, 4, 4))
+    J[:, :3, :3], J[:, 3, 3] = second, mass
+    J[:, :3, 3] = J[:, 3, :3] = mass[:, None] * c
+    return inertial_from_pseudo_inertia(J), np.linalg.norm(axes, axis=1)
+
+
+def test_the_common_factor_has_the_interval_that_errors_of_the_urdfs_links_give():
+    """Of 3000 robots with random errors of mass and centre, 95 % of the intervals hold the scale.
+
+    Two links load three joints, as in an arm, and the gravity torque is not that of a rotation.
+    """
+    rng = np.random.default_rng(4)
+    pi, radius = bodies_of(rng, 4)
+    A = (
+        rng.normal(0.0, 1.0, (3, 4, 10))
+        * np.array([[1, 1, 1, 1], [0, 1, 1, 1], [0, 0, 1, 1]])[:, :, None]
+    )
+    A[:, :, 4:] = 0.0  # moments of inertia are no gravity
+    A /= np.einsum("kbp,bp->k", A, pi)[:, None, None]  # the URDF's own ratio is 1
+    A, inside = A.reshape(3, 40), []
+    factors = []
+    for _ in range(3000):
+        of_mass, of_centre = 0.05 * rng.standard_normal(4), 0.05 * rng.standard_normal((4, 3))
+        true = pi.copy()
+        true[:, :4] *= 1.0 + of_mass[:, None]
+        true[:, 1:4] += pi[:, :1] * radius[:, None] * of_centre
+        factor, half = common_factor(0.8 * A @ true.ravel(), A, pi.ravel())
+        factors.append(factor)
+        inside.append(abs(factor - 0.8) <= half)
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.012)  # 3 standard errors of the share
+    assert np.mean(factors) == pytest.approx(0.8, abs=5 * np.std(factors) / np.sqrt(3000))
+
+
+def test_a_common_factor_is_that_of_generalised_least_squares():
+    rng = np.random.default_rng(5)
+    pi, radius = bodies_of(rng, 3)
+    A, ratios = rng.standard_normal((4, 30)), np.array([1.4, 1.1, 1.7, 1.3])
+    columns = [A[:, 10 * b : 10 * b + 10] @ pi[b] for b in range(3)]
+    columns += [A[:, 10 * b + i] * pi[b, 0] * radius[b] for b in range(3) for i in (1, 2, 3)]
+    V = np.column_stack(columns) @ np.column_stack(columns).T
+    W = np.linalg.inv(V)
+    factor = W.sum(axis=0) @ ratios / W.sum()
+    variance = (ratios - factor) @ W @ (ratios - factor) / 3
+    half = 3.182446 * np.sqrt(variance / W.sum())  # Student's t of 3 degrees of freedom
+    assert common_factor(ratios, A, pi.ravel()) == pytest.approx((factor, half), rel=1e-4)
+
+
+@pytest.mark.parametrize(("common", "is_wrong"), [((1.4, 0.5), False), ((1.4, 0.3), True)])
+def test_a_factor_that_errors_of_the_urdf_explain_contradicts_nothing(common, is_wrong):
+    far = ScaleCheck(scale=1.5, factor=1.5, masses=(20.0, 30.0, 0.0), unexplained=(0.01, 0.5))
+    assert far.contradicts
+    assert far.has_one_factor
+    found = replace(far, common=common)
+    assert (found.contradicts, found.has_one_factor) == (is_wrong, is_wrong)
+    assert not found.agrees
+    said = "The factor common to the joints is 1.40 +- 0.5 (95 %), as the URDF's errors spread"
+    assert (said in found.message) is not is_wrong
+    assert ("The same factor 1.50 fits all joints" in found.message) is is_wrong
+    assert found.to_dict()["common"] == list(common)
+    assert "common" not in far.to_dict()
+
+
+@pytest.mark.parametrize(("error", "is_wrong"), [(6.0, False), (4.0, True)])
+def test_a_total_mass_that_torque_does_not_determine_contradicts_nothing(error, is_wrong):
+    found = ScaleCheck(scale=1.04, factor=1.04, masses=(20.0, 30.0, 0.0), unexplained=(0.2, 0.2))
+    assert replace(found, mass_error=error).contradicts is is_wrong
+    loaded = replace(found, mass_error=error, masses=(20.0, 30.0, 1.0))  # with a small payload
+    assert loaded.contradicts is is_wrong
+    gravity = replace(found, mass_error=error, factor=1.5, scale=1.5)
+    assert gravity.contradicts  # gravity is determined
+    assert replace(gravity, scale=None).contradicts is is_wrong
 
 
 @pytest.mark.parametrize(("masses", "ratio"), [([2.0, 3.0, 7.0], 1.2), ([0.0, 0.0, 0.0], 1.0)])
