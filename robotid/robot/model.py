@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from robotid._native_messages import caught_messages
 from robotid._settings import require_each, require_flag, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError, SettingsError
@@ -18,7 +19,6 @@ from robotid.findings import listed
 from robotid.robot.constraints import Constraint, Contact, Loop, check_constraints
 from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveMotion, DriveTerm
 from robotid.robot.joint_choice import choose_joints, mimic_followers
-from robotid.robot.native_messages import caught_messages
 from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
 from robotid.robot.tree import Joint, Tree, read_tree
 from robotid.robot.urdf_text import LARGEST
