@@ -283,9 +283,10 @@ def _common(misfit: _Misfit, step: float, signals: SignalSettings, name: str) ->
     is_significant = abs(delay) > _SIGNIFICANT * error and gain > (
         _HELPS if abs(delay) > _DELAYED else 0.0
     )
-    is_significant = is_significant and not misfit.is_of_load
+    is_of_load = is_significant and misfit.is_of_load
+    is_significant = is_significant and not is_of_load
     total = delay + signals.torque_delay
-    if misfit.is_of_load:
+    if is_of_load:
         todo = (
             ", but friction that grows with the load explains the torques better; no action needed"
         )

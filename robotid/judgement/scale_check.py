@@ -89,13 +89,16 @@ class ScaleCheck:
         """
         if self._decisive:
             return any(check.contradicts for check in self._decisive)
-        return self.has_one_factor or (self._is_far and not self._is_urdf)
+        return self.has_one_factor or self._is_far
 
     @property
     def _is_far(self) -> bool:
-        """Whether gravity, or a total mass that is determined so far, differs by more than 35 %."""
-        before, after, _ = self.masses
+        """Whether gravity or a determined total mass differs by more than errors of the URDF."""
+        before, after, payload = self.masses
         has_mass = abs(after - before) > _NORMAL * self.mass_error
+        if self._is_urdf:  # gravity is no evidence, a total mass that is determined is
+            least = min(abs(after - before), abs(after - payload - before))
+            return has_mass and not self._is_total_open and least > _ANOTHER * before
         is_any = self._ratios_whole if has_mass else self.scale is not None
         return bool(is_any) and self._off_by(has_mass=has_mass) > _ANOTHER
 

@@ -307,7 +307,7 @@ def test_a_common_factor_is_that_of_generalised_least_squares():
 
 @pytest.mark.parametrize(("common", "is_wrong"), [((1.4, 0.5), False), ((1.4, 0.3), True)])
 def test_a_factor_that_errors_of_the_urdf_explain_contradicts_nothing(common, is_wrong):
-    far = ScaleCheck(scale=1.5, factor=1.5, masses=(20.0, 30.0, 0.0), unexplained=(0.01, 0.5))
+    far = ScaleCheck(scale=1.5, factor=1.5, masses=(20.0, 24.0, 0.0), unexplained=(0.01, 0.5))
     assert far.contradicts
     assert far.has_one_factor
     found = replace(far, common=common)
@@ -318,6 +318,9 @@ def test_a_factor_that_errors_of_the_urdf_explain_contradicts_nothing(common, is
     assert ("The same factor 1.50 fits all joints" in found.message) is is_wrong
     assert found.to_dict()["common"] == list(common)
     assert "common" not in far.to_dict()
+    heavy = replace(found, masses=(20.0, 30.0, 1.0), mass_error=4.0)
+    assert heavy.contradicts  # the total mass is determined
+    assert replace(heavy, mass_error=6.0).contradicts is is_wrong
 
 
 @pytest.mark.parametrize(("error", "is_wrong"), [(6.0, False), (4.0, True)])
