@@ -43,6 +43,7 @@ from robotid.robot.prior import prior_spread
 __all__ = ["with_repeated_errors"]
 
 _FIRST, _MOST = 3e-3, 0.02  # [m] initial value of s, and its bound
+_WIDER = 1e3  # factor of the prior standard deviations: wrong masses of a URDF are no offsets
 _STEPS, _SETTLED = 100, 1e-3  # steps of the maximisation, relative change of s at its end
 
 
@@ -107,6 +108,9 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
 def estimated_uncertainty(R: Array, L: Array, mean: Array, share: float, rows: int) -> float:
     """Return the standard deviation s of offsets with the largest evidence [m].
 
+    The evidence is that of a much wider prior: with the stated one, parameters outside it would be
+    explained by offsets.
+
     Args:
         R: Triangular factor of the rows [W -D tau], shape (b + d + 1, b + d + 1).
         L: Lower triangle, L L^T the prior covariance of the base parameters, shape (b, b).
@@ -116,7 +120,7 @@ def estimated_uncertainty(R: Array, L: Array, mean: Array, share: float, rows: i
     """
     b, d = len(mean), len(R) - 1 - len(mean)
     prior = np.zeros((b + d, b + d + 1))
-    prior[:b, :b] = scipy.linalg.solve_triangular(L, np.eye(b), lower=True)
+    prior[:b, :b] = scipy.linalg.solve_triangular(_WIDER * L, np.eye(b), lower=True)
     prior[:b, -1] = prior[:b, :b] @ mean
     s, sigma = _FIRST, float(np.linalg.norm(R[:, -1]) / np.sqrt(rows))
     for _ in range(_STEPS):

@@ -101,6 +101,15 @@ def test_the_size_of_offsets_is_found(rng):
     assert estimated_uncertainty(R, 10 * np.eye(5), np.zeros(5), 1.0, 2000) < 1e-4
 
 
+def test_parameters_far_from_the_prior_are_no_offsets(rng):
+    """What offsets cause could in part be parameters, which are 100 standard deviations away."""
+    W = rng.standard_normal((2000, 5))
+    D = W @ rng.standard_normal((5, 12)) + rng.standard_normal((2000, 12))
+    tau = W @ np.ones(5) + 1e-3 * rng.standard_normal(2000)
+    R = np.linalg.qr(np.column_stack([W, D, tau]), mode="r")
+    assert estimated_uncertainty(R, 0.01 * np.eye(5), np.zeros(5), 1.0, 2000) < 1e-4
+
+
 def test_the_size_of_offsets_that_rows_determine_weakly_has_the_largest_evidence(rng):
     """Offsets whose own errors are as large as they are; rows without them give the noise."""
     d, size, level = 400, 0.008, 0.5
