@@ -77,12 +77,13 @@ def main():
     if not options.quick:
         servos()
     print()
-    fleets(1 if options.quick else 5)
+    fleets(1, 8) if options.quick else fleets(5)
     unlike(1 if options.quick else 20)
     print("| arms in MuJoCo | sets | named | another | none |\n|---|---|---|---|---|")
     alike_logs(6 if options.quick else 150)
     alike_fleets(6 if options.quick else 150)
-    odd_fleets(1 if options.quick else 20)
+    if not options.quick:
+        odd_fleets(20)
 
 
 def recordings():
@@ -348,10 +349,10 @@ def groups_of(model, held, unit):
     return solve_recordings(some, EstimatorSettings(draws=0)).with_errors().runs
 
 
-def fleets(count):
-    """Print coverage for the next robot and of the spreads, of 20 robots with 5 runs each."""
+def fleets(count, units=20):
+    """Print coverage for the next robot and of the spreads, of robots with 5 runs each."""
     model, pi, friction = arm()
-    names, units, runs = model.layout.names, 20, 5
+    names, runs = model.layout.names, 5
     nexts, spreads, total, joint, box = 0, 0, 0, [], []
 
     def another(rng):
