@@ -315,7 +315,7 @@ class MixedEffects:
 def _integrated(H: Array, h: Array, deviation: Array) -> tuple[Array, Array, Array, Array]:
     """Integrate the deviations of one level out of its members' information.
 
-    W = (H^-1 + D)^-1 = H - H U H with U = S (I + S H S)^-1 S and D = S^2.
+    W = (H^-1 + D)^-1 = H - H U H = S^-1 G^-1 S H with U = S G^-1 S, G = I + S H S and D = S^2.
 
     Args:
         H: Information of the members, shape (..., k, q, q).
@@ -328,11 +328,15 @@ def _integrated(H: Array, h: Array, deviation: Array) -> tuple[Array, Array, Arr
     """
     S = deviation[..., None, :]
     G = np.eye(S.shape[-1]) + S[..., :, None] * H * S[..., None, :]
-    U = S[..., :, None] * np.linalg.inv(G) * S[..., None, :]
-    HU = H @ U
+    inverse = np.linalg.inv(G)
+    U = S[..., :, None] * inverse * S[..., None, :]
+    # 1 - H U = S^-1 G^-1 S: the difference itself would be rounding where H is large
+    left = inverse / S[..., :, None] * S[..., None, :]
+    W = left @ H
     quadratic = np.einsum("...ki,...kij,...kj->...", h, U, h, optimize=True)
     log_det = np.linalg.slogdet(G)[1].sum(axis=-1)
-    return H - HU @ H, h - np.einsum("...pi,...i->...p", HU, h), U, 0.5 * (quadratic - log_det)
+    w = np.einsum("...pi,...i->...p", left, h)
+    return 0.5 * (W + np.swapaxes(W, -1, -2)), w, U, 0.5 * (quadratic - log_det)
 
 
 def _predicted(

@@ -6,7 +6,7 @@ import scipy.linalg
 import scipy.optimize
 import scipy.stats
 
-from robotid.variation.mixed_effects import MixedEffects, Prediction, Runs
+from robotid.variation.mixed_effects import MixedEffects, Prediction, Runs, _integrated
 
 SCALE = np.array([0.2, 0.5])
 BETWEEN = np.array([[0.13, 0.4], [0.31, 0.2]])  # runs, units
@@ -264,3 +264,13 @@ def test_one_more_run_narrows_intervals_as_much_as_expected():
     assert np.mean(np.log(found), axis=0) == pytest.approx(
         np.mean(np.log(expected), axis=0), abs=0.05
     )
+
+
+def test_information_far_above_the_spread_is_integrated_without_rounding():
+    """(H^-1 + S^2)^-1 of diagonal matrices: 1 / S^2 where H is large, H where it is small."""
+    H, S, x = np.array([1e18, 3e12, 1e-3]), np.array([0.1, 0.02, 2.0]), np.array([2.0, -1.0, 5.0])
+    W, w, U, _ = _integrated(np.diag(H)[None], (H * x)[None], S)
+    wanted = H / (1.0 + S**2 * H)
+    np.testing.assert_allclose(W[0], np.diag(wanted), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(w[0], wanted * x, rtol=1e-9)
+    np.testing.assert_allclose(np.diag(U[0]), S**2 / (1.0 + S**2 * H), rtol=1e-9)
