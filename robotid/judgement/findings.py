@@ -20,12 +20,7 @@ from robotid.fitting.settings import BoundedSettings, ConsistentSettings
 from robotid.judgement.correlation import correlated_parameters
 from robotid.judgement.evidence import is_harmless_cost
 from robotid.logs.data import Log
-from robotid.robot.bodies import (
-    density_share,
-    held_parameters,
-    least_density,
-    negligible_bodies,
-)
+from robotid.robot.bodies import density_share, held_parameters, least_density, negligible_bodies
 from robotid.robot.geometry import body_boxes, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -39,8 +34,7 @@ __all__ = [
     "not_written",
 ]
 
-_SAME_TORQUE = 1e-3  # two solvers that differ by more, relative to the torque, disagree
-_SAME_OPTIMUM = 1e-3  # the same for the objectives of log-Cholesky and the cone programme
+_SAME = 1e-3  # two solvers that differ by more, relative to torque or objective, disagree
 _COSTS = 1.05  # residual over that of WLS above which bounds increase the torque error
 _FAR = 3.0  # a total mass differs from the URDF's at most by this factor
 _ROUNDING = 1e-6  # [m^2] tolerance of a body that touches its box
@@ -347,7 +341,7 @@ def consistency_findings(fit: Fit) -> list[Finding]:
             f"(status: {second['status']}); the result is from {details['solver']} only"
         )
         findings.append(Finding("second_solver_failed", "warning", "estimator", message))
-    elif second is not None and second["torque_difference"] > _SAME_TORQUE:
+    elif second is not None and second["torque_difference"] > _SAME:
         message = (
             f"{details['solver']} and {second['solver']} differ by "
             f"{100 * second['torque_difference']:.2g} % of the torque (objective: "
@@ -368,7 +362,7 @@ def consistency_findings(fit: Fit) -> list[Finding]:
         message = f"the bounds {listed(bounds)} are active: {why}"
         findings.append(Finding("active_bound", severity, ", ".join(bounds), message))
     gap = min(details.get("gaps", [0.0]))
-    if gap > _SAME_OPTIMUM:
+    if gap > _SAME:
         message = (
             f"the objective of log-Cholesky is {100 * gap:.2g} % above the optimum of the cone "
             "programme; use the 'consistent' estimator, or more starts"
@@ -490,10 +484,8 @@ def _remedy(fit: Fit, body: str, excess: float = 0.0) -> str:
     for stated, mass in _stated_of(fit, body).items():
         limit = f" (possible: up to about {mass - excess:.3g} kg)" if excess > 0 else ""
         cure = f"Check the stated {stated} of {mass:.4g} kg{limit}: weigh it, or remove it"
-    return (
-        f"{cure}. The predicted torque may still be right; do not use mass, centre of mass and "
-        "inertia of this link"
-    )
+    use = "do not use mass, centre of mass and inertia of this link"
+    return f"{cure}. The predicted torque may still be right; {use}"
 
 
 def _stated_of(fit: Fit, body: str) -> dict[str, float]:
