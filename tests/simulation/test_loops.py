@@ -508,6 +508,21 @@ def test_lanes_know_nothing_of_each_other(legs):
             np.testing.assert_allclose(mine[2], other[2], atol=1e-12)
 
 
+def test_lanes_have_ticks_of_their_own(legs):
+    """Ticks of 73 Hz fall elsewhere in each window; the steps, too, are divided elsewhere."""
+    robot, windows = (
+        ClosedLoopRobot(legs, step=2e-4),
+        cut_windows(commanded(legs, 0.5), 0.042, 0.01),
+    )
+    column, loops = [(robot.kinds["kp"], 4, 0)], replace(loops_of(legs), rate=73.0)
+    together = robot.roll_out(loops, windows, column)
+    for window, out in zip(windows, together, strict=True):
+        [alone] = robot.roll_out(loops, [window], column)
+        np.testing.assert_allclose(alone.q, out.q, atol=1e-5)
+        for mine, other in zip(alone.slopes, out.slopes, strict=True):
+            np.testing.assert_allclose(mine[2], other[2], atol=1e-5)
+
+
 @pytest.mark.parametrize(
     "options",
     [
