@@ -158,7 +158,7 @@ def _slopes(model: RobotModel, rows: Rows, pi: Array, points: Sequence[int]) -> 
         D[:, :, 3 * i : 3 * i + 3] = turning[:, k].swapaxes(1, 2) @ moments.swapaxes(1, 2)
     if motion.basis is not None:
         D = without_forces(motion.basis, D)
-    return D.reshape(-1, D.shape[2])
+    return D.reshape(torque.size, D.shape[2])  # without points there are no columns
 
 
 def _slopes_of_bias(model: RobotModel, rows: Rows, pi: Array) -> Array:

@@ -18,6 +18,7 @@ from robotid.identification.repeated_errors import (
 )
 from robotid.logs.base import BaseMotion
 from robotid.logs.data import Log
+from robotid.logs.imu import ImuFrame, ImuMotion
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import constraint_jacobian, touching
@@ -192,3 +193,29 @@ def test_errors_are_those_of_all_rows_though_only_some_are_used(log, monkeypatch
     count = recordings.reduce(is_cut=False)[0].factors.rows.sum()
     # W has dependent columns here, whose places in the triangle hold a hundredth of D
     assert found.variance == pytest.approx(4e-6 * step * np.sum(left**2) / count, rel=0.03)
+
+
+def test_only_logs_with_an_imu_have_a_bias(log, rng, monkeypatch):
+    """The effect of a bias is that of the first log's rows alone; the second has no IMU."""
+    model = robot(0.0)
+    mapping = structural_mapping(model)
+    values = rng.standard_normal((len(log.t), 6)) + np.array([0, 0, 0, 0, 0, 9.81])
+    frame = ImuFrame(np.eye(4)[3], np.zeros(3), np.array([0, 0, -9.81]), np.zeros(3))
+    moved = replace(log, base=replace(log.base, imu=ImuMotion(values, frame)))
+    with_imu, without = (hold_log(model, x, RAW) for x in (moved, log))
+
+    def slopes(model, rows, pi):
+        return np.random.default_rng(7).standard_normal((rows.trajectory.tau.size, 3))
+
+    monkeypatch.setattr(repeated_errors, "_slopes_of_bias", slopes)
+    alone, both = (
+        with_repeated_errors(Recordings(model, mapping, logs)).repeated
+        for logs in ((with_imu,), (with_imu, without))
+    )
+    assert alone.root.shape[1] == 3
+    assert alone.bias > 0.0
+    assert both.bias == pytest.approx(alone.bias)
+    assert with_repeated_errors(Recordings(model, mapping, (without,))).repeated is None
+    # with slopes that do not depend on the parameters, those of the second log have no effect
+    squares, size = (x.root @ x.root.T for x in (both, alone)), np.abs(alone.root).max()
+    np.testing.assert_allclose(*squares, atol=1e-9 * size**2)
