@@ -242,7 +242,7 @@ def _initialise_from_commands(
     plain = fit_second_order(robot, windows, stated, finds_delay=loop.delay is None)
     groups = groups_of(loop, model.joints, likeness(model))
     top = _largest_speeds(model, loop, logs)
-    typical = typical_sizes(robot, plain, windows, has_gain, top)
+    typical = typical_sizes(robot, plain, windows, has_gain, top, groups)
     finds_limit = (top > 0.0) | (loop.limit == "find")
     base = first_loops(model, stated, plain, typical, finds_limit)
     # positions alone determine only the sum of kd and viscous friction
