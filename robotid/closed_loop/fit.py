@@ -358,8 +358,8 @@ def _settled(
         return simulator, estimator.fit(simulator, estimate.theta, exact=simulator.exact)
     level, first = np.inf, estimate.theta
     for _ in range(_SETTLING):
-        initialised = simulator.with_better_start(estimate.theta)
         try:
+            initialised = simulator.with_better_start(estimate.theta)
             found = estimator.settle(initialised, estimate)
         except NotConvergedError:
             found = None

@@ -62,6 +62,31 @@ def test_where_a_settling_step_cannot_be_simulated_the_parameters_are_fitted():
     assert found == (("from", "first"), ("fitted", ("from", "first"), "first"))
 
 
+def test_where_the_states_after_a_settling_step_cannot_be_simulated_the_parameters_are_fitted():
+    """The step can be simulated with the small steps of the fit, its derivatives cannot."""
+
+    def better(theta):
+        if theta[0] > 1.0:
+            raise NotConvergedError("no solution", "step 1")
+        return started(theta)
+
+    def started(theta):
+        return SimpleNamespace(exact=None, with_better_start=better, start=theta[0])
+
+    class TooLong:
+        def settle(self, simulator, estimate):
+            found = {"std_error": np.array([0.1]), "sigma": np.ones(1)}
+            return SimpleNamespace(theta=estimate.theta + 2.0, **found)
+
+        def fit(self, simulator, theta):
+            return simulator.start, theta
+
+    first = np.array([0.5])
+    simulator, found = fit._settled(started([7.0]), TooLong(), SimpleNamespace(theta=first))
+    assert simulator.start == 0.5
+    assert found == (0.5, first)
+
+
 def test_speeds_of_saturated_drives_are_the_largest_of_all_logs(monkeypatch):
     speeds = {"one": {"a": 2.0, "b": 1.0}, "two": {"b": 3.0}, "three": {"a": 1.5}}
     monkeypatch.setattr(fit, "largest_speeds", speeds.get)
