@@ -12,6 +12,7 @@ from robotid.closed_loop.evaluation import DRIFTS
 from robotid.closed_loop.free_parameters import (
     FreeParameter,
     LoopSimulator,
+    commanded,
     free_body_parameters,
     with_terms,
 )
@@ -379,6 +380,12 @@ def _check_settings(
 ) -> None:
     """Refuse logs without a compared signal, and free loop parameters where none may be free."""
     error = f"estimator: error = {settings.error!r}"
+    if loop.kind != "torque" and not any(commanded(log).any() for log in logs):
+        raise DataError(
+            f"{listed(sorted({log.name for log in logs}))}: the commands of all joints are "
+            "constant, wanted commands that move at least one joint. Record a motion, or check the "
+            "columns of the commands"
+        )
     for log in logs:
         if settings.velocities and (log.v is None or not is_trustworthy(log)):
             found = (
