@@ -361,6 +361,17 @@ class LoopSimulator:
         ]
 
     @property
+    def window_of_parts(self) -> list[int]:
+        """Index of the window of each residual with derivatives: of each part that is compared."""
+        n = len(self.base.kp)
+        return [
+            k
+            for k, window in enumerate(self.windows)
+            for joints in self.robot.parts
+            if self._compared[id(window.log)].reshape(-1, n)[:, joints].any()
+        ]
+
+    @property
     def exact(self) -> "LoopSimulator | None":
         """The simulator with exact derivatives, if its own neglect the change of the motion."""
         return replace(self, error="input") if self.error == "direct" else None

@@ -176,6 +176,10 @@ def test_a_joint_that_a_log_commands_to_rest_is_not_compared_in_it(simulator, rn
     alone = replace(simulator, windows=cut_windows(none, 0.25, 0.0))
     for with_slopes in (True, False):
         assert alone.residuals(theta, with_slopes=with_slopes) == []
+    mixed = replace(simulator, windows=(*alone.windows, *simulator.windows))
+    wanted = list(range(len(alone.windows), len(mixed.windows)))
+    assert mixed.window_of_parts == wanted
+    assert len(mixed.residuals(theta, with_slopes=True)) == len(wanted)
 
 
 def test_direct_slopes_are_those_of_inverse_dynamics_along_the_roll_out(simulator, rng):
