@@ -122,7 +122,8 @@ def position_metrics(
 ) -> Metrics:
     """Return the metrics of simulated positions over all logs.
 
-    Relative errors are 100 rmse / spread of the motion; all logs have equal weight.
+    Relative errors are 100 rmse / spread of the motion, of joints that a log commands to move; all
+    logs have equal weight.
 
     Args:
         model: The robot.
@@ -150,10 +151,11 @@ def position_units(model: RobotModel) -> tuple[str, ...]:
 
 def _joint_metrics(runs: Sequence[OpenLoop], j: int, unit: str) -> JointMetrics:
     rmse, size = (_mean(getattr(run, key)[j] for run in runs) for key in ("rmse", "spread"))
+    moves = size > 0 and any(run.moves[j] for run in runs)
 
     def share(errors: Sequence[Array | None]) -> float | None:
         own = [error[j] for error in errors if error is not None]
-        return 100.0 * _mean(own) / size if size > 0 and len(own) == len(runs) else None
+        return 100.0 * _mean(own) / size if moves and len(own) == len(runs) else None
 
     left = (rmse / size) ** 2 if size > 0 else 1.0
     return JointMetrics(

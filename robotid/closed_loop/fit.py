@@ -12,6 +12,7 @@ from robotid.closed_loop.evaluation import DRIFTS
 from robotid.closed_loop.free_parameters import (
     FreeParameter,
     LoopSimulator,
+    commanded,
     free_body_parameters,
     with_terms,
 )
@@ -242,7 +243,7 @@ def _initialise_from_commands(
     plain = fit_second_order(robot, windows, stated, finds_delay=loop.delay is None)
     groups = groups_of(loop, model.joints, likeness(model))
     top = _largest_speeds(model, loop, logs)
-    typical = typical_sizes(robot, plain, windows, has_gain, top)
+    typical = typical_sizes(robot, plain, windows, has_gain, top, groups)
     finds_limit = (top > 0.0) | (loop.limit == "find")
     base = first_loops(model, stated, plain, typical, finds_limit)
     # positions alone determine only the sum of kd and viscous friction
@@ -358,8 +359,8 @@ def _settled(
         return simulator, estimator.fit(simulator, estimate.theta, exact=simulator.exact)
     level, first = np.inf, estimate.theta
     for _ in range(_SETTLING):
-        initialised = simulator.with_better_start(estimate.theta)
         try:
+            initialised = simulator.with_better_start(estimate.theta)
             found = estimator.settle(initialised, estimate)
         except NotConvergedError:
             found = None
@@ -379,6 +380,12 @@ def _check_settings(
 ) -> None:
     """Refuse logs without a compared signal, and free loop parameters where none may be free."""
     error = f"estimator: error = {settings.error!r}"
+    if loop.kind != "torque" and not any(commanded(log).any() for log in logs):
+        raise DataError(
+            f"{listed(sorted({log.name for log in logs}))}: the commands of all joints are "
+            "constant, wanted commands that move at least one joint. Record a motion, or check the "
+            "columns of the commands"
+        )
     for log in logs:
         if settings.velocities and (log.v is None or not is_trustworthy(log)):
             found = (

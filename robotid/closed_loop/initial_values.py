@@ -65,8 +65,13 @@ def typical_sizes(
     windows: Sequence[Window],
     has_gain: Array,
     top: Array,
+    groups: Sequence[str],
 ) -> TypicalSizes:
     """Return typical sizes; where a gain is unknown, the inertia of bodies scales all torques.
+
+    Joints of a group have one gain, and so one scale: the median of those whose motion determines
+    their inertia. With scales of their own, the friction of one relative to their common gain would
+    not be that of its motion: more than the drive can overcome, and its simulation never moves.
 
     At its largest speed, ``top`` if more than 0, the limit of a drive is the friction torque.
 
@@ -76,12 +81,18 @@ def typical_sizes(
         windows: Windows of the logs.
         has_gain: Whether the gain of a joint is known, shape (n,), bool.
         top: Speeds of joints that run at their largest speed, else 0, shape (n,) [rad/s or m/s].
+        groups: Name of the group of each joint.
     """
     model = robot.model
     q = np.concatenate([w.log.q[w.counted] for w in windows])
     bodies = _inertia(model, model.standard_parameters(), windows)
     measure = np.maximum(bodies, _SMALLEST_BODY * bodies.max()) / _SHARE
     scale = np.where(has_gain, 1.0, measure / plain.inertia)
+    for group in dict.fromkeys(groups):
+        own = (np.array(groups) == group) & ~has_gain
+        shown = own & plain.shows_inertia
+        if own.any():
+            scale[own] = np.median(scale[shown if shown.any() else own])
     # friction may hide the inertia in a second-order model
     inertia = np.maximum(plain.inertia * scale, bodies)
     error = np.concatenate([w.log.q_ref[w.counted] for w in windows]) - q  # type: ignore[index]

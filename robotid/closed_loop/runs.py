@@ -13,6 +13,7 @@ import numpy as np
 from robotid.closed_loop.free_parameters import FreeParameter, LoopSimulator
 from robotid.estimators.estimator import Estimate
 from robotid.estimators.output_error import segment_scores
+from robotid.fitting.identified import FROM_PRIOR
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.variation.groups import FEWEST_RUNS, Group, RunsOf, inflation_of
@@ -37,8 +38,9 @@ def loop_runs(
         unit: Name of the robot of each log; one robot if empty.
 
     Returns:
-        A group for each set of joints with free parameters of loops and drives; none for fewer than
-        three logs, and where the logged torque drives the robot.
+        A group for each set of joints with free parameters of loops and drives that all logs
+        together determine; none for fewer than three logs, and where the logged torque drives the
+        robot.
     """
     logs = list(dict.fromkeys(id(window.log) for window in simulator.windows))
     if len(logs) < FEWEST_RUNS or simulator.torque is not None:
@@ -49,8 +51,10 @@ def loop_runs(
         scores.append(segment_scores(replace(simulator, windows=windows), estimate))
     _, units = np.unique(unit or [""] * len(logs), return_inverse=True)
     groups: dict[tuple[int, ...], list[int]] = {}
+    is_prior = estimate.std_error > FROM_PRIOR * simulator.prior_std
     for k, free in enumerate(simulator.free_parameters):
-        if free.what != "body" and free.name not in estimate.details["at_bound"]:
+        is_open = is_prior[k] or free.name in estimate.details["at_bound"]
+        if free.what != "body" and not is_open:
             groups.setdefault(free.joints, []).append(k)
     found = []
     for places in groups.values():

@@ -24,7 +24,8 @@ _FRICTIONS = (0.05, 0.5)  # Coulomb friction that is tried, over the typical tor
 _DELAYS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08)  # delays that are tried [s]
 _TRIED = 8  # number of windows of the grid search
 _FITTED = 16  # number of windows of the fit
-_SHOWS = 1e-3  # smallest identifiable inertia, over that of the fastest loop
+_SHOWS = 1e-3  # smallest identifiable inertia, over that of the fastest loop ...
+_CLEAR = 2.0  # ... and over its standard error
 _LEAST = 1e-6  # lower bound of the inertia, over its initial value
 _TERMS = (TERMS["viscous"], TERMS["coulomb"], TERMS["offset"])
 _STEPS = 12  # of the fit
@@ -39,18 +40,33 @@ class SecondOrder:
         theta: Its parameters.
         loops: The parameters as loops without bodies.
         torque: Typical torque of the loop, kp rms(q_ref - q) [N m or N].
+        inertia_error: Standard error of the inertia J [kg m^2 or kg].
     """
 
     simulator: LoopSimulator
     theta: Array
     loops: Loops
     torque: Array
+    inertia_error: Array | float = 0.0
+
+    @property
+    def shows_inertia(self) -> Array:
+        """Whether the motion determines the inertia of each joint, shape (n,), bool."""
+        found, fastest = self.loops.armature, self.loops.kp / _FREQUENCIES[-1] ** 2
+        shows: Array = (found > _SHOWS * fastest) & (found > _CLEAR * self.inertia_error)
+        return shows
 
     @property
     def inertia(self) -> Array:
-        """Inertia J of each joint [kg m^2 or kg]; that of the fastest loop if not identifiable."""
-        fastest: Array = self.loops.kp / _FREQUENCIES[-1] ** 2
-        return np.where(self.loops.armature > _SHOWS * fastest, self.loops.armature, fastest)
+        """Inertia J of each joint [kg m^2 or kg].
+
+        Of a joint that does not determine it, the standard error is its size, within those of the
+        loops that are tried: a smaller estimate would make a common scale of torques arbitrary.
+        """
+        found, kp = self.loops.armature, self.loops.kp
+        fastest, slowest = (kp / w**2 for w in (_FREQUENCIES[-1], _FREQUENCIES[0]))
+        possible = np.maximum(found, np.clip(self.inertia_error, fastest, slowest))
+        return np.where(self.shows_inertia, found, possible)
 
     @property
     def time_constant(self) -> Array:
@@ -100,8 +116,10 @@ def fit_second_order(
     free_parameters = _free_parameters(robot, start, torque, finds_delay)
     some = windows[:: max(1, len(windows) // _FITTED)]
     simulator = LoopSimulator(robot, some, start, free_parameters)
-    theta = OutputError(whitens=False, steps=_STEPS).fit(simulator).theta
-    return SecondOrder(simulator, theta, simulator.loops(theta), torque)
+    estimate = OutputError(whitens=False, steps=_STEPS).fit(simulator)
+    is_inertia = [free.what == "armature" for free in free_parameters]  # joint by joint
+    error = estimate.std_error[is_inertia]
+    return SecondOrder(simulator, estimate.theta, simulator.loops(estimate.theta), torque, error)
 
 
 def _free_parameters(

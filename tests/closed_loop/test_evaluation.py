@@ -52,6 +52,10 @@ def test_a_joint_that_no_log_moves_is_left_out_where_motion_is_wanted(arm):
     assert found.relative_error_pct == pytest.approx(1.0)
     [both] = position_metrics(arm, [still, moved]).per_joint.values()
     assert both.relative_error_pct > 1.0
+    aside = run(arm.joints, [3e-3], [1e-4], [0.0], command=[2e-3])
+    [at_rest] = position_metrics(arm, [aside]).per_joint.values()
+    assert (at_rest.relative_error_pct, at_rest.baselines) == (None, {"command": None})
+    assert at_rest.rmse == pytest.approx(3e-3)
     driven = run(arm.joints, [3e-3], [1e-4], [0.0], steady=[0.1])
     assert len(position_metrics(arm, [driven], moving=True).per_joint) == 1, "by its torque"
 

@@ -8,7 +8,8 @@ import pytest
 
 from robotid.closed_loop import fit
 from robotid.closed_loop.settings import LoopSettings
-from robotid.exceptions import NotConvergedError
+from robotid.exceptions import DataError, NotConvergedError
+from robotid.fitting.settings import SimulationSettings
 
 
 class DataRange(Exception):
@@ -62,6 +63,31 @@ def test_where_a_settling_step_cannot_be_simulated_the_parameters_are_fitted():
     assert found == (("from", "first"), ("fitted", ("from", "first"), "first"))
 
 
+def test_where_the_states_after_a_settling_step_cannot_be_simulated_the_parameters_are_fitted():
+    """The step can be simulated with the small steps of the fit, its derivatives cannot."""
+
+    def better(theta):
+        if theta[0] > 1.0:
+            raise NotConvergedError("no solution", "step 1")
+        return started(theta)
+
+    def started(theta):
+        return SimpleNamespace(exact=None, with_better_start=better, start=theta[0])
+
+    class TooLong:
+        def settle(self, simulator, estimate):
+            found = {"std_error": np.array([0.1]), "sigma": np.ones(1)}
+            return SimpleNamespace(theta=estimate.theta + 2.0, **found)
+
+        def fit(self, simulator, theta):
+            return simulator.start, theta
+
+    first = np.array([0.5])
+    simulator, found = fit._settled(started([7.0]), TooLong(), SimpleNamespace(theta=first))
+    assert simulator.start == 0.5
+    assert found == (0.5, first)
+
+
 def test_speeds_of_saturated_drives_are_the_largest_of_all_logs(monkeypatch):
     speeds = {"one": {"a": 2.0, "b": 1.0}, "two": {"b": 3.0}, "three": {"a": 1.5}}
     monkeypatch.setattr(fit, "largest_speeds", speeds.get)
@@ -70,3 +96,16 @@ def test_speeds_of_saturated_drives_are_the_largest_of_all_logs(monkeypatch):
     np.testing.assert_array_equal(found, [2.0, 3.0, 0.0])
     stated = LoopSettings(limit={"b": 5.0})
     np.testing.assert_array_equal(fit._largest_speeds(model, stated, list(speeds)), [2.0, 0.0, 0.0])
+
+
+def test_logs_that_command_no_joint_to_move_are_refused():
+    q_ref = np.array([[0.1, 0.2], [0.1, 0.2], [0.1, 0.3]])
+    log = SimpleNamespace(name="b.csv", q_ref=q_ref, v_ref=None, tau_ref=None)
+    still = SimpleNamespace(name="a.csv", q_ref=q_ref[:2], v_ref=None, tau_ref=0 * q_ref[:2])
+    settings = SimulationSettings()
+    with pytest.raises(DataError, match=r"^a\.csv: the commands of all joints are constant, want"):
+        fit._check_settings(None, [still, still], LoopSettings(), settings)
+    fit._check_settings(None, [still, log], LoopSettings(), settings)
+    pushed = SimpleNamespace(name="c.csv", q_ref=q_ref[:2], v_ref=None, tau_ref=q_ref[1:])
+    fit._check_settings(None, [pushed], LoopSettings(), settings)
+    fit._check_settings(None, [still], LoopSettings(kind="torque"), settings)

@@ -202,6 +202,14 @@ def test_open_loops_beat_plainer_models(leg, found):
         np.testing.assert_allclose(error, np.sqrt(np.mean(missed**2, axis=0)))
 
 
+def test_a_second_order_model_has_the_standard_error_of_each_inertia(found):
+    plain = found.fit.plain
+    again = OutputError(whitens=False).fit(plain.simulator, plain.theta)
+    wanted = [again.std_error[again.names.index(f"{j}.armature")] for j in found.model.joints]
+    np.testing.assert_allclose(plain.inertia_error, wanted, rtol=0.1)
+    assert plain.shows_inertia.all()
+
+
 def test_each_kept_log_is_judged(leg, found):
     _, log, kept = leg
     robot, loops = found.fit.simulator.robot, found.fit.loops

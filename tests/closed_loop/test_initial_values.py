@@ -33,13 +33,15 @@ def planar():
     return RobotModel.from_urdf(URDF / "planar_2r.urdf")
 
 
-def plain_model(model, armature, kp, kd=(1.0, 1.0), values=(0.4, 0.3, 0.1, 0.8, 0.6, -0.2)):
+def plain_model(
+    model, armature, kp, kd=(1.0, 1.0), values=(0.4, 0.3, 0.1, 0.8, 0.6, -0.2), error=0.0
+):
     """Return plain loops of two joints: viscous, Coulomb friction and offset of each."""
     loops = replace(
         stated_loops(model, LoopSettings()), armature=np.array(armature), kp=np.array(kp),
         kd=np.array(kd), values=np.array(values), delay=np.array([0.01, 0.02]),
     )  # fmt: skip
-    return SecondOrder(None, np.zeros(0), loops, np.array([3.0, 5.0]))
+    return SecondOrder(None, np.zeros(0), loops, np.array([3.0, 5.0]), error)
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +62,9 @@ def test_usual_sizes_are_measured_by_known_gains_or_by_the_bodies(planar, logged
     bodies = inertia_of(planar, logged)
     plain = plain_model(planar, [3 * bodies[0], 0.4], [60.0, 1.0])
     found = typical_sizes(
-        SimpleNamespace(model=planar), plain, logged, np.array([True, False]), np.array([2.0, 0.0])
-    )
+        SimpleNamespace(model=planar), plain, logged, np.array([True, False]), np.array([2.0, 0.0]),
+        planar.joints,
+    )  # fmt: skip
     np.testing.assert_allclose(found.bodies, bodies)
     # of the second no gain is known: twice its bodies' inertia, or 0.3 of the first's, measures
     scale = np.array([1.0, 2 * max(bodies[1], 0.3 * bodies[0]) / 0.4])
@@ -75,8 +78,9 @@ def test_usual_sizes_are_measured_by_known_gains_or_by_the_bodies(planar, logged
     np.testing.assert_allclose(found.largest, scale * asked)
     quick = replace(plain, loops=replace(plain.loops, kp=np.array([600.0, 1.0])))
     own = typical_sizes(
-        SimpleNamespace(model=planar), quick, logged, np.array([True, False]), np.array([2.0, 0.0])
-    )
+        SimpleNamespace(model=planar), quick, logged, np.array([True, False]), np.array([2.0, 0.0]),
+        planar.joints,
+    )  # fmt: skip
     np.testing.assert_allclose(own.largest, scale * [taken, asked[1]])
     v = np.column_stack([3.0 * np.cos(6 * T), -2.8 * np.sin(4 * T)])
     np.testing.assert_allclose(found.speed, np.sqrt(np.mean(v**2, axis=0)), rtol=2e-3)
@@ -102,8 +106,9 @@ def test_first_loops_and_unknowns_begin_with_usual_sizes(planar, logged):
     bodies = inertia_of(planar, logged)
     plain = plain_model(planar, [3 * bodies[0], 0.4], [60.0, 1.0])
     usual = typical_sizes(
-        SimpleNamespace(model=planar), plain, logged, np.array([True, False]), np.zeros(2)
-    )
+        SimpleNamespace(model=planar), plain, logged, np.array([True, False]), np.zeros(2),
+        ["both", "both"],
+    )  # fmt: skip
     loop = LoopSettings(kp={planar.joints[0]: 60.0}, delays="one")
     stated = stated_loops(planar, loop)
     first = first_loops(planar, stated, plain, usual, np.array([False, True]))
@@ -149,6 +154,39 @@ def test_first_loops_and_unknowns_begin_with_usual_sizes(planar, logged):
     )  # fmt: skip
     kinds = {u.what for u in bare}
     assert kinds == {"armature", "term"}
+
+
+def test_joints_of_a_group_have_the_scale_of_those_that_show_their_inertia(planar, logged):
+    """Friction over the gain stays that of the second-order model, for both joints."""
+    bodies = inertia_of(planar, logged)
+    measure = 2 * np.maximum(bodies, 0.3 * bodies.max())
+    none = np.zeros(2, dtype=bool)
+
+    def sizes(plain, groups, has_gain=none):
+        robot = SimpleNamespace(model=planar)
+        return typical_sizes(robot, plain, logged, has_gain, np.zeros(2), groups)
+
+    hidden, shown = 1e-5, 0.02  # of 1 / 96**2 = 1.09e-4 and 1 / 6**2 = 0.028
+    plain = plain_model(planar, [hidden, shown], [1.0, 1.0], error=np.array([2e-5, 5e-3]))
+    for groups, scale in (
+        (["both", "both"], [measure[1] / shown] * 2),
+        (planar.joints, [measure[0] * 96**2, measure[1] / shown]),
+    ):
+        found = sizes(plain, groups)
+        np.testing.assert_allclose(found.scale, scale)
+        np.testing.assert_allclose(found.torque, np.array(scale) * [3.0, 5.0])
+        wanted = np.maximum(np.array([1 / 96**2, shown]) * scale, bodies)
+        np.testing.assert_allclose(found.inertia, wanted)
+        first = first_loops(planar, stated_loops(planar, LoopSettings()), plain, found, none)
+        friction = first.values.reshape(2, -1)[:, :2] / first.kp[:, None]
+        np.testing.assert_allclose(friction, [[0.4, 0.3], [0.8, 0.6]])
+    # neither shows its inertia: the median of both
+    plain = plain_model(planar, [1e-9, 1e-9], [1.0, 1.0], error=np.array([2e-4, 1.0]))
+    possible = [2e-4, 1 / 6**2]  # the standard error, at most the slowest loop that is tried
+    scale = sizes(plain, ["a", "a"]).scale
+    np.testing.assert_allclose(scale, np.mean(measure / possible))
+    scale = sizes(plain, ["a", "a"], np.array([True, False])).scale
+    np.testing.assert_allclose(scale, [1.0, measure[1] / possible[1]])
 
 
 def test_a_joint_follows_as_slowly_as_its_damping_or_its_swing(planar):

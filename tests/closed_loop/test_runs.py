@@ -41,7 +41,7 @@ def leg():
     base = loops_of(robot.model, pi, robot.drives)
     simulator = LoopSimulator(ClosedLoopRobot(robot.model), tuple(windows), base, free)
     estimate = Estimate(
-        theta=simulator.prior, covariance=np.eye(3), names=simulator.names,
+        theta=simulator.prior, covariance=1e-6 * np.eye(3), names=simulator.names,
         sigma=np.full(3, NOISE), rank=3, condition=1.0, undetermined=(), converged=True, n_iter=1,
         message="", prior_std=simulator.prior_std,
         details={"correlation": np.zeros(3), "at_bound": ()},
@@ -71,6 +71,15 @@ def test_each_log_tells_its_own_gains_and_friction(leg):
     louder = loop_runs(robot.model, simulator, replace(estimate, sigma=2.0 * estimate.sigma))
     assert louder[1].inflation == pytest.approx(hip.inflation / 4)
     assert pytest.approx(hip.runs.H) == louder[1].runs.H
+
+
+def test_parameters_that_remain_at_their_prior_do_not_vary(leg):
+    robot, simulator, estimate = leg
+    for error, names in ((0.089, ("hip.kp", "hip.delay")), (0.091, ("hip.kp",))):  # of 0.1 s
+        own = replace(estimate, covariance=np.diag([0.8, 1e9, error]) ** 2)
+        calf, hip = loop_runs(robot.model, simulator, own)
+        assert calf.group.parameters == ("calf.coulomb",)
+        assert hip.group.parameters == names
 
 
 def test_robots_bounds_and_two_logs(leg):
