@@ -83,7 +83,7 @@ def process_segments(
     key = settings, tuple(segments), ratios.shape, ratios.tobytes()
     if key not in known:
         known[key] = _process(log, segments, settings, first, own, ratios)
-    return known[key].part(0, len(log.t))  # with a cache of its own
+    return known[key].at(slice(None))  # with a cache of its own
 
 
 def _process(

@@ -9,7 +9,7 @@ from uuid import uuid4
 
 from robotid.exceptions import MissingDependencyError, WorkerError
 from robotid.versions import __version__, code_versions
-from robotid.workers.pieces import Outcome, Work, Workload, run_task
+from robotid.workers.pieces import Lost, Outcome, Work, Workload, run_task
 from robotid.workers.processes import Backend, named
 
 if TYPE_CHECKING:
@@ -41,12 +41,14 @@ class ClusterBackend(Backend):
     def description(self) -> str:
         return f"the Dask cluster {self.address}, one BLAS thread per piece"
 
-    def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
+    def run(
+        self, work: Work, pieces: Sequence[tuple[int, Workload]], lost: Lost | None = None
+    ) -> Iterator[tuple[int, Any]]:
         try:
             if self._client is None:
                 self._client = self._connect()
                 _require_same_version(self.address, self._client)
-            yield from self._collect(self._client, work, pieces)
+            yield from self._collect(self._client, work, pieces, lost)
         except BaseException:
             self.close()
             raise
@@ -79,7 +81,11 @@ class ClusterBackend(Backend):
         return client
 
     def _collect(
-        self, client: "Client", work: Work, pieces: Sequence[tuple[int, Workload]]
+        self,
+        client: "Client",
+        work: Work,
+        pieces: Sequence[tuple[int, Workload]],
+        lost: Lost | None,
     ) -> Iterator[tuple[int, Any]]:
         from distributed import CancelledError, KilledWorker, as_completed
 
@@ -105,10 +111,16 @@ class ClusterBackend(Backend):
                     with named(piece):
                         outcome: Outcome = future.result()
                 except KilledWorker as error:
-                    raise WorkerError(
+                    failure = WorkerError(
                         f"every worker of the cluster that processed {piece.name} ended (killed, "
                         "or out of memory)"
-                    ) from error
+                    )
+                    if lost is None:
+                        raise failure from error
+                    del running[future.key]
+                    future.release()
+                    yield index, lost(piece, failure)
+                    continue
                 except CancelledError as error:
                     raise WorkerError(
                         f"the connection to the cluster {self.address} ended while it processed "
