@@ -168,9 +168,13 @@ def _gravity(probe: Probe, stated: Explanation) -> Explanation:
 
     size = float(np.linalg.norm(probe.gravity)) or _EARTH
     joints = tuple(range(len(probe.model.joints)))
+    is_stated = replace(stated, kind="gravity", joints=joints, values=tuple(probe.gravity.tolist()))
+    is_poor = stated.share.max() > _POOR
+    if not is_poor and stated.misfit - len(joints) * np.log(_FLOOR) < HINT:
+        return is_stated
     share_in, least = _shares_by_gravity(probe)
-    if stated.share.max() <= _POOR and stated.misfit - Explanation("", least).misfit < HINT:
-        return replace(stated, kind="gravity", joints=joints, values=tuple(probe.gravity.tolist()))
+    if not is_poor and stated.misfit - Explanation("", least).misfit < HINT:
+        return is_stated
 
     def explained(g: Array) -> Explanation:
         return Explanation("gravity", share_in(g), joints, tuple(g.tolist()))
