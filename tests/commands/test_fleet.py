@@ -16,6 +16,7 @@ from robotid.commands import fleet
 from robotid.commands.fleet import read_fleet, run_fleet
 from robotid.exceptions import DataError, WorkerError
 from robotid.log_files.read import write_log
+from robotid.report.fleet import fleet_page
 from robotid.robot.model import RobotModel
 from robotid.workers.checkpoint import FOLDER
 from robotid.workers.plan import WorkPlan
@@ -144,6 +145,27 @@ def test_variables_of_the_environment_are_replaced_or_refused(tmp_path, monkeypa
     (unit,) = read_fleet(path)
     assert [log for log, _ in unit.logs] == [tmp_path / "monday" / "x.csv", tmp_path / "y.csv"]
     assert unit.urdf == Path("/robots/arm.urdf")
+
+
+def test_a_page_of_many_failures_and_units_shows_each_kind_and_few_of_them():
+    failures = [
+        {"unit": f"u{k:03d}", "log": f"u{k:03d}/{k}.csv", "error": f"there is no u{k:03d}/{k}.csv"}
+        for k in range(300)
+    ]
+    failures.append({"unit": "last", "log": "", "error": "the URDF of last is broken"})
+    unlike = [
+        {"unit": f"u{k}", "parameter": "a.coulomb", "value": 1.0, "std_error": 0.1,
+         "parameter_unit": "N m", "others": [2.0, 3.0]} for k in range(45)
+    ]  # fmt: skip
+    content = {"units": 1000, "logs": 1000, "done": 699, "verdicts": {"usable": 699},
+               "failures": failures, "unlike": unlike, "parameters": []}  # fmt: skip
+    html = fleet_page(content)
+    shown = tables(html)["Units and logs that were not identified"].rows
+    assert [row[0] for row in shown] == ["u000", "last", *(f"u{k:03d}" for k in range(1, 19))]
+    assert [row[2] for row in shown[:3]] == ["300", "1", "300"]
+    assert "281 more are in <code>fleet.parquet</code>" in html
+    assert len(tables(html)["Units that differ from the others"].rows) == 20
+    assert "25 more are in <code>fleet.json</code>" in html
 
 
 def test_variation_between_units_is_that_of_their_values(done):
