@@ -2,6 +2,7 @@
 
 import logging
 import socket
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from typing import TYPE_CHECKING, Any
@@ -92,17 +93,23 @@ class ClusterBackend(Backend):
         waiting, level = iter(pieces), _log.getEffectiveLevel()
         run = uuid4().hex
         running: dict[object, tuple[int, Workload, Future[Any]]] = {}
+        suspects, again = set[int](), deque[tuple[int, Workload]]()
         results = as_completed(loop=client.loop)
+
+        def submit(index: int, piece: Workload) -> None:
+            key = f"robotid-{run}-{index}" + "-alone" * (index in suspects)
+            future = client.submit(_run, work, piece, level, __version__, key=key, pure=False)
+            running[future.key] = index, piece, future
+            results.add(future)
+
         try:
             while True:
                 most = 2 * max(1, sum(client.nthreads().values()))
-                for index, piece in islice(waiting, max(0, most - len(running))):
-                    key = f"robotid-{run}-{index}"
-                    future = client.submit(
-                        _run, work, piece, level, __version__, key=key, pure=False
-                    )
-                    running[future.key] = index, piece, future
-                    results.add(future)
+                is_alone = bool(again) or any(own[0] in suspects for own in running.values())
+                if again and not running:
+                    submit(*again.popleft())
+                for index, piece in islice(waiting, 0 if is_alone else max(0, most - len(running))):
+                    submit(index, piece)
                 if not running:
                     return
                 future = next(results)
@@ -111,14 +118,18 @@ class ClusterBackend(Backend):
                     with named(piece):
                         outcome: Outcome = future.result()
                 except KilledWorker as error:
+                    del running[future.key]
+                    future.release()
+                    if index not in suspects:  # or its neighbour: each of them is tried alone
+                        suspects.add(index)
+                        again.append((index, piece))
+                        continue
                     failure = WorkerError(
                         f"every worker of the cluster that processed {piece.name} ended (killed, "
                         "or out of memory)"
                     )
                     if lost is None:
                         raise failure from error
-                    del running[future.key]
-                    future.release()
                     yield index, lost(piece, failure)
                     continue
                 except CancelledError as error:

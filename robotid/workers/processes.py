@@ -176,7 +176,7 @@ class ProcessBackend(Backend):
                 if again and not running:
                     submit(*again[0])
                     again.popleft()
-                elif not again:
+                elif not again and not any(failures[index] for index, _ in running.values()):
                     for index, piece in islice(waiting, 2 * self.workers - len(running)):
                         again.append((index, piece))  # until it is submitted
                         submit(index, piece)
