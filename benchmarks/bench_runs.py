@@ -46,7 +46,8 @@ from robotid.robot.model import RobotModel
 from robotid.simulation.motions import random_fourier
 from robotid.variation.draws import correlated_scores, scores_to_values
 from robotid.variation.groups import runs_of
-from robotid.variation.mixed_effects import UNKNOWN, MixedEffects
+from robotid.variation.mixed_effects import MixedEffects
+from robotid.variation.restricted_likelihood import UNKNOWN
 from robotid.variation.variation import SCORES, vary
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"

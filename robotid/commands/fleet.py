@@ -12,7 +12,7 @@ import numpy as np
 from robotid._files import check_folder, folder_beside, write_json, write_text
 from robotid._typing import Array
 from robotid.commands.identify import identify_job
-from robotid.commands.job import Job, LogEntry, PayloadEntry, read_job
+from robotid.commands.job import Job, LogEntry, PayloadEntry, read_job, stated_path
 from robotid.commands.logs import identity_of
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.entries import build_result
@@ -130,7 +130,8 @@ def read_fleet(
 
     Args:
         path: The table, .csv or .parquet, with the columns "unit" and "log", and optionally those
-            of ``COLUMNS``. Paths in it are relative to its folder.
+            of ``COLUMNS``. Paths in it are relative to its folder; ``$NAME`` in a path is replaced
+            by the variable of the environment.
         urdf: URDF of units whose rows do not name one.
         job: Job file of units whose rows do not name one.
 
@@ -193,9 +194,12 @@ def _unit(
                 f"{seen[row['log']]}, too; remove one of the rows"
             )
         seen[row["log"]] = number
-        logs.append((source.parent / row["log"], _mass(source, number, row.get("payload", ""))))
+        mass = _mass(source, number, row.get("payload", ""))
+        logs.append((_path(source, number, "log", row["log"]), mass))
     own_urdf, own_job = (
-        source.parent / stated[column] if stated.get(column) else default and Path(default)
+        _path(source, first, column, stated[column])
+        if stated.get(column)
+        else default and Path(default)
         for column, default in (("urdf", urdf), ("job", job))
     )
     if not (own_urdf or own_job):
@@ -204,6 +208,14 @@ def _unit(
             "or state one for all units with --urdf"
         )
     return FleetUnit(name, tuple(logs), own_urdf or None, own_job or None)
+
+
+def _path(source: Path, number: int, column: str, text: str) -> Path:
+    """Return a path of a row, relative to the table, with $VARIABLES replaced as in job files."""
+    try:
+        return stated_path(text, f"{source.name} row {number}, column {column!r}", source.parent)
+    except SettingsError as error:
+        raise DataError(str(error)) from error
 
 
 def _mass(source: Path, number: int, text: str) -> float | None:
@@ -243,13 +255,18 @@ def identify_unit(unit: FleetUnit, threads: int | None) -> UnitResult:
         rows += _rows(unit.unit, used, result)
         about = result["robot"], {e["name"]: e["expression"] for e in result["base_parameters"]}
     except Exception as error:  # the fleet goes on: the error is in the table, with its type
-        text = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
-        rows, about = [{"unit": unit.unit, "status": "failed", "error": text}], ("", {})
+        rows, about = [_failure(unit, error)], ("", {})
     rows += [
         {"unit": unit.unit, "log": str(path), "status": "failed", "error": error}
         for path, error in refused.items()
     ]
     return UnitResult(rows, *about)
+
+
+def _failure(unit: FleetUnit, error: Exception) -> dict[str, Any]:
+    """Return the row of a unit that is not identified."""
+    text = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
+    return {"unit": unit.unit, "status": "failed", "error": text}
 
 
 def _rows(unit: str, logs: Sequence[Path], result: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
@@ -280,7 +297,8 @@ def run_fleet(
     """Identify all units; write fleet.parquet, fleet.json and fleet.html.
 
     Finished units are stored in a checkpoint until all are, and are not repeated by a resumed run.
-    Files of results are written when all units are finished, with the same bits.
+    A unit that ends its worker in every attempt is a failure in the table. Files of results are
+    written when all units are finished, with the same bits.
 
     Args:
         units: The units.
@@ -294,8 +312,7 @@ def run_fleet(
     Raises:
         DataError: If the checkpoint to resume has other inputs.
         SettingsError: If the folder is not writable.
-        WorkerError: If a worker process ends before its work is done; on a cluster, if every worker
-            that processes a unit ends.
+        WorkerError: If a cluster cannot be used.
     """
     chosen, target = plan or WorkPlan(1), Path(folder)
     check_folder(target, _FILES)
@@ -304,8 +321,9 @@ def run_fleet(
     )
     with chosen, released_on_error(checkpoint):
         for _ in chosen.map(
-            identify_unit, units, "identifying", checkpoint=checkpoint, counted="logs"
-        ):
+            identify_unit, units, "identifying", checkpoint=checkpoint, counted="logs",
+            lost=lambda unit, error: UnitResult([_failure(unit, error)], "", {}),
+        ):  # fmt: skip
             pass
         with folder_beside(target) as partial:
             gathered = _Gathered()

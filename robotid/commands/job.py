@@ -34,7 +34,7 @@ from robotid.robot.parameters import DYNAMICS, Coupling
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
 
-__all__ = ["Job", "LogEntry", "PayloadEntry", "job_from_settings", "read_job"]
+__all__ = ["Job", "LogEntry", "PayloadEntry", "job_from_settings", "read_job", "stated_path"]
 
 _MODEL_KEYS: Mapping[str, tuple[type, ...]] = {
     "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
@@ -483,18 +483,29 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
     check_keys(table, Job.schema(), where)
     if "urdf" not in table:
         raise SettingsError(f"{where} has no key 'urdf'; name the robot's URDF file")
-    found = dict(table, urdf=_path(table["urdf"], where, folder))
+    found = dict(table, urdf=stated_path(table["urdf"], where, folder))
     for key in ("identification", "validation", "payload_check"):
         entries = table.get(key, [])
-        found[key] = [dict(entry, log=_path(entry["log"], where, folder)) for entry in entries]
+        found[key] = [
+            dict(entry, log=stated_path(entry["log"], where, folder)) for entry in entries
+        ]
     try:
         return Job.from_dict(found)
     except SettingsError as error:
         raise SettingsError(f"{where}: {error}") from error
 
 
-def _path(text: str, where: str, folder: Path) -> Path:
-    """Return a path relative to a folder, with $VARIABLES of the environment replaced."""
+def stated_path(text: str, where: str, folder: Path) -> Path:
+    """Return a path relative to a folder, with $VARIABLES of the environment replaced.
+
+    Args:
+        text: The path as stated.
+        where: Where it is stated, for errors.
+        folder: The folder.
+
+    Raises:
+        SettingsError: If it is no path, or names a variable that is not set.
+    """
     is_unicode = not any("\ud800" <= character <= "\udfff" for character in text)
     if "\0" in text or len(text) > _LONGEST_PATH or not is_unicode:
         raise SettingsError(

@@ -15,7 +15,10 @@ import numpy as np
 from robotid._typing import Array
 from robotid.doctor.sample import Probe
 
-__all__ = ["Explanation", "compensated", "explanations", "own_share", "unexplained"]
+__all__ = ["HINT", "Explanation", "compensated", "explanations", "own_share", "unexplained"]
+
+#: Decrease of the misfit from which another gravity is reported.
+HINT = 0.7
 
 _FLOOR = 1e-3  # an unexplained share below this is negligible
 _POOR = 0.08  # unexplained share from which other readings of the positions are tested
@@ -96,7 +99,7 @@ def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanati
     share = unexplained(probe)
     own = np.diagonal(share).T  # (n, 2)
     stated = Explanation("stated", own[:, 0])
-    others = [_signs(own), _unsigned(probe, own), _order(share), _gravity(probe)]
+    others = [_signs(own), _unsigned(probe, own), _order(share), _gravity(probe, stated)]
     loaded = Explanation("payload", np.minimum(own_share(probe, any_load=True), stated.share))
     if stated.share.max() > _POOR:
         others += _positions(probe, min(e.misfit for e in [stated, *others]))
@@ -155,18 +158,26 @@ def _order(share: Array) -> Explanation:
     return Explanation("torque_order", found, moved, tuple(joints.astype(float).tolist()))
 
 
-def _gravity(probe: Probe) -> Explanation:
-    """Return the direction of gravity that explains the torques best."""
+def _gravity(probe: Probe, stated: Explanation) -> Explanation:
+    """Return the direction of gravity that explains the torques best.
+
+    It is the stated one if the torques are explained, and no masses and no gravity, of any size
+    and sign, explain them better by ``HINT``.
+    """
     from scipy.optimize import minimize
 
     size = float(np.linalg.norm(probe.gravity)) or _EARTH
-    n = len(probe.model.joints)
-
-    share_in = _shares_by_gravity(probe)
+    joints = tuple(range(len(probe.model.joints)))
+    is_stated = replace(stated, kind="gravity", joints=joints, values=tuple(probe.gravity.tolist()))
+    is_poor = stated.share.max() > _POOR
+    if not is_poor and stated.misfit - len(joints) * np.log(_FLOOR) < HINT:
+        return is_stated
+    share_in, least = _shares_by_gravity(probe)
+    if not is_poor and stated.misfit - Explanation("", least).misfit < HINT:
+        return is_stated
 
     def explained(g: Array) -> Explanation:
-        share = share_in(g)
-        return Explanation("gravity", share, tuple(range(n)), tuple(g.tolist()))
+        return Explanation("gravity", share_in(g), joints, tuple(g.tolist()))
 
     axes = [sign * size * axis for axis in np.eye(3) for sign in (1, -1)]
     best = min(map(explained, [probe.gravity, *axes, np.zeros(3)]), key=lambda e: e.misfit)
@@ -187,10 +198,11 @@ def _gravity(probe: Probe) -> Explanation:
     return tilted(found.x)
 
 
-def _shares_by_gravity(probe: Probe) -> Callable[[Array], Array]:
+def _shares_by_gravity(probe: Probe) -> tuple[Callable[[Array], Array], Array]:
     """Return a function of gravity (3,): the unexplained share of each torque, (n,).
 
-    Loads are linear in gravity, so one triangular factor per joint is used for all of them.
+    Loads are linear in gravity, so one triangular factor per joint is used for all of them. Second,
+    the shares that all their columns leave, with factors of any sign, (n,): no gravity leaves less.
     """
     links, size = probe.loads(), _variation(probe.tau)
     X = [links, *probe.parts.gravity_loads, probe.drives, probe.tau[:, :, None]]
@@ -204,7 +216,8 @@ def _shares_by_gravity(probe: Probe) -> Callable[[Array], Array]:
         columns = np.concatenate([loads, R[:, :, 4 * bodies : -1]], axis=2)
         return _over(_misfits(columns, R[:, :, -1:])[:, 0], size)
 
-    return shares
+    left = R[:, -1, -1] ** 2 if R.shape[1] == R.shape[2] else np.zeros(len(R))
+    return shares, _over(left, size)
 
 
 def _positions(probe: Probe, best: float) -> Iterator[Explanation]:

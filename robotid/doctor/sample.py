@@ -199,7 +199,7 @@ def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Traj
         SettingsError: If a setting does not fit the log.
     """
     free = np.array([joint.turns_freely for joint in model.limits])
-    log = unwrap(replace(log, v=None, a=None), free)
+    log = unwrap(log, free)
     own = replace(settings, velocity="differentiated", acceleration="differentiated")
     return process(log, resolve(log, own), friction_speeds(model.layout))
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robotid._typing import Array
-from robotid.doctor.hypotheses import Explanation, explanations
+from robotid.doctor.hypotheses import HINT, Explanation, explanations
 from robotid.doctor.loads import NO_GRAVITY, check_loads, counterbalance, holds_gravity
 from robotid.doctor.mounted import check_unmounted_parts
 from robotid.doctor.sample import Probe
@@ -22,7 +22,6 @@ _MUCH_BETTER = 12.0  # ratio of unexplained shares from which the other sign is 
 _NOISE = 3e-3  # share of a torque's variance that is negligible
 _TILT = 5.0  # [deg] angle of gravity from the stated one that is a warning
 _WRONG_TILT = 30.0  # [deg] ... and an error
-_HINT = 0.7  # gain from which a tilt is reported
 _STILL = 1e-3  # [rad, m] range of a joint at rest, as of the finding "static_joint"
 _UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported
 
@@ -179,7 +178,7 @@ def _gravity(reading: _Reading) -> Iterator[Finding]:
     cosine = float(g @ believed) / (float(np.linalg.norm(g)) * size) if size > 0 else 0.0
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
     is_wrong = angle > _WRONG_TILT and reading.is_certain
-    if not is_wrong and (angle < _TILT or gain < _HINT):
+    if not is_wrong and (angle < _TILT or gain < HINT):
         return
     shown, stated = (", ".join(f"{x:.2f}" for x in vector) for vector in (g, believed))
     message = (

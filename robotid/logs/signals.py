@@ -131,6 +131,8 @@ def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> 
     if len(trajectory.t) == 0:
         raise too_short(log.path or "log", len(segments), settings)
     numbers = np.unique(trajectory.segment, return_inverse=True)[1]
+    if np.array_equal(numbers, trajectory.segment):
+        return trajectory
     return replace(trajectory, segment=numbers)
 
 

@@ -5,6 +5,7 @@ A part is resampled and filtered together with neighbouring rows, which are remo
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -25,6 +26,8 @@ _SETTLED = 42.0  # [time constants] after which a filter's transient is negligib
 _LONGEST = 8.0  # [periods of the filter] longest time of stiction
 _FINEST = 1000  # largest number of points of the uniform grid per row of the log
 _ALL = slice(None)
+_KEPT = 20_000  # rows of a log up to which its motions are kept as long as the log
+_KNOWN: WeakKeyDictionary[Log, dict[object, Trajectory]] = WeakKeyDictionary()
 _SPREAD = 1.0  # [periods of the filter] by which it spreads a force
 
 
@@ -72,9 +75,27 @@ def process_segments(
         segments. Its directions are those of Coulomb friction after the filter of the torque; None
         without speeds, and if they are the signs of the speeds.
     """
-    n, base = len(log.joints), 0 if log.base is None else 6
     is_sharp = settings.cutoff is None and settings.friction_band == 0
-    ratios = np.empty((0, n)) if speeds is None or is_sharp else speeds
+    ratios = np.empty((0, len(log.joints))) if speeds is None or is_sharp else speeds
+    if len(log.t) > _KEPT or first or own.indices(len(log.t)) != (0, len(log.t), 1):
+        return _process(log, segments, settings, first, own, ratios)
+    known = _KNOWN.setdefault(log, {})
+    key = settings, tuple(segments), ratios.shape, ratios.tobytes()
+    if key not in known:
+        known[key] = _process(log, segments, settings, first, own, ratios)
+    return known[key].at(slice(None))  # with a cache of its own
+
+
+def _process(
+    log: Log,
+    segments: Sequence[Segment],
+    settings: SignalSettings,
+    first: int,
+    own: slice,
+    ratios: Array,
+) -> Trajectory:
+    """Return the motion as of ``process_segments``, for the speeds of Coulomb friction."""
+    n, base = len(log.joints), 0 if log.base is None else 6
     parts, counts = [], []
     for segment in segments:
         rows = slice(max(segment.first - first, 0), min(segment.stop - first, len(log.t)))

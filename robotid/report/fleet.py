@@ -1,7 +1,9 @@
 """The page of a fleet: verdicts, failures, units that differ, distribution of each parameter."""
 
+from collections import Counter
 from collections.abc import Mapping
 from html import escape
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -12,8 +14,8 @@ from robotid.pages.html import code, facts_html, number, page, table, text, with
 __all__ = ["fleet_page"]
 
 _BINS = 24  # of a distribution, at most
-_CHARTS = 40  # distributions on the page, those with the largest spread
-_ROWS = 500  # failures on the page; all are in the table of results
+_CHARTS = 12  # distributions on the page, those with the largest spread
+_ROWS = 20  # failures on the page, and units that differ; all are in the files of results
 
 
 def fleet_page(content: Mapping[str, Any]) -> str:
@@ -41,16 +43,39 @@ def fleet_page(content: Mapping[str, Any]) -> str:
 
 
 def _failures(content: Mapping[str, Any]) -> str:
+    """Return the failures, the first of each kind first."""
     failures = content["failures"]
     if not failures:
         return "<p>None.</p>\n"
+    kinds = [_kind(each) for each in failures]
+    count, first = Counter(kinds), {kind: k for k, kind in reversed([*enumerate(kinds)])}
+    order = sorted(range(len(kinds)), key=lambda k: (first[kinds[k]] != k, k))
     rows = [
-        [code(each["unit"]), code(each["log"] or "all"), text(each["error"])]
-        for each in failures[:_ROWS]
+        [
+            code(failures[k]["unit"]),
+            code(failures[k]["log"] or "all"),
+            number(count[kinds[k]], "d"),
+            text(failures[k]["error"]),
+        ]
+        for k in order[:_ROWS]
     ]
-    more = len(failures) - len(rows)
-    note = f"<p>{more} more are in <code>fleet.parquet</code>.</p>\n" if more else ""
-    return table("Units and logs that were not identified", ["unit", "log", "error"], rows) + note
+    headers = ["unit", "log", "alike", "error"]
+    shown = table("Units and logs that were not identified", headers, rows)
+    return shown + _more(len(failures), "fleet.parquet")
+
+
+def _kind(failure: Mapping[str, str]) -> str:
+    """Return the error without the names of its unit and log."""
+    kind = failure["error"]
+    for name in (failure["log"], PurePath(failure["log"]).name, failure["unit"]):
+        kind = kind.replace(name, "") if name else kind
+    return kind
+
+
+def _more(count: int, file: str) -> str:
+    """Return a note on the rows that are not shown."""
+    more = count - _ROWS
+    return f"<p>{more} more are in <code>{file}</code>.</p>\n" if more > 0 else ""
 
 
 def _unlike(content: Mapping[str, Any]) -> str:
@@ -62,7 +87,7 @@ def _unlike(content: Mapping[str, Any]) -> str:
             *(with_error(x, each["std_error"])[0] for x in each["others"]),
             text(each["parameter_unit"]),
         ]
-        for each in content["unlike"]
+        for each in content["unlike"][:_ROWS]
     ]
     if not rows:
         return "<p>None.</p>\n"
@@ -72,6 +97,7 @@ def _unlike(content: Mapping[str, Any]) -> str:
         "fleet of alike units has one with a probability of about 2 %. Look for a payload, a "
         "changed gain, wear or a wrong URDF.</p>\n"
         + table("Units that differ from the others", headers, rows, is_data=True)
+        + _more(len(content["unlike"]), "fleet.json")
     )
 
 

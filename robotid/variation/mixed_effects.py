@@ -14,24 +14,29 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-import scipy.optimize
 import scipy.special
 
 from robotid._typing import Array
+from robotid.variation.restricted_likelihood import (
+    GRID,
+    Grid,
+    by_unit,
+    evidence,
+    integrated,
+    most_probable,
+    on_grid,
+    prior_of,
+)
 
-__all__ = ["UNKNOWN", "MixedEffects", "Prediction", "Runs"]
+__all__ = ["Compared", "MixedEffects", "Prediction", "Runs", "covariance_of"]
 
-#: Standard deviation of a parameter before the data, in plausible sizes.
-UNKNOWN = 100.0
-
-_FREEDOM = 4.0  # degrees of freedom of the half Student prior of a standard deviation
-_LEAST, _MOST = -6.0, 5.0  # logarithm of the standard deviations over their plausible size
-_GRID = np.linspace(_LEAST, _MOST, 45)
-_FIRST = -1.0  # the same at the start of the search
-_NEAR = 2.0  # ... and largest distance of a stated start: the gradient is small beyond
-_STEP = 1e-5  # of the numerical gradient
+_FIRST = -1.0  # logarithm of the standard deviations over their plausible size, at the start
+_NEAR = 2.0  # ... and largest distance of a stated start: the slope is small beyond
 _TAIL = 0.025  # probability beyond each end of an interval
-_WIDEST = 40.0  # standard deviations that contain every end
+_ENDS = np.array([_TAIL, 1.0 - _TAIL])
+_ELEMENTS = 1_000_000  # of an array that compares runs, at most
+_HALVINGS = 200  # of the range of a quantile, at most
+_CLOSE = 1e-15  # change of a quantile that rounding decides
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +130,24 @@ class Prediction:
         Returns:
             The quantiles, shape (k,).
         """
-        wanted = scipy.special.ndtr(scores)
-        return np.array([_mixture_quantile(p, *self.mixture) for p in wanted])
+        return _mixture_quantiles(scipy.special.ndtr(scores), *self.mixture)
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Runs, or units, each compared with the prediction of all others.
+
+    Attributes:
+        values: Their own parameters, shape (m, q).
+        covariance: Covariance of these, shape (m, q, q).
+        mean: Mean of the others, shape (m, q).
+        probability: Two-sided probability of such a deviation, shape (m, q).
+    """
+
+    values: Array
+    covariance: Array
+    mean: Array
+    probability: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,11 +157,6 @@ class MixedEffects:
     Attributes:
         runs: The runs.
         first: Deviations at the start of their search, shape (levels or more, q); None: typical.
-
-    References:
-        Patterson, Thompson (1971), Recovery of inter-block information when block sizes are
-        unequal (restricted likelihood). Gelman (2006), Prior distributions for variance parameters
-        in hierarchical models, section 2.2 (half Student prior).
     """
 
     runs: Runs
@@ -151,24 +167,20 @@ class MixedEffects:
         """2 if there are several units, 1 otherwise."""
         return 2 if self.runs.unit.max() > 0 else 1
 
+    @property
+    def n_members(self) -> int:
+        """Number of units if there are several, of runs otherwise."""
+        return int(self.runs.unit.max()) + 1 if self.n_levels == 2 else len(self.runs.h)
+
     @cached_property
     def deviation(self) -> Array:
         """Most probable standard deviations, shape (levels, q): between runs, between units."""
-        size = self.n_levels * len(self.runs.scale)
-
-        def objective(z: Array) -> tuple[float, Array]:
-            tried = np.concatenate([z[None], z + _STEP * np.eye(size)])
-            values = _log_prior(tried).sum(axis=1) + self._likelihood(self._deviation(tried))[0]
-            return -values[0], -(values[1:] - values[0]) / _STEP
-
-        first, bounds = np.full(size, _FIRST), [(_LEAST, _MOST)] * size
+        first = np.full((self.n_levels, len(self.runs.scale)), _FIRST)
         if self.first is not None:
-            first = np.log(self.first[: self.n_levels] / self.runs.scale).ravel()
+            first = np.log(self.first[: self.n_levels] / self.runs.scale)
             first = np.clip(first, _FIRST - _NEAR, _FIRST + _NEAR)
-        found = scipy.optimize.minimize(
-            objective, first, jac=True, method="L-BFGS-B", bounds=bounds
-        )
-        return self._deviation(found.x)
+        found = most_probable(*self._members, self.runs.scale, first[:, :, None])
+        return found[:, :, 0]
 
     @cached_property
     def values(self) -> tuple[Array, Array]:
@@ -178,31 +190,16 @@ class MixedEffects:
         their information (best linear unbiased prediction).
         """
         runs, deviation = self.runs, self.deviation
-        _, mean, covariance = self._likelihood(deviation)
-        W, w, U, _ = _integrated(runs.H, runs.h, deviation[0])
-        centre, around = np.tile(mean, (len(runs.h), 1)), covariance
+        found = evidence(*self._members, runs.scale, deviation[:, :, None] ** 2)
+        centre, around = np.tile(found.mean[0], (len(runs.h), 1)), found.covariance[0]
         if self.n_levels == 2:
-            W, w = self._by_unit(W, w)
-            between = _integrated(W, w, deviation[1])[2]
-            means, around = _predicted(between, W, w, centre[: len(w)], covariance)
+            W, w, _ = integrated(*self._members[:2], deviation[0][:, None] ** 2)
+            W, w = by_unit(W, w, runs.unit)
+            W, w = np.moveaxis(W[:, :, 0], -1, 0), w[:, 0].T
+            means, around = _predicted(deviation[1], W, w, centre[: len(w)], around)
             centre, around = means[runs.unit], around[runs.unit]
-        values, errors = _predicted(U, runs.H, runs.h, centre, around)
+        values, errors = _predicted(deviation[0], runs.H, runs.h, centre, around)
         return values, np.sqrt(np.einsum("kpp->kp", errors))
-
-    def estimate_unit(self, runs: Runs) -> tuple[Array, Array]:
-        """Return the mean of another unit from its runs alone, and its covariance.
-
-        Its runs vary as those of these units.
-
-        Args:
-            runs: The runs of the other unit.
-
-        Returns:
-            Shapes (q,) and (q, q).
-        """
-        W, w, _, _ = _integrated(runs.H, runs.h, self.deviation[0])
-        covariance = np.linalg.inv(W.sum(axis=0) + np.diag((UNKNOWN * runs.scale) ** -2.0))
-        return covariance @ w.sum(axis=0), covariance
 
     def predict(
         self, own: Array | None = None, value: Array | None = None, *, is_unit: bool = False
@@ -217,29 +214,25 @@ class MixedEffects:
             value: Estimates of the new run, whose probability is computed, shape (q,); or None.
             is_unit: Whether the mean of a new unit is predicted, without a deviation of its run.
         """
-        q, levels = len(self.runs.scale), slice(1 if is_unit else 0, None)
+        q = len(self.runs.scale)
         own = np.zeros(q) if own is None else own
         found = []
         for p in range(q):
-            tried, log_density, centres, variance, _ = self._on_grid(p)
-            weight = _weight(log_density)
-            mean, error = _moments(weight, centres, variance)
-            between = (tried[:, levels, p] ** 2).sum(axis=1) + own[p]
-            std = np.sqrt(variance + between)
-            probability = 1.0
-            if value is not None:
-                below = _mixture(value[p], weight, centres, std)
-                probability = 2.0 * min(below, _mixture(-value[p], weight, -centres, std))
+            grid = self._on_grid(p)
+            weight = _weight(grid.log_density[0])
+            mean, error = _moments(weight, grid.mean[0], grid.variance[0])
+            levels = slice(1 if is_unit else 0, -1)
+            between = grid.deviation**2 + (self.deviation[levels, p] ** 2).sum() + own[p]
+            mixture = np.array([weight, grid.mean[0], np.sqrt(grid.variance[0] + between)])
+            probability = 1.0 if value is None else float(_beyond(value[p], *mixture))
             wanted = (_TAIL, 0.5, 1.0 - _TAIL)
             low, median, high = self.runs.scale[p] * np.exp(
-                np.interp(wanted, weight.cumsum() - 0.5 * weight, _GRID)
+                np.interp(wanted, weight.cumsum() - 0.5 * weight, GRID)
             )
-            ends = _mixture_ends(weight, centres, std)
-            spread_ends = np.array([low, high])
+            ends = _mixture_quantiles(_ENDS, *mixture)
             found.append(
                 Prediction(
-                    mean, error, median, spread_ends, ends, min(probability, 1.0),
-                    np.array([weight, centres, std]),
+                    mean, error, median, np.array([low, high]), ends, probability, mixture
                 )
             )  # fmt: skip
         return tuple(found)
@@ -254,138 +247,161 @@ class MixedEffects:
         """
         found = []
         for p, each in enumerate(self.predict()):
-            tried, log_density, centres, variance, alone = self._on_grid(p)
-            total = alone + variance  # of the estimate of a new member about the mean
-            expected = float(np.interp(each.spread, tried[:, -1, p], total))
-            weight = _weight(log_density - 0.5 * (np.log(total) + expected / total))
+            grid = self._on_grid(p)
+            variance = grid.variance[0]
+            total = grid.alone[0] + variance  # of the estimate of a new member about the mean
+            expected = float(np.interp(each.spread, grid.deviation, total))
+            weight = _weight(grid.log_density[0] - 0.5 * (np.log(total) + expected / total))
             more = variance * self.n_members / (self.n_members + 1.0)
-            _, error = _moments(weight, centres, more)
-            std = np.sqrt(more + (tried[:, :, p] ** 2).sum(axis=1))
-            width = float(np.ptp(_mixture_ends(weight, centres, std)))
+            _, error = _moments(weight, grid.mean[0], more)
+            lower = (self.deviation[:-1, p] ** 2).sum()
+            std = np.sqrt(more + grid.deviation**2 + lower)
+            width = float(np.ptp(_mixture_quantiles(_ENDS, weight, grid.mean[0], std)))
             found.append(replace(each, after=(error, width)))
         return tuple(found)
 
-    @property
-    def n_members(self) -> int:
-        """Number of units if there are several, of runs otherwise."""
-        return int(self.runs.unit.max()) + 1 if self.n_levels == 2 else len(self.runs.h)
+    def against_others(self, which: Array, *, is_unit: bool) -> Compared:
+        """Compare runs, or units, each with the prediction of all others.
 
-    def _on_grid(self, p: int) -> tuple[Array, Array, Array, Array, Array]:
-        """Return the model for standard deviations of parameter p at the highest level.
-
-        Returns:
-            Standard deviations (g, levels, q); logarithm of their density, mean of the parameter,
-            variance of the mean, and variance of the estimate of a typical member about its mean,
-            each of shape (g,).
+        Args:
+            which: Indices of the runs or units, shape (m,), int, at least one.
+            is_unit: Whether they are units.
         """
-        tried = np.repeat(self.deviation[None], len(_GRID), axis=0)
-        tried[:, -1, p] = self.runs.scale[p] * np.exp(_GRID)
-        log_likelihood, means, covariances = self._likelihood(tried)
-        prior = np.diag((UNKNOWN * self.runs.scale) ** -2.0)
-        members = (np.linalg.inv(covariances) - prior) / self.n_members
-        alone = np.linalg.inv(members + prior)[:, p, p]
-        log_density = log_likelihood + _log_prior(_GRID)
-        return tried, log_density, means[:, p], covariances[:, p, p], alone
-
-    def _deviation(self, z: Array) -> Array:
-        """Return standard deviations, shape (..., levels, q), from logarithms over the scale."""
-        deviation: Array = self.runs.scale * np.exp(z.reshape(*z.shape[:-1], self.n_levels, -1))
-        return deviation
-
-    def _likelihood(self, deviation: Array) -> tuple[Array, Array, Array]:
-        """Return the log restricted likelihood (...,), mean (..., q) and its covariance."""
-        W, w, _, total = _integrated(self.runs.H, self.runs.h, deviation[..., 0, :])
-        if self.n_levels == 2:
-            W, w = self._by_unit(W, w)
-            W, w, _, more = _integrated(W, w, deviation[..., 1, :])
-            total = total + more
-        information = W.sum(axis=-3) + np.diag((UNKNOWN * self.runs.scale) ** -2.0)
-        score, covariance = w.sum(axis=-2), np.linalg.inv(information)
-        mean = np.einsum("...pi,...i->...p", covariance, score)
-        quadratic = np.einsum("...p,...p->...", score, mean)
-        return total + 0.5 * (quadratic - np.linalg.slogdet(information)[1]), mean, covariance
-
-    def _by_unit(self, W: Array, w: Array) -> tuple[Array, Array]:
-        """Return the sums of the information W and W x over the runs of each unit."""
         unit = self.runs.unit
-        member = 1.0 * (np.arange(unit.max() + 1)[:, None] == unit)
-        return np.einsum("uk,...kij->...uij", member, W), np.einsum("uk,...ki->...ui", member, w)
+        found: list[tuple[Array, tuple[Array, ...]]] = []
+        own = which[:, None] == (unit if is_unit else np.arange(len(unit)))  # (m, k)
+        several = np.array([len(np.unique(unit[~each])) > 1 for each in own])
+        most = max(1, _ELEMENTS // (len(GRID) * len(unit)))
+        for levels in (1, 2):
+            left = np.flatnonzero(several == (levels == 2))
+            for some in np.split(left, range(most, len(left), most)) if len(left) else ():
+                found.append((some, self._compared(own[some], levels, is_unit=is_unit)))
+        order = np.argsort(np.concatenate([some for some, _ in found]))
+        parts = zip(*(part for _, part in found), strict=True)
+        return Compared(*(np.concatenate(each)[order] for each in parts))
+
+    def _compared(
+        self, own: Array, levels: int, *, is_unit: bool
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return the arrays of ``Compared`` for b runs or units.
+
+        Args:
+            own: Whether a run is left out, shape (b, k).
+            levels: Levels of the model of the others.
+            is_unit: Whether they are units.
+        """
+        scale, (H, h, _) = self.runs.scale, self._members
+        unit = self.runs.unit if levels == 2 else None
+        rest = H * ~own, h * ~own, unit
+        first = np.log(self.deviation[:levels] / scale)
+        first = np.clip(first, _FIRST - _NEAR, _FIRST + _NEAR)[:, :, None]
+        first = np.repeat(first, len(own), axis=2)
+        deviation = most_probable(*rest, scale, first)
+        W, w = H * own, h * own
+        if is_unit:
+            W, w, _ = integrated(W, w, deviation[0] ** 2)
+        covariance = covariance_of(np.moveaxis(W.sum(axis=-1), -1, 0), scale)
+        x = np.einsum("bpi,ib->bp", covariance, w.sum(axis=-1))
+        mean, probability = np.empty(x.shape), np.empty(x.shape)
+        for p in range(len(scale)):
+            grid = on_grid(*rest, scale, deviation, p, 1)
+            weight = _weight(grid.log_density)
+            mean[:, p] = (weight * grid.mean).sum(axis=-1)
+            variance = grid.variance + grid.deviation**2 + covariance[:, p, p, None]
+            if levels == 2 and not is_unit:
+                variance = variance + deviation[0, p][:, None] ** 2
+            probability[:, p] = _beyond(x[:, p], weight, grid.mean, np.sqrt(variance))
+        return x, covariance, mean, probability
+
+    @cached_property
+    def _members(self) -> tuple[Array, Array, Array | None]:
+        """Runs as in ``evidence``, one model."""
+        H, h = np.moveaxis(self.runs.H, 0, -1)[:, :, None], self.runs.h.T[:, None]
+        return H, h, self.runs.unit if self.n_levels == 2 else None
+
+    def _on_grid(self, p: int) -> Grid:
+        """Return the model for standard deviations of parameter p at the highest level."""
+        deviation = self.deviation[:, :, None]
+        return on_grid(*self._members, self.runs.scale, deviation, p, self.n_members)
 
 
-def _integrated(H: Array, h: Array, deviation: Array) -> tuple[Array, Array, Array, Array]:
-    """Integrate the deviations of one level out of its members' information.
-
-    W = (H^-1 + D)^-1 = H - H U H = S^-1 G^-1 S H with U = S G^-1 S, G = I + S H S and D = S^2.
+def covariance_of(H: Array, scale: Array) -> Array:
+    """Return the covariance of parameters from their information, with almost no prior.
 
     Args:
-        H: Information of the members, shape (..., k, q, q).
-        h: Information times estimate, shape (..., k, q).
-        deviation: Standard deviations S, shape (..., q).
-
-    Returns:
-        W (..., k, q, q), W x (..., k, q), U (..., k, q, q) with the deviation U (h - H mu), and the
-        logarithm of the likelihood, shape (...,), without the part that depends on the mean.
+        H: Information, shape (..., q, q).
+        scale: Plausible standard deviation of each parameter, shape (q,).
     """
-    S = deviation[..., None, :]
-    G = np.eye(S.shape[-1]) + S[..., :, None] * H * S[..., None, :]
-    inverse = np.linalg.inv(G)
-    U = S[..., :, None] * inverse * S[..., None, :]
-    # 1 - H U = S^-1 G^-1 S: the difference itself would be rounding where H is large
-    left = inverse / S[..., :, None] * S[..., None, :]
-    W = left @ H
-    quadratic = np.einsum("...ki,...kij,...kj->...", h, U, h, optimize=True)
-    log_det = np.linalg.slogdet(G)[1].sum(axis=-1)
-    w = np.einsum("...pi,...i->...p", left, h)
-    return 0.5 * (W + np.swapaxes(W, -1, -2)), w, U, 0.5 * (quadratic - log_det)
+    covariance: Array = np.linalg.inv(H + np.diag(prior_of(scale)))
+    return covariance
 
 
 def _predicted(
-    U: Array, H: Array, h: Array, centre: Array, covariance: Array
+    deviation: Array, H: Array, h: Array, centre: Array, covariance: Array
 ) -> tuple[Array, Array]:
     """Return the values of the members of a level, shape (k, q), and their errors' covariance.
 
+    The deviation of a member is U (h - H centre) with U = (H + D^-1)^-1.
+
     Args:
-        U: As of ``_integrated``, shape (k, q, q).
+        deviation: Standard deviations of the level, shape (q,).
         H: Information of the members, shape (k, q, q).
         h: Information times estimate, shape (k, q).
         centre: Mean of each member before its own information, shape (k, q).
         covariance: Its covariance, shape (k, q, q) or (q, q).
     """
+    U = _posterior(H, deviation)
     left = np.eye(h.shape[1]) - U @ H
     values = centre + np.einsum("kpi,ki->kp", U, h - np.einsum("kpi,ki->kp", H, centre))
     return values, U + left @ covariance @ np.swapaxes(left, 1, 2)
 
 
-def _log_prior(z: Array) -> Array:
-    """Return the log density of z = log(deviation / scale), half Student's distribution."""
-    log_density: Array = z - 0.5 * (_FREEDOM + 1.0) * np.log1p(np.exp(2.0 * z) / _FREEDOM)
-    return log_density
+def _posterior(H: Array, S: Array) -> Array:
+    """Return (H + S^-2)^-1 = S (1 + S H S)^-1 S, shape (k, q, q)."""
+    U: Array = S[:, None] * np.linalg.inv(np.eye(len(S)) + S[:, None] * H * S) * S
+    return U
 
 
-def _mixture(x: float, weight: Array, means: Array, std: Array) -> float:
-    """Return the probability of values below x in a mixture of normal distributions."""
-    return float(weight @ scipy.special.ndtr((x - means) / std))
+def _beyond(x: Array, weight: Array, means: Array, std: Array) -> Array:
+    """Return the two-sided probability of values as far out as x in mixtures of normals, (...)."""
+    z = (x[..., None] - means) / std
+    tails = [(weight * scipy.special.ndtr(side)).sum(axis=-1) for side in (z, -z)]
+    beyond: Array = np.minimum(2.0 * np.minimum(*tails), 1.0)
+    return beyond
 
 
-def _mixture_quantile(probability: float, weight: Array, means: Array, std: Array) -> float:
-    """Return the value with a probability of smaller values in a mixture of normals."""
-    middle, widest = float(weight @ means), _WIDEST * float(std.max())
-    found: float = scipy.optimize.brentq(
-        lambda x: _mixture(x, weight, means, std) - probability, middle - widest, middle + widest
-    )
-    return found
+def _mixture_quantiles(wanted: Array, weight: Array, means: Array, std: Array) -> Array:
+    """Return the values with given probabilities of smaller values in a mixture of normals.
 
+    Newton's method within the quantiles of the normal distributions, halved where it leaves them.
 
-def _mixture_ends(weight: Array, means: Array, std: Array) -> Array:
-    """Return the ends of the 95 % interval of a mixture of normal distributions, shape (2,)."""
-    ends = [_mixture_quantile(p, weight, means, std) for p in (_TAIL, 1.0 - _TAIL)]
-    return np.array(ends)
+    Args:
+        wanted: The probabilities, shape (n,).
+        weight: Weights of the normal distributions, shape (g,).
+        means: Their means, shape (g,).
+        std: Their standard deviations, shape (g,).
+    """
+    each = means + std * scipy.special.ndtri(wanted)[:, None]  # (n, g)
+    low, high = each.min(axis=1), each.max(axis=1)
+    x = np.clip(each @ weight, low, high)
+    for _ in range(_HALVINGS):
+        z = (x[:, None] - means) / std
+        off = scipy.special.ndtr(z) @ weight - wanted
+        density = np.exp(-0.5 * z**2) @ (weight / std) / math.sqrt(2.0 * math.pi)
+        low, high = np.where(off <= 0.0, x, low), np.where(off >= 0.0, x, high)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            tried = x - off / density
+        tried = np.where((tried > low) & (tried < high), tried, 0.5 * (low + high))
+        if np.all(np.abs(tried - x) <= _CLOSE * (high - low + np.abs(x))):
+            break
+        x = tried
+    return np.asarray(tried)
 
 
 def _weight(log_density: Array) -> Array:
-    """Return weights that sum to 1, shape (g,), from the logarithm of a density."""
-    weight = np.exp(log_density - log_density.max())
-    normed: Array = weight / weight.sum()
+    """Return weights that sum to 1, shape (..., g), from the logarithm of a density."""
+    weight = np.exp(log_density - log_density.max(axis=-1, keepdims=True))
+    normed: Array = weight / weight.sum(axis=-1, keepdims=True)
     return normed
 
 

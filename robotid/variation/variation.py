@@ -9,7 +9,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.variation.groups import FEWEST_RUNS, RunsOf
-from robotid.variation.mixed_effects import UNKNOWN, MixedEffects, Prediction
+from robotid.variation.mixed_effects import MixedEffects, Prediction, covariance_of
 
 __all__ = [
     "SCORES",
@@ -179,19 +179,14 @@ def vary(
     pairs = list(zip(groups, models, strict=True))
     unit = groups[0].runs.unit
     n_units = int(unit.max()) + 1
-    compared_units = range(n_units if n_units > FEWEST_RUNS else 0)
-    compared_runs = range(len(names) if len(names) > FEWEST_RUNS else 0)
+    compared_units = np.arange(n_units if n_units > FEWEST_RUNS else 0)
+    compared_runs = np.arange(len(names) if len(names) > FEWEST_RUNS else 0)
     size = sum(group.runs.h.shape[1] for group in groups)
     n_tests = size * (len(compared_units) + len(compared_runs))
-    unlike_units = [
-        found for u in compared_units if (found := _unlike(pairs, u, n_tests, is_unit=True))
-    ]
-    different = {each.run for each in unlike_units}
-    unlike = [
-        found
-        for run in compared_runs
-        if unit[run] not in different and (found := _unlike(pairs, run, n_tests, is_unit=False))
-    ]
+    unlike_units = _unlike(pairs, compared_units, n_tests, is_unit=True)
+    different = [each.run for each in unlike_units]
+    alike = compared_runs[~np.isin(unit[: len(compared_runs)], different)]
+    unlike = _unlike(pairs, alike, n_tests, is_unit=False)
     return Variation(
         tuple(names), n_units, tuple(parameters), tuple(unlike),
         tuple(units) or tuple(map(str, range(n_units))), tuple(unlike_units), tuple(unit.tolist()),
@@ -249,12 +244,6 @@ def shrunk_correlation(values: Array) -> Array:
     return np.where(off, (1.0 - share) * r, 1.0)
 
 
-def _covariance(H: Array, scale: Array) -> Array:
-    """Return the covariance of parameters (q, q) of their information, and almost no prior."""
-    covariance: Array = np.linalg.inv(H + np.diag((UNKNOWN * scale) ** -2.0))
-    return covariance
-
-
 def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter]:
     """Yield the parameters of a group on which the runs have information."""
     values, errors = model.values
@@ -273,53 +262,53 @@ def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter
 
 
 def _unlike(
-    pairs: Sequence[tuple[RunsOf, MixedEffects]], at: int, n_tests: int, *, is_unit: bool
-) -> UnlikeRun | None:
-    """Return how a run or a unit differs from the others; None if it does not."""
-    found = [
-        each
-        for group, every in pairs
-        for each in _compared(group, every, at, n_tests, is_unit=is_unit)
-    ]
-    return max(found, key=lambda each: each[0])[1] if found else None
+    pairs: Sequence[tuple[RunsOf, MixedEffects]], which: Array, n_tests: int, *, is_unit: bool
+) -> list[UnlikeRun]:
+    """Return the runs or units that differ from the others, in order, one cause for each."""
+    causes: dict[int, list[tuple[float, UnlikeRun]]] = {}
+    for group, every in pairs:
+        for explained, found in _compared(group, every, which, n_tests, is_unit=is_unit):
+            causes.setdefault(found.run, []).append((explained, found))
+    return [max(causes[at], key=lambda each: each[0])[1] for at in sorted(causes)]
 
 
 def _compared(
-    group: RunsOf, every: MixedEffects, at: int, n_tests: int, *, is_unit: bool
+    group: RunsOf, every: MixedEffects, which: Array, n_tests: int, *, is_unit: bool
 ) -> Iterator[tuple[float, UnlikeRun]]:
-    """Yield the difference of a run or unit from the others, if any, and what it explains.
+    """Yield each difference of a run or unit from the others, and what it explains.
 
     A payload is compared only if the run determines it: a run in which the last joints are at rest
     has a large moment and a wrong mass in place of any other effect.
     """
-    runs = group.runs
-    if is_unit:
-        others, own = MixedEffects(runs.without_unit(at), every.deviation), runs.of_unit(at)
-        x, covariance = others.estimate_unit(own)
-        information = own.H.sum(axis=0)
-    else:
-        others, information = MixedEffects(runs.without(at), every.deviation), runs.H[at]
-        covariance = _covariance(information, runs.scale)
-        x = covariance @ runs.h[at]
-    variance = np.diag(covariance)
-    if group.group.kind == "payload":
+    runs, kind = group.runs, group.group.kind
+    information = np.array(
+        [runs.of_unit(u).H.sum(axis=0) for u in which] if is_unit else runs.H[which]
+    ).reshape(len(which), *runs.H.shape[1:])
+    if kind == "payload":
         alone, together = (
-            np.diag(_covariance(H, runs.scale)) for H in (information, runs.H.sum(axis=0))
+            np.diagonal(covariance_of(H, runs.scale), axis1=-2, axis2=-1)
+            for H in (information, runs.H.sum(axis=0))
         )
         plausible = runs.scale**2  # what all runs do not determine, no motion does
-        if np.any((alone > plausible) & (together <= plausible)):
-            return
-    expected = others.predict(variance, x, is_unit=is_unit)
-    p = int(np.argmin([each.probability for each in expected]))
-    if expected[p].probability * n_tests >= _FALSE_ALARMS:
+        is_determined = ~np.any((alone > plausible) & (together <= plausible), axis=1)
+        which, information = which[is_determined], information[is_determined]
+    if not len(which):
         return
-    differs = x - np.array([each.mean for each in expected])
-    explained = group.inflation * float(differs @ information @ differs)
-    centre = float(group.centre[p])
-    if group.group.kind == "payload":  # relative to the other runs
-        centre = -expected[p].mean
-    yield explained, UnlikeRun(
-        at, group.group.kind, group.group.name, group.group.parameters[p], group.group.units[p],
-        centre + float(x[p]), float(np.sqrt(variance[p])), centre + expected[p].ends,
-        expected[p].probability,
-    )  # fmt: skip
+    found = every.against_others(which, is_unit=is_unit)
+    for k in np.flatnonzero(found.probability.min(axis=1) * n_tests < _FALSE_ALARMS):
+        at, x, p = int(which[k]), found.values[k], int(np.argmin(found.probability[k]))
+        others = MixedEffects(
+            runs.without_unit(at) if is_unit else runs.without(at), every.deviation
+        )
+        variance = np.diag(found.covariance[k])
+        ends = others.predict(variance, x, is_unit=is_unit)[p].ends
+        differs = x - found.mean[k]
+        explained = group.inflation * float(differs @ information[k] @ differs)
+        centre = float(group.centre[p])
+        if kind == "payload":  # relative to the other runs
+            centre = -float(found.mean[k, p])
+        yield explained, UnlikeRun(
+            at, kind, group.group.name, group.group.parameters[p], group.group.units[p],
+            centre + float(x[p]), float(np.sqrt(variance[p])), centre + ends,
+            float(found.probability[k, p]),
+        )  # fmt: skip

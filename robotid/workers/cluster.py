@@ -2,6 +2,7 @@
 
 import logging
 import socket
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ from uuid import uuid4
 
 from robotid.exceptions import MissingDependencyError, WorkerError
 from robotid.versions import __version__, code_versions
-from robotid.workers.pieces import Outcome, Work, Workload, run_task
+from robotid.workers.pieces import Lost, Outcome, Work, Workload, run_task
 from robotid.workers.processes import Backend, named
 
 if TYPE_CHECKING:
@@ -41,12 +42,14 @@ class ClusterBackend(Backend):
     def description(self) -> str:
         return f"the Dask cluster {self.address}, one BLAS thread per piece"
 
-    def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
+    def run(
+        self, work: Work, pieces: Sequence[tuple[int, Workload]], lost: Lost | None = None
+    ) -> Iterator[tuple[int, Any]]:
         try:
             if self._client is None:
                 self._client = self._connect()
                 _require_same_version(self.address, self._client)
-            yield from self._collect(self._client, work, pieces)
+            yield from self._collect(self._client, work, pieces, lost)
         except BaseException:
             self.close()
             raise
@@ -79,24 +82,34 @@ class ClusterBackend(Backend):
         return client
 
     def _collect(
-        self, client: "Client", work: Work, pieces: Sequence[tuple[int, Workload]]
+        self,
+        client: "Client",
+        work: Work,
+        pieces: Sequence[tuple[int, Workload]],
+        lost: Lost | None,
     ) -> Iterator[tuple[int, Any]]:
         from distributed import CancelledError, KilledWorker, as_completed
 
         waiting, level = iter(pieces), _log.getEffectiveLevel()
         run = uuid4().hex
         running: dict[object, tuple[int, Workload, Future[Any]]] = {}
+        suspects, again = set[int](), deque[tuple[int, Workload]]()
         results = as_completed(loop=client.loop)
+
+        def submit(index: int, piece: Workload) -> None:
+            key = f"robotid-{run}-{index}" + "-alone" * (index in suspects)
+            future = client.submit(_run, work, piece, level, __version__, key=key, pure=False)
+            running[future.key] = index, piece, future
+            results.add(future)
+
         try:
             while True:
                 most = 2 * max(1, sum(client.nthreads().values()))
-                for index, piece in islice(waiting, max(0, most - len(running))):
-                    key = f"robotid-{run}-{index}"
-                    future = client.submit(
-                        _run, work, piece, level, __version__, key=key, pure=False
-                    )
-                    running[future.key] = index, piece, future
-                    results.add(future)
+                is_alone = bool(again) or any(own[0] in suspects for own in running.values())
+                if again and not running:
+                    submit(*again.popleft())
+                for index, piece in islice(waiting, 0 if is_alone else max(0, most - len(running))):
+                    submit(index, piece)
                 if not running:
                     return
                 future = next(results)
@@ -105,10 +118,20 @@ class ClusterBackend(Backend):
                     with named(piece):
                         outcome: Outcome = future.result()
                 except KilledWorker as error:
-                    raise WorkerError(
+                    del running[future.key]
+                    future.release()
+                    if index not in suspects:  # or its neighbour: each of them is tried alone
+                        suspects.add(index)
+                        again.append((index, piece))
+                        continue
+                    failure = WorkerError(
                         f"every worker of the cluster that processed {piece.name} ended (killed, "
                         "or out of memory)"
-                    ) from error
+                    )
+                    if lost is None:
+                        raise failure from error
+                    yield index, lost(piece, failure)
+                    continue
                 except CancelledError as error:
                     raise WorkerError(
                         f"the connection to the cluster {self.address} ended while it processed "

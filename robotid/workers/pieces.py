@@ -12,9 +12,10 @@ from typing import Any, Protocol, TypeAlias
 
 from threadpoolctl import threadpool_limits
 
+from robotid.exceptions import WorkerError
 from robotid.regressor.factors import Reduction
 
-__all__ = ["Outcome", "Piece", "Work", "Workload", "reduce_piece", "run_task"]
+__all__ = ["Lost", "Outcome", "Piece", "Work", "Workload", "reduce_piece", "run_task"]
 
 
 class Workload(Protocol):
@@ -48,6 +49,9 @@ class Piece(Workload):
 
 #: Work on a piece, with the number of threads or None for any; can be pickled.
 Work: TypeAlias = Callable[[Any, int | None], Any]
+
+#: Result of a piece that ended its worker in every attempt, from the piece and the error.
+Lost: TypeAlias = Callable[[Any, WorkerError], Any]
 
 
 @dataclass(frozen=True, eq=False)

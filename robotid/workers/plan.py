@@ -10,7 +10,7 @@ from robotid._typing import ProgressCallback, ignore_progress
 from robotid.regressor.factors import Reduction, available_cores
 from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.cluster import ClusterBackend
-from robotid.workers.pieces import Piece, Work, Workload, reduce_piece
+from robotid.workers.pieces import Lost, Piece, Work, Workload, reduce_piece
 from robotid.workers.processes import Backend, ProcessBackend, SerialBackend, require_workers
 
 __all__ = ["WorkPlan", "choose_workers", "map_pieces"]
@@ -89,6 +89,7 @@ class WorkPlan:
         *,
         checkpoint: Checkpoint | None = None,
         counted: str = "samples",
+        lost: Lost | None = None,
     ) -> Iterator[Any]:
         """Process every piece by the chosen workers; yields results as ``map_pieces`` does.
 
@@ -98,11 +99,12 @@ class WorkPlan:
             what: Name of the work.
             checkpoint: As in ``map_pieces``.
             counted: As in ``map_pieces``.
+            lost: As in ``Backend.run``.
         """
         with self._backend(pieces) as backend:
             yield from map_pieces(
                 work, pieces, what, backend=backend, progress=self.progress,
-                checkpoint=checkpoint, counted=counted,
+                checkpoint=checkpoint, counted=counted, lost=lost,
             )  # fmt: skip
 
 
@@ -115,6 +117,7 @@ def map_pieces(
     progress: ProgressCallback | None = None,
     checkpoint: Checkpoint | None = None,
     counted: str = "samples",
+    lost: Lost | None = None,
 ) -> Iterator[Any]:
     """Process every piece; only results that are ahead of their order are in memory.
 
@@ -126,13 +129,14 @@ def map_pieces(
         progress: Called with (what, samples done, samples in total, counted).
         checkpoint: Stores the results, of its kind; a resumed one provides them.
         counted: What the samples of the pieces are.
+        lost: As in ``Backend.run``.
 
     Yields:
         One result per piece, in order, with the same bits for any backend.
 
     Raises:
         DataError: If a row cannot be used.
-        WorkerError: If a worker ends during its work.
+        WorkerError: If a piece ends its worker in every attempt.
     """
     chosen, report = backend or SerialBackend(), progress or ignore_progress
     stored = frozenset() if checkpoint is None else checkpoint.finished()
@@ -146,7 +150,7 @@ def map_pieces(
     report(what, done, total, counted)
     early: dict[int, Any] = {}
     left = len(missing)
-    with _resumable(checkpoint), closing(chosen.run(work, missing)) as finished:  # type: ignore[type-var]
+    with _resumable(checkpoint), closing(chosen.run(work, missing, lost)) as finished:  # type: ignore[type-var]
         for k in range(len(pieces)):
             while k not in stored and k not in early:
                 index, result = next(finished)

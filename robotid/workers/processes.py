@@ -1,7 +1,7 @@
 """Processing of pieces: in this process, in worker processes, or by another backend.
 
 Every piece is processed independently with one BLAS thread, so that its result has the same bits
-with any backend.
+with any backend, also if a worker process ends and its piece is repeated.
 """
 
 import logging
@@ -10,6 +10,7 @@ import signal
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
@@ -21,14 +22,16 @@ from typing import TYPE_CHECKING, Any, Self
 from threadpoolctl import threadpool_limits
 
 from robotid.exceptions import SettingsError, WorkerError
-from robotid.workers.pieces import Outcome, Work, Workload, run_task
+from robotid.workers.pieces import Lost, Outcome, Work, Workload, run_task
 
 if TYPE_CHECKING:
     from loky import ProcessPoolExecutor
 
 __all__ = ["Backend", "ProcessBackend", "SerialBackend", "named", "require_workers"]
 
+
 _log = logging.getLogger(__name__)
+_ATTEMPTS = 3  # to process a piece whose worker ends
 
 # The pool's feeder thread may be the last owner of a semaphore. If the process ends between the
 # calls that remove and unregister it, the resource tracker warns of a leak.
@@ -55,19 +58,23 @@ class Backend(ABC):
         """Name in messages, such as ``2 worker processes``."""
 
     @abstractmethod
-    def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
+    def run(
+        self, work: Work, pieces: Sequence[tuple[int, Workload]], lost: Lost | None = None
+    ) -> Iterator[tuple[int, Any]]:
         """Process pieces; closing the iterator ends the work.
 
         Args:
             work: The work on a piece.
             pieces: Index and piece.
+            lost: Called with a piece that ended its worker in every attempt and the error, returns
+                the result; None: the error is raised.
 
         Yields:
             Index and result of each piece once, in any order.
 
         Raises:
             DataError: If a row cannot be used.
-            WorkerError: If a worker ends during its work.
+            WorkerError: If a piece ends its worker in every attempt.
         """
 
 
@@ -80,7 +87,10 @@ class SerialBackend(Backend):
     def description(self) -> str:
         return "this process"
 
-    def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
+    def run(
+        self, work: Work, pieces: Sequence[tuple[int, Workload]], lost: Lost | None = None
+    ) -> Iterator[tuple[int, Any]]:
+        del lost  # the work ends with this process
         for index, piece in pieces:
             with threadpool_limits(limits=1, user_api="blas"), named(piece):
                 result = work(piece, None)
@@ -109,9 +119,11 @@ class ProcessBackend(Backend):
     def description(self) -> str:
         return f"{self.workers} worker processes, one BLAS thread each"
 
-    def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
+    def run(
+        self, work: Work, pieces: Sequence[tuple[int, Workload]], lost: Lost | None = None
+    ) -> Iterator[tuple[int, Any]]:
         try:
-            yield from self._collect(work, pieces)
+            yield from self._collect(work, pieces, lost)
         except BaseException:
             self._end(kill_workers=True)
             raise
@@ -140,35 +152,65 @@ class ProcessBackend(Backend):
                     thread.join(_PATIENCE)
 
     def _collect(
-        self, work: Work, pieces: Iterable[tuple[int, Workload]]
+        self, work: Work, pieces: Iterable[tuple[int, Workload]], lost: Lost | None
     ) -> Iterator[tuple[int, Any]]:
-        """Yield the results of the workers, with at most two submitted pieces per worker."""
+        """Yield the results of the workers, with at most two submitted pieces per worker.
+
+        If a worker ends, its pool is lost. The pieces under way are repeated in a new one, one
+        after the other, so that the piece that ends its worker is known.
+        """
         waiting, level = iter(pieces), _log.getEffectiveLevel()
         running: dict[Future[Outcome], tuple[int, Workload]] = {}
         finished: SimpleQueue[Future[Outcome]] = SimpleQueue()
-        try:
-            while True:
-                for index, piece in islice(waiting, 2 * self.workers - len(running)):
-                    with _interrupts_deferred():
-                        pool = self._pool or self._start()
-                        future = pool.submit(run_task, work, piece, level)
-                        running[future] = index, piece
-                        future.add_done_callback(finished.put)
+        again, failures = deque[tuple[int, Workload]](), Counter[int]()
+
+        def submit(index: int, piece: Workload) -> None:
+            with _interrupts_deferred():
+                pool = self._pool or self._start()
+                future = pool.submit(run_task, work, piece, level)
+                running[future] = index, piece
+                future.add_done_callback(finished.put)
+
+        while True:
+            try:
+                if again and not running:
+                    submit(*again[0])
+                    again.popleft()
+                elif not again and not any(failures[index] for index, _ in running.values()):
+                    for index, piece in islice(waiting, 2 * self.workers - len(running)):
+                        again.append((index, piece))  # until it is submitted
+                        submit(index, piece)
+                        again.pop()
                 if not running:
                     return
                 done = finished.get()
+                if done not in running:  # of a pool that was lost
+                    continue
                 index, piece = running[done]
                 with named(piece):
                     outcome = done.result()
-                del running[done]
-                outcome.log()
-                yield index, outcome.result
-        except BrokenProcessPool as error:
-            names = [piece.name for _, piece in running.values()]
-            raise WorkerError(
-                "a worker process ended during its work (killed, or out of memory). Unfinished "
-                f"pieces: {names}"
-            ) from error
+            except BrokenProcessPool as error:
+                self._end(kill_workers=True)
+                for future, (index, piece) in list(running.items()):
+                    if future.done() and not future.cancelled() and not future.exception():
+                        continue  # its result is used
+                    del running[future]
+                    failures[index] += 1
+                    if failures[index] < _ATTEMPTS:
+                        _log.warning("a worker process ended; %s is repeated", piece.name)
+                        again.append((index, piece))
+                        continue
+                    failure = WorkerError(
+                        f"a worker process ended during its work (killed, or out of memory), in "
+                        f"each of {_ATTEMPTS} attempts. Unfinished piece: {piece.name}"
+                    )
+                    if lost is None:
+                        raise failure from error
+                    yield index, lost(piece, failure)
+                continue
+            del running[done]
+            outcome.log()
+            yield index, outcome.result
 
 
 def require_workers(workers: int) -> int:

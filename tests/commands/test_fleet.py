@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet
@@ -13,11 +14,13 @@ from helpers.synthetic import exact_log, truth
 from robotid.cli import main
 from robotid.commands import fleet
 from robotid.commands.fleet import read_fleet, run_fleet
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, WorkerError
 from robotid.log_files.read import write_log
+from robotid.report.fleet import fleet_page
 from robotid.robot.model import RobotModel
 from robotid.workers.checkpoint import FOLDER
 from robotid.workers.plan import WorkPlan
+from robotid.workers.processes import SerialBackend
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
 FILES = ("fleet.parquet", "fleet.json", "fleet.html")
@@ -88,6 +91,81 @@ def test_a_failure_is_a_row_and_the_others_are_identified(done, table):
     shown = page["Units and logs that were not identified"].rows
     assert [row[0] for row in shown] == ["a", "d", "d"]
     assert sum(content["verdicts"].values()) == 3
+
+
+class Killed(SerialBackend):
+    """Has a worker that one unit ends in every attempt."""
+
+    def run(self, work, pieces, lost=None):
+        for index, piece in pieces:
+            if piece.unit == "killer":
+                yield index, lost(piece, WorkerError(f"the worker of {piece.name} ended"))
+            else:
+                yield from super().run(work, [(index, piece)])
+
+
+def test_broken_files_and_a_unit_that_ends_its_workers_are_failed_rows(table, done, tmp_path):
+    good = (table.parent / "b0.csv").read_text().splitlines()
+    (tmp_path / "empty.csv").write_text("")
+    (tmp_path / "header.csv").write_text(good[0] + "\n")
+    (tmp_path / "cut.parquet").write_bytes(b"PAR1 and no more")
+    (tmp_path / "broken.urdf").write_text("<robot><link")
+    rows = [
+        *(f"e,{name},{URDF}" for name in ("empty.csv", "header.csv", "cut.parquet")),
+        f"e,{table.parent / 'c0.csv'},{URDF}",
+        f"f,{table.parent / 'c0.csv'},broken.urdf",
+        f"killer,{table.parent / 'c0.csv'},{URDF}",
+        f"b,{table.parent / 'b0.csv'},{URDF}",
+    ]
+    (tmp_path / "t.csv").write_text("\n".join(["unit,log,urdf", *rows]) + "\n")
+    plan = WorkPlan(1)
+    plan._choose = lambda pieces: Killed()
+    content = run_fleet(read_fleet(tmp_path / "t.csv"), tmp_path / "out", plan=plan)
+    failed = {(Path(e["log"]).name, e["unit"]): e["error"] for e in content["failures"]}
+    assert set(failed) == {
+        ("empty.csv", "e"), ("header.csv", "e"), ("cut.parquet", "e"), ("", "f"), ("", "killer"),
+    }  # fmt: skip
+    assert failed["", "killer"] == "WorkerError: the worker of unit killer ended"
+    assert failed["", "f"].startswith("ModelError: ")
+    assert content["done"] == 2
+    for unit, other in (("b", "b"), ("e", "c")):  # as if the others had never been
+        wanted = rows_of(done[0], unit=other, status="done")
+        found = rows_of(tmp_path / "out", unit=unit, status="done")
+        assert [row["value"] for row in found] == [row["value"] for row in wanted]
+
+
+def test_variables_of_the_environment_are_replaced_or_refused(tmp_path, monkeypatch):
+    path = tmp_path / "t.csv"
+    path.write_text("unit,log,urdf\na,$DAY/x.csv,${ROBOTS}/arm.urdf\na,y.csv,${ROBOTS}/arm.urdf\n")
+    monkeypatch.setenv("ROBOTS", "/robots")
+    monkeypatch.delenv("DAY", raising=False)
+    with pytest.raises(DataError, match=r"t\.csv row 1, column 'log': path '\$DAY/x\.csv' names"):
+        read_fleet(path)
+    monkeypatch.setenv("DAY", "monday")
+    (unit,) = read_fleet(path)
+    assert [log for log, _ in unit.logs] == [tmp_path / "monday" / "x.csv", tmp_path / "y.csv"]
+    assert unit.urdf == Path("/robots/arm.urdf")
+
+
+def test_a_page_of_many_failures_and_units_shows_each_kind_and_few_of_them():
+    failures = [
+        {"unit": f"u{k:03d}", "log": f"u{k:03d}/{k}.csv", "error": f"there is no u{k:03d}/{k}.csv"}
+        for k in range(300)
+    ]
+    failures.append({"unit": "last", "log": "", "error": "the URDF of last is broken"})
+    unlike = [
+        {"unit": f"u{k}", "parameter": "a.coulomb", "value": 1.0, "std_error": 0.1,
+         "parameter_unit": "N m", "others": [2.0, 3.0]} for k in range(45)
+    ]  # fmt: skip
+    content = {"units": 1000, "logs": 1000, "done": 699, "verdicts": {"usable": 699},
+               "failures": failures, "unlike": unlike, "parameters": []}  # fmt: skip
+    html = fleet_page(content)
+    shown = tables(html)["Units and logs that were not identified"].rows
+    assert [row[0] for row in shown] == ["u000", "last", *(f"u{k:03d}" for k in range(1, 19))]
+    assert [row[2] for row in shown[:3]] == ["300", "1", "300"]
+    assert "281 more are in <code>fleet.parquet</code>" in html
+    assert len(tables(html)["Units that differ from the others"].rows) == 20
+    assert "25 more are in <code>fleet.json</code>" in html
 
 
 def test_variation_between_units_is_that_of_their_values(done):

@@ -153,9 +153,27 @@ def test_a_load_is_a_warning_if_it_surely_weighs_a_twelfth_of_the_arm_more_or_le
 
 def test_shares_under_another_gravity_are_those_of_each_joint_by_itself(ur5, ur5_log):
     probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS), samples=120)
-    shares = hypotheses._shares_by_gravity(probe)
-    for g in (np.array([0.0, 3.0, -9.0]), np.array([5.0, 0.0, 1.0])):
+    shares, least = hypotheses._shares_by_gravity(probe)
+    for g in (np.array([0.0, 3.0, -9.0]), np.array([5.0, 0.0, 1.0]), probe.gravity):
         np.testing.assert_allclose(shares(g), own_share(probe, g), rtol=1e-6, atol=1e-9)
+        assert (least <= shares(g) + 1e-9).all()
+
+
+def test_a_gravity_that_cannot_be_reported_is_not_searched_for(ur5, ur5_log):
+    probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS))
+    columns = np.concatenate([probe.loads(), probe.drives], axis=2).swapaxes(0, 1)
+    exact = columns.sum(axis=2).T  # every factor is 1, the gravity is the stated one
+    noise = np.random.default_rng(0).normal(size=exact.shape)
+    probe = replace(probe, tau=exact + 0.02 * exact.std(axis=0) * noise)
+    stated = hypotheses.Explanation("stated", own_share(probe))
+    found = hypotheses._gravity(probe, stated)
+    assert found.values == tuple(probe.gravity)
+    assert found.misfit == stated.misfit
+    tilted = probe.of(ur5.with_gravity(np.array([4.0, 0.0, -9.0])))  # not that of the torques
+    stated = hypotheses.Explanation("stated", own_share(tilted))
+    found = hypotheses._gravity(tilted, stated)
+    assert found.misfit < stated.misfit - hypotheses.HINT
+    assert np.degrees(np.arctan2(np.hypot(*found.values[:2]), -found.values[2])) < 5.0
 
 
 def test_a_share_with_any_load_is_that_of_factors_of_either_sign_for_its_moments(ur5, ur5_log):

@@ -1,12 +1,15 @@
 """The mixed-effects model against dense matrices, brute-force integration, and coverage."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.linalg
 import scipy.optimize
 import scipy.stats
 
-from robotid.variation.mixed_effects import MixedEffects, Prediction, Runs, _integrated
+from robotid.variation.mixed_effects import MixedEffects, Prediction, Runs, _posterior
+from robotid.variation.restricted_likelihood import evidence, integrated
 
 SCALE = np.array([0.2, 0.5])
 BETWEEN = np.array([[0.13, 0.4], [0.31, 0.2]])  # runs, units
@@ -49,14 +52,16 @@ def dense(blocks, unit, deviation):
 @pytest.mark.parametrize("unit", [(0, 0, 0, 0), (0, 0, 1, 1, 1, 2)])
 def test_restricted_likelihood_and_mean_are_those_of_the_covariance_of_all_rows(unit):
     runs, blocks = drawn(np.random.default_rng(1), unit)
-    model, levels = MixedEffects(runs), 2 if max(unit) else 1
+    levels, of_unit = (2, runs.unit) if max(unit) else (1, None)
     tried = np.array([[[0.1, 0.2], [0.3, 0.1]], [[0.5, 0.01], [0.02, 0.7]]])[:, :levels]
-    found = model._likelihood(tried)
+    H, h = np.moveaxis(runs.H, 0, -1)[:, :, None], runs.h.T[:, None]
+    found = evidence(H, h, of_unit, SCALE, np.moveaxis(tried, 0, -1) ** 2)
     wanted = [dense(blocks, np.array(unit), each) for each in tried]
-    assert found[0][1] - found[0][0] == pytest.approx(wanted[1][0] - wanted[0][0], rel=1e-9)
+    difference = found.log_likelihood[1] - found.log_likelihood[0]
+    assert difference == pytest.approx(wanted[1][0] - wanted[0][0], rel=1e-9)
     for k in range(2):
-        assert found[1][k] == pytest.approx(wanted[k][1], rel=1e-9)
-        assert found[2][k] == pytest.approx(wanted[k][2], rel=1e-9)
+        assert found.mean[k] == pytest.approx(wanted[k][1], rel=1e-9)
+        assert found.covariance[k] == pytest.approx(wanted[k][2], rel=1e-9)
 
 
 def test_values_in_each_run_are_the_best_linear_unbiased_prediction():
@@ -189,7 +194,8 @@ def test_a_unit_is_estimated_from_its_runs_and_predicted_without_their_deviation
     runs, blocks = drawn(np.random.default_rng(9), unit)
     left = 2
     model = MixedEffects(runs.without_unit(left))
-    x, C = model.estimate_unit(runs.of_unit(left))
+    found = MixedEffects(runs).against_others(np.array([left]), is_unit=True)
+    x, C = found.values[0], found.covariance[0]
     own = [block for block, u in zip(blocks, unit, strict=True) if u == left]
     A = scipy.linalg.block_diag(*[A for A, _ in own])
     X, y = np.concatenate([A for A, _ in own]), np.concatenate([y for _, y in own])
@@ -204,6 +210,70 @@ def test_a_unit_is_estimated_from_its_runs_and_predicted_without_their_deviation
         assert variance == pytest.approx(np.full(len(variance), deviation**2))
     assert runs.of_unit(left).unit.tolist() == [0, 0]
     assert runs.without_unit(left).unit.tolist() == [0, 0, 1, 1, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("unit", "is_unit"),
+    [
+        ((0, 0, 0, 0, 0), False),
+        ((0, 0, 1, 1, 1, 2, 2), False),
+        ((0, 0, 0, 1), False),  # without the last run there is one unit
+        ((0, 0, 1, 1, 1, 2, 3), True),
+        ((0, 0, 1, 1, 1), True),  # two units: the others are one
+    ],
+)
+def test_each_is_compared_with_the_others_as_if_it_had_never_been(unit, is_unit):
+    runs, _ = drawn(np.random.default_rng(11), unit)
+    factor = np.array([1.0, 1e3, 1e-2, *np.ones(len(unit) - 3)])  # unlike information
+    runs = replace(runs, H=runs.H * factor[:, None, None], h=runs.h * factor[:, None])
+    every, count = MixedEffects(runs), 1 + max(unit) if is_unit else len(unit)
+    which = np.arange(count)[::-1]
+    found = every.against_others(which, is_unit=is_unit)
+    for k, left in enumerate(which):
+        without = runs.without_unit(left) if is_unit else runs.without(left)
+        others = MixedEffects(without, every.deviation)
+        x, C = found.values[k], found.covariance[k]
+        if is_unit:  # its runs vary as those of the others
+            S = np.diag(others.deviation[0] ** 2)
+            own = runs.of_unit(left)
+            W = np.array([H @ np.linalg.inv(np.eye(2) + S @ H) for H in own.H])
+            each = np.array(
+                [np.linalg.solve(np.eye(2) + H @ S, h) for H, h in zip(own.H, own.h, strict=True)]
+            )
+            information, score = W.sum(axis=0), each.sum(axis=0)
+        else:
+            information, score = runs.H[left], runs.h[left]
+        wanted = np.linalg.inv(information + np.diag((100.0 * SCALE) ** -2.0))
+        np.testing.assert_allclose(C, wanted, rtol=1e-7)
+        np.testing.assert_allclose(x, wanted @ score, rtol=1e-7)
+        expected = others.predict(np.diag(C), x, is_unit=is_unit)
+        np.testing.assert_allclose(found.mean[k], [e.mean for e in expected], rtol=1e-8)
+        wanted = [e.probability for e in expected]
+        np.testing.assert_allclose(found.probability[k], wanted, rtol=1e-8)
+
+
+def test_slopes_of_the_likelihood_are_its_finite_differences():
+    unit, rng = np.array([0, 0, 1, 1, 1, 2]), np.random.default_rng(12)
+    runs, _ = drawn(rng, unit)
+    H, h = np.moveaxis(runs.H, 0, -1)[:, :, None], runs.h.T[:, None]
+    variance = np.exp(rng.normal(size=(2, 2, 3)))
+    for levels, of_unit in ((1, None), (2, unit)):
+        found = evidence(H, h, of_unit, SCALE, variance[:levels])
+        for level, p in np.ndindex(levels, 2):
+            step = np.zeros((levels, 2, 1))
+            step[level, p] = 1e-5
+            above, below = (
+                evidence(H, h, of_unit, SCALE, variance[:levels] + side).log_likelihood
+                for side in (step, -step)
+            )
+            wanted = (above - below) / 2e-5
+            np.testing.assert_allclose(found.slope[level, p], wanted, rtol=1e-5, atol=1e-8)
+
+
+def test_many_runs_without_scatter_have_the_smallest_spread():
+    """The information is far above the spread: the most probable one is at the bound."""
+    runs = Runs(np.full((5, 1, 1), 1e12), np.full((5, 1), 2e12), np.zeros(5, int), np.ones(1))
+    assert MixedEffects(runs).deviation == pytest.approx(np.exp(-6.0) * np.ones((1, 1)))
 
 
 def test_the_start_of_the_search_does_not_matter():
@@ -269,8 +339,9 @@ def test_one_more_run_narrows_intervals_as_much_as_expected():
 def test_information_far_above_the_spread_is_integrated_without_rounding():
     """(H^-1 + S^2)^-1 of diagonal matrices: 1 / S^2 where H is large, H where it is small."""
     H, S, x = np.array([1e18, 3e12, 1e-3]), np.array([0.1, 0.02, 2.0]), np.array([2.0, -1.0, 5.0])
-    W, w, U, _ = _integrated(np.diag(H)[None], (H * x)[None], S)
+    W, w, _ = integrated(np.diag(H)[:, :, None, None], (H * x)[:, None, None], S[:, None] ** 2)
     wanted = H / (1.0 + S**2 * H)
-    np.testing.assert_allclose(W[0], np.diag(wanted), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(w[0], wanted * x, rtol=1e-9)
+    np.testing.assert_allclose(W[:, :, 0, 0], np.diag(wanted), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(w[:, 0, 0], wanted * x, rtol=1e-9)
+    U = _posterior(np.diag(H)[None], S)
     np.testing.assert_allclose(np.diag(U[0]), S**2 / (1.0 + S**2 * H), rtol=1e-9)

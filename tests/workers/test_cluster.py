@@ -17,6 +17,7 @@ from robotid.exceptions import DataError, WorkerError
 from robotid.regressor.factors import join
 from robotid.workers import cluster
 from robotid.workers.cluster import ClusterBackend
+from robotid.workers.pieces import reduce_piece
 
 distributed = pytest.importorskip("distributed")
 
@@ -94,6 +95,22 @@ def test_a_piece_that_kills_every_worker_is_named(address, tmp_path):
             reduce_all(pieces, backend=ClusterBackend(address))
     finally:
         allow_failures(address, 3)
+
+
+def test_a_piece_that_kills_every_worker_is_given_up_and_its_neighbours_are_done(address, tmp_path):
+    pieces = pieces_in(tmp_path / "marks", 5, faults={1: "kill"}.items())
+    allow_failures(address, 0)  # its neighbours are suspected, too
+    try:
+        every = list(enumerate(pieces))
+        found = dict(ClusterBackend(address).run(reduce_piece, every, lambda *lost: lost))
+    finally:
+        allow_failures(address, 3)
+    piece, error = found.pop(1)
+    assert piece.name == "random rows 1"
+    assert isinstance(error, WorkerError)
+    serial = reduce_all(pieces_in(tmp_path / "alone", 5))
+    assert sorted(found) == [0, 2, 3, 4]
+    assert all(same_bits(own, serial[k]) for k, own in found.items())
 
 
 def test_no_scheduler_is_said(tmp_path):

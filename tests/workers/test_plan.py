@@ -56,8 +56,8 @@ def test_a_plan_chooses_who_works():
 class Backwards(SerialBackend):
     """Finishes the last piece first."""
 
-    def run(self, work, pieces):
-        yield from super().run(work, list(pieces)[::-1])
+    def run(self, work, pieces, lost=None):
+        yield from super().run(work, list(pieces)[::-1], lost)
 
 
 def test_results_come_in_order_and_progress_counts_what_is_done_however_it_ends():

@@ -128,8 +128,23 @@ def test_a_worker_that_is_killed_is_an_error_that_names_what_was_under_way(tmp_p
     pieces = pieces_in(tmp_path / "marks", faults={2: "kill"}.items())
     with pytest.raises(WorkerError, match="worker process ended during its work") as caught:
         reduce_all(pieces, backend=ProcessBackend(2))
-    assert "random rows 2" in str(caught.value)
+    assert "in each of 3 attempts. Unfinished piece: random rows 2" in str(caught.value)
+    assert marks(tmp_path / "marks")[2] == 3
     assert eventually(lambda: not any(map(is_running, workers_of(tmp_path / "marks"))))
+
+
+def test_a_piece_that_ends_every_worker_is_given_up_and_the_others_have_the_same_bits(tmp_path):
+    pieces = pieces_in(tmp_path / "marks", 6, faults={1: "kill", 4: "kill once"}.items())
+    with ProcessBackend(1) as backend:
+        every = list(enumerate(pieces))
+        found = dict(backend.run(reduce_piece, every, lambda piece, error: (piece.name, error)))
+    name, error = found.pop(1)
+    assert (name, type(error)) == ("random rows 1", WorkerError)
+    attempts = marks(tmp_path / "marks")
+    assert (attempts[1], attempts[4]) == (3, 2)
+    serial = reduce_all(pieces_in(tmp_path / "alone", 6))
+    assert sorted(found) == [0, 2, 3, 4, 5]
+    assert all(same_bits(own, serial[k]) for k, own in found.items())
 
 
 def test_what_stops_the_caller_ends_the_workers(tmp_path):
