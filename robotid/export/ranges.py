@@ -54,7 +54,8 @@ Ranges for domain randomisation of {robot}, by robotid {version}. kg, m, kg m^2,
 nominal is the identified value, low to high its 95 % interval, limited to possible values. The low
 end of a positive parameter is computed from its logarithm. source is the source of the interval:
   data   the motion;
-  logs   the spread between logs, drives only: the 95 % prediction interval of the next log;
+  logs   the spread between logs, drives only: the 95 % prediction interval of the next log, at any
+         temperature and time of the logs if these have an effect;
   prior  the plausible error of the URDF: the motion does not determine the parameter;
   mixed  both, or the motion determines only sums with other parameters;
   bound  the value is at a physical bound; a drive at 0 has no interval: no low, no high;
@@ -134,7 +135,7 @@ def parameter_ranges(found: Identified) -> dict[str, Any]:
             found.standard[k], errors[k], source, least=least, quantile=float(quantile[k])
         )
         if layout.names[k] in between and source != "bound":
-            low, high = between[layout.names[k]].prediction.ends
+            low, high = between[layout.names[k]].seen_ends
             found_range |= {"low": max(float(low), least), "high": float(high), "source": "logs"}
         term_name = layout.names[k].removeprefix(f"{name}.")
         drives[name][term_name] = found_range | {"unit": layout.units[k]}
@@ -228,7 +229,7 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
         drive, _, term = name.rpartition(".")
         own = drives.get(drive, {}).get(term)
         if own is not None and "low" in own and own["source"] != "bound":
-            low, high = entry["next_interval"]
+            low, high = entry.get("seen_interval", entry["next_interval"])
             least = 0.0 if term in _NOT_NEGATIVE or term == "kp" else -math.inf
             own |= {"low": max(low, least), "high": high, "source": "logs"}
     empty = {"robot": content["robot"], "confidence": 0.95, "bodies": {}, "drives": {}}

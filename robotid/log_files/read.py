@@ -7,7 +7,7 @@ columns of the motors are read instead, as `qm_<motor>` and `taum_<motor>` [N m]
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, get_args
@@ -188,6 +188,7 @@ class LogLayout:
     gears: tuple[Transmission, ...]  # of the motors
     has_torque: bool  # whether the file has a torque or a current of any of the joints
     base: BaseColumns = _BASE  # of a floating base and of contacts
+    temperatures: Mapping[str, str] = field(default_factory=dict)  # names in the file by joint
 
     @property
     def wanted(self) -> list[str]:
@@ -372,6 +373,7 @@ def lay_out(
     finder.seen.update(chain.from_iterable(of_base.values()), opened.sensors)
     if base.wrenches and needs in ("torque", "any") and not any(map(finder.has_torque, joints)):
         finder = replace(finder, needs="motion")
+    temperatures = finder.find_temperatures()
     found = finder.find_all() | of_base  # names of columns by kind
     layout = LogLayout(
         path=str(Path(path)) if isinstance(path, str | Path) else "",
@@ -386,6 +388,7 @@ def lay_out(
         gears=gears,
         has_torque=any(finder.has_torque(joint) for joint in joints),
         base=base,
+        temperatures=temperatures,
     )
     return layout, opened
 

@@ -2,14 +2,17 @@
 
     x_run = mu + u_unit + u_run + e_run,    u_unit ~ N(0, D_unit),  u_run ~ N(0, D_run),
 
-with diagonal D. A run gives the information H about its own x and the product h = H x_hat, so runs
-in which a parameter had no effect (singular H) need no special case. Deviations are integrated out
-level by level. The restricted likelihood of the standard deviations in D is weighted by a wide
-prior about a plausible size. The standard deviation that a prediction depends on is integrated
-numerically: with few runs, its uncertainty is the largest part of the prediction interval.
+with diagonal D. A linear effect of the temperature or the time of a run is a part of mu: a slope is
+a parameter without a deviation, see ``Slope``. A run gives the information H about its own x and
+the product h = H x_hat, so runs in which a parameter had no effect (singular H) need no special
+case. Deviations are integrated out level by level. The restricted likelihood of the standard
+deviations in D is weighted by a wide prior about a plausible size. The standard deviation that a
+prediction depends on is integrated numerically: with few runs, its uncertainty is the largest part
+of the prediction interval.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -19,7 +22,7 @@ import scipy.special
 
 from robotid._typing import Array
 
-__all__ = ["UNKNOWN", "MixedEffects", "Prediction", "Runs"]
+__all__ = ["UNKNOWN", "MixedEffects", "Prediction", "Runs", "Slope"]
 
 #: Standard deviation of a parameter before the data, in plausible sizes.
 UNKNOWN = 100.0
@@ -28,10 +31,26 @@ _FREEDOM = 4.0  # degrees of freedom of the half Student prior of a standard dev
 _LEAST, _MOST = -6.0, 5.0  # logarithm of the standard deviations over their plausible size
 _GRID = np.linspace(_LEAST, _MOST, 45)
 _FIRST = -1.0  # the same at the start of the search
+_NONE = -12.0  # ... of a slope, which has no deviation
 _NEAR = 2.0  # ... and largest distance of a stated start: the gradient is small beyond
 _STEP = 1e-5  # of the numerical gradient
 _TAIL = 0.025  # probability beyond each end of an interval
 _WIDEST = 40.0  # standard deviations that contain every end
+
+
+@dataclass(frozen=True, eq=False)
+class Slope:
+    """A linear effect of a covariate of the runs, as their temperature, on a parameter.
+
+    Attributes:
+        parameter: Index of the parameter.
+        covariate: The covariate of each run, shape (k,).
+        scale: Plausible size of the slope, positive.
+    """
+
+    parameter: int
+    covariate: Array
+    scale: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +63,53 @@ class Runs:
         h: H times the estimate of each run, shape (k, q).
         unit: Index of the unit (robot) of each run, shape (k,), int, from 0.
         scale: Plausible standard deviation of each parameter, shape (q,), positive.
+        slopes: The last of the q parameters that are slopes. The others are those at the covariates
+            0. With x = Z (x_0, slopes), H is Z^T H Z.
     """
 
     H: Array
     h: Array
     unit: Array
     scale: Array
+    slopes: tuple[Slope, ...] = ()
+
+    @property
+    def n_varying(self) -> int:
+        """Number of parameters that are not slopes."""
+        return len(self.scale) - len(self.slopes)
+
+    def with_slopes(self, slopes: Sequence[Slope]) -> "Runs":
+        """Return the same runs with other slopes.
+
+        Args:
+            slopes: The slopes, in place of the present ones.
+        """
+        n = self.n_varying
+        Z = np.zeros((len(self.h), n, n + len(slopes)))
+        Z[:, range(n), range(n)] = 1.0
+        for s, slope in enumerate(slopes, start=n):
+            Z[:, slope.parameter, s] = slope.covariate
+        return replace(
+            self,
+            H=np.einsum("kia,kij,kjb->kab", Z, self.H[:, :n, :n], Z, optimize=True),
+            h=np.einsum("kia,ki->ka", Z, self.h[:, :n]),
+            scale=np.concatenate([self.scale[:n], [slope.scale for slope in slopes]]),
+            slopes=tuple(slopes),
+        )
+
+    def seen_from(self, covariates: Sequence[float]) -> "Runs":
+        """Return the runs with their parameters at other covariates than 0.
+
+        Args:
+            covariates: The covariate of each slope.
+        """
+        if not self.slopes:
+            return self
+        moved = [
+            replace(slope, covariate=slope.covariate - at)
+            for slope, at in zip(self.slopes, covariates, strict=True)
+        ]
+        return self.with_slopes(moved)
 
     def without(self, run: int) -> "Runs":
         """Return the runs except one.
@@ -77,7 +137,8 @@ class Runs:
 
     def _only(self, left: Array) -> "Runs":
         _, unit = np.unique(self.unit[left], return_inverse=True)
-        return replace(self, H=self.H[left], h=self.h[left], unit=unit)
+        slopes = tuple(replace(s, covariate=s.covariate[left]) for s in self.slopes)
+        return replace(self, H=self.H[left], h=self.h[left], unit=unit, slopes=slopes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,10 +222,13 @@ class MixedEffects:
             values = _log_prior(tried).sum(axis=1) + self._likelihood(self._deviation(tried))[0]
             return -values[0], -(values[1:] - values[0]) / _STEP
 
-        first, bounds = np.full(size, _FIRST), [(_LEAST, _MOST)] * size
+        first = np.full(size, _FIRST)
         if self.first is not None:
             first = np.log(self.first[: self.n_levels] / self.runs.scale).ravel()
             first = np.clip(first, _FIRST - _NEAR, _FIRST + _NEAR)
+        is_slope = np.tile(np.arange(len(self.runs.scale)) >= self.runs.n_varying, self.n_levels)
+        first[is_slope] = _NONE
+        bounds = [(_NONE, _NONE) if own else (_LEAST, _MOST) for own in is_slope]
         found = scipy.optimize.minimize(
             objective, first, jac=True, method="L-BFGS-B", bounds=bounds
         )
@@ -205,23 +269,29 @@ class MixedEffects:
         return covariance @ w.sum(axis=0), covariance
 
     def predict(
-        self, own: Array | None = None, value: Array | None = None, *, is_unit: bool = False
+        self,
+        own: Array | None = None,
+        value: Array | None = None,
+        *,
+        is_unit: bool = False,
+        at: Sequence[float] = (),
     ) -> tuple[Prediction, ...]:
-        """Return the prediction of each parameter in a new run of a new unit, q items.
+        """Return the prediction of each parameter but slopes in a new run of a new unit.
 
         With one unit it is that of a new run. The standard deviation of the highest level is
         integrated, parameter by parameter; all others have their most probable values.
 
         Args:
-            own: Variance of the estimates of the new run, shape (q,); 0 if None.
-            value: Estimates of the new run, whose probability is computed, shape (q,); or None.
+            own: Variance of the estimates of the new run, of these parameters; 0 if None.
+            value: Estimates of the new run, whose probability is computed; or None.
             is_unit: Whether the mean of a new unit is predicted, without a deviation of its run.
+            at: The covariate of each slope in the new run; 0 if empty.
         """
-        q, levels = len(self.runs.scale), slice(1 if is_unit else 0, None)
+        q, levels = self.runs.n_varying, slice(1 if is_unit else 0, None)
         own = np.zeros(q) if own is None else own
         found = []
         for p in range(q):
-            tried, log_density, centres, variance, _ = self._on_grid(p)
+            tried, log_density, centres, variance, _ = self._on_grid(p, at)
             weight = _weight(log_density)
             mean, error = _moments(weight, centres, variance)
             between = (tried[:, levels, p] ** 2).sum(axis=1) + own[p]
@@ -245,7 +315,7 @@ class MixedEffects:
         return tuple(found)
 
     def with_one_more(self) -> tuple[Prediction, ...]:
-        """Return the prediction of each parameter, with what one more run would add, q items.
+        """Return the prediction of each parameter but slopes, with what one more run would add.
 
         With several units it is one more unit. The new run or unit is expected to give as much
         information as the mean of the others. The information about the mean then increases by
@@ -270,22 +340,57 @@ class MixedEffects:
         """Number of units if there are several, of runs otherwise."""
         return int(self.runs.unit.max()) + 1 if self.n_levels == 2 else len(self.runs.h)
 
-    def _on_grid(self, p: int) -> tuple[Array, Array, Array, Array, Array]:
+    def _on_grid(
+        self, p: int, at: Sequence[float] = ()
+    ) -> tuple[Array, Array, Array, Array, Array]:
         """Return the model for standard deviations of parameter p at the highest level.
+
+        The parameter is that at the covariates ``at`` of its slopes; 0 if empty.
 
         Returns:
             Standard deviations (g, levels, q); logarithm of their density, mean of the parameter,
             variance of the mean, and variance of the estimate of a typical member about its mean,
             each of shape (g,).
         """
-        tried = np.repeat(self.deviation[None], len(_GRID), axis=0)
-        tried[:, -1, p] = self.runs.scale[p] * np.exp(_GRID)
-        log_likelihood, means, covariances = self._likelihood(tried)
+        tried, log_density, means, covariances = self._tried(p)
         prior = np.diag((UNKNOWN * self.runs.scale) ** -2.0)
         members = (np.linalg.inv(covariances) - prior) / self.n_members
         alone = np.linalg.inv(members + prior)[:, p, p]
-        log_density = log_likelihood + _log_prior(_GRID)
-        return tried, log_density, means[:, p], covariances[:, p, p], alone
+        a = 1.0 * (np.arange(len(prior)) == p)
+        for s, (slope, c) in enumerate(zip(self.runs.slopes, at, strict=False)):
+            a[self.runs.n_varying + s] = c * (slope.parameter == p)
+        return tried, log_density, means @ a, np.einsum("i,gij,j->g", a, covariances, a), alone
+
+    def slope(self, s: int) -> tuple[float, float, float]:
+        """Return a slope, its standard error, and the two-sided p-value of a slope of 0.
+
+        The standard deviation of its parameter is integrated between runs if its covariate varies
+        most within units, else between units.
+
+        Args:
+            s: Index of the slope.
+        """
+        own, slope, unit = self.runs.n_varying + s, self.runs.slopes[s], self.runs.unit
+        means_of = np.bincount(unit, slope.covariate) / np.bincount(unit)
+        is_within = float(np.var(slope.covariate - means_of[unit])) > float(np.var(means_of[unit]))
+        level = 0 if is_within else -1
+        _, log_density, means, covariances = self._tried(slope.parameter, level)
+        weight = _weight(log_density)
+        mean, error = _moments(weight, means[:, own], covariances[:, own, own])
+        below = _mixture(0.0, weight, means[:, own], np.sqrt(covariances[:, own, own]))
+        return mean, error, 2.0 * min(below, 1.0 - below)
+
+    def _tried(self, p: int, level: int = -1) -> tuple[Array, Array, Array, Array]:
+        """Return the model for standard deviations of parameter p at a level.
+
+        Returns:
+            Standard deviations (g, levels, q), logarithm of their density (g,), means (g, q) and
+            their covariances (g, q, q).
+        """
+        tried = np.repeat(self.deviation[None], len(_GRID), axis=0)
+        tried[:, level, p] = self.runs.scale[p] * np.exp(_GRID)
+        log_likelihood, means, covariances = self._likelihood(tried)
+        return tried, log_likelihood + _log_prior(_GRID), means, covariances
 
     def _deviation(self, z: Array) -> Array:
         """Return standard deviations, shape (..., levels, q), from logarithms over the scale."""

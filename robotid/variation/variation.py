@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from robotid._typing import Array
+from robotid.variation.covariates import Effect, effects_of, with_effects
 from robotid.variation.groups import FEWEST_RUNS, RunsOf
 from robotid.variation.mixed_effects import UNKNOWN, MixedEffects, Prediction
 
@@ -17,6 +18,7 @@ __all__ = [
     "Variation",
     "VaryingParameter",
     "between_covariance",
+    "effects_by_log",
     "shrunk_correlation",
     "vary",
 ]
@@ -38,8 +40,9 @@ class VaryingParameter:
             units and of the next unit, if there are several.
         within: Most probable spread between runs of one unit, if there are several units.
         values: Its value in each run, shape (k,): the run's own and the mean, weighted by their
-            information.
+            information; at the mean temperature and time if these have effects.
         std_errors: Their standard errors, shape (k,).
+        effects: Effects of temperature and time. Prediction and spread are those at their means.
     """
 
     name: str
@@ -48,6 +51,22 @@ class VaryingParameter:
     values: Array
     std_errors: Array
     within: float | None = None
+    effects: tuple[Effect, ...] = ()
+
+    @property
+    def seen_ends(self) -> Array:
+        """Ends of the 95 % interval of the next run at any temperature and time of the runs, (2,).
+
+        It is the prediction interval if these have no effect.
+        """
+        low, high = self.prediction.ends
+        for each in self.effects:
+            if each.is_used:
+                own = each.covariate.values
+                ends = np.array([each.interval(float(x)) for x in (own.min(), own.max())])
+                low += min(ends[:, 0].min() - self.prediction.ends[0], 0.0)
+                high += max(ends[:, 1].max() - self.prediction.ends[1], 0.0)
+        return np.array([low, high])
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, as result.json has them."""
@@ -60,6 +79,8 @@ class VaryingParameter:
             "spread_interval": found.spread_ends.tolist(),
             **({} if self.within is None else {"spread_within_units": self.within}),
             "next_interval": found.ends.tolist(),
+            **({"seen_interval": self.seen_ends.tolist()}
+               if any(each.is_used for each in self.effects) else {}),
             "next_quantiles": found.quantiles(SCORES).tolist(),
             "one_more": {
                 "std_error": found.after[0],
@@ -67,7 +88,9 @@ class VaryingParameter:
             },
             "by_log": self.values.tolist(),
             "std_error_by_log": self.std_errors.tolist(),
-        }
+            **({"effects": {each.covariate.name: each.to_dict() for each in self.effects}}
+               if self.effects else {}),
+        }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +195,7 @@ def vary(
     if len(names) < FEWEST_RUNS or not groups:
         return None
     parameters: list[VaryingParameter] = []
+    groups = with_effects(groups)
     models = [MixedEffects(group.runs) for group in groups]
     for group, model in zip(groups, models, strict=True):
         if group.group.kind == "drive":
@@ -181,7 +205,7 @@ def vary(
     n_units = int(unit.max()) + 1
     compared_units = range(n_units if n_units > FEWEST_RUNS else 0)
     compared_runs = range(len(names) if len(names) > FEWEST_RUNS else 0)
-    size = sum(group.runs.h.shape[1] for group in groups)
+    size = sum(group.runs.n_varying for group in groups)
     n_tests = size * (len(compared_units) + len(compared_runs))
     unlike_units = [
         found for u in compared_units if (found := _unlike(pairs, u, n_tests, is_unit=True))
@@ -202,7 +226,7 @@ def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Ar
     """Return the covariance of parameters in the next run that the fit to all runs lacks.
 
     Standard deviations are the medians of the spreads: between runs, or between units and between
-    the runs of a unit.
+    the runs of a unit. Temperature and time of the next run are as those of the runs.
 
     Args:
         variation: As of ``Variation.to_dict``.
@@ -221,6 +245,29 @@ def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Ar
     found = np.zeros((len(names), len(names)))
     R = np.array(variation["correlation"])[np.ix_(own, own)]
     found[np.ix_(places, places)] = std[:, None] * R * std
+    moved = effects_by_log(entries)
+    if len(moved):
+        found[np.ix_(places, places)] += np.cov(moved.T).reshape(len(places), len(places))
+    return found
+
+
+def effects_by_log(entries: Sequence[Mapping[str, Any]]) -> Array:
+    """Return the deviations of parameters by effects of temperature and time, shape (k, m).
+
+    Without an effect, k is 0.
+
+    Args:
+        entries: As of ``VaryingParameter.to_dict``, m items.
+    """
+    own = [
+        (p, each)
+        for p, entry in enumerate(entries)
+        for each in entry.get("effects", {}).values()
+        if each["is_used"]
+    ]
+    found = np.zeros((len(own[0][1]["by_log"]) if own else 0, len(entries)))
+    for p, each in own:
+        found[:, p] += each["slope"] * (np.array(each["by_log"]) - each["mean"])
     return found
 
 
@@ -269,6 +316,7 @@ def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter
                 centre + values[:, p],
                 errors[:, p],
                 float(model.deviation[0, p]) if model.n_levels == 2 else None,
+                effects_of(group, model, p),
             )
 
 
@@ -292,15 +340,18 @@ def _compared(
     A payload is compared only if the run determines it: a run in which the last joints are at rest
     has a large moment and a wrong mass in place of any other effect.
     """
-    runs = group.runs
+    of_run = group.runs.unit == at if is_unit else np.arange(len(group.runs.h)) == at
+    runs = group.runs.seen_from([s.covariate[of_run].mean() for s in group.runs.slopes])
+    n = runs.n_varying
     if is_unit:
         others, own = MixedEffects(runs.without_unit(at), every.deviation), runs.of_unit(at)
         x, covariance = others.estimate_unit(own)
-        information = own.H.sum(axis=0)
+        information = own.H.sum(axis=0)[:n, :n]
+        x, covariance = x[:n], covariance[:n, :n]
     else:
-        others, information = MixedEffects(runs.without(at), every.deviation), runs.H[at]
-        covariance = _covariance(information, runs.scale)
-        x = covariance @ runs.h[at]
+        others, information = MixedEffects(runs.without(at), every.deviation), runs.H[at, :n, :n]
+        covariance = _covariance(information, runs.scale[:n])
+        x = covariance @ runs.h[at, :n]
     variance = np.diag(covariance)
     if group.group.kind == "payload":
         alone, together = (
