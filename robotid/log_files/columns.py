@@ -99,6 +99,7 @@ class Finder:
             ]
         found |= {kind: names for kind in optional if (names := self._find_optional(kind))}
         self._note_sizes()
+        self.find_temperatures()  # they are not ignored
         extra = [name for name in self.names if name not in self.seen]
         if extra:
             self.notes.append(f"columns ignored: {listed(extra)}")

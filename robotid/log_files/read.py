@@ -357,23 +357,21 @@ def lay_out(
     if opened.angle_unit and units.angle is None:
         raise DataError(f"{where}: {opened.angle_unit}", code="angle_unit")
     check_transmissions(transmissions, joints)
-    gears = tuple(transmissions)
     stated = {key: opened.renamed.get(name, name) for key, name in (columns or {}).items()}
     of_base = base_columns(where, opened.names, base, stated)
-    base = base.present([*opened.names, *stated])
-    base = replace(base, twist=opened.axes.get("twist", base.twist))
+    twist = opened.axes.get("twist", base.twist)
+    base = replace(base.present([*opened.names, *stated]), twist=twist)
     notes = [*opened.notes, *_notes_of_sensors(where, opened, of_base, base)]
     of_joints = {x: y for x, y in stated.items() if y not in chain.from_iterable(of_base.values())}
     finder = Finder(
-        where, opened.names, of_joints, tuple(joints), gains or {}, source, gears, needs,
-        notes, passive=passive,
+        where, opened.names, of_joints, tuple(joints), gains or {}, source, tuple(transmissions),
+        needs, notes, passive=passive,
     )  # fmt: skip
     joints = [joint for joint in joints if joint not in passive or finder.has_position(joint)]
     finder = replace(finder, joints=tuple(joints))
     finder.seen.update(chain.from_iterable(of_base.values()), opened.sensors)
     if base.wrenches and needs in ("torque", "any") and not any(map(finder.has_torque, joints)):
         finder = replace(finder, needs="motion")
-    temperatures = finder.find_temperatures()
     found = finder.find_all() | of_base  # names of columns by kind
     layout = LogLayout(
         path=str(Path(path)) if isinstance(path, str | Path) else "",
@@ -385,10 +383,10 @@ def lay_out(
         source=source,
         notes=tuple(finder.notes),
         motors={kind: finder.of_motors(kind) for kind in NOUNS},
-        gears=gears,
+        gears=finder.gears,
         has_torque=any(finder.has_torque(joint) for joint in joints),
         base=base,
-        temperatures=temperatures,
+        temperatures=finder.find_temperatures(),
     )
     return layout, opened
 

@@ -154,7 +154,9 @@ def _with_effects(group: RunsOf, level: float) -> RunsOf:
             break
         runs = tried[best]
         del left[best]
-    return replace(group, runs=runs)
+    model = MixedEffects(runs)
+    sizes = [model.slope(s)[0] for s in range(len(runs.slopes))]
+    return replace(group, runs=runs, slopes=tuple(sizes))
 
 
 def _intervals(model: MixedEffects, s: int, covariate: Covariate, centre: float) -> Array:

@@ -8,7 +8,7 @@ at theta.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -80,6 +80,9 @@ class RunsOf:
         runs: Information about x, coloured noise included.
         inflation: Variance of coloured noise over that of independent rows [-].
         covariates: Quantities of the runs that may have an effect on the parameters.
+        slopes: Sizes of the slopes of the runs.
+        across: Rows of the group in A^T A with A = W B of all Q parameters of all groups, in their
+            order, shape (k, q, Q); None: the other groups are independent of it.
     """
 
     group: Group
@@ -87,6 +90,8 @@ class RunsOf:
     runs: Runs
     inflation: float
     covariates: tuple[Covariate, ...] = ()
+    slopes: tuple[float, ...] = ()
+    across: Array | None = None
 
 
 def runs_of(
@@ -120,6 +125,10 @@ def runs_of(
         runs = Runs(H / inflation, h / inflation, unit, scale)
         of_drive = covariates.get(group.name, ()) if group.kind == "drive" else ()
         found.append(RunsOf(group, centre, runs, inflation, tuple(of_drive)))
+    across, end = _across(segments, [each.group for each in found], sigma), 0
+    for k, each in enumerate(found):
+        start, end = end, end + len(each.centre)
+        found[k] = replace(each, across=across[:, start:end])
     return tuple(found)
 
 
@@ -167,6 +176,23 @@ def _products(
             H[k] += A.T @ A
             g[k] += A.T @ (R[:, -1] - R[:, :-1] @ theta[own])
     return H, g
+
+
+def _across(segments: Sequence[Sequence[Factors]], groups: Sequence[Group], sigma: Array) -> Array:
+    """Return A^T A of each run with A = W B of the Q parameters of all groups, (k, Q, Q)."""
+    B = np.hstack([group.columns for group in groups]) if groups else np.zeros((0, 0))
+    acts = np.array([j in g.rows for j in range(len(sigma)) for g in groups]).reshape(
+        len(sigma), -1
+    )
+    acts = np.repeat(acts, [group.columns.shape[1] for group in groups], axis=1)
+    found = np.zeros((len(segments), B.shape[1], B.shape[1]))
+    for k, run in enumerate(segments):
+        for segment in run:
+            for j in range(len(sigma)):
+                own = segment.columns[j]
+                A = segment.triangles[j][:, :-1] @ (B[own] * acts[j]) / sigma[j]
+                found[k] += A.T @ A
+    return found
 
 
 def inflation_of(runs: Sequence[tuple[Array, Array]]) -> float:

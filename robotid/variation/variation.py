@@ -1,13 +1,14 @@
 """Variation of parameters between runs: spreads, the next run, runs that are unlike the others."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from robotid._typing import Array
+from robotid.variation.causes import evidence_by_group
 from robotid.variation.covariates import Effect, effects_of, with_effects
 from robotid.variation.groups import FEWEST_RUNS, RunsOf
 from robotid.variation.mixed_effects import UNKNOWN, MixedEffects, Prediction
@@ -184,8 +185,8 @@ def vary(
     """Return the variation between runs, or None for fewer than three runs.
 
     A run is compared with the prediction of the other runs, and a unit with that of the other
-    units, group by group. Of the groups that differ, the cause named is the one that explains most
-    of the residual.
+    units, group by group. If a group differs, the cause named is the one that explains most of the
+    residual, see ``evidence_by_group``.
 
     Args:
         names: Names of the k runs.
@@ -323,19 +324,28 @@ def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter
 def _unlike(
     pairs: Sequence[tuple[RunsOf, MixedEffects]], at: int, n_tests: int, *, is_unit: bool
 ) -> UnlikeRun | None:
-    """Return how a run or a unit differs from the others; None if it does not."""
-    found = [
-        each
-        for group, every in pairs
-        for each in _compared(group, every, at, n_tests, is_unit=is_unit)
-    ]
-    return max(found, key=lambda each: each[0])[1] if found else None
+    """Return how a run or a unit differs from the others; None if it does not.
+
+    The cause named is the group that explains most of the residual, the others as they vary.
+    """
+    found = [_compared(group, every, at, is_unit=is_unit) for group, every in pairs]
+    named = [own for _, own in found if own is not None]
+    probability = min([own.probability for own in named], default=1.0)
+    if probability * n_tests >= _FALSE_ALARMS:
+        return None
+    groups, unit = [group for group, _ in pairs], pairs[0][0].runs.unit
+    is_own = unit == at if is_unit else np.arange(len(unit)) == at
+    evidence = evidence_by_group(
+        groups, [others.deviation for others, _ in found], is_own, is_unit=is_unit
+    )
+    of_named = [(x, own) for x, (_, own) in zip(evidence, found, strict=True) if own is not None]
+    return replace(max(of_named, key=lambda each: each[0])[1], probability=probability)
 
 
 def _compared(
-    group: RunsOf, every: MixedEffects, at: int, n_tests: int, *, is_unit: bool
-) -> Iterator[tuple[float, UnlikeRun]]:
-    """Yield the difference of a run or unit from the others, if any, and what it explains.
+    group: RunsOf, every: MixedEffects, at: int, *, is_unit: bool
+) -> tuple[MixedEffects, UnlikeRun | None]:
+    """Return the model of the others, and the difference of a run or unit from them.
 
     A payload is compared only if the run determines it: a run in which the last joints are at rest
     has a large moment and a wrong mass in place of any other effect.
@@ -359,17 +369,13 @@ def _compared(
         )
         plausible = runs.scale**2  # what all runs do not determine, no motion does
         if np.any((alone > plausible) & (together <= plausible)):
-            return
+            return others, None
     expected = others.predict(variance, x, is_unit=is_unit)
     p = int(np.argmin([each.probability for each in expected]))
-    if expected[p].probability * n_tests >= _FALSE_ALARMS:
-        return
-    differs = x - np.array([each.mean for each in expected])
-    explained = group.inflation * float(differs @ information @ differs)
     centre = float(group.centre[p])
     if group.group.kind == "payload":  # relative to the other runs
         centre = -expected[p].mean
-    yield explained, UnlikeRun(
+    return others, UnlikeRun(
         at, group.group.kind, group.group.name, group.group.parameters[p], group.group.units[p],
         centre + float(x[p]), float(np.sqrt(variance[p])), centre + expected[p].ends,
         expected[p].probability,
