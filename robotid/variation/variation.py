@@ -150,10 +150,6 @@ class Variation:
 
         It is that of the values in the runs or units, shrunk to 0 by its own uncertainty; shape
         (m, m).
-
-        References:
-            Schaefer, Strimmer (2005), A shrinkage approach to large-scale covariance matrix
-            estimation, doi:10.2202/1544-6115.1175, section 2.4 (target D).
         """
         values = np.array([each.values for each in self.parameters]).reshape(-1, len(self.runs))
         if self.units > 1:
@@ -275,13 +271,20 @@ def effects_by_log(entries: Sequence[Mapping[str, Any]]) -> Array:
 def shrunk_correlation(values: Array) -> Array:
     """Return the correlation of parameters, shrunk to 0 by its own uncertainty.
 
-    r* = (1 - lambda) r with lambda = sum Var(r_ij) / sum r_ij^2 over i != j, within [0, 1].
+    r*_ij = a_i a_j r_ij with a_i^2 = 1 - sum Var(r_ij) / sum r_ij^2 over j != i, within [0, 1]: a
+    parameter that hardly varies, and correlates by noise alone, leaves the others as they are. The
+    matrix is positive definite, as a product of positive semidefinite matrices by elements (Schur).
 
     Args:
         values: Values in k runs, shape (k, m).
 
     Returns:
         Shape (m, m), positive definite.
+
+    References:
+        Schaefer, Strimmer (2005), A shrinkage approach to large-scale covariance matrix
+        estimation, doi:10.2202/1544-6115.1175, section 2.4 (target D), there with one factor for
+        all parameters.
     """
     k, m = values.shape
     centred = values - values.mean(axis=0)
@@ -292,9 +295,10 @@ def shrunk_correlation(values: Array) -> Array:
     r = k / (k - 1) * mean
     variance = k / (k - 1) ** 3 * ((products - mean) ** 2).sum(axis=0)
     off = ~np.eye(m, dtype=bool)
-    size = float((r[off] ** 2).sum())
-    share = min(max(float(variance[off].sum()) / size, _LEAST_SHRUNK), 1.0) if size else 1.0
-    return np.where(off, (1.0 - share) * r, 1.0)
+    size = (r**2 * off).sum(axis=1)
+    share = (variance * off).sum(axis=1) / np.where(size > 0.0, size, 1.0)
+    left = np.sqrt(1.0 - np.clip(np.where(size > 0.0, share, 1.0), _LEAST_SHRUNK, 1.0))
+    return np.where(off, left[:, None] * r * left, 1.0)
 
 
 def _covariance(H: Array, scale: Array) -> Array:
