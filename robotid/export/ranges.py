@@ -7,6 +7,7 @@ fixed axes. Any positive values give a possible body, so each may be drawn indep
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,7 @@ from robotid.robot.bodies import principal_moments
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia_basis
+from robotid.variation.covariates import at_temperature
 from robotid.versions import __version__
 
 if TYPE_CHECKING:
@@ -76,7 +78,12 @@ gains kp and kd, the delay of commands and the zero of the encoder.
 
 
 def export(
-    result: "Result", target: Path, *, samples: int | None = None, seed: int | None = None
+    result: "Result",
+    target: Path,
+    *,
+    samples: int | None = None,
+    seed: int | None = None,
+    temperature: float | None = None,
 ) -> Written:
     """Write the ranges that a result states, as YAML, and samples beside it, as JSON.
 
@@ -86,10 +93,12 @@ def export(
             suffix.
         samples: Number of samples of the joint distribution; None: no samples.
         seed: Seed of the samples; 0 if None.
+        temperature: Temperature of drives on whose parameters it has an effect [degC]; None: any of
+            the logs.
 
     Raises:
         DataError: If the result has no URDF, because it is wrong, or no ranges, or no covariance
-            for samples.
+            for samples, or temperature has no effect, or is far outside that of the logs.
         SettingsError: If the target is a folder, or an option is out of range.
     """
     if samples is None and seed is not None:
@@ -98,6 +107,9 @@ def export(
     has_gains = bool(commanded_drives(model, pi, result.content, result.path.name))
     if "ranges" not in result.content and not has_gains:
         raise DataError(f"{result.path.name} of an earlier version has no ranges; identify again")
+    if temperature is not None:
+        variation = at_temperature(result.content.get("variation", {}), temperature)
+        result = replace(result, content={**result.content, "variation": variation})
     files = [target]
     if samples is not None:
         files.append(target.with_suffix(".samples.json"))

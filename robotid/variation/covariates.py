@@ -1,6 +1,6 @@
 """Effects of temperature and time on drive parameters, taken by their evidence."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -12,7 +12,7 @@ from robotid.exceptions import DataError
 from robotid.variation.groups import Covariate, RunsOf
 from robotid.variation.mixed_effects import MixedEffects, Slope
 
-__all__ = ["Effect", "effects_of", "with_effects"]
+__all__ = ["Effect", "at_temperature", "effects_of", "with_effects"]
 
 _FALSE_EFFECTS = 0.02  # probability that one of all effects is taken where there is none
 _FEWEST = 4  # runs: a mean, a slope, and a spread
@@ -57,19 +57,11 @@ class Effect:
             value: The covariate, in its unit.
 
         Raises:
-            DataError: If the effect is not used, or the value is beyond half of the range of the
-                runs.
+            DataError: If the effect is not used, or the value is far outside those of the runs.
         """
-        name, unit = self.covariate.name, self.covariate.unit
         if not self.is_used:
-            raise DataError(f"the {name} has no effect in the model; its interval is that of any")
-        at, *ends = self.intervals
-        if not at[0] <= value <= at[-1]:
-            raise DataError(
-                f"{name} is {value:g} {unit}, wanted {at[0]:.4g} to {at[-1]:.4g} {unit}: the range "
-                "of the logs, and half of it beyond each end"
-            )
-        return np.array([np.interp(value, at, end) for end in ends])
+            raise DataError(f"the {self.covariate.name} has no effect on this parameter")
+        return _interval(self.covariate.name, self.covariate.unit, self.intervals, value)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, as result.json has them."""
@@ -127,6 +119,63 @@ def effects_of(group: RunsOf, model: MixedEffects, p: int) -> tuple[Effect, ...]
             intervals = np.zeros((3, 0))
         found.append(Effect(covariate, *values, bool(places), intervals))
     return tuple(found)
+
+
+def at_temperature(variation: Mapping[str, Any], temperature: float) -> dict[str, Any]:
+    """Return the variation of a result.json, its predictions at a temperature.
+
+    Args:
+        variation: As in result.json.
+        temperature: The temperature [degC].
+
+    Raises:
+        DataError: If temperature has no effect, or it is far outside that of the logs.
+    """
+    moved = dict(variation.get("parameters", {}))
+    for name, entry in moved.items():
+        own = entry.get("effects", {}).get("temperature", {"is_used": False})
+        if not own["is_used"]:
+            continue
+        table = own["next_interval_at"]
+        intervals = np.array([table[key] for key in ("at", "low", "high")])
+        ends = _interval("temperature", own["unit"], intervals, temperature)
+        at_mean = np.array(entry["next_interval"])
+        wider = float(np.ptp(ends) / np.ptp(at_mean))
+        quantiles = ends.mean() + wider * (np.array(entry["next_quantiles"]) - at_mean.mean())
+        change = own["slope"] * (temperature - own["mean"])
+        others = {key: x for key, x in entry["effects"].items() if key != "temperature"}
+        moved[name] = entry | {
+            "mean": entry["mean"] + change,
+            "next_interval": ends.tolist(),
+            "next_quantiles": quantiles.tolist(),
+            "effects": others,
+        }
+        if "seen_interval" in entry:
+            room = np.array(entry["seen_interval"]) - _hull(intervals, own["by_log"])
+            moved[name]["seen_interval"] = (ends + room).tolist()
+    if all(moved[name] is entry for name, entry in variation.get("parameters", {}).items()):
+        raise DataError(
+            "temperature has no effect on a drive parameter of this result; leave it out, or "
+            "identify from logs at more temperatures, with temperature in [[identification]]"
+        )
+    return {**variation, "parameters": moved}
+
+
+def _interval(name: str, unit: str, intervals: Array, value: float) -> Array:
+    """Return the interval at a covariate from those in a table, shape (2,)."""
+    at, *ends = intervals
+    if not at[0] <= value <= at[-1]:
+        raise DataError(
+            f"{name} is {value:g} {unit}, wanted {at[0]:.4g} to {at[-1]:.4g} {unit}: the range of "
+            "the logs, and half of it beyond each end"
+        )
+    return np.array([np.interp(value, at, end) for end in ends])
+
+
+def _hull(intervals: Array, values: Sequence[float]) -> Array:
+    """Return the ends of the intervals at any of some covariates, shape (2,)."""
+    at, low, high = intervals
+    return np.array([np.interp(values, at, low).min(), np.interp(values, at, high).max()])
 
 
 def _candidates(group: RunsOf) -> list[tuple[Covariate, Slope]]:
