@@ -237,16 +237,17 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
             least=0.0 if term in _NOT_NEGATIVE else -math.inf,
         )
         drives.setdefault(drive, {})[term] = ends | {"unit": entry["unit"]}
-    for name, entry in content.get("variation", {}).get("parameters", {}).items():
-        drive, _, term = name.rpartition(".")
-        own = drives.get(drive, {}).get(term)
-        if own is not None and "low" in own and own["source"] != "bound":
-            low, high = entry.get("seen_interval", entry["next_interval"])
-            least = 0.0 if term in _NOT_NEGATIVE or term == "kp" else -math.inf
-            own |= {"low": max(low, least), "high": high, "source": "logs"}
     empty = {"robot": content["robot"], "confidence": 0.95, "bodies": {}, "drives": {}}
     ranges = content.get("ranges", empty)
     merged = {drive: terms | ranges["drives"].get(drive, {}) for drive, terms in drives.items()}
+    for name, entry in content.get("variation", {}).get("parameters", {}).items():
+        drive, _, term = name.rpartition(".")
+        own = merged.get(drive, {}).get(term)
+        if own is not None and "low" in own and own["source"] != "bound":
+            low, high = entry.get("seen_interval", entry["next_interval"])
+            least = 0.0 if term in _NOT_NEGATIVE or term == "kp" else -math.inf
+            of_logs = {"low": max(low, least), "high": high, "source": "logs"}
+            merged[drive][term] = own | of_logs
     return {"undetermined": content["structure"]["undetermined"], **ranges, "drives": merged}
 
 
