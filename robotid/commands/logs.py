@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,6 +84,7 @@ def survey_logs(
     def survey(entries: Sequence[LogEntry]) -> tuple[SurveyedLog, ...]:
         logs = []
         units_of_logs(entries)
+        hours = dict(zip(entries, _hours_of(entries), strict=True))
         for entry in entries:
             try:
                 found = opened[entry.path]
@@ -90,7 +92,9 @@ def survey_logs(
                     raise found
                 window = entry.start, entry.end
                 log = survey_log(*found, model, job.signals, window, length=length)
-                logs.append(replace(log, unit=entry.unit or ""))
+                if entry.temperature is not None:
+                    log = replace(log, temperature=dict.fromkeys(model.joints, entry.temperature))
+                logs.append(replace(log, unit=entry.unit or "", time=hours[entry]))
             except DataError as error:
                 if refuse is None:
                     raise
@@ -117,6 +121,39 @@ def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:
             f"{named.unit!r}; state the unit (name of the robot) of each log, or of none"
         )
     return [entry.unit or "" for entry in entries]
+
+
+def _hours_of(entries: Sequence[LogEntry]) -> list[float | None]:
+    """Return the time of each log [h], from any origin; None if none is stated.
+
+    Raises:
+        SettingsError: If only some logs state time or temperature, or their times are of two kinds.
+    """
+    for key in ("temperature", "time"):
+        without = [entry for entry in entries if getattr(entry, key) is None]
+        if 0 < len(without) < len(entries):
+            stated = next(entry for entry in entries if getattr(entry, key) is not None)
+            raise SettingsError(
+                f"{without[0].path.name} has no {key}, but {stated.path.name} has {key} = "
+                f"{getattr(stated, key)}; state the {key} of each log, or of none"
+            )
+    found: dict[str, list[float | None]] = {}
+    for entry in entries:
+        kind, hours = "", None
+        if isinstance(entry.time, str):
+            date = datetime.fromisoformat(entry.time)
+            kind = (
+                "a date without a time zone" if date.tzinfo is None else "a date with a time zone"
+            )
+            hours = date.replace(tzinfo=date.tzinfo or UTC).timestamp() / 3600.0
+        elif entry.time is not None:
+            kind, hours = "a number of hours", float(entry.time)
+        found.setdefault(kind, []).append(hours)
+    if len(found) > 1:
+        raise SettingsError(
+            f"the time of a log is {' and of another '.join(found)}; state all times in one way"
+        )
+    return next(iter(found.values()), [])
 
 
 def examine(

@@ -1,6 +1,7 @@
 """The JSON schema of job files, for completion and checks in editors."""
 
 from collections.abc import Mapping
+from datetime import datetime
 from typing import Any
 
 from robotid._settings import REQUIRED, Entries, Key, Settings
@@ -11,7 +12,7 @@ from robotid.logs.transmission import Transmission
 __all__ = ["job_schema"]
 
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
-_NAMES = {str: "string", bool: "boolean", int: "integer", float: "number"}
+_NAMES = {str: "string", datetime: "string", bool: "boolean", int: "integer", float: "number"}
 _NAMES |= {list: "array", dict: "object"}
 _TABLES: Mapping[str, type[Settings]] = {
     "identification": LogEntry,
@@ -69,4 +70,4 @@ def _value(kind: Any, keys: Mapping[str, Key], at: str) -> dict[str, Any]:  # no
 def _types(kinds: tuple[type, ...]) -> list[str]:
     """Return the names that JSON schema has for types; its numbers may be whole."""
     kinds = tuple(kind for kind in kinds if not (kind is int and float in kinds))
-    return [_NAMES[kind] for kind in kinds]
+    return list(dict.fromkeys(_NAMES[kind] for kind in kinds))

@@ -1,5 +1,6 @@
 """Misfit of the drive models: tests the residual of a fit for terms that drives may have."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from operator import attrgetter
@@ -44,6 +45,8 @@ class Misfit:
         theta: The parameters of its columns, shape (c,).
         scale: The motion that sets the scale of its columns.
         entries: Entries of the joint in a job's [drives] that add it; none if there are none.
+        trend: Change of the friction at the RMS speed per minute, and its standard error [N m/min
+            or N/min], of a drift with time; NaN of other terms.
     """
 
     joint: str
@@ -59,6 +62,7 @@ class Misfit:
     theta: Array
     scale: JointMotion
     entries: tuple[str | DriveTerm, ...] = ()
+    trend: tuple[float, float] = (math.nan, math.nan)
 
     def torque(self, motion: JointMotion) -> Array:
         """Return the torque of the term along a motion of the joint, shape (N,) [N m or N].
@@ -148,6 +152,7 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
                 theta=theta,
                 scale=motion,
                 entries=_entries(sample, j, best),
+                trend=_trend(sample, j, best, whole, chosen, new),
             )
         chosen += new
         before, own = this.left[best], [c for c in own if c.code != best.code]
@@ -158,6 +163,20 @@ def _entries(sample: Sample, j: int, term: Candidate) -> tuple[str | DriveTerm, 
     angle = 0.0 if sample.is_prismatic[j] else float(np.ptp(sample.motions[j].q[: sample.rows]))
     families = [name for name in term.families if has_turned(name, angle)]
     return tuple(families[:1]) or term.terms
+
+
+def _trend(
+    sample: Sample, j: int, term: Candidate, whole: Trial, before: list[int], new: list[int]
+) -> tuple[float, float]:
+    """Return the change of the friction at the RMS speed per minute, of a drift, and its error."""
+    if term.code != "drift":
+        return math.nan, math.nan
+    theta, covariance = whole.estimate([*before, *new], sample.fitted)
+    own, motion = slice(len(before), None), sample.motions[j].at(slice(sample.rows))
+    speed = float(np.sqrt(np.mean(motion.v**2)))
+    per_minute = np.array([1.0, speed, 0.0]) * 60.0 / motion.longest  # of direction, v and 1
+    error = float(np.sqrt(per_minute @ covariance[own, own] @ per_minute))
+    return float(per_minute @ theta[own]), error
 
 
 def _size(

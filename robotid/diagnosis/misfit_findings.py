@@ -1,6 +1,7 @@
 """Findings of terms that a drive model lacks, and the entries of a job file that add them."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -172,9 +173,16 @@ def _finding(misfit: Misfit, found: Fit, on_misfit: Sequence[str]) -> Finding:
     if validation is not None:
         confirmed = f" ({100 * max(validation, 0.0):.0f} % on the validation logs)"
     remedy = _advice(term, setting_of(misfit, found))
+    trend, unit = "", misfit.unit.removesuffix(" rms")
+    if not math.isnan(misfit.trend[0]):
+        change, error = misfit.trend
+        verb = "falls" if change < 0 else "rises"
+        trend = (
+            f"; friction at the RMS speed {verb} by {abs(change):.2g} +- {error:.1g} {unit} per min"
+        )
     message = (
         f"{misfit.joint}: {term.meaning}: {misfit.size:.3g} +- {misfit.std_error:.2g} "
-        f"{misfit.unit}. It would explain {100 * misfit.share:.0f} % of the squared residual"
+        f"{misfit.unit}{trend}. It would explain {100 * misfit.share:.0f} % of the squared residual"
         f"{confirmed}; the residual is {100 * misfit.error:.1f} % of the torque. "
         f"{remedy or 'The model has no such term'}{widened}"
     )
@@ -185,6 +193,8 @@ def _finding(misfit: Misfit, found: Fit, on_misfit: Sequence[str]) -> Finding:
         "std_error": misfit.std_error,
         "p_value": misfit.p_value,
     }
+    if trend:
+        evidence |= {"trend": misfit.trend[0], "trend_std_error": misfit.trend[1]}
     if validation is not None:
         evidence["validation_share_pct"] = 100 * validation
     severity = "warning" if misfit.matters else "note"

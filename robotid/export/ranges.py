@@ -7,6 +7,7 @@ fixed axes. Any positive values give a possible body, so each may be drawn indep
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,7 @@ from robotid.robot.bodies import principal_moments
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia_basis
+from robotid.variation.covariates import at_temperature
 from robotid.versions import __version__
 
 if TYPE_CHECKING:
@@ -54,7 +56,8 @@ Ranges for domain randomisation of {robot}, by robotid {version}. kg, m, kg m^2,
 nominal is the identified value, low to high its 95 % interval, limited to possible values. The low
 end of a positive parameter is computed from its logarithm. source is the source of the interval:
   data   the motion;
-  logs   the spread between logs, drives only: the 95 % prediction interval of the next log;
+  logs   the spread between logs, drives only: the 95 % prediction interval of the next log, at any
+         temperature and time of the logs if these have an effect;
   prior  the plausible error of the URDF: the motion does not determine the parameter;
   mixed  both, or the motion determines only sums with other parameters;
   bound  the value is at a physical bound; a drive at 0 has no interval: no low, no high;
@@ -75,7 +78,12 @@ gains kp and kd, the delay of commands and the zero of the encoder.
 
 
 def export(
-    result: "Result", target: Path, *, samples: int | None = None, seed: int | None = None
+    result: "Result",
+    target: Path,
+    *,
+    samples: int | None = None,
+    seed: int | None = None,
+    temperature: float | None = None,
 ) -> Written:
     """Write the ranges that a result states, as YAML, and samples beside it, as JSON.
 
@@ -85,10 +93,12 @@ def export(
             suffix.
         samples: Number of samples of the joint distribution; None: no samples.
         seed: Seed of the samples; 0 if None.
+        temperature: Temperature of drives on whose parameters it has an effect [degC]; None: any of
+            the logs.
 
     Raises:
         DataError: If the result has no URDF, because it is wrong, or no ranges, or no covariance
-            for samples.
+            for samples, or temperature has no effect, or is far outside that of the logs.
         SettingsError: If the target is a folder, or an option is out of range.
     """
     if samples is None and seed is not None:
@@ -97,6 +107,9 @@ def export(
     has_gains = bool(commanded_drives(model, pi, result.content, result.path.name))
     if "ranges" not in result.content and not has_gains:
         raise DataError(f"{result.path.name} of an earlier version has no ranges; identify again")
+    if temperature is not None:
+        variation = at_temperature(result.content.get("variation", {}), temperature)
+        result = replace(result, content={**result.content, "variation": variation})
     files = [target]
     if samples is not None:
         files.append(target.with_suffix(".samples.json"))
@@ -134,7 +147,7 @@ def parameter_ranges(found: Identified) -> dict[str, Any]:
             found.standard[k], errors[k], source, least=least, quantile=float(quantile[k])
         )
         if layout.names[k] in between and source != "bound":
-            low, high = between[layout.names[k]].prediction.ends
+            low, high = between[layout.names[k]].seen_ends
             found_range |= {"low": max(float(low), least), "high": float(high), "source": "logs"}
         term_name = layout.names[k].removeprefix(f"{name}.")
         drives[name][term_name] = found_range | {"unit": layout.units[k]}
@@ -224,16 +237,17 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
             least=0.0 if term in _NOT_NEGATIVE else -math.inf,
         )
         drives.setdefault(drive, {})[term] = ends | {"unit": entry["unit"]}
-    for name, entry in content.get("variation", {}).get("parameters", {}).items():
-        drive, _, term = name.rpartition(".")
-        own = drives.get(drive, {}).get(term)
-        if own is not None and "low" in own and own["source"] != "bound":
-            low, high = entry["next_interval"]
-            least = 0.0 if term in _NOT_NEGATIVE or term == "kp" else -math.inf
-            own |= {"low": max(low, least), "high": high, "source": "logs"}
     empty = {"robot": content["robot"], "confidence": 0.95, "bodies": {}, "drives": {}}
     ranges = content.get("ranges", empty)
     merged = {drive: terms | ranges["drives"].get(drive, {}) for drive, terms in drives.items()}
+    for name, entry in content.get("variation", {}).get("parameters", {}).items():
+        drive, _, term = name.rpartition(".")
+        own = merged.get(drive, {}).get(term)
+        if own is not None and "low" in own and own["source"] != "bound":
+            low, high = entry.get("seen_interval", entry["next_interval"])
+            least = 0.0 if term in _NOT_NEGATIVE or term == "kp" else -math.inf
+            of_logs = {"low": max(low, least), "high": high, "source": "logs"}
+            merged[drive][term] = own | of_logs
     return {"undetermined": content["structure"]["undetermined"], **ranges, "drives": merged}
 
 

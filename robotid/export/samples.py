@@ -23,7 +23,7 @@ from robotid.variation.draws import (
     root_of,
     scores_to_values,
 )
-from robotid.variation.variation import SCORES
+from robotid.variation.variation import SCORES, effects_by_log
 
 if TYPE_CHECKING:
     from robotid.export.result import Result
@@ -100,8 +100,8 @@ def sample(result: "Result", count: int, rng: np.random.Generator) -> tuple[list
 
     Bodies are normal with the covariance of the fit, given that all are physically possible.
     Drive parameters with a spread between logs have the predictive distribution of the next log or
-    robot. Their correlation is that of the error of their mean, with all parameters of the fit, and
-    of their values in the logs, among each other.
+    robot; temperature and time are those of one of the logs. Their correlation is that of the error
+    of the fit, with all its parameters, and that of their values in the logs, among each other.
 
     Args:
         result: The result.
@@ -152,18 +152,24 @@ def sample(result: "Result", count: int, rng: np.random.Generator) -> tuple[list
         own = [name for name in names if name in between]
         at = np.flatnonzero(spread)
         scores = x[:, at] / np.where(error[at] > 0.0, error[at], 1.0)
-        share = np.array([between[name]["share"] for name in own]) * (error[at] > 0.0)
+        # the rest of the error of the mean is due to the spread, and correlates as it does
+        of_mean, total = np.array([between[name]["errors"] for name in own]).T
+        share = np.minimum(np.minimum(error[at], of_mean) / total, 1.0) ** 2
         order = [between[name]["at"] for name in own]
         R = np.array(result.content["variation"]["correlation"])[np.ix_(order, order)]
+        moved = effects_by_log([result.content["variation"]["parameters"][name] for name in own])
+        logs = rng.integers(len(moved), size=count) if len(moved) else np.zeros(0, dtype=int)
         z = correlated_scores(scores, share, R, rng.standard_normal(scores.shape))
         for k, (i, name) in enumerate(zip(at.tolist(), own, strict=True)):
             least = 0.0 if signed[i] else -math.inf
             drawn[:, i] = scores_to_values(z[:, k], SCORES, between[name]["quantiles"], least)
+            if len(logs):
+                drawn[:, i] = np.maximum(drawn[:, i] + moved[logs, k], least)
     return names, drawn
 
 
 def _between(content: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return quantiles of the next log, share of the mean's error, and number, by parameter."""
+    """Return quantiles of the next log, errors of the mean and of it, and number, by parameter."""
     found: dict[str, dict[str, Any]] = {}
     entries = {entry["name"]: entry for entry in content["drive_parameters"]}
     parameters = content.get("variation", {}).get("parameters", {})
@@ -171,9 +177,8 @@ def _between(content: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         if entries[name].get("at_bound"):
             continue
         low, high = entry["next_interval"]
-        total = (high - low) / (2.0 * QUANTILE)
-        share = min((entry["std_error"] / total) ** 2, 1.0)
-        found[name] = {"quantiles": np.array(entry["next_quantiles"]), "share": share, "at": k}
+        errors = entry["std_error"], (high - low) / (2.0 * QUANTILE)
+        found[name] = {"quantiles": np.array(entry["next_quantiles"]), "errors": errors, "at": k}
     return found
 
 

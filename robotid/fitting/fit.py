@@ -33,7 +33,7 @@ from robotid.fitting.standard_errors import (
 from robotid.regressor.factors import Factors, Reduction, join
 from robotid.regressor.memory import is_loaded
 from robotid.robot.prior import prior_spread
-from robotid.variation.groups import FEWEST_RUNS, RunsOf, runs_of
+from robotid.variation.groups import FEWEST_RUNS, Covariate, RunsOf, runs_of
 
 __all__ = ["Solved", "fit_recordings", "rough_choice", "solve_recordings"]
 
@@ -176,7 +176,8 @@ class Solved:
             return ()
         own, sigma = self.recordings, ground.rough.sigma
         _, unit = np.unique([log.unit for log in own.fitted], return_inverse=True)
-        return runs_of(own.model, own.mapping, logs, self.standard, sigma, unit)
+        covariates = _covariates(own)
+        return runs_of(own.model, own.mapping, logs, self.standard, sigma, unit, covariates)
 
     def _measured(self) -> tuple[Estimate, Estimate, StandardErrors]:
         """Return the estimate and that of WLS with standard errors, and how these were found."""
@@ -208,6 +209,23 @@ class Solved:
             estimate = replace(estimate, covariance=ground.grown * estimate.covariance)
             wls = replace(wls, covariance=ground.grown * wls.covariance)
         return estimate, wls, errors
+
+
+def _covariates(recordings: Recordings) -> dict[str, list[Covariate]]:
+    """Return temperature and time of the logs by drive, where every log has them."""
+    found: dict[str, list[Covariate]] = {}
+    for drive in recordings.model.layout.drives:
+        warm = [
+            [log.temperature[joint] for joint, _ in drive.ratios if joint in log.temperature]
+            for log in recordings.fitted
+        ]
+        times = [log.time for log in recordings.fitted if log.time is not None]
+        own = found[drive.name] = list[Covariate]()
+        if all(warm):
+            own.append(Covariate("temperature", "degC", np.array([np.mean(x) for x in warm])))
+        if len(times) == len(warm):
+            own.append(Covariate("time", "h", np.array(times)))
+    return found
 
 
 def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Recordings:

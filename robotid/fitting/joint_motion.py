@@ -30,6 +30,7 @@ class JointMotion:
         travelled: Distance since the last change of sign of v, shape (N,) [rad or m].
         time: Time since the start of the recording, over the longest duration, shape (N,) [-].
         passes: Cut-off frequency of the torque filter [Hz]; infinite without a filter.
+        longest: The longest duration of a recording [s].
         others: Motion of the joints before and after it, by name.
         scale: Motion whose typical speeds, distances and loads scale columns; None: this one.
     """
@@ -42,6 +43,7 @@ class JointMotion:
     travelled: Array
     time: Array
     passes: float = np.inf
+    longest: float = 1.0
     others: dict[str, "JointMotion"] = field(default_factory=dict)
     scale: "JointMotion | None" = None
 
@@ -66,7 +68,7 @@ class JointMotion:
             x[rows] for x in (self.q, self.v, self.a, self.direction, self.load)
         )
         travelled, time = self.travelled[rows], self.time[rows]
-        return JointMotion(q, v, a, direction, load, travelled, time, self.passes)
+        return JointMotion(q, v, a, direction, load, travelled, time, self.passes, self.longest)
 
 
 def joint_motions(
@@ -94,7 +96,15 @@ def joint_motions(
     time = joined(lambda m: (m.t - m.t[0]) / (longest or 1.0))
     alone = [
         JointMotion(
-            q[:, j], v[:, j], a[:, j], signs[:, j], load[:, j], distance[:, j], time, passes
+            q[:, j],
+            v[:, j],
+            a[:, j],
+            signs[:, j],
+            load[:, j],
+            distance[:, j],
+            time,
+            passes,
+            longest or 1.0,
         )
         for j in range(len(model.joints))
     ]

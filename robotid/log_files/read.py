@@ -7,7 +7,7 @@ columns of the motors are read instead, as `qm_<motor>` and `taum_<motor>` [N m]
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, get_args
@@ -188,6 +188,7 @@ class LogLayout:
     gears: tuple[Transmission, ...]  # of the motors
     has_torque: bool  # whether the file has a torque or a current of any of the joints
     base: BaseColumns = _BASE  # of a floating base and of contacts
+    temperatures: Mapping[str, str] = field(default_factory=dict)  # names in the file by joint
 
     @property
     def wanted(self) -> list[str]:
@@ -356,16 +357,15 @@ def lay_out(
     if opened.angle_unit and units.angle is None:
         raise DataError(f"{where}: {opened.angle_unit}", code="angle_unit")
     check_transmissions(transmissions, joints)
-    gears = tuple(transmissions)
     stated = {key: opened.renamed.get(name, name) for key, name in (columns or {}).items()}
     of_base = base_columns(where, opened.names, base, stated)
-    base = base.present([*opened.names, *stated])
-    base = replace(base, twist=opened.axes.get("twist", base.twist))
+    twist = opened.axes.get("twist", base.twist)
+    base = replace(base.present([*opened.names, *stated]), twist=twist)
     notes = [*opened.notes, *_notes_of_sensors(where, opened, of_base, base)]
     of_joints = {x: y for x, y in stated.items() if y not in chain.from_iterable(of_base.values())}
     finder = Finder(
-        where, opened.names, of_joints, tuple(joints), gains or {}, source, gears, needs,
-        notes, passive=passive,
+        where, opened.names, of_joints, tuple(joints), gains or {}, source, tuple(transmissions),
+        needs, notes, passive=passive,
     )  # fmt: skip
     joints = [joint for joint in joints if joint not in passive or finder.has_position(joint)]
     finder = replace(finder, joints=tuple(joints))
@@ -383,9 +383,10 @@ def lay_out(
         source=source,
         notes=tuple(finder.notes),
         motors={kind: finder.of_motors(kind) for kind in NOUNS},
-        gears=gears,
+        gears=finder.gears,
         has_torque=any(finder.has_torque(joint) for joint in joints),
         base=base,
+        temperatures=finder.find_temperatures(),
     )
     return layout, opened
 

@@ -69,12 +69,12 @@ def possible_draws(
 
 
 def correlated_scores(scores: Array, share: Array, correlation: Array, drawn: Array) -> Array:
-    """Return standard normal scores of a new run: error of the mean, and deviation of the run.
+    """Return standard normal scores of a new run: error of the fit, and deviation of the run.
 
     z = sqrt(share) * scores + sqrt(1 - share) * w with w ~ N(0, R).
 
     Args:
-        scores: Scores of the error of the mean, shape (k, m).
+        scores: Scores of the error of the fit, shape (k, m).
         share: Its share of the variance of the prediction, shape (m,), 0 to 1.
         correlation: R, shape (m, m), positive definite.
         drawn: Independent standard normal numbers, shape (k, m).

@@ -7,8 +7,9 @@ group in this run. One group is estimated with the others
 at theta.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from robotid.regressor.factors import Factors
 from robotid.robot.model import RobotModel
 from robotid.variation.mixed_effects import Runs
 
-__all__ = ["FEWEST_RUNS", "Group", "RunsOf", "inflation_of", "runs_of"]
+__all__ = ["FEWEST_RUNS", "Covariate", "Group", "RunsOf", "inflation_of", "runs_of"]
 
 #: Smallest number of runs whose scatter is estimated.
 FEWEST_RUNS = 3
@@ -30,6 +31,7 @@ _PAYLOAD = ("m", "mcx", "mcy", "mcz")
 _SMALLEST = 0.01  # torque of a drive over that of its largest term below which this share counts
 _RANK = 1e-9  # eigenvalue over the largest below which a run does not determine a direction
 _LEAST = 1e-12  # smallest information and inflation
+_NO_COVARIATES: Mapping[str, Sequence["Covariate"]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +56,21 @@ class Group:
 
 
 @dataclass(frozen=True, eq=False)
+class Covariate:
+    """A quantity of the runs that may have an effect on the parameters of a drive.
+
+    Attributes:
+        name: "temperature" or "time".
+        unit: Its unit, "degC" or "h".
+        values: Its value in each run, shape (k,).
+    """
+
+    name: str
+    unit: str
+    values: Array
+
+
+@dataclass(frozen=True, eq=False)
 class RunsOf:
     """The runs' information about the deviation of a group from the fit.
 
@@ -62,12 +79,19 @@ class RunsOf:
         centre: Its values in the fit, shape (q,): 0 for a payload, 1 for a gain.
         runs: Information about x, coloured noise included.
         inflation: Variance of coloured noise over that of independent rows [-].
+        covariates: Quantities of the runs that may have an effect on the parameters.
+        slopes: Sizes of the slopes of the runs.
+        across: Rows of the group in A^T A with A = W B of all Q parameters of all groups, in their
+            order, shape (k, q, Q); None: the other groups are independent of it.
     """
 
     group: Group
     centre: Array
     runs: Runs
     inflation: float
+    covariates: tuple[Covariate, ...] = ()
+    slopes: tuple[float, ...] = ()
+    across: Array | None = None
 
 
 def runs_of(
@@ -77,6 +101,7 @@ def runs_of(
     standard: Array,
     sigma: Array,
     unit: Array,
+    covariates: Mapping[str, Sequence[Covariate]] = _NO_COVARIATES,
 ) -> tuple[RunsOf, ...]:
     """Return the information of each run on each group of parameters.
 
@@ -87,6 +112,7 @@ def runs_of(
         standard: Standard parameters fitted to all runs, shape (p,).
         sigma: Noise level per joint, shape (n,) [N m or N].
         unit: Index of the robot of each run, shape (k,), int, from 0.
+        covariates: Quantities of the runs by drive.
     """
     theta = mapping.to_base(standard)
     found = []
@@ -97,7 +123,12 @@ def runs_of(
             continue
         scale, inflation = _scale(group, centre, H.sum(axis=0), model, standard), inflation_of(own)
         runs = Runs(H / inflation, h / inflation, unit, scale)
-        found.append(RunsOf(group, centre, runs, inflation))
+        of_drive = covariates.get(group.name, ()) if group.kind == "drive" else ()
+        found.append(RunsOf(group, centre, runs, inflation, tuple(of_drive)))
+    across, end = _across(segments, [each.group for each in found], sigma), 0
+    for k, each in enumerate(found):
+        start, end = end, end + len(each.centre)
+        found[k] = replace(each, across=across[:, start:end])
     return tuple(found)
 
 
@@ -145,6 +176,23 @@ def _products(
             H[k] += A.T @ A
             g[k] += A.T @ (R[:, -1] - R[:, :-1] @ theta[own])
     return H, g
+
+
+def _across(segments: Sequence[Sequence[Factors]], groups: Sequence[Group], sigma: Array) -> Array:
+    """Return A^T A of each run with A = W B of the Q parameters of all groups, (k, Q, Q)."""
+    B = np.hstack([group.columns for group in groups]) if groups else np.zeros((0, 0))
+    acts = np.array([j in g.rows for j in range(len(sigma)) for g in groups]).reshape(
+        len(sigma), -1
+    )
+    acts = np.repeat(acts, [group.columns.shape[1] for group in groups], axis=1)
+    found = np.zeros((len(segments), B.shape[1], B.shape[1]))
+    for k, run in enumerate(segments):
+        for segment in run:
+            for j in range(len(sigma)):
+                own = segment.columns[j]
+                A = segment.triangles[j][:, :-1] @ (B[own] * acts[j]) / sigma[j]
+                found[k] += A.T @ A
+    return found
 
 
 def inflation_of(runs: Sequence[tuple[Array, Array]]) -> float:

@@ -2,15 +2,18 @@
 
     x_run = mu + u_unit + u_run + e_run,    u_unit ~ N(0, D_unit),  u_run ~ N(0, D_run),
 
-with diagonal D. A run gives the information H about its own x and the product h = H x_hat, so runs
-in which a parameter had no effect (singular H) need no special case. Deviations are integrated out
-level by level. The restricted likelihood of the standard deviations in D is weighted by a wide
-prior about a plausible size. The standard deviation that a prediction depends on is integrated
-numerically: with few runs, its uncertainty is the largest part of the prediction interval.
+with diagonal D. A linear effect of the temperature or the time of a run is a part of mu: a slope is
+a parameter without a deviation, see ``Slope``. A run gives the information H about its own x and
+the product h = H x_hat, so runs in which a parameter had no effect (singular H) need no special
+case. Deviations are integrated out level by level. The restricted likelihood of the standard
+deviations in D is weighted by a wide prior about a plausible size. The standard deviation that a
+prediction depends on is integrated numerically: with few runs, its uncertainty is the largest part
+of the prediction interval.
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,12 +26,13 @@ from robotid.variation.restricted_likelihood import (
     by_unit,
     evidence,
     integrated,
+    log_prior,
     most_probable,
     on_grid,
     prior_of,
 )
 
-__all__ = ["Compared", "MixedEffects", "Prediction", "Runs", "covariance_of"]
+__all__ = ["Compared", "MixedEffects", "Prediction", "Runs", "Slope", "covariance_of"]
 
 _FIRST = -1.0  # logarithm of the standard deviations over their plausible size, at the start
 _NEAR = 2.0  # ... and largest distance of a stated start: the slope is small beyond
@@ -37,6 +41,21 @@ _ENDS = np.array([_TAIL, 1.0 - _TAIL])
 _ELEMENTS = 1_000_000  # of an array that compares runs, at most
 _HALVINGS = 200  # of the range of a quantile, at most
 _CLOSE = 1e-15  # change of a quantile that rounding decides
+
+
+@dataclass(frozen=True, eq=False)
+class Slope:
+    """A linear effect of a covariate of the runs, as their temperature, on a parameter.
+
+    Attributes:
+        parameter: Index of the parameter.
+        covariate: The covariate of each run, shape (k,).
+        scale: Plausible size of the slope, positive.
+    """
+
+    parameter: int
+    covariate: Array
+    scale: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +68,61 @@ class Runs:
         h: H times the estimate of each run, shape (k, q).
         unit: Index of the unit (robot) of each run, shape (k,), int, from 0.
         scale: Plausible standard deviation of each parameter, shape (q,), positive.
+        slopes: The last of the q parameters that are slopes. The others are those at the covariates
+            0. With x = Z (x_0, slopes), H is Z^T H Z.
     """
 
     H: Array
     h: Array
     unit: Array
     scale: Array
+    slopes: tuple[Slope, ...] = ()
+
+    @property
+    def n_varying(self) -> int:
+        """Number of parameters that are not slopes."""
+        return len(self.scale) - len(self.slopes)
+
+    def with_slopes(self, slopes: Sequence[Slope]) -> "Runs":
+        """Return the same runs with other slopes.
+
+        Args:
+            slopes: The slopes, in place of the present ones.
+        """
+        n = self.n_varying
+        Z = np.zeros((len(self.h), n, n + len(slopes)))
+        Z[:, range(n), range(n)] = 1.0
+        for s, slope in enumerate(slopes, start=n):
+            Z[:, slope.parameter, s] = slope.covariate
+        return replace(
+            self,
+            H=np.einsum("kia,kij,kjb->kab", Z, self.H[:, :n, :n], Z, optimize=True),
+            h=np.einsum("kia,ki->ka", Z, self.h[:, :n]),
+            scale=np.concatenate([self.scale[:n], [slope.scale for slope in slopes]]),
+            slopes=tuple(slopes),
+        )
+
+    def seen_from(self, covariates: Sequence[float]) -> "Runs":
+        """Return the runs with their parameters at other covariates than 0.
+
+        Args:
+            covariates: The covariate of each slope.
+        """
+        if not self.slopes:
+            return self
+        moved = [
+            replace(slope, covariate=slope.covariate - at)
+            for slope, at in zip(self.slopes, covariates, strict=True)
+        ]
+        return self.with_slopes(moved)
+
+    def means_of(self, own: Array) -> list[float]:
+        """Return the mean covariate of each slope in some of the runs.
+
+        Args:
+            own: Whether a run is one of these, shape (k,), bool.
+        """
+        return [float(slope.covariate[own].mean()) for slope in self.slopes]
 
     def without(self, run: int) -> "Runs":
         """Return the runs except one.
@@ -82,7 +150,8 @@ class Runs:
 
     def _only(self, left: Array) -> "Runs":
         _, unit = np.unique(self.unit[left], return_inverse=True)
-        return replace(self, H=self.H[left], h=self.h[left], unit=unit)
+        slopes = tuple(replace(s, covariate=s.covariate[left]) for s in self.slopes)
+        return replace(self, H=self.H[left], h=self.h[left], unit=unit, slopes=slopes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,10 +207,10 @@ class Compared:
     """Runs, or units, each compared with the prediction of all others.
 
     Attributes:
-        values: Their own parameters, shape (m, q).
-        covariance: Covariance of these, shape (m, q, q).
-        mean: Mean of the others, shape (m, q).
-        probability: Two-sided probability of such a deviation, shape (m, q).
+        values: Their own n parameters, without slopes, at their own covariates, shape (m, n).
+        covariance: Covariance of these, shape (m, n, n).
+        mean: Mean of the others, shape (m, n).
+        probability: Two-sided probability of such a deviation, shape (m, n).
     """
 
     values: Array
@@ -174,11 +243,13 @@ class MixedEffects:
 
     @cached_property
     def deviation(self) -> Array:
-        """Most probable standard deviations, shape (levels, q): between runs, between units."""
-        first = np.full((self.n_levels, len(self.runs.scale)), _FIRST)
+        """Most probable standard deviations, shape (levels, q): between runs, between units.
+
+        Those of slopes are 0.
+        """
+        first = np.full((self.n_levels, self.runs.n_varying), _FIRST)
         if self.first is not None:
-            first = np.log(self.first[: self.n_levels] / self.runs.scale)
-            first = np.clip(first, _FIRST - _NEAR, _FIRST + _NEAR)
+            first = self._near(self.first[: self.n_levels])
         found = most_probable(*self._members, self.runs.scale, first[:, :, None])
         return found[:, :, 0]
 
@@ -202,19 +273,28 @@ class MixedEffects:
         return values, np.sqrt(np.einsum("kpp->kp", errors))
 
     def predict(
-        self, own: Array | None = None, value: Array | None = None, *, is_unit: bool = False
+        self,
+        own: Array | None = None,
+        value: Array | None = None,
+        *,
+        is_unit: bool = False,
+        at: Sequence[float] = (),
     ) -> tuple[Prediction, ...]:
-        """Return the prediction of each parameter in a new run of a new unit, q items.
+        """Return the prediction of each parameter but slopes in a new run of a new unit.
 
         With one unit it is that of a new run. The standard deviation of the highest level is
         integrated, parameter by parameter; all others have their most probable values.
 
         Args:
-            own: Variance of the estimates of the new run, shape (q,); 0 if None.
-            value: Estimates of the new run, whose probability is computed, shape (q,); or None.
+            own: Variance of the estimates of the new run, of these parameters; 0 if None.
+            value: Estimates of the new run, whose probability is computed; or None.
             is_unit: Whether the mean of a new unit is predicted, without a deviation of its run.
+            at: The covariate of each slope in the new run; 0 if empty.
         """
-        q = len(self.runs.scale)
+        if any(at):
+            moved = MixedEffects(self.runs.seen_from(at), self.deviation)
+            return moved.predict(own, value, is_unit=is_unit)
+        q = self.runs.n_varying
         own = np.zeros(q) if own is None else own
         found = []
         for p in range(q):
@@ -238,7 +318,7 @@ class MixedEffects:
         return tuple(found)
 
     def with_one_more(self) -> tuple[Prediction, ...]:
-        """Return the prediction of each parameter, with what one more run would add, q items.
+        """Return the prediction of each parameter but slopes, with what one more run would add.
 
         With several units it is one more unit. The new run or unit is expected to give as much
         information as the mean of the others. The information about the mean then increases by
@@ -260,8 +340,31 @@ class MixedEffects:
             found.append(replace(each, after=(error, width)))
         return tuple(found)
 
+    def slope(self, s: int) -> tuple[float, float, float]:
+        """Return a slope, its standard error, and the two-sided p-value of a slope of 0.
+
+        The standard deviation of its parameter is integrated between runs if its covariate varies
+        most within units, else between units.
+
+        Args:
+            s: Index of the slope.
+        """
+        own, slope, unit = self.runs.n_varying + s, self.runs.slopes[s], self.runs.unit
+        means_of = np.bincount(unit, slope.covariate) / np.bincount(unit)
+        is_within = float(np.var(slope.covariate - means_of[unit])) > float(np.var(means_of[unit]))
+        variance = np.repeat(self.deviation[:, :, None] ** 2, len(GRID), axis=2)
+        p = slope.parameter
+        variance[0 if is_within else -1, p] = (self.runs.scale[p] * np.exp(GRID)) ** 2
+        found = evidence(*self._members, self.runs.scale, variance)
+        weight = _weight(found.log_likelihood + log_prior(GRID))
+        means, variances = found.mean[:, own], found.covariance[:, own, own]
+        mean, error = _moments(weight, means, variances)
+        return mean, error, float(_beyond(np.zeros(()), weight, means, np.sqrt(variances)))
+
     def against_others(self, which: Array, *, is_unit: bool) -> Compared:
         """Compare runs, or units, each with the prediction of all others.
+
+        Parameters are those at the mean covariates of the run or unit that is compared.
 
         Args:
             which: Indices of the runs or units, shape (m,), int, at least one.
@@ -270,6 +373,13 @@ class MixedEffects:
         unit = self.runs.unit
         found: list[tuple[Array, tuple[Array, ...]]] = []
         own = which[:, None] == (unit if is_unit else np.arange(len(unit)))  # (m, k)
+        if self.runs.slopes and len(which) > 1:  # each has covariates of its own
+            each = [self.against_others(one[None], is_unit=is_unit) for one in which]
+            return Compared(*(np.concatenate([getattr(x, key.name) for x in each])
+                              for key in fields(Compared)))  # fmt: skip
+        if self.runs.slopes and any(at := self.runs.means_of(own[0])):
+            moved = MixedEffects(self.runs.seen_from(at), self.deviation)
+            return moved.against_others(which, is_unit=is_unit)
         several = np.array([len(np.unique(unit[~each])) > 1 for each in own])
         most = max(1, _ELEMENTS // (len(GRID) * len(unit)))
         for levels in (1, 2):
@@ -290,20 +400,19 @@ class MixedEffects:
             levels: Levels of the model of the others.
             is_unit: Whether they are units.
         """
-        scale, (H, h, _) = self.runs.scale, self._members
+        scale, (H, h, _), n = self.runs.scale, self._members, self.runs.n_varying
         unit = self.runs.unit if levels == 2 else None
         rest = H * ~own, h * ~own, unit
-        first = np.log(self.deviation[:levels] / scale)
-        first = np.clip(first, _FIRST - _NEAR, _FIRST + _NEAR)[:, :, None]
-        first = np.repeat(first, len(own), axis=2)
+        first = np.repeat(self._near(self.deviation[:levels])[:, :, None], len(own), axis=2)
         deviation = most_probable(*rest, scale, first)
         W, w = H * own, h * own
         if is_unit:
             W, w, _ = integrated(W, w, deviation[0] ** 2)
         covariance = covariance_of(np.moveaxis(W.sum(axis=-1), -1, 0), scale)
         x = np.einsum("bpi,ib->bp", covariance, w.sum(axis=-1))
+        x, covariance = x[:, :n], covariance[:, :n, :n]
         mean, probability = np.empty(x.shape), np.empty(x.shape)
-        for p in range(len(scale)):
+        for p in range(n):
             grid = on_grid(*rest, scale, deviation, p, 1)
             weight = _weight(grid.log_density)
             mean[:, p] = (weight * grid.mean).sum(axis=-1)
@@ -312,6 +421,12 @@ class MixedEffects:
                 variance = variance + deviation[0, p][:, None] ** 2
             probability[:, p] = _beyond(x[:, p], weight, grid.mean, np.sqrt(variance))
         return x, covariance, mean, probability
+
+    def _near(self, deviation: Array) -> Array:
+        """Return the start of a search near deviations (levels, q), as of ``most_probable``."""
+        n = self.runs.n_varying
+        first: Array = np.log(deviation[:, :n] / self.runs.scale[:n])
+        return np.clip(first, _FIRST - _NEAR, _FIRST + _NEAR)
 
     @cached_property
     def _members(self) -> tuple[Array, Array, Array | None]:

@@ -167,7 +167,8 @@ def most_probable(H: Array, h: Array, unit: Array | None, scale: Array, first: A
         h: As in ``evidence``.
         unit: As in ``evidence``.
         scale: Plausible standard deviation of each parameter, shape (q,).
-        first: Logarithm of the deviations over the scale at the start, shape (levels, q, b).
+        first: Logarithm of the deviations over the scale at the start, shape (levels, n, b). The
+            parameters after the first n are slopes: they have no deviation.
 
     Raises:
         NotConvergedError: If the search does not end.
@@ -176,14 +177,19 @@ def most_probable(H: Array, h: Array, unit: Array | None, scale: Array, first: A
         Gelman (2006), Prior distributions for variance parameters in hierarchical models, section
         2.2 (half Student prior).
     """
-    shape = first.shape
+    shape, n = first.shape, first.shape[1]
+
+    def deviation_of(z: Array) -> Array:
+        deviation = np.zeros((shape[0], len(scale), z.shape[-1]))
+        deviation[:, :n] = scale[:n, None] * np.exp(z.reshape(*shape[:2], -1))
+        return deviation
 
     def density(z: Array, own: Array) -> tuple[Array, Array]:
         """Return the log density of models (b,) and its slope by z (levels q, b)."""
-        variance = (scale[:, None] * np.exp(z.reshape(*shape[:2], -1))) ** 2
+        variance = deviation_of(z) ** 2
         at = own if H.shape[2] > 1 else np.zeros(1, dtype=int)
         found = evidence(H[:, :, at], h[:, at], unit, scale, variance)
-        slope = (2.0 * variance * found.slope).reshape(z.shape)
+        slope = (2.0 * variance * found.slope)[:, :n].reshape(z.shape)
         rises = 1.0 - (_FREEDOM + 1.0) / (1.0 + _FREEDOM * np.exp(-2.0 * z))
         return found.log_likelihood + log_prior(z).sum(axis=0), slope + rises
 
@@ -194,8 +200,7 @@ def most_probable(H: Array, h: Array, unit: Array | None, scale: Array, first: A
     for _ in range(_STEPS):
         left = left[_steepest(z[:, left], slope[:, left]) > _FLAT]
         if not len(left):
-            deviation: Array = scale[:, None] * np.exp(z.reshape(shape))
-            return deviation
+            return deviation_of(z)
         if len(new := left[is_old[left]]):
             curvature[new] = _curvature(density, z[:, new], slope[:, new], new)
         step = length[left] * _step(curvature[left], z[:, left], slope[:, left])

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from robotid._typing import Array
+from robotid.variation.causes import evidence_by_group
+from robotid.variation.covariates import Effect, effects_of, with_effects
 from robotid.variation.groups import FEWEST_RUNS, RunsOf
 from robotid.variation.mixed_effects import MixedEffects, Prediction, covariance_of
 
@@ -17,6 +19,7 @@ __all__ = [
     "Variation",
     "VaryingParameter",
     "between_covariance",
+    "effects_by_log",
     "shrunk_correlation",
     "vary",
 ]
@@ -38,8 +41,9 @@ class VaryingParameter:
             units and of the next unit, if there are several.
         within: Most probable spread between runs of one unit, if there are several units.
         values: Its value in each run, shape (k,): the run's own and the mean, weighted by their
-            information.
+            information; at the mean temperature and time if these have effects.
         std_errors: Their standard errors, shape (k,).
+        effects: Effects of temperature and time. Prediction and spread are those at their means.
     """
 
     name: str
@@ -48,6 +52,22 @@ class VaryingParameter:
     values: Array
     std_errors: Array
     within: float | None = None
+    effects: tuple[Effect, ...] = ()
+
+    @property
+    def seen_ends(self) -> Array:
+        """Ends of the 95 % interval of the next run at any temperature and time of the runs, (2,).
+
+        It is the prediction interval if these have no effect.
+        """
+        low, high = self.prediction.ends
+        for each in self.effects:
+            if each.is_used:
+                own = each.covariate.values
+                ends = np.array([each.interval(float(x)) for x in (own.min(), own.max())])
+                low += min(ends[:, 0].min() - self.prediction.ends[0], 0.0)
+                high += max(ends[:, 1].max() - self.prediction.ends[1], 0.0)
+        return np.array([low, high])
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, as result.json has them."""
@@ -60,6 +80,8 @@ class VaryingParameter:
             "spread_interval": found.spread_ends.tolist(),
             **({} if self.within is None else {"spread_within_units": self.within}),
             "next_interval": found.ends.tolist(),
+            **({"seen_interval": self.seen_ends.tolist()}
+               if any(each.is_used for each in self.effects) else {}),
             "next_quantiles": found.quantiles(SCORES).tolist(),
             "one_more": {
                 "std_error": found.after[0],
@@ -67,7 +89,9 @@ class VaryingParameter:
             },
             "by_log": self.values.tolist(),
             "std_error_by_log": self.std_errors.tolist(),
-        }
+            **({"effects": {each.covariate.name: each.to_dict() for each in self.effects}}
+               if self.effects else {}),
+        }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,10 +150,6 @@ class Variation:
 
         It is that of the values in the runs or units, shrunk to 0 by its own uncertainty; shape
         (m, m).
-
-        References:
-            Schaefer, Strimmer (2005), A shrinkage approach to large-scale covariance matrix
-            estimation, doi:10.2202/1544-6115.1175, section 2.4 (target D).
         """
         values = np.array([each.values for each in self.parameters]).reshape(-1, len(self.runs))
         if self.units > 1:
@@ -161,8 +181,8 @@ def vary(
     """Return the variation between runs, or None for fewer than three runs.
 
     A run is compared with the prediction of the other runs, and a unit with that of the other
-    units, group by group. Of the groups that differ, the cause named is the one that explains most
-    of the residual.
+    units, group by group. If a group differs, the cause named is the one that explains most of the
+    residual, see ``evidence_by_group``.
 
     Args:
         names: Names of the k runs.
@@ -172,6 +192,7 @@ def vary(
     if len(names) < FEWEST_RUNS or not groups:
         return None
     parameters: list[VaryingParameter] = []
+    groups = with_effects(groups)
     models = [MixedEffects(group.runs) for group in groups]
     for group, model in zip(groups, models, strict=True):
         if group.group.kind == "drive":
@@ -181,7 +202,7 @@ def vary(
     n_units = int(unit.max()) + 1
     compared_units = np.arange(n_units if n_units > FEWEST_RUNS else 0)
     compared_runs = np.arange(len(names) if len(names) > FEWEST_RUNS else 0)
-    size = sum(group.runs.h.shape[1] for group in groups)
+    size = sum(group.runs.n_varying for group in groups)
     n_tests = size * (len(compared_units) + len(compared_runs))
     unlike_units = _unlike(pairs, compared_units, n_tests, is_unit=True)
     different = [each.run for each in unlike_units]
@@ -197,7 +218,7 @@ def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Ar
     """Return the covariance of parameters in the next run that the fit to all runs lacks.
 
     Standard deviations are the medians of the spreads: between runs, or between units and between
-    the runs of a unit.
+    the runs of a unit. Temperature and time of the next run are as those of the runs.
 
     Args:
         variation: As of ``Variation.to_dict``.
@@ -216,19 +237,49 @@ def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Ar
     found = np.zeros((len(names), len(names)))
     R = np.array(variation["correlation"])[np.ix_(own, own)]
     found[np.ix_(places, places)] = std[:, None] * R * std
+    moved = effects_by_log(entries)
+    if len(moved):
+        found[np.ix_(places, places)] += np.cov(moved.T).reshape(len(places), len(places))
+    return found
+
+
+def effects_by_log(entries: Sequence[Mapping[str, Any]]) -> Array:
+    """Return the deviations of parameters by effects of temperature and time, shape (k, m).
+
+    Without an effect, k is 0.
+
+    Args:
+        entries: As of ``VaryingParameter.to_dict``, m items.
+    """
+    own = [
+        (p, each)
+        for p, entry in enumerate(entries)
+        for each in entry.get("effects", {}).values()
+        if each["is_used"]
+    ]
+    found = np.zeros((len(own[0][1]["by_log"]) if own else 0, len(entries)))
+    for p, each in own:
+        found[:, p] += each["slope"] * (np.array(each["by_log"]) - each["mean"])
     return found
 
 
 def shrunk_correlation(values: Array) -> Array:
     """Return the correlation of parameters, shrunk to 0 by its own uncertainty.
 
-    r* = (1 - lambda) r with lambda = sum Var(r_ij) / sum r_ij^2 over i != j, within [0, 1].
+    r*_ij = a_i a_j r_ij with a_i^2 = 1 - sum Var(r_ij) / sum r_ij^2 over j != i, within [0, 1]: a
+    parameter that hardly varies, and correlates by noise alone, leaves the others as they are. The
+    matrix is positive definite, as a product of positive semidefinite matrices by elements (Schur).
 
     Args:
         values: Values in k runs, shape (k, m).
 
     Returns:
         Shape (m, m), positive definite.
+
+    References:
+        Schaefer, Strimmer (2005), A shrinkage approach to large-scale covariance matrix
+        estimation, doi:10.2202/1544-6115.1175, section 2.4 (target D), there with one factor for
+        all parameters.
     """
     k, m = values.shape
     centred = values - values.mean(axis=0)
@@ -239,9 +290,10 @@ def shrunk_correlation(values: Array) -> Array:
     r = k / (k - 1) * mean
     variance = k / (k - 1) ** 3 * ((products - mean) ** 2).sum(axis=0)
     off = ~np.eye(m, dtype=bool)
-    size = float((r[off] ** 2).sum())
-    share = min(max(float(variance[off].sum()) / size, _LEAST_SHRUNK), 1.0) if size else 1.0
-    return np.where(off, (1.0 - share) * r, 1.0)
+    size = (r**2 * off).sum(axis=1)
+    share = (variance * off).sum(axis=1) / np.where(size > 0.0, size, 1.0)
+    left = np.sqrt(1.0 - np.clip(np.where(size > 0.0, share, 1.0), _LEAST_SHRUNK, 1.0))
+    return np.where(off, left[:, None] * r * left, 1.0)
 
 
 def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter]:
@@ -258,57 +310,68 @@ def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter
                 centre + values[:, p],
                 errors[:, p],
                 float(model.deviation[0, p]) if model.n_levels == 2 else None,
+                effects_of(group, model, p),
             )
 
 
 def _unlike(
     pairs: Sequence[tuple[RunsOf, MixedEffects]], which: Array, n_tests: int, *, is_unit: bool
 ) -> list[UnlikeRun]:
-    """Return the runs or units that differ from the others, in order, one cause for each."""
-    causes: dict[int, list[tuple[float, UnlikeRun]]] = {}
-    for group, every in pairs:
-        for explained, found in _compared(group, every, which, n_tests, is_unit=is_unit):
-            causes.setdefault(found.run, []).append((explained, found))
-    return [max(causes[at], key=lambda each: each[0])[1] for at in sorted(causes)]
+    """Return the runs or units that differ from the others, in order.
 
-
-def _compared(
-    group: RunsOf, every: MixedEffects, which: Array, n_tests: int, *, is_unit: bool
-) -> Iterator[tuple[float, UnlikeRun]]:
-    """Yield each difference of a run or unit from the others, and what it explains.
-
-    A payload is compared only if the run determines it: a run in which the last joints are at rest
-    has a large moment and a wrong mass in place of any other effect.
+    The cause named is the group that explains most of the residual, the others as they vary.
     """
-    runs, kind = group.runs, group.group.kind
-    information = np.array(
-        [runs.of_unit(u).H.sum(axis=0) for u in which] if is_unit else runs.H[which]
-    ).reshape(len(which), *runs.H.shape[1:])
-    if kind == "payload":
+    groups, unit, unlike = [group for group, _ in pairs], pairs[0][0].runs.unit, []
+    found = [_probability(group, every, which, is_unit=is_unit) for group, every in pairs]
+    least = np.min(found, axis=0, initial=1.0)
+    for k in np.flatnonzero(least * n_tests < _FALSE_ALARMS):
+        at = int(which[k])
+        is_own = unit == at if is_unit else np.arange(len(unit)) == at
+        moved = [group.runs.seen_from(group.runs.means_of(is_own)) for group in groups]
+        others = [
+            MixedEffects(runs.without_unit(at) if is_unit else runs.without(at), every.deviation)
+            for runs, (_, every) in zip(moved, pairs, strict=True)
+        ]
+        evidence = evidence_by_group(
+            groups, [each.deviation for each in others], is_own, is_unit=is_unit
+        )
+        known = [g for g, probability in enumerate(found) if np.isfinite(probability[k])]
+        best = max(known, key=lambda g: evidence[g])
+        own = MixedEffects(moved[best], pairs[best][1].deviation).against_others(
+            which[k : k + 1], is_unit=is_unit
+        )
+        x, variance = own.values[0], np.diag(own.covariance[0])
+        expected = others[best].predict(variance, x, is_unit=is_unit)
+        p, group = int(np.argmin([each.probability for each in expected])), groups[best]
+        centre = float(group.centre[p])
+        if group.group.kind == "payload":  # relative to the other runs
+            centre = -expected[p].mean
+        unlike.append(UnlikeRun(
+            at, group.group.kind, group.group.name, group.group.parameters[p],
+            group.group.units[p], centre + float(x[p]), float(np.sqrt(variance[p])),
+            centre + expected[p].ends, float(least[k]),
+        ))  # fmt: skip
+    return unlike
+
+
+def _probability(group: RunsOf, every: MixedEffects, which: Array, *, is_unit: bool) -> Array:
+    """Return the smallest probability of the deviations of runs or units from the others, (m,).
+
+    A payload is compared only if the run determines it, else its probability is infinite: a run in
+    which the last joints are at rest has a large moment and a wrong mass in place of any other
+    effect.
+    """
+    runs, found = group.runs, np.full(len(which), np.inf)
+    is_compared = np.ones(len(which), dtype=bool)
+    if group.group.kind == "payload" and len(which):
+        own = np.array([runs.of_unit(u).H.sum(axis=0) for u in which] if is_unit else runs.H[which])
         alone, together = (
             np.diagonal(covariance_of(H, runs.scale), axis1=-2, axis2=-1)
-            for H in (information, runs.H.sum(axis=0))
+            for H in (own, runs.H.sum(axis=0))
         )
         plausible = runs.scale**2  # what all runs do not determine, no motion does
-        is_determined = ~np.any((alone > plausible) & (together <= plausible), axis=1)
-        which, information = which[is_determined], information[is_determined]
-    if not len(which):
-        return
-    found = every.against_others(which, is_unit=is_unit)
-    for k in np.flatnonzero(found.probability.min(axis=1) * n_tests < _FALSE_ALARMS):
-        at, x, p = int(which[k]), found.values[k], int(np.argmin(found.probability[k]))
-        others = MixedEffects(
-            runs.without_unit(at) if is_unit else runs.without(at), every.deviation
-        )
-        variance = np.diag(found.covariance[k])
-        ends = others.predict(variance, x, is_unit=is_unit)[p].ends
-        differs = x - found.mean[k]
-        explained = group.inflation * float(differs @ information[k] @ differs)
-        centre = float(group.centre[p])
-        if kind == "payload":  # relative to the other runs
-            centre = -float(found.mean[k, p])
-        yield explained, UnlikeRun(
-            at, kind, group.group.name, group.group.parameters[p], group.group.units[p],
-            centre + float(x[p]), float(np.sqrt(variance[p])), centre + ends,
-            float(found.probability[k, p]),
-        )  # fmt: skip
+        is_compared = ~np.any((alone > plausible) & (together <= plausible), axis=1)
+    if is_compared.any():
+        compared = every.against_others(which[is_compared], is_unit=is_unit)
+        found[is_compared] = compared.probability.min(axis=1)
+    return found

@@ -6,16 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from helpers.driven import JOINTS, arm, driven_log
 from helpers.synthetic import truth
 
 from robotid.cli.identify import show_result
 from robotid.cli.validate import _show as show_validation
+from robotid.commands.export import export_result
 from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings
+from robotid.commands.logs import survey_logs
 from robotid.commands.preview import preview_job
 from robotid.commands.validate import validate_result
-from robotid.exceptions import SettingsError
+from robotid.exceptions import DataError, SettingsError
 from robotid.export.ranges import parameter_ranges, stated_ranges
 from robotid.identification.summary import variation_lines
 from robotid.log_files.read import write_log
@@ -224,3 +227,116 @@ def test_robots_are_stated_by_unit(folder):
     part = job_from_settings(settings(folder, ("a", "a", "b")), "job.toml", folder)
     with pytest.raises(SettingsError, match=r"run_3.csv has no unit, but run_0.csv has unit = 'a'"):
         run_job(part, folder / "part")
+
+
+@pytest.fixture(scope="module")
+def warm(tmp_path_factory):
+    """Eight logs of an arm whose elbow has 2 % less viscous friction per degC; temperatures."""
+    model, rng, where = arm(), np.random.default_rng(3), tmp_path_factory.mktemp("warm")
+    k, degrees = model.layout.names.index("elbow_joint.viscous"), rng.uniform(15.0, 40.0, 8)
+    for run, own in enumerate(degrees):
+        pi = truth(model)
+        pi[k] *= 1.0 - 0.02 * (own - 25.0)
+        log = driven_log(model, pi, 40 + run, duration=6.0)
+        file = where / f"run_{run}.csv"
+        write_log(log, file)
+        rows = file.read_text().splitlines()
+        rising = own + np.linspace(-1.0, 1.0, len(rows) - 1)  # its mean counts
+        columns = ["temperature_elbow_joint,temperature", *(f"{x},30.0" for x in rising)]
+        file.write_text("\n".join(map(",".join, zip(rows, columns, strict=True))) + "\n")
+    return where, degrees
+
+
+def warm_job(where, **keys):
+    logs = [{"log": str(where / f"run_{k}.csv")} | {key: own[k] for key, own in keys.items()}
+            for k in range(8)]  # fmt: skip
+    return job_from_settings({**settings(where), "identification": logs}, "job.toml", where)
+
+
+def test_friction_falls_with_the_temperature_in_the_logs(warm, capsys):
+    where, degrees = warm
+    days = [f"2026-05-{4 + k:02d}T10:00:00" for k in range(8)]
+    _, content = run_job(warm_job(where, time=days), where / "out")
+    parameters = content["variation"]["parameters"]
+    used = [(name, key) for name, own in parameters.items()
+            for key, each in own["effects"].items() if each["is_used"]]  # fmt: skip
+    assert used == [("elbow_joint.viscous", "temperature")]
+    model = arm()
+    true = -0.02 * truth(model)[model.layout.names.index("elbow_joint.viscous")]
+    effect = parameters["elbow_joint.viscous"]["effects"]["temperature"]
+    assert effect["by_log"] == pytest.approx(degrees, abs=0.01)
+    assert effect["slope"] == pytest.approx(true, abs=3 * effect["std_error"])
+    assert effect["std_error"] < 0.1 * abs(true)
+    # one temperature of all logs has no effect; days count from any origin, in hours
+    assert list(parameters["wrist_1_joint.viscous"]["effects"]) == ["time"]
+    hours = parameters["elbow_joint.viscous"]["effects"]["time"]["by_log"]
+    assert np.diff(hours) == pytest.approx(24.0)
+    show_result(content)
+    printed = " ".join(capsys.readouterr().out.split())
+    share = 100 * abs(effect["slope"]) / parameters["elbow_joint.viscous"]["mean"]
+    said = f"elbow_joint.viscous falls with temperature: by {share:.2g} +- "
+    low, high = min(effect["by_log"]), max(effect["by_log"])
+    assert said in printed
+    assert f"% per degC (logs: {low:.3g} to {high:.3g} degC)" in printed
+    page = (where / "out" / "report.html").read_text()
+    assert said in page
+    # exports: any temperature of the logs, or one of them
+    exports = {}
+    for name, options in (
+        ("any", {}),
+        ("cold", {"temperature": 15.0}),
+        ("hot", {"temperature": 39}),
+    ):
+        target = where / f"{name}.yaml"
+        export_result(where / "out", "ranges", target, samples=300, seed=1, **options)
+        own = yaml.safe_load(target.read_text())["drives"]["elbow_joint"]["viscous"]
+        ends = [own[key] for key in ("low", "high")]
+        drawn = json.loads(target.with_suffix(".samples.json").read_text())["drives"]
+        exports[name] = ends, np.array(drawn["elbow_joint"]["viscous"])
+    (low, high), drawn = exports["any"]
+    seen = parameters["elbow_joint.viscous"]["seen_interval"]
+    assert (low, high) == pytest.approx(tuple(seen), rel=1e-5)
+    spread = abs(effect["slope"]) * np.std(degrees)
+    assert np.std(drawn) == pytest.approx(spread, rel=0.15)
+    (cold, hot), change = (exports[name] for name in ("cold", "hot")), effect["slope"] * 24.0
+    assert np.mean(hot[0]) - np.mean(cold[0]) == pytest.approx(change, rel=0.03)
+    assert np.mean(hot[1]) - np.mean(cold[1]) == pytest.approx(change, rel=0.03)
+    assert np.std(cold[1]) < 0.3 * spread
+    with pytest.raises(DataError, match="temperature is -60 degC, wanted"):
+        export_result(where / "out", "ranges", where / "no.yaml", temperature=-60.0)
+
+
+def test_stated_temperatures_replace_those_of_the_logs(warm):
+    where, degrees = warm
+    job = warm_job(where, temperature=[20.5, *range(21, 28)], time=[5.0, 1, 2, 3, 4, 6, 7, 8.5])
+    (logs,) = survey_logs(job, job.model(), job.identification)
+    assert logs[0].temperature == dict.fromkeys(JOINTS, 20.5)
+    assert [log.time for log in logs][:2] == [5.0, 1.0]
+    (logs,) = survey_logs(warm_job(where), job.model(), warm_job(where).identification[:1])
+    assert logs[0].temperature["wrist_1_joint"] == 30.0
+    assert logs[0].temperature["elbow_joint"] == pytest.approx(degrees[0])
+    assert not any("temperature" in note for note in logs[0].head.notes)
+    named = replace(warm_job(where), columns={"temperature": "temperature_elbow_joint"})
+    (logs,) = survey_logs(named, job.model(), warm_job(where).identification[:1])
+    assert logs[0].temperature == pytest.approx(dict.fromkeys(JOINTS, degrees[0]))
+    assert logs[0].time is None
+
+
+def test_times_and_temperatures_are_of_every_log_and_of_one_kind(warm):
+    where, _ = warm
+    wanted = r"run_0.csv has no temperature, but run_2.csv has temperature = 20.0"
+    job = warm_job(where)
+    entries = list(job.identification)
+    entries[2] = replace(entries[2], temperature=20.0)
+    with pytest.raises(SettingsError, match=wanted):
+        survey_logs(job, job.model(), entries)
+    mixed = ["2026-05-04T10:00:00Z", *map(float, range(7))]
+    with pytest.raises(SettingsError, match="a date with a time zone and of another a number of h"):
+        survey_logs(job, job.model(), warm_job(where, time=mixed).identification)
+    zones = ["2026-05-04T10:00:00+02:00", *["2026-05-04T10:00:00Z"] * 7]
+    (logs,) = survey_logs(job, job.model(), warm_job(where, time=zones).identification)
+    assert logs[1].time - logs[0].time == pytest.approx(2.0)
+    with pytest.raises(SettingsError, match="time is 'monday', wanted a date with a time, as 2026"):
+        warm_job(where, time=["monday"] * 8)
+    with pytest.raises(SettingsError, match=r"temperature is 3000.0, wanted -100 to 300"):
+        warm_job(where, temperature=[3000.0] * 8)

@@ -107,6 +107,27 @@ def test_a_missing_term_is_named_first_on_its_joint_with_its_share(ur5, clean, e
     assert all(other.joint == name and other.share < 0.1 * first.share for other in others)
 
 
+def test_a_drift_has_the_trend_of_the_friction_per_minute(ur5):
+    """Coulomb friction falls by 0.3 of the RMS torque in 30 s."""
+    found = identified(ur5, 1, "drift", 5)
+    log = log_with(ur5, 1, None, 5, noise=0.0)
+    true = -0.3 * np.sqrt(np.mean(log.tau[:, 5] ** 2)) / 0.5  # [N m/min]
+    (first, *_) = misfits(found)
+    change, error = first.trend
+    assert error < 0.05 * abs(true)
+    assert abs(change - true) < 3 * error + 0.05 * abs(true)  # the torque filter
+    (finding, *_) = misfit_findings(found, [first], [])
+    assert finding.evidence["trend"] == change
+    assert finding.evidence["trend_std_error"] == error
+    said = f"friction at the RMS speed falls by {-change:.2g} +- {error:.1g} N m per min. It"
+    assert said in finding.message
+    (other, *_) = misfits(identified(ur5, 1, "spring", 2))
+    assert np.isnan(other.trend).all()
+    (finding, *_) = misfit_findings(found, [other], [])
+    assert "trend" not in finding.evidence
+    assert "per min" not in finding.message
+
+
 def test_nothing_is_named_where_nothing_is_missing(clean):
     assert misfits(clean) == ()
 

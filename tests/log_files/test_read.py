@@ -223,9 +223,9 @@ def test_a_column_given_to_one_quantity_is_no_alias_of_another(run):
 
 
 def test_extra_columns_are_named_once(run):
-    table = make_table(tau_wrist=np.zeros(300), temperature=np.zeros(300))
+    table = make_table(tau_wrist=np.zeros(300), voltage=np.zeros(300))
     log = read_log(run(table), JOINTS)
-    assert log.notes == ("columns ignored: tau_wrist, temperature",)
+    assert log.notes == ("columns ignored: tau_wrist, voltage",)
 
 
 def test_velocity_of_some_joints_only_is_noted(run):

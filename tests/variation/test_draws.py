@@ -70,15 +70,20 @@ def test_correlation_is_shrunk_by_its_uncertainty():
     rng = np.random.default_rng(4)
     x = rng.normal(size=(6, 3)) @ np.array([[1.0, 0.5, 0.0], [0.0, 2.0, 0.1], [0.0, 0.0, 3.0]])
     z = (x - x.mean(axis=0)) / x.std(axis=0, ddof=1)
-    above = below = 0.0
+    left = []
     for i in range(3):
+        above = below = 0.0
         for j in range(3):
             if i != j:
                 w = z[:, i] * z[:, j]
                 above += 6 / 5**3 * ((w - w.mean()) ** 2).sum()
                 below += (6 / 5 * w.mean()) ** 2
-    wanted = (1 - min(above / below, 1.0)) * np.corrcoef(x.T)
-    assert shrunk_correlation(x) - np.eye(3) == pytest.approx(wanted - np.diag(np.diag(wanted)))
+        left.append(np.sqrt(1 - min(above / below, 1.0)))
+    assert len({round(a, 3) for a in left}) == 3  # a factor for each parameter
+    wanted = np.outer(left, left) * np.corrcoef(x.T)
+    assert shrunk_correlation(x) - np.eye(3) == pytest.approx(
+        wanted - np.diag(np.diag(wanted)), abs=2e-3
+    )
     true = np.array([[1.0, 0.7], [0.7, 1.0]])
     many = rng.multivariate_normal([5.0, -2.0], true, 5000) * np.array([1e-3, 40.0])
     assert shrunk_correlation(many) == pytest.approx(true, abs=0.03)

@@ -393,3 +393,27 @@ def test_correlation_is_that_between_logs_or_between_units():
     found = vary([str(k) for k in range(12)], [replace(group, group=drive, runs=one)])
     values = np.array([each.values for each in found.parameters])
     assert found.correlation == pytest.approx(shrunk_correlation(values.T))
+
+
+def test_a_robot_with_a_changed_gain_is_named_though_the_friction_of_robots_differs(model):
+    """Five robots with two logs each; friction differs by 15 % between robots, 5 % between logs."""
+    rng, base, logs = np.random.default_rng(0), truth(model), []
+    friction = [k for k, n in enumerate(model.layout.names) if n.endswith(("coulomb", "viscous"))]
+    for robot in range(5):
+        own = base.copy()
+        own[friction] *= 1 + 0.15 * rng.normal(size=len(friction))
+        for run in range(2):
+            pi = own.copy()
+            pi[friction] *= 1 + 0.05 * rng.normal(size=len(friction))
+            log = driven_log(model, pi, 2 * robot + run, duration=12.0, noise=0.01)
+            logs.append(scaled(log, 1, 1.15) if robot == 3 else log)
+    held = [
+        replace(hold_log(model, log, EXACT), unit=f"arm-{k // 2}") for k, log in enumerate(logs)
+    ]
+    some = Recordings(model, structural_mapping(model), held)
+    fit = solve_recordings(some, FIT).with_errors()
+    variation = vary([str(k) for k in range(10)], fit.runs, [f"arm-{k}" for k in range(5)])
+    (found,) = variation.unlike_units
+    assert (found.run, found.kind, found.where) == (3, "gain", ELBOW)
+    assert found.value == pytest.approx(1.15, abs=0.04)
+    assert not variation.unlike

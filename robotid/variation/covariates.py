@@ -1,0 +1,220 @@
+"""Effects of temperature and time on drive parameters, taken by their evidence."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.variation.groups import Covariate, RunsOf
+from robotid.variation.mixed_effects import MixedEffects, Slope
+
+__all__ = ["Effect", "at_temperature", "effects_of", "with_effects"]
+
+_FALSE_EFFECTS = 0.02  # probability that one of all effects is taken where there is none
+_FEWEST = 4  # runs: a mean, a slope, and a spread
+_POINTS = 9  # covariates at which the interval of the next run is stated
+_BEYOND = 0.5  # of their range, beyond each end of it
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """A linear effect of a covariate of the runs on a parameter.
+
+    Attributes:
+        covariate: The covariate, with its value in each run.
+        slope: Change of the parameter per unit of the covariate.
+        std_error: Its standard error.
+        probability: Two-sided p-value of a slope of 0, before the tests are counted.
+        is_used: Whether it is in the model of the parameter.
+        intervals: 95 % prediction interval of the next run or unit by covariate: covariate, low and
+            high, shape (3, g); none if the effect is not used.
+    """
+
+    covariate: Covariate
+    slope: float
+    std_error: float
+    probability: float
+    is_used: bool
+    intervals: Array
+
+    @property
+    def contribution(self) -> Array:
+        """Deviation of the parameter in each run from its mean by this effect, shape (k,)."""
+        own = self.covariate.values
+        found: Array = self.is_used * self.slope * (own - own.mean())
+        return found
+
+    def interval(self, value: float) -> Array:
+        """Return the 95 % prediction interval of the next run, or unit, at a covariate, shape (2,).
+
+        Other covariates have their means.
+
+        Args:
+            value: The covariate, in its unit.
+
+        Raises:
+            DataError: If the effect is not used, or the value is far outside those of the runs.
+        """
+        if not self.is_used:
+            raise DataError(f"the {self.covariate.name} has no effect on this parameter")
+        return _interval(self.covariate.name, self.covariate.unit, self.intervals, value)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, as result.json has them."""
+        own = self.covariate.values
+        found = {
+            "unit": self.covariate.unit,
+            "slope": self.slope,
+            "std_error": self.std_error,
+            "p_value": self.probability,
+            "is_used": self.is_used,
+            "mean": float(own.mean()),
+            "by_log": own.tolist(),
+        }
+        if self.is_used:
+            keys = "at", "low", "high"
+            rows = zip(keys, self.intervals.tolist(), strict=True)
+            found["next_interval_at"] = dict(rows)
+        return found
+
+
+def with_effects(groups: Sequence[RunsOf]) -> list[RunsOf]:
+    """Return groups whose drive terms have the effects that the runs support.
+
+    The most significant effect of a drive is added to its model, then the next one is tested.
+
+    Args:
+        groups: Information of the runs on each group of parameters.
+    """
+    n_tests = sum(len(_candidates(group)) for group in groups)
+    return [_with_effects(group, _FALSE_EFFECTS / n_tests) if n_tests else group
+            for group in groups]  # fmt: skip
+
+
+def effects_of(group: RunsOf, model: MixedEffects, p: int) -> tuple[Effect, ...]:
+    """Return the effects on a parameter, used or not.
+
+    Args:
+        group: The group of the parameter, as of ``with_effects``.
+        model: Its model.
+        p: Index of the parameter.
+    """
+    runs, found = group.runs, []
+    for covariate, slope in _candidates(group):
+        if slope.parameter != p:
+            continue
+        places = [
+            s for s, used in enumerate(runs.slopes)
+            if used.parameter == p and np.array_equal(used.covariate, slope.covariate)
+        ]  # fmt: skip
+        if places:
+            values = model.slope(places[0])
+            intervals = _intervals(model, places[0], covariate, float(group.centre[p]))
+        else:
+            values = MixedEffects(runs.with_slopes([*runs.slopes, slope])).slope(len(runs.slopes))
+            intervals = np.zeros((3, 0))
+        found.append(Effect(covariate, *values, bool(places), intervals))
+    return tuple(found)
+
+
+def at_temperature(variation: Mapping[str, Any], temperature: float) -> dict[str, Any]:
+    """Return the variation of a result.json, its predictions at a temperature.
+
+    Args:
+        variation: As in result.json.
+        temperature: The temperature [degC].
+
+    Raises:
+        DataError: If temperature has no effect, or it is far outside that of the logs.
+    """
+    moved = dict(variation.get("parameters", {}))
+    for name, entry in moved.items():
+        own = entry.get("effects", {}).get("temperature", {"is_used": False})
+        if not own["is_used"]:
+            continue
+        table = own["next_interval_at"]
+        intervals = np.array([table[key] for key in ("at", "low", "high")])
+        ends = _interval("temperature", own["unit"], intervals, temperature)
+        at_mean = np.array(entry["next_interval"])
+        wider = float(np.ptp(ends) / np.ptp(at_mean))
+        quantiles = ends.mean() + wider * (np.array(entry["next_quantiles"]) - at_mean.mean())
+        change = own["slope"] * (temperature - own["mean"])
+        others = {key: x for key, x in entry["effects"].items() if key != "temperature"}
+        moved[name] = entry | {
+            "mean": entry["mean"] + change,
+            "next_interval": ends.tolist(),
+            "next_quantiles": quantiles.tolist(),
+            "effects": others,
+        }
+        if "seen_interval" in entry:
+            room = np.array(entry["seen_interval"]) - _hull(intervals, own["by_log"])
+            moved[name]["seen_interval"] = (ends + room).tolist()
+    if all(moved[name] is entry for name, entry in variation.get("parameters", {}).items()):
+        raise DataError(
+            "temperature has no effect on a drive parameter of this result; leave it out, or "
+            "identify from logs at more temperatures, with temperature in [[identification]]"
+        )
+    return {**variation, "parameters": moved}
+
+
+def _interval(name: str, unit: str, intervals: Array, value: float) -> Array:
+    """Return the interval at a covariate from those in a table, shape (2,)."""
+    at, *ends = intervals
+    if not at[0] <= value <= at[-1]:
+        raise DataError(
+            f"{name} is {value:g} {unit}, wanted {at[0]:.4g} to {at[-1]:.4g} {unit}: the range of "
+            "the logs, and half of it beyond each end"
+        )
+    return np.array([np.interp(value, at, end) for end in ends])
+
+
+def _hull(intervals: Array, values: Sequence[float]) -> Array:
+    """Return the ends of the intervals at any of some covariates, shape (2,)."""
+    at, low, high = intervals
+    return np.array([np.interp(values, at, low).min(), np.interp(values, at, high).max()])
+
+
+def _candidates(group: RunsOf) -> list[tuple[Covariate, Slope]]:
+    """Return the effects that are tested: of covariates that vary, on determined parameters."""
+    runs = group.runs
+    if len(runs.h) < _FEWEST:
+        return []
+    known = np.flatnonzero(np.einsum("kpp->p", runs.H[:, : runs.n_varying, : runs.n_varying]) > 0)
+    varying = [each for each in group.covariates if np.ptp(each.values) > 0.0]
+    return [
+        (each, Slope(p, own := each.values - each.values.mean(),
+                     float(runs.scale[p]) / float(np.std(own))))
+        for p, each in product(known.tolist(), varying)
+    ]  # fmt: skip
+
+
+def _with_effects(group: RunsOf, level: float) -> RunsOf:
+    """Return a group with the effects whose p-value is below the level."""
+    runs, left = group.runs, [slope for _, slope in _candidates(group)]
+    while left:
+        tried = [runs.with_slopes([*runs.slopes, slope]) for slope in left]
+        p_values = [MixedEffects(each).slope(len(runs.slopes))[2] for each in tried]
+        best = int(np.argmin(p_values))
+        if p_values[best] >= level:
+            break
+        runs = tried[best]
+        del left[best]
+    model = MixedEffects(runs)
+    sizes = [model.slope(s)[0] for s in range(len(runs.slopes))]
+    return replace(group, runs=runs, slopes=tuple(sizes))
+
+
+def _intervals(model: MixedEffects, s: int, covariate: Covariate, centre: float) -> Array:
+    """Return the prediction interval of the next run by a covariate, shape (3, g)."""
+    own = covariate.values
+    room = _BEYOND * np.ptp(own)
+    at = np.linspace(own.min() - room, own.max() + room, _POINTS)
+    slopes, found = model.runs.slopes, []
+    for c in at - own.mean():
+        values = [c * (k == s) for k in range(len(slopes))]
+        found.append(centre + model.predict(at=values)[slopes[s].parameter].ends)
+    return np.array([at, *np.transpose(found)])

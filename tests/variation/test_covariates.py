@@ -1,0 +1,216 @@
+"""Effects of temperature and time on parameters of runs, against generalised least squares."""
+
+import numpy as np
+import pytest
+
+from robotid.exceptions import DataError
+from robotid.variation.covariates import at_temperature, effects_of, with_effects
+from robotid.variation.groups import Covariate, Group, RunsOf
+from robotid.variation.mixed_effects import MixedEffects, Runs, Slope
+from robotid.variation.restricted_likelihood import evidence
+from robotid.variation.variation import between_covariance, vary
+
+UNIT = np.array([0, 0, 0, 1, 1, 2, 2, 2, 2])
+
+
+def drawn_runs(rng, *, q=2, unit=UNIT, scale=0.5):
+    """Return estimates of q parameters in runs, x and covariances, and the runs."""
+    count = len(unit)
+    A = rng.normal(size=(count, q, q))
+    C = 0.05 * (np.einsum("kij,klj->kil", A, A) + np.eye(q))
+    x, H = rng.normal(size=(count, q)), np.linalg.inv(C)
+    return x, C, Runs(H, np.einsum("kij,kj->ki", H, x), unit, np.full(q, scale))
+
+
+def least_squares(x, C, slopes, deviation, unit):
+    """Return the generalised least squares estimate of means and slopes, and its covariance."""
+    count, q = x.shape
+    X = np.zeros((count, q, q + len(slopes)))
+    X[:, range(q), range(q)] = 1.0
+    for s, slope in enumerate(slopes):
+        X[:, slope.parameter, q + s] = slope.covariate
+    same = 1.0 * (unit[:, None] == unit) if len(deviation) > 1 else np.zeros((count, count))
+    V = np.einsum("kl,ij->kilj", same, np.diag(deviation[-1] ** 2)) if len(deviation) > 1 else 0.0
+    V = V + np.einsum("kl,kij->kilj", np.eye(count), C + np.diag(deviation[0] ** 2))
+    V, X, y = V.reshape(count * q, -1), X.reshape(count * q, -1), x.ravel()
+    P = np.linalg.inv(X.T @ np.linalg.solve(V, X))
+    return P @ X.T @ np.linalg.solve(V, y), P
+
+
+@pytest.mark.parametrize("unit", [np.zeros(9, int), UNIT])
+def test_means_and_slopes_are_those_of_generalised_least_squares(unit):
+    rng = np.random.default_rng(1)
+    x, C, runs = drawn_runs(rng, unit=unit)
+    slopes = [Slope(1, rng.normal(size=9) + 3.0, 0.4), Slope(0, rng.normal(size=9), 0.2)]
+    model = MixedEffects(runs.with_slopes(slopes))
+    levels = 1 + int(unit.max() > 0)
+    deviation = np.array([[0.3, 0.7], [0.5, 0.2]])[:levels]
+    variance = np.hstack([deviation, np.zeros((levels, 2))])[:, :, None] ** 2
+    found = evidence(*model._members, model.runs.scale, variance)
+    mean, covariance = found.mean[0], found.covariance[0]
+    wanted, P = least_squares(x, C, slopes, deviation, unit)
+    assert mean == pytest.approx(wanted, abs=2e-3)  # of a prior of 100 plausible sizes
+    assert np.sqrt(np.diag(covariance)) == pytest.approx(np.sqrt(np.diag(P)), rel=2e-3)
+    assert (model.deviation[:, 2:] < 1e-4).all()
+    # other slopes replace the present ones
+    again = model.runs.with_slopes(slopes[:1])
+    assert pytest.approx(runs.with_slopes(slopes[:1]).H) == again.H
+
+
+def test_a_prediction_at_a_covariate_is_that_of_runs_seen_from_it():
+    rng = np.random.default_rng(2)
+    _, _, runs = drawn_runs(rng)
+    slopes = [Slope(1, rng.normal(size=9), 0.4), Slope(1, rng.normal(size=9), 0.2)]
+    model = MixedEffects(runs.with_slopes(slopes))
+    seen = MixedEffects(model.runs.seen_from([0.8, -1.5]))
+    ahead, there = model.predict(at=[0.8, -1.5]), seen.predict()
+    here = model.predict()
+    assert len(here) == len(there) == 2
+    for own, other in zip(ahead, there, strict=True):
+        assert own.ends == pytest.approx(other.ends, rel=5e-3)
+        assert own.mean == pytest.approx(other.mean, rel=5e-3)
+    change = 0.8 * model.slope(0)[0] - 1.5 * model.slope(1)[0]
+    assert ahead[1].mean - here[1].mean == pytest.approx(change, rel=0.05)
+    assert ahead[0].ends == pytest.approx(here[0].ends, rel=1e-5)  # the prior is that there
+    assert np.ptp(ahead[1].ends) > np.ptp(here[1].ends)
+
+
+def group(x, error, covariates, *, name="elbow", unit=None, scale=0.1):
+    """Return estimates (k, q) of the terms of a drive in k runs, each with one standard error."""
+    count, size = x.shape
+    names = tuple(f"{name}.{term}" for term in ("viscous", "coulomb", "offset")[:size])
+    H = np.tile(np.eye(size) / error**2, (count, 1, 1))
+    runs = Runs(H, x / error**2, np.zeros(count, int) if unit is None else unit,
+                np.full(size, scale))  # fmt: skip
+    about = Group("drive", name, names, ("N m",) * size, np.eye(size), (0,))
+    return RunsOf(about, np.full(size, 2.0), runs, 1.0, tuple(covariates))
+
+
+def test_intervals_of_a_slope_cover_it_and_alike_runs_have_no_effect():
+    inside = found = false = 0
+    for seed in range(120):
+        rng = np.random.default_rng([6, seed])
+        warm = 25.0 + 8.0 * rng.normal(size=8)
+        x = 0.08 * rng.normal(size=(8, 1)) - 0.02 * (warm - 25.0)[:, None]
+        known = [Covariate("temperature", "degC", warm)]
+        own = group(x + 0.02 * rng.normal(size=(8, 1)), 0.02, known)
+        c = warm - warm.mean()
+        model = MixedEffects(own.runs.with_slopes([Slope(0, c, 0.1 / c.std())]))
+        size, error, _ = model.slope(0)
+        moved = own.runs.with_slopes([Slope(0, c, 0.1 / c.std())])
+        at = np.einsum("kij,j->ki", moved.H, [0.0, -0.02])  # about the true slope
+        about = MixedEffects(Runs(moved.H, moved.h - at, moved.unit, moved.scale, moved.slopes))
+        inside += about.slope(0)[2] > 0.05
+        assert size == pytest.approx(-0.02, abs=6 * error)
+        found += bool(with_effects([own])[0].runs.slopes)
+        mixed = group(rng.permutation(x), 0.02, own.covariates)
+        false += seed < 60 and bool(with_effects([mixed])[0].runs.slopes)
+    assert 0.90 <= inside / 120 <= 0.98
+    assert found >= 80  # 1.6 standard deviations of the spread per that of the temperature
+    assert false <= 3  # of 60; 2 % expected
+
+
+def two_drives(rng, *, slope=-0.02, count=10):
+    """Return two drives, the viscous friction of the second depends on its own temperature."""
+    warm, other = 20 + 8 * rng.normal(size=(2, count))
+    time = np.linspace(400.0, 430.0, count)
+    x = 0.03 * rng.normal(size=(2, count, 2))
+    x[1, :, 0] += slope * (warm - warm.mean())
+    hours = Covariate("time", "h", time)
+    first = group(x[0], 0.01, [Covariate("temperature", "degC", other), hours], name="lift")
+    second = group(x[1], 0.01, [Covariate("temperature", "degC", warm), hours])
+    return [first, second], warm
+
+
+def test_an_effect_is_found_with_its_parameter_and_the_interval_at_a_temperature():
+    groups, warm = two_drives(np.random.default_rng(3))
+    runs = [f"run_{k}" for k in range(10)]
+    variation = vary(runs, groups)
+    used = [(each.name, own.covariate.name) for each in variation.parameters
+            for own in each.effects if own.is_used]  # fmt: skip
+    assert used == [("elbow.viscous", "temperature")]
+    (viscous,) = [each for each in variation.parameters if each.name == "elbow.viscous"]
+    assert [own.covariate.name for own in viscous.effects] == ["temperature", "time"]
+    effect, unused = viscous.effects
+    assert effect.slope == pytest.approx(-0.02, abs=3 * effect.std_error)
+    assert effect.std_error == pytest.approx(0.032 / warm.std() / np.sqrt(10), rel=0.5)
+    assert viscous.prediction.spread < 0.06  # 0.16 without the temperature
+    assert unused.probability > 0.001
+    # the interval moves with the mean and is wider far away
+    low, high = effect.interval(warm.max())
+    middle = 0.5 * (low + high) - viscous.prediction.mean
+    assert middle == pytest.approx(effect.slope * (warm.max() - warm.mean()), rel=0.1)
+    assert high - low > np.ptp(viscous.prediction.ends)
+    seen = viscous.seen_ends
+    assert seen[0] == pytest.approx(low)
+    assert seen[1] == pytest.approx(effect.interval(warm.min())[1])
+    with pytest.raises(DataError, match=r"temperature is 99 degC, wanted .* half of it beyond"):
+        effect.interval(99.0)
+    with pytest.raises(DataError, match="the time has no effect on this parameter"):
+        unused.interval(410.0)
+    # values are those at the mean temperature
+    assert np.abs(np.corrcoef(viscous.values, warm)[0, 1]) < 0.3
+    # the next log is at any of the temperatures
+    plain = variation.to_dict()
+    C = between_covariance(plain, ["elbow.coulomb", "elbow.viscous"])
+    without = viscous.prediction.spread**2
+    assert C[1, 1] - without == pytest.approx(np.var(effect.contribution, ddof=1))
+    found = plain["parameters"]["elbow.viscous"]
+    assert found["effects"]["temperature"]["by_log"] == warm.tolist()
+    assert found["seen_interval"] == seen.tolist()
+    assert "seen_interval" not in plain["parameters"]["elbow.coulomb"]
+
+
+def test_predictions_of_a_result_are_moved_to_a_temperature():
+    groups, warm = two_drives(np.random.default_rng(3))
+    before = vary([str(k) for k in range(10)], groups)
+    plain = before.to_dict()
+    moved = at_temperature(plain, float(warm.max()))["parameters"]
+    (viscous,) = [each for each in before.parameters if each.name == "elbow.viscous"]
+    effect, own, old = viscous.effects[0], moved["elbow.viscous"], plain["parameters"]
+    assert own["next_interval"] == effect.interval(warm.max()).tolist()
+    assert own["seen_interval"] == pytest.approx(own["next_interval"])
+    change = effect.slope * (warm.max() - warm.mean())
+    assert own["mean"] == pytest.approx(viscous.prediction.mean + change)
+    assert own["next_quantiles"][7] == pytest.approx(np.mean(own["next_interval"]), abs=0.01)
+    ratio = np.ptp(own["next_interval"]) / np.ptp(viscous.prediction.ends)
+    assert np.ptp(own["next_quantiles"]) == pytest.approx(
+        ratio * np.ptp(old["elbow.viscous"]["next_quantiles"])
+    )
+    assert moved["elbow.coulomb"] == old["elbow.coulomb"]
+    assert plain == before.to_dict()
+    with pytest.raises(DataError, match="temperature is -40 degC, wanted"):
+        at_temperature(plain, -40.0)
+    for entry in plain["parameters"].values():
+        entry["effects"]["temperature"]["is_used"] = False
+    with pytest.raises(DataError, match="temperature has no effect on a drive parameter"):
+        at_temperature(plain, 20.0)
+
+
+def test_a_cold_log_is_not_unlike_where_the_temperature_explains_it():
+    rng = np.random.default_rng(8)
+    warm = np.append(20.0 + 3.0 * rng.normal(size=9), -20.0)
+    x = 0.02 * rng.normal(size=(10, 2))
+    x[:, 0] -= 0.02 * (warm - 20.0)
+    names = [str(k) for k in range(10)]
+    known = group(x, 0.01, [Covariate("temperature", "degC", warm)])
+    assert [each.run for each in vary(names, [group(x, 0.01, [])]).unlike] == [9]
+    assert vary(names, [known]).unlike == ()
+    x[4, 1] += 0.5  # another parameter of a log in the middle
+    (found,) = vary(names, [group(x, 0.01, known.covariates)]).unlike
+    assert (found.run, found.name) == (4, "elbow.coulomb")
+    # units at their own temperatures
+    unit = np.repeat(np.arange(5), 2)
+    of_units = group(x, 0.01, known.covariates, unit=unit)
+    of_units.runs.h[4:6, 1] += 0.8 / 0.01**2
+    (odd,) = vary(names, [of_units]).unlike_units
+    assert (odd.run, odd.name) == (2, "elbow.coulomb")
+
+
+def test_covariates_that_do_not_vary_and_few_runs_have_no_effect():
+    rng = np.random.default_rng(9)
+    same = group(rng.normal(size=(6, 2)), 0.1, [Covariate("time", "h", np.full(6, 3.0))])
+    assert effects_of(same, MixedEffects(same.runs), 0) == ()
+    assert with_effects([same])[0].runs.slopes == ()
+    few = group(rng.normal(size=(3, 1)), 0.1, [Covariate("time", "h", np.arange(3.0))])
+    assert with_effects([few])[0] is few
