@@ -63,6 +63,7 @@ POSTURE = {"hip": (0.0, 0.12), "thigh": (0.8, 0.25), "calf": (-1.6, 0.3)}  # mid
 SIGNALS = SignalSettings(cutoff=25.0, velocity="differentiated")
 ARMATURE, DAMPING = 0.01, 0.2
 PRIOR = ConsistentSettings(prior_weight=1.0, draws=0)
+AUTO_PRIOR = ConsistentSettings(draws=0)
 NO_PRIOR = ConsistentSettings(prior="euclidean", prior_weight=1e-6, draws=0)
 
 
@@ -388,7 +389,7 @@ def excited(name, duration, seconds, runs):
                 log = tracked(name, stand, designer, design, np.random.default_rng([seed, 0]))
                 found = identify(
                     with_other_bodies(model, of_urdf(seed)), log, signals=SIGNALS,
-                    estimator=PRIOR, friction="none", doctor=False,
+                    estimator=AUTO_PRIOR, friction="none", doctor=False,
                 )  # fmt: skip
                 is_body = found.mapping.independent < n
                 z = ((found.base - found.mapping.K @ truth) / found.base_error)[is_body]
