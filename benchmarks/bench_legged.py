@@ -207,14 +207,14 @@ def unseen(name, seed, duration):
         first = model.n_rows - len(model.joints)
         used, tau = own.recording.mask[:, first:], own.recording.trajectory.tau[:, first:]
         errors = {
-            key: 100 * np.linalg.norm((tau - own.torques[key][:, first:])[used])
-            / np.linalg.norm(tau[used])
-            for key in ("urdf", "estimate")
-        }  # fmt: skip
+            key: 100 * np.linalg.norm((tau - torque[:, first:])[used]) / np.linalg.norm(tau[used])
+            for key, torque in own.torques.items()
+        }
         trunk = found.standard[[0, 4]] / truth[[0, 4]]
         print(
-            f"  {label:14} {errors['estimate']:6.2f} % (URDF {errors['urdf']:.1f} %) "
-            f"{trunk[0]:6.2f} {trunk[1]:6.2f}",
+            f"  {label:14} {errors['estimate']:6.2f} % (URDF {errors['urdf']:.1f} %, with fitted "
+            f"drives {errors['urdf_with_drives']:.1f} %; without bounds, undetermined parameters "
+            f"of the URDF {errors['wls']:.2f} %) {trunk[0]:6.2f} {trunk[1]:6.2f}",
             flush=True,
         )
 
