@@ -2,6 +2,7 @@
 
     python benchmarks/bench_legged.py [--runs 20] [--robots go1 g1 talos cassie] [--unseen]
     python benchmarks/bench_legged.py --excite [--robots go1 talos] [--design 120]
+    python benchmarks/bench_legged.py --flags [--robots go1 g1 talos] [--seconds 10]
 
 A Go1 stands on point feet in MuJoCo at 0.1 ms with held torques, 18-bit encoders and 0.05 N m of
 torque noise; its joints follow multi-sines, its feet slip and lift at times. G1 and TALOS step in
@@ -13,6 +14,8 @@ those of an arm. With the recordings, a Solo12 that trots in PyBullet is identif
 half of its log: its URDF is the truth. With --unseen: joint torque of the last 30 % of a recording,
 fitted on the others. With --excite: a motion on the feet is designed and followed in MuJoCo by a
 position controller; slip and load of the feet, and the intervals by its log, beside a squat's.
+With --flags: how many contacts the doctor names, as delayed if all flags of a log are, and as
+slipping on the ground of the benchmark and on a slippery one.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -21,6 +24,7 @@ import argparse
 import os
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 from dataclasses import replace
 from tempfile import TemporaryDirectory
@@ -36,6 +40,7 @@ from helpers.walkers import G1, TALOS
 
 from robotid.commands.identify import run_job
 from robotid.commands.job import read_job
+from robotid.constrained.contacts import check_base
 from robotid.exceptions import NotConvergedError, RankDeficientError
 from robotid.excitation.basis import BSplineBasis, FourierBasis
 from robotid.excitation.clearance import Clearance
@@ -58,6 +63,7 @@ POSTURE = {"hip": (0.0, 0.12), "thigh": (0.8, 0.25), "calf": (-1.6, 0.3)}  # mid
 SIGNALS = SignalSettings(cutoff=25.0, velocity="differentiated")
 ARMATURE, DAMPING = 0.01, 0.2
 PRIOR = ConsistentSettings(prior_weight=1.0, draws=0)
+AUTO_PRIOR = ConsistentSettings(draws=0)
 NO_PRIOR = ConsistentSettings(prior="euclidean", prior_weight=1e-6, draws=0)
 
 
@@ -72,11 +78,11 @@ class Go1:
     def __init__(self, estimator="wls", share=1.0):
         self.estimator, self.share, self.model = estimator, share, robot()
 
-    def log(self, model, rng, duration):
+    def log(self, model, rng, duration, **options):
         middle, reach = np.array([POSTURE[joint.split("_")[1]] for joint in model.joints]).T
         return recorded(
             model, FEET, middle, self.share * reach, rng, duration=duration, kp=100.0, kd=2.0,
-            highest=1.5, torque=0.05, armature=ARMATURE, damping=DAMPING,
+            highest=1.5, torque=0.05, armature=ARMATURE, damping=DAMPING, **options,
         )  # fmt: skip
 
     def truth(self, model):
@@ -185,7 +191,7 @@ def unseen(name, seed, duration):
     other = with_other_bodies(model, of_urdf(seed))
     fitted, rest = log.window(end=0.7 * duration), log.window(0.7 * duration)
     truth = plant.truth(model)[:n]
-    print(f"{name}: joint torque of unseen motion, trunk's mass and Ixx / truth")
+    print(f"{name}, run {seed}: joint torque of unseen motion, trunk's mass and Ixx / truth")
     for label, settings in (
         ("wls", "wls"), ("LMI, no prior", NO_PRIOR), ("consistent", PRIOR)
     ):  # fmt: skip
@@ -201,16 +207,68 @@ def unseen(name, seed, duration):
         first = model.n_rows - len(model.joints)
         used, tau = own.recording.mask[:, first:], own.recording.trajectory.tau[:, first:]
         errors = {
-            key: 100 * np.linalg.norm((tau - own.torques[key][:, first:])[used])
-            / np.linalg.norm(tau[used])
-            for key in ("urdf", "estimate")
-        }  # fmt: skip
+            key: 100 * np.linalg.norm((tau - torque[:, first:])[used]) / np.linalg.norm(tau[used])
+            for key, torque in own.torques.items()
+        }
         trunk = found.standard[[0, 4]] / truth[[0, 4]]
         print(
-            f"  {label:14} {errors['estimate']:6.2f} % (URDF {errors['urdf']:.1f} %) "
-            f"{trunk[0]:6.2f} {trunk[1]:6.2f}",
+            f"  {label:14} {errors['estimate']:6.2f} % (URDF {errors['urdf']:.1f} %, with fitted "
+            f"drives {errors['urdf_with_drives']:.1f} %; without bounds, undetermined parameters "
+            f"of the URDF {errors['wls']:.2f} %) {trunk[0]:6.2f} {trunk[1]:6.2f}",
             flush=True,
         )
+
+
+DELAYS = (0.0, 0.04, -0.04, 0.08, -0.08)  # [s] of flags
+GROUND, SLIPPERY = 0.8, {"go1": 0.2, "g1": 0.1, "talos": 0.1}  # coefficients of friction
+SLIDES = (0.0, 0.01, 0.03, 0.1, np.inf)  # [m] classes of the way of a foot in contact
+
+
+def slides(model, log):
+    """Return how far each foot slides while it is in contact [m]."""
+    frames, every = [contact.frame for contact in model.contacts], 10  # 20 ms
+    places = link_positions(
+        model.pin_model, model.configurations(np.hstack([log.base.pose, log.q])[::every]), frames
+    )
+    ways = np.linalg.norm(np.diff(places[..., :2], axis=0), axis=2)
+    flags = np.stack([log.contacts[x] for x in frames], axis=1)
+    stands = np.array([flags[k : k + every + 1].all(axis=0) for k in range(0, len(flags), every)])
+    return np.sum(ways * stands[: len(ways)], axis=0)
+
+
+def named(model, log, codes):
+    """Return the doctor's finding of the codes by contact."""
+    found = [x for x in check_base(model, log, SIGNALS) if x.code in codes]
+    return [next((x for x in found if own.frame in x.message), None) for own in model.contacts]
+
+
+def flags(name, seeds, duration):
+    """Print how many contacts the doctor names as delayed, and as slipping."""
+    plant, late, slips = PLANTS[name](), {delay: [] for delay in DELAYS}, []
+    model = plant.model
+    for seed in seeds:
+        for friction in (GROUND, SLIPPERY[name]):
+            log = plant.log(model, np.random.default_rng(seed), duration, friction=friction)
+            found = named(model, log, ("slipping_foot", "moving_contact"))
+            ways = slides(model, log)
+            slips += [(friction, x, one is not None) for x, one in zip(ways, found, strict=True)]
+            for delay in DELAYS if friction == GROUND else ():
+                rows = np.searchsorted(log.t, log.t - delay).clip(0, len(log.t) - 1)
+                own = {x: flags[rows] for x, flags in log.contacts.items()}
+                late[delay] += named(model, replace(log, contacts=own), ("contact_delay",))
+    for delay, found in late.items():
+        own = [1e3 * x.evidence["delay"] for x in found if x is not None]
+        print(
+            f"{name}, flags {1e3 * delay:+.0f} ms: {len(own)} of {len(found)} contacts named, "
+            f"{min(own, default=0.0):.0f} to {max(own, default=0.0):.0f} ms"
+        )
+    for friction in (GROUND, SLIPPERY[name]):
+        for low, high in pairwise(SLIDES):
+            own = [is_named for mu, x, is_named in slips if mu == friction and low <= x < high]
+            print(
+                f"{name}, friction {friction:g}, slides by {100 * low:g} to {100 * high:g} cm: "
+                f"{sum(own)} of {len(own)} contacts named"
+            )
 
 
 #: Posture, soles, lifted feet of each design and joints that lift them, gains.
@@ -229,7 +287,7 @@ STANDS = {
         (TALOS.kp, TALOS.kd),
     ),
 }  # fmt: skip
-ALLOWED, GROUND = 0.45, 0.8  # coefficient of friction of the design, and in MuJoCo
+ALLOWED = 0.45  # coefficient of friction of the design; GROUND in MuJoCo
 CLEARANCE = {"go1": 0.02, "talos": 0.005}  # [m] TALOS' thighs are 12 mm apart
 LOOKS = 250.0  # [Hz] of forces
 
@@ -262,7 +320,7 @@ def squat(designer):
 
 def tracked(name, stand, designer, design, rng):
     """Return the log of a designed motion in MuJoCo, and print what its feet did."""
-    plant, model, duration = PLANTS[name](), stand.robot, designer.basis.duration
+    model, duration = stand.robot, designer.basis.duration
     first = design.motion.evaluate(np.zeros(1))[0]
     grid = np.linspace(0.0, duration, round(LOOKS * duration) + 1)
     state = design.motion.evaluate(grid)
@@ -296,10 +354,10 @@ def tracked(name, stand, designer, design, rng):
         f"lift, lifted feet touch: {any(log.contacts[x].any() for x in lifted)}",
         flush=True,
     )
-    return replace(log, wrenches={}), plant
+    return replace(log, wrenches={})
 
 
-def excited(name, duration, seconds):
+def excited(name, duration, seconds, runs):
     """Print what a designed motion and a squat of the same length determine."""
     errors = {}
     for lifted in STANDS[name][2]:
@@ -324,22 +382,35 @@ def excited(name, duration, seconds):
                 f"{', '.join(f'{100 * x:.0f}' for x in base[:3])} cm and "
                 f"{', '.join(f'{x:.2f}' for x in base[3:])} rad"
             )
-            log, plant = tracked(name, stand, designer, design, np.random.default_rng(1))
-            other = with_other_bodies(model, np.random.default_rng(2))
-            found = identify(
-                other, log, signals=SIGNALS, estimator=PRIOR, friction="none", doctor=False
-            )
+            plant, shares = PLANTS[name](), []
             n = model.layout.n_inertial
-            is_body = found.mapping.independent < n
-            truth = found.mapping.K @ plant.truth(model)
-            z = ((found.base - truth) / found.base_error)[is_body]
-            held = 100 * np.mean(np.abs(z) < found.errors.quantile[is_body])
-            errors[label, lifted] = found.base_error[is_body]
-            line = f"  {held:.0f} % of {len(z)} intervals hold the truth, total mass "
-            line += f"{found.standard[:n:10].sum():.3f} of {plant.truth(model)[:n:10].sum():.3f} kg"
+            truth = plant.truth(model)
+            for seed in range(runs):
+                log = tracked(name, stand, designer, design, np.random.default_rng([seed, 0]))
+                other = with_other_bodies(model, of_urdf(seed))
+                for estimator in (PRIOR, AUTO_PRIOR) if seed == 0 else (AUTO_PRIOR,):
+                    found = identify(
+                        other, log, signals=SIGNALS, estimator=estimator, friction="none",
+                        doctor=False,
+                    )  # fmt: skip
+                    is_body = found.mapping.independent < n
+                    z = ((found.base - found.mapping.K @ truth) / found.base_error)[is_body]
+                    share = 100 * np.mean(np.abs(z) < found.errors.quantile[is_body])
+                    own, weight = found.standard[:n:10], found.estimate.details["prior"]["weight"]
+                    print(
+                        f"  weight {weight:.3g}: {share:.0f} % of {len(z)} intervals hold the "
+                        f"truth, rms z {np.sqrt(np.mean(z**2)):.2f}, total mass {own.sum():.3f} of "
+                        f"{truth[:n:10].sum():.3f} kg, trunk {own[0]:.2f} +- "
+                        f"{np.sqrt(found.standard_covariance[0, 0]):.2f} of {truth[0]:.2f} kg",
+                        flush=True,
+                    )
+                    if estimator is PRIOR:  # standard errors of motions at one weight
+                        errors[label, lifted] = found.base_error[is_body]
+                shares.append(share)
+            line = f"  mean {np.mean(shares):.0f} %, wanted 90 to 98 %"
             if label != "squat":
                 ratio = errors[label, lifted] / errors["squat", ()]
-                line += f"; over the squat's: {np.exp(np.mean(np.log(ratio))):.2f} (mean), "
+                line += f"; errors over the squat's: {np.exp(np.mean(np.log(ratio))):.2f} (mean), "
                 line += f"{ratio.min():.2f} to {ratio.max():.2f}"
             print(line, flush=True)
 
@@ -376,18 +447,22 @@ def main():
     parser.add_argument("--unseen", action="store_true", help="only errors on unseen motion")
     parser.add_argument("--excite", action="store_true", help="only designed motions on the feet")
     parser.add_argument("--design", type=float, default=120.0, help="seconds of each design")
+    parser.add_argument("--flags", action="store_true", help="only delays of flags, and slips")
     options = parser.parse_args()
     if options.excite:
         for name in [name for name in STANDS if name in options.robots]:
-            excited(name, 10.0, 10.0 if options.quick else options.design)
+            excited(name, 10.0, *((10.0, 1) if options.quick else (options.design, options.runs)))
         return
     runs, seconds = (1, 4.0) if options.quick else (options.runs, options.seconds)
     for name in ("go1", "g1", "cassie") if options.quick else options.robots:
-        if options.unseen:
-            unseen(name, options.first, seconds)
+        if options.flags:
+            flags(name, range(options.first, options.first + runs), seconds)
+        elif options.unseen:
+            for seed in range(options.first, options.first + runs):
+                unseen(name, seed, seconds)
         else:
             coverage(name, range(options.first, options.first + runs), seconds)
-    if not options.unseen:
+    if not (options.unseen or options.flags):
         if "ROBOTID_DATA" in os.environ:
             trot()
         speed(6.0)

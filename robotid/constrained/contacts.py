@@ -28,6 +28,8 @@ _UNLIKE = 0.3  # of the motion: a measured velocity that differs by more is wron
 _BETTER = 0.5  # ... and is of other axes if these reduce the difference below this share
 _MOVES = 1e-3  # [m/s or rad/s] RMS from which velocities are compared
 _LONGEST = 0.15  # [s] delay of contact flags that is searched for
+_NEAR = 0.075  # [s] distance of a change of motion from the delay of most changes
+_STOPS = 1e-3  # of the largest speed: smaller ones are alike
 _OF_MEDIAN = 1.858  # standard error of a median, times sqrt(n), over the median deviation (normal)
 _CERTAIN = 0.975  # probability that the scatter of a delay is below its bound
 _SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
@@ -333,12 +335,13 @@ def _check_flags(
 def flag_delay(t: Array, flags: Array, speed: Array, spread: float) -> tuple[float, float] | None:
     """Return the delay of a contact's flags behind its motion, and its error; None without one.
 
-    At each change of the flags the link starts or stops to move: its speed crosses the geometric
-    mean of its median speeds with and without contact. A delay is the same at both. What has
-    opposite signs at lift-offs and touch-downs, or differs from step to step, is no delay: a slow
-    lift-off, a slip. So the delay is the mean of the two medians, half of their difference is its
-    error, and that of the scatter is added, and half the spread of the filter: rows of that time
-    beside a contact have no force anyway.
+    The flags are shifted to where the link is slowest in contact. Near each of their changes it
+    then starts or stops to move: its speed crosses the geometric mean of its median speeds with
+    and without contact. A delay is the same at both. What has opposite signs at lift-offs and
+    touch-downs, or differs from step to step, is no delay: a slow lift-off, a slip. So the delay
+    is the mean of the two medians, half of their difference is its error, and that of the scatter
+    is added, and half the spread of the filter: rows of that time beside a contact have no force
+    anyway.
 
     Args:
         t: Time stamps, shape (N,) [s].
@@ -350,19 +353,21 @@ def flag_delay(t: Array, flags: Array, speed: Array, spread: float) -> tuple[flo
     width = 2 * round(spread / step) + 1
     share = np.convolve(flags, np.ones(width), mode="same")
     flags = share > 0.5 * np.convolve(np.ones(len(flags)), np.ones(width), mode="same")
-    edges = 1 + np.flatnonzero(np.diff(flags.astype(int)))
     if flags.all() or not flags.any():
         return None
+    shift = _best_shift(flags, speed, int(_LONGEST / step))
+    flags = flags[(np.arange(len(flags)) + shift).clip(0, len(flags) - 1)]
+    edges = 1 + np.flatnonzero(np.diff(flags.astype(int)))
     level = np.sqrt(np.median(speed[flags]) * np.median(speed[~flags]))
-    is_still, reach = speed <= level, int(_LONGEST / step)
+    is_still, near = speed <= level, int(_NEAR / step)
     delays: tuple[list[float], list[float]] = ([], [])  # at lift-offs, at touch-downs
     for before, i, after in zip([0, *edges], edges, [*edges[1:], len(t)], strict=False):
-        first, stop = max(i - reach, (before + i) // 2), min(i + reach, (i + after + 1) // 2)
+        first, stop = max(i - near, (before + i) // 2), min(i + near, (i + after + 1) // 2)
         wrong = np.where(is_still[first:stop] == flags[i], 1, -1)  # ... before the change
         sums = np.cumsum(wrong)
         k = int(np.argmin(sums))
         if 0 < k + 1 < stop - first and sums[k] < 0 and sums[-1] > sums[k]:
-            delays[int(flags[i])].append(float(t[i] - t[first + k + 1]))
+            delays[int(flags[i])].append(shift * step + float(t[i] - t[first + k + 1]))
     if min(map(len, delays)) < _FEWEST:
         return None
     middles = [float(np.median(own)) for own in delays]
@@ -371,6 +376,23 @@ def flag_delay(t: Array, flags: Array, speed: Array, spread: float) -> tuple[flo
     bound = float(stdtrit(len(off) - 2, _CERTAIN)) * scatter / np.sqrt(len(off))
     delay, error = 0.5 * sum(middles), 0.5 * (abs(middles[1] - middles[0]) + spread) + bound
     return (delay, error) if abs(delay) > error + 1.5 * step else None
+
+
+def _best_shift(flags: Array, speed: Array, reach: int) -> int:
+    """Return the delay of flags with the smallest sum of log(speed / mean) in contact [rows].
+
+    Args:
+        flags: Whether the link is in contact, shape (N,).
+        speed: Its speed, shape (N,) [m/s].
+        reach: Longest delay in either direction [rows].
+    """
+    size = np.log(np.maximum(speed, _STOPS * speed.max()))
+    total = np.concatenate([[0.0], np.cumsum(size - size.mean())])
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    delays = np.arange(-reach, reach + 1)
+    bounds = (edges[:, None] - delays).clip(0, len(flags)).reshape(-1, 2, len(delays))
+    sums = (total[bounds[:, 1]] - total[bounds[:, 0]]).sum(axis=0)
+    return int(delays[np.argmin(sums)])
 
 
 def _radius(contact: Contact, v: Array, rolls: Array) -> tuple[float, str, float, float] | None:

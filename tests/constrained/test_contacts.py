@@ -70,6 +70,19 @@ def steps(late_lift, late_touch, slips=0):
     return t, flags, speed
 
 
+@pytest.mark.parametrize("late", [0.08, -0.08])
+def test_the_delay_of_short_swings_is_found_beside_feet_that_hesitate(late):
+    """Swings of 0.12 s are shorter than twice the delay; in each second one the foot waits."""
+    t = 3.0 + 0.002 * np.arange(2500)
+    k = np.arange(1, 9)[:, None]
+    pairs = 3.2001 + 0.5 * k + np.array([0.0, 0.12])
+    moves = ((t > pairs[:, :1]) & (t < pairs[:, 1:])).any(axis=0)
+    lifted = ((t > pairs[:, :1] + late) & (t < pairs[:, 1:] + late)).any(axis=0)
+    waits = ((t > 3.08 + 1.0 * k[:3]) & (t < 3.12 + 1.0 * k[:3])).any(axis=0)
+    found = flag_delay(t, ~lifted, np.where(moves | waits, 0.6, 0.002), spread=0.0)
+    assert found[0] == pytest.approx(late, abs=2e-3)
+
+
 def test_delayed_flags_are_late_at_lift_offs_and_at_touch_downs():
     found = flag_delay(*steps(0.06, 0.06), spread=0.0)
     assert found[0] == pytest.approx(0.06, abs=1e-3)
