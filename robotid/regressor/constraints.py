@@ -193,7 +193,7 @@ def constrained(
     """Return a motion with torques without those of constraint forces, and the rows used.
 
     Torques of measured forces are subtracted, those of unknown forces are eliminated. Rows in which
-    nothing remains, and samples at which a contact changes, are not used.
+    nothing remains, and samples at which a contact changes or the base jumps, are not used.
 
     Args:
         model: The robot.
@@ -203,10 +203,10 @@ def constrained(
     """
     if not has_torque:
         used = used & (np.arange(model.n_rows) < model.n_rows - len(model.joints))
-    if not model.constraints:
-        return motion, used
     if motion.switching is not None:
         used = used & ~motion.switching[:, None]
+    if not model.constraints:
+        return motion, used
     J = constraint_jacobian(model, motion.q, touching(model, motion))
     known, tau = _measured(model), motion.tau
     if motion.wrenches is not None:
