@@ -32,6 +32,7 @@ _SOME = 20  # samples without which a distribution is not estimated
 _ROUNDS = 10
 _WEIGHING = 3  # rounds in which the noise of each row is estimated, after that of groups of rows
 _SCORINGS, _SETTLED, _SAMPLES = 30, 1e-3, 500  # of the latter: rounds, change at their end, samples
+_TINY = 1e-12  # smallest variance
 _WIDER = 30.0  # prior of the forces there: it must not explain residuals
 _LEAST, _NEGLIGIBLE = 0.2, 1e-4  # smallest ratios of a variance to the one before, to the largest
 _SLOWEST = 1e-3  # [m/s] speed below which speeds do not differ
@@ -220,7 +221,7 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
     J, b, weak = J[::step], b[::step], np.eye(J.shape[1]) / (_WIDER * size) ** 2
     group = np.repeat([0, 1, 2], [3, 3, n - 6])
     member = (group == np.arange(3)[:, None]).astype(float)[: group.max() + 1]  # (groups, n)
-    variance = np.full(len(member), np.mean(b**2))
+    variance, largest = np.full(len(member), np.mean(b**2) + _TINY), np.mean(b**2, axis=0).max()
     for _ in range(_SCORINGS):
         inverse = 1.0 / (variance @ member)
         A = J * inverse
@@ -228,9 +229,9 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
         P = np.diag(inverse) - A.swapaxes(1, 2) @ np.linalg.solve(N, A)  # (N, n, n)
         left = member @ np.mean(np.einsum("kij,kj->ki", P, b) ** 2, axis=0)
         curvature = member @ np.mean(P**2, axis=0) @ member.T
-        found = np.linalg.solve(curvature, left)
-        before, variance = variance, np.maximum(found, _LEAST * variance)
-        variance = np.maximum(variance, _NEGLIGIBLE * variance.max()) + 1e-12
+        found = np.linalg.lstsq(curvature, left, rcond=None)[0]  # contacts may explain a group
+        before, variance = variance, np.clip(found, _LEAST * variance, largest + _TINY)
+        variance = np.maximum(variance, _NEGLIGIBLE * variance.max()) + _TINY
         if np.abs(np.log(variance / before)).max() < _SETTLED:
             break
     sigma: Array = np.sqrt(variance @ member)
