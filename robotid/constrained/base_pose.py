@@ -8,20 +8,15 @@ import numpy as np
 from robotid._text import seconds
 from robotid._typing import Array
 from robotid.findings import Finding, log_finding
-from robotid.logs.base import BaseMotion
+from robotid.logs.base import BaseMotion, pose_jumps
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
-from robotid.logs.time_stamps import median_step
 from robotid.robot.constraints import link_positions
 from robotid.robot.model import RobotModel
 
 __all__ = ["check_order", "check_pose"]
 
-_USUAL = 95.0  # percentile of the steps of a pose relative to those before and after ...
-_JUMPS = 10.0  # ... times which a step is a jump ...
-_SMALLEST = (5e-3, 0.02)  # [m], [rad] ... if it is not below this
-_GAP = 2.5  # median steps of time: a longer one is a gap, over which the pose may change
 _MOVES = 0.02  # [m/s] RMS speed of feet in contact below which no other order is tried
 _BETTER = 0.5  # ratio of the speeds below which another order is found
 _ABOVE = 0.3  # vertical distance of base and feet over their distance, from which one is above
@@ -35,31 +30,18 @@ def check_pose(log: Log) -> Iterator[Finding]:
     """
     if log.base is None:
         return
-    dt, pose = np.diff(log.t), log.base.pose
-    whole = dt < _GAP * median_step(log.t)
-    whole = whole[1:-1] & whole[:-2] & whole[2:]
-    if not whole.any():
-        return
-    for values, least, unit in zip(
-        (pose[:, :3], 2.0 * pose[:, 3:]), _SMALLEST, ("m", "rad"), strict=True
-    ):
-        steps = np.diff(values, axis=0)
-        size = np.linalg.norm(steps[1:-1] - 0.5 * (steps[:-2] + steps[2:]), axis=1)
-        usual = float(np.percentile(size[whole], _USUAL))
-        impact = np.linalg.norm(steps[2:] - steps[:-2], axis=1) > size  # a change of the speed
-        rows = np.flatnonzero(whole & ~impact & (size > max(_JUMPS * usual, least)))
-        rows = np.array([k for k in rows if size[k] == size[max(k - 1, 0) : k + 2].max()])
-        if not len(rows):
+    rows, *sizes = pose_jumps(log.t, log.base.pose)
+    for size, unit in zip(sizes, ("m", "rad"), strict=True):
+        if not size.any():
             continue
-        times = [float(log.t[k + 2]) for k in rows]
+        times, own = log.t[rows[size > 0.0]], size[size > 0.0]
         message = (
-            f"the pose of the base jumps {len(rows)} time{'s' * (len(rows) > 1)}, first at t = "
-            f"{seconds(times[0])} s by {size[rows[0]]:.2g} {unit}; 95 % of its steps differ by "
-            f"less than {usual:.2g} {unit} from their neighbours: a marker or tag was found again, "
-            "or odometry was corrected. Its acceleration there is wrong. Fit the times between "
-            "jumps, with start and end, or correct base_x to base_qw"
+            f"the pose of the base jumps {len(own)} time{'s' * (len(own) > 1)}, first at t = "
+            f"{seconds(times[0])} s by {own[0]:.2g} {unit}: a marker or tag was found again, or "
+            "odometry was corrected. Rows whose smoothed motion contains a jump are left out. If "
+            "that leaves too few, correct base_x to base_qw, or use an IMU"
         )
-        evidence = {"jumps": float(len(rows)), "size": float(size[rows].max()), "first": times[0]}
+        evidence = {"jumps": float(len(own)), "size": float(own.max()), "first": float(times[0])}
         yield log_finding(log.name, "base_jump", "warning", message, **evidence)
 
 

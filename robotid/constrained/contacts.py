@@ -11,6 +11,7 @@ from robotid._typing import Array
 from robotid.constrained.base_pose import check_order, check_pose
 from robotid.constrained.found_contacts import with_contacts
 from robotid.constrained.imu import check_imu
+from robotid.constrained.slips import check_slip, rms, without_zeros
 from robotid.constrained.wrenches import check_wrenches
 from robotid.exceptions import DataError
 from robotid.findings import Finding, listed, log_finding
@@ -35,11 +36,6 @@ _CERTAIN = 0.975  # probability that the scatter of a delay is below its bound
 _SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
 _STANDS = 0.3  # ... if it is above this share of its speed without contact
 _LOADED = 0.1  # of the largest measured force: a foot with more is on the ground
-_MARGIN = 0.03  # [s] after and before a change of contact in which a slip is not examined
-_SLIPS = 0.03  # share of the time in contact with a slip that is reported
-_BEYOND = 3.0  # standard errors that a slip must exceed
-_WINDOW = 0.2  # [s] in which the mean velocity of a foot in contact is a slip ...
-_DRIFTS = 0.05  # [m/s] ... from this speed on, 1 cm in a window
 _FEWEST = 2  # lift-offs, and touch-downs, without which a delay is not examined
 _ROLLS = 0.3  # median speed at the contact of a rolling foot, as a share of that of its frame ...
 _ALIKE = 1.1  # ratio of two radii that are stated as one
@@ -137,7 +133,8 @@ def _check_feet(
         if has_ground:  # of 2 feet, each moves by a half
             ways = [2.0 * relative[:, k], velocity[:, k]]
         frame = model.contacts[k].frame
-        yield from found or _check_slip(frame, log, flags[:, k], motion, ways, signals)
+        ways = [without_zeros(motion.t, way, J[:, k], flags[:, k]) for way in ways]
+        yield from found or check_slip(frame, log, flags[:, k], motion.t, ways, signals)
     yield from _rolling(log.name, sorted(rolling))
 
 
@@ -185,56 +182,6 @@ def _of_pairs(J: Array, flags: Array, v: Array) -> tuple[Array, Array]:
     return D, d
 
 
-def _check_slip(
-    link: str,
-    log: Log,
-    flags: Array,
-    motion: Trajectory,
-    ways: Sequence[Array],
-    signals: SignalSettings,
-) -> Iterator[Finding]:
-    """Yield a finding if a link moves during a part of its contacts, away from their ends.
-
-    Contacts are cut into windows. A slip is a mean velocity of a window that its scatter does not
-    explain: slow slips count, vibrations and noise do not.
-
-    Args:
-        link: The link.
-        log: The log.
-        flags: Whether it is in contact, shape (N,).
-        motion: The smoothed motion.
-        ways: Velocities of the link, shape (N, 3) [m/s]: that in the world, and that relative to
-            all links in contact. The slowest one counts.
-        signals: Settings of the filter, which spreads the motion beyond a contact.
-    """
-    step = float(np.median(np.diff(motion.t)))
-    spread = 1.0 / signals.cutoff if signals.cutoff else 0.0
-    width = 2 * round((_MARGIN + spread) / step) + 1
-    inside = np.convolve(~flags, np.ones(width), mode="same") < 0.5
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
-    speeds = np.zeros(len(flags))  # of slips
-    for first, stop in edges.reshape(-1, 2):
-        count = max(1, round((stop - first) * step / _WINDOW))
-        for rows in np.array_split(np.arange(first, stop), count):
-            independent = max(1.0, len(rows) * min(1.0, 2.0 * step / spread if spread else 1.0))
-            means = [v[rows].mean(axis=0) for v in ways]
-            k = int(np.argmin([np.linalg.norm(mean) for mean in means]))
-            error = _rms(ways[k][rows] - means[k]) / np.sqrt(independent)
-            if np.linalg.norm(means[k]) > max(_DRIFTS, _BEYOND * error):
-                speeds[rows] = np.linalg.norm(ways[k][rows], axis=1)
-    slips = speeds > _DRIFTS
-    if np.count_nonzero(slips) < _SLIPS * np.count_nonzero(inside) or not slips.any():
-        return
-    share = np.count_nonzero(slips) / np.count_nonzero(inside)
-    speed, distance = _rms(speeds[slips, None]), step * float(speeds[slips].sum())
-    message = (
-        f"the link {link} slips in {share:.0%} of its time in contact, at {speed:.2g} m/s (RMS), "
-        f"{distance:.2g} m in total. Its force is still eliminated"
-    )
-    evidence = {"share": share, "speed": speed, "distance": distance}
-    yield log_finding(log.name, "slipping_foot", "note", message, **evidence)
-
-
 def _contact_jacobian(model: RobotModel, q: Array) -> tuple[Array, Array]:
     """Return the Jacobians (N, k, 3, n_rows) of the k points of contact, and of their links' turn.
 
@@ -259,12 +206,12 @@ def _check_axes(log: Log) -> Iterator[Finding]:
     quaternion = base.pose[:, 3:]
     for part, unit in ((slice(0, 3), "m/s"), (slice(3, 6), "rad/s")):
         measured, wanted = base.twist[:, part], own[:, part]
-        size = _rms(wanted)
-        off = _rms(measured - wanted)
+        size = rms(wanted)
+        off = rms(measured - wanted)
         if size < _MOVES or off < _UNLIKE * size:
             continue
         what = "linear" if unit == "m/s" else "angular"
-        turned = _rms(in_base(quaternion, measured) - wanted)
+        turned = rms(in_base(quaternion, measured) - wanted)
         message = (
             f"the measured {what} velocity of the base differs by {off:.2g} {unit} from that of "
             f"its pose, {size:.2g} {unit} (RMS)"
@@ -448,8 +395,3 @@ def _rolling(log: str, feet: Sequence[tuple[float, str, float, float]]) -> Itera
         )
         figures = {"radius": radius, "before": before, "after": after}
         yield log_finding(log, "rolling_contact", "warning", message, **figures)
-
-
-def _rms(values: Array) -> float:
-    """Return the root mean square of the lengths of vectors (N, 3)."""
-    return float(np.sqrt(np.mean(np.sum(values**2, axis=1))))

@@ -34,14 +34,20 @@ class RepeatedErrors:
     root: Array  # (b, k), C of the covariance C C^T of W^T tau
     variance: float  # of a row's residual, on average [(N m)^2]
     points: float  # standard deviation of points of contact, the largest [m]
-    bias: float = 0.0  # standard deviation of the bias of accelerometers, per axis [m/s^2]
+    bias: Array | None = None  # (3,), that of the accelerometers that was subtracted [m/s^2]
+    bias_error: float = 0.0  # its standard error, root mean square of the axes [m/s^2]
 
     @property
     def described(self) -> str:
         """Description of the errors."""
         points = f"points of contact uncertain by {self.points:.2g} m"
-        bias = f"bias of the accelerometers uncertain by {self.bias:.2g} m/s^2"
-        parts = [text for x, text in ((self.points, points), (self.bias, bias)) if x > 0.0]
+        parts = [points] if self.points > 0.0 else []
+        if self.bias is not None:
+            shown = ", ".join(f"{x:+.3f}" for x in self.bias)
+            parts.append(
+                f"bias of the accelerometers, estimated and subtracted: {shown} m/s^2, uncertain "
+                f"by {self.bias_error:.2g} m/s^2"
+            )
         return "; ".join(parts)
 
 

@@ -314,6 +314,27 @@ class SurveyedLog:
                 piece.take(own.read(), self.model)
         return other
 
+    def with_accelerometer_bias(self, bias: Array) -> "SurveyedLog":
+        """Return the log with another bias of the accelerometers of its IMU.
+
+        Args:
+            bias: The bias with the axes of the base, shape (3,) [m/s^2].
+        """
+
+        def changed(log: Log) -> Log:
+            if log.base is None or log.base.imu is None:
+                return log
+            imu = replace(log.base.imu, frame=replace(log.base.imu.frame, offset=bias))
+            return replace(log, base=replace(log.base, imu=imu))
+
+        source, windows = self.source, tuple(changed(log) for log in self.windows)
+        if isinstance(source, Log):
+            source = changed(source)
+        elif source.base.imu is not None:
+            frame = replace(source.base.imu, offset=bias)
+            source = replace(source, base=replace(source.base, imu=frame))
+        return replace(self, source=source, windows=windows, asked=self.signals)
+
     @property
     def whole(self) -> Rows:
         """All rows of a log in memory, and their smoothed motion.

@@ -11,26 +11,30 @@ the score W^T tau has the covariance s^2 W^T D D^T W beside that of its noise. I
 it is the one with the largest evidence.
 
 A bias of the accelerometers acts as a change of gravity with the axes of the base. D then has the
-torque per acceleration of the base. Over a log the robot hardly moves away, so its mean
-acceleration in the world is that of the bias, or of a tilted orientation: it is their size, but
-not which of the two.
+torque per acceleration of the base. Where the base turns, gravity turns in its axes and the bias
+does not: the rows determine it. It is estimated together with the parameters and subtracted; of
+the score the covariance D Cov(b) D^T is left, as of partitioned least squares. Its prior size: a
+robot hardly moves away, so its mean acceleration in the world is that of the bias, or of a tilted
+orientation.
 
 References:
-    Bishop (2006), Pattern Recognition and Machine Learning, section 9.3.4 (EM for s).
+    Bishop (2006), Pattern Recognition and Machine Learning, section 3.5 (evidence).
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
+from scipy.optimize import minimize_scalar
 
 from robotid._typing import Array
 from robotid.estimators import WLS
 from robotid.fitting.recordings import Recordings, RepeatedErrors
-from robotid.fitting.survey import Rows
+from robotid.fitting.survey import Rows, SurveyedLog
 from robotid.logs.base import in_base
 from robotid.logs.data import Trajectory
+from robotid.logs.imu import ImuFrame
 from robotid.regressor.constraints import constraint_forces, contact_links, without_forces
 from robotid.regressor.factors import join, triangle_of
 from robotid.regressor.lapack import Triangle
@@ -42,15 +46,16 @@ from robotid.robot.prior import prior_spread
 
 __all__ = ["with_repeated_errors"]
 
-_FIRST, _MOST = 3e-3, 0.02  # [m] initial value of s, and its bound
+_LEAST, _MOST, _TRIED = 1e-6, 0.02, 40  # [m] bounds of s, values that are compared first
 _WIDER = 1e3  # factor of the prior standard deviations: wrong masses of a URDF are no offsets
-_STEPS, _SETTLED = 100, 1e-3  # steps of the maximisation, relative change of s at its end
+_STEPS, _SETTLED = 20, 1e-3  # steps of noise level and s, relative change of s at their end
 
 
 def with_repeated_errors(recordings: Recordings) -> Recordings:
     """Return recordings with the covariance of the score due to contacts and accelerometers.
 
-    Contacts with measured forces, and surfaces, have no such errors.
+    Contacts with measured forces, and surfaces, have no such errors. The bias of accelerometers is
+    subtracted.
 
     Args:
         recordings: The recordings.
@@ -61,55 +66,87 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
     model, mapping = recordings.model, recordings.mapping
     points = [k for k, x in enumerate(model.contacts) if x.kind == "point" and not x.measured]
     points = [k for k in points if model.contacts[k].uncertainty != 0.0]
-    bases = [log.head.base for log in recordings.fitted]
-    with_imu = [base is not None and base.imu is not None for base in bases]
-    if not points and not any(with_imu):
+    frames = [_frame(log) for log in recordings.fitted]
+    biases = [x.offset if x.offset is not None else np.zeros(3) for x in frames if x is not None]
+    if not points and not biases:
         return recordings
     whole, prior = join(recordings.reduce(is_cut=False)), model.standard_parameters()
     spread = prior_spread(model, whole.squares, whole.samples)
     mean, b = mapping.to_base(prior), len(mapping.base_names)
     start = WLS(mean, recordings.share).fit(whole.factors).theta
     pi = mapping.to_standard(start, prior, spread)
-    c, d = 3 * len(points), 3 * any(with_imu)
+    c, d = 3 * len(points), 3 * bool(biases)
     total, drifts = Triangle(b + c + d + 1), []
     step = max(1, int(0.5 / recordings.share))  # filtered rows in between add nothing
-    for log, has_imu in zip(recordings.fitted, with_imu, strict=True):
-        pushed: list[Array] = []
+    for log, frame in zip(recordings.fitted, frames, strict=True):
+        pushed, segments = list[Array](), list[Array]()
         for piece in log.pieces:
             rows = piece.read()
             rows = replace(rows, trajectory=rows.trajectory.every(step), mask=rows.mask[::step])
             D, first = _slopes(model, rows, pi, points), 0
             if d:
+                has_imu = frame is not None
                 D = np.column_stack([D, has_imu * _slopes_of_bias(model, rows, pi)])
-            if has_imu:
-                pushed.append(_world_acceleration(rows.trajectory))
+            if frame is not None:
+                pushed.append(_world_acceleration(rows.trajectory, biases[0]))
+                segments.append(rows.trajectory.segment)
             problem = base_problem(model, mapping, rows.trajectory, rows.mask)
             for W, tau, weight in problem.blocks():
                 both = np.column_stack([W, -D[first : first + len(W)], tau])
                 total.fold(np.asfortranarray(both * np.sqrt(step * weight)[:, None]))
                 first += len(W)
-        drifts += [np.linalg.norm(np.concatenate(pushed).mean(axis=0))] if pushed else []
+        drifts += [mean_drift(np.concatenate(pushed), np.concatenate(segments))] if pushed else []
     stated = [model.contacts[k].uncertainty for k in points]
+    size = float(np.sqrt(np.mean(np.square(drifts)))) if drifts else 0.0
+    before = np.zeros(c + d) if not d else np.append(np.zeros(c), -biases[0])
+    sizes = np.append(np.repeat(np.array(stated, dtype=float), 3), np.full(d, size))
     count = int(whole.factors.rows.sum())
-    if None in stated:
-        L = np.linalg.cholesky((mapping.K * spread**2) @ mapping.K.T)
-        own = triangle_of(total.R[:, [*range(b + c), -1]])
-        s = estimated_uncertainty(own, L, mean, recordings.share, count)
-        stated = [s if x is None else x for x in stated]
-    bias = float(np.sqrt(np.mean(np.square(drifts)))) if drifts else 0.0
-    sizes = np.concatenate([np.repeat(np.array(stated, dtype=float), 3), np.full(d, bias)])
+    L = np.linalg.cholesky((mapping.K * spread**2) @ mapping.K.T)
+    fit = estimated_errors(total.R, L, mean, recordings.share, count, sizes, before)
     cross = total.R[:b, :b].T @ total.R[:b, b:-1]  # -W^T D
-    rest = total.R[b:-1, b:-1] * sizes  # of D, what W cannot explain
+    roots = np.diag(np.where(np.isnan(sizes), fit.size, sizes))
+    roots[c:, c:] = np.linalg.cholesky(fit.covariance[c:, c:])
+    rest = total.R[b:-1, b:-1] @ roots  # of D, what W cannot explain
     variance = float(np.sum(rest**2)) / count
-    errors = RepeatedErrors(cross * sizes, variance, float(sizes[:c].max(initial=0.0)), bias)
-    return replace(recordings, repeated=errors)
+    errors = RepeatedErrors(cross @ roots, variance, float(roots[:c].max(initial=0.0)))
+    if not d:
+        return replace(recordings, repeated=errors)
+    bias = biases[0] + fit.known[c:]
+    error = float(np.sqrt(np.mean(np.diag(fit.covariance)[c:])))
+    errors = replace(errors, bias=bias, bias_error=error)
+    return replace(
+        recordings,
+        repeated=errors,
+        fitted=[log.with_accelerometer_bias(bias) for log in recordings.fitted],
+        validation=[log.with_accelerometer_bias(bias) for log in recordings.validation],
+        checkpoint=None,  # it contains pieces with the bias
+    )
 
 
-def estimated_uncertainty(R: Array, L: Array, mean: Array, share: float, rows: int) -> float:
-    """Return the standard deviation s of offsets with the largest evidence [m].
+def _frame(log: SurveyedLog) -> ImuFrame | None:
+    """Return the place of the IMU of a log, None without one."""
+    base = log.head.base
+    return None if base is None or base.imu is None else base.imu.frame
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedErrors:
+    """Errors that repeat, as the rows of a log determine them."""
+
+    size: float  # standard deviation s of the offsets whose size is unknown [m]; NaN if none is
+    known: Array  # (d,), estimated errors of known size; the prior means of others
+    covariance: Array  # (d, d), of errors of known size; 0 for others
+
+
+def estimated_errors(
+    R: Array, L: Array, mean: Array, share: float, rows: int, sizes: Array, before: Array
+) -> EstimatedErrors:
+    """Return the size s of offsets with the largest evidence, and errors of known size.
 
     The evidence is that of a much wider prior: with the stated one, parameters outside it would be
-    explained by offsets.
+    explained by offsets. With the noise level sigma of the rows, their triangle without parameters
+    and errors of known size has the singular values z and the torque u along their directions:
+    -2 log(evidence) is the sum of log(1 + s^2 z^2) + u^2 / (1 + s^2 z^2).
 
     Args:
         R: Triangular factor of the rows [W -D tau], shape (b + d + 1, b + d + 1).
@@ -117,23 +154,50 @@ def estimated_uncertainty(R: Array, L: Array, mean: Array, share: float, rows: i
         mean: Their prior values, shape (b,).
         share: Share of independent rows [-].
         rows: Number of rows.
+        sizes: Prior standard deviation of the error of each column of D, shape (d,); NaN: it is s.
+        before: Prior means of these errors, shape (d,); 0 where the size is not known.
     """
-    b, d = len(mean), len(R) - 1 - len(mean)
-    prior = np.zeros((b + d, b + d + 1))
+    b, is_open = len(mean), np.isnan(sizes)
+    some = np.flatnonzero(sizes > 0.0)
+    k = b + len(some)
+    R = triangle_of(R[:, [*range(b), *(b + some), *(b + np.flatnonzero(is_open)), -1]])
+    prior = np.zeros((len(R) - 1, len(R)))
     prior[:b, :b] = scipy.linalg.solve_triangular(_WIDER * L, np.eye(b), lower=True)
     prior[:b, -1] = prior[:b, :b] @ mean
-    s, sigma = _FIRST, float(np.linalg.norm(R[:, -1]) / np.sqrt(rows))
+    prior[range(b, k), range(b, k)] = 1.0 / sizes[some]
+    prior[b:k, -1] = before[some] / sizes[some]
+    s, sigma = np.nan, float(np.linalg.norm(R[:, -1]) / np.sqrt(rows))
     for _ in range(_STEPS):
-        prior[b:, b:-1] = np.eye(d) / s
+        last = sigma
+        if is_open.any():
+            T = triangle_of(np.vstack([R * (np.sqrt(share) / sigma), prior[:k]]))
+            U, z, _ = np.linalg.svd(T[k:-1, k:-1])
+            s = _largest(z**2, (U.T @ T[k:-1, -1]) ** 2)
+            prior[range(k, len(prior)), range(k, len(prior))] = 1.0 / s
         T = triangle_of(np.vstack([R * (np.sqrt(share) / sigma), prior]))
         found = scipy.linalg.solve_triangular(T[:-1, :-1], T[:-1, -1])
-        inverse = scipy.linalg.solve_triangular(T[b:-1, b:-1], np.eye(d))
         sigma = float(np.linalg.norm(R[:, -1] - R[:, :-1] @ found) / np.sqrt(max(rows - b, 1)))
-        before, s = s, float(np.sqrt(np.mean(found[b:] ** 2 + np.sum(inverse**2, axis=1))))
-        s = min(s, _MOST)
-        if abs(s - before) < _SETTLED * before:
+        if abs(sigma - last) < _SETTLED * last:
             break
-    return s
+    known, covariance = before.copy(), np.zeros((len(sizes), len(sizes)))
+    inverse = scipy.linalg.solve_triangular(T[b:-1, b:-1], np.eye(len(R) - 1 - b))
+    known[some] = found[b:k]
+    covariance[np.ix_(some, some)] = inverse[: k - b] @ inverse[: k - b].T
+    return EstimatedErrors(s, known, covariance)
+
+
+def _largest(z2: Array, u2: Array) -> float:
+    """Return s with the smallest sum of log(1 + s^2 z^2) + u^2 / (1 + s^2 z^2)."""
+
+    def loss(x: float) -> float:
+        grown = 1.0 + np.exp(2.0 * x) * z2
+        return float(np.sum(np.log(grown) + u2 / grown))
+
+    grid = np.linspace(np.log(_LEAST), np.log(_MOST), _TRIED)  # more than one minimum is possible
+    k = int(np.argmin([loss(x) for x in grid]))
+    near = grid[max(k - 1, 0)], grid[min(k + 1, _TRIED - 1)]
+    options = {"xatol": 0.1 * _SETTLED}
+    return float(np.exp(minimize_scalar(loss, bounds=near, method="bounded", options=options).x))
 
 
 def _slopes(model: RobotModel, rows: Rows, pi: Array, points: Sequence[int]) -> Array:
@@ -178,7 +242,28 @@ def _slopes_of_bias(model: RobotModel, rows: Rows, pi: Array) -> Array:
     return D.reshape(-1, 3)
 
 
-def _world_acceleration(motion: Trajectory) -> Array:
-    """Return the acceleration of the base with the axes of the world, shape (N, 3) [m/s^2]."""
+def _world_acceleration(motion: Trajectory, bias: Array) -> Array:
+    """Return the acceleration of the base with the axes of the world, shape (N, 3) [m/s^2].
+
+    Args:
+        motion: Its motion, without the bias of the accelerometers.
+        bias: The bias, which is added, shape (3,) [m/s^2].
+    """
     v, back = motion.v, motion.q[:, 3:7] * np.array([-1.0, -1.0, -1.0, 1.0])
-    return in_base(back, motion.a[:, :3] + np.cross(v[:, 3:6], v[:, :3]))
+    return in_base(back, motion.a[:, :3] + np.cross(v[:, 3:6], v[:, :3]) + bias)
+
+
+def mean_drift(a: Array, segment: Array) -> float:
+    """Return the mean of an acceleration, root mean square of its three components [m/s^2].
+
+    The mean has the weight w(t) = sin^2(pi t / T) in each segment of duration T. By parts it is
+    that of w'' x: constant speeds have no effect, and those at the ends have none. The plain mean
+    is their change over T, 0.05 m/s^2 for a robot that sways.
+
+    Args:
+        a: Acceleration of the base with the axes of the world, shape (N, 3) [m/s^2].
+        segment: Number of the segment without gaps of each row, shape (N,).
+    """
+    counts = np.unique(segment, return_counts=True)[1]
+    w = np.concatenate([np.hanning(count + 2)[1:-1] for count in counts])
+    return float(np.linalg.norm(w @ a / w.sum()) / np.sqrt(3.0))

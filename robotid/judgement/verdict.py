@@ -42,7 +42,7 @@ _SMALL = 5.0  # [%] of the torque: a missing drive term below this gives no warn
 _REASONS = {
     "angle_scale": "positions fit best when multiplied by another factor",
     "active_bound": "the data, or the masses that result from it, contradict a stated bound",
-    "base_jump": "the pose of the base jumps {jumps:.0f} times: its acceleration there is wrong",
+    "base_jump": "the pose of the base jumps {jumps:.0f} times: some of it may be wrong",
     "clipped": "the torque is clipped at a limit",
     "contact_delay": "contact flags are delayed by {delay:+.3f} s (negative: early): contact "
     "forces remain in the rows",

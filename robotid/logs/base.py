@@ -23,6 +23,7 @@ __all__ = [
     "base_state",
     "contacts_of",
     "in_base",
+    "pose_jumps",
     "quaternions_of_angles",
     "table_of_base",
 ]
@@ -43,6 +44,10 @@ _IMU_REMEDY = (
     "imu_qx, imu_qy, imu_qz, imu_qw, or that of the base"
 )
 _UNIT = 1e-3  # tolerance of the norm of a logged quaternion
+_BESIDE, _USUAL = 32, 75.0  # rows beside a step, and the percentile of their steps ...
+_JUMPS = 15.0  # ... times which a step relative to those before and after it is a jump ...
+_SMALLEST = (5e-3, 0.02)  # [m], [rad] ... if it is not below this
+_GAP = 2.5  # median steps of time: a longer one is a gap, over which the pose may change
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,6 +353,39 @@ def base_state(
     elif acceleration is None:
         acceleration = np.gradient(twist, t, axis=0)
     return pose, twist, acceleration
+
+
+def pose_jumps(t: Array, pose: Array) -> tuple[Array, Array, Array]:
+    """Return the jumps of a pose from one row to the next: rows, lengths and angles.
+
+    A step is compared with the mean of the steps before and after it, and their difference with
+    those of 32 rows on each side. A change of the speed, as by an impact, is no jump.
+
+    Args:
+        t: Time stamps, shape (N,) [s].
+        pose: Pose as of ``BaseMotion``, shape (N, 7).
+
+    Returns:
+        The rows after the jumps, shape (k,); their sizes, 0 if not a jump of this kind [m], [rad].
+    """
+    dt, sizes = np.diff(t), np.zeros((2, len(t)))
+    if len(dt) < 3:
+        return np.empty(0, dtype=int), np.empty(0), np.empty(0)
+    whole = dt < _GAP * np.median(dt)
+    whole = whole[1:-1] & whole[:-2] & whole[2:]
+    for found, values, least in zip(
+        sizes, (pose[:, :3], 2.0 * pose[:, 3:]), _SMALLEST, strict=True
+    ):
+        steps = np.diff(values, axis=0)
+        size = np.linalg.norm(steps[1:-1] - 0.5 * (steps[:-2] + steps[2:]), axis=1)
+        impact = np.linalg.norm(steps[2:] - steps[:-2], axis=1) > size  # a change of the speed
+        for k in np.flatnonzero(whole & ~impact & (size > least)):
+            beside = slice(max(k - _BESIDE, 0), k + _BESIDE + 1)
+            usual = np.percentile(size[beside][whole[beside]], _USUAL)
+            if size[k] > _JUMPS * usual and size[k] == size[max(k - 1, 0) : k + 2].max():
+                found[k + 2] = size[k]
+    rows = np.flatnonzero(sizes.any(axis=0))
+    return rows, *sizes[:, rows]
 
 
 def in_base(quaternion: Array, vector: Array) -> Array:

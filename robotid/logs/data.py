@@ -208,8 +208,8 @@ class Trajectory:
         memory: Regressor columns of drive parameters that depend on internal states, shape (N, m),
             in the order of ``ParameterLayout.remembering``; None if there are none.
         contacts: Which contacts may touch the ground, shape (N, k), bool; None without contacts.
-        switching: Samples at which a contact changes and the acceleration jumps, shape (N,), bool;
-            None without contacts.
+        switching: Samples at which a contact changes and the acceleration jumps, or that a jump of
+            the logged pose of the base reaches, shape (N,), bool; None without contacts and base.
         wrenches: Measured components of wrenches, shape (N, m) [N or N m]; None without any.
         basis: Basis of the torques of constraint forces, shape (N, n_rows, m), as of
             ``force_basis``; None without constraints.

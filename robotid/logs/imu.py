@@ -27,12 +27,14 @@ class ImuFrame:
         gravity: Gravity in the world, shape (3,) [m/s^2].
         bias: Bias of the gyroscopes with the axes of the base, shape (3,) [rad/s]; None to
             estimate it at rest.
+        offset: Bias of the accelerometers with the axes of the base, shape (3,) [m/s^2]; None: 0.
     """
 
     quaternion: Array
     lever: Array
     gravity: Array
     bias: Array | None = None
+    offset: Array | None = None
 
     @property
     def rotation(self) -> Array:
@@ -124,8 +126,8 @@ def inertial_state(
 ) -> tuple[Array, Array]:
     """Return twist (N, 6) and its time derivative (N, 6) of a base with an IMU, in base axes.
 
-    With the lever r of the IMU, its specific force f and gravity g, the specific force at the
-    origin is f - alpha x r - w x (w x r), and dv/dt = that + g - w x v.
+    With the lever r of the IMU, its specific force f without bias and gravity g, the specific
+    force at the origin is f - alpha x r - w x (w x r), and dv/dt = that + g - w x v.
 
     Args:
         t: Time stamps, shape (N,) [s].
@@ -135,6 +137,7 @@ def inertial_state(
         frame: Place of the IMU.
     """
     w, f, r = values[:, :3], values[:, 3:], frame.lever
+    f = f if frame.offset is None else f - frame.offset
     alpha = np.gradient(w, t, axis=0)
     f = f - np.cross(alpha, r) - np.cross(w, np.cross(w, r))
     rate = np.hstack([f + down - np.cross(w, velocity), alpha])

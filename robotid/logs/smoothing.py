@@ -11,7 +11,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
-from robotid.logs.base import BaseMotion, base_state
+from robotid.logs.base import BaseMotion, base_state, pose_jumps
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.filters import butterworth_poles, zero_phase
 from robotid.logs.friction_direction import acting_directions
@@ -29,6 +29,8 @@ _ALL = slice(None)
 _KEPT = 20_000  # rows of a log up to which its motions are kept as long as the log
 _KNOWN: WeakKeyDictionary[Log, dict[object, Trajectory]] = WeakKeyDictionary()
 _SPREAD = 1.0  # [periods of the filter] by which it spreads a force
+_JUMPS = 14.0  # [time constants] after which it has forgotten a jump: 1e-6
+_BESIDE = 16  # rows after which splines and differences have
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,9 @@ def _process(
         np.concatenate(x) for x in zip(nothing, *parts, strict=True)
     )
     contacts, switching = _contacts(log, t, settings) if log.contacts else (None, None)
+    if log.base is not None and log.base.imu is None and len(t):
+        jumping = _jumping(log.t, log.base.pose, t, settings)
+        switching = jumping if switching is None else switching | jumping
     return Trajectory(
         t=t, q=q, v=v, a=a, tau=tau, joints=log.joints, rate=settings.rate,
         segment=np.repeat([segment.number for segment in segments], counts),
@@ -137,11 +142,18 @@ def filter_reach(settings: SignalSettings) -> float:
     delay = max(abs(settings.torque_delay), abs(settings.velocity_delay))
     if settings.cutoff is None or settings.rate is None:
         return delay
+    return delay + 2.0 * _SETTLED * _time_constant(settings) + _LONGEST / settings.cutoff
+
+
+def _time_constant(settings: SignalSettings) -> float:
+    """Return the longest time constant of the filter [s]; 0 without one."""
     order, cutoff, rate = settings.order, settings.cutoff, settings.rate
+    if cutoff is None or rate is None:
+        return 0.0
     poles = butterworth_poles(order, cutoff, rate)
     digital = 1 / (-np.log(np.abs(poles).max()) * rate)
     analog = 1 / (2 * np.pi * cutoff * np.sin(np.pi / (2 * order)))  # on a finer grid
-    return delay + 2.0 * _SETTLED * float(max(digital, analog)) + _LONGEST / cutoff
+    return float(max(digital, analog))
 
 
 def low_pass(values: Array, rate: float, settings: SignalSettings) -> Array:
@@ -269,6 +281,15 @@ def _contacts(log: Log, t: Array, settings: SignalSettings) -> tuple[Array, Arra
         started = np.searchsorted(log.t[rows] - reach, t, side="right")
         changing = started > np.searchsorted(log.t[rows + 1] + reach, t, side="left")
     return touching, changing
+
+
+def _jumping(stamps: Array, pose: Array, t: Array, settings: SignalSettings) -> Array:
+    """Return the times (N,) at which a jump of the pose of the base is in its motion, bool."""
+    rows, reach = pose_jumps(stamps, pose)[0], _JUMPS * _time_constant(settings)
+    begins = stamps[(rows - 1 - _BESIDE).clip(0)] - reach
+    ends = stamps[(rows + _BESIDE).clip(max=len(stamps) - 1)] + reach
+    started = np.searchsorted(begins, t, side="right")
+    return started > np.searchsorted(ends, t, side="left")
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,7 @@ __all__ = [
 _RANK = 1e-8  # singular values below this share of the largest are of dependent constraints
 _AS_IS = BaseSource()
 _BLOCK = 1024  # samples whose Jacobians are in memory together
+_CACHED = 64  # samples that are projected together
 
 
 def constraint_jacobian(model: RobotModel, q: Array, contacts: Array) -> Array:
@@ -132,8 +133,8 @@ def without_forces(basis: Array, rows: Array) -> Array:
     """
     if rows.ndim == 2:
         return without_forces(basis, rows[..., None])[..., 0]
-    projected: Array = rows - basis @ (basis.swapaxes(1, 2) @ rows)
-    return projected
+    projected: Array = basis @ (basis.swapaxes(1, 2) @ rows)
+    return np.subtract(rows, projected, out=projected)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,13 +179,22 @@ class ProjectedRows(RowSource):
     def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
         every, n = self.columns[0], self.weights.shape[1]
         places = [np.append(np.searchsorted(every, own), len(every)) for own in self.own.columns]
+        room = np.zeros((_CACHED, n, len(every) + 1))
         for block in self.own.blocks(start, stop, segment):
-            k = slice(start, start := start + len(block[0]))
-            X = np.zeros((len(block[0]), n, len(every) + 1))
-            for j, (place, rows) in enumerate(zip(places, block, strict=True)):
-                X[:, j, place] = rows
-            X = without_forces(self.basis[k], X) * np.sqrt(self.weights[k])[..., None]
-            yield [np.asfortranarray(X[:, j]) for j in range(n)]
+            size = len(block[0])
+            found = [np.empty((size, len(every) + 1), order="F") for _ in range(n)]
+            for first in range(0, size, _CACHED):  # as many as the cache of a core holds
+                some = slice(first, min(first + _CACHED, size))
+                k = slice(start + some.start, start + some.stop)
+                X = room[: some.stop - some.start]
+                for j, (place, rows) in enumerate(zip(places, block, strict=True)):
+                    X[:, j, place] = rows[some]
+                X = without_forces(self.basis[k], X)  # other columns of the room remain 0
+                X *= np.sqrt(self.weights[k])[..., None]
+                for own, rows in zip(found, X.swapaxes(0, 1), strict=True):
+                    own[some] = rows
+            start += size
+            yield found
 
 
 def constrained(
@@ -193,7 +203,7 @@ def constrained(
     """Return a motion with torques without those of constraint forces, and the rows used.
 
     Torques of measured forces are subtracted, those of unknown forces are eliminated. Rows in which
-    nothing remains, and samples at which a contact changes, are not used.
+    nothing remains, and samples at which a contact changes or the base jumps, are not used.
 
     Args:
         model: The robot.
@@ -203,10 +213,10 @@ def constrained(
     """
     if not has_torque:
         used = used & (np.arange(model.n_rows) < model.n_rows - len(model.joints))
-    if not model.constraints:
-        return motion, used
     if motion.switching is not None:
         used = used & ~motion.switching[:, None]
+    if not model.constraints:
+        return motion, used
     J = constraint_jacobian(model, motion.q, touching(model, motion))
     known, tau = _measured(model), motion.tau
     if motion.wrenches is not None:

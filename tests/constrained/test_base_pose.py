@@ -96,6 +96,6 @@ def test_a_turn_of_the_tag_is_found_and_one_in_a_gap_is_not(log):
     jumped = with_quaternion(log, turned)
     (found,) = check_pose(jumped)
     assert found.evidence["size"] == pytest.approx(0.2, abs=0.02)
-    assert " rad;" in found.message
+    assert " rad: " in found.message
     apart = np.where(np.arange(len(log.t)) < 150, log.t, log.t + 5.0)
     assert not list(check_pose(replace(jumped, t=apart)))

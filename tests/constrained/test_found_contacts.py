@@ -7,7 +7,12 @@ import pytest
 from helpers.paths import JOBS
 
 from robotid.commands.job import read_job
-from robotid.constrained.found_contacts import _forces, find_contacts, with_contacts
+from robotid.constrained.found_contacts import (
+    _forces,
+    _noise_of_groups,
+    find_contacts,
+    with_contacts,
+)
 from robotid.exceptions import DataError
 from robotid.logs.base import BaseMotion, quaternions_of_angles
 from robotid.logs.data import Log
@@ -124,13 +129,14 @@ def test_contacts_of_a_trot_agree_with_stated_ones(recordings, monkeypatch):
         assert min(on, off) > 0.2
 
 
-def test_rows_count_by_their_noise_which_their_residuals_give(robot, rng):
+@pytest.mark.parametrize("levels", [(0.1, 0.01), (1.0, 0.03), (0.02, 0.3)])
+def test_rows_count_by_their_noise_which_their_residuals_give(robot, rng, levels):
     """Forces are near those with the true weights, though rows of the base have large leverages."""
     log, *_ = standing(robot, np.ones((300, 4), dtype=bool))
     motion = process(log, RAW)
     motion = replace(motion, contacts=np.empty((len(motion.t), 0), dtype=bool))
     J = constraint_jacobian(robot, motion.q, np.ones((len(motion.t), 4), dtype=bool))
-    sigma = np.where(np.arange(18) < 6, 0.1, 0.01)  # of the base and of the joints
+    sigma = np.where(np.arange(18) < 6, *levels)  # of the base and of the joints
     f = np.array([1.5, -1.0, 5.0] * 4) * rng.uniform(0.5, 1.5, (len(motion.t), 12))
     b = np.einsum("kmj,km->kj", J, f) + sigma * rng.standard_normal((len(motion.t), 18))
     torque = predict(replace(robot, constraints=()), [robot.standard_parameters()], motion)[0]
@@ -142,3 +148,20 @@ def test_rows_count_by_their_noise_which_their_residuals_give(robot, rng):
 
     wanted, plain = upwards(sigma), upwards(np.ones(18))
     assert np.std(found - wanted) < 0.75 * np.std(plain - wanted)
+    true = f[:, 2::3]
+    assert np.std(found - true) < 1.06 * np.std(wanted - true)
+    assert np.std(plain - true) > (1.0 if levels[0] < levels[1] else 1.8) * np.std(wanted - true)
+
+
+def test_the_noise_of_forces_moments_and_joints_is_found_at_any_ratio(robot, rng):
+    """Two contacts, whose forces ten samples of each determine; in any number of samples."""
+    two = replace(robot, constraints=[Contact(foot) for foot in FEET[:2]])
+    q = np.hstack([np.tile([0, 0, 0.3, 0, 0, 0, 1.0], (1501, 1)), rng.uniform(-1, 1, (1501, 12))])
+    J = constraint_jacobian(two, q, np.ones((1501, 2), dtype=bool))
+    f = np.array([20.0, -30.0, 60.0] * 2) * rng.uniform(0.5, 1.5, (1501, 6))
+    for levels in ((2.0, 0.1, 0.05), (0.5, 0.05, 0.9), (0.3, 4.0, 0.3)):
+        sigma = np.repeat(levels, [3, 3, 12])
+        b = np.einsum("kmj,km->kj", J, f) + sigma * rng.standard_normal((1501, 18))
+        found = _noise_of_groups(J, b, 30.0)
+        np.testing.assert_allclose(found[[0, 3, 6]], levels, rtol=0.15)
+        assert all(len(set(x)) == 1 for x in np.split(found, [3, 6]))

@@ -13,7 +13,8 @@ from robotid.fitting.survey import hold_log
 from robotid.identification import pipeline, repeated_errors
 from robotid.identification.repeated_errors import (
     _slopes,
-    estimated_uncertainty,
+    estimated_errors,
+    mean_drift,
     with_repeated_errors,
 )
 from robotid.logs.base import BaseMotion
@@ -89,17 +90,23 @@ def test_a_force_beside_its_point_leaves_the_torque_of_its_slope(log, rng):
     assert np.abs(left).max() > 1e-5
 
 
+def size_of(R, L, mean, share, rows):
+    """Return the size of offsets, all of which are unknown."""
+    d = len(R) - 1 - len(mean)
+    return estimated_errors(R, L, mean, share, rows, np.full(d, np.nan), np.zeros(d)).size
+
+
 def test_the_size_of_offsets_is_found(rng):
     """Offsets of 2 mm that the rows determine, beside parameters with a wide prior."""
     W, D, x = rng.standard_normal((2000, 5)), rng.standard_normal((2000, 12)), np.zeros(12)
     x = 2e-3 * rng.standard_normal(12)
     tau = W @ np.ones(5) + D @ x + 1e-3 * rng.standard_normal(2000)
     R = np.linalg.qr(np.column_stack([W, D, tau]), mode="r")
-    s = estimated_uncertainty(R, 10 * np.eye(5), np.zeros(5), 1.0, 2000)
+    s = size_of(R, 10 * np.eye(5), np.zeros(5), 1.0, 2000)
     assert s == pytest.approx(np.sqrt(np.mean(x**2)), rel=0.02)
     tau = tau - D @ x
     R = np.linalg.qr(np.column_stack([W, D, tau]), mode="r")
-    assert estimated_uncertainty(R, 10 * np.eye(5), np.zeros(5), 1.0, 2000) < 1e-4
+    assert size_of(R, 10 * np.eye(5), np.zeros(5), 1.0, 2000) < 1e-4
 
 
 def test_parameters_far_from_the_prior_are_no_offsets(rng):
@@ -108,7 +115,7 @@ def test_parameters_far_from_the_prior_are_no_offsets(rng):
     D = W @ rng.standard_normal((5, 12)) + rng.standard_normal((2000, 12))
     tau = W @ np.ones(5) + 1e-3 * rng.standard_normal(2000)
     R = np.linalg.qr(np.column_stack([W, D, tau]), mode="r")
-    assert estimated_uncertainty(R, 0.01 * np.eye(5), np.zeros(5), 1.0, 2000) < 1e-4
+    assert size_of(R, 0.01 * np.eye(5), np.zeros(5), 1.0, 2000) < 1e-4
 
 
 def test_the_size_of_offsets_that_rows_determine_weakly_has_the_largest_evidence(rng):
@@ -120,10 +127,55 @@ def test_the_size_of_offsets_that_rows_determine_weakly_has_the_largest_evidence
     W[-1] = 1.0
     tau = D @ offsets + level * rng.standard_normal(len(D))
     R = triangle_of(np.column_stack([W, D, tau]))
-    found = estimated_uncertainty(R, np.eye(1), np.zeros(1), 1.0, len(D))
+    found = size_of(R, np.eye(1), np.zeros(1), 1.0, len(D))
     # the closed form: the variance of each determined row is level^2 (1 + s^2 / size^2)
     wanted = size * np.sqrt(np.mean(tau[:d] ** 2) / np.var(tau[d:]) - 1.0)
     assert found == pytest.approx(wanted, rel=0.1)
+
+
+def test_the_size_of_offsets_is_that_of_the_density_of_the_rows(rng):
+    """Far below 3 mm, beside errors of known size: by the determinant of all rows' covariance."""
+    W, D, x = rng.standard_normal((150, 3)), rng.standard_normal((150, 10)), np.zeros(10)
+    D[:, :3] *= 5.0
+    x[:3], x[3:] = 0.2 * rng.standard_normal(3), 4e-4 * rng.standard_normal(7)
+    level = 1e-3
+    sizes, before = np.array([0.3, 0.2, 0.0] + 7 * [np.nan]), np.zeros(10)
+    before[:2] = 0.1, -0.2
+    x[2] = 0.0
+    tau = W @ np.ones(3) - D @ x + level * rng.standard_normal(150)
+    R = np.linalg.qr(np.column_stack([W, -D, tau]), mode="r")
+    found = estimated_errors(R, np.eye(3), np.zeros(3), 1.0, 150, sizes, before)
+
+    def loss(s, sigma):
+        wide = np.hstack([1e3 * W, D[:, :2] * sizes[:2], D[:, 3:] * s])
+        V = wide @ wide.T + sigma**2 * np.eye(150)
+        y = tau + D[:, :2] @ before[:2]
+        return np.linalg.slogdet(V)[1] + y @ np.linalg.solve(V, y)
+
+    rows = np.hstack([W, D[:, :2], D[:, 3:]])
+    left = tau - rows @ np.linalg.lstsq(rows, tau, rcond=None)[0]
+    sigma = np.linalg.norm(left) / np.sqrt(150 - 3)
+    grid = np.geomspace(1e-4, 2e-3, 150)
+    wanted = grid[np.argmin([loss(s, sigma) for s in grid])]
+    assert found.size == pytest.approx(wanted, rel=0.05)
+    np.testing.assert_allclose(found.known[:2], x[:2], atol=4 * level / np.sqrt(150) / 5)
+    H = rows.T @ rows / sigma**2
+    H[range(3, 5), range(3, 5)] += sizes[:2] ** -2.0
+    H[range(5, 12), range(5, 12)] += found.size**-2.0
+    np.testing.assert_allclose(
+        found.covariance[:2, :2], np.linalg.inv(H)[3:5, 3:5], rtol=0.02, atol=1e-12
+    )
+    assert not found.covariance[2:].any()
+    assert not found.known[2:].any()
+
+
+def test_a_drift_is_neither_the_speed_at_the_ends_nor_that_of_a_walk():
+    t = np.arange(0.0, 16.0, 0.01)
+    sway = -0.02 * (2 * np.pi * 0.9) ** 2 * np.sin(2 * np.pi * 0.9 * t + 0.3)
+    a = np.column_stack([sway + 0.03, 0.0 * t - 0.04, 0.5 * sway])
+    segment = (t > 5.3).astype(int)
+    assert np.linalg.norm(a.mean(axis=0) - [0.03, -0.04, 0.0]) > 0.01
+    assert mean_drift(a, segment) == pytest.approx(0.05 / np.sqrt(3.0), rel=0.02)
 
 
 def test_the_covariance_of_the_score_is_that_of_the_stated_uncertainty(log):
@@ -209,13 +261,25 @@ def test_only_logs_with_an_imu_have_a_bias(log, rng, monkeypatch):
 
     monkeypatch.setattr(repeated_errors, "_slopes_of_bias", slopes)
     alone, both = (
-        with_repeated_errors(Recordings(model, mapping, logs)).repeated
+        with_repeated_errors(Recordings(model, mapping, logs))
         for logs in ((with_imu,), (with_imu, without))
     )
-    assert alone.root.shape[1] == 3
-    assert alone.bias > 0.0
-    assert both.bias == pytest.approx(alone.bias)
+    assert alone.repeated.root.shape[1] == 3
+    frames = [x.head.base.imu and x.head.base.imu.frame for x in both.fitted]
+    assert frames[1] is None
+    np.testing.assert_array_equal(frames[0].offset, both.repeated.bias)
+    assert np.linalg.norm(both.repeated.bias) > 0.0
+    # what is subtracted from the specific force is missing in the acceleration
+    before, after = (
+        x.fitted[0].whole.trajectory.a for x in (Recordings(model, mapping, (with_imu,)), both)
+    )
+    np.testing.assert_allclose(
+        before[:, :3] - after[:, :3], np.tile(both.repeated.bias, (60, 1)), atol=1e-12
+    )
+    np.testing.assert_array_equal(before[:, 3:], after[:, 3:])
     assert with_repeated_errors(Recordings(model, mapping, (without,))).repeated is None
     # with slopes that do not depend on the parameters, those of the second log have no effect
-    squares, size = (x.root @ x.root.T for x in (both, alone)), np.abs(alone.root).max()
-    np.testing.assert_allclose(*squares, atol=1e-9 * size**2)
+    one, two = alone.repeated.root, both.repeated.root
+    np.testing.assert_allclose(
+        one @ np.linalg.lstsq(one, two, rcond=None)[0], two, atol=1e-9 * np.abs(two).max()
+    )

@@ -1,11 +1,13 @@
 """A segment smoothed part by part is as smooth as the whole."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy.signal import butter
 
+from robotid.logs.base import BaseMotion
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process, resolve
@@ -52,7 +54,7 @@ def in_parts(log, settings):
         rows = slice(low, high)
         part = Log(
             t=log.t[rows], q=log.q[rows], tau=log.tau[rows], joints=log.joints,
-            v=log.v[rows], a=log.a[rows],
+            v=log.v[rows], a=log.a[rows], base=log.base and log.base.at(rows),
         )  # fmt: skip
         own = slice(start, stop)
         yield process_segments(part, mine, settings, first=low, own=own, speeds=SPEEDS)
@@ -149,3 +151,36 @@ def test_points_of_a_grid_are_numbered_from_its_start():
     assert (coarse.decimation, coarse.count, coarse.rate) == (1, 271, pytest.approx(30.0))
     rows = _Grid.of(segment, SignalSettings(rate=None, cutoff=None))
     assert (rows.step, rows.count, rows.start, rows.last) == (None, 901, 1234.5, 1243.5)
+
+
+JUMPS = ((1990, 0.3), (1996, -0.28), (3700, 0.05))  # a marker lost and found, and another one
+
+
+def floating(log, jumps=()):
+    """Return the log with a base that moves, and jumps along z from some rows on [m]."""
+    pose = np.zeros((len(log.t), 7))
+    pose[:, :3] = 0.1 * np.sin(np.outer(log.t, [1.0, 2.0, 3.0]))
+    pose[:, 5], pose[:, 6] = np.sin(0.2 * np.sin(log.t)), np.cos(0.2 * np.sin(log.t))
+    for row, size in jumps:
+        pose[row:, 2] += size
+    return replace(log, base=BaseMotion(pose))
+
+
+@pytest.mark.parametrize("cutoff", [None, 6.0])
+@pytest.mark.parametrize("rate", [None, 160.0])
+def test_samples_that_a_jump_of_the_base_reaches_are_marked(rng, cutoff, rate):
+    log = recording(rng, start=3.0)
+    settings = SignalSettings(cutoff=cutoff, rate=rate)
+    smooth, jumped = (process(floating(log, x), settings, SPEEDS) for x in ((), JUMPS))
+    assert not smooth.switching.any()
+    off = np.abs(jumped.a - smooth.a).max(axis=1)
+    assert off[jumped.switching].max() > 10.0  # [m/s^2]
+    assert off[~jumped.switching].max() < 1e-3
+    assert np.mean(jumped.switching) < (0.02 if cutoff is None else 0.18)
+    edges = np.flatnonzero(np.diff(jumped.switching.astype(int)))
+    starts = jumped.t[edges[::2]]
+    assert len(starts) == 2
+    for first, row in zip(starts, (1990, 3700), strict=True):
+        assert 0.0 < log.t[row] - first < (0.12 if cutoff is None else 1.1)
+    whole = np.concatenate([x.switching for x in in_parts(floating(log, JUMPS), settings)])
+    np.testing.assert_array_equal(whole, jumped.switching)

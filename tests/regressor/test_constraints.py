@@ -136,6 +136,9 @@ def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(quadrupe
     assert np.abs(found.tau).max() > 1.0
     assert not used[4].any()
     assert used[rest].all()
+    bare = replace(motion, contacts=None, wrenches=None)
+    _, used = constrained(replace(quadruped, constraints=()), bare, np.ones((7, 18), dtype=bool))
+    np.testing.assert_array_equal(used, np.tile(rest[:, None], 18))
     unknown = np.linalg.matrix_rank(np.delete(J, measured, axis=1))
     np.testing.assert_allclose(np.sum(found.basis**2, axis=(1, 2))[[0, 1, 6]], unknown[[0, 1, 6]])
 
