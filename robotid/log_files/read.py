@@ -20,6 +20,7 @@ from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
 from robotid.log_files.columns import NOUNS, TORQUES, Finder, Needs, without_torque
+from robotid.log_files.even_stamps import with_even_stamps
 from robotid.log_files.foreign_tables import Frame, is_frame, open_frame, with_own_names
 from robotid.log_files.formats import open_table, write_columns
 from robotid.log_files.table import Table
@@ -387,6 +388,8 @@ def lay_out(
         has_torque=any(finder.has_torque(joint) for joint in joints),
         base=base,
     )
+    if source.stamp == "even":
+        opened = with_even_stamps(opened, found["time"][0])
     return layout, opened
 
 
