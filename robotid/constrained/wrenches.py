@@ -46,6 +46,7 @@ class _Reading:
     is_exchanged: bool  # whether forces of two feet are
     factor: float  # of the forces
     residual: Array  # (N, 6) [N, N m]
+    weight: float  # RMS of the force of the base that is not caused by unknown forces [N]
 
     @property
     def sizes(self) -> tuple[float, float]:
@@ -90,9 +91,13 @@ def check_wrenches(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[
     stated = readings[0]
     least = weight * _FORCE, weight * lever * _MOMENT
     better = [x for x in readings if x.is_better(stated, least)]
+    better = [
+        x for x in better if x.weight > _MISSING * stated.weight
+    ]  # unknown forces explain all
     better = [x for x in better if x.sizes[0] < _MISSING * weight]
     best = min(better, key=size, default=stated)
     remain = best.sizes[1] > _BETTER * stated.sizes[1] and best.sizes[0] < _BETTER * stated.sizes[0]
+    has_plates = all(x.is_measured and x.kind == "surface" for x in measured)
     if remain:  # the force alone does not show which foot it acts on
         best = min([x for x in better if not x.is_exchanged], key=size, default=best)
     if best is not stated:
@@ -101,7 +106,7 @@ def check_wrenches(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[
             f"(RMS) of the base unexplained, but only {_size(best)} if {' and '.join(best.changes)}"
             ". Correct the columns wrench_..., or [[contact]]"
         )
-        if remain:
+        if remain and has_plates:
             message += (
                 ". The moments remain: state the plate of each foot, plate = [x, y, z, roll, "
                 "pitch, yaw]"
@@ -188,12 +193,13 @@ def _fitted(
         if isinstance(x, Contact):
             known += [first + k for k in x.rows_measured]
         first += x.sizes[x.kind]
-    basis = force_basis(np.delete(J, known, axis=1), np.ones((len(J), 6), dtype=bool))
+    basis = force_basis(np.delete(J, known, axis=1), np.ones((len(J), 6), dtype=bool), floats=True)
     caused = without_forces(basis, np.einsum("kmj,km->kj", J[:, known], wrenches))
     left = without_forces(basis, torque)
     square = float(np.sum(caused**2))
     factor = float(np.sum(caused * left)) / square if square > 0.0 else 1.0
-    yield _Reading(*reading, 1.0, left - caused)
+    size = _rms(left[:, :3])
+    yield _Reading(*reading, 1.0, left - caused, size)
     if _ALIKE[0] <= factor <= _ALIKE[1]:
         return
     unit = next((name for name, x in _UNITS.items() if _ALIKE[0] < factor / x < _ALIKE[1]), "")
@@ -201,4 +207,4 @@ def _fitted(
     if abs(factor + 1.0) < 1.0 - _ALIKE[0]:
         factor, words = -1.0, "their sign is reversed (forces on the ground instead of on the feet)"
     changes, is_exchanged = reading
-    yield _Reading((*changes, words), is_exchanged, factor, left - factor * caused)
+    yield _Reading((*changes, words), is_exchanged, factor, left - factor * caused, size)

@@ -8,7 +8,8 @@ rows D of the torque per offset along each axis, and offsets x ~ N(0, s^2) of al
     W pi = tau + J^T f + D x,
 
 the score W^T tau has the covariance s^2 W^T D D^T W beside that of its noise. If s is not stated,
-it is the one with the largest evidence.
+it is the one with the largest evidence. Without torques of joints an offset is like a displaced
+centre of mass: s then is 2 cm, its bound.
 
 A bias of the accelerometers acts as a change of gravity with the axes of the base. D then has the
 torque per acceleration of the base. Over a log the robot hardly moves away, so its mean
@@ -50,7 +51,7 @@ _STEPS, _SETTLED = 100, 1e-3  # steps of the maximisation, relative change of s 
 def with_repeated_errors(recordings: Recordings) -> Recordings:
     """Return recordings with the covariance of the score due to contacts and accelerometers.
 
-    Contacts with measured forces, and surfaces, have no such errors.
+    Surfaces have no such errors: their moments are measured, or unknown.
 
     Args:
         recordings: The recordings.
@@ -59,7 +60,7 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
         DataError: If a row of a log cannot be used.
     """
     model, mapping = recordings.model, recordings.mapping
-    points = [k for k, x in enumerate(model.contacts) if x.kind == "point" and not x.measured]
+    points = [k for k, x in enumerate(model.contacts) if x.kind == "point"]
     points = [k for k in points if model.contacts[k].uncertainty != 0.0]
     bases = [log.head.base for log in recordings.fitted]
     with_imu = [base is not None and base.imu is not None for base in bases]
@@ -91,6 +92,8 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
         drifts += [np.linalg.norm(np.concatenate(pushed).mean(axis=0))] if pushed else []
     stated = [model.contacts[k].uncertainty for k in points]
     count = int(whole.factors.rows.sum())
+    if not whole.factors.rows[6 * model.free_flyer :].any():
+        stated = [_MOST if x is None else x for x in stated]
     if None in stated:
         L = np.linalg.cholesky((mapping.K * spread**2) @ mapping.K.T)
         own = triangle_of(total.R[:, [*range(b + c), -1]])
@@ -154,6 +157,8 @@ def _slopes(model: RobotModel, rows: Rows, pi: Array, points: Sequence[int]) -> 
     D = np.zeros((*torque.shape, 3 * len(points)))
     for i, k in enumerate(points):
         own = f[:, None, first[k] : first[k] + 3]
+        if model.contacts[k].axes == "link":
+            own = own @ rotation[:, k].swapaxes(1, 2)  # with the axes of the world
         moments = np.cross(rotation[:, k].swapaxes(1, 2), own)  # (N, 3, 3), one per axis
         D[:, :, 3 * i : 3 * i + 3] = turning[:, k].swapaxes(1, 2) @ moments.swapaxes(1, 2)
     if motion.basis is not None:
