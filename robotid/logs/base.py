@@ -10,7 +10,14 @@ from numpy.typing import ArrayLike
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
-from robotid.logs.imu import IMU, ImuFrame, ImuMotion, inertial_state, motion_of_imu
+from robotid.logs.imu import (
+    IMU,
+    ImuFrame,
+    ImuMotion,
+    inertial_state,
+    motion_of_imu,
+    orientation_of_imu,
+)
 
 __all__ = [
     "ACCELERATION",
@@ -136,6 +143,15 @@ class BaseColumns:
     imu: ImuFrame | None = None
     link: str = ""
 
+    @property
+    def needs_heading(self) -> bool:
+        """Whether components of wrenches have horizontal axes of the world."""
+        if self.imu is None:
+            return False
+        vertical = "f" + "xyz"[int(np.argmax(np.abs(self.imu.gravity)))]
+        pairs = [name.split(" ", 1) for name in self.wrenches]
+        return any(part != vertical and link not in self.local for part, link in pairs)
+
     def present(self, names: Collection[str]) -> "BaseColumns":
         """Return the same with only those contacts that a file has; the others may be found.
 
@@ -203,7 +219,7 @@ def _columns_of_base(where: str, names: Sequence[str], wanted: BaseColumns) -> d
     used = next((kind for kind in orientations if kind in found), "")
     required = ["imu"] if wanted.imu is not None else []
     missing = [x for kind in required for x in whole[kind] if x not in names]
-    if not used and not missing:
+    if not used and not missing and (not required or wanted.needs_heading):
         missing = [x for x in whole["imu quaternion" if required else "pose"] if x not in names]
     if missing:
         seen = [name for name in names if name.startswith(("base_", "imu_"))]
@@ -232,6 +248,12 @@ def base_of(
         DataError: If a value is not finite, or a quaternion is not of length 1.
     """
     pose, frame = _pose_of(values, wanted.imu), wanted.imu
+    if pose is None and frame is not None and "base imu" in values:
+        imu, note = motion_of_imu(t, q, _checked(values["base imu"], "IMU", 6), frame)
+        pose = np.zeros((len(t), 7))
+        pose[:, 3:] = orientation_of_imu(t, imu.values, frame.gravity)
+        note += "; the orientation is estimated from angular velocity and specific force"
+        return BaseMotion(pose, imu=imu), note
     if pose is None:
         return None, ""
     twist, acceleration = values.get("base twist"), values.get("base acceleration")
