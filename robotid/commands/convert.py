@@ -74,9 +74,8 @@ def convert(
     found |= {name: name for name in others}
     chosen = ["time", *(name for joint in wanted for name in by_joint[joint]), *others]
     columns = [name for name in found if name in chosen]
-    if source.stamp == "even":
-        opened = with_even_stamps(opened, found["time"])
-    table = opened.read([found[name] for name in columns])
+    even = with_even_stamps(opened, found["time"], source.stamp)
+    table = even.read([found[name] for name in columns])
     write_columns({name: table[found[name]] for name in columns}, Path(target))
     return Conversion(
         path=str(target),

@@ -16,7 +16,7 @@ from robotid.logs.time_stamps import median_step
 from robotid.robot.constraints import link_positions
 from robotid.robot.model import RobotModel
 
-__all__ = ["check_order", "check_pose"]
+__all__ = ["check_order", "check_pose", "check_unit"]
 
 _USUAL = 95.0  # percentile of the steps of a pose relative to those before and after ...
 _JUMPS = 10.0  # ... times which a step is a jump ...
@@ -25,6 +25,7 @@ _GAP = 2.5  # median steps of time: a longer one is a gap, over which the pose m
 _MOVES = 0.02  # [m/s] RMS speed of feet in contact below which no other order is tried
 _BETTER = 0.5  # ratio of the speeds below which another order is found
 _ABOVE = 0.3  # vertical distance of base and feet over their distance, from which one is above
+_FASTEST = 30.0  # [m/s^2] RMS acceleration of a base above which its position is in mm
 _ALONG = 0.8  # component of the unit vector from the feet to the base that may be the vertical
 
 
@@ -62,6 +63,26 @@ def check_pose(log: Log) -> Iterator[Finding]:
         )
         evidence = {"jumps": float(len(rows)), "size": float(size[rows].max()), "first": times[0]}
         yield log_finding(log.name, "base_jump", "warning", message, **evidence)
+
+
+def check_unit(log: Log, motion: Trajectory) -> Iterator[Finding]:
+    """Yield a finding if the position of a base is in mm.
+
+    Args:
+        log: The log.
+        motion: Its smoothed motion, differentiated from positions.
+    """
+    if log.base is None or not log.base.has_position or log.base.imu is not None:
+        return
+    size = float(np.sqrt(np.mean(np.sum(motion.a[:, :3] ** 2, axis=1))))
+    if size < _FASTEST:
+        return
+    message = (
+        f"the acceleration of the base is {size:.3g} m/s^2 (RMS), more than that of a jump. If "
+        f"base_x, base_y and base_z are in mm, it is {1e-3 * size:.2g} m/s^2: convert them to m. "
+        "Else their noise is too large: lower cutoff in [signals]"
+    )
+    yield log_finding(log.name, "base_unit", "error", message, acceleration=size)
 
 
 def check_order(

@@ -12,13 +12,16 @@ from robotid.log_files.table import Place, RowReader, Table
 __all__ = ["with_even_stamps"]
 
 
-def with_even_stamps(table: Table, column: str) -> Table:
+def with_even_stamps(table: Table, column: str, stamp: str = "even") -> Table:
     """Return a table whose rows have equal time steps: the straight line through its stamps.
 
     Args:
         table: The table of a file.
         column: Name of its time column.
+        stamp: As of ``LogSource``; the table stays as it is if it is not "even".
     """
+    if stamp != "even":
+        return table
 
     def read(wanted: Sequence[str]) -> dict[str, Array]:
         values = table.read(wanted)

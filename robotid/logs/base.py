@@ -49,6 +49,7 @@ _IMU_REMEDY = (
     "Record imu_wx, imu_wy, imu_wz [rad/s], imu_ax, imu_ay, imu_az [m/s^2], and the orientation "
     "imu_qx, imu_qy, imu_qz, imu_qw, or that of the base"
 )
+_TURN = 2.0 * np.pi  # [rad] larger roll and pitch are in degrees
 _UNIT = 1e-3  # tolerance of the norm of a logged quaternion
 
 
@@ -187,9 +188,14 @@ def base_columns(
     found["wrench"] = [f"wrench_{name.replace(' ', '_', 1)}" for name in wanted.wrenches]
     if missing := [name for name in found["wrench"] if name not in names]:
         seen = [name for name in names if name.startswith("wrench_")]
+        cells = [x for x in seen if x.startswith(tuple(f"{name}_" for name in missing))]
+        sums = (
+            f"If {listed(cells)} are cells of a foot, add a column of their sum. " if cells else ""
+        )
         raise DataError(
             f"{where} has no column {listed(missing)}; columns of that kind found: {listed(seen)}. "
-            "Name the column in [columns], or remove the component from measured in [[contact]]",
+            f"{sums}Name the column in [columns], or remove the component from measured in "
+            "[[contact]]",
             code="missing_column",
         )
     return {
@@ -274,13 +280,25 @@ def _pose_of(values: Mapping[str, Array], frame: ImuFrame | None) -> Array | Non
     if (pose := values.get("base pose")) is not None:
         return pose
     if (angles := values.get("base angles")) is not None:
-        return np.hstack([angles[:, :3], quaternions_of_angles(angles[:, 3:])])
+        return np.hstack([angles[:, :3], quaternions_of_angles(_radians(angles[:, 3:]))])
     quaternion = values.get("base quaternion")
     if (own := values.get("base imu quaternion")) is not None and frame is not None:
         quaternion = _of_base(own, frame.quaternion)
     elif (angles := values.get("base rpy")) is not None:
-        quaternion = quaternions_of_angles(angles)
+        quaternion = quaternions_of_angles(_radians(angles))
     return None if quaternion is None else np.hstack([0.0 * quaternion[:, :3], quaternion])
+
+
+def _radians(angles: Array) -> Array:
+    """Return roll, pitch and yaw (N, 3); refuse those in degrees. Yaw may count full turns."""
+    largest = float(np.abs(angles[:, :2]).max(initial=0.0))
+    if largest > _TURN:
+        raise DataError(
+            f"base_roll and base_pitch are up to {largest:.4g}, wanted at most pi: they look like "
+            "degrees. Convert base_roll, base_pitch and base_yaw to rad",
+            code="angle_unit",
+        )
+    return angles
 
 
 def _of_base(quaternion: Array, own: Array) -> Array:

@@ -82,6 +82,20 @@ def test_another_vertical_axis_of_the_world_is_named(robot, log):
     assert not list(check_base(stated, other, SLOW))
 
 
+def test_a_position_in_millimetres_is_named(robot, log):
+    pose = log.base.pose.copy()
+    pose[:, :3] *= 1e3
+    (found,) = [
+        x for x in check_base(robot, replace(log, base=BaseMotion(pose)), SLOW)
+        if x.code != "base_jump"
+    ]  # fmt: skip
+    assert (found.code, found.severity) == ("base_unit", "error")
+    t, x = log.t, log.base.pose[:, :3]
+    smooth = np.gradient(np.gradient(x, t, axis=0), t, axis=0)  # noise included
+    assert 30.0 < found.evidence["acceleration"] < 1e3 * np.sqrt(np.mean(np.sum(smooth**2, axis=1)))
+    assert "base_x, base_y and base_z are in mm" in found.message
+
+
 def test_jumps_are_found_with_size_and_time(log):
     assert not list(check_pose(log))
     pose = log.base.pose.copy()
