@@ -1,6 +1,6 @@
-"""Checks of measured forces of the ground over time: their delay, and steps on the other plate."""
+"""Checks of measured forces of the ground over time: delay, offsets, steps on the other plate."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from robotid._typing import Array
 from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Trajectory
 
-__all__ = ["check_delay", "check_exchanged_steps"]
+__all__ = ["check_delay", "check_exchanged_steps", "check_offsets"]
 
 _LONGEST = 0.2  # [s] delay that is searched for
 _BLOCKS = 8  # parts of a log whose delays are compared
@@ -19,6 +19,11 @@ _REDUCED = 0.9  # ratio of the squared residuals, with and without the delay, be
 _WRONG = 0.1  # residual of a sample, over the weight, that may be a step on the other plate ...
 _BETTER = 0.5  # ... if it is below this share of it with exchanged forces ...
 _SOME = 0.02  # ... in this share of the samples
+_SWINGS = 0.15  # [m/s] speed of a foot in the air ...
+_ROWS = 5  # ... in at least so many samples together ...
+_FEWEST = 4  # ... at least so many times
+_UNLOADED = 0.1  # of the weight: largest mean force on a foot in the air
+_OFFSET = 0.002  # of the weight (moments: at 0.1 m): a smaller offset is not reported
 
 
 def check_delay(
@@ -100,3 +105,39 @@ def check_exchanged_steps(
     )
     evidence = {"share": float(is_wrong.mean()), "first": first, "last": last}
     yield log_finding(name, "measured_wrench", "error", message, **evidence)
+
+
+def check_offsets(
+    name: str, frame: str, speed: Array, wrench: Array, parts: Sequence[str], weight: float
+) -> Iterator[Finding]:
+    """Yield a finding if a sensor measures a wrench while its foot is in the air.
+
+    Args:
+        name: Name of the log.
+        frame: The foot.
+        speed: Its speed, shape (N,) [m/s].
+        wrench: Its measured components, shape (N, m) [N, N m].
+        parts: Their names, as "fz".
+        weight: Weight of the robot [N].
+    """
+    edges = np.flatnonzero(np.diff(np.pad(speed > _SWINGS, 1).astype(int))).reshape(-1, 2)
+    means = np.array([wrench[i:j].mean(axis=0) for i, j in edges if j - i >= _ROWS])
+    if len(means) < _FEWEST:
+        return
+    mean, error = np.median(means, axis=0), means.std(axis=0, ddof=1) / np.sqrt(len(means))
+    is_moment = np.array([part.startswith("m") for part in parts])
+    size = np.where(is_moment, 0.1, 1.0) * weight
+    chosen = np.flatnonzero(np.abs(mean) > np.maximum(_BEYOND * error, _OFFSET * size)).tolist()
+    if not chosen or (np.abs(mean[~is_moment]) > _UNLOADED * weight).any():
+        return
+    values = [
+        f"{parts[k]} {mean[k]:+.3g} +- {error[k]:.1g} {'N m' if is_moment[k] else 'N'}"
+        for k in chosen
+    ]
+    message = (
+        f"{frame} is in the air {len(means)} times, but its sensor measures {listed(values)} there "
+        "(median): it has an offset, or carries the part of the foot below it. Masses are wrong by "
+        "as much; subtract these values from the columns wrench_..."
+    )
+    evidence = {f"{parts[k]}_{frame}": float(mean[k]) for k in chosen}
+    yield log_finding(name, "wrench_offset", "warning", message, **evidence)

@@ -12,7 +12,11 @@ import numpy as np
 
 from robotid._text import seconds
 from robotid._typing import Array
-from robotid.constrained.wrench_times import check_delay, check_exchanged_steps
+from robotid.constrained.wrench_times import (
+    check_delay,
+    check_exchanged_steps,
+    check_offsets,
+)
 from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Log, Trajectory
 from robotid.regressor.constraints import (
@@ -132,6 +136,24 @@ def check_wrenches(
     slopes = without_forces(basis, J.swapaxes(1, 2)).swapaxes(1, 2) * scale
     left = without_forces(basis, torque[:, :6]) * scale
     yield from check_delay(log.name, whole, slopes, left, delay)
+    if log.base is not None and log.base.has_position:
+        yield from _check_offsets(model, log.name, whole, weight)
+
+
+def _check_offsets(
+    model: RobotModel, name: str, motion: Trajectory, weight: float
+) -> Iterator[Finding]:
+    """Yield a finding for each contact whose sensor measures a wrench in the air."""
+    frames = [x.frame for x in model.contacts]
+    feet = link_positions(model.pin_model, model.configurations(motion.q), frames)
+    speeds = np.linalg.norm(np.gradient(feet, motion.t, axis=0), axis=2)
+    first = 0
+    for k, x in enumerate(model.contacts):
+        last = first + len(x.measured)
+        if motion.wrenches is not None and x.measured:
+            own = motion.wrenches[:, first:last]
+            yield from check_offsets(name, x.frame, speeds[:, k], own, x.measured, weight)
+        first = last
 
 
 def _check_missing(name: str, t: Array, residual: Array, weight: float) -> Iterator[Finding]:

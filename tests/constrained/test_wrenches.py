@@ -125,6 +125,20 @@ def test_the_delay_of_forces_is_found_and_corrected(urdf, long_log, delay):
     )
 
 
+def test_what_sensors_measure_in_the_air_is_an_offset(urdf, long_log):
+    """A foot of this human is in the air for 1.2 s of 3.3 s."""
+    offsets = {"fz LeftFoot": -4.0, "mx LeftFoot": 0.3, "fy RightFoot": 2.0, "my RightFoot": 0.05}
+    shifted = {x: y + offsets.get(x, 0.0) for x, y in long_log.wrenches.items()}
+    left, right = found(human(urdf), replace(long_log, wrenches=shifted))
+    assert {x.code for x in (left, right)} == {"wrench_offset"}
+    assert left.evidence == {
+        "fz_LeftFoot": pytest.approx(-4.0, abs=0.3), "mx_LeftFoot": pytest.approx(0.3, abs=0.03)
+    }  # fmt: skip
+    assert right.evidence == {"fy_RightFoot": pytest.approx(2.0, abs=0.3)}  # 0.05 N m is too small
+    assert left.message.startswith("log: LeftFoot is in the air ")
+    assert f"measures fz {left.evidence['fz_LeftFoot']:+.3g} +- " in left.message
+
+
 def test_a_time_on_the_other_plate_is_named(urdf, motion):
     plain = logged(human(urdf), motion, np.random.default_rng(5), plates=PLATES)
     own = (plain.t > 2.0) & (plain.t < 4.0)
