@@ -397,6 +397,8 @@ _AS_FOUND = (
     "active_bound",
     "base_jump",
     "base_orientation",
+    "base_unit",
+    "bunched_stamps",
     "com_outside",
     "constant_torque",
     "contact_delay",
@@ -430,6 +432,8 @@ _AS_FOUND = (
     "unlike_unit",
     "unmounted_part",
     "unsigned_torque",
+    "wrench_delay",
+    "wrench_offset",
 )
 #: Codes that name the cause of an error of a joint, and codes that state the error only.
 _NAMED_CAUSES = (*_CAUSES, *_AS_FOUND, "clipped", "payload_change", "position_offset")

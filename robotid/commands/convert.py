@@ -7,6 +7,7 @@ from pathlib import Path
 from robotid._files import check_file
 from robotid.exceptions import DataError
 from robotid.findings import listed
+from robotid.log_files.even_stamps import with_even_stamps
 from robotid.log_files.formats import open_table, write_columns
 from robotid.log_files.table import prefixes, quantity_of
 from robotid.logs.base import ACCELERATION, POSE, TWIST
@@ -73,7 +74,8 @@ def convert(
     found |= {name: name for name in others}
     chosen = ["time", *(name for joint in wanted for name in by_joint[joint]), *others]
     columns = [name for name in found if name in chosen]
-    table = opened.read([found[name] for name in columns])
+    even = with_even_stamps(opened, found["time"], source.stamp)
+    table = even.read([found[name] for name in columns])
     write_columns({name: table[found[name]] for name in columns}, Path(target))
     return Conversion(
         path=str(target),

@@ -15,11 +15,13 @@ from robotid.logs.signals import process
 from robotid.robot.constraints import link_positions
 from robotid.robot.model import RobotModel
 
-__all__ = ["check_order", "check_pose"]
+__all__ = ["check_order", "check_pose", "check_unit"]
 
 _MOVES = 0.02  # [m/s] RMS speed of feet in contact below which no other order is tried
 _BETTER = 0.5  # ratio of the speeds below which another order is found
 _ABOVE = 0.3  # vertical distance of base and feet over their distance, from which one is above
+_FASTEST = 30.0  # [m/s^2] RMS acceleration of a base above which its position is in mm
+_ALONG = 0.8  # component of the unit vector from the feet to the base that may be the vertical
 
 
 def check_pose(log: Log) -> Iterator[Finding]:
@@ -45,12 +47,33 @@ def check_pose(log: Log) -> Iterator[Finding]:
         yield log_finding(log.name, "base_jump", "warning", message, **evidence)
 
 
+def check_unit(log: Log, motion: Trajectory) -> Iterator[Finding]:
+    """Yield a finding if the position of a base is in mm.
+
+    Args:
+        log: The log.
+        motion: Its smoothed motion, differentiated from positions.
+    """
+    if log.base is None or not log.base.has_position or log.base.imu is not None:
+        return
+    size = float(np.sqrt(np.mean(np.sum(motion.a[:, :3] ** 2, axis=1))))
+    if size < _FASTEST:
+        return
+    message = (
+        f"the acceleration of the base is {size:.3g} m/s^2 (RMS), more than that of a jump. If "
+        f"base_x, base_y and base_z are in mm, it is {1e-3 * size:.2g} m/s^2: convert them to m. "
+        "Else their noise is too large: lower cutoff in [signals]"
+    )
+    yield log_finding(log.name, "base_unit", "error", message, acceleration=size)
+
+
 def check_order(
     model: RobotModel, log: Log, signals: SignalSettings, motion: Trajectory, flags: Array
 ) -> Iterator[Finding]:
     """Yield a finding if the quaternion of the base has another order, or is that of the inverse.
 
-    The feet in contact then hardly move, and are not above the base.
+    The feet in contact then hardly move, and are not above the base. A world with another vertical
+    axis is found, too: the base is above the feet along it.
 
     Args:
         model: The robot, with contacts.
@@ -62,15 +85,17 @@ def check_order(
     if log.base is None or not log.base.has_position or not flags.any():
         return
     speed, height = _of_feet(model, motion, flags)
-    if speed < _MOVES and height < _ABOVE:
-        return
     q = log.base.pose[:, 3:]
-    readings = {
-        "its order is qw qx qy qz: state base_qw = 'base_qx', base_qx = 'base_qy', base_qy = "
-        "'base_qz' and base_qz = 'base_qw' in [columns]": np.roll(q, -1, axis=1),
-        "it is the orientation of the world in the base: reverse the signs of base_qx, base_qy and "
-        "base_qz": q * np.array([-1.0, -1.0, -1.0, 1.0]),
-    }
+    readings = (
+        {}
+        if speed < _MOVES and height < _ABOVE
+        else {
+            "its order is qw qx qy qz: state base_qw = 'base_qx', base_qx = 'base_qy', base_qy = "
+            "'base_qz' and base_qz = 'base_qw' in [columns]": np.roll(q, -1, axis=1),
+            "it is the orientation of the world in the base: reverse the signs of base_qx, base_qy "
+            "and base_qz": q * np.array([-1.0, -1.0, -1.0, 1.0]),
+        }
+    )
     for words, quaternion in readings.items():
         base = BaseMotion(np.hstack([log.base.pose[:, :3], quaternion]))
         own, above = _of_feet(model, process(replace(log, base=base), signals), flags)
@@ -83,14 +108,44 @@ def check_order(
             evidence = {"speed": speed, "best": own}
             yield log_finding(log.name, "base_orientation", "error", message, **evidence)
             return
+    if height > -_ABOVE:
+        yield from _check_vertical(model, log, motion)
+
+
+def _check_vertical(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Finding]:
+    """Yield a finding if the base is above its feet along another axis of the world."""
+    mean = -_offsets(model, motion).mean(axis=(0, 1))
+    mean /= np.linalg.norm(mean).clip(1e-9)
+    k = int(np.argmax(np.abs(mean)))
+    if abs(mean[k]) < _ALONG:
+        return
+    stated: Array = model.pin_model.gravity.linear
+    gravity = [0.0, 0.0, 0.0]
+    gravity[k] = -float(np.copysign(np.linalg.norm(stated), mean[k]))
+    axis = ("-" if mean[k] < 0 else "") + "xyz"[k]
+    message = (
+        "the feet are not below the base, which is above them along "
+        f"{axis} of the world. If that axis is the vertical, state gravity = "
+        f"[{', '.join(f'{x:g}' for x in gravity)}] at the top of the job file, and measured "
+        "forces with the same axes; else check base_qx to base_qw"
+    )
+    evidence = {"height": float(mean @ -stated / np.linalg.norm(stated)), "best": abs(mean[k])}
+    yield log_finding(log.name, "base_orientation", "error", message, **evidence)
+
+
+def _offsets(model: RobotModel, motion: Trajectory) -> Array:
+    """Return the vectors from the base to the links in contact in the world, (N, k, 3) [m]."""
+    frames = [x.frame for x in model.contacts]
+    feet = link_positions(model.pin_model, model.configurations(motion.q), frames)
+    off: Array = feet - motion.q[:, None, :3]
+    return off
 
 
 def _of_feet(model: RobotModel, motion: Trajectory, flags: Array) -> tuple[float, float]:
     """Return RMS speed [m/s] of feet in contact, and mean height above the base per distance."""
-    frames = [x.frame for x in model.contacts]
-    feet = link_positions(model.pin_model, model.configurations(motion.q), frames)
+    off = _offsets(model, motion)
+    feet = off + motion.q[:, None, :3]
     speeds = np.linalg.norm(np.gradient(feet, motion.t, axis=0), axis=2)
     gravity: Array = model.pin_model.gravity.linear
-    off = feet - motion.q[:, None, :3]
     heights = off @ (-gravity / np.linalg.norm(gravity)) / np.linalg.norm(off, axis=2).clip(1e-9)
     return float(np.sqrt(np.mean(speeds[flags] ** 2))), float(heights.mean())

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from robotid._typing import Array
-from robotid.constrained.base_pose import check_order, check_pose
+from robotid.constrained.base_pose import check_order, check_pose, check_unit
 from robotid.constrained.found_contacts import with_contacts
 from robotid.constrained.imu import check_imu
 from robotid.constrained.slips import check_slip, rms, without_zeros
@@ -65,6 +65,9 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         return
     for note in whole.notes[len(log.notes) :]:
         yield log_finding(log.name, "log_note", "note", note)
+    if wrong := list(check_unit(whole, motion)):
+        yield from wrong
+        return
     flags = _flags(model, log, whole, motion.t)
     if wrong := list(check_order(model, whole, still, motion, flags)):
         yield from wrong
@@ -79,7 +82,7 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
     if not model.contacts:
         return
     if not wrong:
-        yield from check_wrenches(model, log, motion)
+        yield from check_wrenches(model, log, motion, signals.wrench_delay)
     yield from _check_feet(model, log, motion, J, turn, flags, signals)
 
 

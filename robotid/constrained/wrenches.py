@@ -12,6 +12,11 @@ import numpy as np
 
 from robotid._text import seconds
 from robotid._typing import Array
+from robotid.constrained.wrench_times import (
+    check_delay,
+    check_exchanged_steps,
+    check_offsets,
+)
 from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Log, Trajectory
 from robotid.regressor.constraints import (
@@ -26,7 +31,8 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["check_wrenches"]
 
-_MOST = 400  # samples that are examined
+_MOST = 400  # samples that are examined ...
+_LONGEST = 4000  # ... and the same of their delay
 _BETTER = 0.5  # ratio of the residuals of force or moment below which another reading is found ...
 _FORCE, _MOMENT = 0.3, 0.05  # ... of the weight, and of it at the feet's distance: masses may be it
 _NO_WORSE = 1.2  # ... if that of the other one is not above this
@@ -34,6 +40,8 @@ _SIMPLER = 1.2  # ... and another change is not found unless it reduces the resi
 _SMALL = 0.01  # residual of force or moment that is as good as none, relative to the weight
 _ALIKE = (0.6, 1.6)  # factors of the forces that a wrong URDF explains
 _UNITS = {", kN": 1e3, ", kgf": 9.81}
+_MILLI = 1e-3  # N mm in N m
+_FAR = 10.0  # [m] moments over forces above which moments may be in N mm
 _MISSING = 0.5  # of the weight: residual of the vertical force of a sample that is reported ...
 _SOME = 0.02  # ... from this share of samples on
 
@@ -43,9 +51,10 @@ class _Reading:
     """Residuals of the base rows with the forces read in one way."""
 
     changes: tuple[str, ...]  # what differs from the job file
-    is_exchanged: bool  # whether forces of two feet are
+    exchanged: tuple[str, ...]  # two feet whose forces are exchanged, or none
     factor: float  # of the forces
     residual: Array  # (N, 6) [N, N m]
+    weight: float  # RMS of the force of the base that is not caused by unknown forces [N]
 
     @property
     def sizes(self) -> tuple[float, float]:
@@ -60,17 +69,21 @@ class _Reading:
         return is_no_worse and any(y > small and x < _BETTER * y for x, y, small in pairs)
 
 
-def check_wrenches(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Finding]:
+def check_wrenches(
+    model: RobotModel, log: Log, motion: Trajectory, delay: float = 0.0
+) -> Iterator[Finding]:
     """Yield findings on the measured wrenches of one log.
 
     Args:
         model: The robot, whose base floats.
         log: The log.
         motion: Its smoothed motion.
+        delay: Delay of the wrenches that was corrected [s].
     """
     measured = [x for x in model.contacts if x.measured]
     if motion.wrenches is None or not measured:
         return
+    whole = motion.part(0, _LONGEST)
     motion = motion.every(max(1, len(motion.t) // _MOST))
     (torque,) = predict(replace(model, constraints=()), [model.standard_parameters()], motion)
     weight = sum(x.mass for x in model.pin_model.inertias) * float(
@@ -90,18 +103,21 @@ def check_wrenches(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[
     stated = readings[0]
     least = weight * _FORCE, weight * lever * _MOMENT
     better = [x for x in readings if x.is_better(stated, least)]
-    better = [x for x in better if x.sizes[0] < _MISSING * weight]
+    better = [
+        x for x in better if x.sizes[0] < _MISSING * weight and x.weight > _MISSING * stated.weight
+    ]  # and not because all forces are unknown in them
     best = min(better, key=size, default=stated)
     remain = best.sizes[1] > _BETTER * stated.sizes[1] and best.sizes[0] < _BETTER * stated.sizes[0]
+    has_plates = all(x.is_measured and x.kind == "surface" for x in measured)
     if remain:  # the force alone does not show which foot it acts on
-        best = min([x for x in better if not x.is_exchanged], key=size, default=best)
+        best = min([x for x in better if not x.exchanged], key=size, default=best)
     if best is not stated:
         message = (
             f"with the bodies of the URDF, the measured forces of the ground leave {_size(stated)} "
             f"(RMS) of the base unexplained, but only {_size(best)} if {' and '.join(best.changes)}"
             ". Correct the columns wrench_..., or [[contact]]"
         )
-        if remain:
+        if remain and has_plates:
             message += (
                 ". The moments remain: state the plate of each foot, plate = [x, y, z, roll, "
                 "pitch, yaw]"
@@ -109,18 +125,51 @@ def check_wrenches(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[
         evidence = {"force": stated.sizes[0], "best": best.sizes[0], "factor": best.factor}
         yield log_finding(log.name, "measured_wrench", "error", message, **evidence)
         return
-    missing = np.abs(stated.residual[:, :3]).max(axis=1) > _MISSING * weight
-    if np.mean(missing) > _SOME:
-        t = motion.t[missing]
-        message = (
-            f"the measured forces of the ground differ by more than half of the weight in "
-            f"{np.mean(missing):.0%} of the samples, first at {seconds(float(t[0]))} s, last at "
-            f"{seconds(float(t[-1]))} s: a foot may stand beside its force plate, or something "
-            "else carries load. Select the time with start and end"
-        )
-        yield log_finding(
-            log.name, "measured_wrench", "warning", message, share=float(np.mean(missing))
-        )
+    scale = np.repeat([1.0, 1.0 / lever], 3)
+    for x in readings:
+        if x.exchanged and len(x.changes) == 1:
+            residuals = scale * stated.residual, scale * x.residual
+            yield from check_exchanged_steps(log.name, motion.t, residuals, x.exchanged, weight)
+    yield from _check_missing(log.name, motion.t, stated.residual[:, :3], weight)
+    (torque,) = predict(replace(model, constraints=()), [model.standard_parameters()], whole)
+    J, basis = _base_rows(model, whole)
+    slopes = without_forces(basis, J.swapaxes(1, 2)).swapaxes(1, 2) * scale
+    left = without_forces(basis, torque[:, :6]) * scale
+    yield from check_delay(log.name, whole, slopes, left, delay)
+    if log.base is not None and log.base.has_position:
+        yield from _check_offsets(model, log.name, whole, weight)
+
+
+def _check_offsets(
+    model: RobotModel, name: str, motion: Trajectory, weight: float
+) -> Iterator[Finding]:
+    """Yield a finding for each contact whose sensor measures a wrench in the air."""
+    frames = [x.frame for x in model.contacts]
+    feet = link_positions(model.pin_model, model.configurations(motion.q), frames)
+    speeds = np.linalg.norm(np.gradient(feet, motion.t, axis=0), axis=2)
+    first = 0
+    for k, x in enumerate(model.contacts):
+        last = first + len(x.measured)
+        if motion.wrenches is not None and x.measured:
+            own = motion.wrenches[:, first:last]
+            yield from check_offsets(name, x.frame, speeds[:, k], own, x.measured, weight)
+        first = last
+
+
+def _check_missing(name: str, t: Array, residual: Array, weight: float) -> Iterator[Finding]:
+    """Yield a finding if a large part of the weight is missing in some of the samples."""
+    missing = np.abs(residual).max(axis=1) > _MISSING * weight
+    if np.mean(missing) <= _SOME:
+        return
+    t = t[missing]
+    message = (
+        f"the measured forces of the ground differ by more than half of the weight in "
+        f"{np.mean(missing):.0%} of the samples, first at {seconds(float(t[0]))} s, last at "
+        f"{seconds(float(t[-1]))} s: a foot may stand beside its force plate, or something else "
+        "carries load. Select the time with start and end"
+    )
+    share = float(np.mean(missing))
+    yield log_finding(name, "measured_wrench", "warning", message, share=share)
 
 
 def _rms(vectors: Array) -> float:
@@ -143,16 +192,24 @@ def _readings(model: RobotModel, motion: Trajectory, torque: Array) -> Iterator[
         for j, y in enumerate(model.contacts[:i]):
             if x.measured and (x.kind, x.measured) == (y.kind, y.measured):
                 pairs.append((j, i))
-    for (words, other), pair in product(_places(model), pairs):
+    parts = [part for x in model.contacts for part in x.measured]
+    is_moment = np.array([part.startswith("m") for part in parts], dtype=bool)
+    sizes = [_rms(motion.wrenches[:, x]) for x in (is_moment, ~is_moment)]
+    is_far = sizes[0] > _FAR * sizes[1]
+    for (words, other), pair, is_milli in product(_places(model), pairs, (False, True)):
+        if is_milli and not is_far:
+            continue
         order = list(columns)
-        changes = list(words)
+        changes = [*words, *["their moments are in N mm, wanted N m"] * is_milli]
         if pair is not None:
             i, j = pair
             order[i], order[j] = order[j], order[i]
             names = [model.contacts[k].frame for k in pair]
             changes.append(f"those of {listed(names)} are exchanged")
         wrenches = motion.wrenches[:, np.concatenate(order)]
-        yield from _fitted(other, motion, torque, wrenches, (tuple(changes), pair is not None))
+        wrenches = np.where(is_moment & is_milli, _MILLI, 1.0) * wrenches
+        feet = () if pair is None else tuple(model.contacts[k].frame for k in pair)
+        yield from _fitted(other, motion, torque, wrenches, (tuple(changes), feet))
 
 
 def _places(model: RobotModel) -> Iterator[tuple[tuple[str, ...], RobotModel]]:
@@ -179,26 +236,33 @@ def _fitted(
     motion: Trajectory,
     torque: Array,
     wrenches: Array,
-    reading: tuple[tuple[str, ...], bool],
+    reading: tuple[tuple[str, ...], tuple[str, ...]],
 ) -> Iterator[_Reading]:
     """Yield the residual, and that with a factor of the forces, if the URDF is not its cause."""
-    J = constraint_jacobian(model, motion.q, touching(model, motion))[:, :, :6]
-    known, first = list[int](), 0
-    for x in model.constraints:
-        if isinstance(x, Contact):
-            known += [first + k for k in x.rows_measured]
-        first += x.sizes[x.kind]
-    basis = force_basis(np.delete(J, known, axis=1), np.ones((len(J), 6), dtype=bool))
-    caused = without_forces(basis, np.einsum("kmj,km->kj", J[:, known], wrenches))
+    J, basis = _base_rows(model, motion)
+    caused = without_forces(basis, np.einsum("kmj,km->kj", J, wrenches))
     left = without_forces(basis, torque)
     square = float(np.sum(caused**2))
     factor = float(np.sum(caused * left)) / square if square > 0.0 else 1.0
-    yield _Reading(*reading, 1.0, left - caused)
+    size = _rms(left[:, :3])
+    yield _Reading(*reading, 1.0, left - caused, size)
     if _ALIKE[0] <= factor <= _ALIKE[1]:
         return
     unit = next((name for name, x in _UNITS.items() if _ALIKE[0] < factor / x < _ALIKE[1]), "")
     words = f"they are multiplied by about {factor:.2g}: another unit{unit}"
     if abs(factor + 1.0) < 1.0 - _ALIKE[0]:
         factor, words = -1.0, "their sign is reversed (forces on the ground instead of on the feet)"
-    changes, is_exchanged = reading
-    yield _Reading((*changes, words), is_exchanged, factor, left - factor * caused)
+    changes, feet = reading
+    yield _Reading((*changes, words), feet, factor, left - factor * caused, size)
+
+
+def _base_rows(model: RobotModel, motion: Trajectory) -> tuple[Array, Array]:
+    """Return rows of the base per measured component (N, m, 6), and the basis of unknown forces."""
+    J = constraint_jacobian(model, motion.q, touching(model, motion))[:, :, :6]
+    known, first = list[int](), 0
+    for x in model.constraints:
+        if isinstance(x, Contact):
+            known += [first + k for k in x.rows_measured]
+        first += x.sizes[x.kind]
+    used = np.ones((len(J), 6), dtype=bool)
+    return J[:, known], force_basis(np.delete(J, known, axis=1), used, floats=True)

@@ -11,6 +11,7 @@ from robotid.logs.data import Log
 from robotid.logs.measured_velocity import (
     COARSE,
     LARGEST_LAG,
+    is_trustworthy,
     quantum,
     unlike_velocities,
     velocity_lags,
@@ -45,7 +46,8 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     Yields:
         "quantised" per kind of channel: a warning for torques of few steps, and for velocities of
         few steps unless they are differentiated; else a note.
-        "spikes" per channel: an error if they are absurd and large enough to ruin a fit.
+        "spikes" per channel: an error if they are absurd and large enough to ruin a fit, and the
+        channel is used.
         "noise" per kind of channel and "noisy_torque" per joint: notes.
         "velocity_order" per joint: an error if a measured velocity is the derivative of another
         joint's position.
@@ -59,7 +61,7 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     for kind, values in channels.items():
         yield from _quantisation(log, kind, values, signals.velocity)
     for kind, values in channels.items():
-        yield from _spikes(log, kind, values, noise[kind])
+        yield from _spikes(log, kind, values, noise[kind], signals.velocity)
     for kind, values in channels.items():
         yield from _noise(log, kind, values, noise[kind])
     if log.v is not None:
@@ -113,8 +115,10 @@ def _finer(kind: str, step: float, velocity: str, *, few: bool) -> str:
     return "its resolution is too low: log it with more digits" if few else "log more digits"
 
 
-def _spikes(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding]:
+def _spikes(log: Log, kind: str, values: Array, noise: Array, velocity: str) -> Iterator[Finding]:
     """Yield rows that differ strongly from both neighbours."""
+    is_used = kind != "dq" or velocity == "measured"
+    is_used = is_used or (velocity == "auto" and is_trustworthy(log))
     smooth = _without_spikes(values)
     amplitudes = [_amplitude(*own) for own in zip(values.T, smooth.T, noise, strict=True)]
     least = _LEAST.get(kind, _LEAST_TORQUE * float(np.median(amplitudes)))
@@ -129,7 +133,8 @@ def _spikes(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Findin
             f"{kind} of {joint} has spikes of up to {largest:.4g} in {len(rows)} rows, the first "
             f"at t = {seconds(first)} s; remove these rows from the recording"
         )
-        severity = "error" if largest > _ABSURD * amplitude and energy > _HARM else "note"
+        is_harmful = is_used and largest > _ABSURD * amplitude and energy > _HARM
+        severity = "error" if is_harmful else "note"
         evidence = {"rows": len(rows), "largest": largest, "energy_share": energy, "first": first}
         yield log_finding(log.name, "spikes", severity, message, f"{kind}_{joint}", **evidence)
 
@@ -244,9 +249,10 @@ def _velocity_scale(
 
 
 def _slopes(log: Log, velocity: Array) -> tuple[Array, Array]:
-    """Return d(q)/dt and the measured velocity, shape (m, n) each, without gaps."""
+    """Return d(q)/dt and the measured velocity, shape (m, n) each, of steps of a usual length."""
     step = np.diff(log.t)[:, None]
-    is_regular = (step < 5 * np.median(step))[:, 0]
+    median = np.median(step)
+    is_regular = ((step > median / 5) & (step < 5 * median))[:, 0]
     every = max(1, len(step) // 20000)
     slope, v = (
         np.diff(np.unwrap(log.q, axis=0), axis=0) / step,

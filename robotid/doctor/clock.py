@@ -16,6 +16,10 @@ __all__ = ["check_clock", "check_rest", "runs_of"]
 _JITTER = 0.05  # spread of the time steps over their median from which jitter is reported
 _GAP = 2.5  # [median steps] a longer step is a gap
 _LONG = 0.05  # [s] ... a longer gap is a warning
+_BUNCHED = 0.2  # [median steps] a shorter step is of rows that were stamped together ...
+_BUNCHES = 0.02  # ... which are reported from this share of rows on, if the motion per row in them
+_ALIKE = 0.3  # ... over that of all rows is not below this: they were not recorded together
+_EVEN = 0.05  # relative difference of mean and median step above which rows may be missing
 _SET = 1.0  # [s] in a longer gap, a position that moves as in one step shows that the clock was set
 _STALE = 0.05  # share of stale rows from which they are a warning
 _CONTINUES = 0.15  # motion after repeated rows, over that in as many rows before and after it,
@@ -36,6 +40,7 @@ def check_clock(log: Log) -> Iterator[Finding]:
 
     Yields:
         Notes "rate" and "jitter"; at most one "gap", a warning if a gap is long; one warning
+        "bunched_stamps" if rows were stamped together, but not recorded together; one warning
         "clock_step" if the clock was set during the recording; and one "stale_rows" of rows that
         repeat the row before in every channel.
     """
@@ -43,6 +48,7 @@ def check_clock(log: Log) -> Iterator[Finding]:
     median = float(np.median(step))
     yield from _rate(log, step, median)
     yield from _gaps(log, step, median)
+    yield from _bunches(log, step)
     yield from _stale_rows(log, step)
 
 
@@ -143,6 +149,35 @@ def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
         "it are not used; record without interruption if possible"
     )
     yield log_finding(log.name, "gap", severity, message, gaps=len(gaps), longest=longest, at=start)
+
+
+def _bunches(log: Log, step: Array) -> Iterator[Finding]:
+    """Yield rows whose stamps are those of their arrival: they come together after a pause."""
+    mean = float(np.mean(step[step < _SET])) if (step < _SET).any() else 0.0
+    is_bunched = step < _BUNCHED * mean
+    share = float(np.mean(is_bunched))
+    moved = np.abs(np.diff(log.q, axis=0)).mean(axis=0)
+    j = int(np.argmax(moved))  # the joint that shows most of the motion
+    own = np.abs(np.diff(log.q[:, j]))
+    if share < _BUNCHES or own[is_bunched].mean() <= _ALIKE * own.mean():
+        return
+    usual = float(np.median(step[~is_bunched]))
+    is_even = abs(mean / usual - 1.0) < _EVEN
+    message = (
+        f"{is_bunched.sum()} of {len(log.t)} rows are stamped within "
+        f"{1e3 * _BUNCHED * mean:.2g} ms of the row before, after pauses of up to "
+        f"{step.max():.2g} s, but the joints move between them as between other rows: the stamps "
+        "are those of arrival, not of recording. Velocities and accelerations there are wrong; "
+    )
+    if is_even:
+        message += (
+            f"the mean step is {1e3 * mean:.4g} ms, the usual one {1e3 * usual:.4g} ms, so no rows "
+            'are missing: state stamp = "even" in [log], or log the time of recording'
+        )
+    else:
+        message += "log the time of recording"
+    evidence = {"rows": float(is_bunched.sum()), "share": share, "longest": float(step.max())}
+    yield log_finding(log.name, "bunched_stamps", "warning", message, **evidence)
 
 
 def _goes_on(q: Array, k: int) -> bool:

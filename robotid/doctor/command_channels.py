@@ -250,12 +250,18 @@ class _Loop:
 
 
 def _without_torque(log: Log) -> Finding:
+    without_commands = (
+        "the log has forces of the ground and no torques: the rows of the base identify masses; "
+        "friction and armature of the joints are not identified"
+        if log.wrenches
+        else "the log has neither torques nor commands: nothing can be identified from motion alone"
+    )
     message = (
         "the log has no torque. Commands and positions determine the delay of each drive. They "
         "determine friction, armature and load only as ratios to the gains of the controller; "
         "state a known gain, else the inertias of the URDF set the scale"
         if log.q_ref is not None
-        else "the log has neither torques nor commands: nothing can be identified from motion alone"
+        else without_commands
     )
     return log_finding(log.name, "no_torque", "note", message)
 

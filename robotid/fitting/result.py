@@ -43,6 +43,7 @@ __all__ = ["Fit", "Solution"]
 
 _KNOWN = 1e-300  # smallest prior standard deviation, of fixed parameters
 _STAYED = 0.3  # change in prior standard deviations up to which the source may be the prior
+_WORSE = 1.2  # error of WLS over that of the estimate above which it is clearly worse
 _AT_BOUND = 1e-6  # size of a drive term at its bound of 0, in prior standard deviations
 
 
@@ -272,3 +273,17 @@ class Fit(Identified, Solution):
         """Metrics of each validation recording without fitted rows, by its name."""
         new = (e for e in self.validation if not e.is_refitted)
         return {e.recording.name: e.metrics["estimate"] for e in new}
+
+    @cached_property
+    def overfitted(self) -> frozenset[str]:
+        """Rows of which WLS predicts every unseen recording clearly worse than the estimate.
+
+        A smaller residual of WLS on the fitted recordings then is no evidence against the estimate.
+        """
+        new = [e.metrics for e in self.validation if not e.is_refitted]
+        pairs = [(x["estimate"].per_joint, x["wls"].per_joint) for x in new]
+        return frozenset(
+            joint
+            for joint in (pairs[0][0] if pairs else ())
+            if all(wls[joint].rmse > _WORSE * own[joint].rmse for own, wls in pairs)
+        )

@@ -122,11 +122,15 @@ def measured_errors(
         )
         errors = StandardErrors(method, len(segments), 1 / share, np.full(b, np.inf))
         R = factors.weighted(sigma)[:b, :b]
+        meat = share * R.T @ R + (0.0 if more is None else share**2 * more)
         if redraws is not None:
-            return _bounded(estimate, errors, redraws, factors, sigma, share * R.T @ R)
-        if weight_ratio > 1.0:
-            C = about_prior(estimate.covariance, K, share * R.T @ R, R, share, weight_ratio)
+            return _bounded(estimate, errors, redraws, factors, sigma, meat)
+        if len(estimate.theta) != b and (weight_ratio > 1.0 or more is not None):
+            C = about_prior(estimate.covariance, K, meat, R, share, max(weight_ratio, 1.0))
             estimate = replace(estimate, covariance=C)
+        elif more is not None:
+            C = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
+            estimate = replace(estimate, covariance=estimate.covariance + share**2 * C @ more @ C)
         return estimate, errors
     is_open = ~np.isfinite(np.diag(estimate.covariance))
     C = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)

@@ -8,7 +8,8 @@ rows D of the torque per offset along each axis, and offsets x ~ N(0, s^2) of al
     W pi = tau + J^T f + D x,
 
 the score W^T tau has the covariance s^2 W^T D D^T W beside that of its noise. If s is not stated,
-it is the one with the largest evidence.
+it is the one with the largest evidence. Without torques of joints an offset is like a displaced
+centre of mass: s then is 2 cm, its bound.
 
 A bias of the accelerometers acts as a change of gravity with the axes of the base. D then has the
 torque per acceleration of the base. Where the base turns, gravity turns in its axes and the bias
@@ -54,8 +55,8 @@ _STEPS, _SETTLED = 20, 1e-3  # steps of noise level and s, relative change of s 
 def with_repeated_errors(recordings: Recordings) -> Recordings:
     """Return recordings with the covariance of the score due to contacts and accelerometers.
 
-    Contacts with measured forces, and surfaces, have no such errors. The bias of accelerometers is
-    subtracted.
+    Surfaces have no such errors: their moments are measured, or unknown. The bias of accelerometers
+    is subtracted.
 
     Args:
         recordings: The recordings.
@@ -64,7 +65,7 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
         DataError: If a row of a log cannot be used.
     """
     model, mapping = recordings.model, recordings.mapping
-    points = [k for k, x in enumerate(model.contacts) if x.kind == "point" and not x.measured]
+    points = [k for k, x in enumerate(model.contacts) if x.kind == "point"]
     points = [k for k in points if model.contacts[k].uncertainty != 0.0]
     frames = [_frame(log) for log in recordings.fitted]
     biases = [x.offset if x.offset is not None else np.zeros(3) for x in frames if x is not None]
@@ -97,6 +98,8 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
                 first += len(W)
         drifts += [mean_drift(np.concatenate(pushed), np.concatenate(segments))] if pushed else []
     stated = [model.contacts[k].uncertainty for k in points]
+    if not whole.factors.rows[6 * model.free_flyer :].any():
+        stated = [_MOST if each is None else each for each in stated]
     size = float(np.sqrt(np.mean(np.square(drifts)))) if drifts else 0.0
     before = np.zeros(c + d) if not d else np.append(np.zeros(c), -biases[0])
     sizes = np.append(np.repeat(np.array(stated, dtype=float), 3), np.full(d, size))
@@ -218,6 +221,8 @@ def _slopes(model: RobotModel, rows: Rows, pi: Array, points: Sequence[int]) -> 
     D = np.zeros((*torque.shape, 3 * len(points)))
     for i, k in enumerate(points):
         own = f[:, None, first[k] : first[k] + 3]
+        if model.contacts[k].axes == "link":
+            own = own @ rotation[:, k].swapaxes(1, 2)  # with the axes of the world
         moments = np.cross(rotation[:, k].swapaxes(1, 2), own)  # (N, 3, 3), one per axis
         D[:, :, 3 * i : 3 * i + 3] = turning[:, k].swapaxes(1, 2) @ moments.swapaxes(1, 2)
     if motion.basis is not None:

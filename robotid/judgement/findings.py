@@ -100,7 +100,7 @@ def _costs(fit: Fit) -> list[Finding]:
     """Return the joints whose torque error the constraints increase.
 
     It is a note if they add little, sqrt(error^2 - wls^2) of the torque, the verdict does not count
-    it, and the user states no constraint.
+    it, and the user states no constraint; and if WLS predicts unseen recordings worse.
     """
     findings, wls, asked = [], fit.metrics("wls").per_joint, _asked(fit)
     locked = _locked_links(fit)
@@ -109,14 +109,14 @@ def _costs(fit: Fit) -> list[Finding]:
         if measured.rmse <= _DIFFERS * free.rmse:
             continue
         error, least = measured.relative_error_pct, free.relative_error_pct or 0.0
-        message = (
-            f"{joint}: the residual is {measured.rmse:.3g} {measured.unit}, that of "
-            f"unconstrained WLS {free.rmse:.3g}"
-        )
+        own = f"{measured.rmse:.3g} {measured.unit}"
+        message = f"{joint}: the residual is {own}, that of unconstrained WLS {free.rmse:.3g}"
         is_little = error is not None and error**2 - least**2 < _LITTLE**2
-        if is_little and is_harmless_cost(error or 0.0, least) and not (asked or locked):
-            severity = "note"
-            message += f": {error:.2g} % instead of {least:.2g} % of the torque; no action needed"
+        is_little = is_little and is_harmless_cost(error or 0.0, least) and not (asked or locked)
+        if is_little or joint in fit.overfitted:
+            severity, more = "note", "" if is_little else ", which predicts unseen logs worse"
+            message += f": {error or 0.0:.2g} % instead of {least:.2g} % of the torque{more}; "
+            message += "no action needed"
         else:
             severity = "warning"
             message += (

@@ -284,7 +284,10 @@ def check_scale(found: Fit) -> ScaleCheck:
     before, after = (float(pi[:size:10].sum()) for pi in (found.prior, found.standard))
     friction = friction_shares(found)
     errors = [found.metrics(name).per_joint for name in ("estimate", "wls")]
-    follows = all(errors[0][j].rmse <= _HELD_BACK * free.rmse for j, free in errors[1].items())
+    follows = all(
+        errors[0][j].rmse <= _HELD_BACK * free.rmse or j in found.overfitted
+        for j, free in errors[1].items()
+    )
     plain = ScaleCheck(
         masses=(before, after, 0.0), stated=stated_mass(found), friction=friction, follows=follows,
         is_total_determined=determines_total_mass(found),

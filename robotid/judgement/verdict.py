@@ -43,6 +43,7 @@ _REASONS = {
     "angle_scale": "positions fit best when multiplied by another factor",
     "active_bound": "the data, or the masses that result from it, contradict a stated bound",
     "base_jump": "the pose of the base jumps {jumps:.0f} times: some of it may be wrong",
+    "bunched_stamps": "rows are stamped when they arrive: velocities and accelerations are wrong",
     "clipped": "the torque is clipped at a limit",
     "contact_delay": "contact flags are delayed by {delay:+.3f} s (negative: early): contact "
     "forces remain in the rows",
@@ -86,6 +87,8 @@ _REASONS = {
     "unexplained_torque": "gravity, inertia and friction do not explain much of the torque",
     "unlike_run": "the log differs from the other logs",
     "unlike_unit": "the robot differs from the other robots",
+    "wrench_delay": "measured forces of the ground lag the motion by {delay:+.3f} s",
+    "wrench_offset": "the sensor of a foot measures a wrench in the air",
     "unsigned_torque": "the torque may be a magnitude without sign",
     "unmounted_part": "{mass:.2g} kg of the URDF's last link were probably not mounted",
     "urdf_mismatch": "the torques do not fit the URDF's masses: the URDF may be of another robot "

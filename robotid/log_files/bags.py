@@ -117,7 +117,7 @@ def _stamp(message: Any, logged: int, source: LogSource) -> int:  # noqa: ANN401
 
 def _require_stamped(where: str, topic: str, stamps: Sequence[int], source: LogSource) -> None:
     """Reject messages whose header stamps are all 0."""
-    if source.stamp == "header" and not any(stamps):
+    if source.stamp != "log" and not any(stamps):
         raise DataError(
             f"{where}, topic {topic!r}: the header stamps of all {len(stamps)} messages are 0. To "
             'use the time of recording, state stamp = "log" (job file table [log], CLI --stamp '

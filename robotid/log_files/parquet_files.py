@@ -104,7 +104,10 @@ def _open(path: Path, wanted: Sequence[str] = (), buffer: int = 0) -> Iterator[A
         for name in wanted:
             kind = file.schema_arrow.field(name).type
             if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-                raise DataError(f"{path.name}: {name} contains {kind}, wanted numbers; convert it")
+                todo = "write one column per value, or their sum" * pa.types.is_nested(kind)
+                raise DataError(
+                    f"{path.name}: {name} contains {kind}, wanted numbers; {todo or 'convert it'}"
+                )
         yield file
 
 

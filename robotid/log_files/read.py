@@ -20,6 +20,7 @@ from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
 from robotid.log_files.columns import NOUNS, TORQUES, Finder, Needs, without_torque
+from robotid.log_files.even_stamps import with_even_stamps
 from robotid.log_files.foreign_tables import Frame, is_frame, open_frame, with_own_names
 from robotid.log_files.formats import open_table, write_columns
 from robotid.log_files.table import Table
@@ -230,6 +231,7 @@ class LogLayout:
         for kind, array in values.items():
             if kind in ("contact", "wrench") or kind.startswith("base "):
                 _require_rate(array, self.columns[kind], where)
+                require_finite(array, t, self.columns[kind], where, first)
         base, note = base_of(t, values["q"], values, self.base)
         flags = values.pop("contact", None)
         contacts = {} if flags is None else contacts_of(flags, self.base, where)
@@ -288,7 +290,8 @@ def _require_rate(values: Array, names: Sequence[str], where: str) -> None:
         sparse = [name for name, own in zip(names, share, strict=True) if own > _SPARSE]
         raise DataError(
             f"{where}: {share.max():.0%} of the rows have no value of {listed(sparse)}, as of "
-            "another rate than that of the joints; interpolate at the time stamps of the joints"
+            "another rate than that of the joints; interpolate at the time stamps of the joints, "
+            "or keep the rows that have all values"
         )
 
 
@@ -388,7 +391,7 @@ def lay_out(
         base=base,
         temperatures=finder.find_temperatures(),
     )
-    return layout, opened
+    return layout, with_even_stamps(opened, found["time"][0], source.stamp)
 
 
 def _notes_of_sensors(

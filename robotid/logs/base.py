@@ -10,7 +10,14 @@ from numpy.typing import ArrayLike
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
-from robotid.logs.imu import IMU, ImuFrame, ImuMotion, inertial_state, motion_of_imu
+from robotid.logs.imu import (
+    IMU,
+    ImuFrame,
+    ImuMotion,
+    inertial_state,
+    motion_of_imu,
+    orientation_of_imu,
+)
 
 __all__ = [
     "ACCELERATION",
@@ -43,6 +50,7 @@ _IMU_REMEDY = (
     "Record imu_wx, imu_wy, imu_wz [rad/s], imu_ax, imu_ay, imu_az [m/s^2], and the orientation "
     "imu_qx, imu_qy, imu_qz, imu_qw, or that of the base"
 )
+_TURN = 2.0 * np.pi  # [rad] larger roll and pitch are in degrees
 _UNIT = 1e-3  # tolerance of the norm of a logged quaternion
 _BESIDE, _USUAL = 32, 75.0  # rows beside a step, and the percentile of their steps ...
 _JUMPS = 15.0  # ... times which a step relative to those before and after it is a jump ...
@@ -141,6 +149,15 @@ class BaseColumns:
     imu: ImuFrame | None = None
     link: str = ""
 
+    @property
+    def needs_heading(self) -> bool:
+        """Whether components of wrenches have horizontal axes of the world."""
+        if self.imu is None:
+            return False
+        vertical = "f" + "xyz"[int(np.argmax(np.abs(self.imu.gravity)))]
+        pairs = [name.split(" ", 1) for name in self.wrenches]
+        return any(part != vertical and link not in self.local for part, link in pairs)
+
     def present(self, names: Collection[str]) -> "BaseColumns":
         """Return the same with only those contacts that a file has; the others may be found.
 
@@ -176,9 +193,14 @@ def base_columns(
     found["wrench"] = [f"wrench_{name.replace(' ', '_', 1)}" for name in wanted.wrenches]
     if missing := [name for name in found["wrench"] if name not in names]:
         seen = [name for name in names if name.startswith("wrench_")]
+        cells = [x for x in seen if x.startswith(tuple(f"{name}_" for name in missing))]
+        sums = (
+            f"If {listed(cells)} are cells of a foot, add a column of their sum. " if cells else ""
+        )
         raise DataError(
             f"{where} has no column {listed(missing)}; columns of that kind found: {listed(seen)}. "
-            "Name the column in [columns], or remove the component from measured in [[contact]]",
+            f"{sums}Name the column in [columns], or remove the component from measured in "
+            "[[contact]]",
             code="missing_column",
         )
     return {
@@ -208,7 +230,7 @@ def _columns_of_base(where: str, names: Sequence[str], wanted: BaseColumns) -> d
     used = next((kind for kind in orientations if kind in found), "")
     required = ["imu"] if wanted.imu is not None else []
     missing = [x for kind in required for x in whole[kind] if x not in names]
-    if not used and not missing:
+    if not used and not missing and (not required or wanted.needs_heading):
         missing = [x for x in whole["imu quaternion" if required else "pose"] if x not in names]
     if missing:
         seen = [name for name in names if name.startswith(("base_", "imu_"))]
@@ -237,6 +259,12 @@ def base_of(
         DataError: If a value is not finite, or a quaternion is not of length 1.
     """
     pose, frame = _pose_of(values, wanted.imu), wanted.imu
+    if pose is None and frame is not None and "base imu" in values:
+        imu, note = motion_of_imu(t, q, _checked(values["base imu"], "IMU", 6), frame)
+        pose = np.zeros((len(t), 7))
+        pose[:, 3:] = orientation_of_imu(t, imu.values, frame.gravity)
+        note += "; the orientation is estimated from angular velocity and specific force"
+        return BaseMotion(pose, imu=imu), note
     if pose is None:
         return None, ""
     twist, acceleration = values.get("base twist"), values.get("base acceleration")
@@ -257,13 +285,25 @@ def _pose_of(values: Mapping[str, Array], frame: ImuFrame | None) -> Array | Non
     if (pose := values.get("base pose")) is not None:
         return pose
     if (angles := values.get("base angles")) is not None:
-        return np.hstack([angles[:, :3], quaternions_of_angles(angles[:, 3:])])
+        return np.hstack([angles[:, :3], quaternions_of_angles(_radians(angles[:, 3:]))])
     quaternion = values.get("base quaternion")
     if (own := values.get("base imu quaternion")) is not None and frame is not None:
         quaternion = _of_base(own, frame.quaternion)
     elif (angles := values.get("base rpy")) is not None:
-        quaternion = quaternions_of_angles(angles)
+        quaternion = quaternions_of_angles(_radians(angles))
     return None if quaternion is None else np.hstack([0.0 * quaternion[:, :3], quaternion])
+
+
+def _radians(angles: Array) -> Array:
+    """Return roll, pitch and yaw (N, 3); refuse those in degrees. Yaw may count full turns."""
+    largest = float(np.abs(angles[:, :2]).max(initial=0.0))
+    if largest > _TURN:
+        raise DataError(
+            f"base_roll and base_pitch are up to {largest:.4g}, wanted at most pi: they look like "
+            "degrees. Convert base_roll, base_pitch and base_yaw to rad",
+            code="angle_unit",
+        )
+    return angles
 
 
 def _of_base(quaternion: Array, own: Array) -> Array:

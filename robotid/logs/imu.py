@@ -8,13 +8,23 @@ import numpy as np
 
 from robotid._typing import Array
 
-__all__ = ["IMU", "ImuFrame", "ImuMotion", "bias_at_rest", "inertial_state", "motion_of_imu"]
+__all__ = [
+    "IMU",
+    "ImuFrame",
+    "ImuMotion",
+    "bias_at_rest",
+    "inertial_state",
+    "motion_of_imu",
+    "orientation_of_imu",
+]
 
 #: Names of the values of an IMU: orientation, angular velocity [rad/s], specific force [m/s^2].
 IMU = ("qx", "qy", "qz", "qw", "wx", "wy", "wz", "ax", "ay", "az")
 _WINDOW = 0.5  # [s] shortest rest in which the bias of the gyroscopes is estimated
 _STILL = 0.02  # [rad/s] largest standard deviation of a gyroscope at rest
 _UNMOVED = 5e-3  # [rad or m] largest motion of a joint at rest
+_LEVEL = 2.0  # [s] in which the mean specific force is vertical; the mean is taken twice
+_BREAK = 0.1  # [s] a longer time step: the angular velocity in it is not known
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +129,72 @@ def bias_at_rest(parts: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, st
         f"bias of the gyroscopes, estimated in {_WINDOW * len(means):g} s at rest and "
         f"subtracted: {shown} mrad/s"
     )
+
+
+def orientation_of_imu(t: Array, values: Array, gravity: Array) -> Array:
+    """Return the orientation of a base from an IMU alone, qx qy qz qw, shape (N, 4).
+
+    The angular velocity is integrated. With the axes that result, the mean specific force in some
+    seconds is opposite to gravity, for the velocity of a robot hardly changes in them: this
+    corrects the tilt. The heading starts at 0.
+
+    Args:
+        t: Time stamps, shape (N,) [s].
+        values: Angular velocity without bias [rad/s] and specific force [m/s^2] with the axes of
+            the base, shape (N, 6).
+        gravity: Gravity in the world, shape (3,) [m/s^2].
+
+    References:
+        Mahony, Hamel, Pflimlin (2008), Nonlinear Complementary Filters on the Special Orthogonal
+        Group; here without delay, for the whole log is known.
+    """
+    parts = np.split(np.arange(len(t)), np.flatnonzero(np.diff(t) > _BREAK) + 1)
+    return np.concatenate([_levelled(t[k], values[k], -gravity) for k in parts])
+
+
+def _levelled(t: Array, values: Array, up: Array) -> Array:
+    """Return the orientation in a part of a log without gaps, shape (N, 4)."""
+    w, f = values[:, :3], values[:, 3:]
+    q = np.empty((len(t), 4))
+    q[0] = _between(_mean(t, f)[0], up)
+    half = 0.25 * np.diff(t)[:, None] * (w[1:] + w[:-1])  # half of the turn between two samples
+    angle = np.linalg.norm(half, axis=1, keepdims=True)
+    turns = np.hstack([half * np.sinc(angle / np.pi), np.cos(angle)])
+    for k, turn in enumerate(turns):
+        q[k + 1] = _product(q[k], turn)
+    x, s = q[:, :3], q[:, 3:]
+    u = np.cross(x, f)
+    return _product(_between(_mean(t, f + 2.0 * (s * u + np.cross(x, u))), up), q)
+
+
+def _mean(t: Array, x: Array) -> Array:
+    """Return the mean of values over some time around each sample, same shape, taken twice."""
+    if len(t) < 2:
+        return x
+    first, last = (np.clip(t + side * _LEVEL / 2, t[0], t[-1]) for side in (-1, 1))
+    for _ in range(2):
+        areas = 0.5 * np.diff(t)[:, None] * (x[1:] + x[:-1])
+        whole = np.vstack([np.zeros(x.shape[1]), np.cumsum(areas, axis=0)])
+        ends = [np.stack([np.interp(at, t, y) for y in whole.T], axis=1) for at in (first, last)]
+        x = (ends[1] - ends[0]) / (last - first)[:, None]
+    return x
+
+
+def _between(vector: Array, up: Array) -> Array:
+    """Return the smallest rotations that turn vectors (..., 3) upwards, shape (..., 4)."""
+    a = vector / np.linalg.norm(vector, axis=-1, keepdims=True).clip(1e-12)
+    b = up / np.linalg.norm(up)
+    q = np.concatenate([np.cross(a, b), 1.0 + (a @ b)[..., None]], axis=-1)
+    size = np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(size > 1e-6, q / size.clip(1e-12), np.append(np.roll(b, 1), 0.0))
+
+
+def _product(p: Array, q: Array) -> Array:
+    """Return the products of quaternions, shape (..., 4)."""
+    x, y, v, w = p[..., :3], q[..., :3], p[..., 3:], q[..., 3:]
+    vector = v * y + w * x + np.cross(x, y)
+    scalar = v * w - np.sum(x * y, axis=-1, keepdims=True)
+    return np.concatenate([vector, scalar], axis=-1)
 
 
 def inertial_state(

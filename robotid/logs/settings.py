@@ -99,6 +99,9 @@ class SignalSettings(Settings):
     velocity_delay: float = setting(
         0.0, "delay of the measured velocity, likewise [s]", within=_DELAY
     )
+    wrench_delay: float = setting(
+        0.0, "delay of the measured wrenches of contacts, likewise [s]", within=_DELAY
+    )
 
 
 @dataclass(frozen=True)
@@ -167,8 +170,10 @@ class LogSource(Settings):
     )
     stamp: str = setting(
         "header",
-        "the time stamps of a bag: header, the stamp in the message, or log, the time of recording",
-        among=("header", "log"),
+        "the time stamps: even, equal time steps for all rows, for a recorder that stamps rows of "
+        "one rate late, in bunches; of a bag also header, the stamp in the message, or log, the "
+        "time of recording",
+        among=("header", "log", "even"),
     )
     sensors: tuple[str, ...] = setting(
         (),

@@ -139,7 +139,7 @@ def filter_reach(settings: SignalSettings) -> float:
     Returns:
         The time, including delays; some rows must be added for splines and differences.
     """
-    delay = max(abs(settings.torque_delay), abs(settings.velocity_delay))
+    delay = max(map(abs, (settings.torque_delay, settings.velocity_delay, settings.wrench_delay)))
     if settings.cutoff is None or settings.rate is None:
         return delay
     return delay + 2.0 * _SETTLED * _time_constant(settings) + _LONGEST / settings.cutoff
@@ -214,7 +214,11 @@ def _process_part(
         channels |= _base_channels(log.base, settings)
     if log.wrenches:
         channels["wrenches"] = np.column_stack([*log.wrenches.values()])
-    delay = {"tau": settings.torque_delay, "v": settings.velocity_delay}
+    delay = {
+        "tau": settings.torque_delay,
+        "v": settings.velocity_delay,
+        "wrenches": settings.wrench_delay,
+    }
     smooth = {
         name: low_pass(_resample(t - delay.get(name, 0.0), x[rows], times), grid.rate, settings)
         for name, x in channels.items()

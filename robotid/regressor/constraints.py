@@ -37,7 +37,8 @@ __all__ = [
     "without_forces",
 ]
 
-_RANK = 1e-8  # singular values below this share of the largest are of dependent constraints
+_RANK = 1e-8  # singular values below this share of the largest are of dependent constraints ...
+_WEAK = 0.01  # ... if rows of the base alone are used, which feet of equal height hardly load
 _AS_IS = BaseSource()
 _BLOCK = 1024  # samples whose Jacobians are in memory together
 _CACHED = 64  # samples that are projected together
@@ -94,23 +95,33 @@ def contact_links(model: RobotModel, q: Array) -> tuple[Array, Array]:
     return rotation, turning @ model.velocity_map
 
 
-def force_basis(J: Array, used: Array) -> Array:
+def force_basis(J: Array, used: Array, floats: bool = False) -> Array:
     """Return orthonormal bases of the torques that unknown constraint forces can cause.
+
+    Two feet that press against each other hardly load the base: by their difference in height, if
+    their vertical forces are known. In the rows of a floating base alone, forces that would have to
+    be a hundred times larger than others for an effect of the same size are taken to have none.
 
     Args:
         J: Jacobians of the constraints, shape (N, m, n_rows).
         used: Rows used, shape (N, n_rows), bool: the torques are those in these rows.
+        floats: Whether the first six rows are those of a floating base.
 
     Returns:
         B with columns of length 1 or 0, shape (N, n_rows, k), k the smaller of m and n_rows.
     """
     A = J.swapaxes(1, 2) * used[:, :, None]
-    parts = []
+    parts, least = [], _least(used, floats)
     for start in range(0, len(A), _BLOCK):
         U, s, _ = np.linalg.svd(A[start : start + _BLOCK], full_matrices=False)
-        is_independent = s > _RANK * s.max(axis=1, keepdims=True, initial=1e-300)
+        is_independent = s > least * s.max(axis=1, keepdims=True, initial=1e-300)
         parts.append(U * is_independent[:, None])
     return np.concatenate(parts) if parts else A
+
+
+def _least(used: Array, floats: bool) -> float:
+    """Return the smallest relative singular value of forces that have an effect."""
+    return _WEAK if floats and not used[:, 6:].any() else _RANK
 
 
 def loop_basis(model: RobotModel, q: Array) -> Array:
@@ -221,7 +232,7 @@ def constrained(
     known, tau = _measured(model), motion.tau
     if motion.wrenches is not None:
         tau = tau + np.einsum("kmj,km->kj", J[:, known], motion.wrenches)
-    basis = force_basis(np.delete(J, known, axis=1), used)
+    basis = force_basis(np.delete(J, known, axis=1), used, model.free_flyer)
     used = used & (np.sum(basis**2, axis=2) < 1.0 - _RANK)
     return motion.projected(basis, without_forces(basis, tau), tau), used
 
@@ -242,7 +253,7 @@ def touching(model: RobotModel, motion: Trajectory) -> Array:
 def constraint_forces(model: RobotModel, motion: Trajectory, torque: Array, used: Array) -> Array:
     """Return the constraint forces for which a robot has a torque, shape (N, m) [N, N m].
 
-    They are those of least squares; measured ones are 0.
+    Unknown ones are those of least squares.
 
     Args:
         model: The robot.
@@ -253,8 +264,10 @@ def constraint_forces(model: RobotModel, motion: Trajectory, torque: Array, used
     J = constraint_jacobian(model, motion.q, touching(model, motion))
     known, tau = _measured(model), motion.tau if motion.loaded is None else motion.loaded
     f = np.zeros(J.shape[:2])
+    if motion.wrenches is not None:
+        f[:, known] = motion.wrenches
     A = np.delete(J, known, axis=1).swapaxes(1, 2) * used[:, :, None]
-    inverse = np.linalg.pinv(A, rcond=_RANK)
+    inverse = np.linalg.pinv(A, rcond=_least(used, model.free_flyer))
     others = np.delete(np.arange(J.shape[1]), known)
     f[:, others] = (inverse @ ((torque - tau) * used)[..., None])[..., 0]
     return f

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.humans import FEET, human_urdf, logged, walk
 
@@ -60,6 +61,39 @@ def test_another_order_of_the_quaternion_is_named(robot, log, change, words):
     assert (found.code, found.severity) == ("base_orientation", "error")
     assert words in found.message
     assert found.evidence["best"] < 0.1  # [m/s], noise of the markers
+
+
+def test_another_vertical_axis_of_the_world_is_named(robot, log):
+    turn = pin.Quaternion(pin.rpy.rpyToMatrix(-np.pi / 2, 0.0, 0.0))  # z becomes y
+    pose = log.base.pose.copy()
+    pose[:, :3] = pose[:, :3] @ turn.matrix().T
+    pose[:, 3:] = [(turn * pin.Quaternion(x)).coeffs() for x in pose[:, 3:]]
+    other = replace(log, base=BaseMotion(pose))
+    (found,) = check_base(robot, other, SLOW)
+    assert (found.code, found.severity) == ("base_orientation", "error")
+    assert "above them along y of the world" in found.message
+    assert "state gravity = [0, -9.81, 0] at the top" in found.message
+    assert abs(found.evidence["height"]) < 0.2
+    assert found.evidence["best"] > 0.9
+    stated = RobotModel.from_urdf(
+        robot.tree.path, free_flyer=True, terms=(), constraints=robot.contacts,
+        gravity=(0.0, -9.81, 0.0),
+    )  # fmt: skip
+    assert not list(check_base(stated, other, SLOW))
+
+
+def test_a_position_in_millimetres_is_named(robot, log):
+    pose = log.base.pose.copy()
+    pose[:, :3] *= 1e3
+    (found,) = [
+        x for x in check_base(robot, replace(log, base=BaseMotion(pose)), SLOW)
+        if x.code != "base_jump"
+    ]  # fmt: skip
+    assert (found.code, found.severity) == ("base_unit", "error")
+    t, x = log.t, log.base.pose[:, :3]
+    smooth = np.gradient(np.gradient(x, t, axis=0), t, axis=0)  # noise included
+    assert 30.0 < found.evidence["acceleration"] < 1e3 * np.sqrt(np.mean(np.sum(smooth**2, axis=1)))
+    assert "base_x, base_y and base_z are in mm" in found.message
 
 
 def test_jumps_are_found_with_size_and_time(log):

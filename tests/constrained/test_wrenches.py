@@ -54,6 +54,13 @@ def log(urdf, motion):
     return logged(human(urdf), motion, np.random.default_rng(4))
 
 
+@pytest.fixture(scope="module")
+def long_log(urdf):
+    model, rng = human(urdf), np.random.default_rng(8)
+    motion = walk(model, with_other_segments(model, rng), rng, duration=16.0, rate=60.0)
+    return logged(model, motion, rng)
+
+
 def found(model, log):
     return list(check_wrenches(model, log, process(log, SLOW)))
 
@@ -88,6 +95,72 @@ def test_a_fault_of_the_columns_is_named(urdf, log, change, words, factor):
     assert ("exchanged" in finding.message) == ("are exchanged" in " ".join(words))
     assert finding.evidence["factor"] == pytest.approx(factor, rel=0.2)
     assert finding.evidence["best"] < 0.2 * 70 * 9.81  # what masses of the URDF leave
+
+
+def test_moments_in_newton_millimetres_are_named(urdf, log):
+    milli = {x: 1e3 * y if x.startswith("m") else y for x, y in log.wrenches.items()}
+    (finding,) = found(human(urdf), replace(log, wrenches=milli))
+    assert "if their moments are in N mm, wanted N m. Correct" in finding.message
+    assert finding.evidence["factor"] == 1.0
+
+
+@pytest.mark.parametrize("delay", [0.05, -0.03])
+def test_the_delay_of_forces_is_found_and_corrected(urdf, long_log, delay):
+    log = long_log
+    assert not found(human(urdf), log)
+    late = {x: np.interp(log.t - delay, log.t, y) for x, y in log.wrenches.items()}
+    late = replace(log, wrenches=late)
+    (finding,) = found(human(urdf), late)
+    assert (finding.code, finding.severity) == ("wrench_delay", "warning")
+    assert finding.evidence["delay"] == pytest.approx(delay, abs=0.006)
+    assert finding.evidence["std_error"] < 0.005
+    assert f"lag the motion by {1e3 * finding.evidence['delay']:+.0f} +- " in finding.message
+    half = replace(SLOW, wrench_delay=delay / 2)
+    (rest,) = check_wrenches(human(urdf), late, process(late, half), delay / 2)
+    assert rest.evidence["delay"] == pytest.approx(delay / 2, abs=0.006)
+    stated = float(rest.message.partition("wrench_delay = ")[2].partition(" ")[0])
+    assert stated == pytest.approx(delay, abs=0.006)
+    assert not list(
+        check_wrenches(human(urdf), late, process(late, replace(SLOW, wrench_delay=delay)))
+    )
+
+
+def test_what_sensors_measure_in_the_air_is_an_offset(urdf, long_log):
+    """A foot of this human is in the air for 1.2 s of 3.3 s."""
+    offsets = {"fz LeftFoot": -4.0, "mx LeftFoot": 0.3, "fy RightFoot": 2.0, "my RightFoot": 0.05}
+    shifted = {x: y + offsets.get(x, 0.0) for x, y in long_log.wrenches.items()}
+    left, right = found(human(urdf), replace(long_log, wrenches=shifted))
+    assert {x.code for x in (left, right)} == {"wrench_offset"}
+    assert left.evidence == {
+        "fz_LeftFoot": pytest.approx(-4.0, abs=0.3), "mx_LeftFoot": pytest.approx(0.3, abs=0.03)
+    }  # fmt: skip
+    assert right.evidence == {"fy_RightFoot": pytest.approx(2.0, abs=0.3)}  # 0.05 N m is too small
+    assert left.message.startswith("log: LeftFoot is in the air ")
+    assert f"measures fz {left.evidence['fz_LeftFoot']:+.3g} +- " in left.message
+
+
+def test_a_time_on_the_other_plate_is_named(urdf, motion):
+    plain = logged(human(urdf), motion, np.random.default_rng(5), plates=PLATES)
+    own = (plain.t > 2.0) & (plain.t < 4.0)
+    other = exchanged(plain).wrenches
+    mixed = {x: np.where(own, other[x], y) for x, y in plain.wrenches.items()}
+    (finding,) = found(human(urdf, plates=PLATES), replace(plain, wrenches=mixed))
+    assert (finding.code, finding.severity) == ("measured_wrench", "error")
+    assert "those of LeftFoot, RightFoot are exchanged" in finding.message
+    assert finding.evidence["share"] == pytest.approx(2.0 / 5.6, rel=0.15)
+    assert finding.evidence["first"] == pytest.approx(2.0, abs=0.15)
+    assert finding.evidence["last"] == pytest.approx(4.0, abs=0.15)
+
+
+def test_axes_in_which_the_vertical_force_is_unknown_explain_nothing(urdf, log):
+    """Of feet whose z is level, fz with the axes of the link leaves all of the weight unknown."""
+    contacts = [Contact(foot, "point", ("fz",), always=True) for foot in FEET]
+    model = replace(human(urdf), constraints=tuple(contacts))
+    values = {f"fz {foot}": -log.wrenches[f"fz {foot}"] for foot in FEET}
+    toes = replace(log, wrenches=values)
+    (finding,) = found(model, toes)
+    assert "axes" not in finding.message
+    assert "state the plate" not in finding.message  # moments are not measured
 
 
 def test_forces_of_plates_have_the_origin_and_axes_of_the_plates(urdf, motion):

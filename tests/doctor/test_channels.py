@@ -65,6 +65,22 @@ def test_rows_that_jump_are_found_whether_the_joint_moves_or_rests(moving):
     assert spikes(replace(log, q=q, tau=tau)) == {"q_b": "error", "tau_a": "error"}
 
 
+def test_spikes_of_a_velocity_that_is_not_used_are_a_note():
+    log = log_of_two()
+    v = log.v.copy()
+    v[[3000, 9000], 1] += 9.0
+    log = replace(log, v=v)
+    for velocity, severity in (
+        ("auto", "error"),
+        ("measured", "error"),
+        ("differentiated", "note"),
+    ):
+        (found,) = found_of(log, "spikes", velocity=velocity)
+        assert (found.where, found.severity) == ("run.csv: dq_b", severity)
+    coarse = replace(log, v=np.round(v / 0.1) * 0.1)  # "auto" differentiates the position instead
+    assert {f.severity for f in found_of(coarse, "spikes")} == {"note"}
+
+
 @pytest.mark.parametrize("number", [1, 2, 3, 4, 5, 6])
 def test_joints_at_rest_in_a_real_recording_raise_no_alarm(recordings, monkeypatch, number):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))

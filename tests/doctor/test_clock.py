@@ -1,5 +1,7 @@
 """Figures of a log's clock, of its rows and of its rests, against logs made of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -70,6 +72,36 @@ def test_a_clock_that_was_set_is_told_from_a_gap_by_the_position():
     assert jump == {"jump": pytest.approx(5.0), "at": pytest.approx(t[400]), "steps": 2.0}
     assert found["gap"].evidence["gaps"] == 1
     assert found["gap"].evidence["longest"] == pytest.approx(0.5)
+
+
+def bunched(count=900, lost=0):
+    """Return stamps of rows of 10 ms that arrive late: of six in turn, five wait for the last."""
+    k = np.arange(count)
+    t = START + 0.01 * k
+    late = (k // 6 % 4 == 1) & (k % 6 < 5)
+    t[late] = t[k[late] // 6 * 6 + 5] - 1e-4 * (5 - k[late] % 6)
+    t[count // 2 :] += 0.01 * lost
+    return t
+
+
+def test_rows_that_are_stamped_on_arrival_are_named_with_their_remedy():
+    found = said(check_clock(log_of(bunched())))["bunched_stamps"]
+    assert found.severity == "warning"
+    late = 5 * len(range(1, 150, 4))  # steps of 0.1 ms, in every fourth six
+    assert found.evidence == {
+        "rows": late, "share": pytest.approx(late / 899), "longest": pytest.approx(0.0595)
+    }  # fmt: skip
+    assert 'so no rows are missing: state stamp = "even" in [log]' in found.message
+    missing = said(check_clock(log_of(bunched(lost=90))))["bunched_stamps"]
+    assert missing.message.endswith("are wrong; log the time of recording")
+
+
+def test_rows_that_were_recorded_together_have_no_finding():
+    t = bunched()
+    log = log_of(t)
+    q = np.column_stack([np.sin(2.0 * t), 0.5 * np.cos(1.5 * t)])  # as the stamps say
+    assert "bunched_stamps" not in said(check_clock(replace(log, q=q)))
+    assert "bunched_stamps" not in said(check_clock(replace(log, q=0.0 * q)))
 
 
 def test_rows_that_repeat_the_one_before_are_counted_where_the_robot_moves():

@@ -45,6 +45,17 @@ def waves(amplitudes, speeds):
 # --- nothing where nothing is ---------------------------------------------------------------------
 
 
+def test_forces_of_the_ground_identify_masses_without_torques_and_commands(log):
+    bare = replace(log, q_ref=None, v_ref=None, tau_ref=None, tau=0.0 * log.tau, has_torque=False)
+    (note,) = check_commands(bare)
+    assert note.message.endswith("nothing can be identified from motion alone")
+    (note,) = check_commands(replace(bare, wrenches={"fz foot": np.ones(len(log.t))}))
+    assert note.message.endswith(
+        "the rows of the base identify masses; friction and armature of the joints are not "
+        "identified"
+    )
+
+
 def test_a_good_chirp_gives_notes_alone(log):
     note, loops = check_commands(log)
     assert (note.code, note.severity, note.where) == ("no_torque", "note", "log")

@@ -210,6 +210,26 @@ def test_few_stretches_keep_the_band_of_the_filter(W):
         scatter(parts, rough.theta, rough.sigma, rough.covariance)
 
 
+def test_few_segments_have_errors_that_repeat_in_every_row(W, rng):
+    parts = segments(W, W @ TRUTH + noise(np.random.default_rng(0), 0.0))[:11]
+    whole, share = merge(parts), 0.2
+    rough = WLS(independent_share=share).fit(whole)
+    root = rng.standard_normal((4, 2))
+    more = 1e6 * root @ root.T
+    found, _ = measured_errors(rough, parts, whole, share, np.eye(4), rough.sigma, more=more)
+    R = whole.weighted(rough.sigma)[:4, :4]
+    H = share * R.T @ R  # information
+    wanted = np.linalg.solve(H, np.linalg.solve(H, H + share**2 * more).T)
+    np.testing.assert_allclose(found.covariance, wanted, rtol=1e-6, atol=1e-12)
+    assert np.diag(wanted).max() > 1.5 * np.diag(rough.covariance).max()
+    K, L = rng.standard_normal((4, 6)), np.diag(rng.uniform(1.0, 2.0, 6))
+    prior = K.T @ H @ K + L  # of standard parameters, with a prior
+    own = replace(rough, theta=np.zeros(6), covariance=np.linalg.inv(prior))
+    found, _ = measured_errors(own, parts, whole, share, K, rough.sigma, more=more)
+    wanted = own.covariance @ (prior + share**2 * K.T @ more @ K) @ own.covariance
+    np.testing.assert_allclose(found.covariance, wanted, rtol=1e-6, atol=1e-9)
+
+
 def test_quantiles_are_students():
     np.testing.assert_allclose(
         quantile(np.array([5.0, 30.0, np.inf])), scipy.stats.t.ppf(0.975, [5.0, 30.0, 1e12]), 1e-9

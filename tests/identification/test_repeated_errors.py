@@ -37,11 +37,11 @@ RAW = SignalSettings(
 )
 
 
-def robot(uncertainty):
+def robot(uncertainty, **measured):
     contacts = [
         Contact(FEET[1], "surface", always=True),
         Contact(FEET[0], uncertainty=uncertainty),
-        Contact(FEET[3], uncertainty=uncertainty, always=True),
+        Contact(FEET[3], uncertainty=uncertainty, always=True, **measured),
     ]
     return RobotModel.from_urdf(
         example_urdf("solo12.urdf"), free_flyer=True, terms=(), constraints=contacts
@@ -63,8 +63,13 @@ def log():
     return Log(t, waves[:, 6:], tau, joints, base=BaseMotion(np.array(pose)), contacts=flags)
 
 
-def test_a_force_beside_its_point_leaves_the_torque_of_its_slope(log, rng):
-    model = robot(None)
+@pytest.mark.parametrize("axes", ["", "world", "link"])
+def test_a_force_beside_its_point_leaves_the_torque_of_its_slope(log, rng, axes):
+    """One vertical force may be measured, with the axes of the world or of the foot."""
+    model, known = robot(None), []
+    if axes:
+        model, known = robot(None, measured=("fz",), axes=axes), [11]
+        log = replace(log, wrenches={f"fz {FEET[3]}": np.zeros(len(log.t))})
     rows = hold_log(model, log, RAW).whole
     motion, pi, x = rows.trajectory, model.standard_parameters(), 1e-5 * rng.standard_normal(6)
     (torque,) = predict(model, [pi], replace(motion, basis=None))
@@ -79,8 +84,12 @@ def test_a_force_beside_its_point_leaves_the_torque_of_its_slope(log, rng):
             R = data.oMf[frame_id(model.pin_model, model.contacts[i].frame)].rotation
             own = R @ x[3 * (i - 1) : 3 * i]
             w = turning[k, 6 * i + 3 : 6 * i + 6]
-            moved[k, first : first + 3] += np.cross(w, own, axisa=0, axisc=0)
+            turned = np.cross(w, own, axisa=0, axisc=0)
+            moved[k, first : first + 3] += R.T @ turned if axes == "link" and i == 2 else turned
     loaded = torque - np.einsum("kmj,m->kj", moved, f)
+    if known:
+        loaded = loaded + J[:, 11] * f[11]
+        motion = replace(motion, wrenches=np.full((len(motion.t), 1), f[11]))
     rows = replace(rows, trajectory=replace(motion, loaded=loaded))
     D = _slopes(model, rows, pi, [1, 2]).reshape(*torque.shape, 6)
     B = motion.basis
@@ -193,6 +202,20 @@ def test_the_covariance_of_the_score_is_that_of_the_stated_uncertainty(log):
     assert once.variance > 0.0
     assert errors(0.0) is None
     assert 0.0 < np.abs(errors(None).root).max() < np.inf
+
+
+def test_offsets_without_torques_of_joints_are_two_centimetres_if_not_stated(log):
+    def size(log, uncertainty, has_torque):
+        model = robot(uncertainty, measured=("fz",))
+        model = replace(model, constraints=model.contacts[1:])
+        forces = {f"fz {FEET[3]}": np.full(len(log.t), 5.0)}
+        log = replace(log, tau=log.tau * has_torque, wrenches=forces, has_torque=has_torque)
+        held = (hold_log(model, log, RAW),)
+        return with_repeated_errors(Recordings(model, structural_mapping(model), held)).repeated
+
+    assert size(log, None, has_torque=False).points == 0.02
+    assert size(log, 0.005, has_torque=False).points == 0.005
+    assert size(log, None, has_torque=True).points != 0.02
 
 
 def test_contact_errors_follow_the_selected_drive_terms(log, monkeypatch):

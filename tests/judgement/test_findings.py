@@ -381,11 +381,12 @@ def test_a_fit_is_reported_by_its_determination_its_refitted_logs_and_costly_joi
 
     own = {"a": measured(1.19, 11.0), "b": measured(2.5, None), "c": measured(0.61, 9.0),
            "d": measured(0.4, 4.9), "e": measured(0.4, 4.9), "f": measured(0.3, 5.8),
-           "g": measured(0.3, 5.9)}  # fmt: skip
+           "g": measured(0.3, 5.9), "h": measured(0.3, 19.0)}  # fmt: skip
     wls = {"a": measured(1.0, 10.0), "b": measured(2.0, 8.0), "c": measured(0.5, 7.0),
            "d": measured(0.2, 2.5), "e": measured(0.2, 2.4), "f": measured(0.2, 3.0),
-           "g": measured(0.2, 3.0)}  # fmt: skip
+           "g": measured(0.2, 3.0), "h": measured(0.2, 1.1)}  # fmt: skip
     fit = SimpleNamespace(
+        overfitted={"h"},
         determination=SimpleNamespace(
             groups=() if rank == 9 else ("x",), rank=rank, names=range(9), described=lambda: "x is"
         ),
@@ -413,7 +414,11 @@ def test_a_fit_is_reported_by_its_determination_its_refitted_logs_and_costly_joi
         ("warning", "e", {"error_pct": 4.9, "wls_error_pct": 2.4}),
         ("note", "f", {"error_pct": 5.8, "wls_error_pct": 3.0}),  # 4.96 % of the torque
         ("warning", "g", {"error_pct": 5.9, "wls_error_pct": 3.0}),  # 5.08 %
+        ("note", "h", {"error_pct": 19.0, "wls_error_pct": 1.1}),
     ]
+    assert costs[6].message.endswith(
+        "19 % instead of 1.1 % of the torque, which predicts unseen logs worse; no action needed"
+    )
     assert costs[2].message == (
         "d: the residual is 0.4 N m, that of unconstrained WLS 0.2: 4.9 % instead of 2.5 % of the "
         "torque; no action needed"

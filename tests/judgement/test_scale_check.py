@@ -346,7 +346,7 @@ def test_a_floating_base_is_loaded_with_the_whole_mass(monkeypatch, masses, rati
     found = SimpleNamespace(
         model=SimpleNamespace(layout=layout, free_flyer=True), prior=before, standard=after,
         metrics=lambda name: SimpleNamespace(per_joint={"estimate": rmse, "wls": free}[name]),
-        fitted=[SimpleNamespace(recording=recording)],
+        fitted=[SimpleNamespace(recording=recording)], overfitted=frozenset("b"),
     )  # fmt: skip
     monkeypatch.setattr(scale_check, "stated_mass", lambda fit: None)
     monkeypatch.setattr(scale_check, "determines_total_mass", lambda fit: False)
@@ -356,4 +356,6 @@ def test_a_floating_base_is_loaded_with_the_whole_mass(monkeypatch, masses, rati
     assert check.masses == pytest.approx((sum(masses), 14.4, 0.0))
     assert check.is_total_determined
     assert not check.follows  # the residual of a is twice that of WLS
+    found.overfitted = frozenset("a")
+    assert check_scale(found).follows  # which predicts unseen logs worse
     assert (dict(check.friction), dict(check.gravity)) == ({"a": 0.3}, {})

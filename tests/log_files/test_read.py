@@ -699,6 +699,30 @@ def test_columns_of_another_rate_are_named_with_their_share():
     np.testing.assert_array_equal(whole.wrenches["fz f"], t)
 
 
+def test_faults_of_a_base_and_of_cells_of_a_foot_are_named(tmp_path):
+    t = 2.0 + np.arange(90) / 100
+    wanted = BaseColumns(True, wrenches=("fz f",))
+    ends = ("x", "y", "z", "roll", "pitch", "yaw")
+    table = {"time": t, "q_a": t, "wrench_fz_f": t} | {f"base_{x}": 0.1 * t for x in ends}
+
+    def refused(words, **changes):
+        frame = {x: y for x, y in (table | changes).items() if y is not None}
+        with pytest.raises(DataError, match=words):
+            read_log(pd.DataFrame(frame), ["a"], base=wanted)
+
+    read_log(pd.DataFrame(table | {"base_yaw": 30.0 * t}), ["a"], base=wanted)  # full turns
+    lost = np.where(np.arange(90) == 7, np.nan, t)
+    refused(r"log: base_z is NaN at row 7 \(t = 2.07 s\); remove the row", base_z=lost)
+    refused(r"log: wrench_fz_f is NaN at row 7", wrench_fz_f=lost)
+    refused(r"base_roll and base_pitch are up to 20, wanted at most pi", base_pitch=t[-1] - t - 20)
+    cells = {"wrench_fz_f": None, "wrench_fz_f_0": t, "wrench_fz_f_1": t}
+    refused(r"If wrench_fz_f_0, wrench_fz_f_1 are cells of a foot, add a column of their", **cells)
+    table["wrench_fz_f"] = [[x, x] for x in t]
+    pd.DataFrame(table).to_parquet(tmp_path / "run.parquet")
+    with pytest.raises(DataError, match="wanted numbers; write one column per value, or their sum"):
+        read_log(tmp_path / "run.parquet", ["a"], base=wanted)
+
+
 def test_an_empty_cell_of_another_device_names_the_rate(tmp_path):
     (tmp_path / "run.csv").write_text("time,q_a,wrench_fz_f\n0,1,2\n0.1,1,\n0.2,1,3\n")
     with pytest.raises(DataError, match=r"wrench_fz_f is empty at row 1.*column of another rate"):

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pinocchio as pin
 import pytest
 
@@ -10,7 +11,7 @@ from robotid.exceptions import DataError
 from robotid.log_files.read import read_log, write_log
 from robotid.logs.base import BaseColumns, BaseMotion, base_state
 from robotid.logs.data import Log
-from robotid.logs.imu import ImuFrame, ImuMotion, motion_of_imu
+from robotid.logs.imu import ImuFrame, ImuMotion, motion_of_imu, orientation_of_imu
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 
@@ -132,8 +133,12 @@ def test_an_imu_is_read_with_or_without_an_orientation_of_its_own(motion, tmp_pa
     np.testing.assert_array_equal(part.base.imu.values, own.base.imu.values[250:501])
     with pytest.raises(DataError, match=r"no column imu_ax of the IMU.* Record imu_wx"):
         read([x for x in every if x != "imu_ax"])
-    with pytest.raises(DataError, match=r"no column imu_qx, imu_qy, imu_qz, imu_qw of the IMU"):
-        read([x for x in every if not x.startswith(("imu_q", "base_"))])
+    level = read([x for x in every if not x.startswith(("imu_q", "base_"))])
+    np.testing.assert_array_equal(  # the values alone; for horizontal forces see below
+        level.base.pose[:, 3:], BaseMotion(np.hstack(
+            [np.zeros((len(t), 3)), orientation_of_imu(t, level.base.imu.values, G)]
+        )).pose[:, 3:],
+    )  # fmt: skip
 
 
 def test_an_imu_is_filtered_as_the_joints(motion):
@@ -145,3 +150,75 @@ def test_an_imu_is_filtered_as_the_joints(motion):
     rows = np.searchsorted(t, smooth.t - 1e-9)
     np.testing.assert_allclose(smooth.v[:, 3:6], twist[rows, 3:], atol=2e-3)
     np.testing.assert_allclose(smooth.v[:, :3], twist[rows, :3], atol=2e-3)
+
+
+def swaying(x):
+    turn = pin.rpy.rpyToMatrix(2.0 + 0.15 * np.sin(1.9 * x), 0.2 * np.cos(2.3 * x), 0.3 * x)
+    return pin.SE3(turn, 0.05 * np.array([np.sin(2.5 * x), np.cos(1.7 * x), np.sin(3.1 * x)]))
+
+
+@pytest.fixture(scope="module")
+def sway():
+    """Return stamps with a pause, values with the axes of the base, and orientations (N,)."""
+    t, h = np.delete(4.0 + 0.01 * np.arange(2000), slice(900, 950)), 1e-4
+    values, turns = [], []
+    for x in t:
+        before, now, after = (swaying(x + k * h) for k in (-1, 0, 1))
+        w = pin.log3(before.rotation.T @ after.rotation) / (2 * h)
+        a = (before.translation - 2 * now.translation + after.translation) / h**2
+        values.append(np.append(w, now.rotation.T @ (a - G)))
+        turns.append(now.rotation)
+    return t, np.array(values), np.array(turns)
+
+
+def test_the_orientation_of_an_imu_alone_has_its_tilt_and_turns(sway):
+    t, values, turns = sway
+    values = values + np.array([1e-3, -1e-3, 5e-4, 0.0, 0.0, 0.0])  # bias that remains
+    found = orientation_of_imu(t, values, G)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0)
+    R = np.array([pin.Quaternion(x).matrix() for x in found])
+    up = -G / np.linalg.norm(G)
+    tilt = np.linalg.norm(up @ R - up @ turns, axis=1)
+    assert np.sqrt(np.mean(tilt**2)) < 0.01  # [rad]
+    assert tilt.max() < 0.04  # at the ends, where the mean is that of 2 s
+    for part in (slice(0, 900), slice(900, None)):  # the heading of each part is its own
+        heading = np.array(
+            [pin.log3(a @ b.T) @ up for a, b in zip(R[part], turns[part], strict=True)]
+        )
+        assert np.ptp(np.unwrap(heading)) < 0.05
+
+
+def test_a_vertical_vector_upside_down_is_turned_upwards():
+    values = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -9.81], (5, 1))
+    found = orientation_of_imu(0.01 * np.arange(5), values, np.array([0.0, 0.0, -9.81]))
+    R = pin.Quaternion(found[2]).matrix()
+    np.testing.assert_allclose(R @ [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+def test_an_imu_needs_no_orientation_unless_horizontal_forces_of_the_world_are_measured(
+    sway, tmp_path
+):
+    t, values, _ = sway
+    names = ("imu_wx", "imu_wy", "imu_wz", "imu_ax", "imu_ay", "imu_az")
+    parts = ("wrench_fz_foot", "wrench_fx_foot")
+    table = {"time": t, "q_hip": np.sin(t)} | dict(zip(names, values.T, strict=True))
+    path = tmp_path / "log.csv"
+    pd.DataFrame(table | {part: np.ones(len(t)) for part in parts}).to_csv(path, index=False)
+    frame = ImuFrame(np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), G)
+
+    def read(*wrenches, **more):
+        wanted = BaseColumns(floats=True, imu=frame, wrenches=wrenches, **more)
+        return read_log(path, JOINTS, base=wanted)
+
+    log = read("fz foot")
+    assert not log.base.has_position
+    wanted = orientation_of_imu(t, log.base.imu.values, G)
+    np.testing.assert_allclose(np.abs(np.sum(log.base.pose[:, 3:] * wanted, axis=1)), 1.0)
+    assert "the orientation is estimated from angular velocity" in log.notes[-1]
+    assert read("fx foot", local=("foot",)).base is not None
+    with pytest.raises(DataError, match="no column imu_qx, imu_qy, imu_qz, imu_qw of the IMU"):
+        read("fz foot", "fx foot")
+    other = replace(frame, gravity=np.array([0.0, -9.81, 0.0]))
+    with pytest.raises(DataError, match="no column imu_qx"):
+        read_log(path, JOINTS, base=BaseColumns(floats=True, imu=other, wrenches=("fz foot",)))

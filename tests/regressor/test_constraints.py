@@ -229,6 +229,25 @@ def test_dependent_forces_are_counted_once(rng):
     np.testing.assert_allclose(left, wanted, atol=1e-12)
 
 
+def test_feet_that_press_against_each_other_do_not_hide_their_share_of_the_weight():
+    """Horizontal forces of feet whose heights differ by a millimetre: one has hardly an effect."""
+    feet = np.array([[0.01, 0.1, -0.6], [0.0, -0.1, -0.599]])
+    moments = [pin.skew(x) for x in feet]
+    whole = np.concatenate([np.hstack([np.eye(3), -m]) for m in moments])  # (6 forces, 6 rows)
+    J = np.delete(whole, [2, 5], axis=0)[None]  # vertical forces are measured
+    used = np.ones((1, 6), dtype=bool)
+    share = whole[2] - whole[5]  # torque of weight that moves from foot to foot
+    every, some = (force_basis(J, used, floats=x) for x in (False, True))
+    assert [round(np.sum(B**2)) for B in (every, some)] == [4, 3]
+    left = [np.linalg.norm(without_forces(B, share[None])) for B in (every, some)]
+    assert left[0] < 0.01
+    assert left[1] == pytest.approx(0.2 / np.sqrt(1 + 0.6**2), rel=0.01)  # seen from the ground
+    # with rows of joints, each force has an effect of its own
+    joints = np.concatenate([J, 0.1 * np.eye(4)[None]], axis=2)
+    basis = force_basis(joints, np.ones((1, 10), dtype=bool), floats=True)
+    assert round(np.sum(basis**2)) == 4
+
+
 @pytest.mark.parametrize(
     ("kind", "axis", "equations"),
     [("point", (0.0, 0.0, 1.0), 3), ("hinge", (0.3, -0.8, 0.2), 5), ("rigid", (1.0, 0, 0), 6)],
