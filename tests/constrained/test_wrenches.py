@@ -11,6 +11,8 @@ from robotid.constrained.contacts import check_base
 from robotid.constrained.wrenches import check_wrenches
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
+from robotid.regressor.constraints import constraint_jacobian
+from robotid.regressor.prediction import predict
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
 
@@ -58,6 +60,15 @@ def found(model, log):
     return list(check_wrenches(model, log, process(log, SLOW)))
 
 
+def unexplained(model, log):
+    """Return the RMS force and moment of W pi - J^T f of the base."""
+    motion, whole = process(log, SLOW), np.ones((1, 2), dtype=bool)
+    torque = predict(replace(model, constraints=()), [model.standard_parameters()], motion)[0]
+    J = constraint_jacobian(model, motion.q, np.repeat(whole, len(motion.t), axis=0))
+    left = (torque - np.einsum("kmj,km->kj", J, motion.wrenches))[:, :6]
+    return [np.sqrt(np.mean(np.sum(x**2, axis=1))) for x in (left[:, :3], left[:, 3:])]
+
+
 def exchanged(log):
     names = {foot: other for foot, other in zip(FEET, FEET[::-1], strict=True)}
     wrenches = {x: log.wrenches[f"{x[:2]} {names[x[3:]]}"] for x in log.wrenches}
@@ -88,6 +99,14 @@ def test_a_fault_of_the_columns_is_named(urdf, log, change, words, factor):
     assert ("exchanged" in finding.message) == ("are exchanged" in " ".join(words))
     assert finding.evidence["factor"] == pytest.approx(factor, rel=0.2)
     assert finding.evidence["best"] < 0.2 * 70 * 9.81  # what masses of the URDF leave
+    force, moment = unexplained(human(urdf), change(log))
+    assert finding.evidence["force"] == pytest.approx(force)
+    shown = f"leave {force:.3g} N and {moment:.3g} N m (RMS) of the base unexplained, but only"
+    assert shown in finding.message
+    right, moment = unexplained(human(urdf), log)
+    if factor < 10.0:  # as logged, not multiplied by a fitted factor
+        assert finding.evidence["best"] == pytest.approx(right)
+        assert f"but only {right:.3g} N and {moment:.3g} N m if" in finding.message
 
 
 def test_forces_of_plates_have_the_origin_and_axes_of_the_plates(urdf, motion):
@@ -115,7 +134,9 @@ def test_steps_beside_the_plates_are_found_with_their_times(urdf, log):
     (finding,) = found(human(urdf), replace(log, wrenches=missed))
     assert (finding.code, finding.severity) == ("measured_wrench", "warning")
     assert finding.evidence["share"] == pytest.approx(1.0 / 5.6, rel=0.1)  # 0.2 s trimmed
+    assert f"half of the weight in {finding.evidence['share']:.0%} of the samples" in finding.message
     assert "first at 2.0" in finding.message
+    assert ", last at 2.9" in finding.message or ", last at 3 s" in finding.message
 
 
 def test_vertical_forces_alone_show_their_sign_and_foot(urdf, log):
