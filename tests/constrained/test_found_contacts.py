@@ -157,13 +157,14 @@ def test_forces_are_found_beside_a_measured_one_whatever_is_up(robot, axes):
     every = np.ones((60, 4), dtype=bool)
     log, _, rest = standing(tilted, every)
     assert np.abs(rest).max() < 1e-9
-    torque = predict_instants(tilted, tilted.standard_parameters(), np.hstack([log.base.pose, log.q]))
-    J = constraint_jacobian(tilted, np.hstack([log.base.pose, log.q]), every)
+    q = np.hstack([log.base.pose, log.q])
+    torque = predict_instants(tilted, tilted.standard_parameters(), q)
+    J = constraint_jacobian(tilted, q, every)
     f = np.linalg.lstsq(J[0].T, torque[0] - np.r_[np.zeros(6), log.tau[0]], rcond=None)[0]
     contacts = [replace(x, measured=("fx", "fy", "fz"), axes=axes, always=True) if k == 1 else x
                 for k, x in enumerate(tilted.constraints)]  # fmt: skip
     model = replace(tilted, constraints=tuple(contacts))
-    own = constraint_jacobian(model, np.hstack([log.base.pose, log.q]), every)
+    own = constraint_jacobian(model, q, every)
     measured = np.linalg.lstsq(own[0, 3:6].T, J[0, 3:6].T @ f[3:6], rcond=None)[0]
     wrenches = {f"f{x} FR_FOOT": np.full(60, y) for x, y in zip("xyz", measured, strict=True)}
     _, found = find_contacts(model, replace(log, wrenches=wrenches), RAW)

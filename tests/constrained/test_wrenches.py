@@ -134,7 +134,8 @@ def test_steps_beside_the_plates_are_found_with_their_times(urdf, log):
     (finding,) = found(human(urdf), replace(log, wrenches=missed))
     assert (finding.code, finding.severity) == ("measured_wrench", "warning")
     assert finding.evidence["share"] == pytest.approx(1.0 / 5.6, rel=0.1)  # 0.2 s trimmed
-    assert f"half of the weight in {finding.evidence['share']:.0%} of the samples" in finding.message
+    share = finding.evidence["share"]
+    assert f"half of the weight in {share:.0%} of the samples" in finding.message
     assert "first at 2.0" in finding.message
     assert ", last at 2.9" in finding.message or ", last at 3 s" in finding.message
 

@@ -143,7 +143,7 @@ def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(quadrupe
 
 
 def test_forces_are_those_of_least_squares_over_the_rows_used(quadruped, rng):
-    """Measured components and feet in the air have none; torques are those before the projection."""
+    """Measured components and feet in the air have none."""
     q, v, a = random_motion(quadruped, rng, 3)
     flags = np.array([[1, 0, 1], [1, 1, 0], [0, 0, 1]], dtype=bool)
     torque, tau, projected = rng.normal(size=(3, 3, 18))

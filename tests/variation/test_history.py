@@ -93,8 +93,10 @@ def test_the_cause_of_a_change_is_named_with_its_size(cause):
     if cause[0] == "other":
         return
     names = list(EXPRESSIONS)
-    own = {"friction": [f"{cause[1]}.viscous", f"{cause[1]}.coulomb"], "offset": ["two.offset"],
-           "gain": ["tool.mcx", "tool.Izz", "two.viscous", "two.coulomb", "two.armature"]}  # fmt: skip
+    own = {
+        "friction": [f"{cause[1]}.viscous", f"{cause[1]}.coulomb"], "offset": ["two.offset"],
+        "gain": ["tool.mcx", "tool.Izz", "two.viscous", "two.coulomb", "two.armature"],
+    }  # fmt: skip
     if cause[0] == "payload":  # mass and first moment
         A = np.zeros((10, 2))
         A[[0, 2], 0], A[1, 1] = [0.6, -0.015], 1.0
@@ -221,5 +223,7 @@ def test_the_expected_result_has_its_own_error():
     (found,) = changes(x, errors)
     half = scipy.stats.norm.ppf(0.975) * np.hypot(0.3, np.std(x[:40], ddof=1))
     assert (found.result, found.first) == (40, 40)
-    assert found.expected.ends == pytest.approx(x[:40].mean() + [-half, half], abs=0.01)
+    assert found.expected.ends == pytest.approx(
+        [x[:40].mean() - half, x[:40].mean() + half], abs=0.01
+    )
     assert found.expected.probability < 1e-9
