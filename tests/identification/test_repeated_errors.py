@@ -13,6 +13,8 @@ from robotid.fitting.survey import hold_log
 from robotid.identification import pipeline, repeated_errors
 from robotid.identification.repeated_errors import (
     _slopes,
+    _slopes_of_bias,
+    _world_acceleration,
     estimated_uncertainty,
     with_repeated_errors,
 )
@@ -219,3 +221,37 @@ def test_only_logs_with_an_imu_have_a_bias(log, rng, monkeypatch):
     # with slopes that do not depend on the parameters, those of the second log have no effect
     squares, size = (x.root @ x.root.T for x in (both, alone)), np.abs(alone.root).max()
     np.testing.assert_allclose(*squares, atol=1e-9 * size**2)
+
+
+def test_a_bias_of_the_accelerometer_acts_on_the_mass_of_the_robot(log):
+    """The torque per acceleration of the base is three columns of the mass matrix, projected."""
+    model = robot(0.0)
+    rows = hold_log(model, log, RAW).whole
+    motion, pi, pin_model = rows.trajectory, model.standard_parameters(), model.pin_model
+    D = _slopes_of_bias(model, rows, pi).reshape(*motion.tau.shape, 3)
+    data = pin_model.createData()
+    for k, q in enumerate(model.configurations(motion.q)):
+        M = pin.crba(pin_model, data, q)
+        M = model.velocity_map.T @ (np.triu(M) + np.triu(M, 1).T) @ model.velocity_map
+        B = motion.basis[k]
+        np.testing.assert_allclose(D[k], M[:, :3] - B @ (B.T @ M[:, :3]), atol=1e-9)
+
+
+def test_the_bias_is_the_mean_acceleration_in_the_world_of_each_log(log, rng):
+    """A base that turns by 0.4 rad, twice: the RMS of the two logs' mean accelerations."""
+    model, frame = robot(0.0), ImuFrame(np.eye(4)[3], np.zeros(3), np.array([0, 0, -9.81]),
+                                        np.zeros(3))  # fmt: skip
+    held, means = [], []
+    for size in (1.0, 3.0):
+        values = size * rng.standard_normal((len(log.t), 6)) + np.array([0, 0, 0, size, 0, 9.81])
+        own = replace(log, base=replace(log.base, imu=ImuMotion(values, frame)))
+        held.append(hold_log(model, own, RAW))
+        motion = held[-1].whole.trajectory
+        R = np.array([pin.XYZQUATToSE3(x).rotation for x in motion.q[:, :7]])
+        local = motion.a[:, :3] + np.cross(motion.v[:, 3:6], motion.v[:, :3])
+        world = np.einsum("kij,kj->ki", R, local)
+        np.testing.assert_allclose(_world_acceleration(motion), world, atol=1e-9)
+        means.append(np.linalg.norm(world.mean(axis=0)))
+    found = with_repeated_errors(Recordings(model, structural_mapping(model), tuple(held)))
+    assert found.repeated.bias == pytest.approx(np.sqrt(np.mean(np.square(means))))
+    assert means[0] > 2.0 * means[1] > 0.1
