@@ -18,6 +18,7 @@ from helpers.recorders import (
 
 from robotid.cli import main
 from robotid.exceptions import DataError
+from robotid.log_files.bag_sensors import _interpolated
 from robotid.log_files.read import read_log
 from robotid.logs.base import BaseColumns, quaternions_of_angles
 from robotid.logs.imu import ImuFrame
@@ -276,3 +277,19 @@ def test_an_imu_without_orientation_needs_that_of_the_base(tmp_path):
     np.testing.assert_allclose(
         read_log(path, JOINTS, base=INSIDE).base.pose[:, :3], places(T[1:]), atol=1e-9
     )
+
+
+def test_columns_between_messages_are_linear_and_quaternions_have_length_1():
+    """A turn by 2 rad about z whose sign flips; half of the way is 1 rad."""
+    t = np.array([5.0, 5.4, 6.0])
+    q = [[0.0, 0.0, np.sin(x / 2), np.cos(x / 2)] for x in (0.2, 2.2, 2.2)]
+    q = np.array(q) * [[1.0], [-1.0], [1.0]]
+    columns = {f"imu_{end}": q[:, k] for k, end in enumerate(("qx", "qy", "qz", "qw"))}
+    at = np.array([5.2, 5.7])
+    found = _interpolated(t, {"imu_wx": np.array([1.0, 3.0, -3.0]), **columns}, at)
+    np.testing.assert_allclose(found["imu_wx"], [2.0, 0.0], atol=1e-12)
+    turn = [2 * np.arctan2(found["imu_qz"][k], found["imu_qw"][k]) for k in range(2)]
+    np.testing.assert_allclose(turn, [1.2, 2.2])
+    square = sum(found[name] ** 2 for name in columns)
+    np.testing.assert_allclose(square, 1.0)
+    assert not found["imu_qx"].any()
