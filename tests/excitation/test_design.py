@@ -264,17 +264,14 @@ def test_an_examined_motion_is_judged_with_what_is_known_and_its_condition_witho
     widest = np.argsort(np.diag(np.linalg.inv(given)))[-round(size / 4) :]
     assert sorted(some.widest) == sorted(widest)
     assert found.objective == pytest.approx(np.log(variance[widest]).mean())
-    values = np.linalg.eigvalsh(F - given)
-    low, high = values[0], values[-1]
-    if low > 1e-9 * high:
-        assert found.condition == pytest.approx(np.sqrt(high / low), rel=1e-6)
     used = some.limits.used(q, v, a, 0.0 * a, some.information.torque(rows))
     np.testing.assert_allclose(found.used, np.abs(used).max(axis=1))
     assert (found.intervals, found.duration) == (100, 5.0)
-    alone = designer.examined(motion, 5.0, 20.0)
+    whole = designer.checked(designer.random(rng)).motion  # all joints move
+    alone, rows = designer.examined(whole, 5.0, 20.0), designer.along(*whole.evaluate(t))
     W = np.concatenate(
         [np.sqrt(0.05 / n) * w.T * designer.spread
          for n, w in zip(designer.noise, rows.W, strict=True)]
     )  # fmt: skip
-    assert alone.condition == pytest.approx(np.linalg.cond(W), rel=1e-5)
+    assert alone.condition == pytest.approx(np.linalg.cond(W), rel=1e-4)
     assert alone.objective == pytest.approx(-np.linalg.slogdet(W.T @ W + np.eye(size))[1] / size)
