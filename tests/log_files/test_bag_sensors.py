@@ -1,6 +1,8 @@
 """Sensors in bags: odometry, IMU, wrenches and states of Unitree, at other stamps than joints."""
 
 import re
+from contextlib import nullcontext
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,8 +20,10 @@ from helpers.recorders import (
 
 from robotid.cli import main
 from robotid.exceptions import DataError
-from robotid.log_files.bag_sensors import _interpolated
+from robotid.log_files import bags
+from robotid.log_files.bag_sensors import Sensor, _interpolated
 from robotid.log_files.read import read_log
+from robotid.log_files.table import Table
 from robotid.logs.base import BaseColumns, quaternions_of_angles
 from robotid.logs.imu import ImuFrame
 from robotid.logs.settings import LogSource
@@ -293,3 +297,37 @@ def test_columns_between_messages_are_linear_and_quaternions_have_length_1():
     square = sum(found[name] ** 2 for name in columns)
     np.testing.assert_allclose(square, 1.0)
     assert not found["imu_qx"].any()
+
+
+def test_messages_of_a_sensor_are_sorted_with_their_values(monkeypatch):
+    """Stamps of recording [ns], and values, in the order in which they arrived."""
+    arrived = [(7_200_000_000, (3.0, 30.0)), (7_000_000_000, (1.0, 10.0)),
+               (7_100_000_000, (2.0, 20.0))]  # fmt: skip
+    monkeypatch.setattr(bags, "_open", lambda path: nullcontext((None, None)))
+    monkeypatch.setattr(bags, "_messages", lambda *_: iter(arrived))
+    sensor = Sensor("imu", ("a", "b"), lambda message: message)
+    t, values = bags._load(Path("x.mcap"), LogSource(stamp="log"), sensor)
+    assert t.tolist() == [7.0, 7.1, 7.2]
+    assert values.tolist() == [[1.0, 10.0], [2.0, 20.0], [3.0, 30.0]]
+
+
+def test_the_last_command_before_each_message_is_held():
+    """Intervals of 0.1, 0.2 and 0.5 s; a command at the time of a message counts for it."""
+    t, sent = np.array([5.0, 5.1, 5.15, 5.4, 5.6, 6.0]), np.array([5.2, 5.1, 5.9, 5.4])
+    rows = {"time": t, "q_a": 10.0 * t, "tau_a": -t}
+    commands = {"time": sent, "qref_a": np.array([2.0, 1.0, 4.0, 3.0])}
+
+    def table(columns):
+        return Table(list(columns), lambda wanted: {name: columns[name] for name in wanted})
+
+    found = bags._with_commands(table(rows), table(commands), (t, np.sort(sent)), "goal")
+    assert found.names == ["time", "q_a", "tau_a", "qref_a"]
+    read = found.read(["time", "qref_a", "q_a"])
+    assert read["time"].tolist() == t[1:].tolist()
+    assert read["qref_a"].tolist() == [1.0, 1.0, 3.0, 3.0, 4.0]
+    assert read["q_a"].tolist() == (10.0 * t[1:]).tolist()
+    assert found.notes == (
+        "a zero-order hold is applied to the commands of topic 'goal', with a median interval of "
+        "200 ms; messages before the first command, left out: 1; messages after the last "
+        "command: 1",
+    )
