@@ -12,7 +12,9 @@ from robotid.constrained.contacts import (
     _check_slip,
     _contact_jacobian,
     _loaded,
+    _of_pairs,
     _radius,
+    _relative,
     _rolling,
     check_base,
     flag_delay,
@@ -343,3 +345,43 @@ def test_the_error_of_a_delay_counts_the_scatter_from_step_to_step():
     delay, error = flag_delay(t, flags, speed, spread=0.0)
     assert delay == pytest.approx(0.06, abs=2e-3)
     assert error == pytest.approx(stdtrit(20, 0.975) * 1.858 * 0.02 / np.sqrt(22), abs=2e-3)
+
+
+def test_velocities_are_relative_to_the_median_of_the_links_in_contact():
+    v = np.array([[[1.0, 5.0, 0.0], [2.0, 3.0, 0.0], [9.0, 4.0, -6.0], [4.0, 0.0, 7.0]]] * 3)
+    flags = np.array([[1, 1, 1, 0], [1, 0, 0, 1], [0, 0, 1, 0]], dtype=bool)
+    found = _relative(v, flags)
+    np.testing.assert_allclose(found[0], v[0] - [2.0, 4.0, 0.0])
+    np.testing.assert_allclose(found[1], v[1] - [2.5, 2.5, 3.5])
+    assert not found[2].any()  # of one link, nothing is relative
+
+
+def test_pairs_of_links_in_contact_move_alike(robot):
+    rng = np.random.default_rng(3)
+    J, v = rng.normal(size=(2, 3, 3, 9)), rng.normal(size=(2, 9))
+    flags = np.array([[1, 1, 1], [1, 0, 1]], dtype=bool)
+    D, d = _of_pairs(J, flags, v)
+    speed = np.einsum("kcij,kj->kci", J[..., 3:], v[:, 3:])  # without the velocity of the base
+    for k in range(2):
+        found = (D[k] @ v[k, 3:6] + d[k]).reshape(3, 3)
+        for row, (i, j) in zip(found, ((0, 1), (0, 2), (1, 2)), strict=True):
+            wanted = (speed[k, i] - speed[k, j]) * (flags[k, i] and flags[k, j])
+            np.testing.assert_allclose(row, wanted, atol=1e-12)
+
+
+def test_the_radius_has_the_smallest_sum_of_absolute_speeds():
+    """A third of the samples slips; both axes count, the vertical one does not."""
+    rng = np.random.default_rng(4)
+    rolls = np.column_stack([rng.normal(size=(300, 2)) * [1.0, 0.3], np.zeros(300)])
+    v = 0.025 * rolls + 1e-4 * rng.normal(size=(300, 3))
+    v[::3, :2] += 0.2 * rng.normal(size=(100, 2))
+    v[:, 2] = 5.0
+    radius, frame, before, after = _radius(Contact("ball", radius=0.01), v, rolls)
+    change = radius - 0.01
+    tried = change + 1e-3 * np.linspace(-1.0, 1.0, 201)
+    sums = [np.abs(v[:, :2] - x * rolls[:, :2]).sum() for x in tried]
+    assert sums[100] == pytest.approx(min(sums), rel=1e-6)
+    assert (frame, radius) == ("ball", pytest.approx(0.035, abs=2e-4))
+    own = [np.median(np.linalg.norm(v[:, :2] - x * rolls[:, :2], axis=1)) for x in (0.0, change)]
+    assert [before, after] == pytest.approx(own)
+    assert _radius(Contact("ball", radius=0.01), v, 0.0 * rolls) is None
