@@ -3,6 +3,7 @@
 import re
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -331,3 +332,22 @@ def test_the_last_command_before_each_message_is_held():
         "200 ms; messages before the first command, left out: 1; messages after the last "
         "command: 1",
     )
+
+
+def test_a_field_of_a_controller_is_of_the_first_point_that_has_a_number():
+    """Joints without a command are NaN; the output comes before the reference."""
+    nan = float("nan")
+    message = SimpleNamespace(
+        feedback=SimpleNamespace(positions=[1.0, 2.0], velocities=[nan, nan], effort=[]),
+        actual=SimpleNamespace(positions=[9.0, 9.0], velocities=[3.0, nan], effort=[5.0, 6.0]),
+        output=SimpleNamespace(positions=[nan, nan], velocities=[nan, 7.0]),
+        reference=SimpleNamespace(positions=[0.1, nan], velocities=[8.0, 8.0], effort=[nan, nan]),
+        desired=SimpleNamespace(positions=[0.3, 0.4], velocities=[4.0, 4.0], effort=[nan, 0.5]),
+    )
+    found = bags._controlled(message)
+    np.testing.assert_array_equal(found["position"], [1.0, 2.0])
+    np.testing.assert_array_equal(found["velocity"], [3.0, nan])
+    np.testing.assert_array_equal(found["effort"], [5.0, 6.0])
+    np.testing.assert_array_equal(found["qref"], [0.1, nan])
+    np.testing.assert_array_equal(found["dqref"], [nan, 7.0])
+    np.testing.assert_array_equal(found["tauref"], [nan, 0.5])

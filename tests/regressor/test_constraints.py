@@ -136,6 +136,8 @@ def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(quadrupe
     rest = np.arange(7) != 4
     np.testing.assert_allclose(found.tau[rest], predicted[rest], atol=1e-10)
     assert np.abs(found.tau).max() > 1.0
+    own = tau + np.einsum("kmj,km->kj", J[:, measured], f[:, measured])
+    np.testing.assert_allclose(found.loaded, own, atol=1e-12)
     assert not used[4].any()
     assert used[rest].all()
     unknown = np.linalg.matrix_rank(np.delete(J, measured, axis=1))
