@@ -23,9 +23,9 @@ def test_units_that_differ_are_named_and_left_out_of_the_prediction():
     rng = np.random.default_rng(5)
     x = -2.0 + 0.1 * rng.normal(size=30)
     alike, _ = between_units(x, np.full(30, 0.02), 1e-4)
-    x[[7, 20]] += [1.5, -3.0]
+    x[[7, 20]] += [-3.0, 1.5]
     prediction, unlike = between_units(x, np.full(30, 0.02), 1e-4)
-    assert [each.unit for each in unlike] == [7, 20]  # the most unlikely first, found last
+    assert [each.unit for each in unlike] == [20, 7]  # the most unlikely first, found last
     assert unlike[0].probability < 1e-3 * unlike[1].probability
     assert all(each.probability < 1e-4 for each in unlike)
     assert prediction.mean == pytest.approx(alike.mean, abs=0.03)
