@@ -351,3 +351,25 @@ def test_a_field_of_a_controller_is_of_the_first_point_that_has_a_number():
     np.testing.assert_array_equal(found["qref"], [0.1, nan])
     np.testing.assert_array_equal(found["dqref"], [nan, 7.0])
     np.testing.assert_array_equal(found["tauref"], [nan, 0.5])
+
+
+def test_messages_of_several_joints_are_read_in_their_order():
+    """Messages 0, 2 and 5 are of one joint with two fields, 1 and 3 of another order of joints."""
+    one, two = (("a",), ("position", "effort")), (("b", "a"), ("position",))
+    blocks = {two: bags._Block(), one: bags._Block()}
+    for layout, number, values in (
+        (one, 0, [0.1, 7.0]), (two, 1, [9.0, 0.2]), (one, 2, [0.3, 8.0]), (two, 3, [9.5, 0.4]),
+        (one, 5, [0.5, 6.0]),
+    ):  # fmt: skip
+        blocks[layout].number.append(number)
+        blocks[layout].stamp.append(5_000_000_000 + 10_000_000 * number)
+        blocks[layout].values.extend(values)
+    found = bags._read("run", blocks, ["time", "position_a"])
+    np.testing.assert_allclose(found["time"], [5.0, 5.01, 5.02, 5.03, 5.05])
+    np.testing.assert_allclose(found["position_a"], [0.1, 0.2, 0.3, 0.4, 0.5])
+    with pytest.raises(
+        DataError, match=r"run: 3 of 5 messages lack .* first \(message 0\) lacks p"
+    ):
+        bags._read("run", blocks, ["position_a", "position_b"])
+    with pytest.raises(DataError, match=r"5 of 5 messages lack .*, the first \(message 0\) lacks"):
+        bags._read("run", blocks, ["effort_a", "position_b"])

@@ -475,3 +475,12 @@ def test_a_unit_that_differs_is_tested_with_all_its_runs_and_without_their_devia
     assert found.std_error == pytest.approx(np.sqrt(variance))
     assert found.ends == pytest.approx(expected.ends)
     assert found.probability == pytest.approx(expected.probability)
+
+
+def test_only_parameters_of_which_a_run_has_information_vary():
+    rng = np.random.default_rng(6)
+    group = stated("b", rng.normal(size=(5, 3)), 0.1)
+    H = group.runs.H * np.diag([1.0, 0.0, 1.0])
+    runs = replace(group.runs, H=H, h=np.einsum("kij,kj->ki", H, rng.normal(size=(5, 3))))
+    found = vary(list("abcde"), (replace(group, runs=runs),)).parameters
+    assert [each.name for each in found] == ["b.0", "b.2"]
