@@ -8,6 +8,7 @@ import pinocchio as pin
 import pytest
 from helpers.paths import URDF
 
+from robotid.closed_loop import fit
 from robotid.closed_loop.fit import stated_loops
 from robotid.closed_loop.initial_values import (
     first_loops,
@@ -17,9 +18,10 @@ from robotid.closed_loop.initial_values import (
     typical_sizes,
     typical_sizes_of_torques,
 )
-from robotid.closed_loop.second_order import SecondOrder, _better
+from robotid.closed_loop.second_order import _FREQUENCIES, SecondOrder, _better
 from robotid.closed_loop.settings import LoopSettings
 from robotid.closed_loop.zeros import _Motion
+from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
@@ -277,3 +279,42 @@ def test_each_joint_has_all_of_the_trial_that_suits_it_best(planar, logged):
             np.testing.assert_array_equal(getattr(found, name), wanted)
         own = np.r_[second.values[:3], first.values[3:]], np.r_[first.values[:3], second.values[3:]]
         np.testing.assert_array_equal(found.values, own[j])
+
+
+def test_inertia_and_time_constant_of_a_second_order_model_are_those_of_each_joint(planar):
+    """Of damping 0.7 / 50 or oscillation; an inertia below a thousandth of the fastest is not."""
+    plain = plain_model(planar, [0.2, 1e-9], [50.0, 80.0], kd=[0.3, 4.0])
+    fastest = 80.0 / _FREQUENCIES[-1] ** 2
+    np.testing.assert_allclose(plain.inertia, [0.2, fastest])
+    np.testing.assert_allclose(plain.time_constant, [np.sqrt(0.2 / 50), (4.0 + 0.8) / 80])
+    found = [plain.friction(name).tolist() for name in ("viscous", "coulomb", "offset")]
+    assert found == [[0.4, 0.8], [0.3, 0.6], [0.1, -0.2]]
+
+
+@pytest.mark.parametrize("speeds", [(True, True), (True, False)])
+def test_whitening_and_free_gains_are_those_of_all_logs(planar, monkeypatch, speeds):
+    """Logs of 200 and 125 Hz: the longer step counts; kd is free if all logs have speeds."""
+    logs = []
+    for rate, has_speed in zip((200.0, 125.0), speeds, strict=True):
+        t = 3.0 + np.arange(300) / rate
+        q = np.column_stack([0.5 * np.sin(6 * t), 0.7 * np.cos(4 * t)])
+        logs.append(Log(t, q, 0 * q, planar.joints, q_ref=q + 0.01, has_torque=False,
+                        v_ref=0 * q if has_speed else None))  # fmt: skip
+    plain = plain_model(planar, [0.2, 0.1], [50.0, 80.0], kd=[0.3, 4.0])
+    seen = []
+    monkeypatch.setattr(fit, "fit_second_order", lambda *x, **how: seen.append((x, how)) or plain)
+    loop, asked = LoopSettings(delay=0.01), SimulationSettings(window=0.5, lead=0.1, bodies=0.0)
+    found = fit._initialise_from_commands(planar, logs, loop, asked, None, lambda *_: None)
+    most = np.exp(-2.0 * 0.008 / plain.time_constant)
+    np.testing.assert_allclose(found.estimator.most, np.tile(most, 3))
+    names = found.simulator.names
+    assert any(name.endswith(".kd") for name in names) == all(speeds)
+    assert any(name.endswith(".kp") for name in names)
+    assert not any(name.endswith(".delay") for name in names)  # stated
+    [(given, how)] = seen
+    assert how == {"finds_delay": False}
+    np.testing.assert_allclose(given[2].delay, 0.01)
+    lengths = {round(float(w.log.t[w.stop - 1] - w.log.t[w.first]), 1) for w in given[1]}
+    assert max(lengths) == 0.5
+    assert {id(w.log) for w in given[1]} == {id(w.log) for w in found.simulator.windows}
+    assert len({id(w.log) for w in given[1]}) == 2

@@ -10,10 +10,14 @@ from helpers.crane import identified_crane
 
 from robotid.closed_loop import findings, result
 from robotid.closed_loop.findings import loop_findings
+from robotid.closed_loop.gain_check import GainScale
 from robotid.closed_loop.initial_values import _speed
 from robotid.closed_loop.result import LoopIdentification, logged_motion
+from robotid.closed_loop.runs import units_of
 from robotid.closed_loop.settings import LoopSettings
+from robotid.closed_loop.term_choice import Tried
 from robotid.closed_loop.zeros import Encoders
+from robotid.findings import Finding
 from robotid.fitting.bands import QUANTILE
 from robotid.logs.data import Log
 from robotid.simulation.loops import cut_windows
@@ -223,6 +227,8 @@ def test_encoders_are_told_with_the_figures_of_their_own_joint(found):
         said = loop_findings(replace(found, fit=fit, loop=loop), ())
         return {f.code: f for f in said if f.code.startswith("encoder")}
 
+    [open_] = told(margin=[0.13, 0.05]).values()
+    assert open_.evidence == {"margin": 0.13}
     [open_] = told(margin=[0.05, 0.13]).values()
     assert (open_.where, open_.evidence) == ("rail, turn", {"margin": 0.13})
     assert "leaves at most 13 % more squared position error" in open_.message
@@ -268,3 +274,101 @@ def test_the_usual_speed_of_a_joint_is_the_root_of_its_mean_square():
 def test_a_result_of_wrong_logs_has_no_urdf(found):
     assert found.has_urdf
     assert not replace(found, log_errors=("the command is delayed",)).has_urdf
+
+
+def test_findings_of_the_fit_have_its_figures(found):
+    details = {**found.estimate.details, "left": 0.634, "halving": 2.46, "step": 4e-3}
+    scale = GainScale(np.array([0.2, 0.26]), np.array([0.05, 0.04]), 0.234, 0.0152)
+    tried = (
+        Tried("turn", ("stribeck", "load"), 0.316, is_chosen=True),
+        Tried("rail", ("load",), 0.5, is_chosen=False),
+    )
+    own = of(found, details=details, converged=False, n_iter=17)
+    own = replace(own, fit=replace(own.fit, scale=scale, tried=tried))
+    said = {f.code: f for f in loop_findings(own, ())}
+    assert "has not converged after 17 steps" in said["not_settled"].message
+    assert "leaves 63 % of the residual that it should remove, wanted at most 50 %" in (
+        said["soft_loop"].message
+    )
+    assert said["soft_loop"].evidence == {"left": 0.634}
+    assert "halving the steps of 4 ms changes a parameter by 2.5 standard errors" in (
+        said["coarse_steps"].message
+    )
+    gains = said["gains_contradicted"]
+    rail, turn = 1.234 * found.fit.loops.kp
+    assert "weight and inertia indicate gains of 1.23 +- 0.015 times those stated" in gains.message
+    assert f"of kp: rail = {rail:.3g}, turn = {turn:.3g}; kd" in gains.message
+    assert gains.evidence == {"scale": pytest.approx(1.234), "std_error": 0.0152}
+    friction = said["friction_found"]
+    assert friction.where == "turn"
+    assert friction.message == (
+        "turn: stribeck and load lowers the squared error of held-out windows by 32 %"
+    )
+    assert friction.evidence == {"gain_pct": pytest.approx(31.6)}
+    assert said["scale"].severity == "note"
+    quiet = of(found, details={**details, "left": 0.49, "halving": 0.99})
+    codes = {f.code for f in loop_findings(quiet, ())}
+    assert not codes & {"not_settled", "soft_loop", "coarse_steps", "gains_contradicted"}
+
+
+def test_a_delay_that_the_fit_determines_is_a_note(found):
+    """Within a tenth of the 30 ms that one response leaves open."""
+    evidence = {"shortest": 0.01, "longest": 0.04, "frequency": 3.46}
+    slow = Finding("slow_command", "warning", "a.csv", "a.csv: slow", evidence)
+    delay, std = NAMES.index("robot.delay"), found.estimate.std_error.copy()
+
+    def settled(error, **changes):
+        std[delay] = error
+        details = {**found.estimate.details, **changes}
+        own = of(found, covariance=np.diag(std**2), details=details)
+        return next(f for f in loop_findings(own, (slow,)) if f.code == "slow_command")
+
+    note = settled(2.9e-3)
+    assert (note.severity, note.evidence) == ("note", {**evidence, "std_error": 2.9e-3})
+    assert "the fit determines it to +- 2.9 ms" in note.message
+    assert "power only up to 3.5 Hz" in note.message
+    assert settled(3.1e-3) == slow
+    bound = settled(1e-4, at_bound=("robot.delay",))
+    assert bound.severity == "warning"
+    assert bound.message.startswith("a.csv: slow. The delay of the fit is 0, its lower bound")
+    fixed = tuple(x for x in found.fit.simulator.free_parameters if x.what != "delay")
+    keep = [k for k in range(5) if k != delay]
+    estimate = replace(
+        found.estimate, theta=found.estimate.theta[keep],
+        covariance=found.estimate.covariance[np.ix_(keep, keep)],
+        names=tuple(np.array(NAMES)[keep].tolist()),
+    )  # fmt: skip
+    simulator = replace(found.fit.simulator, free_parameters=fixed)
+    fit = SimpleNamespace(simulator=simulator)
+    stated = findings._settled_delay(slow, SimpleNamespace(fit=fit, estimate=estimate))
+    assert "[controller] states it" in stated.message
+    assert stated.evidence["std_error"] == 0.0
+
+
+def test_units_of_a_rail_and_of_a_joint_that_turns(found):
+    """The rail is prismatic."""
+    wanted = {"kp": ("N/m", "N m/rad"), "kd": ("N s/m", "N m s/rad"), "zero": ("m", "rad"),
+              "limit": ("N", "N m"), "armature": ("kg", "kg m^2"), "delay": ("s", "s")}  # fmt: skip
+    free = found.fit.simulator.free_parameters[0]
+    for what, units in wanted.items():
+        own = [replace(free, name="x", what=what, joints=(j,), term=None) for j in (0, 1)]
+        assert tuple(units_of(found.model, x) for x in own) == units
+
+
+def test_metrics_are_those_of_each_joint_in_its_unit(found):
+    metrics, runs = found.metrics(), found.fitted
+    assert len(runs) == 2
+    for j, joint in enumerate(("rail", "turn")):
+        own = metrics.per_joint[joint]
+        assert own.unit == ("m", "rad")[j]
+        rmse = [np.sqrt(np.mean((x.log.q - x.q)[:, j] ** 2)) for x in runs]
+        spread = [np.std(x.log.q[:, j]) for x in runs]
+        command = [np.sqrt(np.mean((x.log.q_ref - x.log.q)[:, j] ** 2)) for x in runs]
+        size = np.linalg.norm(spread)
+        assert own.rmse == pytest.approx(np.linalg.norm(rmse) / np.sqrt(2))
+        assert own.relative_error_pct == pytest.approx(100 * np.linalg.norm(rmse) / size)
+        assert own.baselines["command"] == pytest.approx(100 * np.linalg.norm(command) / size)
+        assert own.r2 == pytest.approx(1.0 - (np.linalg.norm(rmse) / size) ** 2)
+        assert own.rows == sum(len(x.log.t) for x in runs)
+    each = [np.sqrt(np.mean((x.log.q - x.q) ** 2, axis=0)) for x in runs]
+    assert metrics.pooled_rmse == pytest.approx(np.sqrt(np.mean(np.square(each))))

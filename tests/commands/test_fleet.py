@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet
@@ -13,11 +14,12 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
 from robotid.commands import fleet
-from robotid.commands.fleet import read_fleet, run_fleet
+from robotid.commands.fleet import UnitResult, _Gathered, read_fleet, run_fleet
 from robotid.exceptions import DataError, WorkerError
 from robotid.log_files.read import write_log
 from robotid.report.fleet import fleet_page
 from robotid.robot.model import RobotModel
+from robotid.variation.units import between_units
 from robotid.workers.checkpoint import FOLDER
 from robotid.workers.plan import WorkPlan
 from robotid.workers.processes import SerialBackend
@@ -262,3 +264,55 @@ def test_the_command_prints_what_failed_and_takes_a_parquet_table(table, tmp_pat
     content = json.loads(capsys.readouterr().out)
     assert content == json.loads((tmp_path / "out" / "fleet.json").read_text())
     assert content["failures"][1]["log"] == str(tmp_path / "none.csv")
+
+
+def test_units_are_compared_by_parameter_robot_and_expression():
+    """Five units and a failed one; of one robot only two, and one value without an error."""
+    rng, gathered = np.random.default_rng(3), _Gathered()
+    x = np.array([4.0, -2.0]) + [0.1, 0.05] * rng.normal(size=(5, 2))
+    x[1, 0], x[3, 1] = 70.0, -60.0
+    errors = 0.02 * np.exp(rng.normal(size=(5, 2)))
+    units = [SimpleNamespace(logs=range(k + 1)) for k in range(8)]
+    for k in range(5):
+        rows = [
+            {"unit": f"u{k}", "status": "done", "verdict": "good" if k % 2 else "usable",
+             "parameter": name, "parameter_unit": unit, "value": x[k, p],
+             "std_error": None if (k, p) == (0, 1) else errors[k, p]}
+            for p, (name, unit) in enumerate((("a.coulomb", "N m"), ("b.m", "kg")))
+        ]  # fmt: skip
+        rows.append(rows[0] | {"log": "x.csv", "value": 99.0})  # of one log: not compared
+        rows.append({"unit": f"u{k}", "status": "failed", "log": f"{k}.csv", "error": "lost"})
+        gathered.add(UnitResult(rows, "arm", {"a.coulomb": "a.coulomb", "b.m": "b.m + 2 c.m"}))
+    for k in (5, 6):
+        row = {"unit": f"u{k}", "status": "done", "verdict": "good", "parameter": "b.m",
+               "parameter_unit": "kg", "value": 1.0, "std_error": 0.1}  # fmt: skip
+        gathered.add(UnitResult([row], "leg", {"b.m": "b.m"}))
+    gathered.add(UnitResult([{"unit": "u7", "status": "failed", "error": "bad"}], "", {}))
+    found = gathered.content(units)
+    assert (found["units"], found["logs"], found["done"]) == (8, 36, 7)
+    assert found["verdicts"] == {"usable": 3, "good": 4}
+    assert found["failures"][0] == {"unit": "u0", "log": "0.csv", "error": "lost"}
+    assert found["failures"][-1] == {"unit": "u7", "log": "", "error": "bad"}
+    unlike = []
+    for p, entry in enumerate(found["parameters"]):
+        rows = slice(p, None)  # the first has no error of the second parameter
+        own = x[rows, p].tolist()
+        prediction, different = between_units(x[rows, p], errors[rows, p], 0.02 / 9)  # 5 + 4
+        assert (entry["robot"], entry["name"], entry["unit"]) == (
+            "arm", ("a.coulomb", "b.m")[p], ("N m", "kg")[p]
+        )  # fmt: skip
+        assert entry["expression"] == ("a.coulomb", "b.m + 2 c.m")[p]
+        assert (entry["units"], entry["values"]) == (len(own), own)
+        assert entry["spread_interval"] == prediction.spread_ends.tolist()
+        assert entry["next_interval"] == prediction.ends.tolist()
+        figures = entry["mean"], entry["std_error"], entry["spread"]
+        assert figures == (prediction.mean, prediction.std_error, prediction.spread)
+        unlike += [(each.probability, f"u{each.unit + p}", p) for each in different]
+    assert len(found["parameters"]) == 2
+    assert [each[1] for each in unlike] == ["u1", "u3"]
+    for entry, (probability, unit, p) in zip(found["unlike"], sorted(unlike), strict=True):
+        k = int(unit[1])
+        assert (entry["unit"], entry["probability"]) == (unit, probability)
+        assert entry["parameter"] == ("a.coulomb", "b.m")[p]
+        assert (entry["value"], entry["std_error"]) == (x[k, p], errors[k, p])
+        assert entry["others"] == found["parameters"][p]["next_interval"]

@@ -133,3 +133,8 @@ def test_a_turn_of_the_tag_is_found_and_one_in_a_gap_is_not(log):
     assert " rad: " in found.message
     apart = np.where(np.arange(len(log.t)) < 150, log.t, log.t + 5.0)
     assert not list(check_pose(replace(jumped, t=apart)))
+    after = log.base.pose.copy()
+    after[150, 0] += 0.05
+    after[151:, 0] -= 0.1  # the step after a gap has no step before it
+    assert list(check_pose(replace(log, base=BaseMotion(after))))
+    assert not list(check_pose(replace(log, t=apart, base=BaseMotion(after))))

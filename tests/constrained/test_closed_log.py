@@ -10,11 +10,14 @@ import pytest
 from robotid.constrained.closed_log import closed_log
 from robotid.exceptions import ModelError
 from robotid.log_files.read import read_log
+from robotid.logs.imu import ImuFrame, ImuMotion
 from robotid.logs.settings import BaseSource
 from robotid.regressor.constraints import logged_base
 from robotid.robot.constraints import frame_id
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+
+FRAME = ImuFrame(np.r_[0, 0, 0, 1.0], np.zeros(3), np.r_[0, 0, -9.81], np.zeros(3))
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +48,12 @@ def test_the_pose_of_the_root_follows_from_that_of_a_moving_link(robot, link, ha
     if not has_position:
         pose = log.base.pose * np.r_[0, 0, 0, np.ones(4)]
         log = replace(log, base=replace(log.base, pose=pose))
-    found = closed_log(robot, log).base
+    imu = ImuMotion(rng.normal(size=(n, 6)), FRAME)
+    closed = closed_log(robot, replace(log, base=replace(log.base, imu=imu)))
+    found = closed.base
+    assert found.imu is imu
+    if link != "base_link":
+        assert closed.notes[-1] == f"the pose of the base is computed from that of {link}"
     assert found.link == ""
     signs = np.sign(np.sum(found.pose[:, 3:] * roots[:, 3:], axis=1))
     np.testing.assert_allclose(found.pose[:, 3:], signs[:, None] * roots[:, 3:], atol=1e-12)
@@ -56,6 +64,8 @@ def test_the_pose_of_the_root_follows_from_that_of_a_moving_link(robot, link, ha
     assert found.has_position == has_position
     if has_position:
         np.testing.assert_allclose(found.pose[:, :3], roots[:, :3], atol=1e-12)
+    else:
+        assert not found.pose[:, :3].any()
 
 
 def test_an_unknown_link_is_named(robot):

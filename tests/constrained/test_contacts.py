@@ -1,19 +1,30 @@
 """Findings on the motion of a floating base and on contacts."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.special import stdtrit
 
-from robotid.constrained.contacts import _radius, _rolling, check_base, flag_delay
+from robotid.constrained.contacts import (
+    _check_slip,
+    _contact_jacobian,
+    _loaded,
+    _of_pairs,
+    _radius,
+    _relative,
+    _rolling,
+    check_base,
+    flag_delay,
+)
 from robotid.judgement.verdict import warnings_of
 from robotid.logs.base import BaseMotion, base_state
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
-from robotid.robot.constraints import Contact
+from robotid.robot.constraints import Contact, frame_id
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -258,4 +269,132 @@ def test_a_twist_with_the_axes_of_the_world_is_found(robot, walk, part):
     assert f"{words}{size:.2g} {unit} (RMS)" in found.message
     doubled = replace(right, base=BaseMotion(pose, 2.0 * twist))
     other = next(check_base(free, doubled, RAW))
+    linear = np.sqrt(np.mean(np.sum(twist[:, :3] ** 2, axis=1)))  # m/s
+    assert [other.evidence[x] for x in ("off", "size")] == pytest.approx([linear, linear])
     assert "Check the columns base_vx to base_wz, or remove them" in other.message
+
+
+def test_a_foot_of_measured_force_is_on_the_ground_above_a_tenth_of_its_largest_force():
+    t = 3.0 + 0.1 * np.arange(4)
+    contact = Contact("foot", measured=("fx", "fz"))
+    forces = {"fx foot": np.array([60.0, -7.0, 0.0, 3.0]), "fz foot": np.array([80.0, 8, 9, 9.9])}
+    log = Log(t, np.zeros((4, 1)), np.zeros((4, 1)), ("a",), wrenches=forces)
+    times = np.array([3.3, 3.25, 3.1, 3.0])
+    assert _loaded(contact, log, times).tolist() == [True, False, True, True]
+
+
+def slipping(cutoff, speed):
+    """Return the finding on a foot that stands from 2 to 5 s of 10 s, and slips in between."""
+    t = 2.0 + 0.01 * np.arange(1000)
+    log = Log(t, np.zeros((1000, 1)), np.zeros((1000, 1)), ("a",), path="a/walk.csv")
+    flags = (t >= 3.995) & (t < 6.995)
+    motion = SimpleNamespace(t=t)
+    rng, both = np.random.default_rng(0), np.zeros((2, 1000, 3))
+    both[:, 303:401] += [[0.6 * speed, -0.8 * speed, 0.0]]
+    both[1] += 0.3  # the other way to measure it is never the slower one
+    return list(_check_slip("foot", log, flags, motion, both + 0.001 * rng.normal(size=both.shape),
+                            SignalSettings(cutoff=cutoff)))  # fmt: skip
+
+
+def test_a_slip_is_stated_as_a_share_of_the_time_in_contact_with_its_speed_and_distance():
+    """3 s in contact less 0.03 s, and 1 / cutoff, at either end; 0.98 s in windows of 0.2 s."""
+    for cutoff, inside in ((None, 2.94), (5.0, 2.54)):
+        (found,) = slipping(cutoff, 0.2)
+        share, speed, distance = (found.evidence[k] for k in ("share", "speed", "distance"))
+        assert share == pytest.approx(0.98 / inside, abs=1e-3)
+        assert speed == pytest.approx(0.2, rel=0.02)
+        assert distance == pytest.approx(0.98 * 0.2, rel=0.02)
+        assert found.message.startswith(
+            f"walk.csv: the link foot slips in {share:.0%} of its time in contact, at {speed:.2g} "
+            f"m/s (RMS), {distance:.2g} m in total"
+        )
+    assert slipping(None, 0.045) == []
+
+
+@pytest.mark.parametrize(("size", "is_slip"), [(1.0, True), (2.0, False)])
+def test_a_slip_exceeds_three_standard_errors_of_its_window(size, is_slip):
+    """Mean 0.4 m/s over 20 rows; scatter of 0.45 m/s times size: 3 / sqrt(20) of it is 0.3."""
+    t = 1.0 + 0.01 * np.arange(30)
+    log = Log(t, np.zeros((30, 1)), np.zeros((30, 1)), ("a",))
+    v = np.zeros((30, 3))
+    v[:, 1] = 0.4 + 0.45 * size * np.where(np.arange(30) % 2, 1.0, -1.0)
+    found = list(_check_slip("foot", log, np.ones(30, dtype=bool), SimpleNamespace(t=t), [v], RAW))
+    assert [x.code for x in found] == ["slipping_foot"] * is_slip
+
+
+def test_each_contact_has_the_velocity_of_its_own_point(robot):
+    """Of a ball, the point below its centre; the turn is that of its link."""
+    rng = np.random.default_rng(1)
+    contacts = (Contact(FEET[1], "surface"), Contact(FEET[0], radius=0.04),
+                Contact("FR_FOOT", radius=0.01))  # fmt: skip
+    model = replace(robot, constraints=contacts)
+    pose = np.r_[rng.normal(size=3), pin.Quaternion(pin.exp3(rng.normal(size=3))).coeffs()]
+    q, v = np.r_[pose, rng.uniform(-1, 1, 12)][None], rng.normal(size=18)
+    J, turn = _contact_jacobian(model, q)
+    places = []
+    for step in (-1e-6, 0.0, 1e-6):
+        data = model.pin_model.createData()
+        x = pin.integrate(
+            model.pin_model, model.configurations(q)[0], model.velocity_map @ v * step
+        )
+        pin.framesForwardKinematics(model.pin_model, data, x)
+        places.append([data.oMf[frame_id(model.pin_model, x.frame)].copy() for x in contacts])
+    for k, contact in enumerate(contacts):
+        before, now, after = (own[k] for own in places)
+        point = now.actInv(now.translation - [0.0, 0.0, contact.radius])
+        speed = (after.act(point) - before.act(point)) / 2e-6
+        np.testing.assert_allclose(J[0, k] @ v, speed, atol=1e-7)
+        w = pin.log3(after.rotation @ before.rotation.T) / 2e-6
+        np.testing.assert_allclose(turn[0, k] @ v, w, atol=1e-7)
+
+
+def test_the_error_of_a_delay_counts_the_scatter_from_step_to_step():
+    """Delays of 0.06 s with offsets 0, +-20 and +-40 ms: their median distance is 20 ms."""
+    t = 7.0 + 0.002 * np.arange(5500)
+    cycle, phase = (t // 1.0).astype(int), t % 1.0
+    late = 0.06 + np.array([0.0, 0.02, -0.02, 0.04, -0.04])[(cycle - 7) % 5]
+    speed = np.where((phase > 0.399) & (phase < 0.799), 0.8, 0.003)
+    flags = (phase < 0.399 + late) | (phase > 0.799 + late)
+    delay, error = flag_delay(t, flags, speed, spread=0.0)
+    assert delay == pytest.approx(0.06, abs=2e-3)
+    assert error == pytest.approx(stdtrit(20, 0.975) * 1.858 * 0.02 / np.sqrt(22), abs=2e-3)
+
+
+def test_velocities_are_relative_to_the_median_of_the_links_in_contact():
+    v = np.array([[[1.0, 5.0, 0.0], [2.0, 3.0, 0.0], [9.0, 4.0, -6.0], [4.0, 0.0, 7.0]]] * 3)
+    flags = np.array([[1, 1, 1, 0], [1, 0, 0, 1], [0, 0, 1, 0]], dtype=bool)
+    found = _relative(v, flags)
+    np.testing.assert_allclose(found[0], v[0] - [2.0, 4.0, 0.0])
+    np.testing.assert_allclose(found[1], v[1] - [2.5, 2.5, 3.5])
+    assert not found[2].any()  # of one link, nothing is relative
+
+
+def test_pairs_of_links_in_contact_move_alike(robot):
+    rng = np.random.default_rng(3)
+    J, v = rng.normal(size=(2, 3, 3, 9)), rng.normal(size=(2, 9))
+    flags = np.array([[1, 1, 1], [1, 0, 1]], dtype=bool)
+    D, d = _of_pairs(J, flags, v)
+    speed = np.einsum("kcij,kj->kci", J[..., 3:], v[:, 3:])  # without the velocity of the base
+    for k in range(2):
+        found = (D[k] @ v[k, 3:6] + d[k]).reshape(3, 3)
+        for row, (i, j) in zip(found, ((0, 1), (0, 2), (1, 2)), strict=True):
+            wanted = (speed[k, i] - speed[k, j]) * (flags[k, i] and flags[k, j])
+            np.testing.assert_allclose(row, wanted, atol=1e-12)
+
+
+def test_the_radius_has_the_smallest_sum_of_absolute_speeds():
+    """A third of the samples slips; both axes count, the vertical one does not."""
+    rng = np.random.default_rng(4)
+    rolls = np.column_stack([rng.normal(size=(300, 2)) * [1.0, 0.3], np.zeros(300)])
+    v = 0.025 * rolls + 1e-4 * rng.normal(size=(300, 3))
+    v[::3, :2] += 0.2 * rng.normal(size=(100, 2))
+    v[:, 2] = 5.0
+    radius, frame, before, after = _radius(Contact("ball", radius=0.01), v, rolls)
+    change = radius - 0.01
+    tried = change + 1e-3 * np.linspace(-1.0, 1.0, 201)
+    sums = [np.abs(v[:, :2] - x * rolls[:, :2]).sum() for x in tried]
+    assert sums[100] == pytest.approx(min(sums), rel=1e-6)
+    assert (frame, radius) == ("ball", pytest.approx(0.035, abs=2e-4))
+    own = [np.median(np.linalg.norm(v[:, :2] - x * rolls[:, :2], axis=1)) for x in (0.0, change)]
+    assert [before, after] == pytest.approx(own)
+    assert _radius(Contact("ball", radius=0.01), v, 0.0 * rolls) is None

@@ -9,6 +9,7 @@ from helpers.paths import JOBS
 
 from robotid.commands.job import read_job
 from robotid.constrained.contacts import check_base
+from robotid.constrained.imu import _named, _turn
 from robotid.logs.base import BaseMotion, base_state, in_base, quaternions_of_angles
 from robotid.logs.data import Log
 from robotid.logs.imu import ImuFrame, ImuMotion
@@ -217,3 +218,49 @@ def test_what_other_axes_leave_is_stated_as_a_share_of_the_motion(robot, sway):
     assert found.evidence["best"] == pytest.approx(best, rel=0.1)
     shown = f"{found.evidence['off']:.0%} of the motion, {found.evidence['best']:.0%} at best"
     assert shown in found.message
+
+
+def test_the_mean_specific_force_in_the_world_is_stated_for_a_robot_that_drives_a_curve():
+    """1.5 m/s forwards, 0.9 rad/s about the vertical: the centripetal acceleration is in it."""
+    free = RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True, terms=())
+    t = 4.0 + 0.02 * np.arange(150)
+    yaw = 0.9 * (t - 4.0)
+    pose = np.zeros((len(t), 7))
+    pose[:, :2] = 1.5 / 0.9 * np.column_stack([np.sin(yaw), 1.0 - np.cos(yaw)])
+    pose[:, 3:] = quaternions_of_angles(np.column_stack([0 * t + 0.05, 0 * t - 0.1, yaw]))
+    _, v, a = base_state(t, pose, None, None)
+    f = a[:, :3] + np.cross(v[:, 3:], v[:, :3]) - in_base(pose[:, 3:], G)
+    q = np.zeros((len(t), 12))
+    log = Log(t, q, q, free.joints, base=BaseMotion(pose, imu=ImuMotion(
+        np.hstack([v[:, 3:], 1.4 * f]), FRAME)))  # fmt: skip
+    (found,) = check_base(free, log, RAW)
+    world = [pin.XYZQUATToSE3(x).rotation @ y for x, y in zip(pose, f, strict=True)]
+    mean = 1.4 * np.mean(world, axis=0)
+    size = np.linalg.norm(mean)
+    angle = np.degrees(np.arccos(mean[2] / size))
+    assert angle > 4.0
+    assert found.evidence["size"] == pytest.approx(size, rel=5e-3)
+    assert found.evidence["angle"] == pytest.approx(angle, abs=0.3)
+    assert f"is {size:.3g} m/s^2 on average, {angle:.0f} deg from the vertical" in found.message
+    assert "wanted 9.81 m/s^2 upwards: its scale is wrong" in found.message
+    assert not list(check_base(free, log.window(4.0, 5.9), RAW))  # too short for a mean
+
+
+def test_the_turn_is_the_rotation_that_explains_the_motion():
+    rng = np.random.default_rng(3)
+    R, w, D = pin.rpy.rpyToMatrix(0.5, -0.3, 0.9), *rng.normal(size=(2, 200, 3))
+    D = rng.normal(size=(200, 2, 3))
+    d = -np.einsum("kij,jl,kl->ki", D, R, w)
+    np.testing.assert_allclose(_turn(w, D, d), R, atol=2e-3)
+    # a matrix with a small reversed axis: the nearest rotation, not the nearest reflection
+    P = R @ np.diag([1.0, 1.0, -0.3])
+    np.testing.assert_allclose(_turn(w, D, -np.einsum("kij,jl,kl->ki", D, P, w)), R, atol=2e-3)
+    about_z = w * [0.0, 0.0, 1.0]  # what does not move is not turned
+    np.testing.assert_allclose(
+        _turn(about_z, np.tile(np.eye(3), (200, 1, 1)), -about_z), np.eye(3), atol=1e-9
+    )
+    tilt = pin.exp3(np.radians(50.0) * np.array([0.6, 0.0, 0.8]))
+    Q = pin.rpy.rpyToMatrix(0.1, 1.0, -2.0)
+    assert _named(tilt, Q) == "its axes are turned by 50 deg relative to those of the stated link"
+    cycle = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # x is y, y -z, z -x
+    assert _named(Q @ cycle @ Q.T, Q) == "its axes x, y, z are y, -z, -x of the stated link"

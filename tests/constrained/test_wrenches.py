@@ -8,9 +8,11 @@ import pytest
 from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_segments
 
 from robotid.constrained.contacts import check_base
-from robotid.constrained.wrenches import check_wrenches
+from robotid.constrained.wrenches import _Reading, check_wrenches
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
+from robotid.regressor.constraints import constraint_jacobian
+from robotid.regressor.prediction import predict
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
 
@@ -65,6 +67,21 @@ def found(model, log):
     return list(check_wrenches(model, log, process(log, SLOW)))
 
 
+def parts(model, log):
+    """Return J^T f and W pi, shape (N, n_rows)."""
+    motion, whole = process(log, SLOW), np.ones((1, 2), dtype=bool)
+    torque = predict(replace(model, constraints=()), [model.standard_parameters()], motion)[0]
+    J = constraint_jacobian(model, motion.q, np.repeat(whole, len(motion.t), axis=0))
+    return np.einsum("kmj,km->kj", J, motion.wrenches), torque
+
+
+def unexplained(model, log):
+    """Return the RMS force and moment of W pi - J^T f of the base."""
+    caused, torque = parts(model, log)
+    left = (torque - caused)[:, :6]
+    return [np.sqrt(np.mean(np.sum(x**2, axis=1))) for x in (left[:, :3], left[:, 3:])]
+
+
 def exchanged(log):
     names = {foot: other for foot, other in zip(FEET, FEET[::-1], strict=True)}
     wrenches = {x: log.wrenches[f"{x[:2]} {names[x[3:]]}"] for x in log.wrenches}
@@ -95,6 +112,20 @@ def test_a_fault_of_the_columns_is_named(urdf, log, change, words, factor):
     assert ("exchanged" in finding.message) == ("are exchanged" in " ".join(words))
     assert finding.evidence["factor"] == pytest.approx(factor, rel=0.2)
     assert finding.evidence["best"] < 0.2 * 70 * 9.81  # what masses of the URDF leave
+    force, moment = unexplained(human(urdf), change(log))
+    assert finding.evidence["force"] == pytest.approx(force)
+    shown = f"leave {force:.3g} N and {moment:.3g} N m (RMS) of the base unexplained, but only"
+    assert shown in finding.message
+    right, moment = unexplained(human(urdf), log)
+    if factor > 10.0:  # least squares of force and moment together
+        caused, left = (x[:, :6] for x in parts(human(urdf), change(log)))
+        found_factor = np.sum(caused * left) / np.sum(caused**2)
+        assert finding.evidence["factor"] == pytest.approx(found_factor)
+        assert f"multiplied by about {found_factor:.2g}" in finding.message
+    else:  # as logged, not multiplied by a fitted factor
+        assert finding.evidence["factor"] == factor
+        assert finding.evidence["best"] == pytest.approx(right)
+        assert f"but only {right:.3g} N and {moment:.3g} N m if" in finding.message
 
 
 def test_moments_in_newton_millimetres_are_named(urdf, log):
@@ -188,7 +219,10 @@ def test_steps_beside_the_plates_are_found_with_their_times(urdf, log):
     (finding,) = found(human(urdf), replace(log, wrenches=missed))
     assert (finding.code, finding.severity) == ("measured_wrench", "warning")
     assert finding.evidence["share"] == pytest.approx(1.0 / 5.6, rel=0.1)  # 0.2 s trimmed
+    share = finding.evidence["share"]
+    assert f"half of the weight in {share:.0%} of the samples" in finding.message
     assert "first at 2.0" in finding.message
+    assert ", last at 2.9" in finding.message or ", last at 3 s" in finding.message
 
 
 def test_vertical_forces_alone_show_their_sign_and_foot(urdf, log):
@@ -199,3 +233,28 @@ def test_vertical_forces_alone_show_their_sign_and_foot(urdf, log):
     assert not found(model, vertical)
     (finding,) = found(model, scaled(vertical, -1.0))
     assert "their sign is reversed" in finding.message
+
+
+@pytest.mark.parametrize(
+    ("force", "moment", "is_better"),
+    [
+        (49.0, 10.0, True),  # half of a force that is not small
+        (51.0, 10.0, False),
+        (100.0, 4.9, True),  # half of a moment that is not small
+        (119.0, 4.9, True),
+        (121.0, 4.9, False),  # the force is worse by more than 1.2
+        (49.0, 12.1, False),  # the moment is worse by more than 1.2, and not small
+        (49.0, 11.9, True),
+    ],
+)
+def test_a_better_reading_halves_one_residual_and_keeps_the_other(force, moment, is_better):
+    def reading(force, moment):
+        directions = np.tile([0.6, 0.0, 0.8, 0.0, -1.0, 0.0], (4, 1))
+        return _Reading((), False, 1.0, directions * np.repeat([force, moment], 3))
+
+    stated = reading(100.0, 10.0)
+    assert stated.sizes == pytest.approx((100.0, 10.0))
+    assert reading(force, moment).is_better(stated, (90.0, 9.0)) is is_better
+    small = reading(40.0, 4.0).is_better(stated, (101.0, 11.0))  # both are small already
+    assert small is False
+    assert reading(40.0, 15.0).is_better(stated, (90.0, 16.0)) is True  # a small moment may grow

@@ -240,3 +240,38 @@ def test_postures_are_drawn_from_the_middle_of_wide_ranges(designer):
     postures = replace(designer.postures, limits=replace(designer.limits, sizes=sizes))
     q = postures._drawn(np.random.default_rng(0), 4000) - designer.limits.middle
     np.testing.assert_allclose(np.abs(q).max(axis=0), [0.8, 1.44, 1.44], rtol=0.01)
+
+
+def test_an_examined_motion_is_judged_with_what_is_known_and_its_condition_without(designer, rng):
+    """Of 5 s at 20 Hz from the regressor; the second joint rests and contributes nothing."""
+    size = len(designer.spread)
+    A = rng.standard_normal((size, size))
+    given = np.eye(size) + 0.3 * A @ A.T
+    some = replace(
+        designer, given=given, moving=np.array([True, False, True]), name="widest",
+        noise=np.array([0.01, 0.4, 0.09]),
+    )  # fmt: skip
+    motion = some.checked(some.random(rng)).motion
+    found = some.examined(motion, 5.0, 20.0)
+    t = np.linspace(0.0, 5.0, 101)
+    q, v, a = motion.evaluate(t)
+    rows = some.information.rows(q, v, a)
+    F = given.copy()
+    for j, noise in ((0, 0.01), (2, 0.09)):
+        W = rows.W[j].T * some.spread
+        F += 0.05 / noise * W.T @ W
+    variance = np.diag(np.linalg.inv(F))
+    widest = np.argsort(np.diag(np.linalg.inv(given)))[-round(size / 4) :]
+    assert sorted(some.widest) == sorted(widest)
+    assert found.objective == pytest.approx(np.log(variance[widest]).mean())
+    used = some.limits.used(q, v, a, 0.0 * a, some.information.torque(rows))
+    np.testing.assert_allclose(found.used, np.abs(used).max(axis=1))
+    assert (found.intervals, found.duration) == (100, 5.0)
+    whole = designer.checked(designer.random(rng)).motion  # all joints move
+    alone, rows = designer.examined(whole, 5.0, 20.0), designer.along(*whole.evaluate(t))
+    W = np.concatenate(
+        [np.sqrt(0.05 / n) * w.T * designer.spread
+         for n, w in zip(designer.noise, rows.W, strict=True)]
+    )  # fmt: skip
+    assert alone.condition == pytest.approx(np.linalg.cond(W), rel=1e-4)
+    assert alone.objective == pytest.approx(-np.linalg.slogdet(W.T @ W + np.eye(size))[1] / size)

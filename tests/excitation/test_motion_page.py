@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -5,11 +6,16 @@ import numpy as np
 import pytest
 
 from robotid.excitation.basis import FourierBasis
-from robotid.excitation.clearance import Box, Clearance
+from robotid.excitation.clearance import Box, Clearance, Contact
 from robotid.excitation.course import Course
 from robotid.excitation.design import Designer
 from robotid.excitation.limits import LIMITS, MotionLimits
-from robotid.excitation.motion_page import _collisions, _expected
+from robotid.excitation.motion_page import (
+    _collisions,
+    _expected,
+    _free_chart,
+    _limit_table,
+)
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.examples import example_urdf
@@ -143,3 +149,81 @@ def test_the_least_certain_base_parameters_have_their_own_names(ur5):
     assert f"Largest, in % of the plausible range: {first} 90 %, {second} 70 %." in _expected(
         preview
     )
+
+
+def test_the_page_states_use_margin_joint_time_value_and_unit_of_each_limit():
+    """A rail, which is prismatic, carries an elbow."""
+    t = 3.0 + 0.25 * np.arange(9)
+    used = np.zeros((6, 9, 2))
+    used[0, 2, 1], used[1, 7, 0], used[4, 4, 0], used[2, 1, 1] = -0.8, 0.613, -0.475, 0.25
+    sizes = np.array([[0.5, 2.9], [0.4, 3.15], [7.0, 11.0], [np.inf] * 2, [900.0, 150.0],
+                      [np.inf] * 2])  # fmt: skip
+    model = SimpleNamespace(joints=("rail", "elbow"), layout=SimpleNamespace(prismatic=("rail",)))
+    course = Course(t, used, MotionLimits(np.zeros(2), sizes))
+    course.__dict__["used"] = used
+    entries = {"position": ("elbow", 0.2), "velocity": ("rail", 0.387), "torque": ("rail", 0.525),
+               "acceleration": ("elbow", 0.75)}  # fmt: skip
+    content = {"limits": {k: {"where": x, "margin": y} for k, (x, y) in entries.items()},
+               "share": 0.85}  # fmt: skip
+    content["limits"]["friction"] = {
+        "margin": 0.123,
+        "where": "foot",
+        "time": 3.456,
+        "words": "0.4",
+    }
+    found = _limit_table(model, content, course)
+    rows = [re.sub(r"<[^>]+>", "|", row) for row in found.split("<tr>")]
+    texts = ([y.strip() for y in row.split("|") if y.strip()] for row in rows)
+    cells = {x[0]: x[1:7] for x in texts if len(x) > 4}
+    assert cells["position"] == ["80.0", "20.0", "elbow", "3.50", "2.9", "rad"]
+    assert cells["velocity"] == ["61.3", "38.7", "rail", "4.75", "0.4", "m/s"]
+    assert cells["torque"] == ["47.5", "52.5", "rail", "4.00", "900", "N"]
+    assert cells["acceleration"] == ["25.0", "75.0", "elbow", "3.25", "11", "rad/s²"]
+    assert cells["friction"][:4] == ["12.3", "foot", "3.46", "0.4"]
+    assert "100 % of position, velocity and torque is 85 % of the URDF's limit" in found
+    assert "Collisions were not checked" in found
+    chart = _free_chart(model, course, "torque", np.array([0, 1]))
+    assert "torque [N m or N]" in chart
+    assert "torque [N]" in _free_chart(model, course, "torque", np.array([0]))
+    assert "acceleration [rad/s²]" in _free_chart(model, course, "acceleration", np.array([1]))
+
+
+def test_the_page_counts_parameters_by_their_expected_error_and_source(ur5):
+    mapping = structural_mapping(ur5)
+    plausible = np.linspace(0.5, 4.0, len(mapping.base_names))
+    ratio = np.full(len(plausible), 0.3)
+    ratio[:4], ratio[[10, 12, 20]] = 0.05, [0.51, 1.7, 0.62]
+    preview = SimpleNamespace(
+        expected=SimpleNamespace(
+            mapping=mapping, model=ur5, sources=("data", "prior", "data", "mixed", "data")
+        ),
+        noise=SimpleNamespace(
+            std=np.array([0.1, 2.34, 3, 4, 5, 6]), origins=("stated", "log", "stated")
+        ),
+        base_error=ratio * plausible, plausible=plausible, words="30 s at 100 Hz",
+    )  # fmt: skip
+    found = _expected(preview)
+    names = [mapping.base_names[k] for k in (12, 20, 10)]
+    assert "<p>30 s at 100 Hz.</p>" in found
+    assert (
+        f"Of {len(ratio)} base parameters, 4 have an expected standard error below 10 % of their "
+        "plausible range, 3 above 50 %." in found
+    )
+    assert f"Largest, in % of the plausible range: {names[0]} 100 %, {names[1]} 62 %, {names[2]} " \
+        "51 %." in found  # fmt: skip
+    sources = "3 by the motion, 1 by the URDF alone, 1 by motion and URDF together"
+    assert f"The standard parameters will be determined: {sources}." in found
+    assert f"{ur5.joints[0]} 0.1, {ur5.joints[1]} 2.3, {ur5.joints[2]} 3" in found
+
+
+def test_collisions_of_the_page_have_millimetres_and_what_was_not_checked():
+    contact = Contact("forearm", "base", 0.0437, 2.346, 0.0301)
+    entry = {"margin": None, "kept": 0.05, "where": "x", "time": 0.0, "unread": ["gripper", "cam"],
+             "left_alone": ["a and b"], "built_near": ["c and d"]}  # fmt: skip
+    found = _collisions(
+        {"limits": {"collision": entry}}, SimpleNamespace(nearest=contact, clearance=object())
+    )
+    assert "forearm and base, distance 44 mm at 2.35 s. Required: 30 mm." in found
+    assert "Not checked, since no shape can be read: gripper, cam." in found
+    assert "Not checked, since in contact by design: a and b." in found
+    assert "Close by design, with a smaller clearance: c and d." in found

@@ -273,7 +273,17 @@ def test_the_centre_of_pressure_of_flat_feet_is_below_the_centre_of_mass(biped):
     edge = 1e3 * entry["margin"] * (0.11 if margins[0].min() < margins[1].min() else 0.055)
     assert entry["words"] == f"{edge:.0f} mm from the edge"
     load = found["vertical force"]
-    assert load["margin"] == pytest.approx(f[..., 2].min() / biped.ground.mean - 0.1)
+    least, mean = f[..., 2].min(), biped.ground.weight / 8.0
+    assert load["margin"] == pytest.approx(least / mean - 0.1)
+    assert load["words"] == f"{least:.3g} N, wanted {0.1 * mean:.3g} N or more"
+    pushed = f + np.array([3.0, -7.0, 0.0]) * np.arange(1.0, 9.0)[:, None]
+    friction = replace(biped.ground, friction=0.7).smallest(pushed, np.array([4.0, 5.0, 6.0]))
+    used = np.hypot(pushed[..., 0], pushed[..., 1]) / pushed[..., 2]
+    row, point = np.unravel_index(used.argmax(), used.shape)
+    assert friction["friction"] == {
+        "margin": pytest.approx(1.0 - used.max() / 0.7), "where": biped.ground.names[point],
+        "time": 4.0 + row, "words": f"{used.max():.2f}, wanted 0.70 or less",
+    }  # fmt: skip
 
 
 def test_a_squat_is_a_motion_of_base_and_joints(stand):

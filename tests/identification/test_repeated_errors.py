@@ -13,6 +13,8 @@ from robotid.fitting.survey import hold_log
 from robotid.identification import pipeline, repeated_errors
 from robotid.identification.repeated_errors import (
     _slopes,
+    _slopes_of_bias,
+    _world_acceleration,
     estimated_errors,
     mean_drift,
     with_repeated_errors,
@@ -306,3 +308,31 @@ def test_only_logs_with_an_imu_have_a_bias(log, rng, monkeypatch):
     np.testing.assert_allclose(
         one @ np.linalg.lstsq(one, two, rcond=None)[0], two, atol=1e-9 * np.abs(two).max()
     )
+
+
+def test_a_bias_of_the_accelerometer_acts_on_the_mass_of_the_robot(log):
+    """The torque per acceleration of the base is three columns of the mass matrix, projected."""
+    model = robot(0.0)
+    rows = hold_log(model, log, RAW).whole
+    motion, pi, pin_model = rows.trajectory, model.standard_parameters(), model.pin_model
+    D = _slopes_of_bias(model, rows, pi).reshape(*motion.tau.shape, 3)
+    data = pin_model.createData()
+    for k, q in enumerate(model.configurations(motion.q)):
+        M = pin.crba(pin_model, data, q)
+        M = model.velocity_map.T @ (np.triu(M) + np.triu(M, 1).T) @ model.velocity_map
+        B = motion.basis[k]
+        np.testing.assert_allclose(D[k], M[:, :3] - B @ (B.T @ M[:, :3]), atol=1e-9)
+
+
+def test_the_acceleration_in_the_world_is_turned_and_has_the_bias_back(log, rng):
+    """Of the origin of a base that turns by 0.4 rad."""
+    model, frame = robot(0.0), ImuFrame(np.eye(4)[3], np.zeros(3), np.array([0, 0, -9.81]),
+                                        np.zeros(3))  # fmt: skip
+    values = rng.standard_normal((len(log.t), 6)) + np.array([0, 0, 0, 1.0, 0, 9.81])
+    own = replace(log, base=replace(log.base, imu=ImuMotion(values, frame)))
+    motion = hold_log(model, own, RAW).whole.trajectory
+    R = np.array([pin.XYZQUATToSE3(x).rotation for x in motion.q[:, :7]])
+    bias = np.array([0.3, -0.2, 0.1])
+    local = motion.a[:, :3] + np.cross(motion.v[:, 3:6], motion.v[:, :3])
+    world = np.einsum("kij,kj->ki", R, local + bias)
+    np.testing.assert_allclose(_world_acceleration(motion, bias), world, atol=1e-9)

@@ -1,6 +1,9 @@
 """Sensors in bags: odometry, IMU, wrenches and states of Unitree, at other stamps than joints."""
 
 import re
+from contextlib import nullcontext
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +21,10 @@ from helpers.recorders import (
 
 from robotid.cli import main
 from robotid.exceptions import DataError
+from robotid.log_files import bags
+from robotid.log_files.bag_sensors import Sensor, _interpolated
 from robotid.log_files.read import read_log
+from robotid.log_files.table import Table
 from robotid.logs.base import BaseColumns, quaternions_of_angles
 from robotid.logs.imu import ImuFrame
 from robotid.logs.settings import LogSource
@@ -276,3 +282,94 @@ def test_an_imu_without_orientation_needs_that_of_the_base(tmp_path):
     np.testing.assert_allclose(
         read_log(path, JOINTS, base=INSIDE).base.pose[:, :3], places(T[1:]), atol=1e-9
     )
+
+
+def test_columns_between_messages_are_linear_and_quaternions_have_length_1():
+    """A turn by 2 rad about z whose sign flips; half of the way is 1 rad."""
+    t = np.array([5.0, 5.4, 6.0])
+    q = [[0.0, 0.0, np.sin(x / 2), np.cos(x / 2)] for x in (0.2, 2.2, 2.2)]
+    q = np.array(q) * [[1.0], [-1.0], [1.0]]
+    columns = {f"imu_{end}": q[:, k] for k, end in enumerate(("qx", "qy", "qz", "qw"))}
+    at = np.array([5.2, 5.7])
+    found = _interpolated(t, {"imu_wx": np.array([1.0, 3.0, -3.0]), **columns}, at)
+    np.testing.assert_allclose(found["imu_wx"], [2.0, 0.0], atol=1e-12)
+    turn = [2 * np.arctan2(found["imu_qz"][k], found["imu_qw"][k]) for k in range(2)]
+    np.testing.assert_allclose(turn, [1.2, 2.2])
+    square = sum(found[name] ** 2 for name in columns)
+    np.testing.assert_allclose(square, 1.0)
+    assert not found["imu_qx"].any()
+
+
+def test_messages_of_a_sensor_are_sorted_with_their_values(monkeypatch):
+    """Stamps of recording [ns], and values, in the order in which they arrived."""
+    arrived = [(7_200_000_000, (3.0, 30.0)), (7_000_000_000, (1.0, 10.0)),
+               (7_100_000_000, (2.0, 20.0))]  # fmt: skip
+    monkeypatch.setattr(bags, "_open", lambda path: nullcontext((None, None)))
+    monkeypatch.setattr(bags, "_messages", lambda *_: iter(arrived))
+    sensor = Sensor("imu", ("a", "b"), lambda message: message)
+    t, values = bags._load(Path("x.mcap"), LogSource(stamp="log"), sensor)
+    assert t.tolist() == [7.0, 7.1, 7.2]
+    assert values.tolist() == [[1.0, 10.0], [2.0, 20.0], [3.0, 30.0]]
+
+
+def test_the_last_command_before_each_message_is_held():
+    """Intervals of 0.1, 0.2 and 0.5 s; a command at the time of a message counts for it."""
+    t, sent = np.array([5.0, 5.1, 5.15, 5.4, 5.6, 6.0]), np.array([5.2, 5.1, 5.9, 5.4])
+    rows = {"time": t, "q_a": 10.0 * t, "tau_a": -t}
+    commands = {"time": sent, "qref_a": np.array([2.0, 1.0, 4.0, 3.0])}
+
+    def table(columns):
+        return Table(list(columns), lambda wanted: {name: columns[name] for name in wanted})
+
+    found = bags._with_commands(table(rows), table(commands), (t, np.sort(sent)), "goal")
+    assert found.names == ["time", "q_a", "tau_a", "qref_a"]
+    read = found.read(["time", "qref_a", "q_a"])
+    assert read["time"].tolist() == t[1:].tolist()
+    assert read["qref_a"].tolist() == [1.0, 1.0, 3.0, 3.0, 4.0]
+    assert read["q_a"].tolist() == (10.0 * t[1:]).tolist()
+    assert found.notes == (
+        "a zero-order hold is applied to the commands of topic 'goal', with a median interval of "
+        "200 ms; messages before the first command, left out: 1; messages after the last "
+        "command: 1",
+    )
+
+
+def test_a_field_of_a_controller_is_of_the_first_point_that_has_a_number():
+    """Joints without a command are NaN; the output comes before the reference."""
+    nan = float("nan")
+    message = SimpleNamespace(
+        feedback=SimpleNamespace(positions=[1.0, 2.0], velocities=[nan, nan], effort=[]),
+        actual=SimpleNamespace(positions=[9.0, 9.0], velocities=[3.0, nan], effort=[5.0, 6.0]),
+        output=SimpleNamespace(positions=[nan, nan], velocities=[nan, 7.0]),
+        reference=SimpleNamespace(positions=[0.1, nan], velocities=[8.0, 8.0], effort=[nan, nan]),
+        desired=SimpleNamespace(positions=[0.3, 0.4], velocities=[4.0, 4.0], effort=[nan, 0.5]),
+    )
+    found = bags._controlled(message)
+    np.testing.assert_array_equal(found["position"], [1.0, 2.0])
+    np.testing.assert_array_equal(found["velocity"], [3.0, nan])
+    np.testing.assert_array_equal(found["effort"], [5.0, 6.0])
+    np.testing.assert_array_equal(found["qref"], [0.1, nan])
+    np.testing.assert_array_equal(found["dqref"], [nan, 7.0])
+    np.testing.assert_array_equal(found["tauref"], [nan, 0.5])
+
+
+def test_messages_of_several_joints_are_read_in_their_order():
+    """Messages 0, 2 and 5 are of one joint with two fields, 1 and 3 of another order of joints."""
+    one, two = (("a",), ("position", "effort")), (("b", "a"), ("position",))
+    blocks = {two: bags._Block(), one: bags._Block()}
+    for layout, number, values in (
+        (one, 0, [0.1, 7.0]), (two, 1, [9.0, 0.2]), (one, 2, [0.3, 8.0]), (two, 3, [9.5, 0.4]),
+        (one, 5, [0.5, 6.0]),
+    ):  # fmt: skip
+        blocks[layout].number.append(number)
+        blocks[layout].stamp.append(5_000_000_000 + 10_000_000 * number)
+        blocks[layout].values.extend(values)
+    found = bags._read("run", blocks, ["time", "position_a"])
+    np.testing.assert_allclose(found["time"], [5.0, 5.01, 5.02, 5.03, 5.05])
+    np.testing.assert_allclose(found["position_a"], [0.1, 0.2, 0.3, 0.4, 0.5])
+    with pytest.raises(
+        DataError, match=r"run: 3 of 5 messages lack .* first \(message 0\) lacks p"
+    ):
+        bags._read("run", blocks, ["position_a", "position_b"])
+    with pytest.raises(DataError, match=r"5 of 5 messages lack .*, the first \(message 0\) lacks"):
+        bags._read("run", blocks, ["effort_a", "position_b"])

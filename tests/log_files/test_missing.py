@@ -187,3 +187,12 @@ def test_the_name_of_a_locked_joint_is_not_given_to_another():
     found = said(columns, ("pan", "lift", "elbow"))
     assert "[log.joints]" not in found
     assert "--lock elbow=0" in found
+
+
+def test_a_single_column_of_another_joint_is_a_misspelt_one():
+    found = said(["q_pan", "tau_pan", "q_elbw"], ("pan", "elbow"))
+    assert "[log.joints]" not in found
+    assert found.startswith("log has no columns 'q_elbow', 'tau_elbow'; position and torque or")
+    assert "q_elbw" in found
+    both = said(["q_pan", "tau_pan", "q_elbw", "tau_elbw"], ("pan", "elbow"))
+    assert both.endswith('[log.joints]\nelbow = "elbw"  # similar name')

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from robotid.exceptions import DataError, SettingsError
-from robotid.logs.data import Log, Trajectory
+from robotid.logs.data import Log, Trajectory, require_finite, require_increasing
 from robotid.logs.settings import LogUnits
 from robotid.logs.units import check_units
 
@@ -394,4 +394,55 @@ def test_time_stamps_of_no_clock_are_refused(scale):
     t = scale * np.arange(5) / 100
     with pytest.raises(DataError, match=r"5 rows lie within .* wanted at least 1e-12 s") as caught:
         Log(t=t, q=np.zeros((5, 1)), tau=np.zeros((5, 1)), joints=("a",))
+    assert f"within {scale / 25:.3g} s, so the mean time step is {scale / 100:.3g} s" in str(
+        caught.value
+    )
     assert caught.value.code == "time_unit"
+
+
+def test_squares_of_a_trajectory_are_of_torque_speed_and_acceleration_in_this_order(rng):
+    q, v, a, tau = rng.standard_normal((4, 9, 2)) * [[[1.0]], [[2.0]], [[3.0]], [[5.0]]]
+    t, segment = 4.0 + np.arange(9) / 50, np.repeat([0, 1], [4, 5])
+    motion = Trajectory(t=t, q=q, v=v, a=a, tau=tau, joints=("a", "b"), rate=50.0, segment=segment)
+    np.testing.assert_allclose(motion.squares, [(x**2).sum(axis=0) for x in (tau, v, a)])
+    thin = motion.every(2)
+    np.testing.assert_allclose(thin.squares, [(x[::2] ** 2).sum(axis=0) for x in (tau, v, a)])
+    assert (thin.rate, motion.every(1)) == (None, motion)
+
+
+def test_windows_selections_and_signs_are_of_all_signals(rng):
+    t, arrays = 3.0 + np.arange(6) / 10, rng.standard_normal((7, 6, 3))
+    names = ("q", "tau", "v", "a", "q_ref", "v_ref", "tau_ref")
+    log = Log(
+        t, **dict(zip(names, arrays, strict=True)), joints=("a", "b", "c"),
+        contacts={"foot": t > 3.25, "hand": t < 3.15}, wrenches={"fz foot": t**2},
+    )  # fmt: skip
+    part, some = log.window(3.1, 3.4), log.select(["c", "a"])
+    turned = log.turned(np.array([1.0, -1.0, -1.0]))
+    for name, values in zip(names, arrays, strict=True):
+        np.testing.assert_array_equal(getattr(part, name), values[1:5])
+        np.testing.assert_array_equal(getattr(some, name), values[:, [2, 0]])
+        np.testing.assert_array_equal(getattr(turned, name), values * [1.0, -1.0, -1.0])
+    assert part.contacts["foot"].tolist() == [False, False, True, True]
+    assert part.contacts["hand"].tolist() == [True, False, False, False]
+    np.testing.assert_array_equal(part.wrenches["fz foot"], t[1:5] ** 2)
+    assert some.joints == ("c", "a")
+
+
+def test_rows_are_numbered_as_in_the_file(rng):
+    """Of a block whose first row is row 70."""
+    t = 5.0 + np.arange(4) / 10
+    values = rng.standard_normal((4, 2))
+    values[2, 1] = np.inf
+    with pytest.raises(DataError, match=r"x: q_b is inf at row 72 \(t = 5\.2 s\); remove"):
+        require_finite(values, t, ["q_a", "q_b"], "x", 70)
+    with pytest.raises(DataError, match=r"but t\[73\] = 5\.100 s follows t\[72\] = 5\.200 s"):
+        require_increasing(np.array([5.0, 5.1, 5.2, 5.1]), "x", 70)
+    with pytest.raises(DataError, match=r"t\[71\] = 5\.000 s is a duplicate .* as t\[70\]"):
+        require_increasing(np.array([5.0, 5.0, 5.2]), "x", 70)
+
+
+def test_the_rate_of_a_log_is_that_of_its_median_step():
+    t = np.r_[0.0, 0.1, 0.2, 0.3, 2.3]
+    log = Log(t=t, q=np.zeros((5, 1)), tau=np.zeros((5, 1)), joints=("a",))
+    assert repr(log) == "<Log in memory: 5 samples of 1 joints (a) over 2.3 s at 10 Hz>"

@@ -116,3 +116,12 @@ def test_two_stands_are_one_unless_a_gap_lies_between_them():
     assert motion.segment.tolist() == [0, 1]
     np.testing.assert_allclose(motion.tau, [tau[:60].mean(axis=0), tau[60:].mean(axis=0)])
     np.testing.assert_allclose(motion.t, [t[:60].mean(), t[60:].mean()])
+
+
+def test_a_jump_of_the_speed_across_a_gap_is_no_acceleration():
+    row = np.arange(200)  # four segments of 25 rows on either side of 0.2 s
+    t = 2.5 + (row + 20 * (row >= 100)) / 100
+    q = np.column_stack([0.05 * row, np.cumsum(np.where(row < 100, 0.1, 0.25))]) / 100
+    motion, _ = means(log_of(t, q))
+    assert motion.segment.tolist() == [0] * 4 + [1] * 4
+    np.testing.assert_allclose(motion.v[:, 1], np.repeat([0.1, 0.25], 4))

@@ -10,7 +10,7 @@ from robotid.log_files.formats import write_columns
 from robotid.log_files.read import read_log
 from robotid.logs.data import Log
 from robotid.logs.settings import LogUnits
-from robotid.logs.units import check_units
+from robotid.logs.units import _velocity_factor, check_units
 
 T = np.arange(400) * 0.01
 Q = np.column_stack([0.8 * np.sin(2 * T), 0.3 * np.cos(3 * T)])
@@ -57,7 +57,12 @@ def test_more_than_two_turns_look_like_degrees(turns, is_refused):
             check_units(far, LogUnits())
     else:
         check_units(far, LogUnits())
-    check_units(far, LogUnits(angle="rad"))
+    if is_refused:
+        check_units(far, LogUnits(angle="rad"))
+        with pytest.raises(
+            DataError, match=rf"q_b reaches {2 * np.pi * turns:.4g}, .* {turns} rev"
+        ):
+            check_units(log(q=-q[:, ::-1], v=None), LogUnits())  # of either sign
     check_units(far, LogUnits(), prismatic=["a"])
 
 
@@ -105,6 +110,9 @@ def test_a_long_step_looks_like_another_unit(step, unit):
     with pytest.raises(DataError, match=f"looks like {words[unit]}") as caught:
         check_units(slow, LogUnits())
     assert caught.value.code == "time_unit"
+    hertz = {"ms": 1e3, "us": 1e6, "ns": 1e9}[unit] / step
+    said = f"median step {step:.6g} looks like {words[unit]} ({hertz:.4g} Hz); in seconds it would "
+    assert f"{said}be {1 / step:.3g} Hz" in str(caught.value)
     check_units(slow, LogUnits(time="s"))
     check_units(log(t=np.arange(400) * 0.1, v=None), LogUnits())
 
@@ -152,3 +160,24 @@ def test_a_command_in_degrees_is_told_from_one_that_goes_far_along_a_slider(fact
     check_units(far, LogUnits(), prismatic=["b"])
     with pytest.raises(DataError, match=r"qref_b is \S+ times that of q_b: one of them"):
         check_units(far, LogUnits(), prismatic=["a"])
+
+
+def test_a_command_that_is_not_followed_shows_no_unit():
+    """57 times as large as the motion, and at another frequency."""
+    other = np.column_stack([Q[:, 0], 180 / np.pi * 0.1 * np.sin(7.3 * T)])
+    check_units(log(q=0.1 * Q, q_ref=other, v=None), LogUnits())
+    with pytest.raises(DataError, match=r"qref_b is 57\.3 times that of q_b"):
+        check_units(log(q=0.1 * Q, q_ref=0.1 * Q * [1.0, 180 / np.pi], v=None), LogUnits())
+
+
+@pytest.mark.parametrize(("turn", "unit"), [(2 * np.pi, 1.0), (360.0, 180 / np.pi)])
+def test_speeds_are_compared_beside_gaps_and_full_turns(turn, unit):
+    """The factor of dq by d(q)/dt, of a log with jumps of a turn and a gap with a long way."""
+    t = 6.0 + np.where(T < 2.0, T, T + 9.0)
+    q = unit * np.column_stack([0.7 * T + 0.02 * np.sin(5 * T), np.cos(3 * T)])
+    v = unit * np.column_stack([0.7 + 0.1 * np.cos(5 * T), -3.0 * np.sin(3 * T)])
+    q[200:] += [4.0 * unit, -2.0 * unit]  # while nothing was recorded
+    q[60:, 0] -= turn
+    q[300:, 1] += turn
+    found = _velocity_factor(log(t=t, q=q, v=[2.0, -0.5] * v))
+    np.testing.assert_allclose(found, [2.0, -0.5], rtol=2e-3)

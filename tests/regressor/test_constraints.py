@@ -15,7 +15,9 @@ from robotid.logs.settings import BaseSource
 from robotid.regressor.constraints import (
     _measured,
     constrained,
+    constraint_forces,
     constraint_jacobian,
+    contact_links,
     force_basis,
     logged_base,
     without_forces,
@@ -134,6 +136,8 @@ def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(quadrupe
     rest = np.arange(7) != 4
     np.testing.assert_allclose(found.tau[rest], predicted[rest], atol=1e-10)
     assert np.abs(found.tau).max() > 1.0
+    own = tau + np.einsum("kmj,km->kj", J[:, measured], f[:, measured])
+    np.testing.assert_allclose(found.loaded, own, atol=1e-12)
     assert not used[4].any()
     assert used[rest].all()
     bare = replace(motion, contacts=None, wrenches=None)
@@ -141,6 +145,38 @@ def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(quadrupe
     np.testing.assert_array_equal(used, np.tile(rest[:, None], 18))
     unknown = np.linalg.matrix_rank(np.delete(J, measured, axis=1))
     np.testing.assert_allclose(np.sum(found.basis**2, axis=(1, 2))[[0, 1, 6]], unknown[[0, 1, 6]])
+
+
+def test_forces_are_those_of_least_squares_over_the_rows_used(quadruped, rng):
+    """Measured components and feet in the air have none."""
+    q, v, a = random_motion(quadruped, rng, 3)
+    flags = np.array([[1, 0, 1], [1, 1, 0], [0, 0, 1]], dtype=bool)
+    torque, tau, projected = rng.normal(size=(3, 3, 18))
+    motion = Trajectory(
+        t=np.arange(3.0), q=q, v=v, a=a, tau=tau, joints=quadruped.joints, rate=None,
+        segment=np.zeros(3, dtype=int), contacts=flags, wrenches=rng.normal(size=(3, 2)),
+    )  # fmt: skip
+    used = rng.random((3, 18)) < 0.8
+    J = constraint_jacobian(quadruped, q, np.column_stack([flags, np.ones(3, dtype=bool)]))
+    for own in (motion, motion.projected(np.zeros((3, 18, 1)), projected, tau)):
+        found = constraint_forces(quadruped, own, torque, used)
+        assert not found[:, [11, 12]].any()
+        for k in range(3):
+            A = np.delete(J[k], [11, 12], axis=0)[:, used[k]].T
+            wanted = np.linalg.lstsq(A, (torque - tau)[k, used[k]], rcond=1e-10)[0]
+            np.testing.assert_allclose(np.delete(found[k], [11, 12]), wanted, atol=1e-9)
+
+
+def test_links_of_contacts_have_their_axes_and_turn_in_the_world(quadruped, rng):
+    q, v, _ = random_motion(quadruped, rng, 2)
+    rotation, turning = contact_links(quadruped, q)
+    for k in range(2):
+        before, now, after = (moved(quadruped, q[k], v[k], h) for h in (-1e-6, 0.0, 1e-6))
+        for i, foot in enumerate(FEET):
+            frame = quadruped.pin_model.getFrameId(foot, pin.FrameType.BODY)
+            np.testing.assert_allclose(rotation[k, i], now.oMf[frame].rotation, atol=1e-12)
+            w = pin.log3(after.oMf[frame].rotation @ before.oMf[frame].rotation.T) / 2e-6
+            np.testing.assert_allclose(turning[k, i] @ v[k], w, atol=1e-7)
 
 
 def test_flags_belong_to_the_contacts_that_do_not_always_touch(rng):
@@ -287,9 +323,11 @@ def test_measured_components_are_counted_over_loops_and_contacts_of_any_size():
 def test_contacts_state_what_logs_have(quadruped):
     wanted = BaseColumns(True, FEET[:3], ("fz HR_FOOT", "mx HR_FOOT"), "world", (None,) * 3)
     assert logged_base(quadruped, BaseSource(twist="world")) == wanted
-    local = replace(quadruped, constraints=[Contact("FL_FOOT", axes="link", threshold=5.0)])
-    found = logged_base(local)
-    assert [found.local, found.thresholds] == [("FL_FOOT",), (5.0,)]
+    contacts = [Contact("FR_FOOT", always=True, threshold=2.0), Contact("HL_FOOT", threshold=7.0),
+                Contact("FL_FOOT", axes="link", threshold=5.0)]  # fmt: skip
+    found = logged_base(replace(quadruped, constraints=contacts))
+    assert [found.local, found.contacts] == [("FL_FOOT",), ("HL_FOOT", "FL_FOOT")]
+    assert found.thresholds == (7.0, 5.0)
     with pytest.raises(ModelError, match=r"imu in .base. is 'imu', which is not a link of solo"):
         logged_base(quadruped, BaseSource(imu="imu"))
     with pytest.raises(ModelError, match="'FL_FOOT', which moves relative to the root link 'base_"):

@@ -16,7 +16,7 @@ N = 4000
 
 @pytest.fixture
 def run():
-    t = np.arange(N) / 500.0
+    t = 3.0 + np.arange(N) / 500.0
     w = np.array([2.0, 3.0])
     q, v = np.sin(np.outer(t, w)), w * np.cos(np.outer(t, w))
     return Run(t, q, v, -(w**2) * q, np.array([10.0, 1.0]) * v, q, np.zeros(2))

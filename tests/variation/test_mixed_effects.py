@@ -345,3 +345,61 @@ def test_information_far_above_the_spread_is_integrated_without_rounding():
     np.testing.assert_allclose(w[:, 0, 0], wanted * x, rtol=1e-9)
     U = _posterior(np.diag(H)[None], S)
     np.testing.assert_allclose(np.diag(U[0]), S**2 / (1.0 + S**2 * H), rtol=1e-9)
+
+
+def mixture(log, mean, variance, between, value):
+    """Return weights, mean and its error, ends of 95 %, and the probability below a value."""
+    weight = np.exp(log - log.max()) / np.exp(log - log.max()).sum()
+    std = np.sqrt(variance + between)
+    centre = weight @ mean
+    error = np.sqrt(weight @ (variance + (mean - centre) ** 2))
+
+    def below(x):
+        return weight @ scipy.stats.norm.cdf((x - mean) / std)
+
+    ends = [
+        scipy.optimize.brentq(lambda x, share=share: below(x) - share, -900, 900)
+        for share in (0.025, 0.975)
+    ]
+    return weight, centre, error, ends, below(value)
+
+
+@pytest.mark.parametrize("unit", [(0, 0, 0, 0, 0), (0, 0, 1, 1, 1, 2, 2)])
+def test_predictions_are_those_of_dense_matrices_on_a_grid_of_spreads(unit):
+    """All outputs, with and without one more run or unit; other deviations are fixed."""
+    unit = np.array(unit)
+    runs, blocks = drawn(np.random.default_rng(12), unit)
+    model = MixedEffects(runs)
+    members = max(len(set(unit.tolist())), 1) if unit.max() else len(unit)
+    own, value = np.array([0.04, 0.3]), np.array([2.9, -0.2])
+    z, prior = np.linspace(-6.0, 5.0, 45), np.diag((100.0 * SCALE) ** -2.0)
+    every = zip(model.predict(own, value), model.with_one_more(), strict=True)
+    for p, (found, more) in enumerate(every):
+        s = SCALE[p] * np.exp(z)
+        tried = np.repeat(model.deviation[None], 45, axis=0)
+        tried[:, -1, p] = s
+        log, mean, C = zip(*[dense(blocks, unit, x)[:3] for x in tried], strict=True)
+        log = np.array(log) + z + np.log(scipy.stats.t(4).pdf(s / SCALE[p]))
+        mean, variance = np.array(mean)[:, p], np.array([x[p, p] for x in C])
+        between = (tried[:, :, p] ** 2).sum(axis=1)
+
+        weight, centre, error, ends, below = mixture(
+            log, mean, variance, between + own[p], value[p]
+        )
+        assert found.mean == pytest.approx(centre, rel=1e-6)
+        assert found.std_error == pytest.approx(error, rel=1e-6)
+        assert found.ends == pytest.approx(ends, rel=1e-6)
+        assert found.probability == pytest.approx(2.0 * min(below, 1.0 - below), rel=1e-6)
+        middle = np.cumsum(weight) - 0.5 * weight
+        quantiles = SCALE[p] * np.exp(np.interp([0.025, 0.5, 0.975], middle, z))
+        low, high = found.spread_ends
+        assert [low, found.spread, high] == pytest.approx(quantiles)
+        alone = np.array([np.linalg.inv((np.linalg.inv(x) - prior) / members + prior) for x in C])
+        total = alone[:, p, p] + variance
+        log = log - 0.5 * (np.log(total) + np.interp(found.spread, s, total) / total)
+        more_variance = variance * members / (members + 1)
+        _, _, error, ends, _ = mixture(log, mean, more_variance, between, 0.0)
+        assert more.after == pytest.approx((error, ends[1] - ends[0]), rel=1e-6)
+        moved = found.shifted(3.0)
+        assert moved.mixture[1] == pytest.approx(found.mixture[1] + 3.0)
+        assert moved.mixture[[0, 2]].tolist() == found.mixture[[0, 2]].tolist()

@@ -23,9 +23,10 @@ def test_units_that_differ_are_named_and_left_out_of_the_prediction():
     rng = np.random.default_rng(5)
     x = -2.0 + 0.1 * rng.normal(size=30)
     alike, _ = between_units(x, np.full(30, 0.02), 1e-4)
-    x[[7, 20]] += [1.5, -3.0]
+    x[[7, 20]] += [-3.0, 1.5]
     prediction, unlike = between_units(x, np.full(30, 0.02), 1e-4)
-    assert sorted(each.unit for each in unlike) == [7, 20]
+    assert [each.unit for each in unlike] == [20, 7]  # the most unlikely first, found last
+    assert unlike[0].probability < 1e-3 * unlike[1].probability
     assert all(each.probability < 1e-4 for each in unlike)
     assert prediction.mean == pytest.approx(alike.mean, abs=0.03)
     np.testing.assert_allclose(prediction.ends, alike.ends, atol=0.06)
@@ -35,3 +36,15 @@ def test_a_value_with_a_large_error_is_not_unlike():
     x, errors = np.array([1.0, 1.02, 0.97, 1.01, 3.0]), np.array([0.01, 0.01, 0.01, 0.01, 1.0])
     assert between_units(x, errors, 1e-3)[1] == ()
     assert between_units(x[:2], errors[:2], 1e-3) is None
+    x, errors = np.append(x, 1.4), np.append(errors, 0.01)
+    assert [each.unit for each in between_units(x, errors, 1e-3)[1]] == [5]
+
+
+def test_a_unit_of_precise_values_has_the_probability_of_the_t_test():
+    rng = np.random.default_rng(4)
+    x = np.insert(7.0 + 0.2 * rng.normal(size=8), 3, 8.1)
+    p = scipy.stats.ttest_ind(np.delete(x, 3), x[3:4]).pvalue
+    errors = np.full(9, 1e-4)
+    assert between_units(x, errors, 0.9 * p)[1] == ()
+    (found,) = between_units(x, errors, 1.1 * p)[1]
+    assert (found.unit, found.probability) == (3, pytest.approx(p, rel=0.05))
