@@ -1,6 +1,7 @@
 """The command line: flags to arguments, results to text; nothing is computed here."""
 
 import argparse
+import atexit
 import ctypes
 import gc
 import io
@@ -53,6 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     code = 0
     gc.set_threshold(_OBJECTS)
+    atexit.register(gc.freeze)  # no search for cycles in all that the end of the process frees
     for variable in _THREADS:  # before numpy is imported
         os.environ.setdefault(variable, "1")
     open_closed_streams()
