@@ -25,7 +25,7 @@ from robotid.versions import __version__
 __all__ = ["COMMANDS", "main"]
 
 # Objects made between two garbage collections. A command makes many, and almost no cycles.
-_OBJECTS = 50_000
+_OBJECTS = 500_000
 # Threads of BLAS, one each if the environment does not state them: matrices are small, and waiting
 # threads use processor time.
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
