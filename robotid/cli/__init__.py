@@ -1,6 +1,7 @@
 """The command line: flags to arguments, results to text; nothing is computed here."""
 
 import argparse
+import atexit
 import ctypes
 import gc
 import io
@@ -24,7 +25,7 @@ from robotid.versions import __version__
 __all__ = ["COMMANDS", "main"]
 
 # Objects made between two garbage collections. A command makes many, and almost no cycles.
-_OBJECTS = 50_000
+_OBJECTS = 500_000
 # Threads of BLAS, one each if the environment does not state them: matrices are small, and waiting
 # threads use processor time.
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -53,6 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     code = 0
     gc.set_threshold(_OBJECTS)
+    atexit.register(gc.freeze)  # no search for cycles in all that the end of the process frees
     for variable in _THREADS:  # before numpy is imported
         os.environ.setdefault(variable, "1")
     open_closed_streams()

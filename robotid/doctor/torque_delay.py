@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import svd
 
 from robotid._typing import Array
 from robotid.doctor.sample import coupled_columns, smooth_motion
@@ -95,10 +94,7 @@ class _Misfit:
         """
         if self.loaded is None:
             return np.zeros(len(self.squares))
-        now, then = (
-            np.array([[np.interp(delay, _GRID, block) for block in joint] for joint in squares])
-            for squares in (self.squares, self.loaded)
-        )
+        now, then = (_at(delay, squares) for squares in (self.squares, self.loaded))
         share: Array = 1.0 - (then.sum(axis=1) + _EXACT) / (now.sum(axis=1) + _EXACT)
         return share
 
@@ -135,8 +131,8 @@ class _Misfit:
         rests = [np.delete(squares, b, axis=0).sum(axis=0) for b in range(len(squares))]
         delays = [float(_GRID[np.argmin(rest)]) for rest in rests]
         pairs = list(zip(delays, squares, strict=True))
-        now = np.array([np.interp(common, _GRID, block) for block in squares])
-        then = np.array([np.interp(delay, _GRID, block) for delay, block in pairs])
+        now = _at(common, squares)
+        then = np.array([_at(delay, block) for delay, block in pairs])
         best = float(_GRID[np.argmin(squares.sum(axis=0))])
         error = float(np.hypot(_GRID[1] - _GRID[0], np.sqrt((len(delays) - 1) * np.var(delays))))
         explained = 1.0 - float((then.sum() + _EXACT) / (now.sum() + _EXACT))
@@ -170,13 +166,18 @@ class _Misfit:
 
     def gain(self) -> float:
         """Return the share of the unexplained torque that the delay of other blocks explains."""
-        now, then = np.zeros((2, len(self.squares)))
-        delays = self.delays_without(1)
-        for j, squares in enumerate(self.squares):
-            for delay, block in zip(delays, squares, strict=True):
-                now[j] += np.interp(0.0, _GRID, block)
-                then[j] += np.interp(delay, _GRID, block)
+        blocks = zip(self.delays_without(1), np.swapaxes(self.squares, 0, 1), strict=True)
+        then = np.sum([_at(delay, block) for delay, block in blocks], axis=0)
+        now = _at(0.0, self.squares).sum(axis=1)
         return float(1.0 - np.mean((then + _EXACT) / (now + _EXACT)))
+
+
+def _at(delay: float, values: Array) -> Array:
+    """Return values on the grid, shape (..., delays), at a delay of it, linear in between."""
+    k = min(max(int(np.searchsorted(_GRID, delay)), 1), len(_GRID) - 1)
+    share = (delay - _GRID[k - 1]) / (_GRID[k] - _GRID[k - 1])
+    found: Array = values[..., k - 1] + share * (values[..., k] - values[..., k - 1])
+    return found
 
 
 @dataclass(frozen=True)
@@ -227,7 +228,7 @@ class _Window:
     drive: Array
     steady: Array
     delayed: Array
-    load: Array | None = None
+    load: Array
 
 
 def check_torque_delay(
@@ -329,11 +330,9 @@ def _misfit(
     used = {j: one for j, one in enumerate(found) if one is not None}
     if len(used) < max(2.0, len(own) / 2):
         return None
-    squares, rows = zip(*used.values(), strict=True)
-    of_load = [_squares(windows, j, own[j], has_load=True) for j in used]
-    loaded = np.array([one[0] for one in of_load if one is not None])
+    squares, loaded, rows = zip(*used.values(), strict=True)
     names = tuple(model.joints[j] for j in used)
-    return _Misfit(np.array(squares), np.array(rows, dtype=float), names, loaded)
+    return _Misfit(np.array(squares), np.array(rows, dtype=float), names, np.array(loaded))
 
 
 def _segments(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
@@ -385,7 +384,7 @@ def _window(
     slow = is_reversal | (np.abs(v) < _SLOW)
     steady = [_distance(at, t[slow[:, j]]) > _AWAY * period for j in range(v.shape[1])]
     tau = low_pass(motion.tau[rows], 1 / step, signals)
-    delayed = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 2, 0).copy()
+    delayed = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 2, 0)
     drive = np.concatenate([own, coupled], axis=2)
     return _Window(inertial, drive, np.column_stack(steady), delayed, load)
 
@@ -415,13 +414,11 @@ def _distance(at: Array, slow: Array) -> Array:
     return distance
 
 
-def _squares(
-    windows: Sequence[_Window], j: int, own: slice, *, has_load: bool = False
-) -> tuple[Array, int] | None:
-    """Return the unexplained part of joint j's torque, shape (blocks, delays), and its instants.
+def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, Array, int] | None:
+    """Return the unexplained part of joint j's torque, and its instants.
 
-    Its inertial columns are ``own``; its friction grows with the load, too, if asked. None for a
-    joint that moves in too few instants.
+    Its inertial columns are ``own``. The parts have shape (blocks, delays); in the second one
+    friction grows with the load, too. None for a joint that moves in too few instants.
     """
     steady = [window.steady[:, j] for window in windows]
     used = sum(map(np.count_nonzero, steady))
@@ -430,22 +427,28 @@ def _squares(
     pairs = list(zip(windows, steady, strict=True))
     inertial = np.concatenate([window.inertial[at, own] for window, at in pairs])
     drive = np.concatenate([window.drive[at, j] for window, at in pairs])
-    X = np.hstack([inertial, drive, np.ones((used, 1))])
-    if has_load:
-        load = [window.load[at, j] for window, at in pairs if window.load is not None]
-        X = np.column_stack([X, np.concatenate(load)])
+    load = np.concatenate([window.load[at, j] for window, at in pairs])
     tau = np.concatenate([window.delayed[j][:, at] for window, at in pairs], axis=1)
     tau -= tau.mean(axis=1, keepdims=True)  # (delays, N)
     size = np.einsum("dk,dk->d", tau, tau)
     if size.min() <= 0:
         return None
+    Q = _orthonormal(np.hstack([inertial, drive, np.ones((used, 1))]))
+    tau -= (tau @ Q) @ Q.T
+    blocks = np.array_split(tau, _BLOCKS, axis=1)
+    plain = np.array([np.einsum("dk,dk->d", b, b) for b in blocks]) / size
+    rest = load - Q @ (Q.T @ load)
+    if rest @ rest > _DEPENDENT**2 * load @ load:
+        tau -= np.outer(tau @ rest, rest / (rest @ rest))
+    return plain, np.array([np.einsum("dk,dk->d", b, b) for b in blocks]) / size, used
+
+
+def _orthonormal(X: Array) -> Array:
+    """Return an orthonormal basis of columns, (N, k), without those that are dependent."""
     length = np.linalg.norm(X, axis=0)
     is_excited = length > _ROUNDING * length.max()  # other columns are 0 except for rounding
     X = X[:, is_excited] / length[is_excited]
-    # by QR iterations: with many dependent columns, divide and conquer may not converge
-    _, s, Vt = svd(np.linalg.qr(X, mode="r"), lapack_driver="gesvd")
-    independent = s > _DEPENDENT * s[0]
-    Q = X @ (Vt[independent].T / s[independent])
-    tau -= (tau @ Q) @ Q.T
-    blocks = np.array_split(tau, _BLOCKS, axis=1)
-    return np.array([np.einsum("dk,dk->d", b, b) / size for b in blocks]), used
+    squares, V = np.linalg.eigh(X.T @ X)
+    independent = squares > _DEPENDENT**2 * squares[-1]
+    basis: Array = X @ (V[:, independent] / np.sqrt(squares[independent]))
+    return basis

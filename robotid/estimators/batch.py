@@ -70,6 +70,8 @@ class WLS(BatchEstimator):
     Attributes:
         prior: As in ``OLS``.
         independent_share: As in ``OLS``.
+        levels: Noise levels from which the iteration starts, shape (n,), as of a similar fit; None:
+            those of equal weights.
 
     References:
         Gautier (1997), Dynamic identification of robots with power model, section II.
@@ -77,10 +79,13 @@ class WLS(BatchEstimator):
 
     prior: Array | None = None
     independent_share: float = 1.0
+    levels: Array | None = None
 
     def _fit(self, factors: Factors) -> Estimate:
-        start = solve_factor(factors, np.ones(len(factors.rows)), self.prior)
-        sigma = _noise(factors, start.theta, factors.leverages(start.covariance))
+        sigma = self.levels
+        if sigma is None:
+            start = solve_factor(factors, np.ones(len(factors.rows)), self.prior)
+            sigma = _noise(factors, start.theta, factors.leverages(start.covariance))
         for iteration in range(1, _MAX_ITERATIONS + 1):
             solution = solve_factor(factors, sigma, self.prior)
             used = factors.leverages(solution.covariance) / sigma**2

@@ -252,8 +252,9 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
             if estimator.reads == "factors":
                 estimate = estimator.fit(ground.factors)
                 standard, _ = standard_of(estimate, mapping, before.pi, before.spread)
+            recordings = replace(recordings, levels=ground.rough.sigma)
             return recordings.with_model(model.with_reference(standard))
-        own = own.with_model(model.with_reference(standard))
+        own = replace(own, levels=ground.rough.sigma).with_model(model.with_reference(standard))
     raise NotConvergedError(
         f"the joint load torque has not converged after {_MOST_LOADS} fits; set friction = "
         "'viscous+coulomb', or record a motion that excites more parameters",
@@ -320,7 +321,7 @@ def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool)
     )
     factors, share = reduction.factors, recordings.share
     spread = prior_spread(model, reduction.squares, reduction.samples)
-    rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
+    rough = WLS(mapping.to_base(prior), share, recordings.levels).fit(factors)
     held_out = tuple(chain.from_iterable(logs)) or (factors,)
     errors = recordings.repeated
     repeated = 0.0 if errors is None else errors.variance / rough.sigma[-1] ** 2

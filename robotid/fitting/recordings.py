@@ -64,6 +64,7 @@ class Recordings:
         checkpoint: Storage of the reductions until the run is complete.
         weights: Weights of the rows of each log to fit, shapes (N, n_rows); 1 if None.
         repeated: Effect of errors of points of contact and of an IMU; None without any.
+        levels: Noise levels of an earlier fit, shape (n,), from which the next one starts.
     """
 
     model: RobotModel
@@ -74,6 +75,7 @@ class Recordings:
     checkpoint: Checkpoint | None = None
     weights: tuple[Array, ...] | None = None
     repeated: RepeatedErrors | None = None
+    levels: Array | None = None
 
     @property
     def is_in_memory(self) -> bool:

@@ -250,7 +250,8 @@ def with_drives(
         return replace(solved.with_errors(), drives=drives)
 
     def changed() -> Recordings:
-        own = _with_own(recordings, solved.solution, drives)
+        own = replace(recordings, levels=solved.ground.rough.sigma)
+        own = _with_own(own, solved.solution, drives)
         return own if recordings.repeated is None else with_repeated_errors(own)  # of its terms
 
     most = _MOST_SHAPES if any(drive.shapes for drive in drives) else 0

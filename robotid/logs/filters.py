@@ -51,10 +51,11 @@ def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Ar
     first, last = rows[:, :1], rows[:, -1:]
     before, after = 2 * first - rows[:, pad:0:-1], 2 * last - rows[:, -2 : -pad - 2 : -1]
     y = np.concatenate([before, rows, after], axis=1)
+    poles = butterworth_poles(order, cutoff, rate)
     for _ in range(2):
         start = y[:, :1].copy()
         y -= start
-        for pole in butterworth_poles(order, cutoff, rate):
+        for pole in poles:
             _filter(y, pole)
         y += start
         y = np.ascontiguousarray(y[:, ::-1])

@@ -35,11 +35,12 @@ def cubic_spline(t: Array, x: Array, at: Array) -> Array:
     bend = (slope[:-1] + slope[1:] - 2 * chord) / h
     cubic, square = bend / h, (chord - slope[:-1]) / h - bend
     k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    u = (at - t[k])[..., None]
-    found = cubic.take(k, axis=0)
+    u = at - t[k]
+    found = cubic.T.take(k, axis=1)  # (k, ...): long loops over times
     for own in (square, slope, x):
-        found = u * found + own.take(k, axis=0)
-    return found
+        found *= u
+        found += own.T.take(k, axis=1)
+    return np.moveaxis(found, 0, -1)
 
 
 def _slopes(h: Array, chord: Array) -> Array:

@@ -11,7 +11,7 @@ from robotid.regressor.columns import (
     trajectory_values,
 )
 from robotid.regressor.prediction import predict
-from robotid.robot.drives import DriveMotion
+from robotid.robot.drives import DriveMotion, Lag
 from robotid.robot.model import RobotModel
 
 __all__ = ["drive_motion_along", "is_loaded", "remember"]
@@ -40,11 +40,14 @@ def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:
     """
     if not model.layout.remembering:
         return trajectory
-    motion = drive_motion_along(model, trajectory)
+    is_lagging = any(isinstance(term, Lag) for _, term in model.layout.drive_parameters)
+    motion = drive_motion_along(model, trajectory, has_rate=is_lagging)
     return trajectory.with_states(remembered(model.layout, motion))
 
 
-def drive_motion_along(model: RobotModel, trajectory: Trajectory) -> DriveMotion:
+def drive_motion_along(
+    model: RobotModel, trajectory: Trajectory, *, has_rate: bool = True
+) -> DriveMotion:
     """Return the motion and load of the drives of a robot along a trajectory.
 
     The load is the torque of the bodies, and the rate that of the whole torque, by the model's
@@ -53,6 +56,7 @@ def drive_motion_along(model: RobotModel, trajectory: Trajectory) -> DriveMotion
     Args:
         model: The robot.
         trajectory: N samples in order of time.
+        has_rate: Whether the rate is needed, as for a lag; it is 0 otherwise.
 
     Returns:
         Arrays of shape (d, N).
@@ -67,6 +71,8 @@ def drive_motion_along(model: RobotModel, trajectory: Trajectory) -> DriveMotion
     bodies[: layout.n_inertial] = pi[: layout.n_inertial]
     load = predict(plain, [bodies], m)[0][:, first:]
     motion = drive_motion(layout, m.q, m.v, m.a, signs, load, None, begins)
+    if not has_rate:
+        return motion
     if layout.remembering:
         m = m.with_states(remembered(layout, motion))
     drives = trajectory_values(layout, m).T @ (layout.drive_loads * pi[layout.n_inertial :]).T

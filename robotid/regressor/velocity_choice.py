@@ -29,6 +29,7 @@ _PARTS = 8  # of the log, every other one fitted
 _BETTER = 0.85  # ratio of the errors below which the difference is significant
 _EXACT = 1e-6  # smallest relative error of a torque, for noise-free simulated logs
 _FEW = 3.0  # smallest number of rows per column for a joint
+_DEPENDENT = 1e-3  # relative singular value below which columns are dependent
 
 
 def prefers_measured(model: RobotModel, logs: Sequence[Log], settings: SignalSettings) -> bool:
@@ -100,7 +101,9 @@ def _held_out_error(model: RobotModel, motion: Trajectory, mask: Array, every: i
         for first, second in ((even, odd), (odd, even)):
             size = np.linalg.norm(W[first], axis=0)
             X = W / np.where(size > 0, size, 1.0)
-            theta = np.linalg.lstsq(X[first], tau[first], rcond=1e-3)[0]
+            squared, V = np.linalg.eigh(X[first].T @ X[first])  # of singular values
+            kept = squared > _DEPENDENT**2 * squared[-1]
+            theta = V[:, kept] @ (V[:, kept].T @ (X[first].T @ tau[first]) / squared[kept])
             squares += float(np.sum((tau[second] - X[second] @ theta) ** 2))
         error[j] = np.sqrt(squares) + _EXACT * np.linalg.norm(tau)
     return error

@@ -6,7 +6,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
-from functools import cached_property
+from functools import cache, cached_property
 from inspect import signature
 from itertools import pairwise
 from typing import Any, ClassVar, TypeAlias
@@ -216,8 +216,7 @@ class MemorylessTerm(DriveTerm):
         return self._shape(self.position_law)
 
     def _shape(self, law: Law | None) -> tuple[float, ...]:
-        names = [] if law is None else list(signature(law).parameters)[1:]
-        return tuple(float(getattr(self, name)) for name in names)
+        return () if law is None else tuple(float(getattr(self, name)) for name in _shapes(law))
 
     @property
     def ranges(self) -> tuple[float, float, float]:
@@ -252,6 +251,12 @@ class MemorylessTerm(DriveTerm):
         if self.follows_direction:
             column = motion.direction * column
         return np.abs(motion.load) * column if self.is_loaded else column
+
+
+@cache
+def _shapes(law: Law) -> tuple[str, ...]:
+    """Return the names of a law's shape parameters."""
+    return tuple(signature(law).parameters)[1:]
 
 
 #: Ranges of the data: of position "q" and of the absolute speed "v".

@@ -262,8 +262,9 @@ def test_what_a_torque_leaves_at_each_delay_is_of_least_squares_in_blocks(rng):
         inertial[:, 5] = 2.0 * inertial[:, 4] - inertial[:, 6]  # dependent
         steady = rng.random((count, 2)) < 0.7
         delayed = rng.standard_normal((2, 81, count)) + 4.0
-        windows.append(torque_delay._Window(inertial, drive, steady, delayed))
-    squares, used = torque_delay._squares(windows, 1, slice(3, 7))
+        load = rng.standard_normal((count, 2))
+        windows.append(torque_delay._Window(inertial, drive, steady, delayed, load))
+    squares, _, used = torque_delay._squares(windows, 1, slice(3, 7))
     at = [window.steady[:, 1] for window in windows]
     X = np.concatenate(
         [np.column_stack([w.inertial[k, 3:7], w.drive[k, 1], np.ones(k.sum())])
@@ -323,8 +324,7 @@ def test_friction_by_load_explains_what_least_squares_with_its_column_leave_less
         delayed = rng.standard_normal((2, 81, count))
         delayed[1] += 2.0 * load[:, 1]
         windows.append(torque_delay._Window(inertial, drive, steady, delayed, load))
-    plain, rows = torque_delay._squares(windows, 1, slice(1, 4))
-    loaded, _ = torque_delay._squares(windows, 1, slice(1, 4), has_load=True)
+    plain, loaded, rows = torque_delay._squares(windows, 1, slice(1, 4))
     at = [w.steady[:, 1] for w in windows]
     X = np.concatenate(
         [np.column_stack([w.inertial[k, 1:4], w.drive[k, 1], np.ones(k.sum()), w.load[k, 1]])
