@@ -1,11 +1,13 @@
 """The cause of a difference, against generalised least squares of all runs and groups together."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from robotid.variation.causes import evidence_by_group
 from robotid.variation.groups import Group, RunsOf
-from robotid.variation.mixed_effects import Runs
+from robotid.variation.mixed_effects import Runs, Slope
 
 UNIT = np.array([0, 0, 1, 1, 1, 2, 2])
 SIZES = {"drive": 2, "gain": 1, "payload": 2}
@@ -97,3 +99,24 @@ def test_groups_without_common_information_are_independent():
     deviations = [np.full((2, size), 0.4) for size in SIZES.values()]
     found = [evidence_by_group(x, deviations, UNIT == 2, is_unit=True) for x in (alone, blocks)]
     assert found[0] == pytest.approx(found[1])
+
+
+def test_effects_of_the_temperature_are_no_evidence():
+    rng = np.random.default_rng(7)
+    groups, x, C = together(rng, UNIT)
+    c, size, H = rng.normal(size=7), 1.7, np.linalg.inv(C) * INFLATION
+    moved = np.zeros((7, 5))
+    moved[:, 1] = size * c
+    warm = [
+        replace(g, runs=replace(g.runs, h=h / INFLATION))
+        for g, h in zip(
+            groups, np.split(np.einsum("kij,kj->ki", H, x + moved), [2, 3], axis=1), strict=True
+        )
+    ]
+    drive = warm[0]
+    warm[0] = replace(drive, runs=drive.runs.with_slopes([Slope(1, c, 1.0)]), slopes=(size,))
+    deviations = [np.full((2, n), 0.4) for n in SIZES.values()]
+    with_slope = [np.full((2, 3), 0.4), *deviations[1:]]
+    wanted = evidence_by_group(groups, deviations, UNIT == 1, is_unit=True)
+    found = evidence_by_group(warm, with_slope, UNIT == 1, is_unit=True)
+    assert found == pytest.approx(wanted)

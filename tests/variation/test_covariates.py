@@ -214,3 +214,22 @@ def test_covariates_that_do_not_vary_and_few_runs_have_no_effect():
     assert with_effects([same])[0].runs.slopes == ()
     few = group(rng.normal(size=(3, 1)), 0.1, [Covariate("time", "h", np.arange(3.0))])
     assert with_effects([few])[0] is few
+
+
+def test_the_level_of_an_effect_counts_all_tests():
+    """A p-value of 0.006 is below 2 % over 1 test, and above it over 1 + 2 * 2 tests."""
+    rng = np.random.default_rng(10)
+    c = rng.normal(size=8)
+    e, own = 0.08 * rng.normal(size=(8, 1)), [Covariate("temperature", "degC", 30.0 + c)]
+    low, high = 0.0, 2.0
+    for _ in range(20):  # the slope with this p-value
+        size = 0.5 * (low + high)
+        one = group(e + size * c[:, None], 0.02, own, name="lift")
+        slope = Slope(0, c - c.mean(), 0.1 / c.std())
+        p_value = MixedEffects(one.runs.with_slopes([slope])).slope(0)[2]
+        low, high = (size, high) if p_value > 0.006 else (low, size)
+    assert p_value == pytest.approx(0.006, rel=0.02)
+    both = [*own, Covariate("time", "h", rng.normal(size=8))]
+    others = group(0.08 * rng.normal(size=(8, 2)), 0.02, both)
+    assert len(with_effects([one])[0].runs.slopes) == 1
+    assert len(with_effects([one, others])[0].runs.slopes) == 0
