@@ -184,6 +184,7 @@ def test_gains_come_from_a_known_mass(files, capsys, ur5):
              "tool0", "--mass", "tool0=2", "--gains"]  # fmt: skip
     found = json.loads(asked(capsys, *words, "--json"))
     assert list(found["gains"]) == list(ur5.joints)
+    assert not found.get("mass_checks")  # the known mass was used
     for gain, true in zip(found["gains"].values(), GAINS, strict=True):
         assert gain["gain"] == pytest.approx(true, abs=4 * gain["std_error"])
         assert gain["std_error"] < 0.05 * true
