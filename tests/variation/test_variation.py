@@ -496,7 +496,7 @@ def test_the_cause_of_an_unlike_unit_explains_most_of_all_its_runs():
         H = np.ones((11, 1, 1))
         H[6] = first
         own = Group(kind, kind, (f"{kind}.x",), ("N",), np.eye(1), (0,))
-        return RunsOf(own, np.zeros(1), Runs(H, H[:, 0] * x, unit, np.full(1, 1e-3)), 1.0)
+        return RunsOf(own, np.zeros(1), Runs(H, H[:, 0] * x, unit, np.full(1, 1.0)), 1.0)
 
     pair = group("drive", 5000.0, 1.0), group("gain", 2000.0, 4.0)
     for groups in (pair, pair[::-1]):
