@@ -109,3 +109,48 @@ def test_logs_that_command_no_joint_to_move_are_refused():
     pushed = SimpleNamespace(name="c.csv", q_ref=q_ref[:2], v_ref=None, tau_ref=q_ref[1:])
     fit._check_settings(None, [pushed], LoopSettings(), settings)
     fit._check_settings(None, [still], LoopSettings(kind="torque"), settings)
+
+
+@dataclass(frozen=True)
+class Stepping:
+    """A simulator of which only the step counts."""
+
+    windows: tuple
+    robot: SimpleNamespace
+    fine: SimpleNamespace | None = None
+
+
+def test_the_change_by_halving_the_steps_is_part_of_the_covariance(monkeypatch):
+    """Rows of 8 ms and steps of at most 3 ms: 8 / 3 ms, then half of it; 16 times finer at most."""
+    t = 5.0 + 0.008 * np.arange(4)
+    window = SimpleNamespace(log=SimpleNamespace(t=t))
+    simulator = Stepping((window,), SimpleNamespace(model="arm", step=3e-3))
+    error, tried = np.array([0.5, 0.01]), []
+
+    def moved(now, half, theta):
+        tried.append((now.fine and now.fine.step, half.fine.step, half.fine.corrects))
+        return (np.array([-0.03, 1.9e-3]) if len(tried) == 2 else np.array([0.4, -0.05])), error
+
+    @dataclass(frozen=True)
+    class Found:
+        theta: np.ndarray
+        covariance: np.ndarray
+        details: dict
+
+    monkeypatch.setattr(
+        fit, "ClosedLoopRobot",
+        lambda model, step, corrects: SimpleNamespace(model=model, step=step, corrects=corrects),
+    )  # fmt: skip
+    monkeypatch.setattr(fit, "_settled", lambda now, estimator, estimate: (now, estimate))
+    C = np.array([[0.25, 1e-3], [1e-3, 1e-4]])
+    start = Found(np.array([1.0, 2.0]), C, {"inflation": 2.0})
+    now, found = fit.refine_steps(simulator, SimpleNamespace(moved=moved), start)
+    step = 0.008 / 3
+    assert [x[1] for x in tried] == pytest.approx([step / 2, step / 4])
+    assert all(x[2] for x in tried)
+    assert now.fine.step == pytest.approx(step / 2)
+    change = np.array([-0.03, 1.9e-3])
+    np.testing.assert_allclose(found.covariance, C + np.outer(change, change))
+    assert found.details == {
+        "inflation": 2.0, "step": pytest.approx(step / 2), "halving": pytest.approx(0.19)
+    }  # fmt: skip

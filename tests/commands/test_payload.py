@@ -184,6 +184,7 @@ def test_gains_come_from_a_known_mass(files, capsys, ur5):
              "tool0", "--mass", "tool0=2", "--gains"]  # fmt: skip
     found = json.loads(asked(capsys, *words, "--json"))
     assert list(found["gains"]) == list(ur5.joints)
+    assert not found.get("mass_checks")  # the known mass was used
     for gain, true in zip(found["gains"].values(), GAINS, strict=True):
         assert gain["gain"] == pytest.approx(true, abs=4 * gain["std_error"])
         assert gain["std_error"] < 0.05 * true
@@ -269,3 +270,13 @@ def test_friction_that_the_reference_shows_is_that_of_the_payload_s_logs(upright
     for gain, true in ((scaled["joint_1"], 3.0), (scaled["joint_2"], 7.0), (one["joint_1"], 3.0)):
         assert gain["gain"] == pytest.approx(true, abs=4 * gain["std_error"])
         assert gain["std_error"] < 0.02 * true
+
+
+def test_the_narrowest_check_is_that_of_the_smallest_share_of_its_mass():
+    checks = [
+        PayloadCheck("tool", 1.0, interval=(0.9, 1.1), identified=1.0),
+        PayloadCheck("tool", 4.0, interval=(3.8, 4.2), identified=4.0),
+        PayloadCheck("tool", 2.0),
+    ]
+    widths = [payload._width(check) for check in checks]
+    assert widths == [pytest.approx(0.2), pytest.approx(0.1), np.inf]

@@ -14,10 +14,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from robotid.exceptions import DataError, MissingDependencyError, SettingsError
+from robotid.log_files import csv_files
 from robotid.log_files.read import read_log, write_log
+from robotid.log_files.table import Place
 from robotid.logs.base import BaseColumns
 from robotid.logs.data import Log
-from robotid.logs.settings import LogUnits
+from robotid.logs.settings import LogSource, LogUnits
 
 JOINTS = ("shoulder", "elbow")
 FOLDERS = (os.environ.get("ROBOTID_DATA"), Path(__file__).resolve().parents[3] / "shared" / "data")
@@ -727,3 +729,24 @@ def test_an_empty_cell_of_another_device_names_the_rate(tmp_path):
     (tmp_path / "run.csv").write_text("time,q_a,wrench_fz_f\n0,1,2\n0.1,1,\n0.2,1,3\n")
     with pytest.raises(DataError, match=r"wrench_fz_f is empty at row 1.*column of another rate"):
         read_log(tmp_path / "run.csv", ["a"], base=BaseColumns(wrenches=("fz f",)))
+
+
+def test_rows_of_a_csv_file_are_read_from_any_place_before_them(tmp_path, monkeypatch):
+    """Blocks of three lines, some of them blank; the first row is line 2."""
+    monkeypatch.setattr(csv_files, "_BLOCK", 3)
+    lines = ["time,q", "0,10", "", "1,11", "2,12", "3,13", "", "", "4,14", "5,15", "6,16", "7,17"]
+    (tmp_path / "run.csv").write_text("\n".join(lines) + "\n")
+    rows = csv_files.CsvFormat().open(tmp_path / "run.csv", LogSource()).rows
+    blocks = list(rows.scan("q"))
+    assert [values.tolist() for values, _ in blocks] == [[10, 11], [12, 13], [14, 15], [16, 17]]
+    places = [place for _, place in blocks]
+    assert [(place.row, place.line) for place in places] == [(0, 2), (2, 5), (4, 8), (6, 11)]
+    for near in (Place(), *places):
+        for first in range(near.row, 8):
+            for stop in range(first + 1, 9):
+                found = rows.read(["q", "time"], first, stop, near)
+                assert found["time"].tolist() == list(range(first, stop))
+                assert found["q"].tolist() == [10 + k for k in range(first, stop)]
+    (tmp_path / "run.csv").write_text("\n".join([*lines, "8,18,0"]) + "\n")
+    with pytest.raises(DataError, match="line 13 has 3 cells"):
+        rows.read(["q"], 6, 9, places[-1])
