@@ -5,7 +5,10 @@ Writes small logs (Parquet, 4 s at 50 Hz) of planar arms with two joints, whose 
 The same again: one worker is killed (Dask starts another), then the command itself (SIGKILL), and
 then it is resumed in two worker processes without Dask. The files must have the same bits.
 
-    python benchmarks/bench_fleet.py [--quick] [--units 1000] [--logs 10]
+``--once`` leaves out the first run: the rows of ten units must have the bits of a run of these
+units alone.
+
+    python benchmarks/bench_fleet.py [--quick] [--units 1000] [--logs 10] [--once]
 """
 
 import argparse
@@ -22,6 +25,7 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
 import numpy as np
+import pyarrow.parquet
 from distributed import Client, LocalCluster
 from setting import PLANAR, machine
 
@@ -41,6 +45,7 @@ def main():
     parser.add_argument("--quick", action="store_true", help="12 units with 3 logs")
     parser.add_argument("--units", type=int, default=1000)
     parser.add_argument("--logs", type=int, default=10)
+    parser.add_argument("--once", action="store_true", help="the killed run alone")
     options = parser.parse_args()
     units, logs = (12, 3) if options.quick else (options.units, options.logs)
     with tempfile.TemporaryDirectory() as where:
@@ -53,32 +58,37 @@ def main():
             address = cluster.scheduler_address
             before = os.times()
             start = time.perf_counter()
-            subprocess.run(command(table, folder / "one", address), check=True)
-            seconds = time.perf_counter() - start
-            after = os.times()
-            own = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024  # [MiB]
-            others = max(client.run(peak).values())
+            if not options.once:
+                subprocess.run(command(table, folder / "one", address), check=True)
+                seconds = time.perf_counter() - start
             run = subprocess.Popen(command(table, folder / "two", address))
             wait(folder / "two", units // 3, run)
             victim = next(iter(client.run(os.getpid).values()))
             os.kill(victim, signal.SIGKILL)
             wait(folder / "two", 2 * units // 3, run)
+            others = max(client.run(peak).values())
             run.kill()
             run.wait()
         left = units - len(finished(folder / "two"))
         subprocess.run([*command(table, folder / "two"), "--workers", "2", "--resume"], check=True)
-        same = all(
-            (folder / "one" / name).read_bytes() == (folder / "two" / name).read_bytes()
-            for name in FILES
-        )
-        size = (folder / "one" / "fleet.parquet").stat().st_size / 2**20
+        after = os.times()
+        own = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024  # [MiB]
+        if options.once:
+            seconds = time.perf_counter() - start
+            same = are_alone(folder, logs)
+        else:
+            same = all(
+                (folder / "one" / name).read_bytes() == (folder / "two" / name).read_bytes()
+                for name in FILES
+            )
+        size = (folder / "two" / "fleet.parquet").stat().st_size / 2**20
     print(f"| units | logs each | s | logs/s | command, MiB | worker, MiB | results, MiB | "
           f"left after the kills | same bits |\n|{'---:|' * 9}")  # fmt: skip
     rate = units * logs / seconds
     print(f"| {units} | {logs} | {seconds:.0f} | {rate:.1f} | {own:.0f} | {others:.0f} | "
           f"{size:.1f} | {left} | {'yes' if same else 'NO'} |")  # fmt: skip
     used = sum(after[2:4]) - sum(before[2:4])
-    print(f"\n{used:.0f} s of processor time of the command without its workers. {machine()}, "
+    print(f"\n{used:.0f} s of processor time of the commands without its workers. {machine()}, "
           f"load {os.getloadavg()[0]:.1f}")  # fmt: skip
     if not same:
         sys.exit("the resumed run gave other bits")
@@ -118,6 +128,18 @@ def write(folder, units, logs):
 def command(table, out, address=None):
     words = [sys.executable, "-m", "robotid", "fleet", str(table), "--out", str(out)]
     return words if address is None else [*words, "--scheduler", address]
+
+
+def are_alone(folder, logs):
+    """Return whether ten units have the same rows when they are identified alone."""
+    lines = (folder / "fleet.csv").read_text().splitlines()
+    few = folder / "few.csv"
+    few.write_text("\n".join(lines[: 10 * logs + 1]) + "\n")
+    subprocess.run([*command(few, folder / "few"), "--workers", "2"], check=True)
+    alone, every = (
+        pyarrow.parquet.read_table(folder / name / "fleet.parquet") for name in ("few", "two")
+    )
+    return alone.equals(every.slice(0, alone.num_rows))
 
 
 def peak():
