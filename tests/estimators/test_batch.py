@@ -27,6 +27,15 @@ def test_wls_beats_ols_where_joints_are_unequally_noisy(ur5, rng):
     assert np.mean(errors["wls"]) < 1.2  # errors are of the size that is stated
 
 
+def test_wls_is_the_same_from_the_noise_levels_of_a_similar_fit(ur5, rng):
+    problem = Case(ur5, rng, NOISE).problem
+    plain = WLS().fit(problem)
+    near = WLS(levels=1.001 * plain.sigma).fit(problem)
+    assert near.n_iter < plain.n_iter
+    for one, other in ((plain.theta, near.theta), (plain.sigma, near.sigma)):
+        np.testing.assert_allclose(other, one, rtol=1e-6, atol=1e-9)
+
+
 def test_ols_is_plain_least_squares(ur5, rng):
     case = Case(ur5, rng, NOISE)
     W, tau, _ = (np.concatenate(x) for x in zip(*case.problem.blocks(), strict=True))
