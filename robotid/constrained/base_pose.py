@@ -20,7 +20,8 @@ __all__ = ["check_order", "check_pose", "check_unit"]
 _MOVES = 0.02  # [m/s] RMS speed of feet in contact below which no other order is tried
 _BETTER = 0.5  # ratio of the speeds below which another order is found
 _ABOVE = 0.3  # vertical distance of base and feet over their distance, from which one is above
-_FASTEST = 30.0  # [m/s^2] RMS acceleration of a base above which its position is in mm
+_STRIDE = 0.2  # [s] over which the acceleration of a base is averaged against noise
+_FASTEST = 30.0  # [m/s^2] RMS of this above which its position is in mm
 _ALONG = 0.8  # component of the unit vector from the feet to the base that may be the vertical
 
 
@@ -47,22 +48,26 @@ def check_pose(log: Log) -> Iterator[Finding]:
         yield log_finding(log.name, "base_jump", "warning", message, **evidence)
 
 
-def check_unit(log: Log, motion: Trajectory) -> Iterator[Finding]:
-    """Yield a finding if the position of a base is in mm.
+def check_unit(log: Log) -> Iterator[Finding]:
+    """Yield a finding if the position of a base is in mm: it moves too fast, averaged over time.
 
     Args:
-        log: The log.
-        motion: Its smoothed motion, differentiated from positions.
+        log: The log, with a base.
     """
-    if log.base is None or not log.base.has_position or log.base.imu is not None:
+    if log.base is None or not log.base.has_position:
         return
-    size = float(np.sqrt(np.mean(np.sum(motion.a[:, :3] ** 2, axis=1))))
+    t = np.arange(log.t[0], log.t[-1], _STRIDE)
+    x = np.stack([np.interp(t, log.t, own) for own in log.base.pose[:, :3].T], axis=1)
+    if len(t) < 3:
+        return
+    second = np.diff(x, n=2, axis=0) / _STRIDE**2
+    size = float(np.sqrt(np.mean(np.sum(second**2, axis=1))))
     if size < _FASTEST:
         return
     message = (
-        f"the acceleration of the base is {size:.3g} m/s^2 (RMS), more than that of a jump. If "
-        f"base_x, base_y and base_z are in mm, it is {1e-3 * size:.2g} m/s^2: convert them to m. "
-        "Else their noise is too large: lower cutoff in [signals]"
+        f"the acceleration of the base is {size:.3g} m/s^2 (RMS over {_STRIDE:g} s), more than "
+        f"that of jumps. If base_x, base_y and base_z are in mm, it is {1e-3 * size:.2g} m/s^2: "
+        "convert them to m. Else correct them"
     )
     yield log_finding(log.name, "base_unit", "error", message, acceleration=size)
 

@@ -53,6 +53,9 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
     if log.base is not None and log.base.twist is not None and log.base.imu is None:
         yield from _check_axes(log)
     imu = None if log.base is None else log.base.imu
+    if wrong := list(check_unit(log)):
+        yield from wrong
+        return
     if imu is None:
         yield from check_pose(log)
     if not model.contacts and imu is None:
@@ -65,9 +68,6 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         return
     for note in whole.notes[len(log.notes) :]:
         yield log_finding(log.name, "log_note", "note", note)
-    if wrong := list(check_unit(whole, motion)):
-        yield from wrong
-        return
     flags = _flags(model, log, whole, motion.t)
     if wrong := list(check_order(model, whole, still, motion, flags)):
         yield from wrong

@@ -100,7 +100,7 @@ def check_exchanged_steps(
     message = (
         f"in {is_wrong.mean():.0%} of the samples, from {seconds(first)} to {seconds(last)} s, the "
         f"measured forces of the ground fit the motion only if those of {listed(list(frames))} are "
-        "exchanged: each foot stands on the plate of the other one. Exchange the columns there, or "
+        "exchanged: each foot is on the plate of the other one. Exchange the columns there, or "
         "select the time with start and end"
     )
     evidence = {"share": float(is_wrong.mean()), "first": first, "last": last}

@@ -61,7 +61,9 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     for kind, values in channels.items():
         yield from _quantisation(log, kind, values, signals.velocity)
     for kind, values in channels.items():
-        yield from _spikes(log, kind, values, noise[kind], signals.velocity)
+        is_used = kind != "dq" or signals.velocity == "measured"
+        is_used = is_used or (signals.velocity == "auto" and is_trustworthy(log))
+        yield from _spikes(log, kind, values, noise[kind], is_used=is_used)
     for kind, values in channels.items():
         yield from _noise(log, kind, values, noise[kind])
     if log.v is not None:
@@ -115,10 +117,10 @@ def _finer(kind: str, step: float, velocity: str, *, few: bool) -> str:
     return "its resolution is too low: log it with more digits" if few else "log more digits"
 
 
-def _spikes(log: Log, kind: str, values: Array, noise: Array, velocity: str) -> Iterator[Finding]:
+def _spikes(
+    log: Log, kind: str, values: Array, noise: Array, *, is_used: bool = True
+) -> Iterator[Finding]:
     """Yield rows that differ strongly from both neighbours."""
-    is_used = kind != "dq" or velocity == "measured"
-    is_used = is_used or (velocity == "auto" and is_trustworthy(log))
     smooth = _without_spikes(values)
     amplitudes = [_amplitude(*own) for own in zip(values.T, smooth.T, noise, strict=True)]
     least = _LEAST.get(kind, _LEAST_TORQUE * float(np.median(amplitudes)))

@@ -171,8 +171,8 @@ def _bunches(log: Log, step: Array) -> Iterator[Finding]:
     )
     if is_even:
         message += (
-            f"the mean step is {1e3 * mean:.4g} ms, the usual one {1e3 * usual:.4g} ms, so no rows "
-            'are missing: state stamp = "even" in [log], or log the time of recording'
+            f"the mean step is {1e3 * mean:.4g} ms, the typical one {1e3 * usual:.4g} ms, so no "
+            'rows are missing: state stamp = "even" in [log], or log the time of recording'
         )
     else:
         message += "log the time of recording"

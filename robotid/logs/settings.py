@@ -171,8 +171,8 @@ class LogSource(Settings):
     stamp: str = setting(
         "header",
         "the time stamps: even, equal time steps for all rows, for a recorder that stamps rows of "
-        "one rate late, in bunches; of a bag also header, the stamp in the message, or log, the "
-        "time of recording",
+        "one rate on arrival, in bunches; of a bag also header, the stamp in the message, or log, "
+        "the time of recording",
         among=("header", "log", "even"),
     )
     sensors: tuple[str, ...] = setting(

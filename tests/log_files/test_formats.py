@@ -477,7 +477,7 @@ def test_a_topic_of_a_csv_file_is_noted(tmp_path):
     ("settings", "message"),
     [
         ({"effort": "percent"}, "effort is 'percent', wanted one of torque, current"),
-        ({"stamp": "wall"}, "stamp is 'wall', wanted one of header, log"),
+        ({"stamp": "wall"}, "stamp is 'wall', wanted one of header, log, even"),
         ({"joints": {"elbow": 2}}, "joints.elbow is 2, wanted a name"),
     ],
 )
