@@ -90,7 +90,7 @@ def check_slip(
     message = (
         f"the link {link} slips in {share:.0%} of its time in contact, at {mean:.2g} m/s (RMS), "
         f"{distance:.2g} m in total. Its force is still eliminated, and its rows are used: they "
-        "do not assume that it stands"
+        "do not assume that it is at rest"
     )
     evidence = {"share": share, "speed": mean, "distance": distance}
     yield log_finding(log.name, "slipping_foot", "note", message, **evidence)
