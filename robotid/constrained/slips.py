@@ -25,7 +25,7 @@ def without_zeros(t: Array, v: Array, J: Array, flags: Array) -> Array:
 
     Wrong zeros d of the joints move the point by J d, which has the velocity dJ/dt d: it returns
     with the posture, and d is the same in all contacts. It is estimated from all of them, without
-    samples in which the point is much faster than usual.
+    samples of more than three times the median speed.
 
     Args:
         t: Time stamps, shape (N,) [s].
