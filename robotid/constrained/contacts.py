@@ -130,11 +130,16 @@ def _check_feet(
             if found_radius := _radius(contact, velocity[touching, k], rolls[touching]):
                 rolling.append(found_radius)
                 del named[k]
-    relative = _relative(velocity, trusted)
+    relative, is_alone = _relative(velocity, trusted), trusted.sum(axis=1) < 2
+    drift = np.zeros(3)  # of the pose of the base, that of all feet most of the time
+    if trusted.any():
+        drift = np.median(velocity[trusted], axis=0)
     for k, found in named.items():
         ways = [relative[:, k]]
         if has_ground:  # of 2 feet, each moves by a half
-            ways = [2.0 * relative[:, k], velocity[:, k]]
+            apart = 2.0 * relative[:, k]
+            apart[is_alone] = velocity[is_alone, k] - drift
+            ways = [apart, velocity[:, k]]
         frame = model.contacts[k].frame
         ways = [without_zeros(motion.t, way, J[:, k], flags[:, k]) for way in ways]
         yield from found or check_slip(frame, log, flags[:, k], motion.t, ways, signals)

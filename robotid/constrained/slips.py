@@ -16,6 +16,7 @@ _SLIPS = 0.03  # share of the time in contact with a slip that is reported
 _BEYOND = 3.0  # standard errors that a slip must exceed
 _FAST, _SLOW = 0.2, 1.0  # [s] windows in which the mean velocity of a foot in contact is a slip ...
 _DISTANCE = 0.01  # [m] ... from this way in a window on
+_USUAL = 3.0  # median speeds up to which a sample counts for the zeros
 _ZERO = 0.05  # [rad or m] prior standard deviation of the zero of a joint
 
 
@@ -23,7 +24,8 @@ def without_zeros(t: Array, v: Array, J: Array, flags: Array) -> Array:
     """Return the velocity of a point of contact without that due to wrong zeros of joints.
 
     Wrong zeros d of the joints move the point by J d, which has the velocity dJ/dt d: it returns
-    with the posture, and d is the same in all contacts. It is estimated from all of them.
+    with the posture, and d is the same in all contacts. It is estimated from all of them, without
+    samples of more than three times the median speed.
 
     Args:
         t: Time stamps, shape (N,) [s].
@@ -31,10 +33,12 @@ def without_zeros(t: Array, v: Array, J: Array, flags: Array) -> Array:
         J: Its Jacobian, shape (N, 3, n_rows); the first six columns are those of the base.
         flags: Whether it touches the ground, shape (N,).
     """
-    A: Array = np.gradient(J[:, :, 6:], t, axis=0)
-    rows, left = A[flags].reshape(-1, A.shape[2]), v[flags].ravel()
-    if not len(left):
+    if not flags.any():
         return v
+    A: Array = np.gradient(J[:, :, 6:], t, axis=0)
+    speed = np.linalg.norm(v, axis=1)
+    slow = flags & (speed <= _USUAL * np.median(speed[flags]))  # no fast slips
+    rows, left = A[slow].reshape(-1, A.shape[2]), v[slow].ravel()
     step = float(np.median(np.diff(t)))
     noise = np.mean(left**2) * max(1.0, _FAST / step) / _ZERO**2 + 1e-12
     d = np.linalg.solve(rows.T @ rows + noise * np.eye(A.shape[2]), rows.T @ left)
@@ -90,7 +94,7 @@ def check_slip(
     message = (
         f"the link {link} slips in {share:.0%} of its time in contact, at {mean:.2g} m/s (RMS), "
         f"{distance:.2g} m in total. Its force is still eliminated, and its rows are used: they "
-        "do not assume that it stands"
+        "do not assume that it is at rest"
     )
     evidence = {"share": share, "speed": mean, "distance": distance}
     yield log_finding(log.name, "slipping_foot", "note", message, **evidence)

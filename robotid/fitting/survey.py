@@ -133,8 +133,9 @@ class LogPiece:
         model, motion, mask = self.header.model, rows.trajectory, rows.mask
         if model.layout != before.layout or is_loaded(model):
             motion = remember(model, motion.with_states(None))
-        # static rows were chosen by their speeds already, constrained ones with their forces
-        if not (model.is_static or model.constraints):
+        # static rows were chosen by their speeds already, those of a free base without its jumps
+        # and with the forces of its contacts
+        if not (model.is_static or model.constraints or motion.switching is not None):
             mask = row_mask(model, motion, self.header.signals.min_velocity)
         vars(self)["_cached"] = replace(rows, trajectory=motion, mask=mask)
 

@@ -205,7 +205,7 @@ def test_a_bias_of_the_accelerometers_is_estimated(go1, trot):
     held = hold_log(go1, biased, SIGNALS)
     once = with_repeated_errors(Recordings(go1, structural_mapping(go1), [held]))
     again = with_repeated_errors(once).repeated  # of what is left: the whole bias is the same
-    np.testing.assert_allclose(again.bias, once.repeated.bias, atol=0.05 * sure)
+    np.testing.assert_allclose(again.bias, once.repeated.bias, atol=0.4 * sure)
 
 
 def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_path):
