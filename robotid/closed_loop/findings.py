@@ -82,10 +82,32 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
             f"the logs do not determine {names}: the prior values remain. Command a motion that "
             f"depends on these parameters{known}",
         )
+    yield from _at_rest(found)
     yield from _limits_found(found)
     yield from _unequal_gains(found)
     yield from _encoder_findings(found)
     yield from map(_friction_found, (t for t in found.fit.tried if t.is_chosen))
+
+
+def _at_rest(found: LoopIdentification) -> Iterator[Finding]:
+    """Yield which friction terms and offsets are of joints that no fitted log commands to move."""
+    moves = np.any([run.moves for run in found.fitted], axis=0)
+    undetermined = set(found.undetermined)
+    own = [
+        free.name
+        for free in found.fit.simulator.free_parameters
+        if free.what == "term" and not moves[list(free.joints)].any()
+    ]
+    if left := [name for name in own if name not in undetermined]:
+        names = listed(left, _NAMED)
+        yield Finding(
+            "undetermined",
+            "warning",
+            names,
+            f"no log commands the joints of {names} to move: these parameters explain where the "
+            "joints rest, not how they move, and their standard errors are too small. Command a "
+            "motion of these joints",
+        )
 
 
 def _settled_delay(finding: Finding, found: LoopIdentification) -> Finding:

@@ -12,7 +12,6 @@ from robotid.closed_loop.evaluation import DRIFTS
 from robotid.closed_loop.free_parameters import (
     FreeParameter,
     LoopSimulator,
-    commanded,
     free_body_parameters,
     with_terms,
 )
@@ -380,7 +379,7 @@ def _check_settings(
 ) -> None:
     """Refuse logs without a compared signal, and free loop parameters where none may be free."""
     error = f"estimator: error = {settings.error!r}"
-    if loop.kind != "torque" and not any(commanded(log).any() for log in logs):
+    if loop.kind != "torque" and not any(map(_has_motion, logs)):
         raise DataError(
             f"{listed(sorted({log.name for log in logs}))}: the commands of all joints are "
             "constant, wanted commands that move at least one joint. Record a motion, or check the "
@@ -424,6 +423,12 @@ def _check_settings(
             "values for every joint in [controller] (delay = 0 if there is none), or set "
             "error = 'input'"
         )
+
+
+def _has_motion(log: Log) -> bool:
+    """Return whether a log commands a joint to move, by position, speed or torque."""
+    given = [x for x in (log.q_ref, log.v_ref, log.tau_ref) if x is not None]
+    return any(bool((np.ptp(x, axis=0) > 0).any()) for x in given)
 
 
 def _largest_speeds(model: RobotModel, loop: LoopSettings, logs: Sequence[Log]) -> Array:

@@ -10,7 +10,7 @@ from robotid._typing import Array
 from robotid.closed_loop.drive_torques import drive_torques
 from robotid.estimators.simulator import Residual
 from robotid.exceptions import NotConvergedError
-from robotid.logs.data import Log, Trajectory
+from robotid.logs.data import Trajectory
 from robotid.regressor.memory import remember
 from robotid.regressor.prediction import predict
 from robotid.robot.drives import DriveTerm
@@ -18,14 +18,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 from robotid.simulation.loops import ClosedLoopRobot, Column, Loops, RollOut, Window
 
-__all__ = [
-    "FreeParameter",
-    "LoopSimulator",
-    "TorqueRows",
-    "commanded",
-    "free_body_parameters",
-    "with_terms",
-]
+__all__ = ["FreeParameter", "LoopSimulator", "TorqueRows", "free_body_parameters", "with_terms"]
 
 _STARTS = 2  # steps of the initial states of windows
 _SHARES = (1.0, 0.3, 0.1)  # step lengths that are tried
@@ -308,8 +301,6 @@ class LoopSimulator:
         """Return measured minus simulated outputs, window by window; see ``Simulator``.
 
         With ``error`` "direct", derivatives are those of inverse dynamics along the roll-out.
-        Positions and speeds of a joint are not compared in a log that commands it to rest: friction
-        holds it where it stopped before, whatever its parameters are.
 
         Args:
             theta: Values of the free parameters, shape (c,).
@@ -345,30 +336,14 @@ class LoopSimulator:
                 for out, error in zip(coarse, errors, strict=True)
                 for part in self._parts(out, error, loops, columns)
             ]
+        everything, none = np.arange(self._outputs), np.array([], dtype=int)
         if not with_slopes:
-            none = np.array([], dtype=int)
-            compared = [np.flatnonzero(self._compared[id(out.window.log)]) for out in outs]
-            return [
-                Residual(self._error(out, loops)[:, own], None, own, none)
-                for out, own in zip(outs, compared, strict=True)
-                if own.size
-            ]
+            return [Residual(self._error(out, loops), None, everything, none) for out in outs]
         slopes, own = self._inverse_dynamics(outs, theta), np.arange(len(theta))
         return [
             Residual(self._error(out, loops)[:, joints], Y[:, joints], joints, own)
             for out, Y in zip(outs, slopes, strict=True)
             for joints in self.robot.parts
-        ]
-
-    @property
-    def window_of_parts(self) -> list[int]:
-        """Index of the window of each residual with derivatives: of each part that is compared."""
-        n = len(self.base.kp)
-        return [
-            k
-            for k, window in enumerate(self.windows)
-            for joints in self.robot.parts
-            if self._compared[id(window.log)].reshape(-1, n)[:, joints].any()
         ]
 
     @property
@@ -386,17 +361,6 @@ class LoopSimulator:
         """Number of compared outputs: positions, speeds, torques, in this order."""
         further = self.velocities + (self.lag is not None) if self.error == "output" else 0
         return len(self.base.kp) * (1 + further)
-
-    @cached_property
-    def _compared(self) -> dict[int, Array]:
-        """Which outputs of each log are compared, shape (outputs,), bool, by the id of the log."""
-        found = {}
-        for log in {id(window.log): window.log for window in self.windows}.values():
-            found[id(log)] = np.ones(self._outputs, dtype=bool)
-            if self.error == "output" and self.base.kp.any():
-                motion = np.tile(commanded(log), 1 + self.velocities)
-                found[id(log)][: len(motion)] = motion
-        return found
 
     def _error(self, out: RollOut, loops: Loops) -> Array:
         """Return measured minus simulated outputs, shape (N, outputs)."""
@@ -428,10 +392,6 @@ class LoopSimulator:
             slopes = np.concatenate(parts, axis=1)
             outputs = np.concatenate([joints + n * i for i in range(len(parts))])
             own = places[places < free_parameters]  # initial states follow
-            kept = self._compared[id(out.window.log)][outputs]
-            if not kept.any():
-                continue
-            outputs, slopes = outputs[kept], slopes[:, kept]
             by_start = slopes[:, :, len(own) :]
             yield Residual(error[:, outputs], slopes[:, :, : len(own)], outputs, own, by_start)
 
@@ -502,17 +462,6 @@ class LoopSimulator:
                 half = U @ change @ T.T @ U.T
                 directions.append(inertial_from_pseudo_inertia(half + half.T))
         return bodies, np.array(directions).reshape(-1, 10)
-
-
-def commanded(log: Log) -> Array:
-    """Return which joints a log commands to move, shape (n,), bool.
-
-    Args:
-        log: The log, with commands.
-    """
-    given = [x for x in (log.q_ref, log.v_ref, log.tau_ref) if x is not None]
-    moves: Array = np.any([np.ptp(x, axis=0) > 0 for x in given], axis=0)
-    return moves
 
 
 def with_terms(model: RobotModel, loops: Loops) -> RobotModel:

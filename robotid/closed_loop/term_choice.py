@@ -160,9 +160,10 @@ def _folds(simulator: LoopSimulator, theta: Array, estimator: OutputError) -> li
     known = 1.0 / simulator.prior_std**2 / count
     H = np.tile(np.diag(known), (count, 1, 1))
     g, rows = np.tile(known * (simulator.prior - theta), (count, 1)), [0] * count
-    parts = linearised(simulator, estimator.weights(simulator, theta), theta)
-    for window, (A, b, columns) in zip(simulator.window_of_parts, parts, strict=True):
-        fold = window % count
+    parts = list(linearised(simulator, estimator.weights(simulator, theta), theta))
+    each = len(parts) // len(simulator.windows)  # parts of the robot
+    for k, (A, b, columns) in enumerate(parts):
+        fold = (k // each) % count
         H[fold][np.ix_(columns, columns)] += A.T @ A
         g[fold][columns] += A.T @ b
         rows[fold] += len(b)

@@ -147,41 +147,6 @@ def test_what_is_compared_is_what_was_logged(simulator):
             np.testing.assert_allclose(given.e[:, j], log.tau[k, j] - tau, atol=1e-12)
 
 
-def test_a_joint_that_a_log_commands_to_rest_is_not_compared_in_it(simulator, rng):
-    theta, log = off(simulator, rng), simulator.windows[0].log
-    q_ref = log.q_ref.copy()
-    q_ref[:, 1] = q_ref[7, 1]
-    still = replace(log, q_ref=q_ref)
-    pushed = replace(still, tau_ref=np.outer(1e-9 * log.t, [0.0, 1.0, 0.0]))
-
-    def residuals(last, with_slopes):
-        windows = (simulator.windows[0], *cut_windows(last, 0.25, 0.0))
-        all_ = replace(simulator, windows=windows, velocities=True, lag=np.array([3, 2, 2.5]))
-        return all_.residuals(theta, with_slopes=with_slopes, with_starts=with_slopes)
-
-    kept = [0, 2, 3, 5, 6, 7, 8]  # positions, speeds, torques
-    for with_slopes in (True, False):
-        first, *rest = residuals(still, with_slopes)
-        first_of_all, *every = residuals(pushed, with_slopes)
-        assert first.joints.tolist() == first_of_all.joints.tolist() == list(range(9))
-        assert len(rest) == len(every) > 1
-        for some, whole in zip(rest, every, strict=True):
-            assert some.joints.tolist() == kept
-            assert whole.joints.tolist() == list(range(9))
-            np.testing.assert_allclose(some.e, whole.e[:, kept], atol=1e-8)
-            for name in ("slopes", "by_start") if with_slopes else ():
-                own, wanted = getattr(some, name), getattr(whole, name)[:, kept]
-                np.testing.assert_allclose(own, wanted, atol=1e-6 * np.abs(wanted).max())
-    none = replace(log, q_ref=np.repeat(q_ref[:1], len(q_ref), axis=0))
-    alone = replace(simulator, windows=cut_windows(none, 0.25, 0.0))
-    for with_slopes in (True, False):
-        assert alone.residuals(theta, with_slopes=with_slopes) == []
-    mixed = replace(simulator, windows=(*alone.windows, *simulator.windows))
-    wanted = list(range(len(alone.windows), len(mixed.windows)))
-    assert mixed.window_of_parts == wanted
-    assert len(mixed.residuals(theta, with_slopes=True)) == len(wanted)
-
-
 def test_direct_slopes_are_those_of_inverse_dynamics_along_the_roll_out(simulator, rng):
     """By the recursive Newton-Euler algorithm, with bodies a little different."""
     theta = off(simulator, rng)

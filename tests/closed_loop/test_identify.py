@@ -202,6 +202,28 @@ def test_open_loops_beat_plainer_models(leg, found):
         np.testing.assert_allclose(error, np.sqrt(np.mean(missed**2, axis=0)))
 
 
+def test_friction_of_joints_that_no_log_moves_is_reported(leg, found):
+    hip, thigh, calf = leg[0].model.joints
+    [run] = found.fitted
+
+    def undetermined(rests):
+        logs = [run]
+        for moving in rests:
+            q_ref = np.where(moving, run.log.q_ref, run.log.q_ref[3])
+            logs.append(replace(run, log=replace(run.log, q_ref=q_ref)))
+        findings = loop_findings(replace(found, fitted=tuple(logs[1:])), [])
+        return [f.where for f in findings if f.code == "undetermined"]
+
+    assert undetermined([[True, True, True]]) == []
+    assert undetermined([[True, False, True], [False, True, True]]) == []
+    [where] = undetermined([[True, False, True], [True, False, False]])
+    assert where == f"{thigh}.viscous, {thigh}.coulomb, {thigh}.offset"
+    [where] = undetermined([[False, False, True]])
+    for joint in (hip, thigh):
+        assert f"{joint}.coulomb" in where
+    assert calf not in where
+
+
 def test_a_second_order_model_has_the_standard_error_of_each_inertia(found):
     plain = found.fit.plain
     again = OutputError(whitens=False).fit(plain.simulator, plain.theta)
