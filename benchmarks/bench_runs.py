@@ -5,10 +5,11 @@ prediction interval of the other logs, and with the interval of their mean alone
 alike; all of them together with draws of their joint distribution; its torque error with the
 expected one. Servos: the fit is to all logs, the prediction from the others to first order.
 Estimates of simulated drives: coverage of the joint regions of samples, effects of the temperature.
-Warm-up within a log: the finding drift, and false ones. Simulated arms (Pinocchio's inverse dynamics, not the regressor): coverage for the next robot, one
-by one and jointly, and of the spreads; causes named in runs that differ, false alarms in runs that
-do not. Arms in MuJoCo (0.1 ms, torque held for 1 ms, encoders of 18 bits): false alarms for logs
-and robots, causes named in robots that differ.
+Warm-up within a log: the finding drift, and false ones. Simulated arms (Pinocchio's inverse
+dynamics, not the regressor): coverage for the next robot, one by one and jointly, and of the
+spreads; causes named in runs that differ, false alarms in runs that do not. Arms in MuJoCo (0.1 ms,
+torque held for 1 ms, encoders of 18 bits): false alarms for logs and robots, causes named in robots
+that differ.
 
     ROBOTID_DATA=folder python benchmarks/bench_runs.py [--quick]
 """
