@@ -5,10 +5,11 @@ prediction interval of the other logs, and with the interval of their mean alone
 alike; all of them together with draws of their joint distribution; its torque error with the
 expected one. Servos: the fit is to all logs, the prediction from the others to first order.
 Estimates of simulated drives: coverage of the joint regions of samples, effects of the temperature.
-Simulated arms (Pinocchio's inverse dynamics, not the regressor): coverage for the next robot, one
-by one and jointly, and of the spreads; causes named in runs that differ, false alarms in runs that
-do not. Arms in MuJoCo (0.1 ms, torque held for 1 ms, encoders of 18 bits): false alarms for logs
-and robots, causes named in robots that differ.
+Warm-up within a log: the finding drift, and false ones. Simulated arms (Pinocchio's inverse
+dynamics, not the regressor): coverage for the next robot, one by one and jointly, and of the
+spreads; causes named in runs that differ, false alarms in runs that do not. Arms in MuJoCo (0.1 ms,
+torque held for 1 ms, encoders of 18 bits): false alarms for logs and robots, causes named in robots
+that differ.
 
     ROBOTID_DATA=folder python benchmarks/bench_runs.py [--quick]
 """
@@ -37,7 +38,7 @@ from robotid.fitting.fit import solve_recordings
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.survey import hold_log
-from robotid.identification.pipeline import with_drives
+from robotid.identification.pipeline import identify, with_drives
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -82,7 +83,8 @@ def main():
     print()
     fleets(1, 8) if options.quick else fleets(5)
     samples(1 if options.quick else 12)
-    temperatures(5 if options.quick else 100)
+    temperatures(5 if options.quick else 60)
+    warm_up(3, 3) if options.quick else warm_up(110, 25)
     unlike(1 if options.quick else 20)
     print("| arms in MuJoCo | sets | named | another | none |\n|---|---|---|---|---|")
     alike_logs(6 if options.quick else 150)
@@ -512,6 +514,35 @@ def temperatures(count):
         total = 2 * count
         shares = f"{100 * inside / total:.0f} % | {100 * ahead / total:.0f} %"
         print(f"| {logs} | {hits} of {total} | {others} of {count} | {shares} |", flush=True)
+
+
+def warm_up(honest, count):
+    """Print how often a log has the finding drift, without and with a warm-up of the elbow.
+
+    Its friction is higher at the start by a share that falls with a time constant of 20 s.
+    """
+    model, pi, friction = arm()
+    names, seconds = model.layout.names, 40.0
+    print("| friction at the start | logs | drift found | trend within 95 % |\n|---|---|---|---|")
+    for share, logs in ((0.0, honest), (0.3, count), (0.15, count)):
+        found = inside = 0
+        for k in range(logs):
+            rng = np.random.default_rng([5, k, round(100 * share)])
+            own = pi.copy()
+            own[friction] *= rng.uniform(0.5, 2.0, len(friction))
+            log = simulated(model, own, rng, seconds=seconds)
+            v, t = log.v[:, 1], log.t
+            terms = [own[names.index(f"elbow_joint.{term}")] for term in ("coulomb", "viscous")]
+            more, tau = share * np.exp(-t / 20.0), log.tau.copy()
+            tau[:, 1] += more * (terms[0] * np.sign(v) + terms[1] * v)
+            size = terms[0] + terms[1] * np.sqrt(np.mean(v**2))
+            true = np.polyfit(t / 60.0, more * size, 1)[0]
+            fit = identify(model, [replace(log, tau=tau)], estimator=EstimatorSettings(draws=0),
+                           friction="viscous+coulomb", doctor=False)  # fmt: skip
+            drifts = [f.evidence for f in fit.findings if f.code == "drift"]
+            found += bool(drifts)
+            inside += any(abs(e["trend"] - true) < 1.96 * e["trend_std_error"] for e in drifts)
+        print(f"| {100 * share:.0f} % higher | {logs} | {found} | {inside} |", flush=True)
 
 
 def unlike(count):
