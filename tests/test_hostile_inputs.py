@@ -24,6 +24,7 @@ EXAMPLES = {
 }  # others: 8
 
 
+@pytest.mark.filterwarnings("ignore:Generating overly large repr")  # a whole result.json
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_input_gives_a_traceback(kind):
     make, arguments, run = KINDS[kind]

@@ -437,10 +437,19 @@ def stated_covariance(result: Mapping[str, Any], names: Sequence[str]) -> Array 
 
     Returns:
         Shape (k, k); 0 for a parameter that was not identified.
+
+    Raises:
+        DataError: If the covariance has not a row for each name.
     """
     if "covariance" not in result:
         return None
-    own = dict(zip(result["covariance"]["names"], result["covariance"]["root"], strict=True))
+    stated, rows = result["covariance"]["names"], result["covariance"]["root"]
+    if len(stated) != len(rows):
+        raise DataError(
+            f"covariance of the result has {len(rows)} rows, wanted {len(stated)}, one for each "
+            "name; write the result again"
+        )
+    own = dict(zip(stated, rows, strict=True))
     root = np.zeros((len(names), max(map(len, own.values()), default=0)))
     for row, name in zip(root, names, strict=True):
         row[: len(own.get(name, ()))] = own.get(name, ())

@@ -230,7 +230,8 @@ def _columns_of_base(where: str, names: Sequence[str], wanted: BaseColumns) -> d
     used = next((kind for kind in orientations if kind in found), "")
     required = ["imu"] if wanted.imu is not None else []
     missing = [x for kind in required for x in whole[kind] if x not in names]
-    if not used and not missing and (not required or wanted.needs_heading):
+    is_blind = wanted.needs_heading or (wanted.imu is not None and not wanted.imu.gravity.any())
+    if not used and not missing and (not required or is_blind):
         missing = [x for x in whole["imu quaternion" if required else "pose"] if x not in names]
     if missing:
         seen = [name for name in names if name.startswith(("base_", "imu_"))]

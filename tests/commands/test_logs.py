@@ -67,6 +67,7 @@ def test_what_is_read_is_what_the_job_says_of_windows_and_of_joints_that_slide(h
 class _Surveyed:
     name: str
     unit: str = ""
+    time: float | None = None
 
 
 @pytest.mark.parametrize(

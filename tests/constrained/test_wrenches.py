@@ -250,7 +250,7 @@ def test_vertical_forces_alone_show_their_sign_and_foot(urdf, log):
 def test_a_better_reading_halves_one_residual_and_keeps_the_other(force, moment, is_better):
     def reading(force, moment):
         directions = np.tile([0.6, 0.0, 0.8, 0.0, -1.0, 0.0], (4, 1))
-        return _Reading((), False, 1.0, directions * np.repeat([force, moment], 3))
+        return _Reading((), False, 1.0, directions * np.repeat([force, moment], 3), 200.0)
 
     stated = reading(100.0, 10.0)
     assert stated.sizes == pytest.approx((100.0, 10.0))

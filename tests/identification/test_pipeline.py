@@ -378,27 +378,38 @@ def test_fits_are_counted_and_end_with_the_shapes_that_settled(monkeypatch, sett
 
     def solve(recordings, choice, is_last=True):
         solved.append((recordings, choice, is_last))
-        return SimpleNamespace(solution=Solved(len(solved)))
+        ground = SimpleNamespace(rough=SimpleNamespace(sigma=10 * len(solved)))
+        return SimpleNamespace(solution=Solved(len(solved)), ground=ground)
 
     moved = iter([*(drives[k] for k in range(1, 3) if k not in settles), None])
     monkeypatch.setattr(pipeline, "solve_recordings", solve)
     monkeypatch.setattr(pipeline, "rough_choice", lambda choice: "rough")
     monkeypatch.setattr(pipeline, "choose_drives", lambda *_: drives[0])
-    monkeypatch.setattr(pipeline, "_with_own", lambda recordings, fit, own: (fit.k, own[0].k))
+    monkeypatch.setattr(
+        pipeline, "_with_own", lambda own, fit, drives: (own.levels, fit.k, drives[0].k)
+    )
     monkeypatch.setattr(pipeline, "settled_shapes", lambda fit: next(moved))
     monkeypatch.setattr(pipeline, "fit_recordings", lambda own, choice: Solved(own))
-    everything = SimpleNamespace(repeated=None)
+    everything = Everything()
     found = pipeline.with_drives(everything, "exact", {}, progress=lambda *x: reported.append(x))
     last = reported.pop()
     assert last == ("fits", 3, 4, "fits")
     assert reported == [("fits", 0, 1, "fits"), ("fits", 1, 4, "fits"), ("fits", 2, 4, "fits")]
     assert solved == [
         (everything, "exact", True),
-        ((1, 0), "rough", False),
-        ((2, 1), "rough", False),
+        ((10, 1, 0), "rough", False),
+        ((20, 2, 1), "rough", False),
     ]
     final = 1 if settles else 2
-    assert (found.k, found.drives) == ((3, final), drives[final])
+    assert (found.k, found.drives) == ((30, 3, final), drives[final])
+
+
+@dataclass(frozen=True)
+class Everything:
+    """All logs, and the noise levels at which their fit starts."""
+
+    repeated: None = None
+    levels: object = None
 
 
 @dataclass(frozen=True)

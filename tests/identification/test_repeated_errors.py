@@ -231,12 +231,16 @@ def test_contact_errors_follow_the_selected_drive_terms(log, monkeypatch):
         DriveChoice("FR_KFE", ("cubic",), (Viscous(), Cubic())),
         DriveChoice("HL_HFE", (), (Viscous(),)),
     ]
-    monkeypatch.setattr(
-        pipeline, "solve_recordings", lambda *x, **_: SimpleNamespace(solution=found)
+    solved = SimpleNamespace(
+        solution=found, ground=SimpleNamespace(rough=SimpleNamespace(sigma=None))
     )
+    monkeypatch.setattr(pipeline, "solve_recordings", lambda *x, **_: solved)
     monkeypatch.setattr(pipeline, "choose_drives", lambda *x: drives)
     monkeypatch.setattr(pipeline, "rough_choice", lambda choice: choice)
-    monkeypatch.setattr(pipeline, "replace", lambda fit, **_: fits.append(fit))
+    monkeypatch.setattr(
+        pipeline, "replace",
+        lambda x, **new: fits.append(x) if "drives" in new else replace(x, **new),
+    )  # fmt: skip
     monkeypatch.setattr(pipeline, "fit_recordings", lambda recordings, choice: recordings)
     pipeline.with_drives(plain, None, {})
     (changed,) = fits

@@ -511,7 +511,7 @@ def test_only_parameters_of_which_a_run_has_information_vary():
 
 
 def test_the_cause_of_an_unlike_unit_explains_most_of_all_its_runs():
-    """Squares of 5000 and 2000, times information of 3 and 6; in the first run it is 1 and 4."""
+    """Squares of 5000 and 1000, times information of 3 and 10; in the first run it is 1 and 8."""
     rng, unit = np.random.default_rng(7), np.array([0, 0, 1, 1, 2, 2, 3, 3, 3, 4, 4])
 
     def group(kind, square, first):
@@ -522,7 +522,7 @@ def test_the_cause_of_an_unlike_unit_explains_most_of_all_its_runs():
         own = Group(kind, kind, (f"{kind}.x",), ("N",), np.eye(1), (0,))
         return RunsOf(own, np.zeros(1), Runs(H, H[:, 0] * x, unit, np.full(1, 1.0)), 1.0)
 
-    pair = group("drive", 5000.0, 1.0), group("gain", 2000.0, 4.0)
+    pair = group("drive", 5000.0, 1.0), group("gain", 1000.0, 8.0)
     for groups in (pair, pair[::-1]):
         found = vary([str(k) for k in range(11)], groups).unlike_units
         assert [each.kind for each in found if each.run == 3] == ["drive"]
