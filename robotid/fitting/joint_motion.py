@@ -94,18 +94,9 @@ def joint_motions(
     signs = joined(partial(_directions, model))
     distance = joined(travelled)
     time = joined(lambda m: (m.t - m.t[0]) / (longest or 1.0))
+    columns = (q, v, a, signs, load, distance)
     alone = [
-        JointMotion(
-            q[:, j],
-            v[:, j],
-            a[:, j],
-            signs[:, j],
-            load[:, j],
-            distance[:, j],
-            time,
-            passes,
-            longest or 1.0,
-        )
+        JointMotion(*(x[:, j] for x in columns), time, passes, longest or 1.0)
         for j in range(len(model.joints))
     ]
     neighbours = [[k for k in (j - 1, j + 1) if 0 <= k < len(alone)] for j in range(len(alone))]

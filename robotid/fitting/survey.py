@@ -71,7 +71,7 @@ class _Header:
         if isinstance(self.source, Log):
             return self.source
         layout = self.source
-        reader = _reader(open_table(Path(layout.path), layout.source), layout.wanted)
+        reader = open_table(Path(layout.path), layout.source).reader(layout.wanted)
         log = _log_of(layout, reader.read(layout.wanted, first, stop, near), first)
         return with_contacts(self.model, closed_log(self.model, log), self.signals)
 
@@ -460,7 +460,7 @@ def survey_log(
         positions = _positions(locked, [columns], layout, model, inside)
         held = hold_log(model, used, signals, positions)
         return replace(held, temperature=_temperatures(warm, [columns], inside))
-    reader, places, where = _reader(table, wanted), list[Place](), Path(layout.path).name
+    reader, places, where = table.reader(wanted), list[Place](), Path(layout.path).name
     stamps = map_stamps(_stamps(reader, layout, places), where)
     first, stop = _window(stamps, where, *window)
     ranges = _close_looks(first, stop)
@@ -499,31 +499,6 @@ def _with_one_bias(
         notes = tuple(note if x == before else x for x in log.notes)
         changed.append(replace(log, base=base, notes=notes))
     return replace(layout, base=replace(layout.base, imu=frame)), tuple(changed)
-
-
-@dataclass(frozen=True, eq=False)
-class _WholeTable(RowReader):
-    """Rows of a file of a format that cannot be read in parts."""
-
-    table: Table
-    wanted: Sequence[str]
-
-    def count(self) -> int:
-        return len(next(iter(self._columns.values())))
-
-    def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
-        yield self._columns[name], Place()
-
-    def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
-        return {name: self._columns[name][first:stop] for name in wanted}
-
-    @cached_property
-    def _columns(self) -> dict[str, Array]:
-        return self.table.read(self.wanted)
-
-
-def _reader(table: Table, wanted: Sequence[str]) -> RowReader:
-    return _WholeTable(table, wanted) if table.rows is None else table.rows
 
 
 def _log_of(layout: LogLayout, columns: Mapping[str, Array], first: int) -> Log:

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from robotid._typing import Array
@@ -102,6 +103,35 @@ class Table:
     angle_unit: str = ""  # why the unit of angles must be stated; "" if it is known
     sensors: Mapping[str, str] = field(default_factory=dict)  # sources of interpolated columns
     axes: Mapping[str, str] = field(default_factory=dict)  # of "twist" and "wrench", if known
+
+    def reader(self, wanted: Sequence[str]) -> RowReader:
+        """Return the reader of the rows; of a format that is read as a whole, of wanted columns.
+
+        Args:
+            wanted: Names of the columns.
+        """
+        return self.rows or _WholeTable(self, wanted)
+
+
+@dataclass(frozen=True, eq=False)
+class _WholeTable(RowReader):
+    """Rows of a file of a format that cannot be read in parts."""
+
+    table: Table
+    wanted: Sequence[str]
+
+    def count(self) -> int:
+        return len(next(iter(self._columns.values())))
+
+    def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
+        yield self._columns[name], Place()
+
+    def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
+        return {name: self._columns[name][first:stop] for name in wanted}
+
+    @cached_property
+    def _columns(self) -> dict[str, Array]:
+        return self.table.read(self.wanted)
 
 
 class Format(ABC):
