@@ -33,6 +33,7 @@ __all__ = [
     "force_basis",
     "logged_base",
     "loop_basis",
+    "mixed_rows",
     "touching",
     "without_forces",
 ]
@@ -148,12 +149,23 @@ def without_forces(basis: Array, rows: Array) -> Array:
     return np.subtract(rows, projected, out=projected)
 
 
+def mixed_rows(basis: Array, weights: Array) -> Array:
+    """Return the rows that are used or projected into used rows, shape (n_rows,), bool.
+
+    Args:
+        basis: As of ``force_basis``.
+        weights: Weight of each row, shape (N, n_rows).
+    """
+    mixed: Array = weights.any(axis=0) | basis.any(axis=(0, 2))
+    return mixed
+
+
 @dataclass(frozen=True, eq=False)
 class ProjectedRows(RowSource):
     """Rows of a trajectory without the torques of its constraint forces; see ``RowSource``.
 
-    Every row has the columns of all rows. The count of rows is that of independent equations, the
-    sum of the diagonal of P.
+    Every used row has the columns of all rows; a row with weight 0 in all samples has none. The
+    count of rows is that of independent equations, the sum of the diagonal of P.
 
     Attributes:
         own: The rows before the projection, not weighted.
@@ -176,7 +188,7 @@ class ProjectedRows(RowSource):
     @cached_property
     def columns(self) -> tuple[Array, ...]:
         every: Array = np.unique(np.concatenate(self.own.columns))
-        return tuple([every] * self.weights.shape[1])
+        return tuple(every if used else every[:0] for used in self.weights.any(axis=0))
 
     def rows(self, start: int, stop: int) -> Array:
         k = slice(start, stop)
@@ -188,22 +200,27 @@ class ProjectedRows(RowSource):
         return replace(self, own=self.own.select(columns))
 
     def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
-        every, n = self.columns[0], self.weights.shape[1]
+        every = np.unique(np.concatenate(self.own.columns))
         places = [np.append(np.searchsorted(every, own), len(every)) for own in self.own.columns]
-        room = np.zeros((_CACHED, n, len(every) + 1))
+        mixed = np.flatnonzero(mixed_rows(self.basis, self.weights))
+        basis, weights = self.basis, self.weights
+        if len(mixed) < weights.shape[1]:
+            basis, weights = basis[:, mixed], weights[:, mixed]
+        room = np.zeros((_CACHED, len(mixed), len(every) + 1))
         for block in self.own.blocks(start, stop, segment):
             size = len(block[0])
-            found = [np.empty((size, len(every) + 1), order="F") for _ in range(n)]
+            found = [np.zeros((size, len(own) + 1), order="F") for own in self.columns]
             for first in range(0, size, _CACHED):  # as many as the cache of a core holds
                 some = slice(first, min(first + _CACHED, size))
                 k = slice(start + some.start, start + some.stop)
                 X = room[: some.stop - some.start]
-                for j, (place, rows) in enumerate(zip(places, block, strict=True)):
-                    X[:, j, place] = rows[some]
-                X = without_forces(self.basis[k], X)  # other columns of the room remain 0
-                X *= np.sqrt(self.weights[k])[..., None]
-                for own, rows in zip(found, X.swapaxes(0, 1), strict=True):
-                    own[some] = rows
+                for i, j in enumerate(mixed):
+                    X[:, i, places[j]] = block[j][some]
+                X = without_forces(basis[k], X)  # other columns of the room remain 0
+                X *= np.sqrt(weights[k])[..., None]
+                for j, rows in zip(mixed, X.swapaxes(0, 1), strict=True):
+                    if len(self.columns[j]):
+                        found[j][some] = rows
             start += size
             yield found
 
