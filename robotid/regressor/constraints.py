@@ -156,8 +156,7 @@ def mixed_rows(basis: Array, weights: Array) -> Array:
         basis: As of ``force_basis``.
         weights: Weight of each row, shape (N, n_rows).
     """
-    mixed: Array = weights.any(axis=0) | basis.any(axis=(0, 2))
-    return mixed
+    return np.asarray(np.any(weights, axis=0) | np.any(basis, axis=(0, 2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +187,8 @@ class ProjectedRows(RowSource):
     @cached_property
     def columns(self) -> tuple[Array, ...]:
         every: Array = np.unique(np.concatenate(self.own.columns))
-        return tuple(every if used else every[:0] for used in self.weights.any(axis=0))
+        is_used = np.asarray(np.any(self.weights, axis=0))
+        return tuple(every if used else every[:0] for used in is_used)
 
     def rows(self, start: int, stop: int) -> Array:
         k = slice(start, stop)
@@ -245,11 +245,15 @@ def constrained(
         used = used & ~motion.switching[:, None]
     if not model.constraints:
         return motion, used
-    J = constraint_jacobian(model, motion.q, touching(model, motion))
-    known, tau = _measured(model), motion.tau
-    if motion.wrenches is not None:
-        tau = tau + np.einsum("kmj,km->kj", J[:, known], motion.wrenches)
-    basis = force_basis(np.delete(J, known, axis=1), used, model.free_flyer)
+    known, tau, parts = _measured(model), motion.tau.copy(), []
+    contacts, floats = touching(model, motion), model.free_flyer and not used[:, 6:].any()
+    for start in range(0, max(len(tau), 1), _BLOCK):
+        k = slice(start, start + _BLOCK)
+        J = constraint_jacobian(model, motion.q[k], contacts[k])
+        if motion.wrenches is not None:
+            tau[k] += np.einsum("kmj,km->kj", J[:, known], motion.wrenches[k])
+        parts.append(force_basis(np.delete(J, known, axis=1), used[k], floats))
+    basis = np.concatenate(parts)
     used = used & (np.sum(basis**2, axis=2) < 1.0 - _RANK)
     return motion.projected(basis, without_forces(basis, tau), tau), used
 

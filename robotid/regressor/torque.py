@@ -257,7 +257,7 @@ def build_problem(
         DataError: If joints or shapes are not those of the model.
     """
     own = trajectory_rows(model, trajectory, weight, compiled)
-    weights, used = own.weights, own.weights.any(axis=0)[:, None]
+    weights, used = own.weights, np.any(own.weights, axis=0, keepdims=True).T
     own = replace(own, support=own.support & used)
     source: RowSource = own
     support = own.support
