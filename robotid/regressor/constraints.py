@@ -33,6 +33,7 @@ __all__ = [
     "force_basis",
     "logged_base",
     "loop_basis",
+    "mixed_rows",
     "touching",
     "without_forces",
 ]
@@ -148,12 +149,22 @@ def without_forces(basis: Array, rows: Array) -> Array:
     return np.subtract(rows, projected, out=projected)
 
 
+def mixed_rows(basis: Array, weights: Array) -> Array:
+    """Return the rows that are used or projected into used rows, shape (n_rows,), bool.
+
+    Args:
+        basis: As of ``force_basis``.
+        weights: Weight of each row, shape (N, n_rows).
+    """
+    return np.asarray(np.any(weights, axis=0) | np.any(basis, axis=(0, 2)))
+
+
 @dataclass(frozen=True, eq=False)
 class ProjectedRows(RowSource):
     """Rows of a trajectory without the torques of its constraint forces; see ``RowSource``.
 
-    Every row has the columns of all rows. The count of rows is that of independent equations, the
-    sum of the diagonal of P.
+    Every used row has the columns of all rows; a row with weight 0 in all samples has none. The
+    count of rows is that of independent equations, the sum of the diagonal of P.
 
     Attributes:
         own: The rows before the projection, not weighted.
@@ -176,7 +187,8 @@ class ProjectedRows(RowSource):
     @cached_property
     def columns(self) -> tuple[Array, ...]:
         every: Array = np.unique(np.concatenate(self.own.columns))
-        return tuple([every] * self.weights.shape[1])
+        is_used = np.asarray(np.any(self.weights, axis=0))
+        return tuple(every if used else every[:0] for used in is_used)
 
     def rows(self, start: int, stop: int) -> Array:
         k = slice(start, stop)
@@ -188,22 +200,27 @@ class ProjectedRows(RowSource):
         return replace(self, own=self.own.select(columns))
 
     def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
-        every, n = self.columns[0], self.weights.shape[1]
+        every = np.unique(np.concatenate(self.own.columns))
         places = [np.append(np.searchsorted(every, own), len(every)) for own in self.own.columns]
-        room = np.zeros((_CACHED, n, len(every) + 1))
+        mixed = np.flatnonzero(mixed_rows(self.basis, self.weights))
+        basis, weights = self.basis, self.weights
+        if len(mixed) < weights.shape[1]:
+            basis, weights = basis[:, mixed], weights[:, mixed]
+        room = np.zeros((_CACHED, len(mixed), len(every) + 1))
         for block in self.own.blocks(start, stop, segment):
             size = len(block[0])
-            found = [np.empty((size, len(every) + 1), order="F") for _ in range(n)]
+            found = [np.zeros((size, len(own) + 1), order="F") for own in self.columns]
             for first in range(0, size, _CACHED):  # as many as the cache of a core holds
                 some = slice(first, min(first + _CACHED, size))
                 k = slice(start + some.start, start + some.stop)
                 X = room[: some.stop - some.start]
-                for j, (place, rows) in enumerate(zip(places, block, strict=True)):
-                    X[:, j, place] = rows[some]
-                X = without_forces(self.basis[k], X)  # other columns of the room remain 0
-                X *= np.sqrt(self.weights[k])[..., None]
-                for own, rows in zip(found, X.swapaxes(0, 1), strict=True):
-                    own[some] = rows
+                for i, j in enumerate(mixed):
+                    X[:, i, places[j]] = block[j][some]
+                X = without_forces(basis[k], X)  # other columns of the room remain 0
+                X *= np.sqrt(weights[k])[..., None]
+                for j, rows in zip(mixed, X.swapaxes(0, 1), strict=True):
+                    if len(self.columns[j]):
+                        found[j][some] = rows
             start += size
             yield found
 
@@ -228,11 +245,15 @@ def constrained(
         used = used & ~motion.switching[:, None]
     if not model.constraints:
         return motion, used
-    J = constraint_jacobian(model, motion.q, touching(model, motion))
-    known, tau = _measured(model), motion.tau
-    if motion.wrenches is not None:
-        tau = tau + np.einsum("kmj,km->kj", J[:, known], motion.wrenches)
-    basis = force_basis(np.delete(J, known, axis=1), used, model.free_flyer)
+    known, tau, parts = _measured(model), motion.tau.copy(), []
+    contacts, floats = touching(model, motion), model.free_flyer and not used[:, 6:].any()
+    for start in range(0, max(len(tau), 1), _BLOCK):
+        k = slice(start, start + _BLOCK)
+        J = constraint_jacobian(model, motion.q[k], contacts[k])
+        if motion.wrenches is not None:
+            tau[k] += np.einsum("kmj,km->kj", J[:, known], motion.wrenches[k])
+        parts.append(force_basis(np.delete(J, known, axis=1), used[k], floats))
+    basis = np.concatenate(parts)
     used = used & (np.sum(basis**2, axis=2) < 1.0 - _RANK)
     return motion.projected(basis, without_forces(basis, tau), tau), used
 

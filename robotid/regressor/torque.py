@@ -4,6 +4,7 @@ Pinocchio computes the inertial columns; the drive columns follow them.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +13,7 @@ from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import drive_values, friction_directions, instant_state
-from robotid.regressor.constraints import ProjectedRows, loop_basis, without_forces
+from robotid.regressor.constraints import ProjectedRows, loop_basis, mixed_rows, without_forces
 from robotid.regressor.problem import Block, Problem, RowSource
 from robotid.regressor.rows import BLOCK, kept_rows, trajectory_rows
 from robotid.robot.closure import Chains
@@ -256,12 +257,16 @@ def build_problem(
         DataError: If joints or shapes are not those of the model.
     """
     own = trajectory_rows(model, trajectory, weight, compiled)
+    weights, used = own.weights, np.any(own.weights, axis=0, keepdims=True).T
+    own = replace(own, support=own.support & used)
     source: RowSource = own
-    weights, support = own.weights, own.support
+    support = own.support
     if trajectory.basis is not None:
         own = trajectory_rows(model, trajectory, None, compiled)
+        mixed = mixed_rows(trajectory.basis, weights)[:, None]
+        own = replace(own, support=own.support & mixed)
         source = ProjectedRows(own, trajectory.basis, weights)
-        support = np.broadcast_to(support.any(axis=0), support.shape)
+        support = own.support.any(axis=0) & used
     shape = weights.shape
     length = max(1, min(BLOCK, _BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
 

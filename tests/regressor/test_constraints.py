@@ -22,7 +22,7 @@ from robotid.regressor.constraints import (
     logged_base,
     without_forces,
 )
-from robotid.regressor.factors import Factors, Reduction, compress, merge
+from robotid.regressor.factors import Factors, Reduction, compress, compress_segments, merge
 from robotid.regressor.prediction import predict
 from robotid.regressor.torque import build_problem, joint_torque_regressor
 from robotid.robot.constraints import Contact, Loop
@@ -250,6 +250,41 @@ def test_rows_are_projected_and_counted(quadruped, rng):
     level = both.noise_levels(np.zeros(len(both.names)), np.full(18, 2.0))
     tau = (dense[..., -1] ** 2).sum()
     np.testing.assert_allclose(level, np.sqrt(2 * tau / 36.0))
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("has_torque", [False, True])
+def test_rows_without_weight_have_no_factor(quadruped, rng, has_torque, compiled):
+    q, v, a = random_motion(quadruped, rng, 40)
+    motion = Trajectory(
+        t=np.arange(40.0), q=q, v=v, a=a, tau=rng.standard_normal((40, 18)),
+        joints=quadruped.joints, rate=None, segment=np.zeros(40, dtype=int),
+        contacts=rng.random((40, 3)) < 0.5, wrenches=rng.standard_normal((40, 2)),
+    )  # fmt: skip
+    used = np.ones((40, 18), dtype=bool)
+    found, used = constrained(quadruped, motion, used, has_torque=has_torque)
+    used[:, 9] = False  # its torque is projected into other rows if it was measured
+    problem = build_problem(quadruped, found, used.astype(float), compiled=compiled)
+    idle = ~used.any(axis=0)
+    assert idle.sum() == (1 if has_torque else 12)
+    (source,) = problem.sources
+    assert [len(own) == 0 for own in source.columns] == idle.tolist()
+    is_read = [len(own) > 0 for own in source.own.columns]
+    assert is_read == [has_torque or j < 6 for j in range(18)]
+    dense = np.dstack(
+        [joint_torque_regressor(quadruped, q, v, a).reshape(40, 18, -1), found.loaded]
+    )
+    dense -= found.basis @ (found.basis.swapaxes(1, 2) @ dense)
+    dense *= used[..., None]
+    whole, segments = compress(problem), compress_segments(problem, 15)
+    for rows, factors in zip(np.split(dense, [15, 30]), segments, strict=True):
+        assert [len(R) == 1 for R in factors.triangles] == idle.tolist()
+        for j, R in enumerate(factors.R):
+            X = rows[:, j]
+            np.testing.assert_allclose(R.T @ R, X.T @ X, atol=1e-9 * np.abs(dense).max() ** 2)
+    gram = np.einsum("kji,kjl->il", dense, dense)
+    for R in (whole.weighted(np.ones(18)), merge(segments).weighted(np.ones(18))):
+        np.testing.assert_allclose(R.T @ R, gram, atol=1e-9 * np.abs(gram).max())
 
 
 def test_dependent_forces_are_counted_once(rng):
