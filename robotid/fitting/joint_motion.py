@@ -94,10 +94,10 @@ def joint_motions(
     signs = joined(partial(_directions, model))
     distance = joined(travelled)
     time = joined(lambda m: (m.t - m.t[0]) / (longest or 1.0))
-    columns = (q, v, a, signs, load, distance)
+    columns = zip(q.T, v.T, a.T, signs.T, load.T, distance.T, strict=True)
     alone = [
-        JointMotion(*(x[:, j] for x in columns), time, passes, longest or 1.0)
-        for j in range(len(model.joints))
+        JointMotion(q_j, v_j, a_j, sign, load_j, far, time, passes, longest or 1.0)
+        for q_j, v_j, a_j, sign, load_j, far in columns
     ]
     neighbours = [[k for k in (j - 1, j + 1) if 0 <= k < len(alone)] for j in range(len(alone))]
     return tuple(
