@@ -281,6 +281,14 @@ def test_torques_tell_gains_before_anything_is_fitted(told):
     )
     np.testing.assert_array_equal(found.kp, open_.kp)  # no gain that would drive it away
     np.testing.assert_array_equal(found.kd, open_.kd)
+    largest = np.abs(log.tau).max(axis=0)
+    for share in ([0.4, 2.0], [2.0, 0.4]):  # the samples at the limit of their own joint are none
+        limit = share * largest
+        at_limit = with_torques(moved, np.clip(log.tau, -limit, limit))
+        _, found = find_gains(
+            at_limit, replace(open_, limit=limit), is_free, knows_delay=False, is_whole=True
+        )
+        np.testing.assert_allclose(found.kp, loops.kp, rtol=0.02)
 
 
 def test_torques_are_missed_over_all_windows_by_the_larger_of_logged_and_given(simulator):

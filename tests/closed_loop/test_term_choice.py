@@ -49,6 +49,19 @@ def test_folds_share_windows_in_turn_and_count_the_prior_once(tmp_path, monkeypa
         np.testing.assert_allclose(fold.g, g, rtol=1e-9, atol=1e-9 * np.abs(g).max())
         assert fold.rows == rows // 2  # of one joint of two
 
+    def halved(*_):
+        """Yield two parts of each window, as of a robot of two arms."""
+        for A, b, columns in parts:
+            cut = len(b) // 3
+            yield A[:cut], b[:cut], columns
+            yield A[cut:], b[cut:], columns
+
+    monkeypatch.setattr(term_choice, "linearised", halved)
+    for fold, other in zip(folds, _folds(simulator, theta, estimator), strict=True):
+        np.testing.assert_allclose(other.H, fold.H, rtol=1e-9, atol=1e-9 * np.abs(fold.H).max())
+        np.testing.assert_allclose(other.g, fold.g, rtol=1e-9, atol=1e-9 * np.abs(fold.g).max())
+        assert other.rows == fold.rows
+
 
 def test_terms_are_offered_in_the_size_of_motion_and_torque():
     t = 7.0 + np.arange(400) / 200.0  # two windows of a second, one of them in the log's middle

@@ -8,7 +8,9 @@ import scipy.stats
 from helpers.paths import JOBS
 
 from robotid.commands.job import read_job
+from robotid.constrained import found_contacts
 from robotid.constrained.found_contacts import (
+    FoundContact,
     _forces,
     _noise_of_groups,
     _probabilities,
@@ -94,6 +96,22 @@ def test_feet_without_load_are_found(robot):
         "HR_FOOT 75 % in contact, 25 % not, 0 % undecided. Undecided samples count as contact",
     )
     assert with_contacts(robot, full, RAW) is full
+
+
+def test_the_shares_are_of_all_samples_of_which_undecided_ones_count_as_contact(robot, monkeypatch):
+    log, *_ = standing(robot, np.ones((200, 4), dtype=bool))
+    touches = [np.repeat([1.0, 0.0, 0.5], n) for n in ([120, 50, 30], [40, 150, 10])]
+    found = [FoundContact(FEET[k], x, 0.0 * x) for k, x in zip((1, 3), touches, strict=True)]
+    monkeypatch.setattr(found_contacts, "find_contacts", lambda *_: (log.t, found))
+    stated = {foot: log.t >= 0.0 for foot in (FEET[0], FEET[2])}
+    full = with_contacts(robot, replace(log, contacts=stated), RAW)
+    assert full.notes == (
+        "contacts found from torques and motion: FR_FOOT 60 % in contact, 25 % not, 15 % "
+        "undecided; HR_FOOT 20 % in contact, 75 % not, 5 % undecided. Undecided samples count as "
+        "contact",
+    )
+    for k, x in zip((1, 3), touches, strict=True):
+        np.testing.assert_array_equal(full.contacts[FEET[k]], x > 0.0)
 
 
 def test_what_cannot_be_found_names_what_to_log(robot):

@@ -8,6 +8,7 @@ import pytest
 from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_segments
 
 from robotid.constrained.contacts import check_base
+from robotid.constrained.wrench_times import check_offsets
 from robotid.constrained.wrenches import _Reading, check_wrenches
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
@@ -168,6 +169,22 @@ def test_what_sensors_measure_in_the_air_is_an_offset(urdf, long_log):
     assert right.evidence == {"fy_RightFoot": pytest.approx(2.0, abs=0.3)}  # 0.05 N m is too small
     assert left.message.startswith("log: LeftFoot is in the air ")
     assert f"measures fz {left.evidence['fz_LeftFoot']:+.3g} +- " in left.message
+
+
+def test_an_offset_has_the_standard_error_of_the_mean_of_its_swings():
+    swings = np.array([[3.0, 0.2, 0.5], [5.0, 0.3, 5.0], [4.0, 0.5, -3.0], [6.0, 0.4, 4.0],
+                       [4.5, 0.3, 2.5], [5.5, 0.4, 1.5]])  # fmt: skip
+    starts, speed, wrench = range(10, 130, 20), np.full(140, 0.01), np.full((140, 3), 300.0)
+    for first, own in zip(starts, swings, strict=True):
+        speed[first : first + 8], wrench[first : first + 8] = 0.5, own
+    middle, error = np.median(swings, axis=0), swings.std(axis=0, ddof=1) / np.sqrt(6.0)
+    assert error[2] < middle[2] < 4.0 * error[2]  # not found
+    (finding,) = check_offsets("log", "LeftFoot", speed, wrench, ("fz", "mx", "fy"), 700.0)
+    assert finding.evidence == pytest.approx({"fz_LeftFoot": middle[0], "mx_LeftFoot": middle[1]})
+    assert (
+        f"is in the air 6 times, but its sensor measures fz {middle[0]:+.3g} +- {error[0]:.1g} N, "
+        f"mx {middle[1]:+.3g} +- {error[1]:.1g} N m there (median)"
+    ) in finding.message
 
 
 def test_a_time_on_the_other_plate_is_named(urdf, motion):

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from robotid.excitation import course as course_of_motions
 from robotid.excitation.basis import FourierBasis
 from robotid.excitation.clearance import Box, Clearance, Contact
 from robotid.excitation.course import Course
@@ -125,7 +126,7 @@ def test_the_page_states_the_distance_between_links_beside_the_required_one():
     )
 
 
-def test_distances_of_a_long_motion_are_looked_at_less_often(course):
+def test_distances_of_a_long_motion_are_looked_at_less_often(course, monkeypatch):
     *_, found = course
     t = np.linspace(0.0, 60.0, 6001)
     values = np.arange(6.0 * 6001 * 3).reshape(6, 6001, 3)
@@ -133,6 +134,15 @@ def test_distances_of_a_long_motion_are_looked_at_less_often(course):
     np.testing.assert_array_equal(few.t, t[::7])
     np.testing.assert_array_equal(few.values, values[:, ::7])
     assert len(found.thinned.t) == len(found.t)
+    monkeypatch.setattr(course_of_motions, "_MOST", 60)
+    few = replace(found)  # nothing kept
+    step = round(len(found.t) / len(few.thinned.t))
+    assert step > 1
+    distances = found.clearance.near(
+        found.clearance.placed(few.thinned.values[0]), np.inf, found.clearance.everything
+    ).distance
+    k = np.unravel_index((distances - found.clearance.required[:, None]).argmin(), distances.shape)
+    assert few.nearest.time == found.t[::step][k[1]] > 0.0
 
 
 def test_the_least_certain_base_parameters_have_their_own_names(ur5):

@@ -142,7 +142,7 @@ def test_what_cannot_be_asked_for_is_refused(designer):
         design_payload(designer, RNG(0), Payload(link="forearm_link"), moving=WRIST[-1:])
 
 
-def test_a_payload_that_holds_a_limit_up_is_not_counted_on(designer, found):
+def test_a_payload_that_holds_a_limit_up_is_not_counted_on(designer, found, monkeypatch):
     # gravity of the load lowers what the wrist bears where its offset points upwards
     sizes = designer.limits.sizes.copy()
     bare = designer.used_and_informed(found.design.motion, 5.0, 200.0)[0]
@@ -152,3 +152,8 @@ def test_a_payload_that_holds_a_limit_up_is_not_counted_on(designer, found):
         NotConvergedError, match=r"without the payload \w+ needs 101.0 % of its torq"
     ):
         _check_bare(replace(designer, limits=limits), found.design)
+    monkeypatch.setattr(Designer, "design", lambda *_, **__: found.design)
+    with pytest.raises(
+        NotConvergedError, match=r"without the payload \w+ needs 101.0 % of its torq"
+    ):
+        design_payload(replace(designer, limits=limits), RNG(0), LOAD, moving=found.moving)

@@ -247,6 +247,16 @@ def test_loads_of_a_stand_on_a_slope_are_those_of_statics():
     assert margins[8] == 1.0
 
 
+def test_the_first_centre_of_mass_is_above_the_middle_of_the_soles(biped):
+    """The soles reach farther to the front, 0.12 m, than to the back, 0.1 m."""
+    q = np.tile(biped.feet.posture, (2, 1))
+    placed = biped.feet.placed(q)
+    points = np.array([placed.position(point)[0] for point in biped.ground.points])
+    own, *_ = floating(biped, (q, 0.0 * q, 0.0 * q))
+    centre = pin.centerOfMass(biped.robot.pin_model, biped.robot.pin_model.createData(), own[0])
+    np.testing.assert_allclose(centre[:2], points.mean(axis=0)[:2], atol=1e-3)
+
+
 def test_the_centre_of_pressure_of_flat_feet_is_below_the_centre_of_mass(biped):
     info = information(biped)
     x = np.repeat(biped.feet.posture[None, biped.feet.free], 3, axis=0)

@@ -290,13 +290,16 @@ def test_only_logs_with_an_imu_have_a_bias(log, rng, monkeypatch):
 
     monkeypatch.setattr(repeated_errors, "_slopes_of_bias", slopes)
     alone, both = (
-        with_repeated_errors(Recordings(model, mapping, logs))
+        with_repeated_errors(Recordings(model, mapping, logs, validation=(without, with_imu)))
         for logs in ((with_imu,), (with_imu, without))
     )
     assert alone.repeated.root.shape[1] == 3
     frames = [x.head.base.imu and x.head.base.imu.frame for x in both.fitted]
     assert frames[1] is None
     np.testing.assert_array_equal(frames[0].offset, both.repeated.bias)
+    unfitted = [x.head.base.imu and x.head.base.imu.frame for x in both.validation]
+    assert unfitted[0] is None
+    np.testing.assert_array_equal(unfitted[1].offset, both.repeated.bias)
     assert np.linalg.norm(both.repeated.bias) > 0.0
     # what is subtracted from the specific force is missing in the acceleration
     before, after = (

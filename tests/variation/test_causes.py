@@ -101,12 +101,12 @@ def test_groups_without_common_information_are_independent():
     assert found[0] == pytest.approx(found[1])
 
 
-def test_effects_of_the_temperature_are_no_evidence():
+def test_effects_of_temperature_and_time_are_no_evidence():
     rng = np.random.default_rng(7)
     groups, x, C = together(rng, UNIT)
-    c, size, H = rng.normal(size=7), 1.7, np.linalg.inv(C) * INFLATION
+    c, sizes, H = rng.normal(size=(2, 7)), (1.7, -0.9), np.linalg.inv(C) * INFLATION
     moved = np.zeros((7, 5))
-    moved[:, 1] = size * c
+    moved[:, 1] = sizes @ c
     warm = [
         replace(g, runs=replace(g.runs, h=h / INFLATION))
         for g, h in zip(
@@ -114,9 +114,11 @@ def test_effects_of_the_temperature_are_no_evidence():
         )
     ]
     drive = warm[0]
-    warm[0] = replace(drive, runs=drive.runs.with_slopes([Slope(1, c, 1.0)]), slopes=(size,))
+    warm[0] = replace(
+        drive, runs=drive.runs.with_slopes([Slope(1, own, 1.0) for own in c]), slopes=sizes
+    )
     deviations = [np.full((2, n), 0.4) for n in SIZES.values()]
-    with_slope = [np.full((2, 3), 0.4), *deviations[1:]]
+    with_slope = [np.full((2, 4), 0.4), *deviations[1:]]
     wanted = evidence_by_group(groups, deviations, UNIT == 1, is_unit=True)
     found = evidence_by_group(warm, with_slope, UNIT == 1, is_unit=True)
     assert found == pytest.approx(wanted)
