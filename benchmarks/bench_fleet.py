@@ -88,7 +88,8 @@ def main():
     print(f"| {units} | {logs} | {seconds:.0f} | {rate:.1f} | {own:.0f} | {others:.0f} | "
           f"{size:.1f} | {left} | {'yes' if same else 'NO'} |")  # fmt: skip
     used = sum(after[2:4]) - sum(before[2:4])
-    print(f"\n{used:.0f} s of processor time of the commands without its workers. {machine()}, "
+    what = "commands, and of the workers of the resumed one" if options.once else "commands"
+    print(f"\n{used:.0f} s of processor time of the {what}. {machine()}, "
           f"load {os.getloadavg()[0]:.1f}")  # fmt: skip
     if not same:
         sys.exit("the resumed run gave other bits")

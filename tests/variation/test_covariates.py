@@ -233,3 +233,59 @@ def test_the_level_of_an_effect_counts_all_tests():
     others = group(0.08 * rng.normal(size=(8, 2)), 0.02, both)
     assert len(with_effects([one])[0].runs.slopes) == 1
     assert len(with_effects([one, others])[0].runs.slopes) == 0
+
+
+@pytest.mark.parametrize("is_within", [True, False])
+def test_a_slope_is_averaged_over_the_spread_at_the_level_of_its_covariate(is_within):
+    """Of temperatures that vary within robots the spread between runs; else that between robots."""
+    rng = np.random.default_rng(4)
+    x, C, runs = drawn_runs(rng, scale=0.2)
+    covariate = rng.normal(size=9) if is_within else np.array([-1.0, 0.5, 1.5])[UNIT]
+    slopes = [Slope(1, covariate, 0.4)]
+    model = MixedEffects(runs.with_slopes(slopes))
+    found = []
+    for level in (0, 1):
+        deviation = model.deviation[:, :2].copy()
+        means, errors, density = np.empty(45), np.empty(45), np.empty(45)
+        for g, z in enumerate(np.linspace(-6.0, 5.0, 45)):
+            deviation[level, 1] = 0.2 * np.exp(z)
+            wanted, P = least_squares(x, C, slopes, deviation, UNIT)
+            means[g], errors[g] = wanted[2], np.sqrt(P[2, 2])
+            variance = np.hstack([deviation, np.zeros((2, 1))])[:, :, None] ** 2
+            own = evidence(*model._members, model.runs.scale, variance).log_likelihood[0]
+            density[g] = own + z - 2.5 * np.log1p(np.exp(2.0 * z) / 4.0)
+        w = np.exp(density - density.max())
+        w /= w.sum()
+        found.append((w @ means, np.sqrt(w @ errors**2 + w @ (means - w @ means) ** 2)))
+    mean, error, _ = model.slope(0)
+    own, other = found if is_within else found[::-1]
+    assert (mean, error) == pytest.approx(own, rel=2e-3)
+    assert error != pytest.approx(other[1], rel=5e-3)
+
+
+def test_runs_and_robots_are_compared_with_others_at_their_own_covariates():
+    """Also if they are two, and not the first; a robot's runs differ in temperature."""
+    rng = np.random.default_rng(5)
+    x, C, _ = drawn_runs(rng)
+    C[8] /= 40.0  # so that the mean temperature is not where a robot's mean is known best
+    H = np.linalg.inv(C)
+    runs = Runs(H, np.einsum("kij,kj->ki", H, x), UNIT, np.full(2, 0.5))
+    model = MixedEffects(runs.with_slopes([Slope(1, 20.0 + 5.0 * rng.normal(size=9), 0.1)]))
+    covariate = model.runs.slopes[0].covariate
+    found = model.against_others(np.array([4, 7]), is_unit=False)
+    for k, run in enumerate((4, 7)):
+        others = MixedEffects(model.runs.seen_from([covariate[run]]).without(run), model.deviation)
+        expected = others.predict(np.diag(C[run]), x[run])
+        assert found.values[k] == pytest.approx(x[run], abs=1e-3)
+        assert np.diag(found.covariance[k]) == pytest.approx(np.diag(C[run]), rel=1e-3)
+        assert found.mean[k] == pytest.approx([each.mean for each in expected], rel=1e-6)
+        wanted = [each.probability for each in expected]
+        assert found.probability[k] == pytest.approx(wanted, rel=1e-3)
+    own, moved = UNIT == 2, model.runs.seen_from([covariate[UNIT == 2].mean()])
+    others = MixedEffects(moved.without_unit(2), model.deviation)
+    slope = Slope(1, moved.slopes[0].covariate[own], 0.1)
+    wanted, P = least_squares(x[own], C[own], [slope], others.deviation[:1, :2], np.zeros(4, int))
+    found = model.against_others(np.array([2]), is_unit=True)
+    assert found.values[0] == pytest.approx(wanted[:2], rel=5e-3)
+    assert np.sqrt(np.diag(found.covariance[0])) == pytest.approx(np.sqrt(np.diag(P))[:2], rel=5e-3)
+    assert found.mean[0] == pytest.approx([each.mean for each in others.predict()], rel=1e-6)

@@ -526,3 +526,22 @@ def test_the_cause_of_an_unlike_unit_explains_most_of_all_its_runs():
     for groups in (pair, pair[::-1]):
         found = vary([str(k) for k in range(11)], groups).unlike_units
         assert [each.kind for each in found if each.run == 3] == ["drive"]
+
+
+def test_a_payload_of_a_robot_is_compared_if_all_its_runs_determine_it():
+    """Its first run alone does not: nothing of the second parameter."""
+    rng, unit = np.random.default_rng(8), np.array([0, 0, 1, 1, 2, 2, 3, 3, 3, 4, 4])
+    x = 0.05 * rng.normal(size=(11, 2))
+    x[unit == 3] += [0.0, 3.0]
+    H = np.tile(np.diag([400.0, 400.0]), (11, 1, 1))
+    H[6, 1, 1] = 0.0
+    own = Group("payload", "hand", ("hand.m", "hand.mcx"), ("kg", "kg m"), np.eye(2), (0,))
+
+    def unlike():
+        runs = Runs(H, np.einsum("kij,kj->ki", H, x), unit, np.ones(2))
+        return vary(list("abcdefghijk"), (RunsOf(own, np.zeros(2), runs, 1.0),)).unlike_units
+
+    (found,) = unlike()
+    assert (found.run, found.kind, found.name) == (3, "payload", "hand.mcx")
+    H[6:9, 1, 1] = 0.0
+    assert not unlike()
