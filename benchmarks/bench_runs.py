@@ -49,8 +49,7 @@ from robotid.simulation.motions import random_fourier
 from robotid.variation.covariates import with_effects
 from robotid.variation.draws import scores_to_values
 from robotid.variation.groups import Covariate, Group, RunsOf, runs_of
-from robotid.variation.mixed_effects import MixedEffects, Runs, Slope
-from robotid.variation.restricted_likelihood import UNKNOWN
+from robotid.variation.mixed_effects import MixedEffects, Runs, Slope, covariance_of
 from robotid.variation.variation import SCORES, Variation, _parameters, vary
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"
@@ -174,7 +173,7 @@ def is_likely(drives, k, rng):
     truth, errors, order = [], [], []
     for group in drives:
         runs = group.runs
-        C = np.linalg.inv(runs.H[k] + np.diag((UNKNOWN * runs.scale) ** -2.0))
+        C = covariance_of(runs.H[k], runs.scale)
         x, known = C @ runs.h[k] + group.centre, np.sqrt(np.diag(C)) < runs.scale
         own = [p for p in np.flatnonzero(known) if group.group.parameters[p] in at]
         truth += x[own].tolist()
@@ -228,13 +227,13 @@ def compared(runs, k):
 
     Values that the run hardly determines are left out.
     """
-    C = np.linalg.inv(runs.H[k] + np.diag((UNKNOWN * runs.scale) ** -2.0))
+    C = covariance_of(runs.H[k], runs.scale)
     x, others = C @ runs.h[k], runs.without(k)
     error, known = np.sqrt(np.diag(C)), np.sqrt(np.diag(C)) < runs.scale
     found = MixedEffects(others).predict(np.diag(C))
     ends = np.array([each.ends for each in found])
     inside = (ends[:, 0] < x) & (x < ends[:, 1])
-    P = np.linalg.inv(others.H.sum(axis=0) + np.diag((UNKNOWN * runs.scale) ** -2.0))
+    P = covariance_of(others.H.sum(axis=0), runs.scale)
     alone = np.abs(x - P @ others.h.sum(axis=0)) < 1.96 * np.sqrt(np.diag(P) + error**2)
     return (inside & known).sum(), (alone & known).sum(), known.sum()
 

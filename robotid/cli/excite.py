@@ -89,6 +89,14 @@ def motion_settings(options: argparse.Namespace) -> "MotionSettings":
     return MotionSettings.from_dict(_MOTION.stated(options))
 
 
+def _numbers(word: str) -> tuple[float, ...]:
+    """Return the numbers between commas, none if one of them is no number."""
+    try:
+        return tuple(float(number) for number in word.split(","))
+    except ValueError:
+        return ()
+
+
 def _boxes(words: Sequence[str], flag: str) -> tuple["Box", ...]:
     """Return boxes that are stated as NAME=x0,y0,z0,x1,y1,z1, two corners [m].
 
@@ -101,10 +109,7 @@ def _boxes(words: Sequence[str], flag: str) -> tuple["Box", ...]:
     boxes = []
     for word in words:
         name, _, numbers = word.partition("=")
-        try:
-            x = [float(number) for number in numbers.split(",")]
-        except ValueError:
-            x = []
+        x = _numbers(numbers)
         if len(x) != 6 or not all(abs(number) <= FARTHEST for number in x):
             raise SettingsError(
                 f"{flag} {word!r}: wanted NAME=x0,y0,z0,x1,y1,z1, the lower and the upper corner "
@@ -125,10 +130,7 @@ def _soles(words: Sequence[str], flag: str) -> tuple[tuple[str, tuple[float, ...
     soles = []
     for word in words:
         name, _, numbers = word.partition("=")
-        try:
-            x = tuple(float(number) for number in numbers.split(","))
-        except ValueError:
-            x = ()
+        x = _numbers(numbers)
         if len(x) != 5 or not all(abs(number) <= FARTHEST for number in x):
             raise SettingsError(
                 f"{flag} {word!r}: wanted LINK=x0,y0,x1,y1,z, two corners of the foot and its "
@@ -139,10 +141,7 @@ def _soles(words: Sequence[str], flag: str) -> tuple[tuple[str, tuple[float, ...
 
 
 def _centre(word: str, _: str) -> tuple[float, ...]:
-    try:
-        found = tuple(float(number) for number in word.split(","))
-    except ValueError:
-        found = ()
+    found = _numbers(word)
     if len(found) != 3:
         raise SettingsError(_COM.format(word))
     return found

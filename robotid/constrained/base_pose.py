@@ -91,17 +91,14 @@ def check_order(
         return
     speed, height = _of_feet(model, motion, flags)
     q = log.base.pose[:, 3:]
-    readings = (
-        {}
-        if speed < _MOVES and height < _ABOVE
-        else {
-            "its order is qw qx qy qz: state base_qw = 'base_qx', base_qx = 'base_qy', base_qy = "
-            "'base_qz' and base_qz = 'base_qw' in [columns]": np.roll(q, -1, axis=1),
-            "it is the orientation of the world in the base: reverse the signs of base_qx, base_qy "
-            "and base_qz": q * np.array([-1.0, -1.0, -1.0, 1.0]),
-        }
-    )
-    for words, quaternion in readings.items():
+    is_wrong = speed >= _MOVES or height >= _ABOVE
+    readings = {
+        "its order is qw qx qy qz: state base_qw = 'base_qx', base_qx = 'base_qy', base_qy = "
+        "'base_qz' and base_qz = 'base_qw' in [columns]": np.roll(q, -1, axis=1),
+        "it is the orientation of the world in the base: reverse the signs of base_qx, base_qy and "
+        "base_qz": q * np.array([-1.0, -1.0, -1.0, 1.0]),
+    }
+    for words, quaternion in readings.items() if is_wrong else ():
         base = BaseMotion(np.hstack([log.base.pose[:, :3], quaternion]))
         own, above = _of_feet(model, process(replace(log, base=base), signals), flags)
         if above < _ABOVE and (own < _BETTER * speed or height > _ABOVE):

@@ -12,6 +12,7 @@ import numpy as np
 
 from robotid._text import seconds
 from robotid._typing import Array
+from robotid.constrained.slips import rms
 from robotid.constrained.wrench_times import (
     check_delay,
     check_exchanged_steps,
@@ -60,7 +61,7 @@ class _Reading:
     def sizes(self) -> tuple[float, float]:
         """RMS of force [N] and moment [N m]."""
         force, moment = self.residual[:, :3], self.residual[:, 3:]
-        return _rms(force), _rms(moment)
+        return rms(force), rms(moment)
 
     def is_better(self, than: "_Reading", least: Sequence[float]) -> bool:
         """Whether its residual is clearly smaller, one of force or moment that is not small."""
@@ -172,10 +173,6 @@ def _check_missing(name: str, t: Array, residual: Array, weight: float) -> Itera
     yield log_finding(name, "measured_wrench", "warning", message, share=share)
 
 
-def _rms(vectors: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
-
-
 def _size(reading: _Reading) -> str:
     force, moment = reading.sizes
     return f"{force:.3g} N and {moment:.3g} N m"
@@ -194,7 +191,7 @@ def _readings(model: RobotModel, motion: Trajectory, torque: Array) -> Iterator[
                 pairs.append((j, i))
     parts = [part for x in model.contacts for part in x.measured]
     is_moment = np.array([part.startswith("m") for part in parts], dtype=bool)
-    sizes = [_rms(motion.wrenches[:, x]) for x in (is_moment, ~is_moment)]
+    sizes = [rms(motion.wrenches[:, x]) for x in (is_moment, ~is_moment)]
     is_far = sizes[0] > _FAR * sizes[1]
     for (words, other), pair, is_milli in product(_places(model), pairs, (False, True)):
         if is_milli and not is_far:
@@ -244,7 +241,7 @@ def _fitted(
     left = without_forces(basis, torque)
     square = float(np.sum(caused**2))
     factor = float(np.sum(caused * left)) / square if square > 0.0 else 1.0
-    size = _rms(left[:, :3])
+    size = rms(left[:, :3])
     yield _Reading(*reading, 1.0, left - caused, size)
     if _ALIKE[0] <= factor <= _ALIKE[1]:
         return

@@ -17,7 +17,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.variation.groups import RunsOf
-from robotid.variation.restricted_likelihood import UNKNOWN
+from robotid.variation.mixed_effects import covariance_of
 
 __all__ = ["evidence_by_group"]
 
@@ -54,7 +54,7 @@ def evidence_by_group(
         others, of_others = _lifted(
             np.einsum("uk,kij->uij", member, others), member @ of_others, np.diag(S[-1] ** 2)
         )
-    C = np.linalg.inv(others.sum(axis=0) + np.diag((UNKNOWN * scale) ** -2.0))
+    C = covariance_of(others.sum(axis=0), scale)
     mean = C @ of_others.sum(axis=0)
     own, score = (W, w) if is_unit else (H, h)
     levels = S[1:] if is_unit else S

@@ -29,6 +29,7 @@ __all__ = [
     "log_prior",
     "most_probable",
     "on_grid",
+    "prior_of",
 ]
 
 #: Standard deviation of a parameter before the data, in plausible sizes.

@@ -25,19 +25,9 @@ from robotid.logs.signals import process
 from robotid.regressor.constraints import constraint_jacobian
 from robotid.regressor.prediction import predict, predict_instants
 from robotid.robot.constraints import Contact
-from robotid.robot.examples import example_urdf
-from robotid.robot.model import RobotModel
 
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 RAW = SignalSettings(cutoff=None, trim=0.0, velocity="differentiated")
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return RobotModel.from_urdf(
-        example_urdf("solo12.urdf"), free_flyer=True, terms=(),
-        constraints=[Contact(foot) for foot in FEET],
-    )  # fmt: skip
 
 
 def standing(robot, loaded):

@@ -28,14 +28,6 @@ FRAME = ImuFrame(pin.Quaternion(TURN).coeffs(), np.zeros(3), G, np.zeros(3))
 
 
 @pytest.fixture(scope="module")
-def robot():
-    return RobotModel.from_urdf(
-        example_urdf("solo12.urdf"), free_flyer=True, terms=(),
-        constraints=[Contact(foot) for foot in FEET],
-    )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
 def sway(robot):
     """Return the log of a robot whose trunk moves in all directions while its feet stand."""
     t = np.arange(0.0, 4.0, 0.02)

@@ -11,20 +11,10 @@ from robotid.logs.base import BaseMotion, quaternions_of_angles
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.constraints import constraint_jacobian
-from robotid.robot.constraints import Contact, link_positions
-from robotid.robot.examples import example_urdf
-from robotid.robot.model import RobotModel
+from robotid.robot.constraints import link_positions
 
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 SETTINGS = SignalSettings(cutoff=10.0, trim=0.2)
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return RobotModel.from_urdf(
-        example_urdf("solo12.urdf"), free_flyer=True, terms=(),
-        constraints=[Contact(foot) for foot in FEET],
-    )  # fmt: skip
 
 
 def standing(robot, seed, slide=0.0):
