@@ -15,7 +15,7 @@ from robotid.estimators import WLS
 from robotid.exceptions import DataError
 from robotid.fitting import survey
 from robotid.fitting.recordings import Recordings
-from robotid.fitting.survey import ReducedPiece, hold_log, survey_log
+from robotid.fitting.survey import ReducedPiece, _temperatures, hold_log, survey_log
 from robotid.log_files.formats import open_table, write_columns
 from robotid.log_files.read import lay_out, read_log, write_log
 from robotid.logs.base import BaseColumns, BaseMotion
@@ -341,3 +341,15 @@ def test_other_drive_terms_keep_the_rows_and_torques_without_contact_forces(rng)
         hold_log(model, turned, settings)
     with pytest.raises(DataError, match="log has no pose of the floating base"):
         hold_log(model, replace(log, base=None), settings)
+
+
+def test_the_temperature_of_a_joint_is_the_mean_of_the_rows_read():
+    """Of all windows, without missing values; a joint without any value has none."""
+    names = {"a": "temperature_a", "b": "temperature_b", "c": "temperature"}
+    nan, none = np.nan, np.full(3, np.nan)
+    first = {"temperature_a": np.array([90.0, 20.0, nan]), "temperature_b": none,
+             "temperature": np.array([7.0, 1.0, 2.0])}  # fmt: skip
+    last = {"temperature_a": np.array([26.0, 29.0, 80.0]), "temperature_b": none,
+            "temperature": np.array([3.0, 4.0, 8.0])}  # fmt: skip
+    assert _temperatures(names, [first, last], slice(1, 5)) == {"a": 25.0, "c": 2.5}
+    assert _temperatures(names, [first]) == {"a": 55.0, "c": pytest.approx(10.0 / 3.0)}
