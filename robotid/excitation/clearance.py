@@ -386,7 +386,7 @@ class Clearance:
         hulls = self._hulls
         starts = np.cumsum([0, *(len(hull.corners) for hull in hulls)])
         of_each = zip(*[(h.body, h.centre, h.radius, h.half) for h in hulls], strict=True)
-        points = np.vstack([hull.corners for hull in hulls])
+        points = np.array(np.vstack([hull.corners for hull in hulls]), order="C")
         return *map(np.array, of_each), points, starts
 
     def _poses(self, placed: Placements, hulls: Array, samples: Array) -> tuple[Array, Array]:

@@ -61,10 +61,15 @@ def work_space(entries: int) -> Array:
 def compiled(function: Any) -> Any:
     """Compile without the interpreter's lock; contract: a b + c may be rounded once.
 
+    Only compiled code may call a function whose name begins with an underscore: it has no entry for
+    the interpreter. These entries, and those for C, take a fifth of the time of compilation.
+
     Args:
         function: The function.
     """
-    return _cached(njit, function, nogil=True)
+    is_private = function.__name__.startswith("_")
+    entries = {"no_cfunc_wrapper": True, "no_cpython_wrapper": is_private}
+    return _cached(njit, function, nogil=True, **entries)
 
 
 def pointed(function: Callable[..., Any], arguments: int) -> Any:

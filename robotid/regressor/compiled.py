@@ -104,7 +104,7 @@ class CompiledWriter:
         values = values[self._drives]
         if (self._ratios != 1.0).any():
             values *= self._ratios
-        self._values = np.vstack([values, tau.T])
+        self._values = np.array(np.vstack([values, tau.T]), order="C")  # as of ``own_motion``
         self._weights = np.zeros((0, 0)) if weights is None else np.array(weights, float, order="C")
 
     def write(self, start: int, stop: int) -> None:
@@ -191,8 +191,9 @@ def own_motion(
         a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
         base: State of a floating base, shape (12, N), as of ``inertial_rows``; None: it is fixed.
     """
-    q, v, a = (np.array(x, dtype=float, order="C") for x in (q, v, a))
-    return q, v, a, np.zeros((12, 0)) if base is None else base
+    base = np.zeros((12, 0)) if base is None else base
+    q, v, a, base = (np.array(x, dtype=float, order="C") for x in (q, v, a, base))
+    return q, v, a, base
 
 
 def flatten(model: "RobotModel") -> Tree:

@@ -66,7 +66,12 @@ def divide_rows(stamps, ticks, times, is_tick):
         edges[count] = stamps[k + 1]
         shares[:count] = 1
         for _ in range(every - count):
-            shares[np.argmax(np.diff(edges[: count + 1]) / shares[:count])] += 1
+            longest, length = 0, 0.0  # np.argmax and np.diff take three seconds to compile
+            for j in range(count):
+                step = (edges[j + 1] - edges[j]) / shares[j]
+                if step > length:
+                    longest, length = j, step
+            shares[longest] += 1
         at = k * every
         for j in range(count):
             is_tick[at] = is_tick[at] or j > 0

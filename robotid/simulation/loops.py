@@ -418,7 +418,7 @@ class ClosedLoopRobot:
                 if values is None:
                     continue
                 for i, j in enumerate(part.joints):
-                    x = np.ascontiguousarray(values[:, j])
+                    x = values[:, j].copy()  # contiguous and writable: else Numba compiles again
                     average_command(log.t, x, edges, loops.delay[j], mean, change)
                     command[:, i, k, lane] = mean[of_step]
                     command[:, i, by_delay, lane] = change[of_step]
