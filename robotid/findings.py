@@ -254,6 +254,8 @@ def _merged(findings: Sequence[Finding], joints: Sequence[str]) -> tuple[str, ..
     Text to type has one value, because a user cannot type a range of values. If no log has all the
     joints of a message, the logs with the same joints have one.
     """
+    if len(findings) == 1:
+        return (findings[0].message,)
     logs = {finding.where.rpartition(": ")[0] or finding.where for finding in findings}
     names = sorted({name for name in (*joints, *logs) if name}, key=len, reverse=True)
     named = "|".join(rf"'{x}'|(?<!\w){x}(?!\w)" for x in map(re.escape, names))

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cache
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -359,9 +360,11 @@ def _open(
     job: Job, model: RobotModel, path: Path, needs: Needs
 ) -> tuple[LogLayout, Table] | DataError:
     try:
-        return job.lay_out(LogEntry(path), model, needs=needs)
+        layout, table = job.lay_out(LogEntry(path), model, needs=needs)
     except DataError as error:
         return error
+    read = cache(table.read)  # once for all windows of the file
+    return layout, replace(table, read=lambda wanted: read(tuple(wanted)))
 
 
 def _count(found: tuple[LogLayout, Table] | DataError) -> int:

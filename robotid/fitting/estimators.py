@@ -89,7 +89,8 @@ def consistent_fit(
     segments = Segments.of(fit, folds)
     if extent:
         beyond = contradicted_extents(fit, segments)
-        fit = replace(fit, constraints=fit.constraints.without_extent(beyond))
+        if beyond:  # else the programme that is set up already remains
+            fit = replace(fit, constraints=fit.constraints.without_extent(beyond))
     if not how:
         return fit
     choice = choose_weight(fit, segments, how, known.repeated)

@@ -239,9 +239,11 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
         return recordings
     choice = rough_choice(choice)
     own = replace(recordings, validation=())  # no predictions are needed here
+    spread = None
     for step in range(_MOST_LOADS):
-        ground = _ground(own, choice, is_last=False)
+        ground = _ground(own, choice, is_last=False, spread=spread)
         before = ground.before
+        spread = before.spread  # the same for any load
         standard, _ = standard_of(ground.rough, mapping, before.pi, before.spread)
         moved = standard - own.model.carried_by
         if step >= _DAMPED:  # friction that depends strongly on the load may overshoot
@@ -307,8 +309,17 @@ class _Ground:
         return determine(factors.names, rows, base_spread(K, before.spread, self.pinned))
 
 
-def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool) -> _Ground:
-    """Reduce the rows, reweighted if the loss is robust, to the input of every estimator."""
+def _ground(
+    recordings: Recordings,
+    choice: EstimatorSettings,
+    *,
+    is_last: bool,
+    spread: Array | None = None,
+) -> _Ground:
+    """Reduce the rows, reweighted if the loss is robust, to the input of every estimator.
+
+    The prior standard deviations, shape (p,), are computed if they are None.
+    """
     model, mapping = recordings.model, recordings.mapping
     prior, understated = model.standard_parameters(), 1.0
     if choice.is_robust:
@@ -320,7 +331,8 @@ def _ground(recordings: Recordings, choice: EstimatorSettings, *, is_last: bool)
         for parts in (reductions if is_last else ())
     )
     factors, share = reduction.factors, recordings.share
-    spread = prior_spread(model, reduction.squares, reduction.samples)
+    if spread is None:
+        spread = prior_spread(model, reduction.squares, reduction.samples)
     rough = WLS(mapping.to_base(prior), share, recordings.levels).fit(factors)
     held_out = tuple(chain.from_iterable(logs)) or (factors,)
     errors = recordings.repeated

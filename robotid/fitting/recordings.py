@@ -99,10 +99,11 @@ class Recordings:
             model: The robot, with the same bodies, joints and couplings.
         """
         is_same = model.layout == self.model.layout
+        plain = None if self.model.layout.own else self.mapping
         return replace(
             self,
             model=model,
-            mapping=self.mapping if is_same else structural_mapping(model),
+            mapping=self.mapping if is_same else structural_mapping(model, plain=plain),
             fitted=[log.with_model(model) for log in self.fitted],
             validation=[log.with_model(model) for log in self.validation],
             checkpoint=None,  # it contains the pieces of the first fit

@@ -52,28 +52,32 @@ def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Ar
     before, after = 2 * first - rows[:, pad:0:-1], 2 * last - rows[:, -2 : -pad - 2 : -1]
     y = np.concatenate([before, rows, after], axis=1)
     poles = butterworth_poles(order, cutoff, rate)
+    work = np.empty_like(y)
     for _ in range(2):
         start = y[:, :1].copy()
         y -= start
         for pole in poles:
-            _filter(y, pole)
+            y, work = _filter(y, pole, work)
         y += start
         y = np.ascontiguousarray(y[:, ::-1])
     return np.asarray(y[:, pad : y.shape[1] - pad].T.reshape(x.shape))
 
 
-def _filter(x: Array, pole: complex) -> None:
-    """Filter signals in place, shape (k, N), by one pole or a conjugate pair, from state 0.
+def _filter(x: Array, pole: complex, work: Array) -> tuple[Array, Array]:
+    """Return filtered signals, shape (k, N), by one pole or a conjugate pair, from state 0.
 
     With zeros at half the rate: y + a y' = g (x + x'), or y + a y' + b y'' = g (x + 2 x' + x'').
+    The signals and another array of their shape are overwritten; the second one returned is free.
     """
     is_real = abs(pole.imag) < 1e-12 * abs(pole)
     a = np.array([1.0, -pole.real] if is_real else [1.0, -2 * pole.real, abs(pole) ** 2])
     for _ in a[1:]:
-        x[:, 1:] += x[:, :-1]
+        work[:, 0] = x[:, 0]
+        np.add(x[:, 1:], x[:, :-1], out=work[:, 1:])  # in place it would copy the signals first
+        x, work = work, x
     x *= a.sum() / 2.0 ** (len(a) - 1)  # gain 1 for constant signals
     band = np.tile(a, (x.shape[1], 1)).T  # of the triangle whose solution is the recursion
-    x[:] = dtbtrs(band, x.T, uplo="L", diag="U", overwrite_b=1)[0].T
+    return dtbtrs(band, x.T, uplo="L", diag="U", overwrite_b=1)[0].T, work
 
 
 def local_polynomial(

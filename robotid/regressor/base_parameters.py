@@ -322,7 +322,9 @@ def _expression(row: Array, names: tuple[str, ...], first: int) -> str:
     return text
 
 
-def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> BaseMapping:
+def structural_mapping(
+    model: RobotModel, *, inertial_only: bool = False, plain: BaseMapping | None = None
+) -> BaseMapping:
     """Return the structural base parameters of a robot, always the same for one robot.
 
     Further terms of single drives do not change the base parameters without them. They add new
@@ -331,10 +333,11 @@ def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> Bas
     Args:
         model: The robot.
         inertial_only: Whether to exclude the drive terms.
+        plain: The mapping without further terms of single drives, if it is known.
     """
     columns = model.layout.n_inertial if inertial_only else len(model.layout.names)
     if model.layout.own and not inertial_only:
-        return _with_own_terms(model, structural_mapping(model.with_terms({})))
+        return _with_own_terms(model, plain or structural_mapping(model.with_terms({})))
     samples = 2 * columns // model.n_rows + 20
     W = random_regressor(model, samples, np.random.default_rng(0))
     return base_mapping(

@@ -48,7 +48,6 @@ _LEAST = 1e-12  # [rad/s or m/s] speed below which the slope of a power is const
 _POSITIVE = (1e-9, 1e9)  # bounds of shape parameters that are divisors
 
 
-@dataclass(frozen=True)
 class Armature(DriveTerm):
     """Inertia of the rotor behind its gear, tau = Ia dw/dt."""
 
@@ -70,7 +69,6 @@ class Armature(DriveTerm):
         return motion.a
 
 
-@dataclass(frozen=True)
 class Viscous(MemorylessTerm):
     """Viscous friction, tau = Fv w."""
 
@@ -82,7 +80,6 @@ class Viscous(MemorylessTerm):
     dynamics = "damping"
 
 
-@dataclass(frozen=True)
 class Coulomb(MemorylessTerm):
     """Coulomb friction, tau = Fc sign(w)."""
 
@@ -93,7 +90,6 @@ class Coulomb(MemorylessTerm):
     dynamics = "friction"
 
 
-@dataclass(frozen=True)
 class Offset(MemorylessTerm):
     """A constant torque: a sensor's zero error, or Coulomb friction that differs by direction."""
 
@@ -104,7 +100,6 @@ class Offset(MemorylessTerm):
     part = "offset"
 
 
-@dataclass(frozen=True)
 class Asymmetric(MemorylessTerm):
     """Viscous friction that differs by direction, tau = x |w|; for Coulomb's see ``Offset``."""
 
@@ -116,7 +111,6 @@ class Asymmetric(MemorylessTerm):
         return np.abs(w), np.sign(w)
 
 
-@dataclass(frozen=True)
 class LoadFriction(MemorylessTerm):
     """Coulomb friction proportional to the joint load torque, tau = mu sign(w) |tau_rigid|.
 
@@ -136,7 +130,6 @@ class LoadFriction(MemorylessTerm):
     typical = (0.04, 0.1)
 
 
-@dataclass(frozen=True)
 class Cubic(MemorylessTerm):
     """Friction with the cube of the speed, tau = x w^3."""
 
@@ -356,7 +349,6 @@ class Bristles(DriveTerm):
         return np.asarray(z[:, 0])
 
 
-@dataclass(frozen=True)
 class Presliding(Bristles):
     """Friction x z that builds up over a displacement after each reversal.
 
@@ -392,7 +384,6 @@ class LuGre(Bristles):
         return self.displacement, self.speed, self.excess
 
 
-@dataclass(frozen=True)
 class Spring(MemorylessTerm):
     """A linear spring, tau = k q; the torque at q = 0 is part of the offset."""
 
@@ -461,7 +452,6 @@ class Counterbalance(MemorylessTerm):
         )
 
 
-@dataclass(frozen=True)
 class Lag(DriveTerm):
     """A delayed torque, by a delay T or an elastic gear: to first order -T d(tau)/dt."""
 

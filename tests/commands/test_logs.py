@@ -132,6 +132,26 @@ def test_a_log_that_cannot_be_used_is_refused_alone_where_that_is_wanted(hand, m
         survey_logs(hand, hand.model(), entries)
 
 
+def test_a_file_of_which_two_windows_are_used_is_read_once(hand, tmp_path, monkeypatch):
+    lay_out, reads, path = Job.lay_out, [], tmp_path / "a.csv"
+
+    def counted(*words, **settings):
+        layout, table = lay_out(*words, **settings)
+        read = table.read
+        return layout, replace(table, read=lambda wanted: reads.append(wanted) or read(wanted))
+
+    monkeypatch.setattr(Job, "lay_out", counted)
+    t = 2.0 + 0.01 * np.arange(100)
+    q = np.column_stack([np.sin(3 * t), 0.2 * np.cos(2 * t)])
+    names = "time,q_ja,q_slide,tau_ja,tau_slide"
+    np.savetxt(path, np.column_stack([t, q, q]), delimiter=",", header=names, comments="")
+    entries = LogEntry(path, 2.1, 2.3), LogEntry(path, 2.5)
+    (first,), (second,) = survey_logs(hand, hand.model(), *([entry] for entry in entries))
+    np.testing.assert_allclose(first.head.q, q[10:31])
+    np.testing.assert_allclose(second.head.q, q[50:])
+    assert len(reads) == 1
+
+
 @dataclass(frozen=True)
 class Held:
     """A surveyed log, as far as its locked joints go."""

@@ -171,6 +171,7 @@ def test_further_terms_that_are_multiples_of_each_other_are_one_base_parameter(r
     model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), terms=("coulomb",), own_terms=own)
     plain, found = structural_mapping(model.with_terms({})), structural_mapping(model)
     assert len(found.K) == len(plain.K) + 2
+    np.testing.assert_array_equal(structural_mapping(model, plain=plain).K, found.K)
     pi = rng.standard_normal(len(model.layout.names))
     pi[model.layout.names.index("elbow_joint.tanh")] = speed = 1e5
     q, v, a = rng.uniform(-2, 2, (3, 40, 6))
