@@ -13,6 +13,7 @@ from robotid.excitation.routes import (
     _PLACES,
     Route,
     _free_range,
+    _legs,
     _sweeps,
     design_stands,
     design_sweeps,
@@ -156,3 +157,14 @@ def test_stands_tell_more_of_gravity_than_random_ones(designer):
     some = designer.postures.resting(rng)
     random = [told(rng.choice(some, len(places), replace=False)) for _ in range(50)]
     assert told(places) > max(random)
+
+
+def test_a_leg_has_half_the_speed_limit_of_the_slowest_joint_and_at_least_a_second(designer):
+    fastest = designer.limits.sizes[1]
+    way = np.array([0.4, -1.5, 0.9]) * fastest
+    route = _legs(designer, np.array([0.0 * way, way, 1.01 * way]))
+    np.testing.assert_allclose(route.times, [2.0 * 1.5 / 0.5, 1.0])
+    np.testing.assert_array_equal(route.holds, 2.0)
+    t = np.linspace(2.0, 8.0, 601)  # the first leg, after 2 s at rest
+    v = np.abs(route.evaluate(t)[1]).max(axis=0)
+    np.testing.assert_allclose(v, 0.5 * np.abs(way) / 1.5, rtol=1e-9)

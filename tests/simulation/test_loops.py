@@ -575,6 +575,14 @@ def test_of_a_simulation_without_another_reason_gain_and_inertia_are_named(plana
     )
     assert most == pytest.approx(inertia / 2e-3**2, rel=1e-2)
     assert inertia > loops.armature[1]
+    # positions of the encoders, from their own zeros
+    q, zero = np.array([0.3, -0.9]), np.array([0.2, 0.5])
+    own, at_0 = (
+        why_no_solution(planar, replace(loops, zero=x), np.array([0, 1]), q + zero - x, 0, 2e-3)
+        for x in (zero, 0.0 * zero)
+    )
+    assert own == at_0
+    assert own != why_no_solution(planar, loops, np.array([0, 1]), q, 0, 2e-3)
 
 
 def test_friction_that_falls_faster_than_inertia_allows_slips_as_in_small_steps(tmp_path):
