@@ -77,7 +77,11 @@ def test_a_unit_of_three_logs_has_mean_spread_and_the_values_of_its_logs(table, 
         found = row["value"], row["std_error"], row["spread"]
         assert found == (own["mean"], own["std_error"], own["spread"])
         by_log = {row["log"]: row["value"] for row in rows_of(done[0], unit="a", parameter=name)}
+        errors = {
+            row["log"]: row["std_error"] for row in rows_of(done[0], unit="a", parameter=name)
+        }
         assert [by_log[log] for log in logs] == own["by_log"]
+        assert [errors[log] for log in logs] == own["std_error_by_log"]
 
 
 def test_a_failure_is_a_row_and_the_others_are_identified(done, table):
