@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from helpers.paths import URDF
 
-from robotid.robot.drives import Cubic, LoadFriction, LuGre, Presliding
+from robotid.robot.drives import LoadFriction, LuGre, Presliding
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 from robotid.simulation.plant import RobotPlant, rk4
@@ -100,27 +100,3 @@ def test_a_motor_of_two_joints_bears_the_load_that_its_gear_leaves_it(rng):
     friction = R * (0.4 + 0.15 * borne) * np.sign(R @ v)
     np.testing.assert_allclose(plant.friction_torque(plant.friction(q, v), v, load), friction)
     np.testing.assert_allclose(load + 0.03 * R * (R @ a) + friction, u, rtol=1e-9)
-
-
-def test_a_term_of_two_drives_has_the_parameter_of_each(rng):
-    terms = (Presliding(displacement=0.02), Cubic(), LoadFriction())
-    model = RobotModel.from_urdf(
-        URDF / "planar_2r.urdf", own_terms={"joint_1": terms, "joint_2": terms[::-1]}
-    )
-    pi = model.standard_parameters()
-    size = model.layout.n_inertial
-    pi[size:] = 0.0
-    values = {"presliding": (0.8, 0.3), "cubic": (0.2, 0.5), "load": (0.1, 0.05)}
-    for term, each in values.items():
-        for joint, value in zip(("joint_1", "joint_2"), each, strict=True):
-            pi[model.layout.names.index(f"{joint}.{term}")] = value
-    plant = RobotPlant(model, pi)
-    q, v, load = rng.uniform(0.3, 1.0, (3, 2))
-    v[1] = -v[1]
-    own = {term: np.array(each) for term, each in values.items()}
-    wanted = own["cubic"] * v**3 + (own["presliding"] + own["load"] * load) * np.sign(v)
-    np.testing.assert_allclose(plant.friction_torque(plant.friction(q, v), v, load), wanted)
-    z = np.array([0.4, -0.7])
-    wanted += own["presliding"] * (z - np.sign(v))
-    np.testing.assert_allclose(plant.friction_torque(plant.friction(q, v, z), v, load), wanted)
-    assert plant.n_states == 2
