@@ -3,6 +3,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from robotid.exceptions import SettingsError
 from robotid.excitation import routes
 from robotid.excitation.basis import FourierBasis
 from robotid.excitation.clearance import Clearance
@@ -15,6 +16,7 @@ from robotid.excitation.routes import (
     _free_range,
     _legs,
     _sweeps,
+    _visited,
     design_stands,
     design_sweeps,
 )
@@ -138,6 +140,8 @@ def test_stands_weigh_torques_by_their_noise_over_two_seconds(monkeypatch, rng):
     places = design_stands(about, None, count=4)
     np.testing.assert_array_equal(places[0], q[wanted[0]])
     assert sorted(places[:, 0]) == sorted(q[wanted, 0])
+    for k in range(1, 4):  # from each to the nearest that is left
+        assert np.abs(places[k:] - places[k - 1]).max(axis=1).argmin() == 0
 
 
 def test_stands_tell_more_of_gravity_than_random_ones(designer):
@@ -168,3 +172,17 @@ def test_a_leg_has_half_the_speed_limit_of_the_slowest_joint_and_at_least_a_seco
     t = np.linspace(2.0, 8.0, 601)  # the first leg, after 2 s at rest
     v = np.abs(route.evaluate(t)[1]).max(axis=0)
     np.testing.assert_allclose(v, 0.5 * np.abs(way) / 1.5, rtol=1e-9)
+
+
+def test_a_posture_is_reached_from_the_last_one_visited_or_left_out(monkeypatch):
+    def examined(leg, *_):
+        is_blocked = leg.places[:, 0].tolist() == [1.0, 2.0]  # the line from 1 to 2
+        return SimpleNamespace(contact=None, used=np.full((6, 1), 0.5 + is_blocked), leg=leg)
+
+    monkeypatch.setattr(
+        routes, "_legs", lambda designer, places: SimpleNamespace(places=places, duration=1.0)
+    )
+    found = _visited(SimpleNamespace(examined=examined), np.arange(5.0)[:, None])
+    assert found.leg.places[:, 0].tolist() == [0.0, 1.0, 3.0, 4.0]
+    with pytest.raises(SettingsError, match="every line between two postures has a collision"):
+        _visited(SimpleNamespace(examined=examined), np.array([[1.0], [2.0], [2.0]]))
