@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.pages import chart
 
 from robotid.excitation import course as course_of_motions
 from robotid.excitation.basis import FourierBasis
@@ -13,9 +14,11 @@ from robotid.excitation.design import Designer
 from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.excitation.motion_page import (
     _collisions,
+    _distance_chart,
     _expected,
     _free_chart,
     _limit_table,
+    _share_chart,
 )
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.prediction import predict_instants
@@ -96,6 +99,26 @@ def test_the_distance_of_a_course_is_that_of_all_pairs(course):
     assert not changes[~np.array(last)].any()
     nothing = np.zeros(len(around.pairs), dtype=bool)
     assert np.isinf(found.nearness(nothing)[0]).all()
+
+
+def test_distances_that_do_not_change_are_not_drawn(course):
+    model, *_, found = course
+    around, values = found.clearance, found.values[:, ::10].copy()
+    values[0, :, :2] = values[0, 0, :2]  # the last joint moves alone
+    turned = replace(found, t=found.t[::10], values=values)
+    what = chart(_distance_chart(model, turned, around), "distance of the two nearest hulls")
+    changes = turned.changes(around)
+    exact = around.near(around.placed(values[0]), np.inf, around.everything).distance
+    links = np.array([set(pair) <= set(model.tree.links) for pair in around.named])
+    near = np.isfinite(around.slack)
+    assert (~changes & ~links).any()
+    shown = {series["label"]: series["y"] for series in what["series"]}
+    np.testing.assert_allclose(shown.pop("clearance"), 30.0, rtol=1e-3)
+    wanted = {"links": links & ~near, "floor and boxes": ~links, "links close by design": near}
+    wanted = {label: own & changes for label, own in wanted.items() if (own & changes).any()}
+    assert list(shown) == list(wanted)
+    for label, own in wanted.items():
+        np.testing.assert_allclose(shown[label], 1e3 * exact[own].min(axis=0), rtol=2e-3)
 
 
 def test_the_nearest_pair_is_that_of_the_smallest_margin_not_distance(course, monkeypatch):
@@ -192,10 +215,16 @@ def test_the_page_states_use_margin_joint_time_value_and_unit_of_each_limit():
     assert cells["friction"][:4] == ["12.3", "foot", "3.46", "0.4"]
     assert "100 % of position, velocity and torque is 85 % of the URDF's limit" in found
     assert "Collisions were not checked" in found
-    chart = _free_chart(model, course, "torque", np.array([0, 1]))
-    assert "torque [N m or N]" in chart
+    assert "torque [N m or N]" in _free_chart(model, course, "torque", np.array([0, 1]))
     assert "torque [N]" in _free_chart(model, course, "torque", np.array([0]))
     assert "acceleration [rad/s²]" in _free_chart(model, course, "acceleration", np.array([1]))
+    used[4, 5, 1], used[4, 6, 0] = 0.3, 0.35
+    shares = chart(_share_chart(model, course, "torque", np.array([1, 0])), "torque of each joint")
+    shown = {series["label"]: series["y"] for series in shares["series"]}
+    assert list(shown) == ["limit", "−limit", "elbow", "rail"]
+    np.testing.assert_allclose(shares["x"], t, rtol=1e-3)
+    wanted = [np.full(9, 100.0), np.full(9, -100.0), 100 * used[4, :, 1], 100 * used[4, :, 0]]
+    np.testing.assert_allclose([*shown.values()], wanted, atol=0.01)
 
 
 def test_the_page_counts_parameters_by_their_expected_error_and_source(ur5):
