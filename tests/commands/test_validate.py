@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +11,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.commands import validate
 from robotid.commands.identify import run_job
-from robotid.commands.job import LogEntry, job_from_settings
+from robotid.commands.job import job_from_settings
 from robotid.commands.validate import validate_result
 from robotid.log_files.read import write_log
 from robotid.logs.data import Log, Trajectory
@@ -235,42 +234,6 @@ def test_few_fitted_rows_in_a_long_log_and_a_few_of_it_in_a_long_fitted_one_are_
     holder = replace(long, q=q, tau=tau)
     assert validate._share(short, holder)
     assert validate._share(holder, short)
-
-
-@pytest.mark.parametrize(
-    ("logs", "wanted"), [(["new", "old"], False), (["old", "new"], False), (["new", "more"], True)]
-)
-def test_one_fitted_log_of_commands_among_others_is_no_validation(monkeypatch, logs, wanted):
-    inputs = [{"role": "identification", "sha256": "old"}, {"role": "validation", "sha256": "new"}]
-    loaded = SimpleNamespace(
-        robot=SimpleNamespace(joints=("a",)), path="out/result.json",
-        open_loop=lambda log: f"run {log}",
-        content={"inputs": inputs, "outputs": {"urdf": "a.urdf"}},
-    )  # fmt: skip
-    job = SimpleNamespace(signals="signals", ignore=("code",))
-    errors, heard = [SimpleNamespace(message="it is cut")], {}
-    for name, stands_for in {
-        "log_of_commands": lambda job, entry, loaded: str(entry.path),
-        "file_sha256": str,
-        "diagnose": lambda model, fitted, logs, signals: [(logs, signals)],
-        "blocking": lambda found, ignored: heard.update(found=found, ignored=ignored) or errors,
-        "position_metrics": lambda model, runs, moving: (runs, moving),
-        "judge_positions": lambda *asked, **stated: (
-            heard.update(stated, asked=asked) or SimpleNamespace(to_dict=lambda: "verdict")
-        ),
-        "_errors_of": lambda model, run: run,
-    }.items():
-        monkeypatch.setattr(validate, name, stands_for)
-    found = validate._validate_commands(loaded, job, [LogEntry(Path(log)) for log in logs])
-    runs = [f"run {log}" for log in logs]
-    assert found == {
-        "result": "out/result.json", "predicted_with": "a.urdf", "validation": runs,
-        "verdict": "verdict",
-    }  # fmt: skip
-    assert heard == {
-        "found": [(logs, "signals")], "ignored": ("code",), "asked": ((runs, True), ("a",)),
-        "is_validation": wanted, "log_errors": ["it is cut"],
-    }  # fmt: skip
 
 
 def test_the_expected_error_has_the_parts_of_fit_spread_and_residual(arm, rng, monkeypatch):
