@@ -11,6 +11,8 @@ from robotid.excitation.clearance import Box, Clearance
 from robotid.excitation.design import Designer
 from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.excitation.multipliers import Multipliers
+from robotid.identification.assumptions import TorqueNoise
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -285,3 +287,23 @@ def test_a_motion_longer_than_the_basis_is_examined_for_collisions_to_its_end(wr
     near, motion = replace(designer, clearance=around), ProgramMotion(np.full(3, 0.2), 9.0)
     assert near.examined(motion, 9.0, 10.0).contact is None
     assert heard == [(motion, 9.0)]  # that of the basis is 4 s
+
+
+def test_a_motion_after_a_run_has_its_noise_its_parameters_and_its_information(wrist, rng):
+    mapping, heard = structural_mapping(wrist), []
+    A = rng.standard_normal(2 * (len(mapping.K),))
+    noise = TorqueNoise(np.array([0.3, 0.5, 0.2]), np.array([0.02, 0.04, 0.05]), 3 * ("found",))
+    pi = wrist.standard_parameters()
+    pi[wrist.layout.n_inertial :] = rng.uniform(0.1, 0.3, len(pi) - wrist.layout.n_inertial)
+    factors = SimpleNamespace(information=lambda weights: heard.append(weights) or A @ A.T)
+    run = SimpleNamespace(standard=pi, noise=lambda K: noise, step=0.01, factors=factors)
+    found = Designer.of_model(
+        wrist, FourierBasis(4.0, 3), MotionLimits.of_model(wrist), run=run, noise={WRIST[1]: 0.9}
+    )
+    density = np.array([0.3, 0.9, 0.2]) ** 2 * [0.02, 0.1, 0.05]  # one is stated, over 0.1 s
+    np.testing.assert_allclose(found.noise, density)
+    np.testing.assert_allclose(heard, [0.01 / density])
+    S = found.spread
+    np.testing.assert_allclose(found.given, np.eye(len(A)) + S[:, None] * (A @ A.T) * S)
+    np.testing.assert_allclose(found.known, found.given)
+    np.testing.assert_allclose(found.information.beta, mapping.to_base(pi))
