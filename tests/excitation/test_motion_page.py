@@ -17,6 +17,8 @@ from robotid.excitation.motion_page import (
     _distance_chart,
     _expected,
     _free_chart,
+    _head,
+    _history,
     _limit_table,
     _share_chart,
 )
@@ -266,3 +268,30 @@ def test_collisions_of_the_page_have_millimetres_and_what_was_not_checked():
     assert "Not checked, since no shape can be read: gripper, cam." in found
     assert "Not checked, since in contact by design: a and b." in found
     assert "Close by design, with a smaller clearance: c and d." in found
+
+
+def test_the_head_and_the_course_of_the_optimisation_have_the_figures_of_the_design():
+    model = SimpleNamespace(name="a<b", joints=("one", "two", "three"))
+    content = {
+        "kind": "bspline", "duration": 12.3456, "criterion": "E", "condition_number": 1234.5,
+        "seconds": 7.89, "starts": 1, "converged": True,
+        "history": [[0.5, 3.25], [1.25, 2.5], [4.0, -1.75]],
+    }  # fmt: skip
+
+    def facts(**changes):
+        head = _head(model, content | changes)
+        assert head.startswith("<h1>a&lt;b: excitation trajectory</h1>")
+        return dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", head))
+
+    assert facts() == {
+        "motion": "bspline, 12.35 s", "joints": "3", "criterion": "E",
+        "condition number": "1,234 (regressor, columns in units of the prior)",
+        "computing time": "7.9 s, 1 start, converged",
+    }  # fmt: skip
+    other = facts(condition_number=None, starts=3, converged=False)
+    assert other["condition number"] == "infinite"
+    assert other["computing time"] == "7.9 s, 3 starts, not converged: allow more seconds"
+    assert facts(starts=0)["computing time"] == "7.9 s"
+    what = chart(_history(content), "criterion of the best motion against the computing time")
+    np.testing.assert_allclose(what["x"], [0.5, 1.25, 4.0], atol=1e-3)
+    np.testing.assert_allclose(what["series"][0]["y"], [3.25, 2.5, -1.75], atol=1e-3)

@@ -564,6 +564,13 @@ def test_friction_without_a_solution_is_named_with_joint_value_and_time(legs, te
     assert log.t[40] <= float(time) < log.t[50], "of the log, not of the window"
 
 
+def test_friction_of_a_rail_without_a_solution_has_its_units(tmp_path):
+    model = slider(tmp_path)
+    loops = loops_of(model, (Coulomb(), PositionCoulomb(order=1, centre=0.1)), (0.5, 2.0))
+    words = why_no_solution(model, loops, np.array([0]), np.array([-0.4]), 0, 2e-3)
+    assert "its Coulomb friction is -0.5 N at -0.4 m, wanted 0 or more" in words
+
+
 def test_of_a_simulation_without_another_reason_gain_and_inertia_are_named(planar):
     loops = loops_of(planar, kp=1e9)
     words = why_no_solution(planar, loops, np.array([0, 1]), np.zeros(2), 1, 2e-3)
