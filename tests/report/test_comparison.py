@@ -644,3 +644,21 @@ def test_results_of_several_logs_are_in_the_order_of_their_first_ones():
 
     found = history_of([result(2, 4), result(9, 1), result(3)], [], ["A", "B", "C"])
     assert (found["order"], found["by_time"]) == ([1, 0, 2], True)
+
+
+def test_the_chart_of_a_friction_has_its_units_its_loads_and_no_line_across_standstill():
+    content = {"results": [{"label": label} for label in "ABC"]}
+    v = [-0.5, 0.0, 0.5]
+    entry = {"joint": "ra<il", "unit": "N", "speeds": v, "load": [0.0812, None, 0.5],
+             "torques": [[-3.0, 0.5, 4.0], None, [-1.0, 0.0, 2.0]]}  # fmt: skip
+    html = comparison_page._friction_figure(content, entry)
+    (drawn,) = charts(html)
+    assert (drawn["x_label"], drawn["y_label"]) == ("speed [m/s]", "friction [N]")
+    assert [series["label"] for series in drawn["series"]] == ["A", "C"]
+    wanted = [[-3.0, np.nan, 4.0], [-1.0, np.nan, 2.0]]
+    np.testing.assert_allclose([s["y"] for s in drawn["series"]], wanted, atol=1e-3)
+    caption = "<strong>ra&lt;il</strong>; additional friction per N of load: A 0.0812, C 0.5"
+    assert caption in html
+    plain = comparison_page._friction_figure(content, entry | {"unit": "N m", "load": 3 * [None]})
+    assert charts(plain)[0]["x_label"] == "speed [rad/s]"
+    assert "of load" not in plain
