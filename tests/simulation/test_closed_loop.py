@@ -3,7 +3,6 @@ import re
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.single_joint import slider
 from helpers.synthetic import truth
 
 from robotid.exceptions import DataError, SettingsError
@@ -244,16 +243,3 @@ def test_more_steps_than_a_computer_makes_are_refused_before_the_first(ur5):
         Simulation(rate=1e9)
     with pytest.raises(SettingsError, match="inertials is 1000, wanted 0 to 5"):
         Truth(inertials=1000)
-
-
-def test_a_random_motion_has_the_largest_amplitude_or_speed_of_its_joint(panda, rng, tmp_path):
-    for model, amplitude, speed in ((panda, 1.2, 1.5), (slider(tmp_path), 0.15, 0.3)):
-        limits = [(j.lower, j.upper) if j.has_limits else (-1.0, 1.0) for j in model.limits]
-        low, high = np.array(limits).T
-        centre = low + rng.choice([0.4, 0.65], len(low)) * (high - low)
-        q, v, _ = random_fourier(model, rng, centre=centre).evaluate(np.linspace(0, 10, 1000))
-        for j, joint in enumerate(model.limits):
-            room = 0.9 * min(high[j] - centre[j], centre[j] - low[j])
-            far = np.abs(q[:, j] - centre[j]).max() / min(amplitude, room)
-            fast = np.abs(v[:, j]).max() / min(speed, 0.9 * joint.velocity or np.inf)
-            assert max(far, fast) == pytest.approx(1.0), joint.name
