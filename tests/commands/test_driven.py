@@ -119,6 +119,8 @@ def test_what_a_job_says_reaches_the_fit_of_roll_outs(job, monkeypatch, is_auto)
 
     monkeypatch.setattr("robotid.closed_loop.identify.identify_loops", told)
     asked = replace(read_job(job), ignore=("spikes",))
+    logs = tuple(replace(entry, unit="third arm") for entry in asked.identification)
+    asked = replace(asked, identification=logs)
     asked = replace(asked, terms=(*asked.terms, *([AUTO] if is_auto else [])))
     with pytest.raises(Told) as error:
         identify._identify_loops(asked, asked.model(), None)
@@ -129,6 +131,7 @@ def test_what_a_job_says_reaches_the_fit_of_roll_outs(job, monkeypatch, is_auto)
     assert options["signals"].cutoff == 30.0
     assert options["ignore"] == ("spikes",)
     assert options["chooses"] is is_auto
+    assert options["units"] == ["third arm"]
 
 
 def test_its_report_is_made_anew_and_its_replay_shows_torques(folder, job, tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robotid.cli import excite, main
-from robotid.commands.excite import _designer, _expected
+from robotid.commands.excite import _designer, _expected, _log
 from robotid.commands.job import Job, read_job
 from robotid.excitation.clearance import Box
 from robotid.excitation.design import Designer
@@ -318,16 +318,28 @@ def test_what_is_expected_of_a_motion_rests_on_the_noise_that_is_stated(pan_tilt
     motion = random_fourier(model, rng, period=4.0)
     settings = MotionSettings(points=50.0, noise={"a": 0.2, "b": 0.6})
     job = Job(pan_tilt, signals=SignalSettings(cutoff=None, trim=0.0))
-    design = SimpleNamespace(motion=motion, duration=4.0)
+    design = SimpleNamespace(motion=motion, duration=3.995)  # it ends before the last row
     found = _expected(job, model, design, settings, None, "m.csv")
     assert found.noise.std.tolist() == [0.2, 0.6]
     (evaluation,) = found.expected.fitted
     trajectory = evaluation.recording.trajectory
     np.testing.assert_allclose(trajectory.t, np.arange(201) / 50.0)
-    for name, values in zip("qva", motion.evaluate(trajectory.t), strict=True):
+    rows = motion.evaluate(np.minimum(trajectory.t, 3.995))
+    for name, values in zip("qva", rows, strict=True):
         np.testing.assert_allclose(getattr(trajectory, name), values, atol=1e-12)
     assert evaluation.recording.log.path == "m.csv"
     assert found.before is None
+
+
+def test_the_table_of_a_motion_on_the_feet_ends_with_the_motion():
+    asked = []
+    motion = SimpleNamespace(evaluate=lambda t: asked.append(t) or "state")
+    stand = SimpleNamespace(log=lambda *words: words)
+    design = SimpleNamespace(motion=motion, duration=2.06)
+    state, t, path = _log(stand, design, MotionSettings(points=10.0), "squat.csv")
+    assert (state, path) == ("state", "squat.csv")
+    np.testing.assert_allclose(t, np.arange(22) / 10.0)
+    np.testing.assert_allclose(asked[0], np.minimum(t, 2.06))
 
 
 def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt, capsys):

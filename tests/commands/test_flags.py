@@ -1,11 +1,14 @@
 """Flags state what the keys of a job file state."""
 
 import argparse
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import ANY
 
 import pytest
 
-from robotid.cli import doctor, identify, preview, track
+from robotid.cli import doctor, identify, main, preview, track
 from robotid.cli.flags import job_from_flags, source_words
 from robotid.cli.parser import CommandParser
 from robotid.commands.job import job_from_settings
@@ -13,6 +16,7 @@ from robotid.exceptions import SettingsError
 from robotid.fitting.settings import ESTIMATORS
 from robotid.logs.settings import LogSource, SignalSettings
 from robotid.robot.drives import FAMILIES
+from robotid.workers.plan import WorkPlan
 
 
 def job(command, *words):
@@ -174,3 +178,67 @@ def test_a_flag_is_stated_once_and_validation_logs_add_up(capsys):
                 ["r.urdf", "a.csv", flag, "6" if value == "5" else value, flag, value]
             )
         assert f"argument {flag}: stated twice, as " in capsys.readouterr().err
+
+
+class Heard(Exception):
+    """What a command hands to the function that does its work."""
+
+
+JOB_OF_FLAGS = SimpleNamespace(workers=2)
+UNSTATED = dict.fromkeys(("step", "delay", "samples", "seed", "temperature"))
+FORWARDED = {
+    "validate out a.csv b.csv": ("validate.validate_result", ("out", ["a.csv", "b.csv"]), {}),
+    "report out --out p.html": ("report.rewrite_report", ("out", "p.html"), {"progress": ANY}),
+    "export out --format mjcf --out a.xml --step 0.002 --delay filter": (
+        "export.export_result", ("out", "mjcf", "a.xml"),
+        UNSTATED | {"step": 0.002, "delay": "filter"},
+    ),
+    "export out --format ranges --out a.yaml --samples 5 --seed 3 --temperature 31.5": (
+        "export.export_result", ("out", "ranges", "a.yaml"),
+        UNSTATED | {"samples": 5, "seed": 3, "temperature": 31.5},
+    ),
+    "payload u a.csv --reference c --reference d --link x --link y --mass x=2 --gains": (
+        "payload.measure_payload", (JOB_OF_FLAGS, ["c", "d"]),
+        {"links": ["x", "y"], "masses": ["x=2"], "find_gains": True, "progress": ANY},
+    ),
+    "preview u a.csv --given out --noise a=0.2 --noise b=3 --correlation 0.3": (
+        "preview.preview_job", (JOB_OF_FLAGS, "out"),
+        {"noise": {"a": 0.2, "b": 3.0}, "correlation": 0.3},
+    ),
+    "track u a.csv --out there": ("track.run_track", (JOB_OF_FLAGS, "there"), {}),
+    "track u a.csv --out there --serve 8123 --speed 2.5": (
+        "track.serve_track", (JOB_OF_FLAGS, "there"),
+        {"port": 8123, "speed": 2.5, "announce": ANY, "finished": ANY},
+    ),
+    "identify u a.csv --out there --workers 3 --resume": (
+        "identify.run_job", (JOB_OF_FLAGS, "there"),
+        {"plan": WorkPlan(3, None, True, ANY), "source": ANY},
+    ),
+    "identify u a.csv --scheduler tcp://host:8786": (
+        "identify.run_job", (JOB_OF_FLAGS, "robotid-out"),
+        {"plan": WorkPlan(2, "tcp://host:8786", False, ANY), "source": ANY},  # workers of the job
+    ),
+    "replay u a.csv --ghost g.csv --html p.html": (
+        "replay.replay_files", (JOB_OF_FLAGS, ANY), {"ghost": "g.csv"}
+    ),
+    "convert in.csv out.npz --joints a,b --sensors x,y": (
+        "convert.convert", ("in.csv", "out.npz"),
+        {"joints": ["a", "b"], "source": LogSource(sensors=("x", "y"))},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", FORWARDED)
+def test_every_flag_reaches_the_function_that_does_the_work(words, monkeypatch):
+    place, wanted, options = FORWARDED[words]
+
+    def heard(*asked, **stated):
+        raise Heard(asked, stated)
+
+    monkeypatch.setattr(f"robotid.commands.{place}", heard)
+    command = import_module(f"robotid.cli.{words.split()[0]}")
+    if hasattr(command, "job_from_flags"):
+        monkeypatch.setattr(command, "job_from_flags", lambda options: JOB_OF_FLAGS)
+    with pytest.raises(Heard) as caught:
+        main(words.split())
+    assert caught.value.args == (wanted, options)

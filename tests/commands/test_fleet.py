@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pyarrow.parquet
 import pytest
-from helpers.pages import tables
+from helpers.pages import charts, tables
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
@@ -77,7 +77,11 @@ def test_a_unit_of_three_logs_has_mean_spread_and_the_values_of_its_logs(table, 
         found = row["value"], row["std_error"], row["spread"]
         assert found == (own["mean"], own["std_error"], own["spread"])
         by_log = {row["log"]: row["value"] for row in rows_of(done[0], unit="a", parameter=name)}
+        errors = {
+            row["log"]: row["std_error"] for row in rows_of(done[0], unit="a", parameter=name)
+        }
         assert [by_log[log] for log in logs] == own["by_log"]
+        assert [errors[log] for log in logs] == own["std_error_by_log"]
 
 
 def test_a_failure_is_a_row_and_the_others_are_identified(done, table):
@@ -156,7 +160,7 @@ def test_a_page_of_many_failures_and_units_shows_each_kind_and_few_of_them():
     ]
     failures.append({"unit": "last", "log": "", "error": "the URDF of last is broken"})
     unlike = [
-        {"unit": f"u{k}", "parameter": "a.coulomb", "value": 1.0, "std_error": 0.1,
+        {"unit": f"u{k // 3}", "parameter": "a.coulomb", "value": 1.0, "std_error": 0.1,
          "parameter_unit": "N m", "others": [2.0, 3.0]} for k in range(45)
     ]  # fmt: skip
     content = {"units": 1000, "logs": 1000, "done": 699, "verdicts": {"usable": 699},
@@ -168,6 +172,8 @@ def test_a_page_of_many_failures_and_units_shows_each_kind_and_few_of_them():
     assert "281 more are in <code>fleet.parquet</code>" in html
     assert len(tables(html)["Units that differ from the others"].rows) == 20
     assert "25 more are in <code>fleet.json</code>" in html
+    assert "<dt>Failures</dt><dd>301</dd>" in html
+    assert "<dt>Units that differ</dt><dd>15</dd>" in html
 
 
 def test_variation_between_units_is_that_of_their_values(done):
@@ -214,6 +220,20 @@ def test_another_table_does_not_resume(table, tmp_path, monkeypatch):
     other = [replace(units[0], logs=units[0].logs[:1]), *units[1:]]
     with pytest.raises(DataError, match=r"checkpoint of other inputs: units\.a was"):
         run_fleet(other, tmp_path, plan=WorkPlan(1, resume=True))
+
+
+def test_a_unit_is_another_one_with_another_payload_job_or_file(table, tmp_path):
+    units = read_fleet(table)
+    first, *others = units[0].logs
+    (tmp_path / "job.toml").write_text("")
+    before = fleet._inputs(units)["units"]
+    for change in (
+        {"logs": ((first[0], 2.5), *others)},
+        {"job": tmp_path / "job.toml"},
+        {"logs": ((units[1].logs[0][0], None), *others)},
+    ):
+        after = fleet._inputs([replace(units[0], **change), *units[1:]])["units"]
+        assert [name for name in before if before[name] != after[name]] == ["a"]
 
 
 def test_rows_state_urdf_job_and_payload(tmp_path):
@@ -316,3 +336,44 @@ def test_units_are_compared_by_parameter_robot_and_expression():
         assert entry["parameter"] == ("a.coulomb", "b.m")[p]
         assert (entry["value"], entry["std_error"]) == (x[k, p], errors[k, p])
         assert entry["others"] == found["parameters"][p]["next_interval"]
+
+
+def test_a_distribution_is_of_the_values_with_the_interval_of_the_next_unit():
+    values = [1.0, 1.1, 1.15, 1.2, 3.0, 3.1]
+    entry = {"name": "a.coulomb", "robot": "arm", "expression": "a.coulomb", "unit": "N m",
+             "units": 6, "mean": 1.759, "std_error": 0.4, "spread": 0.9123, "values": values,
+             "spread_interval": [0.5, 2.2], "next_interval": [-0.7, 4.25]}  # fmt: skip
+    even = entry | {"name": "b.coulomb", "mean": 200.0, "spread": 1.0}
+    content = {"units": 6, "logs": 6, "done": 6, "verdicts": {"good": 6}, "failures": [],
+               "unlike": [], "parameters": [even, entry]}  # fmt: skip
+    html = fleet_page(content)
+    first, second = charts(html)  # the larger relative spread comes first
+    assert first["title"] == "Distribution of a.coulomb over units"
+    assert second["title"] == "Distribution of b.coulomb over units"
+    assert first["marks"] == [-0.7, 4.25]
+    width = (3.1 - 1.0) / 4
+    np.testing.assert_allclose(first["x"], 1.0 + width * (np.arange(4) + 0.5), rtol=1e-3)
+    np.testing.assert_allclose(first["series"][0]["y"], [4, 0, 0, 2], atol=1e-3)
+    row = tables(html)["Base parameters of the units"].by_name()["a.coulomb"]
+    shown = [row[head] for head in ("units", "mean", "± error", "spread", "low", "high", "unit")]
+    assert shown == ["6", "1.76", "0.40", "0.91", "−0.70", "4.25", "N m"]
+
+
+def test_every_flag_reaches_the_units_and_their_workers(monkeypatch, capsys):
+    heard = {}
+
+    def run(units, folder, *, plan):
+        heard.update(units=units, folder=folder, plan=plan)
+        return {"done": 1}
+
+    monkeypatch.setattr(fleet, "read_fleet", lambda *words: words)
+    monkeypatch.setattr(fleet, "run_fleet", run)
+    words = "fleet t.csv --urdf arm.urdf --job all.toml --out there --resume --json --workers 3"
+    assert main(words.split()) == 0
+    assert heard["units"] == ("t.csv", "arm.urdf", "all.toml")
+    assert heard["folder"] == "there"
+    assert (heard["plan"].workers, heard["plan"].resume) == (3, True)
+    assert main(["fleet", "t.csv", "--scheduler", "tcp://host:8786", "--json"]) == 0
+    assert heard["units"] == ("t.csv", None, None)
+    assert heard["plan"].scheduler == "tcp://host:8786"
+    assert capsys.readouterr().out == '{"done": 1}\n' * 2

@@ -1,6 +1,8 @@
 """robotid.identify by simulation: what run_job finds of the same logs, without files."""
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +10,8 @@ from helpers.mujoco_plant import plant, torque_log
 
 import robotid
 from robotid.closed_loop.result import LoopIdentification
+from robotid.commands.identify import _entries
+from robotid.commands.job import LogEntry
 from robotid.exceptions import DataError, SettingsError
 
 SETTINGS = {"bodies": 0.0, "step": 4e-3, "torques": False}
@@ -51,6 +55,16 @@ def test_it_finds_what_a_job_finds_of_the_same_logs(arm, found, tmp_path):
     for role, log in zip(("identification", "validation"), logs, strict=True):
         (entry,) = saved.content["settings"][role]
         assert (entry["start"], entry["end"]) == pytest.approx((log.t[0], log.t[-1]), abs=1e-6)
+
+
+def test_a_saved_result_names_the_windows_of_its_logs_in_files():
+    files = (("a.csv", 2.5, 7.25), ("", 0.0, 3.0), ("b.csv", -1.0, 4.0))
+    runs = [
+        SimpleNamespace(log=SimpleNamespace(path=path, t=np.linspace(start, end, 5)))
+        for path, start, end in files
+    ]
+    wanted = [LogEntry(Path(path), start, end) for path, start, end in files if path]
+    assert list(_entries(runs)) == wanted
 
 
 def test_it_is_saved_and_loaded(found, tmp_path):

@@ -164,13 +164,14 @@ def test_a_check_of_the_scale_reads_the_windows_that_a_job_states(files, monkeyp
     read = []
 
     def checked(loaded, reference, *, masses):
+        assert reference == ("first", "second")
         read.append([log.t[[0, -1]] for own in loaded for log in own.looks])
         return {"tool0": PayloadCheck("tool0", masses["tool0"])}
 
     monkeypatch.setattr(payload, "Recordings", lambda model, mapping, run: run)
     monkeypatch.setattr(payload, "mass_checks", checked)
     job = job_from_settings(table, "job.toml", files)
-    checks = payload.check_payloads(job, job.model(), ())
+    checks = payload.check_payloads(job, job.model(), ("first", "second"))
     assert len(checks) == 3
     for check in checks:
         assert (check.known, check.sha256) == (1.8, file_sha256(files / "loaded.csv"))

@@ -127,6 +127,10 @@ def test_of_each_motion_its_window_is_previewed(files):
     for motion, start, end in ((first, 2.0, 7.0), (second, 1.0, 4.5)):
         (look,) = motion.looks
         assert (look.t[0], look.t[-1]) == pytest.approx((start, end), abs=0.0101)
+    shown = preview.preview_job(job)["motions"]
+    assert [Path(motion["path"]).name for motion in shown] == ["log_motion.csv", "other_motion.csv"]
+    ends = [(motion["start"], motion["end"]) for motion in shown]
+    np.testing.assert_allclose(ends, [(2.0, 7.0), (1.0, 4.5)], atol=0.0101)
 
 
 @pytest.mark.parametrize(

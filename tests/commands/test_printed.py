@@ -10,6 +10,7 @@ from robotid.cli import (
     convert,
     excite,
     export,
+    fleet,
     identify,
     inspect,
     paper,
@@ -504,3 +505,32 @@ def test_compare(shown):
         "versions: numpy: 1 | 2",
         "only r1 read a.csv 1-2 s (validation)",
     ]
+
+
+def test_fleet(shown):
+    failures = [
+        {"unit": "u1", "log": "", "error": "no URDF"}, {"unit": "u2", "log": "x.csv", "error": "?"},
+    ]  # fmt: skip
+    unlike = [
+        {"unit": f"r{k}", "parameter": "one.coulomb", "value": 1.23456, "std_error": 0.0123,
+         "parameter_unit": "N m", "others": [0.51234, 0.98765]} for k in range(13)
+    ]  # fmt: skip
+    content = {
+        "units": 30, "done": 28, "logs": 75, "verdicts": {"good": 20, "poor": 8},
+        "failures": failures, "unlike": unlike,
+    }  # fmt: skip
+    lines = shown(fleet._show, content)
+    assert lines[:5] == [
+        "28 of 30 units identified (20 good, 8 poor), 75 logs",
+        "failed: u1: no URDF",
+        "failed: u2: x.csv: ?",
+        "differs: r0: one.coulomb is 1.235 +- 0.012 N m; the other units predict 0.512 to 0.988",
+        "differs: r1: one.coulomb is 1.235 +- 0.012 N m; the other units predict 0.512 to 0.988",
+    ]
+    assert len(lines) == 1 + 2 + 10 + 1
+    assert lines[-1] == "3 more failures or differences: fleet.html"
+    few = content | {"verdicts": {}, "done": 0, "failures": 12 * failures[:1], "unlike": unlike[:2]}
+    lines = shown(fleet._show, few)
+    assert lines[0] == "0 of 30 units identified, 75 logs"
+    assert lines[-1] == "2 more failures or differences: fleet.html"
+    assert len(shown(fleet._show, content | {"unlike": unlike[:10]})) == 13

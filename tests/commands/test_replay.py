@@ -16,12 +16,14 @@ from helpers.replay_data import shown
 from helpers.synthetic import exact_log, payload_log, truth
 
 from robotid.cli import main
+from robotid.commands import replay
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.replay import _base_poses, read_findings, replay_identified
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.log_files.formats import write_columns
 from robotid.log_files.read import write_log
+from robotid.logs.data import Log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -441,3 +443,36 @@ def test_drives_that_follow_commands_are_played_with_their_ghosts(tmp_path):
         other.follow_commands(log)
     with pytest.raises(DataError, match="log has no commands, columns qref_ of each joint"):
         load_result(out).follow_commands(replace(log, q_ref=None))
+
+
+def test_of_two_results_both_are_shown_and_the_error_is_that_of_the_first(monkeypatch):
+    t = 3.0 + 0.01 * np.arange(50)
+    q = np.column_stack([np.sin(t), np.cos(t)])
+    log = Log(t, q, 0.0 * q, ("a", "b"), q_ref=q + np.array([0.04, 0.05]), has_torque=False)
+
+    def result(zeros, *errors):
+        drives = [SimpleNamespace(zero=zero) for zero in zeros]
+        robot = SimpleNamespace(joints=log.joints)
+        return SimpleNamespace(
+            robot=robot, commanded=drives, follow_commands=lambda log: log.q + errors
+        )
+
+    results = {"one": result((0.1, -0.2), 1e-3, 3e-3), "two": result((0.5, 0.5), 0.02, 0.01)}
+    heard = {}
+    monkeypatch.setattr(
+        replay, "replay", lambda model, t, q, **stated: heard.update(stated, q=q, model=model)
+    )
+    monkeypatch.setattr(replay, "log_of_commands", lambda job, entry, result: log)
+    job = SimpleNamespace(identification=(LogEntry(Path("day/log.csv")),))
+    replay._replay_commanded(job, results, None)
+    zero = [0.1, -0.2]  # of the first
+    assert heard["model"] is results["one"].robot
+    np.testing.assert_allclose(heard["q"], q + zero)
+    wanted = {"simulated: one": [1e-3, 3e-3], "simulated: two": [0.02, 0.01],
+              "commanded": [0.04, 0.05]}  # fmt: skip
+    assert list(heard["ghosts"]) == list(heard["torques"].predicted) == list(wanted)
+    for label, error in wanted.items():
+        np.testing.assert_allclose(heard["torques"].predicted[label], q + error)
+        np.testing.assert_allclose(heard["ghosts"][label][1], q + error + zero)
+    np.testing.assert_allclose(heard["torques"].noise, [0.04, 0.05])
+    assert heard["notes"][1] == "Simulated position error, RMS [mrad or mm]: b 3, a 1."

@@ -26,6 +26,7 @@ from robotid.simulation.settings import (
     Sensors,
     Simulation,
     Truth,
+    read_simulation,
 )
 
 URDF = str(example_urdf("ur5_robot.urdf"))
@@ -294,3 +295,17 @@ def test_a_motion_passes_its_rows_with_their_speeds_and_accelerations(tmp_path, 
     found = _motion(job, ur5, files).evaluate(t - 3.0)
     for one, stated in zip(found, (q, v, a), strict=True):
         np.testing.assert_allclose(one, stated, atol=1e-9)
+
+
+def test_a_flag_replaces_one_value_of_a_table_of_the_plants_file(tmp_path):
+    (tmp_path / "plant.toml").write_text(
+        "rate = 250.0\n[controller]\nkind = 'pd'\nbandwidth = 9.0\n[sensors]\njitter = 1e-4\n"
+        "[sensors.noise]\nq = 2e-5\ntau = 0.05\n"
+    )
+    given = {"seed": 3, "controller": {"kind": "feedforward"}, "sensors": {"noise": {"tau": 0.02}}}
+    found, drives = read_simulation(tmp_path / "plant.toml", given)
+    assert (found.seed, found.rate, drives) == (3, 250.0, {})
+    assert (found.controller.kind, found.controller.bandwidth) == ("feedforward", 9.0)
+    assert (found.sensors.jitter, found.sensors.noise.q, found.sensors.noise.tau) == (
+        1e-4, 2e-5, 0.02
+    )  # fmt: skip

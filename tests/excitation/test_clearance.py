@@ -286,3 +286,13 @@ def test_links_of_several_pairs_are_told_with_the_least_of_their_distances(slide
     assert told.endswith("(9 mm)")
     (told,) = clearance._listed(np.array([True, True, True]), np.array([0.009, -0.004, 0.001]))
     assert told.endswith("(overlap by 4 mm)")
+
+
+def test_of_links_close_by_design_no_more_than_the_clearance_is_required(tmp_path):
+    # the plate hardly tilts, 6 mm above the base: half of it is more than the clearance
+    text = TILTED.replace('"0 0 0.065"', '"0 0 0.056"').replace("0.35", "0.001")
+    (tmp_path / "flat.urdf").write_text(text)
+    clearance = Clearance(RobotModel.from_urdf(tmp_path / "flat.urdf"), least=0.002)
+    assert clearance.named == [("base", "plate")]
+    assert clearance.required == pytest.approx(0.002)
+    assert clearance.slack == pytest.approx(0.004, abs=1e-4)

@@ -1,5 +1,6 @@
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,10 +11,13 @@ from robotid.excitation.clearance import Box, Clearance
 from robotid.excitation.design import Designer
 from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.excitation.multipliers import Multipliers
+from robotid.identification.assumptions import TorqueNoise
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
+from robotid.simulation.motions import ProgramMotion
 
 WRIST = ["wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
 
@@ -243,7 +247,7 @@ def test_postures_are_drawn_from_the_middle_of_wide_ranges(designer):
 
 
 def test_an_examined_motion_is_judged_with_what_is_known_and_its_condition_without(designer, rng):
-    """Of 5 s at 20 Hz from the regressor; the second joint rests and contributes nothing."""
+    """Of 5.02 s in 100 steps, about 20 Hz; the second joint rests and contributes nothing."""
     size = len(designer.spread)
     A = rng.standard_normal((size, size))
     given = np.eye(size) + 0.3 * A @ A.T
@@ -252,26 +256,54 @@ def test_an_examined_motion_is_judged_with_what_is_known_and_its_condition_witho
         noise=np.array([0.01, 0.4, 0.09]),
     )  # fmt: skip
     motion = some.checked(some.random(rng)).motion
-    found = some.examined(motion, 5.0, 20.0)
-    t = np.linspace(0.0, 5.0, 101)
+    found = some.examined(motion, 5.02, 20.0)
+    t = np.linspace(0.0, 5.02, 101)
     q, v, a = motion.evaluate(t)
     rows = some.information.rows(q, v, a)
     F = given.copy()
     for j, noise in ((0, 0.01), (2, 0.09)):
         W = rows.W[j].T * some.spread
-        F += 0.05 / noise * W.T @ W
+        F += 0.0502 / noise * W.T @ W
     variance = np.diag(np.linalg.inv(F))
     widest = np.argsort(np.diag(np.linalg.inv(given)))[-round(size / 4) :]
     assert sorted(some.widest) == sorted(widest)
     assert found.objective == pytest.approx(np.log(variance[widest]).mean())
     used = some.limits.used(q, v, a, 0.0 * a, some.information.torque(rows))
     np.testing.assert_allclose(found.used, np.abs(used).max(axis=1))
-    assert (found.intervals, found.duration) == (100, 5.0)
+    assert (found.intervals, found.duration) == (100, 5.02)
     whole = designer.checked(designer.random(rng)).motion  # all joints move
-    alone, rows = designer.examined(whole, 5.0, 20.0), designer.along(*whole.evaluate(t))
+    alone, rows = designer.examined(whole, 5.02, 20.0), designer.along(*whole.evaluate(t))
     W = np.concatenate(
-        [np.sqrt(0.05 / n) * w.T * designer.spread
+        [np.sqrt(0.0502 / n) * w.T * designer.spread
          for n, w in zip(designer.noise, rows.W, strict=True)]
     )  # fmt: skip
     assert alone.condition == pytest.approx(np.linalg.cond(W), rel=1e-4)
     assert alone.objective == pytest.approx(-np.linalg.slogdet(W.T @ W + np.eye(size))[1] / size)
+
+
+def test_a_motion_longer_than_the_basis_is_examined_for_collisions_to_its_end(wrist, designer):
+    heard = []
+    around = SimpleNamespace(nearest=lambda *asked: heard.append(asked) or None)
+    near, motion = replace(designer, clearance=around), ProgramMotion(np.full(3, 0.2), 9.0)
+    assert near.examined(motion, 9.0, 10.0).contact is None
+    assert heard == [(motion, 9.0)]  # that of the basis is 4 s
+
+
+def test_a_motion_after_a_run_has_its_noise_its_parameters_and_its_information(wrist, rng):
+    mapping, heard = structural_mapping(wrist), []
+    A = rng.standard_normal(2 * (len(mapping.K),))
+    noise = TorqueNoise(np.array([0.3, 0.5, 0.2]), np.array([0.02, 0.04, 0.05]), 3 * ("found",))
+    pi = wrist.standard_parameters()
+    pi[wrist.layout.n_inertial :] = rng.uniform(0.1, 0.3, len(pi) - wrist.layout.n_inertial)
+    factors = SimpleNamespace(information=lambda weights: heard.append(weights) or A @ A.T)
+    run = SimpleNamespace(standard=pi, noise=lambda K: noise, step=0.01, factors=factors)
+    found = Designer.of_model(
+        wrist, FourierBasis(4.0, 3), MotionLimits.of_model(wrist), run=run, noise={WRIST[1]: 0.9}
+    )
+    density = np.array([0.3, 0.9, 0.2]) ** 2 * [0.02, 0.1, 0.05]  # one is stated, over 0.1 s
+    np.testing.assert_allclose(found.noise, density)
+    np.testing.assert_allclose(heard, [0.01 / density])
+    S = found.spread
+    np.testing.assert_allclose(found.given, np.eye(len(A)) + S[:, None] * (A @ A.T) * S)
+    np.testing.assert_allclose(found.known, found.given)
+    np.testing.assert_allclose(found.information.beta, mapping.to_base(pi))

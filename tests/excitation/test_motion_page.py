@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.pages import chart
 
 from robotid.excitation import course as course_of_motions
 from robotid.excitation.basis import FourierBasis
@@ -13,9 +14,13 @@ from robotid.excitation.design import Designer
 from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.excitation.motion_page import (
     _collisions,
+    _distance_chart,
     _expected,
     _free_chart,
+    _head,
+    _history,
     _limit_table,
+    _share_chart,
 )
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.prediction import predict_instants
@@ -96,6 +101,26 @@ def test_the_distance_of_a_course_is_that_of_all_pairs(course):
     assert not changes[~np.array(last)].any()
     nothing = np.zeros(len(around.pairs), dtype=bool)
     assert np.isinf(found.nearness(nothing)[0]).all()
+
+
+def test_distances_that_do_not_change_are_not_drawn(course):
+    model, *_, found = course
+    around, values = found.clearance, found.values[:, ::10].copy()
+    values[0, :, :2] = values[0, 0, :2]  # the last joint moves alone
+    turned = replace(found, t=found.t[::10], values=values)
+    what = chart(_distance_chart(model, turned, around), "distance of the two nearest hulls")
+    changes = turned.changes(around)
+    exact = around.near(around.placed(values[0]), np.inf, around.everything).distance
+    links = np.array([set(pair) <= set(model.tree.links) for pair in around.named])
+    near = np.isfinite(around.slack)
+    assert (~changes & ~links).any()
+    shown = {series["label"]: series["y"] for series in what["series"]}
+    np.testing.assert_allclose(shown.pop("clearance"), 30.0, rtol=1e-3)
+    wanted = {"links": links & ~near, "floor and boxes": ~links, "links close by design": near}
+    wanted = {label: own & changes for label, own in wanted.items() if (own & changes).any()}
+    assert list(shown) == list(wanted)
+    for label, own in wanted.items():
+        np.testing.assert_allclose(shown[label], 1e3 * exact[own].min(axis=0), rtol=2e-3)
 
 
 def test_the_nearest_pair_is_that_of_the_smallest_margin_not_distance(course, monkeypatch):
@@ -192,10 +217,16 @@ def test_the_page_states_use_margin_joint_time_value_and_unit_of_each_limit():
     assert cells["friction"][:4] == ["12.3", "foot", "3.46", "0.4"]
     assert "100 % of position, velocity and torque is 85 % of the URDF's limit" in found
     assert "Collisions were not checked" in found
-    chart = _free_chart(model, course, "torque", np.array([0, 1]))
-    assert "torque [N m or N]" in chart
+    assert "torque [N m or N]" in _free_chart(model, course, "torque", np.array([0, 1]))
     assert "torque [N]" in _free_chart(model, course, "torque", np.array([0]))
     assert "acceleration [rad/s²]" in _free_chart(model, course, "acceleration", np.array([1]))
+    used[4, 5, 1], used[4, 6, 0] = 0.3, 0.35
+    shares = chart(_share_chart(model, course, "torque", np.array([1, 0])), "torque of each joint")
+    shown = {series["label"]: series["y"] for series in shares["series"]}
+    assert list(shown) == ["limit", "−limit", "elbow", "rail"]
+    np.testing.assert_allclose(shares["x"], t, rtol=1e-3)
+    wanted = [np.full(9, 100.0), np.full(9, -100.0), 100 * used[4, :, 1], 100 * used[4, :, 0]]
+    np.testing.assert_allclose([*shown.values()], wanted, atol=0.01)
 
 
 def test_the_page_counts_parameters_by_their_expected_error_and_source(ur5):
@@ -237,3 +268,30 @@ def test_collisions_of_the_page_have_millimetres_and_what_was_not_checked():
     assert "Not checked, since no shape can be read: gripper, cam." in found
     assert "Not checked, since in contact by design: a and b." in found
     assert "Close by design, with a smaller clearance: c and d." in found
+
+
+def test_the_head_and_the_course_of_the_optimisation_have_the_figures_of_the_design():
+    model = SimpleNamespace(name="a<b", joints=("one", "two", "three"))
+    content = {
+        "kind": "bspline", "duration": 12.3456, "criterion": "E", "condition_number": 1234.5,
+        "seconds": 7.89, "starts": 1, "converged": True,
+        "history": [[0.5, 3.25], [1.25, 2.5], [4.0, -1.75]],
+    }  # fmt: skip
+
+    def facts(**changes):
+        head = _head(model, content | changes)
+        assert head.startswith("<h1>a&lt;b: excitation trajectory</h1>")
+        return dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", head))
+
+    assert facts() == {
+        "motion": "bspline, 12.35 s", "joints": "3", "criterion": "E",
+        "condition number": "1,234 (regressor, columns in units of the prior)",
+        "computing time": "7.9 s, 1 start, converged",
+    }  # fmt: skip
+    other = facts(condition_number=None, starts=3, converged=False)
+    assert other["condition number"] == "infinite"
+    assert other["computing time"] == "7.9 s, 3 starts, not converged: allow more seconds"
+    assert facts(starts=0)["computing time"] == "7.9 s"
+    what = chart(_history(content), "criterion of the best motion against the computing time")
+    np.testing.assert_allclose(what["x"], [0.5, 1.25, 4.0], atol=1e-3)
+    np.testing.assert_allclose(what["series"][0]["y"], [3.25, 2.5, -1.75], atol=1e-3)

@@ -75,6 +75,13 @@ def test_the_fewest_joints_before_the_link_move_and_the_others_rest(designer, fo
     assert list(fewer) == [WRIST[-1:], WRIST[-2:]]
     assert found.fewer[WRIST[-2:]].described() == "tool0.m is not identifiable"
     assert "With wrist_2_joint, wrist_3_joint alone: tool0.m is not" in " ".join(found.described())
+    still = designer.information.model.joints[:3]
+    assert found.described()[0] == (
+        f"For a payload on tool0, {', '.join(WRIST)} move; {', '.join(still)} rest. Record the "
+        "motion twice: with the payload and without it."
+    )
+    resting = found.to_dict()["resting"]
+    assert resting == pytest.approx(dict(zip(still, q[0, :3].tolist(), strict=True)))
 
 
 def test_the_limits_are_kept_with_the_payload_and_without_it(designer, found):

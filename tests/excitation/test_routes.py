@@ -3,6 +3,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from robotid.exceptions import SettingsError
 from robotid.excitation import routes
 from robotid.excitation.basis import FourierBasis
 from robotid.excitation.clearance import Clearance
@@ -13,7 +14,9 @@ from robotid.excitation.routes import (
     _PLACES,
     Route,
     _free_range,
+    _legs,
     _sweeps,
+    _visited,
     design_stands,
     design_sweeps,
 )
@@ -118,9 +121,10 @@ def test_sweeps_are_about_the_posture_whose_worst_joint_has_the_largest_share(mo
     assert speeds == (0.1,)
 
 
-def test_stands_weigh_torques_by_their_noise_over_two_seconds(monkeypatch, rng):
-    """Four of nine postures, one by one: each adds most to log det of the information."""
-    q, W = rng.standard_normal((9, 2)), rng.standard_normal((2, 3, 9))
+def test_stands_weigh_torques_by_their_noise_over_two_seconds(monkeypatch):
+    """Six of nine postures, one by one: each adds most to log det of the information."""
+    rng = np.random.default_rng(3)
+    q, W = rng.uniform(-3.0, 3.0, (9, 2)), rng.standard_normal((2, 3, 9))
     noise, spread = np.array([4.0, 0.01]), np.array([1.0, 2.0, 0.5])  # [(N m)^2 s]
     W[1] *= 0.05
     about = SimpleNamespace(
@@ -130,13 +134,15 @@ def test_stands_weigh_torques_by_their_noise_over_two_seconds(monkeypatch, rng):
     monkeypatch.setattr(routes, "_visited", lambda designer, places: places)
     F, wanted = np.eye(3), []
     of = [(W[..., k] * spread).T @ np.diag(2.0 / noise) @ (W[..., k] * spread) for k in range(9)]
-    for _ in range(4):
+    for _ in range(6):
         left = [k for k in range(9) if k not in wanted]
         wanted.append(max(left, key=lambda k: np.linalg.det(F + of[k])))
         F = F + of[wanted[-1]]
-    places = design_stands(about, None, count=4)
+    places = design_stands(about, None, count=6)
     np.testing.assert_array_equal(places[0], q[wanted[0]])
     assert sorted(places[:, 0]) == sorted(q[wanted, 0])
+    for k in range(1, 6):  # from each to the nearest that is left
+        assert np.abs(places[k:] - places[k - 1]).max(axis=1).argmin() == 0
 
 
 def test_stands_tell_more_of_gravity_than_random_ones(designer):
@@ -156,3 +162,28 @@ def test_stands_tell_more_of_gravity_than_random_ones(designer):
     some = designer.postures.resting(rng)
     random = [told(rng.choice(some, len(places), replace=False)) for _ in range(50)]
     assert told(places) > max(random)
+
+
+def test_a_leg_has_half_the_speed_limit_of_the_slowest_joint_and_at_least_a_second(designer):
+    fastest = designer.limits.sizes[1]
+    way = np.array([0.4, -1.5, 0.9]) * fastest
+    route = _legs(designer, np.array([0.0 * way, way, 1.01 * way]))
+    np.testing.assert_allclose(route.times, [2.0 * 1.5 / 0.5, 1.0])
+    np.testing.assert_array_equal(route.holds, 2.0)
+    t = np.linspace(2.0, 8.0, 601)  # the first leg, after 2 s at rest
+    v = np.abs(route.evaluate(t)[1]).max(axis=0)
+    np.testing.assert_allclose(v, 0.5 * np.abs(way) / 1.5, rtol=1e-9)
+
+
+def test_a_posture_is_reached_from_the_last_one_visited_or_left_out(monkeypatch):
+    def examined(leg, *_):
+        is_blocked = leg.places[:, 0].tolist() == [1.0, 2.0]  # the line from 1 to 2
+        return SimpleNamespace(contact=None, used=np.full((6, 1), 0.5 + is_blocked), leg=leg)
+
+    monkeypatch.setattr(
+        routes, "_legs", lambda designer, places: SimpleNamespace(places=places, duration=1.0)
+    )
+    found = _visited(SimpleNamespace(examined=examined), np.arange(5.0)[:, None])
+    assert found.leg.places[:, 0].tolist() == [0.0, 1.0, 3.0, 4.0]
+    with pytest.raises(SettingsError, match="every line between two postures has a collision"):
+        _visited(SimpleNamespace(examined=examined), np.array([[1.0], [2.0], [2.0]]))

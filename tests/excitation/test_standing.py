@@ -334,3 +334,14 @@ def test_what_cannot_stand_is_refused():
     refused("FL_foot is a surface of unknown size", flat)
     soles = {foot: (-0.1, -0.1, 0.1, 0.1, 0.0) for foot in FEET}
     refused("24 conditions, of which the 12 joints of the legs satisfy 12", flat, soles=soles)
+
+
+def test_noise_of_the_joints_is_spread_over_the_rows_of_base_and_joints(stand):
+    joints = stand.robot.joints
+    std = np.linspace(0.5, 2.0, len(joints))
+    designer = Designer.of_model(
+        stand.model, FourierBasis(4.0, 2), MotionLimits.of_model(stand.model), stand=stand,
+        noise=dict(zip(joints, std.tolist(), strict=True)), correlation=0.2,
+    )  # fmt: skip
+    wanted = 0.2 * np.sum(std**2) / (6 + len(joints))  # the base has no sensors
+    np.testing.assert_allclose(designer.noise, np.full(6 + len(joints), wanted))

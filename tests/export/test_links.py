@@ -111,7 +111,7 @@ def test_an_actuator_is_pd_about_its_offset_within_its_limit_and_late():
     assert figures(at["biasprm"]) == [-0.75, -50.0, -2.0]
     assert figures(at["forcerange"]) == [-6.75, 5.25]
     assert "delay" not in at
-    for delay, late, samples in ((0.007, 0.008, 4), (0.0004, 0.002, 1), (0.0081, 0.0091, 5)):
+    for delay, late, samples in ((0.007, 0.008, 4), (0.0004, 0.002, 1), (0.0072, 0.0082, 5)):
         at = stated(delay)
         assert (float(at["delay"]), int(at["nsample"])) == (pytest.approx(late), samples)
         assert at["interp"] == "linear"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.crane import RATES, STARTS, identified_crane
 
-from robotid.export.loops import _loop_parameters, loop_entries, loop_inputs
+from robotid.export.loops import _covariance, _loop_parameters, loop_entries, loop_inputs
 
 
 @pytest.fixture(scope="module")
@@ -145,3 +145,24 @@ def test_the_fit_says_what_it_is(found, entries):
     assert entries["structure"]["rank"] == estimate.rank == 5
     assert entries["uncertainty"]["inflation"] == estimate.details["inflation"]
     assert entries["simulation"]["signs"] == {"rail": 1.0, "turn": 1.0}
+
+
+def test_the_covariance_is_that_of_the_free_parameters_that_are_not_at_a_bound(rng):
+    """Free: a gain, the delay of both joints, an armature and a zero, which is at its bound."""
+    slopes, A = rng.standard_normal((3, 4)), rng.standard_normal((4, 4))
+    free = [("kp", (0,)), ("delay", (0, 1)), ("armature", (1,)), ("zero", (1,))]
+    names = ["a.kp", "delay", "b.armature", "b.zero"]
+    estimate = SimpleNamespace(
+        theta=np.zeros(4), covariance=A @ A.T, details={"at_bound": ("b.zero",)}
+    )
+    simulator = SimpleNamespace(
+        names=names, standard=lambda model, theta: (None, slopes),
+        free_parameters=[SimpleNamespace(what=what, joints=joints) for what, joints in free],
+    )  # fmt: skip
+    model = SimpleNamespace(layout=SimpleNamespace(names=("x", "y", "z")), joints=("a", "b"))
+    fit = SimpleNamespace(simulator=simulator)
+    entry = _covariance(SimpleNamespace(fit=fit, estimate=estimate, model=model))
+    assert entry["names"] == ["x", "y", "z", "a.kp", "a.delay", "b.delay", "b.zero"]
+    S = np.vstack([slopes, np.eye(4)[[0, 1, 1, 3]]])[:, :3]
+    L = np.array([[*row, *[0.0] * (7 - len(row))] for row in entry["root"]])
+    np.testing.assert_allclose(L @ L.T, S @ (A @ A.T)[:3, :3] @ S.T, atol=1e-6)

@@ -183,3 +183,27 @@ def test_samples_of_gains_are_positive_and_vary_with_the_logs(tmp_path):
     content = json.loads((tmp_path / "x.json").read_text())
     assert content["parameters"]["units"][-3:] == ["s", "N m/rad", "N m/rad"]
     assert len(content["drives"][first.joint]["kp"]) == 20
+
+
+@pytest.mark.parametrize(("std_error", "of_gain"), [(0.8, 0.5), (0.3, 0.3)])
+def test_a_gain_of_the_next_log_has_the_part_of_the_fit_in_its_error(tmp_path, std_error, of_gain):
+    """Its deviation is 1 % of it, its error in the fit half of that, with r = 0.6 to another."""
+    leg = plant("leg", np.random.default_rng(0))
+    result = load_result(written_result(leg, tmp_path / "out"))
+    names, first = list(result.robot.layout.names), leg.drives[0]
+    own, size = [f"{drive.joint}.kp" for drive in leg.drives[:2]], 0.01 * first.kp
+    entry = {
+        "std_error": std_error * size,
+        "next_interval": [first.kp - 1.96 * size, first.kp + 1.96 * size],
+        "next_quantiles": (first.kp + size * SCORES).tolist(),
+    }
+    root = [[]] * len(names) + [[0.5 * size], [0.3 * size, 0.4 * size]]
+    stated = {
+        "covariance": {"names": [*names, *own], "root": root},
+        "variation": {"parameters": {own[0]: entry}, "correlation": [[1.0]]},
+    }
+    varying = replace(result, content={**result.content, **stated})
+    _, values = sample(varying, 800, np.random.default_rng(3))
+    kp, other = values[:, -2:].T
+    assert kp.std() == pytest.approx(size, rel=0.1)
+    assert np.corrcoef(kp, other)[0, 1] == pytest.approx(0.6 * of_gain, abs=0.08)

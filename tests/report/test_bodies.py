@@ -100,3 +100,25 @@ def test_marks_lie_on_one_axis_per_group(central, picture):
 def test_many_links_are_folded(identified, monkeypatch):
     monkeypatch.setattr("robotid.report.bodies._LINKS", 5)
     assert '<details id="inertials"><summary>Parameters of 6 links' in parameter_picture(identified)
+
+
+def test_intervals_and_values_of_the_urdf_are_on_the_axis_of_their_group(central, picture):
+    for term, scaled in (("m", lambda x: x), ("Iyy", lambda x: np.sign(x) * np.sqrt(np.abs(x)))):
+        k = CENTRAL_TERMS.index(term)
+        column = re.search(rf'aria-label="{term} of each link">(.*?)</svg>', picture)[1]
+        places = [float(x) for x in re.findall(r'<circle cx="([-\d.]+)%"', column)]
+        slope, zero = np.polyfit(scaled(central.values[:, k]), places, 1)
+
+        def at(x, scaled=scaled, slope=slope, zero=zero):
+            return np.clip(slope * scaled(x) + zero, -5.0, 105.0)
+
+        marks = re.findall(r"<g class=.*?</g>", column)
+        for mark, urdf, value, half in zip(
+            marks, central.urdf[:, k], central.values[:, k], central.half[:, k], strict=True
+        ):
+            (was,) = re.findall(r'<circle class="urdf" cx="([-\d.]+)%"', mark)
+            assert float(was) == pytest.approx(at(urdf), abs=0.15)
+            if np.isfinite(half):
+                ends = re.search(r'class="half" x1="([-\d.]+)%" x2="([-\d.]+)%"', mark).groups()
+                wanted = [at(value - half), at(value + half)]
+                assert [float(x) for x in ends] == pytest.approx(wanted, abs=0.3)

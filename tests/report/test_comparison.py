@@ -23,6 +23,7 @@ from robotid.log_files.read import write_log
 from robotid.pages.html import code
 from robotid.report import comparison_page
 from robotid.report.comparison import _friction_curves, compare_results, write_comparison
+from robotid.report.history import history_of
 from robotid.robot.drives import Asymmetric, LoadFriction, Stribeck
 from robotid.robot.model import RobotModel
 
@@ -596,12 +597,20 @@ def test_results_are_in_the_order_of_the_dates_of_their_logs(folder, tmp_path, c
     assert {chart["title"].split()[0] for chart in named} == set(finding["parameters"])
     assert named[0]["x_names"] == list("BDEAFC")
     assert named[0]["marks"] == [4.5]
+    entry = next(x for x in content["base_parameters"] if named[0]["title"].startswith(x["name"]))
+    errors = [entry["std_errors"][k] for k in content["order"]]
+    np.testing.assert_allclose(named[0]["series"][1]["half"], 1.96 * np.array(errors), rtol=1e-3)
+    low, high = next(x["predicted"] for x in content["changes"] if x["name"] == entry["name"])
+    before = named[0]["series"][0]  # from the first result to the one that changed
+    np.testing.assert_allclose(before["y"], np.full(6, (low + high) / 2), rtol=1e-3)
+    np.testing.assert_allclose(before["half"], np.full(6, (high - low) / 2), rtol=1e-3)
     words = ["compare", *(str(tmp_path / f"{k}.json") for k in range(6))]
     assert main(words) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "finding: C: friction of joint_2 is 3" in printed
-    assert main([*words, "--false-alarms", "1e-9"]) == 0
-    assert "finding:" not in capsys.readouterr().out
+    for more in ([], ["--out", str(tmp_path / "few.html")]):
+        assert main([*words, "--false-alarms", "1e-9", *more]) == 0
+        assert "finding:" not in capsys.readouterr().out
     assert main([*words, "--false-alarms", "2"]) == 2
     assert "false_alarms is 2, wanted a probability" in capsys.readouterr().err
 
@@ -614,8 +623,42 @@ def test_time_stamps_from_the_start_of_a_log_are_no_order(folder, tmp_path):
 def test_a_value_that_a_result_does_not_determine_raises_no_alarm(folder, tmp_path):
     paths = history(folder, tmp_path, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], 4.0)
     assert len(compare_results(paths)["findings"]) == 1
+    other = read_result(paths[2])  # the change of the last one is known from the others
+    other["structure"]["undetermined"] = ["joint_2.coulomb", "joint_2.viscous"]
+    write_json(other, paths[2])
+    (finding,) = compare_results(paths)["findings"]
+    assert (finding["result"], finding["since"]) == ("F", "F")
     last = read_result(paths[-1])
     last["structure"]["undetermined"] = ["joint_2.coulomb", "joint_2.viscous"]
     write_json(last, paths[-1])
     content = compare_results(paths)
     assert (content["findings"], content["changes"]) == ([], [])
+
+
+def test_results_of_several_logs_are_in_the_order_of_their_first_ones():
+    def result(*days):
+        starts = [1.7e9 + 86400.0 * day for day in days]
+        inputs = [{"role": "identification", "start": start} for start in starts]
+        inputs.append({"role": "validation", "start": 0.0})
+        return {"inputs": inputs, "drive_parameters": [], "standard_parameters": []}
+
+    found = history_of([result(2, 4), result(9, 1), result(3)], [], ["A", "B", "C"])
+    assert (found["order"], found["by_time"]) == ([1, 0, 2], True)
+
+
+def test_the_chart_of_a_friction_has_its_units_its_loads_and_no_line_across_standstill():
+    content = {"results": [{"label": label} for label in "ABC"]}
+    v = [-0.5, 0.0, 0.5]
+    entry = {"joint": "ra<il", "unit": "N", "speeds": v, "load": [0.0812, None, 0.5],
+             "torques": [[-3.0, 0.5, 4.0], None, [-1.0, 0.0, 2.0]]}  # fmt: skip
+    html = comparison_page._friction_figure(content, entry)
+    (drawn,) = charts(html)
+    assert (drawn["x_label"], drawn["y_label"]) == ("speed [m/s]", "friction [N]")
+    assert [series["label"] for series in drawn["series"]] == ["A", "C"]
+    wanted = [[-3.0, np.nan, 4.0], [-1.0, np.nan, 2.0]]
+    np.testing.assert_allclose([s["y"] for s in drawn["series"]], wanted, atol=1e-3)
+    caption = "<strong>ra&lt;il</strong>; additional friction per N of load: A 0.0812, C 0.5"
+    assert caption in html
+    plain = comparison_page._friction_figure(content, entry | {"unit": "N m", "load": 3 * [None]})
+    assert charts(plain)[0]["x_label"] == "speed [rad/s]"
+    assert "of load" not in plain

@@ -8,6 +8,7 @@ import pytest
 from helpers.pages import charts, tables
 
 from robotid.identification.pictures import residual_charts
+from robotid.logs.settings import SignalSettings
 from robotid.pages.charts import Chart, Series
 from robotid.report.diagnosis import (
     _choice,
@@ -18,7 +19,7 @@ from robotid.report.diagnosis import (
 )
 from robotid.report.errors import _notes
 from robotid.report.information import information
-from robotid.report.torques import _facts, _totals
+from robotid.report.torques import _chain, _facts, _intro, _totals
 
 
 def test_shares_of_the_data_are_those_of_all_and_of_the_weakest(identified):
@@ -159,3 +160,32 @@ def test_a_total_mass_that_torque_leaves_open_says_so(is_determined, beside):
     facts = _facts(found)
     assert facts["Total mass"] == f"<strong>20.00 → 23.00 kg</strong> (+15 %){beside}"
     assert facts["Base parameters determined"].startswith("<strong>4 of 5</strong>")
+
+
+def test_charts_of_a_long_recording_state_how_much_of_it_is_drawn():
+    def run(name, count, whole):
+        recording = SimpleNamespace(
+            name=name, is_partial=count < whole, extent=SimpleNamespace(smooth=whole),
+            trajectory=SimpleNamespace(t=np.zeros(count)),
+        )  # fmt: skip
+        return SimpleNamespace(recording=recording)
+
+    shown, left = [run("<a>", 300, 4000), run("b", 500, 500)], [run("c", 5, 5), run("d", 6, 6)]
+    html = _intro(SimpleNamespace(validation=()), shown, left)
+    assert "&lt;a&gt; is long: 300 of its 4000 samples are drawn" in html
+    assert "b is long" not in html
+    assert "Not drawn, to limit the file size: c, d." in html
+    assert "There is no validation log. The charts show the fitted logs." in html
+    other = _intro(SimpleNamespace(validation=shown), shown[1:], [])
+    assert "no validation log" not in other
+    assert "Not drawn" not in other
+
+
+def test_the_processing_of_signals_is_stated_in_words():
+    assert _chain(SignalSettings(cutoff=7.5, order=4, rate=250.0, velocity="measured")) == (
+        "zero-phase Butterworth low-pass, cut-off 7.5 Hz, order 4 run forward and backward, grid "
+        "of 250 Hz, velocity measured"
+    )
+    assert _chain(SignalSettings(cutoff=None, velocity="differentiated")) == (
+        "no filter, samples as recorded, velocity differentiated"
+    )

@@ -164,3 +164,13 @@ def test_without_folder_or_file_there_is_no_dock():
     clips = json.loads(unescape(re.search(r'data-clips="([^"]*)"', html)[1]))
     assert [c["log"] for c in clips] == ["", "a b.csv"]
     assert "<pre" not in Dock("replay.html", Origin(), "arm.urdf", [in_memory]).html
+
+
+def test_recordings_have_their_times_and_links_theirs():
+    clips = [Clip("recording 0", "day/a b.csv", 1.5, 9.25), Clip("recording 1", "c.csv", 3.0, 4.0)]
+    dock = Dock("replay.html", Origin((), "out"), "arm.urdf", clips)
+    found = json.loads(unescape(re.search(r'data-clips="([^"]*)"', dock.html)[1]))
+    shown = [tuple(clip[key] for key in ("link", "log", "start", "end")) for clip in found]
+    assert shown == [("recording 0", "a b.csv", 1.5, 9.25), ("recording 1", "c.csv", 3.0, 4.0)]
+    link = unescape(dock.link("Show", 2.34567, "joint 1", "a b.csv"))
+    assert 'href="replay.html#t=2.346&joint=joint%201&log=a%20b.csv" target="replay"' in link

@@ -15,7 +15,14 @@ from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.logs.data import Log
 from robotid.report.errors import worst_errors
-from robotid.report.positions import _charts, _fixed, _horizons, _undetermined, shown_positions
+from robotid.report.positions import (
+    _charts,
+    _controller,
+    _fixed,
+    _horizons,
+    _undetermined,
+    shown_positions,
+)
 from robotid.report.shown import page_of
 
 ERRORS = {"rmse": (2e-3, 4e-3, 8e-3), "command_rmse": (0.02, 0.05, 0.08), "urdf_rmse": (0.01,) * 3}
@@ -324,3 +331,21 @@ def test_the_worst_joint_of_the_verdict_is_open(content, followed):
     assert opened == ["1"]
     assert next(iter(bars(page))) == LEG[1]
     assert '<a href="#cause-saturation">saturation</a>' in page.split('id="worst"')[0]
+
+
+def test_logs_have_their_role_and_the_worst_second_is_of_those_not_fitted(content, followed):
+    fitted = replace(followed, log=replace(followed.log, path="fitted.csv"), q=followed.q + 0.2)
+    for validation, wanted in (([followed], "kept.csv"), ([], "fitted.csv")):
+        _, html = shown_positions(content, [fitted], validation, Origin((), "out")).curves
+        roles = set(re.findall(r"(\w+\.csv) 1-5 s, ([a-z ]+): RMSE", html))
+        own = {("kept.csv", "not fitted")} if validation else set()
+        assert roles == {*own, ("fitted.csv", "fitted")}
+        assert re.findall(r"Largest residual within 1 s: (\S+)", html) == 3 * [wanted]
+
+
+def test_the_controller_has_its_settings_in_words():
+    stated = {"kind": "pd", "effort_limit": {"a": 23.0, "b": 7.12345}, "rate": None}
+    html = _controller({"simulation": {"controller": stated}})
+    assert tables(html)["Controller"].rows == [
+        ["kind", "pd"], ["effort_limit", "a 23, b 7.123"], ["rate", "none"]
+    ]  # fmt: skip

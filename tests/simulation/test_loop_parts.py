@@ -64,6 +64,11 @@ def test_gains_that_are_not_stated_suit_the_mass_matrix(ur5):
     wanted = ahead + kp * (q_r - q) + kd * (v_r - v)
     np.testing.assert_allclose(found.of(q, v, q_r, v_r, 0 * q, ahead), wanted)
     assert not found.feedforward(q[None], v[None], q_r[None]).any(), "no feed-forward was asked for"
+    computed = _Torque(ur5, Controller("computed_torque", bandwidth=9.0), mass)
+    asked = ahead + 81.0 * (q_r - q) + 18.0 * (v_r - v)
+    robot = ur5.pin_model
+    wanted = pin.rnea(robot, robot.createData(), q, v, asked)
+    np.testing.assert_allclose(computed.of(q, v, q_r, v_r, ahead, 0 * q), wanted, atol=1e-9)
 
 
 def test_limits_are_a_share_of_the_urdfs_but_where_stated(panda):

@@ -564,6 +564,13 @@ def test_friction_without_a_solution_is_named_with_joint_value_and_time(legs, te
     assert log.t[40] <= float(time) < log.t[50], "of the log, not of the window"
 
 
+def test_friction_of_a_rail_without_a_solution_has_its_units(tmp_path):
+    model = slider(tmp_path)
+    loops = loops_of(model, (Coulomb(), PositionCoulomb(order=1, centre=0.1)), (0.5, 2.0))
+    words = why_no_solution(model, loops, np.array([0]), np.array([-0.4]), 0, 2e-3)
+    assert "its Coulomb friction is -0.5 N at -0.4 m, wanted 0 or more" in words
+
+
 def test_of_a_simulation_without_another_reason_gain_and_inertia_are_named(planar):
     loops = loops_of(planar, kp=1e9)
     words = why_no_solution(planar, loops, np.array([0, 1]), np.zeros(2), 1, 2e-3)
@@ -575,6 +582,14 @@ def test_of_a_simulation_without_another_reason_gain_and_inertia_are_named(plana
     )
     assert most == pytest.approx(inertia / 2e-3**2, rel=1e-2)
     assert inertia > loops.armature[1]
+    # positions of the encoders, from their own zeros
+    q, zero = np.array([0.3, -0.9]), np.array([0.2, 0.5])
+    own, at_0 = (
+        why_no_solution(planar, replace(loops, zero=x), np.array([0, 1]), q + zero - x, 0, 2e-3)
+        for x in (zero, 0.0 * zero)
+    )
+    assert own == at_0
+    assert own != why_no_solution(planar, loops, np.array([0, 1]), q, 0, 2e-3)
 
 
 def test_friction_that_falls_faster_than_inertia_allows_slips_as_in_small_steps(tmp_path):

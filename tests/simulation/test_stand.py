@@ -13,7 +13,7 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.closed_loop import follow, simulate
 from robotid.simulation.settings import Controller, Sensors, Simulation
-from robotid.simulation.stand import contact_forces, on_feet
+from robotid.simulation.stand import Stand, contact_forces, on_feet
 
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 MIDDLE = np.tile([0.0, 0.8, -1.6], 4)
@@ -130,3 +130,24 @@ def test_what_a_stand_cannot_do_is_refused(robot, motion):
     away = motion.pose + np.r_[0, 0, 1.0, 0, 0, 0, 0] * (motion.t > 0.5)[:, None]
     with pytest.raises(DataError, match=r"sample 51: the feet on the ground cannot remain"):
         on_feet(robot, away, motion.q, motion.contacts)
+
+
+@pytest.mark.parametrize("velocity", [True, False])
+@pytest.mark.parametrize("acceleration", [True, False])
+def test_the_base_has_the_signals_that_are_logged(rng, velocity, acceleration):
+    pose, twist, change = rng.standard_normal((5, 7)), *rng.standard_normal((2, 5, 6))
+    pose[:, 3:] = [0.0, 0.6, 0.0, 0.8]
+    rows, flags, force = np.array([0, 1, 1, 0, 1]) > 0, np.arange(5) > 2, np.arange(5.0)
+    found = Stand(pose, twist, change, {"foot": flags}, {"fz foot": force}).logged(
+        Sensors(velocity=velocity, acceleration=acceleration), rows
+    )
+    np.testing.assert_allclose(found["base"].pose, pose[rows])
+    for values, is_logged, true in (
+        (found["base"].twist, velocity, twist), (found["base"].acceleration, acceleration, change)
+    ):  # fmt: skip
+        if is_logged:
+            np.testing.assert_array_equal(values, true[rows])
+        else:
+            assert values is None
+    assert found["contacts"]["foot"].tolist() == [False, False, True]
+    assert found["wrenches"]["fz foot"].tolist() == [1.0, 2.0, 4.0]
