@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from helpers.humans import FEET, human_urdf, logged, walk
 
-from robotid.constrained.base_pose import check_pose
+from robotid.constrained.base_pose import check_pose, check_unit
 from robotid.constrained.contacts import check_base
 from robotid.logs.base import BaseMotion
 from robotid.logs.settings import SignalSettings
@@ -92,6 +92,8 @@ def test_a_position_in_millimetres_is_named(robot, log):
     second = (x[2:] - 2 * x[1:-1] + x[:-2]) / 0.2**2
     size = np.sqrt(np.mean(np.sum(second**2, axis=1)))
     assert found.evidence["acceleration"] == pytest.approx(size, rel=0.05)
+    (later,) = check_unit(replace(log, t=log.t + 900.0, base=BaseMotion(pose)))
+    assert later.evidence["acceleration"] == pytest.approx(found.evidence["acceleration"], rel=1e-6)
     noisy = log.base.pose + 5e-3 * np.random.default_rng(0).standard_normal(log.base.pose.shape)
     noisy[:, 3:] = log.base.pose[:, 3:]
     assert not [x.code for x in check_base(robot, replace(log, base=BaseMotion(noisy)), SLOW)
