@@ -112,7 +112,7 @@ def test_jumps_are_found_with_size_and_time(log):
     assert found.evidence["jumps"] == 2
     assert found.evidence["size"] == pytest.approx(0.06, rel=0.1)
     assert found.evidence["first"] == log.t[100]
-    assert "jumps 2 times, first at t = 1.667 s by 0.04 m: a marker" in found.message
+    assert "jumps 2 times, first at t = 1.667 s by 0.041 m: a marker" in found.message
     pose[:50, 3:] = np.roll(pose[:50, 3:], 1, axis=1)  # turned before: each kind has its own time
     of_kind = list(check_pose(replace(log, base=BaseMotion(pose))))
     assert [x.evidence["first"] for x in of_kind] == [log.t[100], log.t[50]]
