@@ -72,8 +72,12 @@ def test_an_imu_has_the_acceleration_of_the_base(motion):
         np.testing.assert_allclose(
             specific_force(*found)[some], specific_force(pose, twist, acceleration)[some], atol=5e-3
         )
-    np.testing.assert_allclose(base_state(t, pose, None, None, imu)[2][some], acceleration[some],
-                               atol=2e-2)  # fmt: skip
+    whole = base_state(t, pose, None, None, imu)
+    np.testing.assert_allclose(whole[2][some], acceleration[some], atol=2e-2)
+    offset = np.array([0.3, -0.2, 0.1])  # of the accelerometers, with the axes of the base
+    biased = replace(imu, values=imu.values + np.append(np.zeros(3), offset),
+                     frame=replace(imu.frame, offset=offset))  # fmt: skip
+    np.testing.assert_allclose(base_state(t, pose, None, None, biased)[2], whole[2], atol=1e-12)
 
 
 def test_the_bias_is_estimated_at_rest(rng):
