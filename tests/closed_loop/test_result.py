@@ -47,6 +47,9 @@ def test_intervals_reach_as_far_as_those_of_what_they_follow_from(found):
     assert sums.sum(axis=1).max() > 1, "a base parameter sums several"
     for row, base in zip(sums, own.base_quantile, strict=True):
         assert base == own.standard_quantile[row].max()
+    opposite = replace(own)  # parameters that decrease, as moments do if a body moves to one side
+    vars(opposite)["_slopes"] = -own._slopes
+    np.testing.assert_array_equal(opposite.standard_quantile, own.standard_quantile)
 
 
 def test_errors_of_sums_are_those_of_their_parameters(found):
