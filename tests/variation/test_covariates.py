@@ -8,7 +8,7 @@ from robotid.variation.covariates import at_temperature, effects_of, with_effect
 from robotid.variation.groups import Covariate, Group, RunsOf
 from robotid.variation.mixed_effects import MixedEffects, Runs, Slope
 from robotid.variation.restricted_likelihood import evidence
-from robotid.variation.variation import between_covariance, vary
+from robotid.variation.variation import between_covariance, effects_by_log, vary
 
 UNIT = np.array([0, 0, 0, 1, 1, 2, 2, 2, 2])
 
@@ -174,6 +174,9 @@ def test_the_interval_at_a_covariate_has_the_other_one_at_its_mean():
         values = each.covariate.values
         middle = each.interval(values.max()).mean() - 2.0 - plain.mean
         assert middle == pytest.approx(slope * (values.max() - values.mean()), abs=0.04)
+    moved = effects_by_log([{}, {"effects": {x.covariate.name: x.to_dict() for x in effects}}])
+    wanted = sum(x.slope * (x.covariate.values - x.covariate.values.mean()) for x in effects)
+    np.testing.assert_allclose(moved, np.column_stack([np.zeros(12), wanted]), atol=1e-12)
 
 
 def test_predictions_of_a_result_are_moved_to_a_temperature():
