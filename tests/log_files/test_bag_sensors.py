@@ -142,6 +142,14 @@ FORCE = {"/left": (WRENCH, S, Maker.wrench)}
 INERTIAL = {"/imu": (IMU, S, Maker.imu)}
 
 
+def test_a_stamp_is_that_of_the_header_or_of_the_recording():
+    clock = SimpleNamespace(sec=1_700_000_000, nanosec=123_456_789)
+    message = SimpleNamespace(header=SimpleNamespace(stamp=clock))
+    for stamp, wanted in (("header", 1_700_000_000_123_456_789), ("log", 42)):
+        assert bags._stamp(message, 42, LogSource(stamp=stamp)) == wanted
+    assert bags._stamp(SimpleNamespace(), 42, LogSource()) == 42
+
+
 @pytest.mark.parametrize("name", ["log", "log.bag"])
 def test_odometry_is_interpolated_at_the_stamps_of_the_joints(tmp_path, name):
     store = Stores.ROS1_NOETIC if name == "log.bag" else Stores.ROS2_HUMBLE
