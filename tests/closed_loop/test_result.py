@@ -114,6 +114,14 @@ def test_a_parameter_at_its_upper_bound_is_told_from_one_at_0(found):
     assert below.message.startswith(f"{NAMES[1]}: the estimate is 0, the lower bound")
 
 
+def at_limit(found, limit, theta):
+    """Return the same with a limit in place of the first parameter."""
+    simulator = found.fit.simulator
+    others = replace(simulator, free_parameters=(limit, *simulator.free_parameters[1:]))
+    estimate = replace(found.estimate, theta=theta, names=("turn.limit", *NAMES[1:]))
+    return replace(found, fit=replace(found.fit, simulator=others, estimate=estimate))
+
+
 def test_a_limit_and_a_gain_at_their_lower_bound_are_findings(found):
     simulator, theta = found.fit.simulator, found.estimate.theta.copy()
     first, second, *others = simulator.free_parameters
@@ -136,6 +144,13 @@ def test_a_limit_and_a_gain_at_their_lower_bound_are_findings(found):
     assert bound.where == "turn.kp = 1.5"
     assert free.where == "rail"
     assert free.evidence["limit"] == 0.25
+    error = found.estimate.std_error[0]
+    assert f"rail: the torque limit of the drive is estimated as 0.25 +- {error:.2g} N; at the" in (
+        free.message
+    )
+    first = replace(limit, joints=(1,))
+    (other,) = [f for f in loop_findings(at_limit(found, first, theta), ()) if f.code == "limit"]
+    assert f"0.25 +- {error:.2g} N m; at the limit" in other.message
 
 
 def test_gains_of_joints_with_equal_limits_that_differ_are_a_note(found):

@@ -192,6 +192,19 @@ def test_the_orientation_of_an_imu_alone_has_its_tilt_and_turns(sway):
         assert np.ptp(np.unwrap(heading)) < 0.05
 
 
+def test_the_turn_between_two_samples_is_that_of_their_mean_angular_velocity():
+    t = 30.0 + 0.01 * np.arange(101)
+    values = np.zeros((101, 6))
+    values[:, 2], values[:, 5] = 3.0 * (t - 30.0), 9.81  # [rad/s] from rest, about the vertical
+    x, y, z, w = orientation_of_imu(t, values, np.array([0.0, 0.0, -9.81])).T
+    np.testing.assert_allclose([x, y], 0.0, atol=1e-12)
+    np.testing.assert_allclose(2 * np.arctan2(z, w), 1.5 * (t - 30.0) ** 2, atol=1e-9)
+    after = orientation_of_imu(  # what turned in a gap is not known: each part starts anew
+        np.append(t, t + 1.2), np.vstack([values, values]), np.array([0.0, 0.0, -9.81])
+    )
+    np.testing.assert_allclose(after, np.tile(np.column_stack([x, y, z, w]), (2, 1)), atol=1e-12)
+
+
 def test_a_vertical_vector_upside_down_is_turned_upwards():
     values = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -9.81], (5, 1))
     found = orientation_of_imu(0.01 * np.arange(5), values, np.array([0.0, 0.0, -9.81]))
