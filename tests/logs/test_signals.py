@@ -125,6 +125,15 @@ def test_auto_takes_the_measured_velocity_unless_it_is_late(lag, choice):
     assert resolve(log, SignalSettings()).velocity == choice
 
 
+@pytest.mark.parametrize(("velocity", "lag"), [("differentiated", 0.0), ("auto", 0.05)])
+def test_auto_takes_no_acceleration_without_the_measured_velocity(velocity, lag):
+    t = np.arange(0, 10, 0.01)
+    log = sine_log(t, lag=lag, a=np.ones((1000, 2)))
+    assert resolve(log, SignalSettings(velocity=velocity)).acceleration == "differentiated"
+    stated = SignalSettings(velocity=velocity, acceleration="measured")
+    assert resolve(log, stated).acceleration == "measured"
+
+
 def test_what_was_automatic_is_stated():
     resolved = resolve(sine_log(np.arange(0, 10, 0.01)), SignalSettings(cutoff=10.0))
     assert resolved.rate == pytest.approx(100.0)
