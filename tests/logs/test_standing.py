@@ -139,3 +139,12 @@ def test_poses_are_joined_if_the_way_between_them_is_that_of_rest(step, samples)
     wanted = [[0.0, 1.0 + step / 2]] if samples == 1 else [[0.0, 1.0], [0.0, 1.0 + step]]
     np.testing.assert_allclose(motion.q, wanted)
     np.testing.assert_allclose(motion.t, np.mean(np.split(t, samples), axis=1))
+
+
+def test_the_slope_of_a_short_block_is_reduced_by_its_own_duration():
+    t = np.concatenate([0.05 * np.arange(20), [5.0, 5.05]])
+    q = np.column_stack([0.1 * t, np.zeros(22)])
+    motion, resting = means(log_of(t, q))
+    assert not resting.any()
+    np.testing.assert_allclose(motion.v[:-1, 0], 0.1)
+    np.testing.assert_allclose(motion.v[-1, 0], 0.1 * 2 * 0.05 / 0.25)
