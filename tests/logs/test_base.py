@@ -222,6 +222,17 @@ def test_a_jump_is_in_the_row_after_it():
     np.testing.assert_allclose(angles, [0.0, 0.1], rtol=1e-3)
 
 
+@pytest.mark.parametrize("is_later", [True, False])
+def test_a_step_is_compared_with_those_on_both_sides_of_it(rng, is_later):
+    """A vibration that starts or ends with a step of 0.04 m has steps of 0.005 m."""
+    t, pose = 50.0 + 0.01 * np.arange(200), np.tile(np.append(np.zeros(6), 1.0), (200, 1))
+    pose[100:, 0] = 0.04
+    assert pose_jumps(t, pose)[0].tolist() == [100]
+    vibrates = (np.arange(200) >= 100) == is_later
+    pose[vibrates, 0] += 0.004 * rng.standard_normal(100)
+    assert pose_jumps(t, pose)[0].tolist() == []
+
+
 def test_columns_of_a_base_may_have_other_names(log, tmp_path):
     write_log(log, tmp_path / "log.csv")
     names = {"base_qy": "q2", "base_wz": "yaw_rate", "base_alx": "d", "contact_r_sole": "right"}

@@ -11,7 +11,7 @@ from robotid.exceptions import DataError
 from robotid.log_files.read import read_log, write_log
 from robotid.logs.base import BaseColumns, BaseMotion, base_state
 from robotid.logs.data import Log
-from robotid.logs.imu import ImuFrame, ImuMotion, motion_of_imu, orientation_of_imu
+from robotid.logs.imu import ImuFrame, ImuMotion, bias_at_rest, motion_of_imu, orientation_of_imu
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 
@@ -97,6 +97,14 @@ def test_the_bias_is_estimated_at_rest(rng):
     imu, note = motion_of_imu(t, np.sin(5 * t)[:, None], values, FRAME)
     assert not imu.frame.bias.any()
     assert note.endswith("the bias of the gyroscopes is not estimated; record 1 s at rest")
+
+
+@pytest.mark.parametrize(("rate", "is_known"), [(8.0, False), (10.0, True)])
+def test_a_window_of_rest_has_five_samples(rate, is_known):
+    t = 70.0 + np.arange(30) / rate
+    bias, note = bias_at_rest([(t, np.zeros((30, 1)), np.tile(BIAS, (30, 1)))])
+    np.testing.assert_allclose(bias, is_known * BIAS, atol=1e-15)
+    assert ("never at rest" in note) != is_known
 
 
 def test_an_imu_is_read_with_or_without_an_orientation_of_its_own(motion, tmp_path):
