@@ -348,6 +348,19 @@ def test_stated_units_become_si(run):
         np.testing.assert_array_equal(getattr(log, name)[:, 1], getattr(truth, name)[100:201, 1])
 
 
+@pytest.mark.parametrize(("name", "value", "message"), [
+    ("time", 2.02, r"t\[203\] = 2\.020 s is a duplicate time stamp, the same as t\[202\]"),
+    ("time", 2.01, r"t\[203\] = 2\.010 s follows t\[202\] = 2\.020 s"),
+    ("q_elbow", np.nan, "q_elbow is NaN at row 203"),
+])  # fmt: skip
+def test_rows_of_a_part_are_named_by_their_number_in_the_file(name, value, message):
+    layout, _ = lay_out(pd.DataFrame(make_table()), JOINTS)
+    part = {key: values[200:210].copy() for key, values in make_table().items()}
+    part[name][3] = value
+    with pytest.raises(DataError, match=message):
+        layout.to_log(part, 200)
+
+
 def test_the_temperature_of_a_joint_is_preferred_to_that_of_all():
     cold = {name: np.zeros(300) for name in ("temperature", "temperature_shoulder", "T3")}
     frame = pd.DataFrame(make_table(**cold))
