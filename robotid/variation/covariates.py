@@ -41,13 +41,6 @@ class Effect:
     is_used: bool
     intervals: Array
 
-    @property
-    def contribution(self) -> Array:
-        """Deviation of the parameter in each run from its mean by this effect, shape (k,)."""
-        own = self.covariate.values
-        found: Array = self.is_used * self.slope * (own - own.mean())
-        return found
-
     def interval(self, value: float) -> Array:
         """Return the 95 % prediction interval of the next run, or unit, at a covariate, shape (2,).
 

@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, torque_log
 
+from robotid._typing import ignore_progress
 from robotid.closed_loop.driven import driven_log, torque_rows
 from robotid.closed_loop.evaluation import DRIFTS, run_open_loop
+from robotid.closed_loop.fit import _initialise_from_torque
 from robotid.closed_loop.identify import identify_loops
 from robotid.closed_loop.settings import LoopSettings
 from robotid.exceptions import DataError
@@ -132,6 +134,17 @@ def test_open_loops_of_torques_are_put_back_and_beside_plainer_models(arm, both)
         assert (run.rmse < 1.05 * other).all()
     assert (run.rmse < 0.02 * run.baselines["steady"]).all()
     assert both.verdict.status in ("good", "usable")
+
+
+def test_windows_have_the_stated_length_and_lead(arm):
+    robot, *logs = arm
+    logs = [driven_log(robot.model, log.window(0.5, 2.0), SIGNALS) for log in logs]
+    stated = SimulationSettings(bodies=0.0, torques=False, window=0.4, lead=0.1)
+    found = _initialise_from_torque(robot.model, logs, DRIVEN, stated, SIGNALS, ignore_progress)
+    wanted = [(x.first, x.start_row, x.stop) for log in logs for x in cut_windows(log, 0.4, 0.1)]
+    windows = found.simulator.windows
+    assert [(x.first, x.start_row, x.stop) for x in windows] == wanted
+    assert wanted[1][0] - wanted[1][1] == 25  # rows of 4 ms
 
 
 def test_full_turns_are_taken_out_of_joints_that_turn_freely(tmp_path):

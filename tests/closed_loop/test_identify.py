@@ -6,6 +6,7 @@ import pytest
 from helpers.mujoco_plant import held, multisine, plant, recorded
 from helpers.single_joint import slider
 
+from robotid.closed_loop import identify
 from robotid.closed_loop.evaluation import position_metrics, run_open_loop
 from robotid.closed_loop.findings import loop_findings
 from robotid.closed_loop.fit import fit_loops, stated_loops
@@ -222,6 +223,27 @@ def test_friction_of_joints_that_no_log_moves_is_reported(leg, found):
     for joint in (hip, thigh):
         assert f"{joint}.coulomb" in where
     assert calf not in where
+    # a term that two joints share is of a joint that moves if one of them does
+    simulator = found.fit.simulator
+    shared = [
+        replace(x, name="upper.viscous", joints=(0, 1)) if x.name == f"{hip}.viscous" else x
+        for x in simulator.free_parameters
+    ]
+    simulator = replace(simulator, free_parameters=tuple(shared))
+    found = replace(found, fit=replace(found.fit, simulator=simulator))
+    [where] = undetermined([[False, True, True], [False, True, True]])
+    assert where == f"{hip}.coulomb, {hip}.offset"
+
+
+def test_robots_of_logs_are_those_of_their_variation(leg, found, monkeypatch):
+    given, log = [], leg[1]
+    monkeypatch.setattr(identify, "fit_loops", lambda *_, **__: found.fit)
+    monkeypatch.setattr(identify, "run_open_loop", lambda *_: found.fitted[0])
+    monkeypatch.setattr(identify, "loop_runs", lambda *args: given.append(args[3]) or ())
+    monkeypatch.setattr(identify, "vary", lambda names, _, units: given.append((names, units)))
+    logs = [replace(log, path=f"{k}.csv") for k in range(3)]
+    identify_loops(leg[0].model, logs, [], stated(leg[0]), SETTINGS, units=["go", "arm", "go"])
+    assert given == [["go", "arm", "go"], (["0.csv", "1.csv", "2.csv"], ["arm", "go"])]
 
 
 def test_a_second_order_model_has_the_standard_error_of_each_inertia(found):

@@ -47,6 +47,9 @@ def test_intervals_reach_as_far_as_those_of_what_they_follow_from(found):
     assert sums.sum(axis=1).max() > 1, "a base parameter sums several"
     for row, base in zip(sums, own.base_quantile, strict=True):
         assert base == own.standard_quantile[row].max()
+    opposite = replace(own)  # parameters that decrease, as moments do if a body moves to one side
+    vars(opposite)["_slopes"] = -own._slopes
+    np.testing.assert_array_equal(opposite.standard_quantile, own.standard_quantile)
 
 
 def test_errors_of_sums_are_those_of_their_parameters(found):
@@ -111,6 +114,14 @@ def test_a_parameter_at_its_upper_bound_is_told_from_one_at_0(found):
     assert below.message.startswith(f"{NAMES[1]}: the estimate is 0, the lower bound")
 
 
+def at_limit(found, limit, theta):
+    """Return the same with a limit in place of the first parameter."""
+    simulator = found.fit.simulator
+    others = replace(simulator, free_parameters=(limit, *simulator.free_parameters[1:]))
+    estimate = replace(found.estimate, theta=theta, names=("turn.limit", *NAMES[1:]))
+    return replace(found, fit=replace(found.fit, simulator=others, estimate=estimate))
+
+
 def test_a_limit_and_a_gain_at_their_lower_bound_are_findings(found):
     simulator, theta = found.fit.simulator, found.estimate.theta.copy()
     first, second, *others = simulator.free_parameters
@@ -133,6 +144,13 @@ def test_a_limit_and_a_gain_at_their_lower_bound_are_findings(found):
     assert bound.where == "turn.kp = 1.5"
     assert free.where == "rail"
     assert free.evidence["limit"] == 0.25
+    error = found.estimate.std_error[0]
+    assert f"rail: the torque limit of the drive is estimated as 0.25 +- {error:.2g} N; at the" in (
+        free.message
+    )
+    first = replace(limit, joints=(1,))
+    (other,) = [f for f in loop_findings(at_limit(found, first, theta), ()) if f.code == "limit"]
+    assert f"0.25 +- {error:.2g} N m; at the limit" in other.message
 
 
 def test_gains_of_joints_with_equal_limits_that_differ_are_a_note(found):

@@ -9,6 +9,8 @@ JOINTS = ("FL_hip_joint", "FL_calf_joint", "FR_hip_joint", "FR_calf_joint", "tai
 def test_joints_that_are_alike_share_a_group_named_by_their_words():
     found = groups_of(LoopSettings(), JOINTS, ["a", "b", "a", "b", "c"])
     assert found == ["hip", "calf", "hip", "calf", "tail"]
+    legs = ("front_left_knee", "front_right_knee", "rear_left_knee")  # words of some are not theirs
+    assert groups_of(LoopSettings(), legs, "kkk") == ["knee", "knee", "knee"]
 
 
 def test_alike_joints_without_a_word_in_common_have_the_first_ones_name():

@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 from helpers.mujoco_plant import multisine, plant
 
-from robotid.closed_loop.free_parameters import FreeParameter, LoopSimulator
+from robotid.closed_loop.free_parameters import FreeParameter, LoopSimulator, _better_start
 from robotid.export.commanded import loops_of
 from robotid.logs.data import Log
-from robotid.simulation.loops import ClosedLoopRobot, cut_windows
+from robotid.simulation.loops import ClosedLoopRobot, RollOut, Window, cut_windows
 
 NOISE = 3e-4  # [rad]
 
@@ -55,3 +55,21 @@ def test_shorter_corrections_are_tried_only_where_the_whole_one_is_not_better(rn
     n = len(measured.windows)
     assert tried[:3] == [(n, 4), (n, 0), (n, 0)], "sensitivities, at rest, the whole correction"
     assert all(size < n for size, columns in tried[3:5] if not columns)
+
+
+def test_a_corrected_start_is_regularised_by_position_errors_and_the_typical_speed(rng):
+    """Two parts of one and two joints; sensitivities are of positions, then of speeds."""
+    t, n, sigma = 5.0 + 0.02 * np.arange(40), 3, np.array([0.01, 0.03, 0.002])
+    q = np.cumsum(rng.normal(size=(40, n)), axis=0)
+    window = Window(Log(t, q, 0 * q, ("a", "b", "c")), 5, 10, 30)
+    parts = [(np.array([1]), np.array([1, 4])), (np.array([0, 2]), np.array([0, 2, 3, 5]))]
+    slopes = tuple((*x, rng.normal(size=(20, len(x[0]), len(x[1])))) for x in parts)
+    simulated = q[10:30] + 0.05 * rng.normal(size=(20, n))
+    found = _better_start(RollOut(window, simulated, 0 * simulated, slopes), sigma).ravel()
+    speed = np.sqrt(np.mean((np.diff(q, axis=0) / 0.02) ** 2, axis=0))
+    prior = np.diag(np.concatenate([3.0 * sigma, speed]) ** -2.0)
+    for joints, places, S in slopes:
+        W = np.tile(sigma[joints] ** -2.0, 20)
+        A, e = S.reshape(-1, len(places)), (q[10:30] - simulated)[:, joints].ravel()
+        H = (A.T * W) @ A + prior[np.ix_(places, places)]
+        np.testing.assert_allclose(found[places], np.linalg.solve(H, (A.T * W) @ e), rtol=1e-6)

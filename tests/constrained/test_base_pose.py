@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from helpers.humans import FEET, human_urdf, logged, walk
 
-from robotid.constrained.base_pose import check_pose
+from robotid.constrained.base_pose import check_pose, check_unit
 from robotid.constrained.contacts import check_base
 from robotid.logs.base import BaseMotion
 from robotid.logs.settings import SignalSettings
@@ -63,21 +63,22 @@ def test_another_order_of_the_quaternion_is_named(robot, log, change, words):
     assert found.evidence["best"] < 0.1  # [m/s], noise of the markers
 
 
-def test_another_vertical_axis_of_the_world_is_named(robot, log):
-    turn = pin.Quaternion(pin.rpy.rpyToMatrix(-np.pi / 2, 0.0, 0.0))  # z becomes y
+@pytest.mark.parametrize(("axis", "down"), [("y", -9.81), ("-y", 9.81)])
+def test_another_vertical_axis_of_the_world_is_named(robot, log, axis, down):
+    turn = pin.Quaternion(pin.rpy.rpyToMatrix(np.sign(down) * np.pi / 2, 0.0, 0.0))  # z becomes it
     pose = log.base.pose.copy()
     pose[:, :3] = pose[:, :3] @ turn.matrix().T
     pose[:, 3:] = [(turn * pin.Quaternion(x)).coeffs() for x in pose[:, 3:]]
     other = replace(log, base=BaseMotion(pose))
     (found,) = check_base(robot, other, SLOW)
     assert (found.code, found.severity) == ("base_orientation", "error")
-    assert "above them along y of the world" in found.message
-    assert "state gravity = [0, -9.81, 0] at the top" in found.message
+    assert f"above them along {axis} of the world" in found.message
+    assert f"state gravity = [0, {down}, 0] at the top" in found.message
     assert abs(found.evidence["height"]) < 0.2
     assert found.evidence["best"] > 0.9
     stated = RobotModel.from_urdf(
         robot.tree.path, free_flyer=True, terms=(), constraints=robot.contacts,
-        gravity=(0.0, -9.81, 0.0),
+        gravity=(0.0, down, 0.0),
     )  # fmt: skip
     assert not list(check_base(stated, other, SLOW))
 
@@ -92,11 +93,13 @@ def test_a_position_in_millimetres_is_named(robot, log):
     second = (x[2:] - 2 * x[1:-1] + x[:-2]) / 0.2**2
     size = np.sqrt(np.mean(np.sum(second**2, axis=1)))
     assert found.evidence["acceleration"] == pytest.approx(size, rel=0.05)
+    (later,) = check_unit(replace(log, t=log.t + 900.0, base=BaseMotion(pose)))
+    assert later.evidence["acceleration"] == pytest.approx(found.evidence["acceleration"], rel=1e-6)
     noisy = log.base.pose + 5e-3 * np.random.default_rng(0).standard_normal(log.base.pose.shape)
     noisy[:, 3:] = log.base.pose[:, 3:]
     assert not [x.code for x in check_base(robot, replace(log, base=BaseMotion(noisy)), SLOW)
                 if x.code == "base_unit"]  # fmt: skip
-    assert "base_x, base_y and base_z are in mm" in found.message
+    assert f"are in mm, it is {1e-3 * found.evidence['acceleration']:.2g} m/s^2" in found.message
 
 
 def test_jumps_are_found_with_size_and_time(log):
@@ -109,6 +112,10 @@ def test_jumps_are_found_with_size_and_time(log):
     assert found.evidence["jumps"] == 2
     assert found.evidence["size"] == pytest.approx(0.06, rel=0.1)
     assert found.evidence["first"] == log.t[100]
+    assert "jumps 2 times, first at t = 1.667 s by 0.041 m: a marker" in found.message
+    pose[:50, 3:] = np.roll(pose[:50, 3:], 1, axis=1)  # turned before: each kind has its own time
+    of_kind = list(check_pose(replace(log, base=BaseMotion(pose))))
+    assert [x.evidence["first"] for x in of_kind] == [log.t[100], log.t[50]]
 
 
 def test_an_impact_is_no_jump(log):

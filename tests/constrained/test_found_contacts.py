@@ -102,6 +102,14 @@ def test_the_shares_are_of_all_samples_of_which_undecided_ones_count_as_contact(
     )
     for k, x in zip((1, 3), touches, strict=True):
         np.testing.assert_array_equal(full.contacts[FEET[k]], x > 0.0)
+    part = [FoundContact(FEET[1], np.zeros(190), np.zeros(190))]  # rows beyond are undecided, too
+    monkeypatch.setattr(found_contacts, "find_contacts", lambda *_: (log.t[4:-6], part))
+    full = with_contacts(
+        robot, replace(log, contacts={FEET[k]: log.t >= 0 for k in (0, 2, 3)}), RAW
+    )
+    np.testing.assert_array_equal(
+        np.flatnonzero(full.contacts[FEET[1]]), [*range(4), *range(194, 200)]
+    )
 
 
 def test_what_cannot_be_found_names_what_to_log(robot):

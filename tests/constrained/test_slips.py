@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robotid.constrained.contacts import check_base
-from robotid.constrained.slips import without_zeros
+from robotid.constrained.slips import check_slip, without_zeros
 from robotid.logs.base import BaseMotion, quaternions_of_angles
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -90,3 +90,18 @@ def test_the_velocity_due_to_zeros_is_removed_and_a_slip_is_not(rng):
     left = without_zeros(t, v + slip, J, flags)
     np.testing.assert_allclose(left[flags].mean(axis=0), slip, atol=2e-3)
     np.testing.assert_array_equal(without_zeros(t, v, J, flags & False), v)
+
+
+@pytest.mark.parametrize(("speed", "is_slip"), [(0.095, False), (0.105, True)])
+def test_a_slip_in_a_short_contact_is_one_of_a_centimetre(robot, speed, is_slip):
+    """0.1 s of each contact are examined, in which 0.1 m/s are 1 cm."""
+    step = 0.005
+    flags = np.abs(np.arange(400) % 50 - 24.5) < 16  # contacts of 0.16 s, less 0.03 s at each end
+    t, n = 8.0 + step * np.arange(400), len(robot.joints)
+    log = Log(t, np.zeros((400, n)), np.zeros((400, n)), robot.joints)
+    way = np.tile([speed, 0.0, 0.0], (400, 1))
+    found = list(check_slip("FOOT", log, flags, t, [way], SignalSettings(cutoff=None)))
+    assert len(found) == is_slip
+    for finding in found:
+        assert finding.evidence["speed"] == pytest.approx(speed)
+        assert finding.evidence["share"] == 1.0

@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_segments
 
+from robotid.constrained import wrenches
 from robotid.constrained.contacts import check_base
 from robotid.constrained.wrench_times import check_offsets
 from robotid.constrained.wrenches import _Reading, check_wrenches
@@ -14,7 +15,7 @@ from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.constraints import constraint_jacobian
 from robotid.regressor.prediction import predict
-from robotid.robot.constraints import Contact
+from robotid.robot.constraints import Contact, link_positions
 from robotid.robot.model import RobotModel
 
 SLOW = SignalSettings(cutoff=4.0)
@@ -250,6 +251,25 @@ def test_vertical_forces_alone_show_their_sign_and_foot(urdf, log):
     assert not found(model, vertical)
     (finding,) = found(model, scaled(vertical, -1.0))
     assert "their sign is reversed" in finding.message
+
+
+def test_the_delay_is_searched_without_the_torques_of_unknown_forces(urdf, log, monkeypatch):
+    contacts = tuple(Contact(foot, "point", ("fz",), always=True) for foot in FEET)
+    model, given = replace(human(urdf), constraints=contacts), []
+    monkeypatch.setattr(wrenches, "check_delay", lambda *args: given.append(args) or [])
+    vertical = replace(log, wrenches={f"fz {foot}": log.wrenches[f"fz {foot}"] for foot in FEET})
+    list(check_wrenches(model, vertical, process(vertical, SLOW), 0.02))
+    ((_, motion, slopes, left, stated),) = given
+    J = constraint_jacobian(model, motion.q, np.ones((len(motion.t), 2), dtype=bool))[..., :6]
+    feet = link_positions(model.pin_model, model.configurations(motion.q), FEET)
+    apart = np.linalg.norm(feet - motion.q[:, None, :3], axis=2)
+    scale = np.repeat([1.0, 1.0 / (np.sqrt(np.mean(apart**2)) + 1e-3)], 3)  # equal units
+    (torque,) = predict(replace(model, constraints=()), [model.standard_parameters()], motion)
+    unknown = J[:, [0, 1, 3, 4]]  # fx and fy of each foot
+    for x, whole in ((left, torque[:, :6]), (slopes[:, 0], J[:, 2]), (slopes[:, 1], J[:, 5])):
+        own, size = (np.einsum("kmj,kj->km", unknown, y) for y in (x / scale, whole))
+        assert np.linalg.norm(own) < 0.02 * np.linalg.norm(size)
+    assert stated == 0.02
 
 
 @pytest.mark.parametrize(

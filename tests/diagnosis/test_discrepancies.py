@@ -261,6 +261,14 @@ def test_what_may_be_otherwise_changes_torques_as_differences_do(model, rng):
             np.testing.assert_allclose(own[code, joint], wanted, rtol=1e-4, atol=1e-3)
     every = slope(np.ones(n), 0.0)
     np.testing.assert_allclose(own["angle_scale", ""], every, rtol=1e-4, atol=1e-3)
+    bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
+
+    def on_clock(f):  # torques of the bodies if the time stamps run f times as fast
+        faster = [replace(m, v=f * m.v, a=f**2 * m.a) for m in at]
+        return np.concatenate([inverse_dynamics(model, bodies, m) for m in faster])
+
+    np.testing.assert_allclose(own["time_scale", ""], on_clock(np.sqrt(2.0)) - on_clock(1.0),
+                               atol=1e-9)  # fmt: skip
 
 
 def test_what_differs_is_reported_with_the_norm_of_its_sizes_and_others_that_would_do():

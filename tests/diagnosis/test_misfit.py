@@ -107,6 +107,20 @@ def test_a_missing_term_is_named_first_on_its_joint_with_its_share(ur5, clean, e
     assert all(other.joint == name and other.share < 0.1 * first.share for other in others)
 
 
+def test_a_trend_is_that_of_the_friction_at_the_rms_speed_without_the_offset():
+    v = np.array([1.0, -3.0, 2.0, 50.0])  # the last one is of a validation log
+    motion = SimpleNamespace(at=lambda rows: SimpleNamespace(v=v[rows], longest=90.0))
+    sample = SimpleNamespace(motions=[None, motion], rows=3, fitted=8)
+    C = np.array([[9.0, 0, 0, 0], [0, 0.04, 0.01, 0.3], [0, 0.01, 0.09, 0.2], [0, 0.3, 0.2, 25.0]])
+    whole = SimpleNamespace(estimate=lambda which, fitted: (np.r_[7.0, 0.3, -0.2, 5.0], C))
+    (drift,) = [term for term in CANDIDATES if term.code == "drift"]
+    change, error = misfit._trend(sample, 1, drift, whole, [4], [0, 1, 2])
+    speed = np.sqrt(14.0 / 3.0)
+    assert change == pytest.approx((0.3 - 0.2 * speed) * 60.0 / 90.0)
+    square = 0.04 + 2 * 0.01 * speed + 0.09 * speed**2
+    assert error == pytest.approx(np.sqrt(square) * 60.0 / 90.0)
+
+
 def test_a_drift_has_the_trend_of_the_friction_per_minute(ur5):
     """Coulomb friction falls by 0.3 of the RMS torque in 30 s."""
     found = identified(ur5, 1, "drift", 5)

@@ -1,5 +1,6 @@
 """Rows that terms are tried on, and what columns beside the base parameters leave of them."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ from robotid.diagnosis.sample import (
     Sample,
     Trials,
     _is_steady,
+    _noise_level,
     _segments,
     _spread_rows,
     _typical_size,
@@ -163,6 +165,21 @@ def test_the_typical_size_is_the_median_of_the_rows_used():
     assert _typical_size(r, used).tolist() == [2.0, np.inf]
 
 
+def test_projected_rows_have_one_noise_level_and_as_much_freedom_as_is_left(rng):
+    b = rng.standard_normal((N, 3)) * [1.0, 2.0, 0.1]
+    b /= np.linalg.norm(b, axis=1, keepdims=True)
+    e = rng.standard_normal((N, 3))
+    r = e - b * np.sum(b * e, axis=1, keepdims=True)
+    r[[4, 80]] *= 100.0  # outliers, of a fitted and of a validation log
+    used = rng.random((N, 3)) < 0.9
+    found, level = _noise_level(r, used, 70, b[:, :, None])
+    usual = np.arange(N)[:, None] % 76 != 4
+    np.testing.assert_array_equal(found, used & usual)
+    own = (used & usual)[:70]
+    squares, freedom = np.sum(r[:70][own] ** 2), np.sum(1.0 - b[:70][own] ** 2)
+    np.testing.assert_allclose(level, np.full(3, np.sqrt(squares / freedom)))
+
+
 def test_samples_are_weighted_by_the_residual_of_fitted_rows_joint_by_joint(identified):
     """Against the dense regressor of all recordings."""
     found = take_sample(identified)
@@ -205,6 +222,22 @@ def test_samples_are_weighted_by_the_residual_of_fitted_rows_joint_by_joint(iden
     assert alone.rows == len(alone.r) == fitted
 
 
+def test_the_torque_of_a_joint_alone_is_along_its_projected_axis(sample, rng):
+    b = rng.standard_normal((N, JOINTS))
+    b /= np.linalg.norm(b, axis=1, keepdims=True)
+    P = np.eye(JOINTS) - b[:, :, None] * b[:, None, :]
+    parts = [np.einsum("kij,kj->ki", P[k], rng.standard_normal((len(P[k]), JOINTS)))
+             for k in (slice(40), slice(40, None))]  # fmt: skip
+    weight = np.tile(sample.weight[:, :1], (1, JOINTS))
+    at = tuple(SimpleNamespace(tau=part) for part in parts)
+    alone = replace(sample, basis=b[:, :, None], at=at, weight=weight).of_joint(1)
+    axis = P[:, :, 1] / np.linalg.norm(P[:, :, 1], axis=1, keepdims=True)
+    along = np.sum(axis * np.concatenate(parts), axis=1)[: 10 * FITTED]
+    np.testing.assert_allclose(alone.torque, [np.sum((weight[: 10 * FITTED, 0] * along) ** 2)])
+    np.testing.assert_allclose(alone.weight[:, 0], weight[:, 0] * np.sqrt(P[:, 1, 1]))
+    np.testing.assert_allclose(alone.r[:, 0], sample.r[:, 1] / np.sqrt(P[:, 1, 1]))
+
+
 def test_columns_beside_are_each_as_free_as_what_is_left(sample, rng):
     Z = rng.standard_normal((N, JOINTS, 3)) * [1.0, 30.0, 0.0]
     found = sample.with_columns(Z)
@@ -225,3 +258,4 @@ def test_columns_beside_are_each_as_free_as_what_is_left(sample, rng):
     twice = own.reweighted(3.0)
     np.testing.assert_allclose(twice.torque, 9 * own.torque)
     np.testing.assert_allclose(twice.normal.A, own.normal.A + 8 * own.own.A)
+    np.testing.assert_allclose(twice.normal.B, own.normal.B + 8 * own.own.B)

@@ -109,6 +109,13 @@ def test_a_table_with_standard_columns_and_another_clock_is_left_as_it_is(given)
     assert_same(read_log(given(table | others), JOINTS))
 
 
+def test_a_time_beside_that_of_plotjuggler_is_the_time_of_the_log():
+    both = pd.DataFrame(juggled("/joints") | {"time": 7.0 + LOG.t})
+    back = read_log(both, JOINTS)
+    np.testing.assert_array_equal(back.t, 7.0 + LOG.t)
+    assert back.notes == ("columns ignored: __time",)
+
+
 def test_rows_of_a_file_are_read_by_the_same_names(tmp_path):
     pd.DataFrame(juggled("/joint_states")).to_csv(tmp_path / "run.csv", index=False)
     rows = open_table(tmp_path / "run.csv", LogSource()).rows

@@ -15,7 +15,7 @@ import pytest
 
 from robotid.exceptions import DataError, MissingDependencyError, SettingsError
 from robotid.log_files import csv_files
-from robotid.log_files.read import read_log, write_log
+from robotid.log_files.read import lay_out, read_log, write_log
 from robotid.log_files.table import Place
 from robotid.logs.base import BaseColumns
 from robotid.logs.data import Log
@@ -346,6 +346,29 @@ def test_stated_units_become_si(run):
     for name in ("q", "v", "a"):
         np.testing.assert_allclose(getattr(log, name), getattr(truth, name)[100:201], rtol=1e-14)
         np.testing.assert_array_equal(getattr(log, name)[:, 1], getattr(truth, name)[100:201, 1])
+
+
+@pytest.mark.parametrize(("name", "value", "message"), [
+    ("time", 2.02, r"t\[203\] = 2\.020 s is a duplicate time stamp, the same as t\[202\]"),
+    ("time", 2.01, r"t\[203\] = 2\.010 s follows t\[202\] = 2\.020 s"),
+    ("q_elbow", np.nan, "q_elbow is NaN at row 203"),
+])  # fmt: skip
+def test_rows_of_a_part_are_named_by_their_number_in_the_file(name, value, message):
+    layout, _ = lay_out(pd.DataFrame(make_table()), JOINTS)
+    part = {key: values[200:210].copy() for key, values in make_table().items()}
+    part[name][3] = value
+    with pytest.raises(DataError, match=message):
+        layout.to_log(part, 200)
+
+
+def test_the_temperature_of_a_joint_is_preferred_to_that_of_all():
+    cold = {name: np.zeros(300) for name in ("temperature", "temperature_shoulder", "T3")}
+    frame = pd.DataFrame(make_table(**cold))
+    assert lay_out(frame, JOINTS)[0].temperatures == {
+        "shoulder": "temperature_shoulder", "elbow": "temperature",
+    }  # fmt: skip
+    layout, _ = lay_out(frame, JOINTS, columns={"temperature_elbow": "T3"})
+    assert layout.temperatures == {"shoulder": "temperature_shoulder", "elbow": "T3"}
 
 
 def test_percentages_become_positions_between_their_ends(run):

@@ -14,6 +14,7 @@ from robotid.logs.base import (
     base_state,
     contacts_of,
     in_base,
+    pose_jumps,
     quaternions_of_angles,
 )
 from robotid.logs.data import Log
@@ -200,7 +201,7 @@ def test_a_contact_is_0_or_1(log, tmp_path):
 
 
 def test_each_contact_has_the_threshold_of_its_own_link():
-    forces = np.array([[10.0, 10.0, 0.0], [30.0, 30.0, 1.0], [60.0, 60.0, 0.0]])
+    forces = np.array([[-70.0, 10.0, 0.0], [30.0, 30.0, 1.0], [60.0, 60.0, 0.0]])
     wanted = BaseColumns(contacts=("a", "b", "c"), thresholds=(20.0, 50.0, None))
     flags = {link: own.tolist() for link, own in contacts_of(forces, wanted, "run").items()}
     assert flags["a"] == [False, True, True]
@@ -208,6 +209,28 @@ def test_each_contact_has_the_threshold_of_its_own_link():
     assert flags["c"] == [False, True, False]
     some = wanted.present(["contact_b", "contact_c", "contact_d"])  # the file lacks the first
     assert (some.contacts, some.thresholds) == (("b", "c"), (50.0, None))
+
+
+def test_a_jump_is_in_the_row_after_it():
+    t = 50.0 + 0.01 * np.arange(200)
+    pose = np.column_stack([0.3 * (t - 50.0), np.zeros((200, 5)), np.ones(200)])
+    pose[80:, 1] += 0.04
+    pose[150:, 5:] = [np.sin(0.05), np.cos(0.05)]  # 0.1 rad about z
+    rows, lengths, angles = pose_jumps(t, BaseMotion(pose).pose)
+    np.testing.assert_array_equal(rows, [80, 150])
+    np.testing.assert_allclose(lengths, [0.04, 0.0], atol=1e-12)
+    np.testing.assert_allclose(angles, [0.0, 0.1], rtol=1e-3)
+
+
+@pytest.mark.parametrize("is_later", [True, False])
+def test_a_step_is_compared_with_those_on_both_sides_of_it(rng, is_later):
+    """A vibration that starts or ends with a step of 0.04 m has steps of 0.005 m."""
+    t, pose = 50.0 + 0.01 * np.arange(200), np.tile(np.append(np.zeros(6), 1.0), (200, 1))
+    pose[100:, 0] = 0.04
+    assert pose_jumps(t, pose)[0].tolist() == [100]
+    vibrates = (np.arange(200) >= 100) == is_later
+    pose[vibrates, 0] += 0.004 * rng.standard_normal(100)
+    assert pose_jumps(t, pose)[0].tolist() == []
 
 
 def test_columns_of_a_base_may_have_other_names(log, tmp_path):

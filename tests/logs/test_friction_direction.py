@@ -17,6 +17,7 @@ from robotid.logs.data import Log, Trajectory
 from robotid.logs.friction_direction import acting_directions
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
+from robotid.logs.smoothing import _acting
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_directions, friction_speeds
 from robotid.regressor.factors import join
@@ -208,6 +209,17 @@ def test_friction_of_a_drive_that_sticks_goes_from_one_sign_to_the_other(after):
     np.testing.assert_allclose(acting(w), expected, atol=1e-6)
     np.testing.assert_array_equal(acting(w, longest=0.4), acting(w, band=0.0))
     assert np.count_nonzero(np.diff(np.sign(acting(w, band=0.0)))) > 3  # as the ringing has it
+
+
+@pytest.mark.parametrize(("cutoff", "is_stuck"), [(4.0, True), (6.0, False)])
+def test_stiction_lasts_eight_periods_of_the_filter_at_most(cutoff, is_stuck):
+    t = np.arange(0.0, 4.0, 0.005)
+    q = np.column_stack([np.where(t < 1.2, -(t - 1.2), np.maximum(t - 2.8, 0.0))])
+    w = np.gradient(q, t, axis=0)  # -1, 0 for 1.6 s, and 1 rad/s
+    settings = SignalSettings(cutoff=cutoff, min_velocity=BAND)
+    found = _acting(t, w, settings)[(t > 1.3) & (t < 2.7), 0]
+    wanted = (t[(t > 1.3) & (t < 2.7)] - 2.0) / 0.8
+    np.testing.assert_allclose(found, wanted if is_stuck else 0.0, atol=0.01)
 
 
 def test_rest_has_no_direction():

@@ -11,7 +11,7 @@ from robotid.exceptions import DataError
 from robotid.log_files.read import read_log, write_log
 from robotid.logs.base import BaseColumns, BaseMotion, base_state
 from robotid.logs.data import Log
-from robotid.logs.imu import ImuFrame, ImuMotion, motion_of_imu, orientation_of_imu
+from robotid.logs.imu import ImuFrame, ImuMotion, bias_at_rest, motion_of_imu, orientation_of_imu
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 
@@ -72,8 +72,12 @@ def test_an_imu_has_the_acceleration_of_the_base(motion):
         np.testing.assert_allclose(
             specific_force(*found)[some], specific_force(pose, twist, acceleration)[some], atol=5e-3
         )
-    np.testing.assert_allclose(base_state(t, pose, None, None, imu)[2][some], acceleration[some],
-                               atol=2e-2)  # fmt: skip
+    whole = base_state(t, pose, None, None, imu)
+    np.testing.assert_allclose(whole[2][some], acceleration[some], atol=2e-2)
+    offset = np.array([0.3, -0.2, 0.1])  # of the accelerometers, with the axes of the base
+    biased = replace(imu, values=imu.values + np.append(np.zeros(3), offset),
+                     frame=replace(imu.frame, offset=offset))  # fmt: skip
+    np.testing.assert_allclose(base_state(t, pose, None, None, biased)[2], whole[2], atol=1e-12)
 
 
 def test_the_bias_is_estimated_at_rest(rng):
@@ -93,6 +97,14 @@ def test_the_bias_is_estimated_at_rest(rng):
     imu, note = motion_of_imu(t, np.sin(5 * t)[:, None], values, FRAME)
     assert not imu.frame.bias.any()
     assert note.endswith("the bias of the gyroscopes is not estimated; record 1 s at rest")
+
+
+@pytest.mark.parametrize(("rate", "is_known"), [(8.0, False), (10.0, True)])
+def test_a_window_of_rest_has_five_samples(rate, is_known):
+    t = 70.0 + np.arange(30) / rate
+    bias, note = bias_at_rest([(t, np.zeros((30, 1)), np.tile(BIAS, (30, 1)))])
+    np.testing.assert_allclose(bias, is_known * BIAS, atol=1e-15)
+    assert ("never at rest" in note) != is_known
 
 
 def test_an_imu_is_read_with_or_without_an_orientation_of_its_own(motion, tmp_path):
@@ -186,6 +198,19 @@ def test_the_orientation_of_an_imu_alone_has_its_tilt_and_turns(sway):
             [pin.log3(a @ b.T) @ up for a, b in zip(R[part], turns[part], strict=True)]
         )
         assert np.ptp(np.unwrap(heading)) < 0.05
+
+
+def test_the_turn_between_two_samples_is_that_of_their_mean_angular_velocity():
+    t = 30.0 + 0.01 * np.arange(101)
+    values = np.zeros((101, 6))
+    values[:, 2], values[:, 5] = 3.0 * (t - 30.0), 9.81  # [rad/s] from rest, about the vertical
+    x, y, z, w = orientation_of_imu(t, values, np.array([0.0, 0.0, -9.81])).T
+    np.testing.assert_allclose([x, y], 0.0, atol=1e-12)
+    np.testing.assert_allclose(2 * np.arctan2(z, w), 1.5 * (t - 30.0) ** 2, atol=1e-9)
+    after = orientation_of_imu(  # what turned in a gap is not known: each part starts anew
+        np.append(t, t + 1.2), np.vstack([values, values]), np.array([0.0, 0.0, -9.81])
+    )
+    np.testing.assert_allclose(after, np.tile(np.column_stack([x, y, z, w]), (2, 1)), atol=1e-12)
 
 
 def test_a_vertical_vector_upside_down_is_turned_upwards():

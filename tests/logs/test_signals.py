@@ -73,6 +73,10 @@ def test_a_lower_rate_is_reached_after_the_filter():
     out = process(log, SignalSettings(cutoff=8.0, rate=100.0))
     np.testing.assert_allclose(np.diff(out.t), 0.01, rtol=1e-9)
     np.testing.assert_allclose(out.v[:, 0], np.pi * np.cos(np.pi * out.t), atol=1e-3)
+    late = sine_log(3.0 + np.arange(0, 10, 0.001))
+    out = process(late, SignalSettings(cutoff=8.0, rate=100.0, trim=0.2034))
+    assert out.t[0] == pytest.approx(3.204, abs=1e-9)  # the first point after the trim
+    np.testing.assert_allclose(np.diff(out.t), 0.01, rtol=1e-9)
 
 
 def test_nothing_crosses_a_gap():
@@ -121,6 +125,15 @@ def test_auto_takes_the_measured_velocity_unless_it_is_late(lag, choice):
     assert resolve(log, SignalSettings()).velocity == choice
 
 
+@pytest.mark.parametrize(("velocity", "lag"), [("differentiated", 0.0), ("auto", 0.05)])
+def test_auto_takes_no_acceleration_without_the_measured_velocity(velocity, lag):
+    t = np.arange(0, 10, 0.01)
+    log = sine_log(t, lag=lag, a=np.ones((1000, 2)))
+    assert resolve(log, SignalSettings(velocity=velocity)).acceleration == "differentiated"
+    stated = SignalSettings(velocity=velocity, acceleration="measured")
+    assert resolve(log, stated).acceleration == "measured"
+
+
 def test_what_was_automatic_is_stated():
     resolved = resolve(sine_log(np.arange(0, 10, 0.01)), SignalSettings(cutoff=10.0))
     assert resolved.rate == pytest.approx(100.0)
@@ -134,9 +147,14 @@ def test_what_is_stated_to_be_late_is_moved_back(rate):
     late = sine_log(t, lag=0.03)  # of the velocity
     tau = np.column_stack([np.cos(w * (t - 0.05)), np.sin(w * (t - 0.05))])
     settings = SignalSettings(
-        cutoff=None, rate=rate, velocity="measured", torque_delay=0.05, velocity_delay=0.03
-    )
-    out = process(Log(t=t, q=late.q, v=late.v, tau=tau, joints=late.joints), settings)
+        cutoff=None, rate=rate, velocity="measured", torque_delay=0.05, velocity_delay=0.03,
+        wrench_delay=-0.02,
+    )  # fmt: skip
+    forces = {"fz a": np.cos(w * (t + 0.02)), "fx a": np.sin(w * (t + 0.02))}
+    log = Log(t=t, q=late.q, v=late.v, tau=tau, joints=late.joints, wrenches=forces)
+    out = process(log, settings)
+    np.testing.assert_allclose(out.wrenches[:, 0], np.cos(w * out.t), atol=1e-6)
+    np.testing.assert_allclose(out.wrenches[:, 1], np.sin(w * out.t), atol=1e-6)
     np.testing.assert_allclose(out.tau[:, 0], np.cos(w * out.t), atol=1e-6)
     np.testing.assert_allclose(out.v[:, 0], w * np.cos(w * out.t), atol=1e-6)
     np.testing.assert_allclose(out.q[:, 0], np.sin(w * out.t), atol=1e-6)

@@ -1,6 +1,7 @@
 """Stands count once, slow segments once each, and what is fast is left out."""
 
 import numpy as np
+import pytest
 
 from robotid.logs.data import Log
 from robotid.logs.standing import standing_motion
@@ -125,3 +126,25 @@ def test_a_jump_of_the_speed_across_a_gap_is_no_acceleration():
     motion, _ = means(log_of(t, q))
     assert motion.segment.tolist() == [0] * 4 + [1] * 4
     np.testing.assert_allclose(motion.v[:, 1], np.repeat([0.1, 0.25], 4))
+
+
+@pytest.mark.parametrize(("step", "samples"), [(0.02, 1), (0.03, 2)])
+def test_poses_are_joined_if_the_way_between_them_is_that_of_rest(step, samples):
+    """At 0.1 rad/s a joint moves 0.025 rad from one block of 0.25 s to the next."""
+    t = 40.0 + 0.05 * np.arange(20)
+    q = np.column_stack([np.zeros(20), np.where(np.arange(20) < 10, 1.0, 1.0 + step)])
+    one = np.ones(2)
+    motion, resting = standing_motion(Log(t, q, q, ("a", "b")), 1.0, 0.1 * one, one, one)
+    assert resting.tolist() == [True] * samples
+    wanted = [[0.0, 1.0 + step / 2]] if samples == 1 else [[0.0, 1.0], [0.0, 1.0 + step]]
+    np.testing.assert_allclose(motion.q, wanted)
+    np.testing.assert_allclose(motion.t, np.mean(np.split(t, samples), axis=1))
+
+
+def test_the_slope_of_a_short_block_is_reduced_by_its_own_duration():
+    t = np.concatenate([0.05 * np.arange(20), [5.0, 5.05]])
+    q = np.column_stack([0.1 * t, np.zeros(22)])
+    motion, resting = means(log_of(t, q))
+    assert not resting.any()
+    np.testing.assert_allclose(motion.v[:-1, 0], 0.1)
+    np.testing.assert_allclose(motion.v[-1, 0], 0.1 * 2 * 0.05 / 0.25)

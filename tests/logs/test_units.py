@@ -86,6 +86,7 @@ def test_one_joint_in_degrees_is_converted_alone():
         ({"scale": c, "v": one}, "q_c"),  # the velocity is in radians
         ({"scale": c, "v": c, "q_ref": c}, "q_c, dq_c and qref_c"),
         ({"scale": c, "q_ref": one}, "q_c"),
+        ({"scale": c, "q_ref": c[::-1]}, "q_c"),  # the command of another joint is in degrees
     ):
         with pytest.raises(DataError, match=re.escape(advice.format(columns))) as caught:
             check_units(three(**changes), LogUnits())

@@ -122,3 +122,8 @@ def test_effects_of_temperature_and_time_are_no_evidence():
     wanted = evidence_by_group(groups, deviations, UNIT == 1, is_unit=True)
     found = evidence_by_group(warm, with_slope, UNIT == 1, is_unit=True)
     assert found == pytest.approx(wanted)
+    last = [*warm[1:], replace(drive, runs=warm[0].runs, slopes=sizes)]  # the drive is last
+    columns = np.array([2, 3, 4, 0, 1])
+    last = [replace(g, across=g.across[:, :, columns]) for g in last]
+    found = evidence_by_group(last, [*with_slope[1:], with_slope[0]], UNIT == 1, is_unit=True)
+    assert found == pytest.approx([*wanted[1:], wanted[0]])

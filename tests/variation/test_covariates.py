@@ -8,7 +8,7 @@ from robotid.variation.covariates import at_temperature, effects_of, with_effect
 from robotid.variation.groups import Covariate, Group, RunsOf
 from robotid.variation.mixed_effects import MixedEffects, Runs, Slope
 from robotid.variation.restricted_likelihood import evidence
-from robotid.variation.variation import between_covariance, vary
+from robotid.variation.variation import between_covariance, effects_by_log, vary
 
 UNIT = np.array([0, 0, 0, 1, 1, 2, 2, 2, 2])
 
@@ -154,11 +154,29 @@ def test_an_effect_is_found_with_its_parameter_and_the_interval_at_a_temperature
     plain = variation.to_dict()
     C = between_covariance(plain, ["elbow.coulomb", "elbow.viscous"])
     without = viscous.prediction.spread**2
-    assert C[1, 1] - without == pytest.approx(np.var(effect.contribution, ddof=1))
+    assert C[1, 1] - without == pytest.approx(np.var(effect.slope * warm, ddof=1))
     found = plain["parameters"]["elbow.viscous"]
     assert found["effects"]["temperature"]["by_log"] == warm.tolist()
     assert found["seen_interval"] == seen.tolist()
     assert "seen_interval" not in plain["parameters"]["elbow.coulomb"]
+
+
+def test_the_interval_at_a_covariate_has_the_other_one_at_its_mean():
+    rng = np.random.default_rng(8)
+    warm, hours = 20.0 + 8.0 * rng.normal(size=12), 5.0 + rng.normal(size=12)
+    x = 0.02 * rng.normal(size=(12, 1)) + (0.03 * warm - 0.4 * hours)[:, None]
+    both = [Covariate("temperature", "degC", warm), Covariate("time", "h", hours)]
+    (own,) = with_effects([group(x - x.mean(), 0.01, both)])
+    model = MixedEffects(own.runs)
+    effects, (plain,) = effects_of(own, model, 0), model.predict()
+    assert [each.is_used for each in effects] == [True, True]
+    for each, slope in zip(effects, (0.03, -0.4), strict=True):
+        values = each.covariate.values
+        middle = each.interval(values.max()).mean() - 2.0 - plain.mean
+        assert middle == pytest.approx(slope * (values.max() - values.mean()), abs=0.04)
+    moved = effects_by_log([{}, {"effects": {x.covariate.name: x.to_dict() for x in effects}}])
+    wanted = sum(x.slope * (x.covariate.values - x.covariate.values.mean()) for x in effects)
+    np.testing.assert_allclose(moved, np.column_stack([np.zeros(12), wanted]), atol=1e-12)
 
 
 def test_predictions_of_a_result_are_moved_to_a_temperature():

@@ -62,6 +62,11 @@ def test_after_an_alarm_the_new_level_is_expected():
     assert [each.first for each in found] == [8, 16]
     assert [each.start for each in found] == [0, 8]
     assert found[1].expected.ends == pytest.approx([3.85, 4.15], abs=0.12)
+    x[8:16] -= 0.82  # found some results after it
+    first, *_, last = changes(x, np.full((24, 1), 0.02))
+    assert (first.start, first.first) == (0, 8)
+    assert first.result > 8
+    assert last.start == 8
 
 
 EXPRESSIONS = {

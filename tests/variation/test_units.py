@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from robotid.variation.mixed_effects import MixedEffects, Runs
 from robotid.variation.units import between_units
 
 
@@ -56,3 +57,16 @@ def test_a_unit_of_precise_values_has_the_probability_of_the_t_test():
     assert between_units(x, errors, 0.9 * p)[1] == ()
     (found,) = between_units(x, errors, 1.1 * p)[1]
     assert (found.unit, found.probability) == (3, pytest.approx(p, rel=0.05))
+
+
+@pytest.mark.parametrize(("x", "error", "scale"), [
+    ([-4.0, -4.0, -4.0], 0.05, 0.4),  # a tenth of their size
+    ([0.3, -0.1, 0.1, 0.1], 0.7, 0.7),  # their errors
+    ([1.0, 4.0, 7.0], 0.2, 3.0),  # their scatter
+])  # fmt: skip
+def test_the_plausible_spread_is_the_largest_of_a_tenth_the_errors_and_the_scatter(x, error, scale):
+    H = np.full((len(x), 1, 1), error**-2)
+    runs = Runs(H, H[:, 0] * np.array(x)[:, None], np.zeros(len(x), int), np.array([scale]))
+    (wanted,) = MixedEffects(runs).predict()
+    found, _ = between_units(np.array(x), np.full(len(x), error), 1e-9)
+    assert (found.spread, *found.ends) == pytest.approx((wanted.spread, *wanted.ends))

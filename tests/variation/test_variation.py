@@ -13,6 +13,7 @@ from robotid.fitting.survey import hold_log
 from robotid.judgement.unlike_runs import unlike_findings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
+from robotid.variation import variation
 from robotid.variation.groups import Group, RunsOf, _groups, inflation_of, runs_of
 from robotid.variation.mixed_effects import MixedEffects, Runs
 from robotid.variation.variation import (
@@ -360,6 +361,15 @@ def test_the_unit_that_differs_is_named_and_its_logs_are_not():
     assert found.unlike == ()
     alike, _ = units_of(np.random.default_rng(1), np.zeros(2))
     assert vary(names, [alike], []).unlike_units == ()
+
+
+def test_a_unit_is_named_by_the_number_of_parameters_in_all_units_and_runs(monkeypatch):
+    group, _ = units_of(np.random.default_rng(0), np.array([0.8, 0.0]))
+    names, tests = [f"{k}.csv" for k in range(10)], 2 * (5 + 10)
+    (odd,) = vary(names, [group]).unlike_units
+    for factor, units in ((1.001, [3]), (0.999, [])):
+        monkeypatch.setattr(variation, "_FALSE_ALARMS", factor * tests * odd.probability)
+        assert [each.run for each in vary(names, [group]).unlike_units] == units
 
 
 def test_three_units_are_not_compared():

@@ -117,3 +117,23 @@ def test_no_scheduler_is_said(tmp_path):
     backend = ClusterBackend("tcp://127.0.0.1:9", patience=0.2)
     with pytest.raises(WorkerError, match=r"no Dask scheduler answers at 'tcp://127.0.0.1:9'"):
         reduce_all(pieces_in(tmp_path / "marks", 2), backend=backend)
+
+
+def test_the_patience_is_that_for_the_scheduler_and_for_its_first_worker(monkeypatch):
+    waited = []
+
+    class Client:
+        def __init__(self, address, *, timeout, set_as_default):
+            waited.append((address, timeout, set_as_default))
+
+        def wait_for_workers(self, number, timeout):
+            waited.append((number, timeout))
+            raise TimeoutError
+
+        def close(self):
+            waited.append("closed")
+
+    monkeypatch.setattr("distributed.Client", Client)
+    with pytest.raises(WorkerError, match="the Dask scheduler tcp://host:1 has no workers"):
+        ClusterBackend("tcp://host:1", patience=7.5)._connect()
+    assert waited == [("tcp://host:1", 7.5, False), (1, 7.5), "closed"]
