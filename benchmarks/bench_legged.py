@@ -3,6 +3,7 @@
     python benchmarks/bench_legged.py [--runs 20] [--robots go1 g1 talos cassie] [--unseen]
     python benchmarks/bench_legged.py --excite [--robots go1 talos] [--design 120]
     python benchmarks/bench_legged.py --flags [--robots go1 g1 talos] [--seconds 10]
+    python benchmarks/bench_legged.py --robots human human_soft icub --seconds 15
 
 A Go1 stands on point feet in MuJoCo at 0.1 ms with held torques, 18-bit encoders and 0.05 N m of
 torque noise; its joints follow multi-sines, its feet slip and lift at times. G1 and TALOS step in
@@ -14,6 +15,8 @@ those of an arm. With the recordings, a Solo12 that trots in PyBullet is identif
 half of its log: its URDF is the truth. With --unseen: joint torque of the last 30 % of a recording,
 fitted on the others. With --excite: a motion on the feet is designed and followed in MuJoCo by a
 position controller; slip and load of the feet, and the intervals by its log, beside a squat's.
+Without torques of joints: a human on two force shoes, also with errors of soft tissue, and
+an iCub that walks on the spot, of whose feet the vertical forces are measured.
 With --flags: how many contacts the doctor names, as delayed if all flags of a log are, and as
 slipping on the ground of the benchmark and on a slippery one.
 """
@@ -30,13 +33,16 @@ from dataclasses import replace
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import pinocchio as pin
 from scipy.interpolate import CubicSpline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers import cassie
+from helpers.humans import FEET as SHOES
+from helpers.humans import PARTS, Walk, forces, human_urdf, logged, walk, with_other_segments
 from helpers.legged import followed, recorded, with_other_bodies
 from helpers.paths import JOBS
-from helpers.walkers import G1, TALOS
+from helpers.walkers import G1, ICUB, TALOS, planned, waves
 
 from robotid.commands.identify import run_job
 from robotid.commands.job import read_job
@@ -112,10 +118,86 @@ class Cassie:
         self.log, self.truth = cassie.log, cassie.truth
 
 
+class Human:
+    """A human on two force shoes; see ``helpers.humans``."""
+
+    estimator, signals, other = AUTO_PRIOR, SignalSettings(cutoff=4.0), with_other_segments
+
+    def __init__(self, tissue=0.0):
+        self.tissue = tissue  # error of the position [m], of the angles 3 rad/m of it
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "human.urdf"
+            path.write_text(human_urdf())
+            contacts = [Contact(foot, "surface", PARTS, axes="link") for foot in SHOES]
+            self.model = RobotModel.from_urdf(
+                path, free_flyer=True, terms=(), constraints=contacts
+            )  # fmt: skip
+
+    def log(self, model, rng, duration):
+        motion = walk(model, model, rng, duration, rate=60.0)
+        log = logged(model, motion, rng)
+        if not self.tissue:
+            return log
+        soft = waves(rng, 6 + len(model.joints), 0.3, 2.0)(motion.t)
+        soft *= self.tissue / soft.std(axis=0) * np.where(np.arange(soft.shape[1]) < 3, 1.0, 3.0)
+        pose = log.base.pose.copy()
+        pose[:, :3] += soft[:, :3]
+        for row, turn in zip(pose, soft[:, 3:6], strict=True):
+            row[3:] = (pin.Quaternion(row[3:]) * pin.Quaternion(pin.exp3(turn))).coeffs()
+        return replace(log, q=log.q + soft[:, 6:], base=replace(log.base, pose=pose))
+
+    def truth(self, model):
+        return model.standard_parameters()
+
+
+class Icub:
+    """An iCub that steps on the spot, with vertical forces of its feet only."""
+
+    estimator, signals = AUTO_PRIOR, SignalSettings(cutoff=4.0)
+
+    def __init__(self):
+        legs = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
+        arms = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow")
+        trunk = ["neck_pitch", "neck_roll", "torso_pitch", "torso_roll", "torso_yaw"]
+        contacts = [Contact(foot, measured=("fz",), threshold=10.0) for foot in ICUB.feet]
+        self.model = RobotModel.from_urdf(
+            example_urdf(ICUB.urdf), free_flyer=True, terms=(), constraints=contacts,
+            joints=trunk + [f"{side}_{x}" for side in "lr" for x in (*arms, *legs)],
+        )  # fmt: skip
+
+    def log(self, model, rng, duration):
+        """Return the log; the vertical forces are those of the centre of pressure."""
+        _, times, places, _, lifts = planned(ICUB, model, rng, duration)
+        at, t = CubicSpline(times, places), np.arange(0.0, duration, 0.01)
+
+        def q_at(t):
+            q = at(t)
+            q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
+            return q
+
+        total, feet = forces(model.pin_model, q_at, t, ICUB.feet)
+        pressure = np.column_stack([-total[:, 4], total[:, 3]]) / total[:, 2:3]
+        soles = np.array([[place.translation[:2] for place in row] for row in feet])
+        line = soles[:, 0] - soles[:, 1]
+        left = np.sum((pressure - soles[:, 1]) * line, axis=1) / np.sum(line**2, axis=1)
+        up = np.array([np.interp(t, times, lift) > 1e-9 for lift in lifts])
+        left = np.where(up[0], 0.0, np.where(up[1], 1.0, left.clip(0.0, 1.0)))
+        motion = Walk(t, q_at(t), np.zeros((len(t), 2, 6)), feet)
+        bare = logged(model, motion, rng, noise=(5e-4, 1e-3, 0.0, 0.0), frames=ICUB.feet)
+        vertical = np.stack([left, 1.0 - left]) * total[:, 2] + rng.standard_normal((2, len(t)))
+        own = {f"fz {foot}": f for foot, f in zip(ICUB.feet, vertical, strict=True)}
+        flags = {foot: f > 10.0 for foot, f in zip(ICUB.feet, vertical, strict=True)}
+        return replace(bare, wrenches=own, contacts=flags)
+
+    def truth(self, model):
+        return model.standard_parameters()
+
+
 PLANTS = {
     "go1": Go1, "go1_consistent": lambda: Go1("consistent"),
     "go1_still": lambda: Go1("consistent", 0.3),
     "g1": lambda: Walker(G1), "talos": lambda: Walker(TALOS), "cassie": Cassie,
+    "human": Human, "human_soft": lambda: Human(5e-3), "icub": Icub,
 }  # fmt: skip
 
 
@@ -129,16 +211,18 @@ def coverage(name, seeds, duration):
     model = plant.model
     truth, n = plant.truth(model), model.layout.n_inertial
     print(
-        f"{name}\n{'run':>4} {'covered':>8} {'of':>4} {'rms z':>6} {'total mass [kg]':>16} {'s':>6}"
+        f"{name}\n{'run':>4} {'covered':>8} {'of':>4} {'rms z':>6} {'masses':>8} "
+        f"{'total mass [kg]':>16} {'its z':>6} {'s':>6}"
     )
-    shares = []
+    shares, of_masses = [], []
+    others, signals = getattr(plant, "other", with_other_bodies), getattr(plant, "signals", SIGNALS)
     for seed in seeds:
         rng = np.random.default_rng(seed)
         log = plant.log(model, rng, duration)
-        other, start = with_other_bodies(model, of_urdf(seed)), time.process_time()
+        other, start = others(model, of_urdf(seed)), time.process_time()
         try:
             found = identify(
-                other, log, signals=SIGNALS, estimator=plant.estimator, friction="none",
+                other, log, signals=signals, estimator=plant.estimator, friction="none",
                 doctor=False,
             )  # fmt: skip
         except (RankDeficientError, NotConvergedError) as error:
@@ -147,15 +231,24 @@ def coverage(name, seeds, duration):
         spent = time.process_time() - start
         is_body = found.mapping.independent < n
         z = ((found.base - found.mapping.K @ truth) / found.base_error)[is_body]
-        mass = found.standard[:n:10].sum()
+        masses = slice(0, n, 10)
+        mass, error = found.standard[masses].sum(), found.standard_covariance[masses, masses].sum()
+        low, high = found.standard_interval[masses].T
+        own = truth[masses]
+        is_free = high - low > 1e-6 * own.sum()  # links of negligible mass keep the URDF's
+        of_masses.append(np.mean(((low <= own) & (own <= high))[is_free]))
         shares.append(np.mean(np.abs(z) < found.errors.quantile[is_body]))
         print(
             f"{seed:4} {100 * shares[-1]:7.0f}% {len(z):4} {np.sqrt(np.mean(z**2)):6.2f} "
-            f"{mass:16.3f} {spent:6.1f}",
+            f"{100 * of_masses[-1]:7.0f}% {mass:16.3f} {(mass - own.sum()) / np.sqrt(error):6.2f} "
+            f"{spent:6.1f}",
             flush=True,
         )
     if shares:
-        print(f"mean {100 * np.mean(shares):7.0f}%, wanted 90 to 98 %")
+        print(
+            f"mean {100 * np.mean(shares):7.1f}%, of masses {100 * np.mean(of_masses):.1f} %, "
+            f"wanted 90 to 98 %; total mass true {truth[:n:10].sum():.3f} kg"
+        )
 
 
 def trot():
