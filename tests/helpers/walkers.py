@@ -89,7 +89,7 @@ TALOS = Biped(
 )  # fmt: skip
 ICUB = Biped(
     "icub.urdf", {f"{x}_sole": _corners(0.1, -0.05, 0.025, 0.0) for x in "lr"},
-    {"hip_pitch": 0.4, "knee": -0.8, "ankle_pitch": -0.4, "elbow": 0.8, "l_shoulder_roll": 0.5,
+    {"hip_pitch": 0.8, "knee": -1.6, "ankle_pitch": -0.8, "elbow": 0.8, "l_shoulder_roll": 0.5,
      "r_shoulder_roll": 0.5},
     kp=0.0, kd=0.0, armature=0.0, damping=0.0, torque=0.0,
 )  # fmt: skip
