@@ -3,6 +3,7 @@
     python benchmarks/bench_legged.py [--runs 20] [--robots go1 g1 talos cassie] [--unseen]
     python benchmarks/bench_legged.py --excite [--robots go1 talos] [--design 120]
     python benchmarks/bench_legged.py --flags [--robots go1 g1 talos] [--seconds 10]
+    python benchmarks/bench_legged.py --faults [--robots go1 g1 talos human human_soft icub]
     python benchmarks/bench_legged.py --robots human human_soft icub --seconds 15
 
 A Go1 stands on point feet in MuJoCo at 0.1 ms with held torques, 18-bit encoders and 0.05 N m of
@@ -17,7 +18,8 @@ fitted on the others. With --excite: a motion on the feet is designed and follow
 position controller; slip and load of the feet, and the intervals by its log, beside a squat's.
 Without torques of joints: a human on two force shoes, also with errors of soft tissue, and
 an iCub that walks on the spot, of whose feet the vertical forces are measured.
-With --flags: how many contacts the doctor names, as delayed if all flags of a log are, and as
+With --faults: how many logs with a
+wrong pose of the base, and with a wrong gain of one foot, the doctor names. With --flags: how many contacts the doctor names, as delayed if all flags of a log are, and as
 slipping on the ground of the benchmark and on a slippery one.
 """
 
@@ -364,6 +366,47 @@ def flags(name, seeds, duration):
             )
 
 
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+QUARTER, BACK = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), [-1, -1, -1, 1]
+#: Poses x y z qx qy qz qw (N, 7) as another tool or a wrong reading has them.
+POSES = {
+    "none": lambda x: x,
+    "qw qx qy qz": lambda x: np.hstack([x[:, :3], np.roll(x[:, 3:], 1, axis=1)]),
+    "inverse quaternion": lambda x: np.hstack([x[:, :3], x[:, 3:] * BACK]),
+    "y up": lambda x: posed(x, Y_UP, lambda R: Y_UP @ R),
+    "y up, base too": lambda x: posed(x, Y_UP, lambda R: Y_UP @ R @ Y_UP.T),
+    "y up, position only": lambda x: posed(x, Y_UP, lambda R: R),
+    "base turned by 90 deg": lambda x: posed(x, np.eye(3), lambda R: R @ QUARTER),
+    "y reversed": lambda x: posed(x, np.diag([1.0, -1.0, 1.0]), lambda R: R),
+}
+
+
+def posed(pose, place, turn):
+    """Return a pose whose position has other axes, and whose rotation matrices are changed."""
+    own = [pin.Quaternion(turn(pin.Quaternion(x).matrix())).coeffs() for x in pose[:, 3:]]
+    return np.hstack([pose[:, :3] @ place.T, np.array(own)])
+
+
+def faults(name, seeds, duration):
+    """Print how many logs with a wrong pose, or a wrong gain of one foot, the doctor names."""
+    plant, counts = PLANTS[name](), {}
+    others, signals = getattr(plant, "other", with_other_bodies), getattr(plant, "signals", SIGNALS)
+    for seed in seeds:
+        log = plant.log(plant.model, np.random.default_rng(seed), duration)
+        other = others(plant.model, of_urdf(seed))
+        for label, change in POSES.items():
+            wrong = replace(log, base=replace(log.base, pose=change(log.base.pose)))
+            codes = [x.code for x in check_base(other, wrong, signals) if x.severity == "error"]
+            counts.setdefault(label, []).append("base_orientation" in codes)
+        for foot in [x.frame for x in plant.model.contacts if x.measured]:
+            for gain in (1.0, 1.1, 1.3):
+                own = {x: f * (gain if x.endswith(foot) else 1.0) for x, f in log.wrenches.items()}
+                codes = [x.code for x in check_base(other, replace(log, wrenches=own), signals)]
+                counts.setdefault(f"gain {gain:g}", []).append("wrench_gain" in codes)
+    for label, own in counts.items():
+        print(f"{name}, {label}: {sum(own)} of {len(own)} named", flush=True)
+
+
 #: Posture, soles, lifted feet of each design and joints that lift them, gains.
 STANDS = {
     "go1": (
@@ -540,6 +583,7 @@ def main():
     parser.add_argument("--unseen", action="store_true", help="only errors on unseen motion")
     parser.add_argument("--excite", action="store_true", help="only designed motions on the feet")
     parser.add_argument("--design", type=float, default=120.0, help="seconds of each design")
+    parser.add_argument("--faults", action="store_true", help="only wrong poses and gains")
     parser.add_argument("--flags", action="store_true", help="only delays of flags, and slips")
     options = parser.parse_args()
     if options.excite:
@@ -548,14 +592,16 @@ def main():
         return
     runs, seconds = (1, 4.0) if options.quick else (options.runs, options.seconds)
     for name in ("go1", "g1", "cassie") if options.quick else options.robots:
-        if options.flags:
+        if options.faults:
+            faults(name, range(options.first, options.first + runs), seconds)
+        elif options.flags:
             flags(name, range(options.first, options.first + runs), seconds)
         elif options.unseen:
             for seed in range(options.first, options.first + runs):
                 unseen(name, seed, seconds)
         else:
             coverage(name, range(options.first, options.first + runs), seconds)
-    if not (options.unseen or options.flags):
+    if not (options.unseen or options.flags or options.faults):
         if "ROBOTID_DATA" in os.environ:
             trot()
         speed(6.0)
