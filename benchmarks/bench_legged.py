@@ -18,9 +18,9 @@ fitted on the others. With --excite: a motion on the feet is designed and follow
 position controller; slip and load of the feet, and the intervals by its log, beside a squat's.
 Without torques of joints: a human on two force shoes, also with errors of soft tissue, and
 an iCub that walks on the spot, of whose feet the vertical forces are measured.
-With --faults: how many logs with a
-wrong pose of the base, and with a wrong gain of one foot, the doctor names. With --flags: how many contacts the doctor names, as delayed if all flags of a log are, and as
-slipping on the ground of the benchmark and on a slippery one.
+With --faults: how many logs with a wrong pose of the base, and with a wrong gain of one foot, the
+doctor names. With --flags: how many contacts it names, as delayed if all flags of a log are, and as slipping on the ground of the
+benchmark and on a slippery one.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -201,6 +201,7 @@ PLANTS = {
     "g1": lambda: Walker(G1), "talos": lambda: Walker(TALOS), "cassie": Cassie,
     "human": Human, "human_soft": lambda: Human(5e-3), "icub": Icub,
 }  # fmt: skip
+WITH_TORQUES = [name for name in PLANTS if name not in ("human", "human_soft", "icub")]
 
 
 def of_urdf(seed):
@@ -579,7 +580,7 @@ def main():
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--first", type=int, default=0, help="number of the first run")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of each recording")
-    parser.add_argument("--robots", nargs="+", choices=PLANTS, default=[*PLANTS])
+    parser.add_argument("--robots", nargs="+", choices=PLANTS, default=WITH_TORQUES)
     parser.add_argument("--unseen", action="store_true", help="only errors on unseen motion")
     parser.add_argument("--excite", action="store_true", help="only designed motions on the feet")
     parser.add_argument("--design", type=float, default=120.0, help="seconds of each design")
