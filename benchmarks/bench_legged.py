@@ -19,8 +19,8 @@ position controller; slip and load of the feet, and the intervals by its log, be
 Without torques of joints: a human on two force shoes, also with errors of soft tissue, and
 an iCub that walks on the spot, of whose feet the vertical forces are measured.
 With --faults: how many logs with a wrong pose of the base, and with a wrong gain of one foot, the
-doctor names. With --flags: how many contacts it names, as delayed if all flags of a log are, and as slipping on the ground of the
-benchmark and on a slippery one.
+doctor names. With --flags: how many contacts it names, as delayed if all flags of a log are, and
+as slipping on the ground of the benchmark and on a slippery one.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported

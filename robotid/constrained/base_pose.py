@@ -21,8 +21,9 @@ from robotid.robot.model import RobotModel
 __all__ = ["check_order", "check_pose", "check_twist", "check_unit", "orientation_readings"]
 
 _MOVES = 5e-3  # [m/s] mean speed of feet on the ground below which no other pose is tried
-_BETTER = 0.5  # ratio of the speeds below which another pose, or another twist, is found
-_SIMPLER = 1.2  # ... and one with another change is preferred if it reduces the speed by this ...
+_SLOWER = 0.75  # ratio of the speeds below which another pose is found ...
+_BETTER = 0.5  # ... and of the differences below which another twist is
+_SIMPLER = 1.2  # a pose with another change is preferred if it reduces the speed by this ...
 _FLOOR = 1e-3  # [m/s] ... plus this
 _MOST = 1000  # samples at which poses are compared
 _TURNS_BY = 1e-3  # [m/s or rad/s] RMS from which velocities are compared
@@ -101,23 +102,15 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     except DataError:  # too short: raised again when the log is read
         return
     place, quaternion, twist = motion.q[:, :3], motion.q[:, 3:7], motion.v[:, :6]
-    back = quaternion * _BACK
 
     def of_pose(quaternion: Array) -> Array:
         return base_state(motion.t, np.hstack([place, quaternion]), None, None)[1]
 
     wanted, readings = of_pose(quaternion), orientation_readings(quaternion)
     parts = {"linear": slice(0, 3), "angular": slice(3, 6)}
+    read = twist, _turned(quaternion, twist), _turned(quaternion * _BACK, twist)
     axes = {  # differences from the pose: as logged, of the world, of the base if turned before
-        what: [
-            rms(x - wanted[:, part])
-            for x in (
-                twist[:, part],
-                in_base(quaternion, twist[:, part]),
-                in_base(back, twist[:, part]),
-            )
-        ]
-        for what, part in parts.items()
+        what: [rms((x - wanted)[:, part]) for x in read] for what, part in parts.items()
     }
     for what, part in parts.items():
         (off, in_world, turned), unit = axes[what], "m/s" if what == "linear" else "rad/s"
@@ -139,24 +132,28 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
             evidence = {"speed": off, "best": best}
             yield log_finding(log.name, "base_orientation", "error", message, **evidence)
             return
+        other = next(x for x in parts if x != what)
+        remedy = ". Check the columns base_vx to base_wz, or remove them"
         if is_explained and best == in_world:
-            other = next(x for x in parts if x != what)
-            message += (
+            is_mixed = axes[other][0] < _BETTER * axes[other][1]
+            remedy = (
                 f"; read with the axes of the world it differs by {best:.2g} {unit}. State twist "
                 "= 'world' in [base]"
-            )
-            if axes[other][0] < _BETTER * axes[other][1]:
-                message += f", and turn the {other} velocity, which has the axes of the base, too"
+            ) + is_mixed * f", and turn the {other} velocity, which has the axes of the base, too"
         elif is_explained and best == turned:
-            message += (
+            remedy = (
                 f"; it has the axes of the base, with which it differs by {best:.2g} {unit}. State "
                 "twist = 'base' in [base]"
             )
         elif is_explained:
-            message += f", by {best:.2g} {unit} if it is in {name}: convert it to {unit}"
-        else:
-            message += ". Check the columns base_vx to base_wz, or remove them"
+            remedy = f", by {best:.2g} {unit} if it is in {name}: convert it to {unit}"
+        message += remedy
         yield log_finding(log.name, "base_twist", "error", message, **evidence)
+
+
+def _turned(quaternion: Array, twist: Array) -> Array:
+    """Return twists (N, 6) with the axes of the base, from those of the world."""
+    return np.hstack([in_base(quaternion, twist[:, :3]), in_base(quaternion, twist[:, 3:])])
 
 
 def orientation_readings(quaternion: Array) -> dict[str, Array]:
@@ -266,7 +263,7 @@ def _check_readings(model: RobotModel, log: Log, feet: _Feet, q: Array) -> Itera
             changes = [words] if words else []
             changes += [_named_body(body)] if (body != one).any() else []
             changes += [_named_world(world)] if (world != one).any() else []
-            is_above, is_slow = direction @ up >= _ABOVE, is_moving and own < _BETTER * speed
+            is_above, is_slow = direction @ up >= _ABOVE, is_moving and own < _SLOWER * speed
             is_turned_back = height < -_ABOVE and is_above and own < speed + _MOVES
             remedy = _vertical(direction, gravity)
             if not changes or not (is_slow or (is_turned_back and changes == [words])):

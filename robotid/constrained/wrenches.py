@@ -135,17 +135,26 @@ def check_wrenches(
             residuals = scale * stated.residual, scale * x.residual
             yield from check_exchanged_steps(log.name, motion.t, residuals, x.exchanged, weight)
     yield from _check_missing(log.name, motion.t, stated.residual[:, :3], weight)
-    forces = torque[:, :3]
-    (torque,) = predict(replace(model, constraints=()), [model.standard_parameters()], whole)
-    J, basis = _base_rows(model, whole)
-    slopes = without_forces(basis, J.swapaxes(1, 2)).swapaxes(1, 2) * scale
-    left = without_forces(basis, torque[:, :6]) * scale
-    yield from check_delay(log.name, whole, slopes, left, delay)
+    yield from _check_clock(model, log.name, whole, scale, delay)
     offsets = []
     if log.base is not None and log.base.has_position:
         offsets = list(_check_offsets(model, log.name, whole, weight))
         yield from offsets
-    yield from _check_loads(model, log.name, motion, forces, weight, has_offsets=bool(offsets))
+    yield from _check_loads(
+        model, log.name, motion, torque[:, :3], weight, has_offsets=bool(offsets)
+    )
+
+
+def _check_clock(
+    model: RobotModel, name: str, motion: Trajectory, scale: Array, delay: float
+) -> Iterator[Finding]:
+    """Yield a finding if measured wrenches have a delay; ``scale`` gives the six rows one unit."""
+    (torque,) = predict(replace(model, constraints=()), [model.standard_parameters()], motion)
+    J, basis = _base_rows(model, motion)
+    slopes = without_forces(basis, J.swapaxes(1, 2)).swapaxes(1, 2) * scale
+    yield from check_delay(
+        name, motion, slopes, without_forces(basis, torque[:, :6]) * scale, delay
+    )
 
 
 def _check_offsets(

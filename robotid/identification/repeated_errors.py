@@ -87,8 +87,11 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
     start = WLS(mean, recordings.share).fit(whole.factors).theta
     pi = mapping.to_standard(start, prior, spread)
     c, d = 3 * len(points), 3 * bool(biases)
-    total, drifts, shift = Triangle(b + c + d + 1), [], np.zeros(b)
+    total, drifts = Triangle(b + c + d + 1), []
     step = max(1, int(0.5 / recordings.share))  # filtered rows in between add nothing
+    shift = _shift(recordings, start, step) if is_blind else np.empty((b, 0))
+    if not c + d:
+        return replace(recordings, repeated=RepeatedErrors(shift, 0.0, 0.0, has_motion=True))
     for log, frame in zip(recordings.fitted, frames, strict=True):
         pushed, segments = list[Array](), list[Array]()
         for piece in log.pieces:
@@ -101,18 +104,12 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
             if frame is not None:
                 pushed.append(_world_acceleration(rows.trajectory, biases[0]))
                 segments.append(rows.trajectory.segment)
-            if is_blind:
-                shift += step * _shift_of_motion(model, mapping, rows, start)
             problem = base_problem(model, mapping, rows.trajectory, rows.mask)
             for W, tau, weight in problem.blocks():
                 both = np.column_stack([W, -D[first : first + len(W)], tau])
                 total.fold(np.asfortranarray(both * np.sqrt(step * weight)[:, None]))
                 first += len(W)
         drifts += [mean_drift(np.concatenate(pushed), np.concatenate(segments))] if pushed else []
-    if not c + d:
-        return replace(
-            recordings, repeated=RepeatedErrors(shift[:, None], 0.0, 0.0, has_motion=True)
-        )
     stated = [model.contacts[k].uncertainty for k in points]
     if not whole.factors.rows[6 * model.free_flyer :].any():
         stated = [_MOST if each is None else each for each in stated]
@@ -127,14 +124,17 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
     roots[c:, c:] = np.linalg.cholesky(fit.covariance[c:, c:])
     rest = total.R[b:-1, b:-1] @ roots  # of D, what W cannot explain
     variance = float(np.sum(rest**2)) / count
-    root = np.column_stack([cross @ roots, shift]) if is_blind else cross @ roots
-    largest = float(roots[:c].max(initial=0.0))
+    root, largest = np.column_stack([cross @ roots, shift]), float(roots[:c].max(initial=0.0))
     errors = RepeatedErrors(root, variance, largest, has_motion=is_blind)
     if not d:
         return replace(recordings, repeated=errors)
     bias = biases[0] + fit.known[c:]
     error = float(np.sqrt(np.mean(np.diag(fit.covariance)[c:])))
-    errors = replace(errors, bias=bias, bias_error=error)
+    return _without_bias(recordings, replace(errors, bias=bias, bias_error=error), bias)
+
+
+def _without_bias(recordings: Recordings, errors: RepeatedErrors, bias: Array) -> Recordings:
+    """Return recordings with their errors, without the bias (3,) of accelerometers [m/s^2]."""
     return replace(
         recordings,
         repeated=errors,
@@ -263,6 +263,17 @@ def _slopes_of_bias(model: RobotModel, rows: Rows, pi: Array) -> Array:
     if rows.trajectory.basis is not None:
         D = without_forces(rows.trajectory.basis, D)
     return D.reshape(-1, 3)
+
+
+def _shift(recordings: Recordings, theta: Array, step: int) -> Array:
+    """Return the sum of ``_shift_of_motion`` over all logs, of every step-th row, shape (b, 1)."""
+    shift = np.zeros((len(theta), 1))
+    for log in recordings.fitted:
+        for rows in (piece.read() for piece in log.pieces):
+            own = replace(rows, trajectory=rows.trajectory.every(step), mask=rows.mask[::step])
+            found = _shift_of_motion(recordings.model, recordings.mapping, own, theta)
+            shift[:, 0] += step * found
+    return shift
 
 
 def _shift_of_motion(model: RobotModel, mapping: BaseMapping, rows: Rows, theta: Array) -> Array:
