@@ -3,6 +3,8 @@
     python benchmarks/bench_legged.py [--runs 20] [--robots go1 g1 talos cassie] [--unseen]
     python benchmarks/bench_legged.py --excite [--robots go1 talos] [--design 120]
     python benchmarks/bench_legged.py --flags [--robots go1 g1 talos] [--seconds 10]
+    python benchmarks/bench_legged.py --faults [--robots go1 g1 talos human human_soft icub]
+    python benchmarks/bench_legged.py --robots human human_soft icub --seconds 15
 
 A Go1 stands on point feet in MuJoCo at 0.1 ms with held torques, 18-bit encoders and 0.05 N m of
 torque noise; its joints follow multi-sines, its feet slip and lift at times. G1 and TALOS step in
@@ -14,8 +16,11 @@ those of an arm. With the recordings, a Solo12 that trots in PyBullet is identif
 half of its log: its URDF is the truth. With --unseen: joint torque of the last 30 % of a recording,
 fitted on the others. With --excite: a motion on the feet is designed and followed in MuJoCo by a
 position controller; slip and load of the feet, and the intervals by its log, beside a squat's.
-With --flags: how many contacts the doctor names, as delayed if all flags of a log are, and as
-slipping on the ground of the benchmark and on a slippery one.
+Without torques of joints: a human on two force shoes, also with errors of soft tissue, and
+an iCub that walks on the spot, of whose feet the vertical forces are measured.
+With --faults: how many logs with a wrong pose of the base, and with a wrong gain of one foot, the
+doctor names. With --flags: how many contacts it names, as delayed if all flags of a log are, and
+as slipping on the ground of the benchmark and on a slippery one.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -30,13 +35,16 @@ from dataclasses import replace
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import pinocchio as pin
 from scipy.interpolate import CubicSpline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers import cassie
+from helpers.humans import FEET as SHOES
+from helpers.humans import PARTS, Walk, forces, human_urdf, logged, walk, with_other_segments
 from helpers.legged import followed, recorded, with_other_bodies
 from helpers.paths import JOBS
-from helpers.walkers import G1, TALOS
+from helpers.walkers import G1, ICUB, TALOS, planned, waves
 
 from robotid.commands.identify import run_job
 from robotid.commands.job import read_job
@@ -112,11 +120,88 @@ class Cassie:
         self.log, self.truth = cassie.log, cassie.truth
 
 
+class Human:
+    """A human on two force shoes; see ``helpers.humans``."""
+
+    estimator, signals = AUTO_PRIOR, SignalSettings(cutoff=4.0)
+    other = staticmethod(with_other_segments)
+
+    def __init__(self, tissue=0.0):
+        self.tissue = tissue  # error of the position [m], of the angles 3 rad/m of it
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "human.urdf"
+            path.write_text(human_urdf())
+            contacts = [Contact(foot, "surface", PARTS, axes="link") for foot in SHOES]
+            self.model = RobotModel.from_urdf(
+                path, free_flyer=True, terms=(), constraints=contacts
+            )  # fmt: skip
+
+    def log(self, model, rng, duration):
+        motion = walk(model, model, rng, duration, rate=60.0)
+        log = logged(model, motion, rng)
+        if not self.tissue:
+            return log
+        soft = waves(rng, 6 + len(model.joints), 0.3, 2.0)(motion.t)
+        soft *= self.tissue / soft.std(axis=0) * np.where(np.arange(soft.shape[1]) < 3, 1.0, 3.0)
+        pose = log.base.pose.copy()
+        pose[:, :3] += soft[:, :3]
+        for row, turn in zip(pose, soft[:, 3:6], strict=True):
+            row[3:] = (pin.Quaternion(row[3:]) * pin.Quaternion(pin.exp3(turn))).coeffs()
+        return replace(log, q=log.q + soft[:, 6:], base=replace(log.base, pose=pose))
+
+    def truth(self, model):
+        return model.standard_parameters()
+
+
+class Icub:
+    """An iCub that steps on the spot, with vertical forces of its feet only."""
+
+    estimator, signals = AUTO_PRIOR, SignalSettings(cutoff=4.0)
+
+    def __init__(self):
+        still = ("wrist", "hand", "thumb", "index", "middle", "pinkie", "eye", "neck_yaw")
+        contacts = [Contact(foot, measured=("fz",), threshold=10.0) for foot in ICUB.feet]
+        every = RobotModel.from_urdf(example_urdf(ICUB.urdf), free_flyer=True).joints
+        self.model = RobotModel.from_urdf(
+            example_urdf(ICUB.urdf), free_flyer=True, terms=(), constraints=contacts,
+            joints=[x for x in every if not any(part in x for part in still)],
+        )  # fmt: skip
+
+    def log(self, model, rng, duration):
+        """Return the log; the vertical forces are those of the centre of pressure."""
+        _, times, places, _, lifts = planned(ICUB, model, rng, duration)
+        at, t = CubicSpline(times, places), np.arange(0.0, duration, 0.01)
+
+        def q_at(t):
+            q = at(t)
+            q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
+            return q
+
+        total, feet = forces(model.pin_model, q_at, t, ICUB.feet)
+        pressure = np.column_stack([-total[:, 4], total[:, 3]]) / total[:, 2:3]
+        soles = np.array([[place.translation[:2] for place in row] for row in feet])
+        line = soles[:, 0] - soles[:, 1]
+        left = np.sum((pressure - soles[:, 1]) * line, axis=1) / np.sum(line**2, axis=1)
+        up = np.array([np.interp(t, times, lift) > 1e-9 for lift in lifts])
+        left = np.where(up[0], 0.0, np.where(up[1], 1.0, left.clip(0.0, 1.0)))
+        motion = Walk(t, q_at(t), np.zeros((len(t), 2, 6)), feet)
+        bare = logged(model, motion, rng, noise=(5e-4, 1e-3, 0.0, 0.0), frames=ICUB.feet)
+        vertical = np.stack([left, 1.0 - left]) * total[:, 2] + rng.standard_normal((2, len(t)))
+        own = {f"fz {foot}": f for foot, f in zip(ICUB.feet, vertical, strict=True)}
+        flags = {foot: f > 10.0 for foot, f in zip(ICUB.feet, vertical, strict=True)}
+        return replace(bare, wrenches=own, contacts=flags)
+
+    def truth(self, model):
+        return model.standard_parameters()
+
+
 PLANTS = {
     "go1": Go1, "go1_consistent": lambda: Go1("consistent"),
     "go1_still": lambda: Go1("consistent", 0.3),
     "g1": lambda: Walker(G1), "talos": lambda: Walker(TALOS), "cassie": Cassie,
+    "human": Human, "human_soft": lambda: Human(5e-3), "icub": Icub,
 }  # fmt: skip
+WITH_TORQUES = [name for name in PLANTS if name not in ("human", "human_soft", "icub")]
 
 
 def of_urdf(seed):
@@ -129,33 +214,44 @@ def coverage(name, seeds, duration):
     model = plant.model
     truth, n = plant.truth(model), model.layout.n_inertial
     print(
-        f"{name}\n{'run':>4} {'covered':>8} {'of':>4} {'rms z':>6} {'total mass [kg]':>16} {'s':>6}"
+        f"{name}\n{'run':>4} {'covered':>8} {'of':>4} {'rms z':>6} {'masses':>8} "
+        f"{'total mass [kg]':>16} {'its z':>6} {'s':>6}"
     )
-    shares = []
+    shares, of_masses = [], []
+    others, signals = getattr(plant, "other", with_other_bodies), getattr(plant, "signals", SIGNALS)
     for seed in seeds:
         rng = np.random.default_rng(seed)
         log = plant.log(model, rng, duration)
-        other, start = with_other_bodies(model, of_urdf(seed)), time.process_time()
+        other, start = others(model, of_urdf(seed)), time.process_time()
         try:
             found = identify(
-                other, log, signals=SIGNALS, estimator=plant.estimator, friction="none",
+                other, log, signals=signals, estimator=plant.estimator, friction="none",
                 doctor=False,
             )  # fmt: skip
         except (RankDeficientError, NotConvergedError) as error:
             print(f"{seed:4} {str(error)[:60]}")
             continue
         spent = time.process_time() - start
-        is_body = found.mapping.independent < n
-        z = ((found.base - found.mapping.K @ truth) / found.base_error)[is_body]
-        mass = found.standard[:n:10].sum()
+        is_body = (found.mapping.independent < n) & (found.base_error > 0.0)  # not negligible links
+        z = (found.base - found.mapping.K @ truth)[is_body] / found.base_error[is_body]
+        masses = slice(0, n, 10)
+        mass, error = found.standard[masses].sum(), found.standard_covariance[masses, masses].sum()
+        low, high = found.standard_interval[masses].T
+        own = truth[masses]
+        is_free = high - low > 1e-6 * own.sum()  # links of negligible mass keep the URDF's
+        of_masses.append(np.mean(((low <= own) & (own <= high))[is_free]))
         shares.append(np.mean(np.abs(z) < found.errors.quantile[is_body]))
         print(
             f"{seed:4} {100 * shares[-1]:7.0f}% {len(z):4} {np.sqrt(np.mean(z**2)):6.2f} "
-            f"{mass:16.3f} {spent:6.1f}",
+            f"{100 * of_masses[-1]:7.0f}% {mass:16.3f} {(mass - own.sum()) / np.sqrt(error):6.2f} "
+            f"{spent:6.1f}",
             flush=True,
         )
     if shares:
-        print(f"mean {100 * np.mean(shares):7.0f}%, wanted 90 to 98 %")
+        print(
+            f"mean {100 * np.mean(shares):7.1f}%, of masses {100 * np.mean(of_masses):.1f} %, "
+            f"wanted 90 to 98 %; total mass true {truth[:n:10].sum():.3f} kg"
+        )
 
 
 def trot():
@@ -269,6 +365,47 @@ def flags(name, seeds, duration):
                 f"{name}, friction {friction:g}, slides by {100 * low:g} to {100 * high:g} cm: "
                 f"{sum(own)} of {len(own)} contacts named"
             )
+
+
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+QUARTER, BACK = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), [-1, -1, -1, 1]
+#: Poses x y z qx qy qz qw (N, 7) as another tool or a wrong reading has them.
+POSES = {
+    "none": lambda x: x,
+    "qw qx qy qz": lambda x: np.hstack([x[:, :3], np.roll(x[:, 3:], 1, axis=1)]),
+    "inverse quaternion": lambda x: np.hstack([x[:, :3], x[:, 3:] * BACK]),
+    "y up": lambda x: posed(x, Y_UP, lambda R: Y_UP @ R),
+    "y up, base too": lambda x: posed(x, Y_UP, lambda R: Y_UP @ R @ Y_UP.T),
+    "y up, position only": lambda x: posed(x, Y_UP, lambda R: R),
+    "base turned by 90 deg": lambda x: posed(x, np.eye(3), lambda R: R @ QUARTER),
+    "y reversed": lambda x: posed(x, np.diag([1.0, -1.0, 1.0]), lambda R: R),
+}
+
+
+def posed(pose, place, turn):
+    """Return a pose whose position has other axes, and whose rotation matrices are changed."""
+    own = [pin.Quaternion(turn(pin.Quaternion(x).matrix())).coeffs() for x in pose[:, 3:]]
+    return np.hstack([pose[:, :3] @ place.T, np.array(own)])
+
+
+def faults(name, seeds, duration):
+    """Print how many logs with a wrong pose, or a wrong gain of one foot, the doctor names."""
+    plant, counts = PLANTS[name](), {}
+    others, signals = getattr(plant, "other", with_other_bodies), getattr(plant, "signals", SIGNALS)
+    for seed in seeds:
+        log = plant.log(plant.model, np.random.default_rng(seed), duration)
+        other = others(plant.model, of_urdf(seed))
+        for label, change in POSES.items():
+            wrong = replace(log, base=replace(log.base, pose=change(log.base.pose)))
+            codes = [x.code for x in check_base(other, wrong, signals) if x.severity == "error"]
+            counts.setdefault(label, []).append("base_orientation" in codes)
+        for foot in [x.frame for x in plant.model.contacts if x.measured]:
+            for gain in (1.0, 1.1, 1.3):
+                own = {x: f * (gain if x.endswith(foot) else 1.0) for x, f in log.wrenches.items()}
+                codes = [x.code for x in check_base(other, replace(log, wrenches=own), signals)]
+                counts.setdefault(f"gain {gain:g}", []).append("wrench_gain" in codes)
+    for label, own in counts.items():
+        print(f"{name}, {label}: {sum(own)} of {len(own)} named", flush=True)
 
 
 #: Posture, soles, lifted feet of each design and joints that lift them, gains.
@@ -443,10 +580,11 @@ def main():
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--first", type=int, default=0, help="number of the first run")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of each recording")
-    parser.add_argument("--robots", nargs="+", choices=PLANTS, default=[*PLANTS])
+    parser.add_argument("--robots", nargs="+", choices=PLANTS, default=WITH_TORQUES)
     parser.add_argument("--unseen", action="store_true", help="only errors on unseen motion")
     parser.add_argument("--excite", action="store_true", help="only designed motions on the feet")
     parser.add_argument("--design", type=float, default=120.0, help="seconds of each design")
+    parser.add_argument("--faults", action="store_true", help="only wrong poses and gains")
     parser.add_argument("--flags", action="store_true", help="only delays of flags, and slips")
     options = parser.parse_args()
     if options.excite:
@@ -455,14 +593,16 @@ def main():
         return
     runs, seconds = (1, 4.0) if options.quick else (options.runs, options.seconds)
     for name in ("go1", "g1", "cassie") if options.quick else options.robots:
-        if options.flags:
+        if options.faults:
+            faults(name, range(options.first, options.first + runs), seconds)
+        elif options.flags:
             flags(name, range(options.first, options.first + runs), seconds)
         elif options.unseen:
             for seed in range(options.first, options.first + runs):
                 unseen(name, seed, seconds)
         else:
             coverage(name, range(options.first, options.first + runs), seconds)
-    if not (options.unseen or options.flags):
+    if not (options.unseen or options.flags or options.faults):
         if "ROBOTID_DATA" in os.environ:
             trot()
         speed(6.0)

@@ -433,6 +433,7 @@ _AS_FOUND = (
     "unmounted_part",
     "unsigned_torque",
     "wrench_delay",
+    "wrench_gain",
     "wrench_offset",
 )
 #: Codes that name the cause of an error of a joint, and codes that state the error only.

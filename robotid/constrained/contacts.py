@@ -1,4 +1,4 @@
-"""Checks of a floating base and of contacts: axes of the twist, flags, gravity, forces."""
+"""Checks of a floating base and of contacts: pose, twist, flags, gravity, forces."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -8,14 +8,13 @@ import numpy as np
 from scipy.special import stdtrit
 
 from robotid._typing import Array
-from robotid.constrained.base_pose import check_order, check_pose, check_unit
+from robotid.constrained.base_pose import check_order, check_pose, check_twist, check_unit
 from robotid.constrained.found_contacts import with_contacts
 from robotid.constrained.imu import check_imu
-from robotid.constrained.slips import check_slip, rms, without_zeros
+from robotid.constrained.slips import check_slip, without_zeros
 from robotid.constrained.wrenches import check_wrenches
 from robotid.exceptions import DataError
 from robotid.findings import Finding, listed, log_finding
-from robotid.logs.base import base_state, in_base
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
@@ -25,9 +24,6 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["check_base", "flag_delay"]
 
-_UNLIKE = 0.3  # of the motion: a measured velocity that differs by more is wrong
-_BETTER = 0.5  # ... and is of other axes if these reduce the difference below this share
-_MOVES = 1e-3  # [m/s or rad/s] RMS from which velocities are compared
 _LONGEST = 0.15  # [s] delay of contact flags that is searched for
 _NEAR = 0.075  # [s] distance of a change of motion from the delay of most changes
 _STOPS = 1e-3  # of the largest speed: smaller ones are alike
@@ -50,34 +46,37 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         log: The log.
         signals: How the log becomes a trajectory.
     """
-    if log.base is not None and log.base.twist is not None and log.base.imu is None:
-        yield from _check_axes(log)
     imu = None if log.base is None else log.base.imu
     if wrong := list(check_unit(log)):
         yield from wrong
         return
     if imu is None:
         yield from check_pose(log)
+    twist = check_twist(log, signals)
     if not model.contacts and imu is None:
+        yield from twist
         return
     still = replace(signals, velocity="differentiated", acceleration="differentiated")
     try:
-        whole = with_contacts(model, log, signals)
+        motion = process(log, still)
+        wrong = list(check_order(model, log, motion))
+        whole = log if wrong else with_contacts(model, log, signals)
         motion = process(whole, still)
     except DataError:  # too short, or no contacts: raised again when the log is read
+        yield from twist
+        return
+    yield from wrong or twist
+    if wrong:
         return
     for note in whole.notes[len(log.notes) :]:
         yield log_finding(log.name, "log_note", "note", note)
     flags = _flags(model, log, whole, motion.t)
-    if wrong := list(check_order(model, whole, still, motion, flags)):
-        yield from wrong
-        return
     J, turn = _contact_jacobian(model, motion.q)
     wrong = []
     if imu is not None:
         wrong = list(check_imu(whole, motion, _of_pairs(J, flags, motion.v)))
         yield from wrong
-        if any(finding.code == "imu_axes" for finding in wrong):
+        if any(finding.code in ("imu_axes", "base_orientation") for finding in wrong):
             return
     if not model.contacts:
         return
@@ -203,36 +202,6 @@ def _contact_jacobian(model: RobotModel, q: Array) -> tuple[Array, Array]:
     J[:, :, 0] -= radius * J[:, :, 4]  # v + w x (0, 0, -radius)
     J[:, :, 1] += radius * J[:, :, 3]
     return J[:, :, :3], J[:, :, 3:]
-
-
-def _check_axes(log: Log) -> Iterator[Finding]:
-    """Yield a finding if the measured twist is not that of the pose, with the axes of the base."""
-    base = log.base
-    if base is None or base.twist is None:
-        return
-    _, own, _ = base_state(log.t, base.pose, None, None)
-    quaternion = base.pose[:, 3:]
-    for part, unit in ((slice(0, 3), "m/s"), (slice(3, 6), "rad/s")):
-        measured, wanted = base.twist[:, part], own[:, part]
-        size = rms(wanted)
-        off = rms(measured - wanted)
-        if size < _MOVES or off < _UNLIKE * size:
-            continue
-        what = "linear" if unit == "m/s" else "angular"
-        turned = rms(in_base(quaternion, measured) - wanted)
-        message = (
-            f"the measured {what} velocity of the base differs by {off:.2g} {unit} from that of "
-            f"its pose, {size:.2g} {unit} (RMS)"
-        )
-        if turned < _BETTER * off:
-            message += (
-                f"; read with the axes of the world it differs by {turned:.2g} {unit}. State twist "
-                "= 'world' in [base]"
-            )
-        else:
-            message += ". Check the columns base_vx to base_wz, or remove them"
-        evidence = {"off": off, "size": size, "off_world": turned}
-        yield log_finding(log.name, "base_twist", "error", message, **evidence)
 
 
 def _check_flags(

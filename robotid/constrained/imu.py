@@ -5,6 +5,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from robotid._typing import Array
+from robotid.constrained.base_pose import orientation_readings
+from robotid.constrained.slips import rms
 from robotid.findings import Finding, log_finding
 from robotid.logs.base import base_state, in_base
 from robotid.logs.data import Log, Trajectory
@@ -38,9 +40,34 @@ def check_imu(log: Log, motion: Trajectory, legs: tuple[Array, Array]) -> Iterat
     frame, w = log.base.imu.frame, motion.v[:, 3:6]
     turned = np.broadcast_to(np.eye(3), (len(w), 3, 3))
     own = base_state(motion.t, motion.q[:, :7], None, None)[1][:, 3:]
-    found = list(_check_axes(log, frame, w, turned, -own, _BY_ORIENTATION))
+    found = list(_check_orientation(log, motion, own))
+    found = found or list(_check_axes(log, frame, w, turned, -own, _BY_ORIENTATION))
     yield from found or _check_axes(log, frame, w, *legs, "from the links in contact")
     yield from _check_gravity(log, frame, motion)
+
+
+def _check_orientation(log: Log, motion: Trajectory, own: Array) -> Iterator[Finding]:
+    """Yield a finding if the gyroscopes agree with another reading of the quaternion only.
+
+    ``own`` is the angular velocity by the quaternion as logged, shape (N, 3) [rad/s].
+    """
+    w, place = motion.v[:, 3:6], motion.q[:, :3]
+    now, size = rms(w - own), rms(own)
+    if rms(w) < _MOVES or now <= _UNLIKE * size:
+        return
+    readings = {
+        words: rms(w - base_state(motion.t, np.hstack([place, q]), None, None)[1][:, 3:])
+        for words, q in orientation_readings(motion.q[:, 3:7]).items()
+    }
+    words = min(readings, key=lambda x: readings[x])
+    if readings[words] > _UNLIKE * size:
+        return
+    message = (
+        f"the angular velocity of the IMU differs by {now:.2g} rad/s (RMS) from that of the "
+        f"quaternion of the base, with another one by {readings[words]:.2g} rad/s: {words}"
+    )
+    evidence = {"speed": now, "best": readings[words]}
+    yield log_finding(log.name, "base_orientation", "error", message, **evidence)
 
 
 def _check_axes(

@@ -16,9 +16,12 @@ from robotid.constrained.slips import rms
 from robotid.constrained.wrench_times import (
     check_delay,
     check_exchanged_steps,
+    check_gains,
+    check_level,
     check_offsets,
 )
 from robotid.findings import Finding, listed, log_finding
+from robotid.logs.base import in_base
 from robotid.logs.data import Log, Trajectory
 from robotid.regressor.constraints import (
     constraint_jacobian,
@@ -132,13 +135,26 @@ def check_wrenches(
             residuals = scale * stated.residual, scale * x.residual
             yield from check_exchanged_steps(log.name, motion.t, residuals, x.exchanged, weight)
     yield from _check_missing(log.name, motion.t, stated.residual[:, :3], weight)
-    (torque,) = predict(replace(model, constraints=()), [model.standard_parameters()], whole)
-    J, basis = _base_rows(model, whole)
-    slopes = without_forces(basis, J.swapaxes(1, 2)).swapaxes(1, 2) * scale
-    left = without_forces(basis, torque[:, :6]) * scale
-    yield from check_delay(log.name, whole, slopes, left, delay)
+    yield from _check_clock(model, log.name, whole, scale, delay)
+    offsets = []
     if log.base is not None and log.base.has_position:
-        yield from _check_offsets(model, log.name, whole, weight)
+        offsets = list(_check_offsets(model, log.name, whole, weight))
+        yield from offsets
+    yield from _check_loads(
+        model, log.name, motion, torque[:, :3], weight, has_offsets=bool(offsets)
+    )
+
+
+def _check_clock(
+    model: RobotModel, name: str, motion: Trajectory, scale: Array, delay: float
+) -> Iterator[Finding]:
+    """Yield a finding if measured wrenches have a delay; ``scale`` gives the six rows one unit."""
+    (torque,) = predict(replace(model, constraints=()), [model.standard_parameters()], motion)
+    J, basis = _base_rows(model, motion)
+    slopes = without_forces(basis, J.swapaxes(1, 2)).swapaxes(1, 2) * scale
+    yield from check_delay(
+        name, motion, slopes, without_forces(basis, torque[:, :6]) * scale, delay
+    )
 
 
 def _check_offsets(
@@ -155,6 +171,39 @@ def _check_offsets(
             own = motion.wrenches[:, first:last]
             yield from check_offsets(name, x.frame, speeds[:, k], own, x.measured, weight)
         first = last
+
+
+def _check_loads(
+    model: RobotModel, name: str, motion: Trajectory, left: Array, weight: float, *,
+    has_offsets: bool,
+) -> Iterator[Finding]:  # fmt: skip
+    """Yield findings on the force of the base alone: gain of a foot, mean horizontal force.
+
+    Args:
+        model: The robot.
+        name: Name of the log.
+        motion: Its motion, with wrenches.
+        left: Force of the base that the bodies cause, shape (N, 3) [N].
+        weight: Weight of the robot [N].
+        has_offsets: Whether offsets of sensors are known: they cause a horizontal force.
+    """
+    if motion.wrenches is None:
+        return
+    J, basis = _base_rows(model, motion, 3)
+    edges = np.cumsum([0, *(len(x.measured) for x in model.contacts)])
+    loads = np.stack(
+        [np.einsum("kmj,km->kj", J[:, i:j], motion.wrenches[:, i:j]) for i, j in pairwise(edges)],
+        axis=2,
+    )
+    loads, left = without_forces(basis, loads), without_forces(basis, left)
+    feet = [k for k, x in enumerate(model.contacts) if rms(loads[:, :, k]) > 0.0]
+    frames = [model.contacts[k].frame for k in feet]
+    found = list(check_gains(name, frames, loads[:, :, feet], left))
+    yield from found
+    if not (found or has_offsets or basis.any()):
+        back = motion.q[:, 3:7] * np.array([-1.0, -1.0, -1.0, 1.0])
+        gravity: Array = model.pin_model.gravity.linear
+        yield from check_level(name, in_base(back, loads.sum(axis=2) - left), gravity, weight)
 
 
 def _check_missing(name: str, t: Array, residual: Array, weight: float) -> Iterator[Finding]:
@@ -253,13 +302,16 @@ def _fitted(
     yield _Reading((*changes, words), feet, factor, left - factor * caused, size)
 
 
-def _base_rows(model: RobotModel, motion: Trajectory) -> tuple[Array, Array]:
-    """Return rows of the base per measured component (N, m, 6), and the basis of unknown forces."""
-    J = constraint_jacobian(model, motion.q, touching(model, motion))[:, :, :6]
+def _base_rows(model: RobotModel, motion: Trajectory, rows: int = 6) -> tuple[Array, Array]:
+    """Return rows of the base per measured component, and the basis of unknown forces.
+
+    The shape is (N, m, rows); the first three rows are those of its force.
+    """
+    J = constraint_jacobian(model, motion.q, touching(model, motion))[:, :, :rows]
     known, first = list[int](), 0
     for x in model.constraints:
         if isinstance(x, Contact):
             known += [first + k for k in x.rows_measured]
         first += x.sizes[x.kind]
-    used = np.ones((len(J), 6), dtype=bool)
+    used = np.ones((len(J), rows), dtype=bool)
     return J[:, known], force_basis(np.delete(J, known, axis=1), used, floats=True)

@@ -1,4 +1,4 @@
-"""Errors of points of contact and of an IMU that repeat, which are errors of the parameters.
+"""Errors of contacts, an IMU and the motion of the base that do not average out.
 
 A force f that acts x beside the stated point adds J_w^T (x x f) to the torque, with the Jacobian
 J_w of the link's rotation. Links of other lengths, feet that are deformed, or are not balls, cause
@@ -18,7 +18,14 @@ the score the covariance D Cov(b) D^T is left, as of partitioned least squares. 
 robot hardly moves away, so its mean acceleration in the world is that of the bias, or of a tilted
 orientation.
 
+Without torques of joints the residual is mostly an error of the motion, as of soft tissue under
+markers. It is in the regressor, too, E beside W: the score has the mean -E^T E theta, least squares
+underestimates the mass by about three times the squared ratio of residual and weight, and neither
+more data nor the scatter of the segments show it. E is taken to be the error of the acceleration of
+the base that would cause the residual; its effect is counted as an error.
+
 References:
+    Carroll, Ruppert, Stefanski, Crainiceanu (2006), Measurement Error in Nonlinear Models.
     Bishop (2006), Pattern Recognition and Machine Learning, section 3.5 (evidence).
 """
 
@@ -36,6 +43,7 @@ from robotid.fitting.survey import Rows, SurveyedLog
 from robotid.logs.base import in_base
 from robotid.logs.data import Trajectory
 from robotid.logs.imu import ImuFrame
+from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.constraints import constraint_forces, contact_links, without_forces
 from robotid.regressor.factors import join, triangle_of
 from robotid.regressor.lapack import Triangle
@@ -49,14 +57,15 @@ __all__ = ["with_repeated_errors"]
 
 _LEAST, _MOST, _TRIED = 1e-6, 0.02, 40  # [m] bounds of s, values that are compared first
 _WIDER = 1e3  # factor of the prior standard deviations: wrong masses of a URDF are no offsets
+_RANK = 1e-6  # of the inertia of the whole robot: forces of all its axes are not always known
 _STEPS, _SETTLED = 20, 1e-3  # steps of noise level and s, relative change of s at their end
 
 
 def with_repeated_errors(recordings: Recordings) -> Recordings:
-    """Return recordings with the covariance of the score due to contacts and accelerometers.
+    """Return recordings with the covariance of the score due to contacts, accelerometers, motion.
 
-    Surfaces have no such errors: their moments are measured, or unknown. The bias of accelerometers
-    is subtracted.
+    Surfaces have no errors of their points: their moments are measured, or unknown. The bias of
+    accelerometers is subtracted. Errors of the motion count without torques of joints.
 
     Args:
         recordings: The recordings.
@@ -69,7 +78,8 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
     points = [k for k in points if model.contacts[k].uncertainty != 0.0]
     frames = [_frame(log) for log in recordings.fitted]
     biases = [x.offset if x.offset is not None else np.zeros(3) for x in frames if x is not None]
-    if not points and not biases:
+    is_blind = model.free_flyer and not any(log.head.has_torque for log in recordings.fitted)
+    if not (points or biases or is_blind):
         return recordings
     whole, prior = join(recordings.reduce(is_cut=False)), model.standard_parameters()
     spread = prior_spread(model, whole.squares, whole.samples)
@@ -79,6 +89,9 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
     c, d = 3 * len(points), 3 * bool(biases)
     total, drifts = Triangle(b + c + d + 1), []
     step = max(1, int(0.5 / recordings.share))  # filtered rows in between add nothing
+    shift = _shift(recordings, start, step) if is_blind else np.empty((b, 0))
+    if not c + d:
+        return replace(recordings, repeated=RepeatedErrors(shift, 0.0, 0.0, has_motion=True))
     for log, frame in zip(recordings.fitted, frames, strict=True):
         pushed, segments = list[Array](), list[Array]()
         for piece in log.pieces:
@@ -111,12 +124,17 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
     roots[c:, c:] = np.linalg.cholesky(fit.covariance[c:, c:])
     rest = total.R[b:-1, b:-1] @ roots  # of D, what W cannot explain
     variance = float(np.sum(rest**2)) / count
-    errors = RepeatedErrors(cross @ roots, variance, float(roots[:c].max(initial=0.0)))
+    root, largest = np.column_stack([cross @ roots, shift]), float(roots[:c].max(initial=0.0))
+    errors = RepeatedErrors(root, variance, largest, has_motion=is_blind)
     if not d:
         return replace(recordings, repeated=errors)
     bias = biases[0] + fit.known[c:]
     error = float(np.sqrt(np.mean(np.diag(fit.covariance)[c:])))
-    errors = replace(errors, bias=bias, bias_error=error)
+    return _without_bias(recordings, replace(errors, bias=bias, bias_error=error), bias)
+
+
+def _without_bias(recordings: Recordings, errors: RepeatedErrors, bias: Array) -> Recordings:
+    """Return recordings with their errors, without the bias (3,) of accelerometers [m/s^2]."""
     return replace(
         recordings,
         repeated=errors,
@@ -245,6 +263,43 @@ def _slopes_of_bias(model: RobotModel, rows: Rows, pi: Array) -> Array:
     if rows.trajectory.basis is not None:
         D = without_forces(rows.trajectory.basis, D)
     return D.reshape(-1, 3)
+
+
+def _shift(recordings: Recordings, theta: Array, step: int) -> Array:
+    """Return the sum of ``_shift_of_motion`` over all logs, of every step-th row, shape (b, 1)."""
+    shift = np.zeros((len(theta), 1))
+    for log in recordings.fitted:
+        for rows in (piece.read() for piece in log.pieces):
+            own = replace(rows, trajectory=rows.trajectory.every(step), mask=rows.mask[::step])
+            found = _shift_of_motion(recordings.model, recordings.mapping, own, theta)
+            shift[:, 0] += step * found
+    return shift
+
+
+def _shift_of_motion(model: RobotModel, mapping: BaseMapping, rows: Rows, theta: Array) -> Array:
+    """Return E^T E theta, the mean of the score due to errors E of the regressor, shape (b,).
+
+    The errors of the acceleration of the base are those that cause the residual, sample by sample.
+
+    Args:
+        model: The robot.
+        mapping: Standard to base parameters.
+        rows: Its motion, and the rows used.
+        theta: Base parameters, shape (b,).
+    """
+    motion, shift = rows.trajectory, np.zeros(len(theta))
+    pushed = [replace(motion, a=motion.a + np.eye(1, model.n_rows, k)) for k in range(6)]
+    problems = [base_problem(model, mapping, x, rows.mask).blocks() for x in (motion, *pushed)]
+    for (W, tau, weight), *others in zip(*problems, strict=True):
+        root = np.sqrt(weight)[:, None]
+        G = np.stack([root * (own - W) for own, *_ in others], axis=1)  # (m, 6, b) per m/s^2
+        G = G.reshape(-1, model.n_rows, *G.shape[1:])
+        residual = (root[:, 0] * (tau - W @ theta)).reshape(-1, model.n_rows)
+        A = G @ theta  # (n, n_rows, 6), inertia of the whole robot
+        e = (np.linalg.pinv(A, rcond=_RANK) @ residual[..., None])[..., 0]
+        E = np.einsum("nric,ni->nrc", G, e)
+        shift += np.einsum("nrc,nr->c", E, E @ theta)
+    return shift
 
 
 def _world_acceleration(motion: Trajectory, bias: Array) -> Array:

@@ -88,7 +88,8 @@ _REASONS = {
     "unlike_run": "the log differs from the other logs",
     "unlike_unit": "the robot differs from the other robots",
     "wrench_delay": "measured forces of the ground lag the motion by {delay:+.3f} s",
-    "wrench_offset": "the sensor of a foot measures a wrench in the air",
+    "wrench_gain": "the force of a foot must be multiplied by {factor:.3g} relative to the others",
+    "wrench_offset": "measured forces of the ground have an offset",
     "unsigned_torque": "the torque may be a magnitude without sign",
     "unmounted_part": "{mass:.2g} kg of the URDF's last link were probably not mounted",
     "urdf_mismatch": "the torques do not fit the URDF's masses: the URDF may be of another robot "

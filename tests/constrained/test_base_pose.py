@@ -7,11 +7,14 @@ import pinocchio as pin
 import pytest
 from helpers.humans import FEET, human_urdf, logged, walk
 
-from robotid.constrained.base_pose import check_pose, check_unit
+from robotid.constrained.base_pose import check_pose, check_twist, check_unit
 from robotid.constrained.contacts import check_base
-from robotid.logs.base import BaseMotion
+from robotid.logs.base import BaseMotion, base_state, in_base, quaternions_of_angles
+from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
-from robotid.robot.constraints import Contact
+from robotid.logs.signals import process
+from robotid.robot.constraints import Contact, link_positions
+from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 SLOW = SignalSettings(cutoff=4.0)
@@ -148,3 +151,133 @@ def test_a_turn_of_the_tag_is_found_and_one_in_a_gap_is_not(log):
     after[151:, 0] -= 0.1  # the step after a gap has no step before it
     assert list(check_pose(replace(log, base=BaseMotion(after))))
     assert not list(check_pose(replace(log, t=apart, base=BaseMotion(after))))
+
+
+Y_UP = pin.rpy.rpyToMatrix(-np.pi / 2, 0.0, 0.0)  # z becomes y
+QUARTER = pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2)
+MIRROR = np.eye(3)[[0, 2, 1]]  # y and z exchanged: left-handed
+
+
+@pytest.mark.parametrize(
+    ("place", "turn", "words"),
+    [
+        (Y_UP, lambda R: R, ["replace base_x, base_y, base_z by base_x, -base_z, base_y"]),
+        (np.diag([1.0, -1.0, 1.0]), lambda R: R, ["by base_x, -base_y, base_z"]),
+        (np.eye(3), lambda R: R @ QUARTER.T,
+         ["base in the log are -y, x, z of its link: add a link with these axes"]),
+        (Y_UP, lambda R: Y_UP @ R @ Y_UP.T,
+         ["are x, z, -y of its link", "state gravity = [0, -9.81, 0]"]),
+        (MIRROR, lambda R: MIRROR @ R @ MIRROR,
+         ["are x, z, y of its link, left-handed", "state gravity = [0, -9.81, 0]"]),
+    ],
+)  # fmt: skip
+def test_axes_of_another_tool_are_named(robot, log, place, turn, words):
+    pose = log.base.pose.copy()
+    pose[:, :3] = pose[:, :3] @ place.T
+    pose[:, 3:] = [pin.Quaternion(turn(pin.Quaternion(x).matrix())).coeffs() for x in pose[:, 3:]]
+    (found,) = check_base(robot, replace(log, base=BaseMotion(pose)), SLOW)
+    assert (found.code, found.severity) == ("base_orientation", "error")
+    assert all(text in found.message for text in words)
+    assert ("gravity" in found.message) == (len(words) == 2)
+    assert found.evidence["best"] < 0.1 < 2.0 * found.evidence["speed"]
+
+
+def test_contacts_need_not_be_known_to_name_another_order(robot, log):
+    unknown = replace(log, contacts={})  # not found either: the log has no torque
+    assert not list(check_base(robot, unknown, SLOW))
+    (found,) = check_base(robot, with_quaternion(unknown, lambda q: np.roll(q, 1, axis=1)), SLOW)
+    assert "its order is qw qx qy qz: state" in found.message
+
+
+def test_the_speed_of_feet_is_the_mean_of_the_slower_one(robot, log):
+    """With the inverse quaternion, by finite differences of the places of the feet."""
+    wrong = with_quaternion(log, lambda q: q * [-1.0, -1.0, -1.0, 1.0])
+    (found,) = check_base(robot, wrong, SLOW)
+    speeds = []
+    for own in (wrong, log):
+        motion = process(own, replace(SLOW, velocity="differentiated"))
+        feet = link_positions(robot.pin_model, robot.configurations(motion.q), FEET)
+        v = np.linalg.norm(np.gradient(feet, motion.t, axis=0), axis=2)
+        speeds.append(v.min(axis=1).mean())
+    assert [found.evidence[x] for x in ("speed", "best")] == pytest.approx(speeds, rel=0.02)
+    low, high = sorted(f"{x:.2g} m/s" for x in speeds)
+    assert f"move at {high} (mean) below the base, else at {low} below it" in found.message
+
+
+def test_inverted_flags_are_no_error_of_the_pose(robot, log):
+    inverted = replace(log, contacts={foot: ~x for foot, x in log.contacts.items()})
+    assert "base_orientation" not in {x.code for x in check_base(robot, inverted, SLOW)}
+
+
+@pytest.fixture(scope="module")
+def free():
+    return RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True, terms=())
+
+
+def flight(free, noise=0.0):
+    """Return a log at 500 Hz with pose and right twist, with noise of the position [m]."""
+    t = 3.0 + 0.002 * np.arange(2000)
+    pose = np.zeros((len(t), 7))
+    pose[:, :3] = 0.1 * np.column_stack([np.sin(t), np.cos(2 * t), np.sin(3 * t)])
+    angles = np.column_stack([0.2 * np.sin(2 * t), 0.1 * np.cos(3 * t), 0.15 * np.sin(t)])
+    pose[:, 3:] = quaternions_of_angles(angles)
+    twist = base_state(t, pose, None, None)[1]
+    pose[:, :3] += noise * np.random.default_rng(0).standard_normal((len(t), 3))
+    q = np.zeros((len(t), 12))
+    return Log(t, q, q, free.joints, base=BaseMotion(pose, twist))
+
+
+def changed(log, linear=1.0, angular=1.0, turned=()):
+    """Return a log with a scaled twist, parts of it with the axes of the world."""
+    twist, back = log.base.twist.copy(), log.base.pose[:, 3:] * [-1.0, -1.0, -1.0, 1.0]
+    for part in turned:
+        twist[:, part] = in_base(back, twist[:, part])
+    return replace(log, base=replace(log.base, twist=twist * np.repeat([linear, angular], 3)))
+
+
+def test_noise_of_the_pose_is_no_error_of_the_twist(free):
+    assert not list(check_twist(flight(free, noise=5e-4), SignalSettings(cutoff=20.0)))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"linear": 1e3}, ["linear", "if it is in mm/s: convert it to m/s"]),
+        ({"angular": 180 / np.pi}, ["angular", "if it is in deg/s: convert it to rad/s"]),
+        ({"turned": [slice(0, 3)]},
+         ["linear", "State twist = 'world' in [base], and turn the angular velocity"]),
+    ],
+)  # fmt: skip
+def test_a_wrong_part_of_the_twist_is_named(free, change, words):
+    (found,) = check_twist(changed(flight(free), **change), SignalSettings(cutoff=20.0))
+    assert (found.code, found.severity) == ("base_twist", "error")
+    assert all(text in found.message for text in words)
+
+
+def test_axes_of_the_world_are_named_though_the_base_hardly_turns(free):
+    """By 0.1 rad: the velocities differ by less than 30 % of the motion."""
+    both = changed(flight(free), turned=[slice(0, 3), slice(3, 6)])
+    found = list(check_twist(both, SignalSettings(cutoff=20.0)))
+    assert len(found) == 2
+    for finding in found:
+        assert finding.message.endswith("State twist = 'world' in [base]")
+        assert 0.05 < finding.evidence["off"] / finding.evidence["size"] < 0.3
+
+
+def test_a_twist_that_was_turned_though_it_had_the_axes_of_the_base_is_named(free):
+    log = flight(free)
+    twist = np.hstack([in_base(log.base.pose[:, 3:], log.base.twist[:, k : k + 3]) for k in (0, 3)])
+    wrong = replace(log, base=replace(log.base, twist=twist))
+    found = list(check_twist(wrong, SignalSettings(cutoff=20.0)))
+    assert len(found) == 2
+    assert all("State twist = 'base' in [base]" in x.message for x in found)
+
+
+def test_a_right_twist_shows_that_the_quaternion_is_the_inverse(free):
+    log = flight(free)
+    pose = log.base.pose * [1, 1, 1, -1, -1, -1, 1]
+    inverse = replace(log, base=replace(log.base, pose=pose))
+    (found,) = check_base(free, inverse, SignalSettings(cutoff=20.0))
+    assert (found.code, found.severity) == ("base_orientation", "error")
+    assert "it is the orientation of the world in the base" in found.message
+    assert found.evidence["best"] < 0.02 * found.evidence["speed"]

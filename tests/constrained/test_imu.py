@@ -256,3 +256,24 @@ def test_the_turn_is_the_rotation_that_explains_the_motion():
     assert _named(tilt, Q) == "its axes are turned by 50 deg relative to those of the stated link"
     cycle = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # x is y, y -z, z -x
     assert _named(Q @ cycle @ Q.T, Q) == "its axes x, y, z are y, -z, -x of the stated link"
+
+
+@pytest.mark.parametrize("has_contacts", [True, False])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda q: np.roll(q, 1, axis=1), "its order is qw qx qy qz: state"),
+        (lambda q: q * [-1.0, -1.0, -1.0, 1.0], "it is the orientation of the world in the base"),
+    ],
+)
+def test_another_quaternion_is_named_without_a_position(robot, sway, change, words, has_contacts):
+    """By the feet relative to each other, or by the gyroscopes."""
+    log = without_position(sway)
+    pose = log.base.pose.copy()
+    pose[:, 3:] = change(pose[:, 3:])
+    model = robot if has_contacts else replace(robot, constraints=())
+    wrong = replace(log, base=replace(log.base, pose=pose))
+    found = [x for x in check_base(model, wrong, RAW) if x.code != "imu_gravity"]
+    assert [(x.code, x.severity) for x in found] == [("base_orientation", "error")]
+    assert words in found[0].message
+    assert found[0].evidence["best"] < 0.02 * found[0].evidence["speed"]

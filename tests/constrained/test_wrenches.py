@@ -9,8 +9,9 @@ from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_seg
 
 from robotid.constrained import wrenches
 from robotid.constrained.contacts import check_base
-from robotid.constrained.wrench_times import check_offsets
+from robotid.constrained.wrench_times import check_gains, check_level, check_offsets
 from robotid.constrained.wrenches import _Reading, check_wrenches
+from robotid.logs.base import BaseMotion
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.constraints import constraint_jacobian
@@ -295,3 +296,85 @@ def test_a_better_reading_halves_one_residual_and_keeps_the_other(force, moment,
     small = reading(40.0, 4.0).is_better(stated, (101.0, 11.0))  # both are small already
     assert small is False
     assert reading(40.0, 15.0).is_better(stated, (90.0, 16.0)) is True  # a small moment may grow
+
+
+@pytest.mark.parametrize("foot", FEET)
+def test_the_gain_of_one_foot_is_named_with_its_factor(urdf, long_log, foot):
+    wrong = {x: y * (1.3 if x.endswith(foot) else 1.0) for x, y in long_log.wrenches.items()}
+    (finding,) = found(human(urdf), replace(long_log, wrenches=wrong))
+    assert (finding.code, finding.severity) == ("wrench_gain", "warning")
+    factor = finding.evidence["factor"]
+    is_other = f"that of {foot} is multiplied" not in finding.message
+    assert (1 / factor if is_other else factor) == pytest.approx(1 / 1.3, rel=0.02)
+    assert "The log does not show which of both is wrong" in finding.message
+
+
+def shifting(rng, gains, count=400):
+    """Return loads (N, 3, k) that share a force in motion, measured with gains, and that force."""
+    shares = rng.dirichlet(np.full(len(gains), 0.5), 20)
+    shares = np.repeat(shares, count // 20, axis=0)
+    left = np.array([3.0, -2.0, 500.0]) + rng.normal(size=(count, 3)) * [20.0, 20.0, 10.0]
+    loads = left[:, :, None] * shares[:, None] / gains + rng.normal(size=(count, 3, len(gains)))
+    return loads, left
+
+
+def test_the_gain_of_a_foot_is_relative_to_the_median_of_the_others():
+    """A mass of the URDF that is wrong by 1.2 is common to all feet."""
+    gains, names = np.array([1.0, 1.02, 0.8, 0.99]), ("a", "b", "c", "d")
+    loads, left = shifting(np.random.default_rng(0), gains)
+    (finding,) = check_gains("log", names, loads, 1.2 * left)
+    solved = np.linalg.lstsq(loads.reshape(-1, 4), 1.2 * left.ravel(), rcond=None)[0]
+    factor = solved[2] / np.median(solved[[0, 1, 3]])
+    assert finding.evidence["factor"] == pytest.approx(factor, rel=2e-3)
+    assert factor == pytest.approx(0.8, abs=0.01)
+    assert 1e-4 < finding.evidence["std_error"] < 0.01
+    assert f"that of c is multiplied by {finding.evidence['factor']:.3g} +-" in finding.message
+    assert "relative to a, b, d: the gain" in finding.message
+    assert not list(check_gains("log", names[:2], loads[:, :, :2] * 1.1, left))  # not all the load
+    right, same = shifting(np.random.default_rng(1), np.array([1.03, 1.0, 1.0, 0.98]))
+    assert not list(check_gains("log", names, right, 1.2 * same))
+
+
+def test_the_standard_error_of_a_gain_is_its_scatter_over_logs():
+    gains, found = np.array([1.0, 1.0, 0.8]), []
+    for seed in range(60):
+        loads, left = shifting(np.random.default_rng(seed), gains)
+        (finding,) = check_gains("log", ("a", "b", "c"), loads, left)
+        found.append([finding.evidence["factor"], finding.evidence["std_error"]])
+    factors, errors = np.array(found).T
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(factors.std(ddof=1), rel=0.35)
+
+
+def test_loads_that_do_not_shift_show_no_gain():
+    rng = np.random.default_rng(0)
+    left = np.array([0.0, 0.0, 500.0]) + rng.normal(size=(400, 3))
+    loads = left[:, :, None] * np.array([0.5, 0.5 / 1.3]) + 0.1 * rng.normal(size=(400, 3, 2))
+    assert not list(check_gains("log", ("a", "b"), loads, left))
+
+
+def test_a_mean_horizontal_force_is_an_offset_or_a_tilt():
+    rng, down = np.random.default_rng(0), np.array([0.0, -9.81, 0.0])
+    excess = rng.normal(size=(400, 3)) * [5.0, 50.0, 5.0] + [6.0, 200.0, -8.0]
+    (finding,) = check_level("log", excess, down, 700.0)
+    mean = excess[:, [0, 2]].mean(axis=0)
+    assert (finding.code, finding.severity) == ("wrench_offset", "warning")
+    assert finding.evidence["horizontal"] == pytest.approx(np.hypot(*mean))
+    assert finding.evidence["angle"] == pytest.approx(np.degrees(np.arctan(10.0 / 700.0)), rel=0.1)
+    parts = excess.reshape(8, 50, 3)[:, :, [0, 2]].mean(axis=1)
+    error = np.sqrt(np.sum(parts.var(axis=0, ddof=1)) / 8)
+    assert finding.evidence["std_error"] == pytest.approx(error)
+    assert not list(check_level("log", excess, down, 1100.0))  # below 1 % of the weight
+    assert not list(check_level("log", excess - [6.0, 0.0, -8.0], down, 50.0))
+
+
+def test_an_offset_of_feet_that_stand_is_named(urdf, long_log):
+    """A tilt of the axes of the motion by 1.5 deg is like a horizontal force of 2.6 % of it."""
+    model = human(urdf)
+    assert not found(model, long_log)
+    tilt = pin.Quaternion(pin.rpy.rpyToMatrix(np.radians(1.5), 0.0, 0.0))
+    pose = long_log.base.pose.copy()
+    pose[:, :3] = pose[:, :3] @ tilt.matrix().T
+    pose[:, 3:] = [(tilt * pin.Quaternion(x)).coeffs() for x in pose[:, 3:]]
+    (finding,) = found(model, replace(long_log, base=BaseMotion(pose)))
+    assert finding.code == "wrench_offset"
+    assert finding.evidence["angle"] == pytest.approx(1.5, abs=0.3)

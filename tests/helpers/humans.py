@@ -171,20 +171,35 @@ def walk(model, true, rng, duration=20.0, rate=100.0, pace=1.0):
         turn = [pin.Quaternion(pin.rpy.rpyToMatrix(x)).coeffs() for x in pose[:, 3:]]
         return np.hstack([pose[:, :3], turn, joints(t)])
 
-    data = robot.createData()
-    ids = [robot.getFrameId(foot) for foot in FEET]
     left = shares(pace * t)[0]
-    wrenches, feet = np.empty((len(t), 2, 6)), np.empty((len(t), 2), dtype=object)
+    total, feet = forces(robot, q_at, t, FEET)
+    return Walk(t, q_at(t), np.stack([left, 1 - left], axis=1)[:, :, None] * total[:, None], feet)
+
+
+def forces(robot, q_at, t, frames):
+    """Return the wrench that moves a robot, and the placements of frames, by plain RNEA.
+
+    Args:
+        robot: Its Pinocchio model.
+        q_at: Pose of the base and positions of joints, shape (N, 7 + n), from times.
+        t: Times, shape (N,) [s].
+        frames: Names of the frames.
+
+    Returns:
+        The wrench at the origin of the world, shape (N, 6), and placements, shape (N, k), objects.
+    """
+    data = robot.createData()
+    ids = [robot.getFrameId(name) for name in frames]
+    total, places = np.empty((len(t), 6)), np.empty((len(t), len(ids)), dtype=object)
     before, now, after = q_at(t - _STEP), q_at(t), q_at(t + _STEP)
     for k in range(len(t)):
         first = pin.difference(robot, before[k], now[k]) / _STEP
         last = pin.difference(robot, now[k], after[k]) / _STEP
         tau = pin.rnea(robot, data, now[k], (first + last) / 2, (last - first) / _STEP)
         pin.framesForwardKinematics(robot, data, now[k])
-        total = data.oMi[1].act(pin.Force(tau[:6])).vector  # at the origin of the world
-        wrenches[k] = np.outer([left[k], 1 - left[k]], total)
-        feet[k] = [data.oMf[i].copy() for i in ids]
-    return Walk(t, now, wrenches, feet)
+        total[k] = data.oMi[1].act(pin.Force(tau[:6])).vector
+        places[k] = [data.oMf[i].copy() for i in ids]
+    return total, places
 
 
 def _postures(model, t, rng, pace):
@@ -234,7 +249,9 @@ def _stand(robot, foot, pelvis, joints, columns, goals, swings):
             raise AssertionError(f"the {foot} does not come to its place in posture {k}")
 
 
-def logged(model, motion, rng, *, plates=None, noise=(5e-4, 2e-3, 1.0, 0.05)):
+def logged(
+    model, motion, rng, *, plates=None, noise=(5e-4, 2e-3, 1.0, 0.05), frames=FEET
+):  # fmt: skip
     """Return the log of a motion, without torques.
 
     Args:
@@ -244,6 +261,7 @@ def logged(model, motion, rng, *, plates=None, noise=(5e-4, 2e-3, 1.0, 0.05)):
         plates: Placement of the force plate of each foot, whose origin and axes the wrenches have;
             None: those of the foot, as of shoes.
         noise: Standard deviations of positions [m], angles [rad], forces [N] and moments [N m].
+        frames: The feet.
     """
     position, angle, force, moment = noise
     q = motion.q + angle * rng.standard_normal(motion.q.shape)
@@ -252,7 +270,7 @@ def logged(model, motion, rng, *, plates=None, noise=(5e-4, 2e-3, 1.0, 0.05)):
     for k, turn in enumerate(turns):
         q[k, 3:7] = (pin.Quaternion(motion.q[k, 3:7]) * pin.Quaternion(pin.exp3(turn))).coeffs()
     wrenches = {}
-    for i, foot in enumerate(FEET):
+    for i, foot in enumerate(frames):
         own = np.array([
             (motion.feet[k, i] if plates is None else plates[i]).actInv(pin.Force(f)).vector
             for k, f in enumerate(motion.wrenches[:, i])

@@ -87,6 +87,12 @@ TALOS = Biped(
      "arm_right_4_joint": -0.8, "gripper_left_joint": -0.5, "gripper_right_joint": -0.5},
     kp=5000.0, kd=50.0, armature=0.1, damping=1.0, torque=0.3,
 )  # fmt: skip
+ICUB = Biped(
+    "icub.urdf", {f"{x}_sole": _corners(0.1, -0.05, 0.025, 0.0) for x in "lr"},
+    {"hip_pitch": 0.8, "knee": -1.6, "ankle_pitch": -0.8, "elbow": 0.8, "l_shoulder_roll": 0.5,
+     "r_shoulder_roll": 0.5},
+    kp=0.0, kd=0.0, armature=0.0, damping=0.0, torque=0.0,
+)  # fmt: skip
 
 
 def waves(rng, count, lowest, highest, tones=6):
@@ -117,12 +123,11 @@ def _pendulum(pressure, height):
     return solve_banded((1, 1), bands, pressure)
 
 
-def steps(biped, model, rng, duration):
-    """Return the first posture, and positions and torques of joints from the time.
+def planned(biped, model, rng, duration):
+    """Return what ``steps`` plans: the posture, times, places (N, 7 + n), loads and lifts.
 
-    The feet leave the ground in turn, and return. The centre of mass moves as an inverted pendulum
-    on the centre of pressure, which shifts between the feet. The trunk moves up and down and turns,
-    other joints follow sines. The torques are those of this motion.
+    The load is the share of the weight on the left foot, shape (N,); lifts are those of both feet,
+    shape (2, N).
     """
     t = np.arange(-SETTLES - 2 / _PLAN, duration + 3 / _PLAN, 1 / _PLAN)
     body, late = _Posture(biped, model), np.maximum(t, 0.0)
@@ -138,12 +143,23 @@ def steps(biped, model, rng, duration):
     for k in range(len(t)):
         feet = [lift[k] * up + lift[k] ** 2 * swings[k] for lift in lifts]
         places.append(body.reach(trunk[k], arms[k], feet, between[k]))
+    return body, t, np.array(places), share, lifts
+
+
+def steps(biped, model, rng, duration):
+    """Return the first posture, and positions and torques of joints from the time.
+
+    The feet leave the ground in turn, and return. The centre of mass moves as an inverted pendulum
+    on the centre of pressure, which shifts between the feet. The trunk moves up and down and turns,
+    other joints follow sines. The torques are those of this motion.
+    """
+    body, t, places, share, _ = planned(biped, model, rng, duration)
     rates = [body.rate(*x) for x in pairwise(places)]
     torques = [
         body.torque(q, 0.5 * (v + w), (w - v) * _PLAN, own)
         for q, v, w, own in zip(places[1:], rates, rates[1:], share[1:], strict=False)
     ]
-    at = CubicSpline(t[1:-1], np.hstack([np.array(places)[1:-1, 7:], torques]))
+    at = CubicSpline(t[1:-1], np.hstack([places[1:-1, 7:], torques]))
     return places[2], lambda time: np.split(at(time), [len(model.joints)])
 
 
