@@ -204,26 +204,26 @@ class ProjectedRows(RowSource):
         every = np.unique(np.concatenate(self.own.columns))
         places = [np.append(np.searchsorted(every, own), len(every)) for own in self.own.columns]
         mixed = np.flatnonzero(mixed_rows(self.basis, self.weights))
-        room = np.zeros((_CACHED, len(mixed), len(every) + 1))
+        room, done = np.zeros((2, _CACHED, len(mixed), len(every) + 1))
         found: list[Array] = []
         for block in self.own.blocks(start, stop, segment):
             size = len(block[0])
-            if len(found) == 0 or len(found[0]) != size:
+            if not found or len(found[0]) < size:
                 found = [np.zeros((size, len(own) + 1), order="F") for own in self.columns]
             for first in range(0, size, _CACHED):  # as many as the cache of a core holds
                 some = slice(first, min(first + _CACHED, size))
                 k = slice(start + some.start, start + some.stop)
-                X = room[: some.stop - some.start]
+                X, Y = (x[: some.stop - some.start] for x in (room, done))
                 for i, j in enumerate(mixed):
-                    X[:, i, places[j]] = block[j][some]
+                    X[:, i, places[j]] = block[j][some]  # other columns of the room remain 0
                 B, root = self.basis[k][:, mixed], np.sqrt(self.weights[k][:, mixed, None])
                 P = root * (np.eye(len(mixed)) - B @ B.swapaxes(1, 2))
-                X = P @ X  # other columns of the room remain 0
-                for j, rows in zip(mixed, X.swapaxes(0, 1), strict=True):
+                np.matmul(P, X, out=Y)
+                for j, rows in zip(mixed, Y.swapaxes(0, 1), strict=True):
                     if len(self.columns[j]):
                         found[j][some] = rows
             start += size
-            yield found
+            yield [rows[:size] for rows in found]
 
 
 def constrained(
