@@ -28,7 +28,7 @@ _FINEST = 1000  # largest number of points of the uniform grid per row of the lo
 _ALL = slice(None)
 _KEPT = 20_000  # rows of a log up to which its motions are kept as long as the log
 _KNOWN: WeakKeyDictionary[Log, dict[object, Trajectory]] = WeakKeyDictionary()
-_SPREAD = 1.0  # [periods of the filter] by which it spreads a force
+_SPREAD = 4.0  # [time constants] from a force at which the filter leaves 0.5 % of it
 _JUMPS = 14.0  # [time constants] after which it has forgotten a jump: 1e-6
 _BESIDE = 16  # rows after which splines and differences have
 
@@ -265,10 +265,10 @@ def _contacts(log: Log, t: Array, settings: SignalSettings) -> tuple[Array, Arra
     """Return which links may touch the ground at times (N, k), and where that changes (N,), bool.
 
     A contact begins and ends between two rows of the log. The filter of the torque spreads its
-    force over a period before and after it: there, too, the force is unknown. Without a filter the
-    acceleration jumps between the two rows.
+    force before and after it: there, too, the force is unknown. What is neglected adds up over
+    steps to an error of the mass. Without a filter the acceleration jumps between the two rows.
     """
-    reach = _SPREAD / settings.cutoff if settings.cutoff else 0.0
+    reach = _SPREAD * _time_constant(settings)
     reach += 1e-9 * float(log.t[-1] - log.t[0])
     touching = np.zeros((len(t), len(log.contacts)), dtype=bool)
     for k, flags in enumerate(log.contacts.values()):

@@ -191,9 +191,10 @@ class ProjectedRows(RowSource):
         return tuple(every if used else every[:0] for used in is_used)
 
     def rows(self, start: int, stop: int) -> Array:
-        k = slice(start, stop)
-        left = 1.0 - np.sum(self.basis[k] ** 2, axis=2)  # (k, n_rows), diagonal of P
-        count: Array = np.rint(np.sum(left, axis=0, where=self.weights[k] > 0)).astype(int)
+        B = self.basis[start:stop]
+        left = 1.0 - np.einsum("kij,kij->ki", B, B)  # (k, n_rows), diagonal of P
+        is_used = self.weights[start:stop] > 0
+        count: Array = np.rint(np.sum(left, axis=0, where=is_used)).astype(int)
         return count
 
     def select(self, columns: Array) -> "ProjectedRows":
@@ -203,26 +204,26 @@ class ProjectedRows(RowSource):
         every = np.unique(np.concatenate(self.own.columns))
         places = [np.append(np.searchsorted(every, own), len(every)) for own in self.own.columns]
         mixed = np.flatnonzero(mixed_rows(self.basis, self.weights))
-        basis, weights = self.basis, self.weights
-        if len(mixed) < weights.shape[1]:
-            basis, weights = basis[:, mixed], weights[:, mixed]
-        room = np.zeros((_CACHED, len(mixed), len(every) + 1))
+        room, done = np.zeros((2, _CACHED, len(mixed), len(every) + 1))
+        found: list[Array] = []
         for block in self.own.blocks(start, stop, segment):
             size = len(block[0])
-            found = [np.zeros((size, len(own) + 1), order="F") for own in self.columns]
+            if not found or len(found[0]) < size:
+                found = [np.zeros((size, len(own) + 1), order="F") for own in self.columns]
             for first in range(0, size, _CACHED):  # as many as the cache of a core holds
                 some = slice(first, min(first + _CACHED, size))
                 k = slice(start + some.start, start + some.stop)
-                X = room[: some.stop - some.start]
+                X, Y = (x[: some.stop - some.start] for x in (room, done))
                 for i, j in enumerate(mixed):
-                    X[:, i, places[j]] = block[j][some]
-                X = without_forces(basis[k], X)  # other columns of the room remain 0
-                X *= np.sqrt(weights[k])[..., None]
-                for j, rows in zip(mixed, X.swapaxes(0, 1), strict=True):
+                    X[:, i, places[j]] = block[j][some]  # other columns of the room remain 0
+                B, root = self.basis[k][:, mixed], np.sqrt(self.weights[k][:, mixed, None])
+                P = root * (np.eye(len(mixed)) - B @ B.swapaxes(1, 2))
+                np.matmul(P, X, out=Y)
+                for j, rows in zip(mixed, Y.swapaxes(0, 1), strict=True):
                     if len(self.columns[j]):
                         found[j][some] = rows
             start += size
-            yield found
+            yield [rows[:size] for rows in found]
 
 
 def constrained(
