@@ -50,7 +50,8 @@ class Slope:
     Attributes:
         parameter: Index of the parameter.
         covariate: The covariate of each run, shape (k,).
-        scale: Plausible size of the slope, positive.
+        scale: Plausible size of the slope, positive. Before the data, the slope is normal about 0
+            with 100 times this standard deviation, as a mean is.
     """
 
     parameter: int

@@ -9,7 +9,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.variation.causes import evidence_by_group
-from robotid.variation.covariates import Effect, effects_of, with_effects
+from robotid.variation.covariates import Effect, effects_of, model_of, with_effects
 from robotid.variation.groups import FEWEST_RUNS, RunsOf
 from robotid.variation.mixed_effects import MixedEffects, Prediction, covariance_of
 
@@ -296,17 +296,19 @@ def shrunk_correlation(values: Array) -> Array:
     return np.where(off, left[:, None] * r * left, 1.0)
 
 
-def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter]:
+def _parameters(group: RunsOf, every: MixedEffects) -> Iterator[VaryingParameter]:
     """Yield the parameters of a group on which the runs have information."""
-    values, errors = model.values
+    of_every = every.with_one_more()
     known = np.einsum("kpp->p", group.runs.H) > 0.0
-    for p, prediction in enumerate(model.with_one_more()):
+    for p in range(len(of_every)):
         if known[p]:
-            centre = float(group.centre[p])
+            centre, model = float(group.centre[p]), model_of(group, every, p)
+            predictions = of_every if model is every else model.with_one_more()
+            values, errors = model.values
             yield VaryingParameter(
                 group.group.parameters[p],
                 group.group.units[p],
-                prediction.shifted(centre),
+                predictions[p].shifted(centre),
                 centre + values[:, p],
                 errors[:, p],
                 float(model.deviation[0, p]) if model.n_levels == 2 else None,
