@@ -507,8 +507,8 @@ def tally(count, robots, logs, true, similar):
         unit = np.repeat(np.arange(robots), logs)
         warm = 20.0 + 8.0 * rng.normal(size=total)
         c, x = warm - warm.mean(), 0.08 * rng.normal(size=(total, 12))
-        of_robot = BETWEEN * rng.normal(size=(robots, 12)) * (robots > 1)
-        x += of_robot[unit]
+        if robots > 1:
+            x += BETWEEN * rng.normal(size=(robots, 12))[unit]
         for p, slope in true.items():
             x[:, p] += slope * c
         about = (Covariate("temperature", "degC", warm),
@@ -536,11 +536,11 @@ def tally(count, robots, logs, true, similar):
             spread = np.hypot(0.08, BETWEEN * (robots > 1))
             ahead += low < slope * at + spread * rng.normal() < high
     total = len(true) * count
-    words = " and ".join(f"{100 * slope:g} % of {p}" for p, slope in true.items())
+    words = "two drives" if 9 in true else "two of a drive" if 1 in true else "one"
     words += ", hardly distinguishable" if similar < 1.0 else ""
     print(f"| {robots} x {logs} | {words} | {hits} of {total} | {others} of {count} | "
-          f"{np.median(sizes or [np.nan]):.2f} | {100 * inside / total:.0f} % | {right} of {hits} | "
-          f"{100 * ahead / total:.0f} % |", flush=True)  # fmt: skip
+          f"{np.median(sizes or [np.nan]):.2f} | {100 * inside / total:.0f} % | {right} of {hits} "
+          f"| {100 * ahead / total:.0f} % |", flush=True)  # fmt: skip
 
 
 def warm_up(honest, count):

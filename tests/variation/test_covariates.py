@@ -340,3 +340,21 @@ def test_an_effect_is_not_biased_by_one_of_a_term_that_is_hardly_distinguishable
             inside += abs(effect.slope + 0.02) < 1.96 * effect.std_error
     assert np.mean(sizes) == pytest.approx(-0.02, abs=0.002)
     assert 17 <= inside <= 20
+
+
+def test_units_are_compared_whose_mean_covariate_rounds():
+    """The mean of c - mean(c) is 1e-16, not 0, for one of these robots."""
+    rng = np.random.default_rng(14)
+    unit, c = np.repeat(np.arange(5), 3), np.round(8.0 * rng.normal(size=15), 1)
+    x, C, runs = drawn_runs(rng, unit=unit)
+    own = c[3:6] - c[3:6].mean()
+    assert own.mean() != 0.0
+    model = MixedEffects(runs.with_slopes([Slope(1, c, 0.1)]))
+    found = model.against_others(np.arange(5), is_unit=True)
+    moved = model.runs.seen_from([c[3:6].mean()])
+    others = MixedEffects(moved.without_unit(1), model.deviation)
+    slopes, first = [Slope(1, own, 0.1)], others.deviation[:1, :2]
+    wanted, P = least_squares(x[3:6], C[3:6], slopes, first, np.zeros(3, int))
+    assert found.values[1] == pytest.approx(wanted[:2], rel=1e-2)
+    assert np.sqrt(np.diag(found.covariance[1])) == pytest.approx(np.sqrt(np.diag(P))[:2], rel=1e-2)
+    assert found.mean[1] == pytest.approx([each.mean for each in others.predict()], rel=1e-6)
