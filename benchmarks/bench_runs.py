@@ -515,18 +515,23 @@ def tally(count, robots, logs, true, similar):
                  Covariate("time", "h", rng.uniform(0.0, 50.0, total)))  # fmt: skip
         found = estimates(rng, x, unit, about, similar)
         chosen = with_effects(found)
-        used = {4 * j + p: each for j, group in enumerate(chosen) for p in range(4)
-                for each in effects_of(group, model_of(group, MixedEffects(group.runs), p), p)[:1]
-                if each.is_used}  # fmt: skip
-        n_used = sum(len(group.runs.slopes) for group in chosen)
+        used = {}
+        for j, group in enumerate(chosen):
+            for place, each in enumerate(group.runs.slopes):
+                if np.array_equal(each.covariate, c):
+                    model = model_of(group, MixedEffects(group.runs), each.parameter)
+                    used[4 * j + each.parameter] = model.slope(place)
         own = [p for p in used if p in true]
-        hits, others = hits + len(own), others + (n_used > len(own))
-        sizes += [used[p].slope / true[p] for p in own]
-        right += sum(abs(used[p].slope - true[p]) < 1.96 * used[p].std_error for p in own)
+        hits += len(own)
+        others += sum(len(group.runs.slopes) for group in chosen) > len(own)
+        sizes += [used[p][0] / true[p] for p in own]
+        right += sum(abs(used[p][0] - true[p]) < 1.96 * used[p][1] for p in own)
         for p, slope in true.items():
             group, q = found[p // 4], p % 4
             moved = group.runs.h - slope * c[:, None] * group.runs.H[:, :, q]
-            shifted = replace(group, runs=replace(group.runs, h=moved))  # about the true slope
+            shifted = replace(  # about the true slope
+                group, runs=replace(group.runs, h=moved), covariates=about[:1]
+            )
             inside += effects_of(shifted, MixedEffects(shifted.runs), q)[0].probability > 0.05
             runs = group.runs.with_slopes([Slope(q, c, 0.1 / c.std())])
             model = model_of(replace(group, runs=runs), MixedEffects(runs), q)
